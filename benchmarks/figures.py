@@ -50,7 +50,9 @@ def holds(value: float, goal: str) -> bool:
 
 
 def _printed(value: float, goal: str) -> str:
-    """Four digits, or as many as the verdict needs: 99.996 is not printed as 100 where the goal is 100."""
+    """Four digits, all those of a whole number, or as many as the verdict needs: 99.996 is not 100 if the goal is."""
+    if value == int(value):
+        return str(int(value))
     texts = [f"{value:.{digits}g}" for digits in range(4, 18)]
     return next(text for text in texts if holds(float(text), goal) == holds(value, goal))
 

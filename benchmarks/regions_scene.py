@@ -22,7 +22,7 @@ from kinefit.bodies.surfaces.triangles import body_mesh
 from kinefit.bodies.tree import KinematicTree
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.rendering import Canvas
+from kinefit.rendering import Canvas, lens_of
 
 SIZE, FOCAL = (640, 512), 650.0
 RATE = 30.0  # [Hz]
@@ -204,14 +204,13 @@ def plates() -> tuple[NDArray, ...]:
 
 def drawn(what: Thing, T: NDArray, light: NDArray, canvas: Canvas, cam: Camera) -> tuple[NDArray, NDArray]:
     """Colours (h, w, 3) and cover (h, w) of an object in a canvas of twice the camera's size."""
-    K = cam.matrix
-    fx, fy, cx, cy = 2 * K[0, 0], 2 * K[1, 1], 2 * K[0, 2] + 0.5, 2 * K[1, 2] + 0.5
+    lens = 2 * lens_of(cam) + (0.0, 0.0, 0.5, 0.5)
     x = what.vertices @ T[:3, :3].T + T[:3, 3]
-    raster = canvas.draw(x, what.faces, fx, fy, cx, cy, cull=True)
+    raster = canvas.draw(x, what.faces, lens, cull=True)
     colour, cover = np.zeros((*raster.face.shape, 3), np.float32), (raster.face >= 0).astype(np.float32)
     v, u = np.nonzero(raster.face >= 0)
     z, face = raster.depth[v, u], raster.face[v, u]
-    seen = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], axis=1)
+    seen = np.stack([(u - lens[2]) / lens[0] * z, (v - lens[3]) / lens[1] * z, z], axis=1)
     own = (seen - T[:3, 3]) @ T[:3, :3]
     corners = x[what.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -94,8 +94,8 @@ def track(model: Morphing, seen: list[list[NDArray]], views: list[Camera], first
             for camera, image in zip(views, several):
                 rim = finder.find(pose.vertices, camera)
                 rim = rim.chosen(~rim.inner)
-                pairs = outline_pairs(rim.outline, image, reach=bound)
-                parts.append(morphed_outline_rows(pose, rim, camera, image, pairs, sigma=bound / 3.0))
+                i, k = outline_pairs(rim.outline, image, reach=bound)
+                parts.append(morphed_outline_rows(pose, rim.chosen(i), camera, image[:, k], sigma=bound / 3.0))
             state = gauss_newton(model.body, state, parts, loss=geman_mcclure(2.0), locked=locked, damping=1e-3).state
         speed = before.difference(state) if found else speed
         found.append(state.angles[np.array(joints) - 6])

@@ -21,7 +21,7 @@ from kinefit.bodies.surfaces import body_mesh
 from kinefit.geometry.camera import Rig
 from kinefit.images.silhouette import colour_mask
 from kinefit.observations import SilhouetteFrame
-from kinefit.rendering import Canvas, render_body
+from kinefit.rendering import Canvas, lens_of, render_body
 from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.tracker import Tracker
 
@@ -120,12 +120,12 @@ def _renderers(body: Body, rig: Rig) -> None:
     R, t = camera.T_camera_world[:3, :3], camera.T_camera_world[:3, 3]
     states = swaying(body, 20)
     x = np.array([mesh.posed(body.tree.forward(s.T_world_root, s.angles)[0]) @ R.T + t for s in states])
-    K, canvas = camera.matrix, Canvas(camera.size)
+    lens, canvas = lens_of(camera), Canvas(camera.size)
     best = np.inf
     for _ in range(5):
         start = time.process_time()
         for vertices in x:
-            canvas.draw(vertices, mesh.faces, K[0, 0], K[1, 1], K[0, 2], K[1, 2], cull=True)
+            canvas.draw(vertices, mesh.faces, lens, cull=True)
         best = min(best, 1e3 * (time.process_time() - start) / len(x))
     print(f"# kinefit {best:.2f} ms a drawing")
     peers = (("OpenGL in software", "KINEFIT_MODERNGL_PYTHON", _GL, ">= 3"),
@@ -137,7 +137,7 @@ def _renderers(body: Body, rig: Rig) -> None:
             continue
         with tempfile.TemporaryDirectory() as folder:
             given = Path(folder) / "in.npz"
-            np.savez(given, x=x, faces=mesh.faces, lens=K[[0, 1, 0, 1], [0, 1, 2, 2]], size=camera.size)
+            np.savez(given, x=x, faces=mesh.faces, lens=lens, size=camera.size)
             alone = {**os.environ, "OMP_NUM_THREADS": "1", "LP_NUM_THREADS": "1"}
             done = subprocess.run([python, "-c", code, given], capture_output=True, text=True, timeout=300, env=alone)
         if done.returncode:

@@ -53,7 +53,7 @@ def test_any_triangles_are_as_rays_see_them(seed):
     random = np.random.default_rng(seed)
     x = random.normal(size=(15, 3)) * 10 ** random.uniform(-1.5, 0.7) + [0, 0, random.uniform(-0.2, 2.0)]
     faces = random.integers(0, 15, (12, 3))
-    raster = rasterise(x, faces, *LENS, SIZE)
+    raster = rasterise(x, faces, LENS, SIZE)
     depth, face = cast(x, faces, *LENS, SIZE)
     differ = raster.face != face
     for j, i in zip(*np.nonzero(differ)):  # only where a ray meets two at one depth, or an edge or plane by a hair
@@ -88,14 +88,14 @@ def test_neighbours_share_no_pixel_and_leave_none(whole_pixels):
         u, v = np.round(u), np.round(v)
     z = random.uniform(1.0, 3.0, u.shape)
     x, faces = grid(11, 9, np.stack([(u - 15) / 64 * z, (v - 11) / 64 * z, z], axis=-1).reshape(-1, 3))
-    count = sum(rasterise(x, face[None], 64, 64, 15, 11, SIZE).seen.astype(int) for face in faces)
+    count = sum(rasterise(x, face[None], (64, 64, 15, 11), SIZE).seen.astype(int) for face in faces)
     assert (count == 1).all()
 
 
 def test_depth_is_exact_on_a_slanted_plane():
     """1/z is linear in the image, z is not."""
     x = np.array([[-1.0, -1.0, 1.0], [1.0, -1.0, 4.0], [1.0, 1.0, 4.0], [-1.0, 1.0, 1.0]]) * 3
-    raster = rasterise(x, [[0, 1, 2], [0, 2, 3]], *LENS, SIZE)
+    raster = rasterise(x, [[0, 1, 2], [0, 2, 3]], LENS, SIZE)
     ray = np.broadcast_to((np.arange(SIZE[0]) - LENS[2]) / LENS[0], raster.depth.shape)  # plane z = 7.5 + 1.5 x
     assert raster.seen.mean() > 0.7
     np.testing.assert_allclose(raster.depth[raster.seen], (7.5 / (1 - 1.5 * ray))[raster.seen], rtol=1e-6)
@@ -103,24 +103,24 @@ def test_depth_is_exact_on_a_slanted_plane():
 
 def test_what_is_turned_away_is_left_out():
     x, faces = sphere(centre=(0, 0, 3))
-    whole, front = rasterise(x, faces, *LENS, SIZE), rasterise(x, faces, *LENS, SIZE, cull=True)
+    whole, front = rasterise(x, faces, LENS, SIZE), rasterise(x, faces, LENS, SIZE, cull=True)
     np.testing.assert_array_equal(whole.face, front.face)
-    inside = rasterise(x, faces[:, ::-1], *LENS, SIZE, cull=True)
+    inside = rasterise(x, faces[:, ::-1], LENS, SIZE, cull=True)
     assert inside.depth[12, 15] == pytest.approx(4.0, abs=0.05)
     assert whole.depth[12, 15] == pytest.approx(2.0, abs=0.05)
 
 
 def test_nothing_without_an_inside_is_drawn():
     x = np.array([[0, 0, 1.0], [0.1, 0.1, 1.0], [0.2, 0.2, 1.0], [0, 0, 1.0], [0, 0, -1.0]])
-    raster = rasterise(x, [[0, 1, 2], [0, 3, 1], [0, 0, 0], [4, 4, 4], [4, 4, 0]], *LENS, SIZE)
+    raster = rasterise(x, [[0, 1, 2], [0, 3, 1], [0, 0, 0], [4, 4, 4], [4, 4, 0]], LENS, SIZE)
     assert not raster.seen.any()
-    assert not rasterise(np.empty((0, 3)), np.empty((0, 3), int), *LENS, SIZE).seen.any()
+    assert not rasterise(np.empty((0, 3)), np.empty((0, 3), int), LENS, SIZE).seen.any()
 
 
 def test_standing_within_a_sphere_leaves_no_hole():
     """The floor on which a camera lies, and all that reaches behind it, is cut and not lost."""
     x, faces = sphere(around=40, centre=(0.2, 0.1, 0.3))
-    assert rasterise(x, faces, 20.0, 20.0, 15, 11, SIZE).seen.all()
+    assert rasterise(x, faces, (20.0, 20.0, 15, 11), SIZE).seen.all()
 
 
 @pytest.mark.parametrize(
@@ -205,7 +205,7 @@ def test_cutting_triangles_keeps_the_surface_whole():
     edges = np.concatenate([more[:, [0, 1]], more[:, [1, 2]], more[:, [2, 0]]])
     assert np.linalg.norm(fine[edges[:, 0]] - fine[edges[:, 1]], axis=1).max() <= 0.2
     np.testing.assert_allclose(
-        rasterise(fine + [0, 0, 3], more, *LENS, SIZE).depth, rasterise(x + [0, 0, 3], faces, *LENS, SIZE).depth,
+        rasterise(fine + [0, 0, 3], more, LENS, SIZE).depth, rasterise(x + [0, 0, 3], faces, LENS, SIZE).depth,
         rtol=1e-6,
     )  # fmt: skip
 
@@ -219,14 +219,14 @@ def test_cutting_triangles_keeps_the_surface_whole():
         ({"faces": [0, 1, 2]}, "faces"),
         ({"vertices_camera": [[0, 0], [1, 0], [0, 1]]}, "vertices"),
         ({"size": (0, 4)}, "image"),
-        ({"fx": 0.0}, "lens"),
-        ({"cx": np.nan}, "lens"),
+        ({"lens": (0.0, 9.0, 4.0, 4.0)}, "lens"),
+        ({"lens": (9.0, 9.0, np.nan, 4.0)}, "lens"),
         ({"near": 0.0}, "lens"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(change, word):
-    good = {"vertices_camera": [[0, 0, 1], [1, 0, 1], [0, 1, 1.0]], "faces": [[0, 1, 2]], "fx": 9.0, "fy": 9.0}
-    good |= {"cx": 4.0, "cy": 4.0, "size": (8, 8)}
+    good = {"vertices_camera": [[0, 0, 1], [1, 0, 1], [0, 1, 1.0]], "faces": [[0, 1, 2]]}
+    good |= {"lens": (9.0, 9.0, 4.0, 4.0), "size": (8, 8)}
     rasterise(**good)
     with pytest.raises(ObservationError, match=word):
         rasterise(**good | change)
@@ -239,4 +239,4 @@ def test_a_canvas_of_another_size_is_refused(figure):
     with pytest.raises(ObservationError, match="scaled"):
         render_body(body, body.usual_state(), camera, mesh=Balls(body), scale=0.0)
     with pytest.raises(ObservationError, match="labels"):
-        _ = rasterise([[0, 0, 1], [1, 0, 1], [0, 1, 1.0]], [[0, 1, 2]], *LENS, SIZE).segment
+        _ = rasterise([[0, 0, 1], [1, 0, 1], [0, 1, 1.0]], [[0, 1, 2]], LENS, SIZE).segment

@@ -70,3 +70,15 @@ def listed(names: Iterable[str]) -> str:
     """Names as "a", "a and b" or "a, b and c"."""
     names = list(names)
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1] if names else "none"
+
+
+def frame_ranges(frames: Iterable[int], most: int = 12) -> str:
+    """Frames in ascending order as "3, 7-9"; at most so many stretches."""
+    runs: list[list[int]] = []
+    for f in frames:
+        if runs and f == runs[-1][1] + 1:
+            runs[-1][1] = f
+        else:
+            runs.append([f, f])
+    texts = [f"{a}" if a == b else f"{a}-{b}" for a, b in runs]
+    return ", ".join(texts[:most]) + (f" and {len(texts) - most} more stretches" if len(texts) > most else "")

@@ -16,8 +16,9 @@ from tests.cli.stopping import STOPPABLE
 import kinefit
 from kinefit.batch.results import NAMES, USUAL
 from kinefit.cli import main
-from kinefit.cli._summary import bone_lengths, frame_ranges
+from kinefit.cli._summary import bone_lengths
 from kinefit.exporters.report.moments import doubt_sentence, doubtful_moments, when
+from kinefit.findings import frame_ranges
 from kinefit.readers.video import Video
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.tracking.checkpoints.interrupted import TrackingInterrupted

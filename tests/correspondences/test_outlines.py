@@ -120,8 +120,7 @@ def test_rows_by_rays_and_by_pixels_tell_of_one_distance():
     rim = RimFinder(mesh).find(x, view)
     shifted = rim.outline.copy()
     shifted[:2] += 2.0 * shifted[2:]  # two pixels further out everywhere
-    same = np.arange(len(rim))
-    given = (body, state, rim, x, view, shifted, (same, same))
+    given = (body, state, rim, x, view, shifted)
     pixels = outline_rows(*given, sigma=1.0)
     np.testing.assert_allclose(pixels.weight * pixels.residual**2, 4.0, rtol=1e-6)
     rays = outline_rows(*given, sigma=1.0, by="rays")

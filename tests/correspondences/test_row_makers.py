@@ -144,17 +144,17 @@ CASES = {
         lambda state: collision_rows(s.body, state, pairs=random_capsules(s), margin=9.0, sigma=0.7)
     ),
     "depth_image_rows": lambda s: (
-        lambda state: depth_image_rows(s.body, state, *measured_samples(s), before=np.inf, behind=np.inf, facing=-1.0)
+        lambda state: depth_image_rows(frames(s, state), *measured_samples(s), reach=np.inf, facing=-1.0)
     ),
     "free_space_rows": lambda s: (
-        lambda state: free_space_rows(s.body, state, *seen_through(s), sigma=2.0, tolerance=0.0, reach=np.inf)
+        lambda state: free_space_rows(frames(s, state), *seen_through(s), sigma=2.0, tolerance=0.0, reach=np.inf)
     ),
     "surface_rows": lambda s: about_surfaces(s),
     "anchored_rows": lambda s: (
-        lambda state: anchored_rows(s.body, state, *anchors(s), s.target[:, [1, 2, 0]], weight=s.sigma)
+        lambda state: anchored_rows(frames(s, state), *anchors(s), s.target[:, [1, 2, 0]], weight=s.sigma)
     ),
     "target_rows": lambda s: (
-        lambda state: target_rows(s.body, state, *anchors(s)[:2], *in_one_camera(s), slack=3.0, sigma=0.7)
+        lambda state: target_rows(frames(s, state), *anchors(s)[:2], *in_one_camera(s), slack=3.0, sigma=0.7)
     ),
     "morphed_rows": lambda s: on_a_morphed_skin(s),
     "morphed_outline_rows": lambda s: outlines_of_a_morphed_skin(s),
@@ -167,6 +167,11 @@ CASES = {
         )
     ),
 }
+
+
+def frames(s, state):
+    """Those of the body's segments."""
+    return s.body.tree.forward(state.T_world_root, state.angles)[0]
 
 
 def anchors(s):
@@ -214,9 +219,9 @@ def outlines_of_a_morphed_skin(s):
     none = np.zeros(30, int)
     rim = Rim(np.zeros((4, 30)), random.integers(0, 40, (30, 2)), random.random(30), none, none > 0)
     uv = camera.project(rim.on(morphing.pose(s.state).vertices)) + random.normal(scale=20, size=(30, 2))
-    turn, numbers = random.uniform(0, 2 * np.pi, 30), np.arange(30)
+    turn = random.uniform(0, 2 * np.pi, 30)
     image = np.stack([*uv.T, np.cos(turn), np.sin(turn)])
-    return lambda state: morphed_outline_rows(morphing.pose(state), rim, camera, image, (numbers, numbers), sigma=3.0)
+    return lambda state: morphed_outline_rows(morphing.pose(state), rim, camera, image, sigma=3.0)
 
 
 def outlines_of_random_edges(s):
@@ -232,9 +237,9 @@ def outlines_of_random_edges(s):
 
     rim = Rim(np.zeros((4, count)), np.arange(2 * count).reshape(-1, 2), random.random(count), owner, owner < 0)
     uv = camera.project(rim.on(vertices(s.state))) + random.normal(scale=20, size=(count, 2))
-    turn, numbers = random.uniform(0, 2 * np.pi, count), np.arange(count)
+    turn = random.uniform(0, 2 * np.pi, count)
     image = np.stack([*uv.T, np.cos(turn), np.sin(turn)])
-    return lambda state: outline_rows(s.body, state, rim, vertices(state), camera, image, (numbers, numbers), sigma=3.0)
+    return lambda state: outline_rows(s.body, state, rim, vertices(state), camera, image, sigma=3.0)
 
 
 def on_a_morphed_skin(s):

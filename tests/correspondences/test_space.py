@@ -58,6 +58,10 @@ def one_point(x, normal=(0.0, 0.0, -1.0)):
     return Body("point", tree, ("root",), ("s",), np.zeros(1, int), points), samples
 
 
+def frames(body, state):
+    return body.tree.forward(state.T_world_root, state.angles)[0]
+
+
 def seen(person=2.0, behind=4.0):
     """A depth image of a person 40 pixels wide before a wall."""
     depth = np.full((240, 320), behind, np.float32)
@@ -81,23 +85,23 @@ def seen(person=2.0, behind=4.0):
 def test_only_what_stands_in_free_space_makes_a_row(x, normal, rows):
     body, samples = one_point(x, normal)
     space = FreeSpace.of(seen(), farthest=2.5)
-    assert len(free_space_rows(body, body.rest_state(), samples, space, CAMERA)) == rows
+    assert len(free_space_rows(frames(body, body.rest_state()), samples, space, CAMERA)) == rows
 
 
 def test_a_hole_makes_no_row():
     body, samples = one_point((0.2, 0.0, 2.0))
     space = FreeSpace.of(np.where(seen() > 3.0, 0.0, seen()).astype(np.float32), farthest=2.5)
-    assert len(free_space_rows(body, body.rest_state(), samples, space, CAMERA)) == 0
+    assert len(free_space_rows(frames(body, body.rest_state()), samples, space, CAMERA)) == 0
 
 
 def test_a_sample_goes_sideways_to_the_outline():
     body, samples = one_point((0.2, 0.0, 2.0))
     space = FreeSpace.of(seen(), farthest=2.5)
     state = body.rest_state()
-    rows = free_space_rows(body, state, samples, space, CAMERA)
+    rows = free_space_rows(frames(body, state), samples, space, CAMERA)
     np.testing.assert_allclose(rows.direction[0], [-1, 0, 0.2], atol=0.25)
     for _ in range(4):
-        rows = free_space_rows(body, state, samples, space, CAMERA)
+        rows = free_space_rows(frames(body, state), samples, space, CAMERA)
         state = gauss_newton(body, state, rows).state if len(rows) else state
     uv = CAMERA.project(body.positions(state, PointSet(("p",), np.zeros(1), samples.point.T)))
     assert abs(uv[0, 0] - 139.5) <= space.cell and abs(uv[0, 1] - 119.5) < space.cell
@@ -115,10 +119,10 @@ def test_a_limb_astray_goes_to_where_one_is_missing():
     assert rows.min() >= 50 and rows.max() < 60 and columns.min() >= 115 and columns.max() < 130
     body, samples = one_point((0.2, 0.0, 2.0))  # 45 px right of the trunk, 45 px left of the limb
     for one, way in ((near, -1), (space, 1)):
-        rows = free_space_rows(body, body.rest_state(), samples, one, CAMERA)
+        rows = free_space_rows(frames(body, body.rest_state()), samples, one, CAMERA)
         assert np.sign(rows.direction[0, 0]) == way
     body, samples = one_point((-0.13, 0.0, 2.0))  # 4 px beside the trunk
-    rows = free_space_rows(body, body.rest_state(), samples, space, CAMERA)
+    rows = free_space_rows(frames(body, body.rest_state()), samples, space, CAMERA)
     assert rows.direction[0, 0] < 0 and rows.residual[0] < 0.05
     everything = FreeSpace.of(seen(), farthest=2.5, shown=shown)
     assert np.all(everything.missing == -1)
@@ -133,9 +137,9 @@ def test_free_space_refuses_what_makes_no_sense():
         FreeSpace.of(np.zeros(3), farthest=2.0)
     space = FreeSpace.of(seen(), farthest=2.5)
     with pytest.raises(ObservationError, match="camera depth"):
-        free_space_rows(body, body.rest_state(), samples, space, CAMERA.scaled((160, 120)))
+        free_space_rows(frames(body, body.rest_state()), samples, space, CAMERA.scaled((160, 120)))
     with pytest.raises(ObservationError, match="deviation"):
-        free_space_rows(body, body.rest_state(), samples, space, CAMERA, sigma=-1.0)
+        free_space_rows(frames(body, body.rest_state()), samples, space, CAMERA, sigma=-1.0)
 
 
 def test_gaps_of_capsules_are_the_least_distances():

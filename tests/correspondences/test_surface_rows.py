@@ -59,9 +59,9 @@ def test_points_keep_what_they_found_when_the_body_moves():
     measured, rest, normal = anchored(rows, x, frames)
     assert len(rows) > 50
     np.testing.assert_array_equal(measured, x[rows.group])
-    again = anchored_rows(BODY, state, rows.segment, rest, normal, measured, weight=rows.weight)
+    again = anchored_rows(frames, rows.segment, rest, normal, measured, weight=rows.weight)
     np.testing.assert_allclose(again.data, rows.data, atol=1e-12)
-    away = anchored_rows(BODY, STATE, rows.segment, rest, normal, measured)
+    away = anchored_rows(BODY.tree.forward(STATE.T_world_root, STATE.angles)[0], rows.segment, rest, normal, measured)
     R, R0 = (BODY.tree.forward(s.T_world_root, s.angles)[0][:, :9].reshape(-1, 3, 3) for s in (state, STATE))
     turned = (R0 @ R.swapaxes(1, 2))[rows.segment]
     np.testing.assert_allclose(away.direction, np.einsum("nij,nj->ni", turned, rows.direction), atol=1e-12)

@@ -157,6 +157,12 @@ def test_printed_values_show_their_verdict(log, capsys):
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(("value", "text"), [(61430, "61430"), (12.0, "12"), (61430.5, "6.143e+04"), (-0.0, "0")])
+def test_whole_numbers_are_printed_with_all_their_digits(log, capsys, value, text):
+    figure("a", value, "", "<= 2")
+    assert capsys.readouterr().out.startswith(f"figure a = {text} ")
+
+
 def test_processes_side_by_side_lose_nothing(tmp_path):
     log, code = tmp_path / "figures.csv", (
         "import sys; from pathlib import Path; from benchmarks import ledger\n"

@@ -37,12 +37,6 @@ def test_distance_of_a_point_to_a_line():
     )
 
 
-def test_derivative_of_point_to_line():
-    J = lines.point_line_jacobian(LINE)
-    for k in range(len(X)):
-        np.testing.assert_allclose(J[k], differences(lambda x: lines.point_line(x, LINE[k]), X[k]), atol=1e-9)  # noqa: B023
-
-
 def test_a_plane_holds_what_it_was_made_of():
     np.testing.assert_allclose(np.linalg.norm(PLANE[:, :3], axis=1), 1, atol=1e-14)
     for x in (A, B, X):
@@ -63,14 +57,6 @@ def test_line_to_plane_tells_tilt_and_offset():
     np.testing.assert_allclose(lines.line_plane(above, plane), [0, 0, 0, 0.5], atol=1e-14)
     tilted = lines.line_along([0.0, 0.0, 2.0], [1.0, 0.0, 1.0])
     assert abs(lines.line_plane(tilted, plane)[0] - np.sin(np.pi / 4)) < 1e-14
-
-
-def test_derivative_of_line_to_plane():
-    planes = np.roll(PLANE, 1, axis=0)
-    J = lines.line_plane_jacobian(LINE, planes)
-    for k in range(len(X)):
-        expected = differences(lambda line: lines.line_plane(line, planes[k]), LINE[k])  # noqa: B023
-        np.testing.assert_allclose(J[k], expected, atol=1e-8)
 
 
 @pytest.mark.parametrize("size", [1.0, 1e-7])

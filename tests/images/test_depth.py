@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from kinefit.errors import ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
-from kinefit.images.depth import clean, downsample, normals, slope_of, to_points, voxel
+from kinefit.images.depth import clean, downsample, normals, slope_of, to_points
 
 K = [[150.0, 0, 79.0], [0, 152.0, 61.0], [0, 0, 1]]
 
@@ -109,20 +109,12 @@ def test_downsampling_keeps_factor_minimum_and_maximum(n, factor, minimum, maxim
         assert gaps.max() <= gaps.min() + 1
 
 
-def test_a_voxel_holds_the_mean_of_its_points():
-    x = np.array([[0.0, 0, 0], [0.01, 0, 0], [0.5, 0, 0], [0.5, 0.02, 0], [0.5, 0.9, 0.9]])
-    np.testing.assert_allclose(voxel(x, 0.1), [[0.005, 0, 0], [0.5, 0.01, 0], [0.5, 0.9, 0.9]])
-    assert voxel(np.zeros((0, 3)), 0.1).shape == (0, 3)
-
-
 def test_what_cannot_be_is_told():
     cam = camera()
     with pytest.raises(ObservationError, match=r"shape \(3, 3\)"):
         to_points(np.zeros((3, 3)), cam)
     with pytest.raises(ObservationError, match="factor"):
         downsample(np.zeros((3, 3)), factor=0.5)
-    with pytest.raises(ObservationError, match="cubes"):
-        voxel(np.zeros((3, 3)), 0.0)
     with pytest.raises(ObservationError, match="depth image of shape"):
         clean(np.zeros(5))
 

@@ -9,8 +9,9 @@ from tests.oracle import look_at
 
 from kinefit.errors import CalibrationError, ObservationError
 from kinefit.geometry import se3
-from kinefit.geometry.camera import Camera, Rig
-from kinefit.images.stereo import StereoRectifier, stereo_points
+from kinefit.geometry.camera import Camera
+from kinefit.images.depth import to_points
+from kinefit.images.stereo import StereoRectifier
 from kinefit.readers.calibration.read import read_opencv_stereo
 
 MATRIX = [[290.0, 0, 159.5], [0, 290.0, 119.5], [0, 0, 1]]
@@ -54,7 +55,9 @@ def test_a_wall_is_where_it_is(kind):
     """Most of it is found, and its distance is off by less than half a pixel's worth, without bias."""
     a, b = RIGS[kind]
     pair = StereoRectifier(a, b, near=1.0, far=4.0)
-    points, moved = stereo_points(wall(a), wall(b), Rig((a, b)), ("a", "b"), near=1.0, far=4.0)
+    moved = pair.disparity(wall(a), wall(b))
+    depth = np.nan_to_num(np.float32(pair.camera.matrix[0, 0] * pair.baseline) / moved, nan=0.0)
+    points = to_points(depth, pair.camera)
     assert moved.shape == pair.camera.size[::-1]
     assert len(points) == np.isfinite(moved).sum() > 0.7 * 320 * 240
     off = points @ NORMAL - OFFSET
@@ -115,7 +118,6 @@ def test_what_cannot_work_is_refused():
         (lambda: StereoRectifier(a, b, near=np.nan), ObservationError, "0 < near < far"),
         (lambda: StereoRectifier(a, b).depth(wall(a)[:100], wall(b)), ObservationError, "camera a"),
         (lambda: StereoRectifier(a, b).depth(wall(a), wall(b).astype(float)), ObservationError, "camera b"),
-        (lambda: stereo_points(wall(a), wall(b), Rig((a, b)), ("a", "c")), CalibrationError, "no camera 'c'"),
     ]
     for make, error, message in cases:
         with pytest.raises(error, match=message):

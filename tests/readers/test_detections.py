@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ExportError, FileError
-from kinefit.exporters.pictures.detections import draw_people, write_detections
+from kinefit.exporters.pictures.detections import write_detections
 from kinefit.observations import Detections
 from kinefit.readers.detections import detections_file, detections_key, read_detections
 
@@ -104,15 +104,3 @@ def test_only_npz_is_written(found, tmp_path):
 def test_files_lie_beside_the_take(tmp_path):
     assert detections_file(tmp_path / "walk.toml", "cam 1") == tmp_path / "walk-detect" / "cam 1.npz"
     assert detections_file(tmp_path / "walk.toml", "a/../b").parent == tmp_path / "walk-detect"
-
-
-def test_the_drawing_shows_everybody_and_leaves_the_picture_alone():
-    points = np.full((1, 2, 33, 2), np.nan)
-    points[0, 0] = np.linspace([20, 20], [80, 180], 33)
-    points[0, 1] = np.linspace([1e9, -1e9], [120, 180], 33)
-    runs = [100 * 200, 50, 150, 50, 100 * 200 - 250]
-    found = Detections("c", 1.0, (200, 200), points, np.ones((1, 2, 33)), runs, [0, 5, 5])
-    image = np.zeros((200, 200, 3), np.uint8)
-    drawn = draw_people(image, found, 0)
-    assert not image.any() and drawn.shape == image.shape
-    assert drawn[15:185, 15:85].any() and drawn[0:50, 100:102].any(), "a person, and the outline of the mask"

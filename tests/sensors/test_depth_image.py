@@ -81,17 +81,16 @@ def by_hand(measurement, state, bound, sigma=0.01):
     """The rows of a match by the row makers, with the image drawn where the measurement was prepared."""
     camera, surface, depth = a_rig()["depth"], scene().surface, measurement.depth
     points = np.ascontiguousarray(measurement._points.T)
-    shown = measurement._shown
+    shown, frames = measurement._shown, BODY.tree.forward(state.T_world_root, state.angles)[0]
     own = sigma / np.sqrt(measurement._share / 2.0)
     space = FreeSpace.of(depth, farthest=measurement._farthest, shown=shown, tolerance=3 * sigma + 0.03)
     return [
         surface_rows(BODY, state, points, max_distance=bound, sigma=own, viewpoint=camera.centre_world),
         depth_image_rows(
-            BODY, state, surface.samples, camera, depth, shown, before=bound, behind=bound,
-            sigma=measurement._sample_sigma,
+            frames, surface.samples, camera, depth, shown, reach=bound, sigma=measurement._sample_sigma
         ),
         free_space_rows(
-            BODY, state, surface.samples, space, camera, tolerance=3 * sigma + 0.03, sigma=SETTINGS.through * space.cell
+            frames, surface.samples, space, camera, tolerance=3 * sigma + 0.03, sigma=SETTINGS.through * space.cell
         ),
     ]  # fmt: skip
 

@@ -98,7 +98,7 @@ def twin(score, state):
     frames, _ = tree.forward(state.T_world_root, state.angles)
     x = mesh.posed(frames) @ view.T_view_world[:3, :3].T + view.T_view_world[:3, 3]
     h, w = view.observed.shape
-    z = rasterise(x, mesh.faces, *view.lens.tolist(), (w, h)).depth.astype(float)
+    z = rasterise(x, mesh.faces, view.lens, (w, h)).depth.astype(float)
     drawn, seen = np.isfinite(z), view.seen
     gap = np.where(drawn & seen, z - view.observed, 0.0) / TOLERANCE
     explained = np.sum(np.clip(1 - np.abs(gap), 0, 1)[drawn & seen])

@@ -44,9 +44,9 @@ def test_at_the_match_the_rows_are_those_of_the_row_maker(reach):
     (rows,) = measurement.match(here, reach).rows(here)
     bound = max(reach * measurement.pixels_per_metre, 3.0 * measurement.sigma, 3.0)
     rim, image, sigma = measurement.rim(here), measurement.outline, measurement._row_sigma
-    pairs = outline_pairs(rim.outline, image, reach=bound, angle=SETTINGS.angle)
+    i, k = outline_pairs(rim.outline, image, reach=bound, angle=SETTINGS.angle)
     x = here.pose.vertices
-    expected = outline_rows(BODY, ASIDE, rim, x, measurement.camera, image, pairs, sigma=sigma)
+    expected = outline_rows(BODY, ASIDE, rim.chosen(i), x, measurement.camera, image[:, k], sigma=sigma)
     assert len(rows) > 300
     np.testing.assert_allclose(rows.data[:7], expected.data[:7], atol=1e-9)
     np.testing.assert_allclose(rows.data[7], expected.data[7], rtol=1e-9)

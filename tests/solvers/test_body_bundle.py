@@ -1,12 +1,14 @@
 """Body and cameras in one fit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.oracle import posture, rig_around
 
 from kinefit.bodies import BodyState, load_body
 from kinefit.losses import geman_mcclure
-from kinefit.solvers.bundle.body_bundle import fit_body_and_cameras
+from kinefit.solvers.bundle.body_bundle import BundleState, fit_body_and_cameras
 from kinefit.solvers.bundle.cameras import COLUMNS, TIME, CameraPrior, PointPixels, departure, moved_rig
 from kinefit.solvers.bundle.shape import PixelFrames, shape_parameters
 
@@ -57,10 +59,8 @@ def test_derivatives_by_the_cameras_agree_with_differences():
         s2 = pixels.weight[0] * np.sum(left**2, axis=1)
         return float(np.sum(share * s2 / (1 + s2 / loss.scale**2)))
 
-    H, g = parameters.equations(
-        theta, states[0], RIG, pixels.camera, pixels.column, pixels.uv[0], pixels.weight[0], loss=loss, share=share,
-        freedom=np.ones((3, COLUMNS)), velocity=velocity,
-    )
+    moving = replace(pixels, share=share, velocity=velocity[None])
+    H, g = parameters.equations(theta, states[0], RIG, moving, 0, loss=loss, freedom=np.ones((3, COLUMNS)))
     assert H.shape == (first + 3 * COLUMNS,) * 2
     for k in range(3 * COLUMNS):
         step = np.zeros(3 * COLUMNS)
@@ -69,12 +69,16 @@ def test_derivatives_by_the_cameras_agree_with_differences():
         assert -2.0 * g[first + k] == pytest.approx(slope, rel=1e-4, abs=1e-2 * np.abs(g).max() * 1e-3)
 
 
+def from_mean(rig, states, x=None):
+    return BundleState(rig, np.zeros(len(rig)), model().mean, states, np.zeros((0, 3)) if x is None else x)
+
+
 def test_cameras_that_were_knocked_come_back_with_the_body():
     pixels, states = seen()
     delta = np.random.default_rng(2).normal(scale=0.01, size=(3, COLUMNS)) * (sigma() > 0)
     start = moved_rig(RIG, delta)
     found = fit_body_and_cameras(
-        model(), start, pixels, np.zeros(pixels.uv.shape), states, model().mean, CameraPrior(start, sigma())
+        model(), pixels, from_mean(start, states), CameraPrior(start, sigma())
     )
     left = np.abs(departure(found.rig, RIG))
     assert left[:, :3].max() < 0.02 and left[:, 3:6].max() < 2e-3
@@ -92,7 +96,7 @@ def test_static_points_join_and_hold_the_cameras():
     away = []
     for known, start in ((None, None), (static, x + 0.01)):
         found = fit_body_and_cameras(
-            model(), RIG, pixels, np.zeros(pixels.uv.shape), states, model().mean, prior, static=known, x_static=start
+            model(), pixels, from_mean(RIG, states, start), prior, static=known
         )
         seen_at = np.stack([found.rig.cameras[c].project(x[p]) for p, c in zip(point, camera, strict=True)])
         away.append(np.abs(seen_at - uv).mean())
@@ -103,8 +107,6 @@ def test_static_points_join_and_hold_the_cameras():
 def test_the_order_of_what_is_known_decides_what_moves():
     pixels, states = seen(frames=4)
     fixed = CameraPrior(RIG, np.zeros((3, COLUMNS)))
-    found = fit_body_and_cameras(
-        model(), RIG, pixels, np.zeros(pixels.uv.shape), states, model().mean, fixed
-    )
+    found = fit_body_and_cameras(model(), pixels, from_mean(RIG, states), fixed)
     np.testing.assert_allclose(departure(found.rig, RIG), 0.0, atol=1e-9)
     np.testing.assert_array_equal(found.offsets, 0.0)

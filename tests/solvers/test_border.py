@@ -14,6 +14,7 @@ from kinefit.losses import SQUARED, huber
 from kinefit.rows import PairRows, ParameterRows
 from kinefit.solvers import _kernels_border
 from kinefit.solvers.bundle.border import Prior, solve
+from kinefit.solvers.bundle.border_frames import Weighing
 from kinefit.solvers.bundle.whitened import PoseScrews, columns, residuals
 
 ARM = load_body("arm")
@@ -119,7 +120,7 @@ def test_a_loss_keeps_an_outlier_from_the_lengths():
 def test_a_share_leaves_the_prior_more_to_say():
     problem, states, prior = task()
     full = solve(problem, np.zeros(3), states, prior, np.full(3, 1e-4))
-    less = solve(problem, np.zeros(3), states, prior, np.full(3, 1e-4), shares={"mocap": 0.01})
+    less = solve(problem, np.zeros(3), states, prior, np.full(3, 1e-4), weighing=Weighing({"mocap": 0.01}))
     assert np.allclose(less.information, 0.01 * full.information, rtol=0.05)
     assert np.linalg.norm(less.theta) < np.linalg.norm(full.theta)
 

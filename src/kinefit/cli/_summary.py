@@ -10,6 +10,7 @@ import numpy as np
 
 from kinefit.batch.results import ABOUT
 from kinefit.cli._screen import console, say
+from kinefit.findings import frame_ranges
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -65,13 +66,6 @@ def print_files(files: Mapping[str, Path]) -> None:
     width = max((len(str(path)) for path in files.values()), default=0)
     for format, path in files.items():
         say(f"  {path!s:<{width}}  {ABOUT[format]}")
-
-
-def frame_ranges(frames: NDArray) -> str:
-    """Frames as "3, 7-9"."""
-    parts = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
-    told = [f"{p[0]}" if len(p) == 1 else f"{p[0]}-{p[-1]}" for p in parts if len(p)]
-    return ", ".join(told[:12]) + (f" and {len(told) - 12} more stretches" if len(told) > 12 else "")
 
 
 def lost_segments(motion: Motion) -> dict[str, NDArray]:

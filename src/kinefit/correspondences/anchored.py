@@ -5,17 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit.bodies import Body, BodyState
 from kinefit.correspondences import _kernels_surface as kernels
-from kinefit.correspondences import targets
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.rows import Rows
 
 
 def anchored_rows(
-    body: Body,
-    state: BodyState,
+    frames: NDArray,
     segment: NDArray,
     points: NDArray,
     normals: NDArray,
@@ -23,12 +20,12 @@ def anchored_rows(
     *,
     weight: ArrayLike = 1e4,
     at_surface: bool = True,
-    frames: NDArray | None = None,
 ) -> Rows:
     """One row a point of the surface: what was measured, q, lies r = n·(q − x) along its normal n, which turns with it.
 
     Parameters
     ----------
+    frames : (S, 12) of the segments: `body.tree.forward(state.T_world_root, state.angles)[0]`, or of joints that move.
     segment : (N,) int
     points, normals : (N, 3) [m] of the surface, in the root frame at rest; see `SurfaceAnchors`.
     x_world : (N, 3) [m] measured.
@@ -36,7 +33,6 @@ def anchored_rows(
     at_surface : bool
         Whether a row's point is q's foot on the tangent plane, as of `surface_rows`, or q itself, as of
         `depth_image_rows`. The derivative is the same.
-    frames : (S, 12), optional, of a body whose joints move with its angles.
 
     Raises
     ------
@@ -47,9 +43,7 @@ def anchored_rows(
     x, given = _checked(points, count), _checked(x_world, count)
     w = np.ascontiguousarray(np.broadcast_to(np.asarray(weight, float), count))
     data = np.empty((8, count))
-    kernels.anchored_rows(
-        targets.of_segments(body, state, frames), segment, x, _checked(normals, count), given, w, at_surface, data
-    )
+    kernels.anchored_rows(frames, segment, x, _checked(normals, count), given, w, at_surface, data)
     return Rows(data, segment, np.arange(count))
 
 
@@ -67,8 +61,7 @@ def anchored(rows: Rows, x_world: NDArray, frames: NDArray) -> tuple[NDArray, ND
 
 
 def target_rows(
-    body: Body,
-    state: BodyState,
+    frames: NDArray,
     segment: NDArray,
     points: NDArray,
     camera: Camera,
@@ -76,7 +69,6 @@ def target_rows(
     *,
     slack: float = 0.0,
     sigma: float = 2.0,
-    frames: NDArray | None = None,
 ) -> Rows:
     """One row a point of the body: its pixel should come within `slack` of a target, straight towards it.
 
@@ -85,10 +77,10 @@ def target_rows(
 
     Parameters
     ----------
+    frames : (S, 12) of the segments: `body.tree.forward(state.T_world_root, state.angles)[0]`, or of joints that move.
     segment : (N,) int; points : (N, 3) [m] in the root frame at rest.
     target : (N, 2) [px]
     slack, sigma : float [px]
-    frames : (S, 12), optional, of a body whose joints move with its angles.
 
     Raises
     ------
@@ -99,7 +91,6 @@ def target_rows(
         raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive one.")
     count = len(segment)
     data, x, pixel = np.empty((8, count)), _checked(points, count), _checked(target, count, 2)
-    frames = targets.of_segments(body, state, frames)
     kernels.target_rows(frames, segment, x, camera.packed, pixel, slack, 1.0 / sigma**2, data)
     return Rows(data, segment, np.arange(count))
 

@@ -11,8 +11,7 @@ ones are equations for `solvers.closed`, or rows of `STIFF` where a quadratic co
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -197,8 +196,3 @@ def looped(body: Body) -> NDArray:
             paths.append(path)
         out |= paths[0] ^ paths[1]
     return out[6:]
-
-
-def with_closures(body: Body, closures: Sequence[str]) -> Body:
-    """The body with some of its closures alone, by name."""
-    return replace(body, closures=tuple(c for c in body.closures if c.name in closures))

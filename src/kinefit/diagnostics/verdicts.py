@@ -13,7 +13,7 @@ from kinefit.diagnostics.bias import SHIFT, TURN, CameraBias, Disagreement
 from kinefit.diagnostics.timing import TimeOffsets
 from kinefit.diagnostics.views import KeypointViews
 from kinefit.errors import command
-from kinefit.findings import SEVERITIES, Finding, Severity, listed
+from kinefit.findings import SEVERITIES, Finding, Severity, frame_ranges, listed
 
 _ACCURACY = 8.0  # [px] of keypoints of which nothing else is said, as in a take
 _SURE = 4.0  # standard errors from which a bias or an offset is there
@@ -198,7 +198,8 @@ def side_findings(views: KeypointViews) -> list[Finding]:
     found = {name: frames for name, frames in found.items() if len(frames)}
     if not found:
         return [Finding("good", "sides", "Left and right agree in all cameras and frames.")]
-    told = [f"{len(frames)} of {len(views)} frames of {name} ({_ranges(frames)})" for name, frames in found.items()]
+    total = len(views)
+    told = [f"{len(frames)} of {total} frames of {name} ({frame_ranges(frames, 6)})" for name, frames in found.items()]
     most = max(found, key=lambda name: len(found[name]))
     often = len(found[most]) > 0.5 * len(views)
     remedy = (
@@ -220,10 +221,3 @@ def explained(findings: Sequence[Finding]) -> list[Finding]:
     follows = f"Nothing: it follows from {listed(moved.cameras)}."
     out = [replace(f, severity="note", remedy=follows) if f in biases else f for f in findings if f is not moved]
     return [*out, replace(moved, severity=worst)]
-
-
-def _ranges(frames: np.ndarray, most: int = 6) -> str:
-    """Frames as "3, 7-9"."""
-    runs = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
-    told = [f"{r[0]}" if len(r) == 1 else f"{r[0]}-{r[-1]}" for r in runs]
-    return ", ".join(told[:most]) + (f" and {len(told) - most} more" if len(told) > most else "")

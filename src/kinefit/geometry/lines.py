@@ -57,14 +57,6 @@ def point_line(x: NDArray, line: NDArray) -> NDArray:
     return np.cross(x, line[..., :3]) - line[..., 3:]
 
 
-def point_line_jacobian(line: NDArray) -> NDArray:
-    """∂(x × n − m)/∂x, (..., 3, 3)."""
-    n = line[..., :3]
-    out = np.zeros((*n.shape[:-1], 3, 3))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = n[..., 2], -n[..., 1], n[..., 0]
-    return out - np.swapaxes(out, -1, -2)
-
-
 def point_plane(x: NDArray, plane: NDArray) -> NDArray:
     """Signed distance n·x − d (...) [m] of a point to a plane; its derivative with respect to x is n."""
     return np.sum(plane[..., :3] * x, -1) - plane[..., 3]
@@ -80,16 +72,6 @@ def line_plane(line: NDArray, plane: NDArray) -> NDArray:
     foot = np.cross(n_line, line[..., 3:])
     tilt = np.sum(n_line * n_plane, -1, keepdims=True)
     return np.concatenate([tilt, point_plane(foot, plane)[..., None] * n_plane], -1)
-
-
-def line_plane_jacobian(line: NDArray, plane: NDArray) -> NDArray:
-    """∂ line_plane / ∂(n, m) of the line, (..., 4, 6), for unconstrained changes of n and m."""
-    n_line, m_line, n_plane = line[..., :3], line[..., 3:], plane[..., :3]
-    out = np.zeros((*np.broadcast_shapes(n_line.shape, n_plane.shape)[:-1], 4, 6))
-    out[..., 0, :3] = n_plane
-    along = np.concatenate([np.cross(m_line, n_plane), np.cross(n_plane, n_line)], -1)
-    out[..., 1:, :] = n_plane[..., :, None] * along[..., None, :]
-    return out
 
 
 def closest_points(line_a: NDArray, line_b: NDArray) -> tuple[NDArray, NDArray]:

@@ -98,12 +98,18 @@ def transform(rotation: NDArray, translation: NDArray) -> NDArray:
     return out
 
 
+def nearest_rotation(M: NDArray) -> NDArray:
+    """Rotations nearest to matrices (..., 3, 3) by least squares (W. Kabsch, 1978)."""
+    u, _, vt = np.linalg.svd(M)
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return np.asarray(u @ vt)
+
+
 def aligned(x: NDArray, y: NDArray, weight: NDArray | None = None) -> NDArray:
     """T_y_x (4, 4) that lays points x (K, 3) onto y (K, 3) best, by least squares with weights (K,) (Kabsch)."""
     w = np.full(len(x), 1.0 / len(x)) if weight is None else weight / weight.sum()
     middle, aim = w @ x, w @ y
-    u, _, vt = np.linalg.svd((w[:, None] * (y - aim)).T @ (x - middle))
-    R = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    R = nearest_rotation((w[:, None] * (y - aim)).T @ (x - middle))
     return transform(R, aim - R @ middle)
 
 
@@ -122,10 +128,7 @@ def exp(xi: NDArray) -> NDArray:
     """Screw motion of a twist: ξ = (v, ω) (..., 6) [m, rad] -> T (..., 4, 4) (P3, eq. 3)."""
     xi = np.asarray(xi, float)
     v, omega = xi[..., :3], xi[..., 3:]
-    _, b, c = _coefficients(np.linalg.norm(omega, axis=-1))
-    w = hat(omega)
-    left = np.eye(3) + b[..., None, None] * w + c[..., None, None] * (w @ w)
-    return transform(exp_so3(omega), (left @ v[..., None])[..., 0])
+    return transform(exp_so3(omega), (left_jacobian_so3(omega) @ v[..., None])[..., 0])
 
 
 def log(T: NDArray) -> NDArray:
@@ -152,34 +155,6 @@ def _left_so3_inverse(omega: NDArray) -> NDArray:
     d = (c - 2.0 * e) / (2.0 * b)
     w = hat(omega)
     return np.eye(3) - 0.5 * w + d[..., None, None] * (w @ w)
-
-
-def left_jacobian(xi: NDArray) -> NDArray:
-    """Left Jacobian of SE(3), (..., 6) -> (..., 6, 6): exp(ξ + δ) ≈ exp(J δ) exp(ξ) to first order in δ.
-
-    Source: the closed form of T. Barfoot, State Estimation for Robotics, eq. 7.86, for twists ordered (v, ω).
-    """
-    xi = np.asarray(xi, float)
-    v, omega = xi[..., :3], xi[..., 3:]
-    theta = np.linalg.norm(omega, axis=-1)
-    theta2, small = theta**2, theta < _SMALL
-    t = np.where(small, 1.0, theta)
-    _, b, c = _coefficients(theta)
-    e = np.where(small, _series(theta2, 4), (0.5 - b) / t**2)
-    f = np.where(small, _series(theta2, 5), (1.0 / 6.0 - c) / t**2)
-    w, u = hat(omega), hat(v)
-    wu, uw = w @ u, u @ w
-    wuw = wu @ w
-    q = (
-        0.5 * u
-        + c[..., None, None] * (wu + uw + wuw)
-        + e[..., None, None] * (w @ wu + uw @ w - 3.0 * wuw)
-        + (0.5 * (e - 3.0 * f))[..., None, None] * (wuw @ w + w @ wuw)
-    )
-    out = np.zeros((*theta.shape, 6, 6))
-    out[..., :3, :3] = out[..., 3:, 3:] = left_jacobian_so3(omega)
-    out[..., :3, 3:] = q
-    return out
 
 
 def adjoint(T: NDArray) -> NDArray:

@@ -137,17 +137,3 @@ def downsample(points: NDArray, *, factor: float = 1.0, minimum: int = 0, maximu
     if wanted == n:
         return points
     return points[((np.arange(wanted) + 0.5) * (n / wanted)).astype(np.intp)]
-
-
-def voxel(points: NDArray, size: float) -> NDArray:
-    """Mean of the points (N, 3) [m] in every cube of edge `size` [m]: as dense far away as nearby."""
-    if not size > 0.0:
-        raise ObservationError(f"cubes of {size} m", remedy="Give a positive edge.")
-    if not len(points):
-        return np.zeros((0, 3))
-    cell = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
-    shape = cell.max(axis=0) + 1
-    _, index, count = np.unique(
-        (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2], return_inverse=True, return_counts=True
-    )
-    return np.stack([np.bincount(index, points[:, i]) for i in range(3)], axis=1) / count[:, None]

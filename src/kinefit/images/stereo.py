@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import CalibrationError, ObservationError
-from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.camera import Camera
 from kinefit.geometry.se3 import transform
-from kinefit.images.depth import to_points
 from kinefit.observations import DepthFrame
 
 _BLOCK = 5  # [px] OpenCV advises 3 to 11; below it noise matches, above it limbs grow at their edges
@@ -143,30 +142,6 @@ class StereoRectifier:
     def deviation(self, depth: float, matching: float = 0.5) -> float:
         """[m] standard deviation of a depth [m] where matches are off by `matching` [px]: z² / (f b) · matching."""
         return depth**2 / (self._focal * self.baseline) * matching
-
-
-def stereo_points(
-    left: NDArray, right: NDArray, rig: Rig, names: tuple[str, str], *, near: float = 0.5, far: float = 5.0
-) -> tuple[NDArray, NDArray]:
-    """World points (N, 3) [m] of a stereo pair, and its disparity (H, W) [px], NaN for none.
-
-    For many pairs make one `StereoRectifier` and keep it.
-
-    Parameters
-    ----------
-    left, right : (h, w) or (h, w, 3) uint8
-    rig : Rig; names of both cameras in it.
-    near, far : float [m] between which depth is sought.
-
-    Raises
-    ------
-    CalibrationError, ObservationError
-        As `StereoRectifier`, and images of another size than calibrated.
-    """
-    pair = StereoRectifier(rig[names[0]], rig[names[1]], near=near, far=far)
-    moved = pair.disparity(left, right)
-    depth = np.nan_to_num(np.float32(pair.camera.matrix[0, 0] * pair.baseline) / moved, nan=0.0)
-    return to_points(depth, pair.camera), moved
 
 
 def _rotation(left: Camera, right: Camera, x: NDArray) -> NDArray:

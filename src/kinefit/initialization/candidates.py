@@ -51,8 +51,8 @@ def starts_from_points(
 
 
 def starts_from_views(
-    body: Body, rig: Rig, frames: Sequence[Any], up: NDArray, measurements: Sequence[Measurement], scene: Scene,
-    count: int = 3, *, backgrounds: Mapping[str, NDArray] | None = None, forward: NDArray | None = None,
+    scene: Scene, frames: Sequence[Any], up: NDArray, measurements: Sequence[Measurement], count: int = 3, *,
+    backgrounds: Mapping[str, NDArray] | None = None, forward: NDArray | None = None,
 ) -> list[BodyState]:  # fmt: skip
     """States to begin with from one depth image or cloud; those that known points agree with come first.
 
@@ -61,11 +61,11 @@ def starts_from_views(
     """
     starts: list[Start] = []
     for frame in frames:
-        view = _view(rig, frame)
+        view = _view(scene.rig, frame)
         if view is not None and not starts:
             try:
                 empty = (backgrounds or {}).get(view[1].name)
-                starts = start_from_points(body, *view, background=empty, up=up, count=count, forward=forward)
+                starts = start_from_points(scene.body, *view, background=empty, up=up, count=count, forward=forward)
             except KinefitError:
                 continue
     points, x, _ = known_points(measurements, scene)
@@ -73,7 +73,7 @@ def starts_from_views(
     if known.any():
         starts.sort(
             key=lambda start: float(
-                np.median(np.linalg.norm(body.positions(start.state, points)[known] - x[known], axis=1))
+                np.median(np.linalg.norm(scene.body.positions(start.state, points)[known] - x[known], axis=1))
             )
         )
     return [start.state for start in starts]

@@ -152,15 +152,15 @@ class Score:
         frames, _ = self.body.tree.forward(state.T_world_root, state.angles)
         x = BodyMesh(part.vertices, part.faces, part.owner, np.zeros(0, np.int32)).posed(frames)
         x = x @ view.T_view_world[:3, :3].T + view.T_view_world[:3, 3]
-        size, (fx, fy, cx, cy) = view.observed.shape[::-1], view.lens.tolist()
-        shown = rasterise(x, part.faces, fx, fy, cx, cy, (size[0], size[1]))
+        height, width = view.observed.shape
+        shown = rasterise(x, part.faces, view.lens, (width, height))
         hands = np.zeros((1 + part.fingers.max(initial=0), 2))
         if len(hands) > 1:
             hand = np.append(part.fingers, 0)[shown.face]
             kernels.of_hands(shown.depth, hand, view.observed, view.behind, view.trust, TOLERANCE, hands)
             folded = (hands[:, 0] <= hands[:, 1]) & (np.arange(len(hands)) > 0)
             if folded.any():
-                shown = rasterise(x, part.faces[~folded[part.fingers]], fx, fy, cx, cy, (size[0], size[1]))
+                shown = rasterise(x, part.faces[~folded[part.fingers]], view.lens, (width, height))
         return shown.depth
 
     def of(self, state: BodyState) -> float:
@@ -194,11 +194,11 @@ class Score:
         h, w = view.observed.shape
         canvas = Canvas((3 * w, 3 * h))  # the view in the middle: how much lies beside it counts too
         lens = view.lens + (0, 0, w, h)
-        raster = canvas.draw(x, mesh.faces, *lens)
+        raster = canvas.draw(x, mesh.faces, lens)
         middle = (slice(h, 2 * h), slice(w, 2 * w))
         nearer = np.where(view.seen, np.inf, view.behind)
         shown = (raster.face[middle] >= 0) & (view.trust > 0) & (raster.depth[middle] < nearer)
         count = np.bincount(mesh.face_segment[raster.face[middle][shown]], minlength=len(tree.segments))
         faces = [mesh.faces[mesh.face_segment == s] for s in range(len(tree.segments))]
-        own = [np.sum(canvas.draw(x, f, *lens).face >= 0) for f in faces]
+        own = [np.sum(canvas.draw(x, f, lens).face >= 0) for f in faces]
         return count / np.maximum(own, 1.0)

@@ -147,8 +147,6 @@ def match(
     deformation: ArrayLike | None = None,
     window: int | ArrayLike = WINDOW,
     levels: int = 0,
-    steps: int = STEPS,
-    tolerance: float = TOLERANCE,
 ) -> Matches:
     """Find windows of one image in another.
 
@@ -161,7 +159,6 @@ def match(
     deformation : (2, 2) or (N, 2, 2) to start with; default: none
     window : odd side [px], of all or of each (`windows_by_texture` chooses them)
     levels : of the pyramid, each of half the size, from which to come down
-    steps, tolerance : at most so many iterations, until no part of a window moves by more [px]
 
     Raises
     ------
@@ -179,17 +176,17 @@ def match(
         )
     begin = np.concatenate([goal, np.broadcast_to(maps, (len(at), 2, 2)).reshape(-1, 4)], axis=1)
     if levels:
-        begin = _from_above(first, second, at, begin, halves, levels, steps)
+        begin = _from_above(first, second, at, begin, halves, levels)
     out = np.empty((len(at), kernels.ROW))
     kernels.match_points(
-        first.coefficients, second.coefficients, at, begin, halves, steps, tolerance, template_share(first, second),
+        first.coefficients, second.coefficients, at, begin, halves, STEPS, TOLERANCE, template_share(first, second),
         first.noise**2, out,
     )  # fmt: skip
     return Matches.of(at, out, first, second, halves)
 
 
 def _from_above(
-    first: SplineImage, second: SplineImage, at: NDArray, begin: NDArray, halves: NDArray, levels: int, steps: int
+    first: SplineImage, second: SplineImage, at: NDArray, begin: NDArray, halves: NDArray, levels: int
 ) -> NDArray:
     """Starts (N, 6) from the levels of a pyramid; a window that is not found on one starts from the nearest."""
     if levels < 0 or min(*first.size, *second.size) >> levels < 32:
@@ -205,7 +202,7 @@ def _from_above(
         start[:, :2] *= scale
         share = template_share(one, two)
         pair = one.coefficients, two.coefficients
-        kernels.match_points(*pair, at * scale, start, halves, steps, 0.01, share, one.noise**2, out)
+        kernels.match_points(*pair, at * scale, start, halves, STEPS, 0.01, share, one.noise**2, out)
         good = (out[:, kernels.STATUS] == kernels.FOUND) & (out[:, kernels.CORRELATION] >= _HELPFUL)
         if good.any():
             near = np.flatnonzero(good)[_nearest(at, at[good])]

@@ -124,18 +124,15 @@ def grow(
     *,
     window: int | ArrayLike = WINDOW,
     least: float = LEAST_CORRELATION,
-    reach: float | None = None,
-    steps: int = STEPS,
-    tolerance: float = TOLERANCE,
 ) -> Matches:
     """Match a grid of the first image in the second, from seeds outwards.
+
+    A match may be off its neighbour's map by half of the grid's step, so that no two neighbours can change places.
 
     Parameters
     ----------
     window : odd side [px], of all or of each place of the grid
     least : correlation of a match
-    reach : [px] by which a match may be off its neighbour's map; default: half of the grid's step, so that no two
-        neighbours can change places
 
     Returns
     -------
@@ -146,7 +143,7 @@ def grow(
     halves = halves_of(window, len(grid.points))
     out = np.empty((len(grid.points), _kernels_matching.ROW))
     _kernels_growing.grow(
-        first.coefficients, second.coefficients, grid.points, grid.columns, index, starts, halves, steps, tolerance,
-        template_share(first, second), first.noise**2, least, grid.step / 2 if reach is None else reach, out,
+        first.coefficients, second.coefficients, grid.points, grid.columns, index, starts, halves, STEPS, TOLERANCE,
+        template_share(first, second), first.noise**2, least, grid.step / 2, out,
     )  # fmt: skip
     return Matches.of(grid.points, out, first, second, halves)

@@ -29,7 +29,6 @@ def measure_states(
     seeds: Sequence[Seeds] | None = None,
     window: int | ArrayLike = WINDOW,
     least: float = LEAST_CORRELATION,
-    constrained: bool | None = None,
     incremental: bool = False,
     progress: Progress | None = None,
 ) -> list[MeasuredSurface]:
@@ -38,7 +37,7 @@ def measure_states(
     Parameters
     ----------
     states : of each the images of all cameras, in the rig's order; asked for one by one, in this order
-    grid, seeds, window, least, constrained : as in `measure`, of the first state
+    grid, seeds, window, least : as in `measure`, of the first state
     incremental : False: every image is matched with the first one of the first camera, so that errors do not add up.
         True: with the state before, for motions so large that the first image is not recognised any more
     progress : called with what is done, and how many states of how many
@@ -52,7 +51,7 @@ def measure_states(
         raise ObservationError("no state", remedy="Give the images of one time, or more.")
     first = states[0]
     check_images(rig, first)
-    out = [measure(rig, first, grid, seeds=seeds, window=window, least=least, constrained=constrained)]
+    out = [measure(rig, first, grid, seeds=seeds, window=window, least=least)]
     template, places = first[0], grid
     for k in range(1, len(states)):
         if progress is not None:

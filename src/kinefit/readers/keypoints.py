@@ -110,7 +110,7 @@ def read_openpose(
     data = np.zeros((len(people), max(map(len, people)), len(names), 3))
     for row, persons in zip(data, people, strict=True):
         row[: len(persons)] = persons
-    return _keypoints(data, names, camera, keypoint_set, rate, time_offset, start, folder, image_frame)
+    return _keypoints(data, camera, keypoint_set, rate, time_offset, start, folder, image_frame)
 
 
 @checked
@@ -156,7 +156,7 @@ def read_mediapipe(
             f"nobody is seen in any of the {len(data)} frames of camera {camera}", file=path,
             remedy="Check that the detector ran on this camera's video; or leave this camera out.",
         )
-    return _keypoints(data[:, None], names, camera, "MEDIAPIPE_33", rate, time_offset, start, path, image_frame)
+    return _keypoints(data[:, None], camera, "MEDIAPIPE_33", rate, time_offset, start, path, image_frame)
 
 
 _GAPS, _PORTS = 20, 100  # indices for each that is there, and cameras, beyond which a table is damaged
@@ -218,7 +218,7 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
         data = np.zeros((frame.max() + 1, 1, len(names), 3))
         rows = port == p
         data[frame[rows], 0, point[rows]] = np.column_stack([table[rows, 4:6], np.ones(rows.sum())])
-        keypoints[f"cam_{p}"] = _keypoints(data, names, f"cam_{p}", "MEDIAPIPE_33", rate, 0.0, 0, path, None)
+        keypoints[f"cam_{p}"] = _keypoints(data, f"cam_{p}", "MEDIAPIPE_33", rate, 0.0, 0, path, None)
     return keypoints
 
 
@@ -332,9 +332,9 @@ def _cut(items: Any, frames: tuple[int, int] | None, file: Path) -> tuple[Any, i
 
 
 def _keypoints(
-    data: NDArray, names: tuple[str, ...], camera: str, keypoint_set: str, rate: float, time_offset: float,
-    start: int, source: Path, image_frame: ImageFrame | None,
-) -> Keypoints:
+    data: NDArray, camera: str, keypoint_set: str, rate: float, time_offset: float, start: int, source: Path,
+    image_frame: ImageFrame | None,
+) -> Keypoints:  # fmt: skip
     """Record from (F, P, K, 3) x, y, confidence with zeros where unseen."""
     if not rate > 0 or not np.isfinite(rate):
         raise ObservationError(f"rate {rate} Hz", file=source, remedy="Give a positive frame rate.")
@@ -346,4 +346,5 @@ def _keypoints(
     points = sealed(kept(np.where(seen[..., None], points, np.nan)))
     confidence = sealed(kept(np.where(seen, confidence, 0.0)))
     offset = time_offset + start / rate
+    names = keypoint_names(keypoint_set)
     return Keypoints(camera, keypoint_set, names, rate, points, confidence, time_offset=offset, source=str(source))

@@ -9,6 +9,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.geometry.se3 import nearest_rotation
+
 MANY = 6
 """Points from which a segment is matched by the coarse update (P5: "our threshold is 6")."""
 
@@ -69,8 +71,7 @@ def candidate_table(
 def motion(x: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
     """(1): the rotation and translation of x onto y by SVD (Arun et al.)."""
     a, b = x.mean(0), y.mean(0)
-    u, _, vt = np.linalg.svd((x - a).T @ (y - b))
-    R = vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))]) @ u.T
+    R = nearest_rotation((y - b).T @ (x - a))
     return R, b - R @ a
 
 

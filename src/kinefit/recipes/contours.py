@@ -24,6 +24,9 @@ from kinefit.geometry.lines import perpendiculars
 __all__ = ["ContourFit", "pose_of_contour"]
 
 _GOOD = 2.0  # [px] mean distance of contours that belong together; Zhang's D
+_SAMPLES = 200  # points of the curve
+_MAX_CYCLES = 30  # of each approximation
+_MIN_STEP = 1e-5  # [m, rad] of a cycle that ends those of one approximation
 
 By = Literal["rays", "planes"]
 
@@ -44,10 +47,7 @@ def pose_of_contour(
     *,
     orders: Sequence[int] = (2, 8),
     by: By = "planes",
-    samples: int = 200,
     reach: float = 80.0,
-    cycles: int = 30,
-    tolerance: float = 1e-5,
 ) -> ContourFit:
     """Pose of a closed curve whose contour in one image is known.
 
@@ -59,10 +59,7 @@ def pose_of_contour(
     orders : highest frequencies of the low-pass approximations that come first; then the whole curve.
     by : "rays", a point to the ray of its partner, or "planes", to the plane through the contour's tangent there, so
         that contours glide along each other.
-    samples : points of the curve.
     reach : float [px] beyond which no points are paired at first; then it follows from the distances themselves.
-    cycles : int, at most, of each approximation.
-    tolerance : float, of a step (metres and radians) that ends the cycles of one.
 
     Raises
     ------
@@ -76,8 +73,8 @@ def pose_of_contour(
     T, done = np.array(T_world_object, float), 0
     levels = [*(order for order in orders if order < curve.order), curve.order]
     for order in levels:
-        points, bound = curve.low_pass(order).samples(samples), reach
-        for _ in range(cycles):
+        points, bound = curve.low_pass(order).samples(_SAMPLES), reach
+        for _ in range(_MAX_CYCLES):
             x = se3.apply(T, points)
             near, distance = _nearest(camera.project(x), seen[:2])
             pairs = distance < _kept(distance, bound)
@@ -85,9 +82,9 @@ def pose_of_contour(
                 raise ObservationError("no contour is near the curve", remedy="Start nearer to it, or widen the reach.")
             delta = _twist(x[pairs], camera.centre_world, *(part[near[pairs]] for part in fixed), by=by)
             T, done = se3.exp(delta) @ T, done + 1
-            if np.linalg.norm(delta) < tolerance:
+            if np.linalg.norm(delta) < _MIN_STEP:
                 break
-    _, distance = _nearest(camera.project(se3.apply(T, curve.samples(samples))), seen[:2])
+    _, distance = _nearest(camera.project(se3.apply(T, curve.samples(_SAMPLES))), seen[:2])
     return ContourFit(T, float(np.sqrt(np.mean(distance**2))), done)
 
 

@@ -93,8 +93,7 @@ def pose_from_regions(
             here = cell[v * camera.size[0] + u]
             moved = np.array(rim.outline)
             moved[:2] += shift * np.sign(p1[here] - p2[here]) * moved[2:]
-            every = np.arange(len(rim))
-            parts.append(outline_rows(body, state, rim, vertices, camera, moved, (every, every), by="rays"))
+            parts.append(outline_rows(body, state, rim, vertices, camera, moved, by="rays"))
         rows, energy = Rows.concat(*parts), float(np.mean(told))
         if not len(rows):
             raise ObservationError("nothing of the body is in view", remedy="Start nearer to where it is.")

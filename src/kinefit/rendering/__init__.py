@@ -81,19 +81,17 @@ class Canvas:
         return self._face
 
     def draw(
-        self, vertices_camera: ArrayLike, faces: ArrayLike, fx: float, fy: float, cx: float, cy: float, *,
-        near: float = NEAR, cull: bool = False, labels: NDArray | None = None,
+        self, vertices_camera: ArrayLike, faces: ArrayLike, lens: ArrayLike, *, near: float = NEAR, cull: bool = False
     ) -> Raster:
         """As `rasterise`, into this canvas."""
-        return self._draw(vertices_camera, _IDENTITY, faces, np.array([fx, fy, cx, cy, near], float), cull, labels)
+        return self._draw(vertices_camera, _IDENTITY, faces, np.append(lens, near), cull, None)
 
     def draw_for(
         self, camera: Camera, vertices_world: ArrayLike, faces: ArrayLike, *, cull: bool = False,
         labels: NDArray | None = None,
     ) -> Raster:
         """Draw triangles of the world (V, 3) [m] as `camera`, of this canvas' size, sees them."""
-        K = camera.matrix
-        lens = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], NEAR])
+        lens = np.append(lens_of(camera), NEAR)
         if _is_straight(camera):
             return self._draw(vertices_world, camera.T_camera_world, faces, lens, cull, labels)
         return self._draw(in_camera(camera, vertices_world), _IDENTITY, faces, lens, cull, labels)
@@ -122,9 +120,9 @@ class Canvas:
 
 
 def rasterise(
-    vertices_camera: ArrayLike, faces: ArrayLike, fx: float, fy: float, cx: float, cy: float,
-    size: tuple[int, int], *, near: float = NEAR, cull: bool = False,
-) -> Raster:
+    vertices_camera: ArrayLike, faces: ArrayLike, lens: ArrayLike, size: tuple[int, int], *, near: float = NEAR,
+    cull: bool = False,
+) -> Raster:  # fmt: skip
     """Depth and triangle seen by a pinhole camera.
 
     Parameters
@@ -132,8 +130,8 @@ def rasterise(
     vertices_camera : (V, 3) [m]
         In the camera's frame: x right, y down, z along the optical axis.
     faces : (T, 3) int
-    fx, fy, cx, cy : float [px]
-        The centre of the first pixel is (0, 0).
+    lens : (4,) [px]
+        Focal lengths fx, fy and principal point cx, cy; the centre of the first pixel is (0, 0).
     size : (width, height) [px]
     near : float [m]
         Nothing nearer than this is drawn.
@@ -145,7 +143,12 @@ def rasterise(
     ObservationError
         Vertices that are not finite, faces of vertices that are not there, a size or lens that cannot be.
     """
-    return Canvas(size).draw(vertices_camera, faces, fx, fy, cx, cy, near=near, cull=cull)
+    return Canvas(size).draw(vertices_camera, faces, lens, near=near, cull=cull)
+
+
+def lens_of(camera: Camera) -> NDArray:
+    """(4,) [px] focal lengths fx, fy and principal point cx, cy of a camera."""
+    return camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
 
 
 def render_body(

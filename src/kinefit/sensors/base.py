@@ -241,7 +241,7 @@ class Sensor(ABC):
     def prepare(self, frame: Any, scene: Scene) -> Measurement:
         """What it saw at one time, ready to be matched; the scene has the body where it is expected."""
 
-    def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:  # noqa: B027
+    def learn(self, measurement: Any, scene: Scene, sure: bool) -> None:  # noqa: B027
         """Learn from a step that was accepted; `sure` where no segment is lost.
 
         Replace what was learnt by something new, rather than change it in place: where another sensor of the step

@@ -7,7 +7,7 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
 from kinefit.bodies import Body, BodyState, PointSet, load_body
@@ -106,14 +106,24 @@ def known_motion(
 
 
 def _fit(body: Body, start: BodyState, points: PointSet, target: NDArray, *, change: float) -> Fit:
-    sigma = np.concatenate([np.full(6, np.inf), np.full(len(start.angles), change)])
     accuracy = np.where([name in _EXTREMITIES for name in points.names], _LOOSE, _ACCURACY)
+    return fit_to_points(body, start, points, target, sigma=accuracy, change=change)
+
+
+def fit_to_points(
+    body: Body, start: BodyState, points: PointSet, target: NDArray, *, sigma: ArrayLike, change: float
+) -> Fit:
+    """The state that brings points of a body to targets (K, 3) [m] with `sigma` [m], and leaves the rest as it was.
+
+    `change` : float [rad] spread of the angles about those of the start.
+    """
+    of_change = np.concatenate([np.full(6, np.inf), np.full(len(start.angles), change)])
 
     def make_rows(state: BodyState) -> tuple:
         return (
-            point_rows(body, state, points, target, sigma=accuracy),
+            point_rows(body, state, points, target, sigma=sigma),
             prior_rows(body, state, sigma=_POSTURE),
-            prediction_rows(body, state, start, sigma=sigma),
+            prediction_rows(body, state, start, sigma=of_change),
         )
 
     return levenberg_marquardt(body, start, make_rows, tolerance=1e-6)

@@ -6,15 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
-from kinefit.correspondences import point_rows, prediction_rows, prior_rows
 from kinefit.errors import BodyError
 from kinefit.geometry import se3
 from kinefit.motion import Motion
-from kinefit.simulation.retarget import known_motion
-from kinefit.solvers.least_squares import levenberg_marquardt
+from kinefit.simulation.retarget import fit_to_points, known_motion
 
 _ACCURACY = 0.01  # [m] bodies differ by more than this; small beside a limb, so that the priors only fill in
-_POSTURE = 0.5  # [rad] spread of the angles about the usual posture
 _CHANGE = 0.2  # [rad] from frame to frame
 _FEWEST = 6  # landmarks that both must have: fewer leave limbs open
 
@@ -49,26 +46,14 @@ def on_body(motion: Motion, body: Body) -> Motion:
     if body.stature > 0 and motion.body.stature > 0:
         scale = body.stature / motion.body.stature
     targets = scale * motion.positions(motion.body.landmarks.select(names))
-    sigma = np.concatenate([np.full(6, np.inf), np.full(len(body.tree.coordinates), _CHANGE)])
     state, roots, angles = body.usual_state(), [], []
     for frame, target in enumerate(targets):
         start = BodyState(_aligned(body, state, points, target), state.angles)
-
-        state = _fitted(body, start, points, target, sigma if frame else np.full_like(sigma, np.inf))
+        change = _CHANGE if frame else np.inf
+        state = fit_to_points(body, start, points, target, sigma=_ACCURACY, change=change).state
         roots.append(state.T_world_root)
         angles.append(state.angles)
     return known_motion(body, motion.rate, np.array(roots), np.array(angles), up=motion.up, name=motion.name)
-
-
-def _fitted(body: Body, start: BodyState, points: PointSet, target: NDArray, change: NDArray) -> BodyState:
-    def make_rows(state: BodyState) -> tuple:
-        return (
-            point_rows(body, state, points, target, sigma=_ACCURACY),
-            prior_rows(body, state, sigma=_POSTURE),
-            prediction_rows(body, state, start, sigma=change),
-        )
-
-    return levenberg_marquardt(body, start, make_rows, tolerance=1e-6).state
 
 
 def _aligned(body: Body, state: BodyState, points: PointSet, target: NDArray) -> NDArray:

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.losses import SQUARED, Loss
 from kinefit.rows import AnyRows
 from kinefit.solvers import _kernels_linear
 from kinefit.solvers.equations import lock, normal_equations
@@ -62,11 +61,10 @@ def null_space(A: NDArray, c: NDArray, held: NDArray) -> Null:
 
 
 def onto(
-    body: Body, state: BodyState, constraint: Constraint, *, limits: bool = True, locked: NDArray | None = None,
-    steps: int = _BACK,
+    body: Body, state: BodyState, constraint: Constraint, *, limits: bool = True, steps: int = _BACK
 ) -> tuple[BodyState, float]:  # fmt: skip
     """The state nearest to one at which the equations hold, and by how much the worst of them is off still."""
-    bounds, fixed = bounds_of(body, limits), lock(body, locked)
+    bounds, fixed = bounds_of(body, limits), lock(body, None)
     c, A = constraint(state)
     worst, best = float(np.abs(c).max(initial=0.0)), float(c @ c)
     for _ in range(steps):
@@ -137,18 +135,16 @@ def _step(
 
 
 def closed_fit(
-    body: Body, state: BodyState, make_rows: MakeRows, constraint: Constraint, *, loss: Loss = SQUARED,
-    limits: bool = True, locked: NDArray | None = None, damping: float | None = None, max_iterations: int = 50,
-    tolerance: float = 1e-9,
+    body: Body, state: BodyState, make_rows: MakeRows, constraint: Constraint, *, damping: float | None = None,
+    max_iterations: int = 50, tolerance: float = 1e-9,
 ) -> Fit:  # fmt: skip
-    """Minimise Σ ρ(w r²) under equations, by Levenberg-Marquardt; arguments as of `levenberg_marquardt`.
+    """Minimise Σ ρ(w r²) under equations and limits of joints, by `levenberg_marquardt`, whose arguments these are.
 
     Where the equations cannot be met from the start, the fit ends at once, at the state that comes nearest.
     """
-    bounds, held = bounds_of(body, limits), lock(body, locked)
-    state = state.retract(np.zeros(body.tree.n_dofs), bounds)
-    state, off = onto(body, state, constraint, limits=limits, locked=locked)
-    eq = normal_equations(body, state, make_rows(state), loss=loss)
+    bounds, held = bounds_of(body, True), lock(body, None)
+    state, off = onto(body, state.retract(np.zeros(body.tree.n_dofs), bounds), constraint)
+    eq = normal_equations(body, state, make_rows(state))
     if off > CLOSED:
         return Fit(state, eq, 1, False, damping or 0.0)
     mean = float(eq.diagonal.mean()) + 1e-300
@@ -160,10 +156,10 @@ def closed_fit(
         delta, predicted = _step(H, g, damping, A, c, state, bounds, held)
         if predicted <= tolerance * eq.cost + nothing:
             return Fit(state, eq, iteration, True, damping)
-        candidate, off = onto(body, state.retract(delta, bounds), constraint, limits=limits, locked=locked, steps=8)
+        candidate, off = onto(body, state.retract(delta, bounds), constraint, steps=8)
         fall, new = -1.0, None
         if off <= CLOSED:
-            new = normal_equations(body, candidate, make_rows(candidate), loss=loss)
+            new = normal_equations(body, candidate, make_rows(candidate))
             fall = eq.cost - new.cost
         damping, growth = _kernels_linear.adapt(damping, growth, fall, predicted, least)
         if new is not None and fall > 0.0:
@@ -175,11 +171,11 @@ def closed_fit(
 
 
 def closed_step(
-    body: Body, state: BodyState, rows: AnyRows | Iterable[AnyRows], constraint: Constraint, *, loss: Loss = SQUARED
+    body: Body, state: BodyState, rows: AnyRows | Iterable[AnyRows], constraint: Constraint
 ) -> Step:
     """One constrained Gauss-Newton step for rows linearised at `state`; for loops that renew their rows (ICP)."""
     bounds, held = bounds_of(body, True), lock(body, None)
-    eq = normal_equations(body, state, rows, loss=loss)
+    eq = normal_equations(body, state, rows)
     damping = _kernels_linear.LEAST_DAMPING * float(eq.diagonal.mean()) + 1e-300
     c, A = constraint(state)
     delta, _ = _step(eq.matrix, eq.gradient, damping, A, c, state, bounds, held)

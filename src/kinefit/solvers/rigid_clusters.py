@@ -7,6 +7,8 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.geometry.se3 import nearest_rotation
+
 
 def middle(values: NDArray, axis: int | tuple[int, ...]) -> NDArray:
     """Median of what is not NaN along an axis; NaN, with no warning, where nothing is left."""
@@ -35,9 +37,7 @@ def rigid_frames(
     size = (share * a * a).sum((1, 2))[:, None, None]
     cross = np.einsum("fki,fkj->fij", share * b, a)
     cross += (1e-4 * size + 1e-12) * np.where(np.isfinite(prior), prior, np.eye(3))
-    u, _, vt = np.linalg.svd(cross)
-    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
-    R = u @ vt
+    R = nearest_rotation(cross)
     t = y_mid - np.einsum("fij,fj->fi", R, x_mid)
     nothing = ~seen.any(1)
     R[nothing], t[nothing] = np.nan, np.nan

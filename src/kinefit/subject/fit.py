@@ -18,7 +18,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.losses import SQUARED, Loss
 from kinefit.sensors.base import Measurement
 from kinefit.solvers.bundle.border import Bordered, Prior, solve
-from kinefit.solvers.bundle.border_frames import POSTURE, SETTLING
+from kinefit.solvers.bundle.border_frames import POSTURE, SETTLING, Weighing
 from kinefit.solvers.equations import inverse
 from kinefit.subject.lasting import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
@@ -104,8 +104,8 @@ def fit_subject(
         early, before = anew or used < min(len(reach), rounds), theta
         iterations, settling = coarse if early else (_ITERATIONS, SETTLING)
         solved = solve(
-            frames, theta, states, prior, step, shares=shares, loss=loss, posture=posture,
-            max_iterations=iterations, settling=settling,
+            frames, theta, states, prior, step, weighing=Weighing(shares, loss, posture), max_iterations=iterations,
+            settling=settling,
         )  # fmt: skip
         theta, states, moved = solved.theta, solved.states, solved.theta - before
         if not early and solved.converged and moved @ (prior.information + solved.information) @ moved < _DONE**2:
@@ -115,9 +115,8 @@ def fit_subject(
         shares = {sensor: 1.0 / max(told.get(sensor, 1.0), 1.0) for sensor in sensors}
         if min(shares.values()) < 1.0:
             solved = solve(
-                frames, theta, states, prior, step, shares=shares, loss=loss, posture=posture,
-                max_iterations=_ITERATIONS,
-            )  # fmt: skip
+                frames, theta, states, prior, step, weighing=Weighing(shares, loss, posture), max_iterations=_ITERATIONS
+            )
     world = worlds.at(solved.theta)
     return SubjectFit(
         world.body, world.rig, world.values, names, solved.theta, inverse(prior.information + solved.information),

@@ -128,7 +128,7 @@ class Recovery:
         known = self._root if elapsed <= _TURN + 1e-6 else None
         here = None if result is None or _astray(result, self.settings.poor) else result.state.T_world_root
         for state in starts_from_views(
-            self.body, self.rig, tracker.alone(frames), self.up, own.measurements(frames, scene, points=True), scene,
+            scene, tracker.alone(frames), self.up, own.measurements(frames, scene, points=True),
             backgrounds=own.stated, forward=None if known is None else known[:3, 0],
         ):  # fmt: skip
             if known is not None and _gone(state.T_world_root, known) > _STRIDE + _SPEED * elapsed:

@@ -8,7 +8,7 @@ from tests.calibration.people_data import BODY, errors, room, seen, walker
 
 from kinefit.calibration.refine.gauge import aligned, covariance_in_gauge, generators, resized
 from kinefit.calibration.refine.refine import refine
-from kinefit.calibration.refine.sightings import correlation_time, shifted, sight, togetherness
+from kinefit.calibration.refine.sightings import PersonTrial, correlation_time, shifted, sight, togetherness
 from kinefit.errors import CalibrationError, ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
@@ -211,7 +211,7 @@ def test_correlation_time_of_errors_that_last():
 
 
 def test_independent_errors_are_not_together():
-    sighting = sight(room(), seen(), BODY, sigma=2.0, up="z", offsets={})
+    sighting = sight(room(), PersonTrial(seen(), BODY, "z", 2.0), {})
     assert togetherness(sighting) < 0.2
     c = sighting.channels
     group = c.source * 100 + c.points.segments[c.column]

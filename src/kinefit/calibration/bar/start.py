@@ -98,7 +98,8 @@ def first_pairs(cameras: Sequence[Camera], uv: NDArray, known: bool, length: flo
         if _is_flat(a[inside], b[inside], limit):
             told[f"all places that {name} share lie in one plane, or they stand all but in one place"] = 1.0
             continue
-        pairs += _metric(i, j, cameras, F, a[inside], b[inside], known, share, length)
+        for metric, gain in _metric((cameras[i], cameras[j]), F, a[inside], b[inside], known, length):
+            pairs.append(Pair(i, j, metric, share, gain * share))
     if not pairs:
         worst = max(told, key=lambda text: told[text]) if told else "no two cameras see it from sides that differ"
         flatness = "plane" in worst
@@ -186,10 +187,9 @@ def _is_flat(a: NDArray, b: NDArray, limit: float) -> bool:
 
 
 def _metric(
-    i: int, j: int, cameras: Sequence[Camera], F: NDArray, a: NDArray, b: NDArray, known: bool, share: float,
-    length: float,
-) -> list[Pair]:
-    """The focal lengths with which the bar keeps its length, and the poses that go with them."""
+    cameras: tuple[Camera, Camera], F: NDArray, a: NDArray, b: NDArray, known: bool, length: float
+) -> list[tuple[tuple[Camera, Camera], float]]:
+    """Cameras with which the bar keeps its length, by focal lengths and the poses of these, and what each is worth."""
     few = np.unique(np.linspace(0, len(a) - 1, min(len(a), 80)).astype(int))
     focals = np.ones(1) if known else _FOCALS
     trials = []
@@ -206,15 +206,15 @@ def _metric(
             if angle > _PARALLAX:
                 trials.append((spread + 0.5 * (1 - s[1] / s[0]) + 2 * (1 - front), fi, fj, T, middle, angle))
     trials.sort(key=lambda trial: trial[0])
-    chosen: list[Pair] = []
+    chosen: list[tuple[tuple[Camera, Camera], float]] = []
     for cost, fi, fj, T, middle, angle in trials:
         if cost > 2 * trials[0][0] + 0.02 or len(chosen) == 4:
             break
         T = T.copy()
         T[:3, 3] *= length / middle
-        pair = (with_focal(cameras[i], fi, known).with_pose(np.eye(4)), with_focal(cameras[j], fj, known).with_pose(T))
-        if not any(_alike(pair, other.cameras) for other in chosen) or known:
-            chosen.append(Pair(i, j, pair, share, len(a) * np.sin(angle) * share / (0.02 + cost)))
+        pair = with_focal(cameras[0], fi, known).with_pose(np.eye(4)), with_focal(cameras[1], fj, known).with_pose(T)
+        if not any(_alike(pair, other) for other, _ in chosen) or known:
+            chosen.append((pair, len(a) * np.sin(angle) / (0.02 + cost)))
     return chosen
 
 

@@ -117,8 +117,7 @@ def interior_parameters(camera: Camera) -> int:
 def moved_camera(camera: Camera, delta: NDArray, interiors: bool) -> Camera:
     """The camera, its pose moved by a twist delta[:6] in its frame, its interior changed by the rest."""
     T = se3.exp(delta[:_POSE]) @ camera.T_camera_world
-    u, _, vt = np.linalg.svd(T[:3, :3])
-    T[:3, :3] = u @ vt
+    T[:3, :3] = se3.nearest_rotation(T[:3, :3])
     if not interiors:
         return camera.with_pose(T)
     d, K = delta[_POSE : _POSE + interior_parameters(camera)], np.array(camera.matrix)

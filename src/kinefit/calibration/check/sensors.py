@@ -253,7 +253,7 @@ class _PlacementProblem:
         assert covariance is not None  # of a fit
         known = covariance[: len(scales), : len(scales)]
         out: list[Parameters] = [KnownLengths(self.body, scales=np.ones(len(scales)), covariance=known)]
-        surfaces = self.body.surfaces if any(isinstance(f, DepthFrame) for seen in frames for f in seen) else ()
+        surfaces = self.body.surfaces if any(f.sensor in self.depth for seen in frames for f in seen) else ()
         if any(isinstance(s, TaperedCylinder) for s in surfaces) and not self.body.skin:
             out.append(CylinderShape(self.body))
         sets = {name: std for name, std in self.recording.marker_sets if std is not None}

@@ -17,7 +17,7 @@ from kinefit.calibration.refine.bundle import bundle_adjust
 from kinefit.calibration.refine.gauge import resized
 from kinefit.calibration.refine.refine import Length, check_input, length_of, prior_sigma, refine_from
 from kinefit.calibration.refine.result import Refinement
-from kinefit.calibration.refine.sightings import PersonSighting, Progress
+from kinefit.calibration.refine.sightings import PersonSighting, PersonTrial, Progress
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.triangulation import triangulate_robust
@@ -90,10 +90,7 @@ def calibrate_people(
     def stand(rig: Rig, seen: PersonSighting) -> tuple[Rig, str]:
         return _on_the_floor(rig, seen, body, height, known_length, up)
 
-    return refine_from(
-        rig, keypoints, body, prior, up=up, sigma=sigma, progress=progress, gauge=stand,
-        from_scratch=True,
-    )  # fmt: skip
+    return refine_from(rig, PersonTrial(keypoints, body, up, sigma), prior, stand, progress=progress, from_scratch=True)
 
 
 def steady_person(record: Keypoints) -> Keypoints:

@@ -63,8 +63,8 @@ def aligned(rig: Rig, old: Rig, *, scale: bool = True) -> tuple[Rig, NDArray, fl
 
 def _by_centres(rig: Rig, old: Rig) -> tuple[NDArray, float]:
     """T_old_new and factor to start from: mean turn, then centres."""
-    u, _, vt = np.linalg.svd(sum(b.T_world_camera[:3, :3] @ a.T_camera_world[:3, :3] for a, b in zip(rig, old)))
-    R = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    turns = [b.T_world_camera[:3, :3] @ a.T_camera_world[:3, :3] for a, b in zip(rig, old)]
+    R = se3.nearest_rotation(np.sum(turns, axis=0))
     a, b = (np.stack([c.centre_world for c in r]) for r in (rig, old))
     a_in, b_in = (a - a.mean(axis=0)) @ R.T, b - b.mean(axis=0)
     spread = float(np.sum(a_in * a_in))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from kinefit.calibration.refine.gauge import aligned, resized
 from kinefit.calibration.refine.result import SURE_PX, CameraChange, Refinement, changes_of
 from kinefit.calibration.refine.sightings import (
     PersonSighting,
+    PersonTrial,
     Progress,
     body_model,
     pixel_frames,
@@ -25,7 +27,7 @@ from kinefit.errors import CalibrationError, ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
-from kinefit.solvers.bundle.body_bundle import fit_body_and_cameras
+from kinefit.solvers.bundle.body_bundle import BundleState, fit_body_and_cameras
 from kinefit.solvers.bundle.cameras import COLUMNS, FOCAL, POSE, RADIAL, TIME, CameraPrior, PointPixels, departure
 
 PLACE_SIGMA, TURN_SIGMA = 0.05, np.radians(2.0)
@@ -94,10 +96,8 @@ def refine(
     def gauge(new: Rig, seen: PersonSighting) -> tuple[Rig, str]:
         return _in_old_frame(new, rig, seen, static_points or {}, height, known_length)
 
-    return refine_from(
-        rig, keypoints, body, CameraPrior(rig, prior_std), up=up, sigma=sigma, gauge=gauge,
-        static_points=static_points, progress=progress,
-    )  # fmt: skip
+    trial, prior = PersonTrial(keypoints, body, up, sigma), CameraPrior(rig, prior_std)
+    return refine_from(rig, trial, prior, gauge, static_points=static_points, progress=progress)
 
 
 def prior_sigma(cameras: int, *, focal: bool, distortion: bool, time_offsets: bool) -> NDArray:
@@ -111,9 +111,8 @@ def prior_sigma(cameras: int, *, focal: bool, distortion: bool, time_offsets: bo
 
 
 def refine_from(
-    rig: Rig, keypoints: Sequence[Keypoints], body: Body, prior: CameraPrior, *, up: str,
-    sigma: float, gauge: Gauge, static_points: StaticPoints | None = None, progress: Progress | None = None,
-    from_scratch: bool = False,
+    rig: Rig, trial: PersonTrial, prior: CameraPrior, gauge: Gauge, *, static_points: StaticPoints | None = None,
+    progress: Progress | None = None, from_scratch: bool = False,
 ) -> Refinement:  # fmt: skip
     """As `refine`, from any start with any prior; `gauge` puts the rig into its final frame and says by which rule."""
     step = progress or (lambda *_: None)
@@ -123,28 +122,26 @@ def refine_from(
     rounds = _CLOCK_ROUNDS if prior.freedom[:, TIME].any() else _ROUNDS
     for turn in range(rounds):
         step("refining", turn, rounds + 1)
-        seen = _sight(rig, keypoints, body, sigma, up, offsets)
+        seen = _sight(rig, trial, offsets)
         first = first or seen
         off = float(np.nanmedian(np.linalg.norm(seen.residuals, axis=-1))) / _RAYLEIGH
-        if off > 2.0 * sigma:  # so far off, a robust loss would take most of what is seen for outliers
-            seen = _sight(rig, keypoints, body, min(off, _COARSEST), up, offsets)
+        if off > 2.0 * trial.sigma:  # so far off, a robust loss would take most of what is seen for outliers
+            seen = _sight(rig, replace(trial, sigma=min(off, _COARSEST)), offsets)
         chosen = spread_frames(seen, _MOST_FRAMES)
         _check_frames(seen, chosen)
-        pixels, velocity = pixel_frames(seen, chosen)
-        model, theta = body_model(seen, body)
-        bundle = fit_body_and_cameras(
-            model, rig, pixels, velocity, [seen.motion.state(int(f)) for f in chosen], theta, prior,
-            static=static, x_static=static_start(rig, static),
-        )  # fmt: skip
+        pixels, (model, theta) = pixel_frames(seen, chosen), body_model(seen, trial.body)
+        states = [seen.motion.state(int(f)) for f in chosen]
+        start = BundleState(rig, np.zeros(len(rig)), theta, states, static_start(rig, static))
+        bundle = fit_body_and_cameras(model, pixels, start, prior, static=static)
         change = np.abs(departure(bundle.rig, rig)[:, POSE]).max(), np.abs(np.ptp(bundle.offsets))
         rig, offsets = bundle.rig, offsets + bundle.offsets
         offsets = offsets - offsets[0]
         if change[0] < _SETTLED and change[1] * seen.motion.rate < _SETTLED_FRAMES:
             break
     step("refining", rounds, rounds + 1)
-    covariance = chance(bundle, prior, seen, chosen) + bias(model, bundle, pixels, velocity, prior, static)
+    covariance = chance(bundle, prior, seen, chosen) + bias(model, bundle, pixels, prior, static)
     rig, rule = gauge(rig, seen)
-    last = _sight(rig, keypoints, body, sigma, up, offsets)
+    last = _sight(rig, trial, offsets)
     assert first is not None
     changes, distance = changes_of(prior.rig, rig, first, last, covariance, offsets)
     step("refining", rounds + 1, rounds + 1)
@@ -156,12 +153,9 @@ def refine_from(
     )  # fmt: skip
 
 
-def _sight(
-    rig: Rig, keypoints: Sequence[Keypoints], body: Body, sigma: float, up: str, offsets: NDArray
-) -> PersonSighting:
+def _sight(rig: Rig, trial: PersonTrial, offsets: NDArray) -> PersonSighting:
     try:
-        late = dict(zip(rig.names, offsets.tolist(), strict=True))
-        return sight(rig, keypoints, body, sigma=sigma, up=up, offsets=late)
+        return sight(rig, trial, dict(zip(rig.names, offsets.tolist(), strict=True)))
     except TrackingError as error:
         raise CalibrationError(
             f"the cameras agree on nobody ({error.problem})",

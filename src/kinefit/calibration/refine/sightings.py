@@ -89,16 +89,31 @@ def shifted(record: Keypoints, offset: float) -> Keypoints:
     return replace(record, points=points, confidence=confidence, lifted=None)
 
 
-def sight(
-    rig: Rig, keypoints: Sequence[Keypoints], body: Body, *, sigma: float, up: str,
-    offsets: Mapping[str, float], progress: Progress | None = None,
-) -> PersonSighting:  # fmt: skip
+@dataclass(frozen=True, eq=False)
+class PersonTrial:
+    """What cameras saw of the person by whom they are calibrated.
+
+    Parameters
+    ----------
+    keypoints : records of the same number of frames and the same rate.
+    body : Body, generic.
+    up : str, vertical axis of the world.
+    sigma : float [px] standard deviation of a sure keypoint.
+    """
+
+    keypoints: Sequence[Keypoints]
+    body: Body
+    up: str
+    sigma: float
+
+
+def sight(rig: Rig, trial: PersonTrial, offsets: Mapping[str, float]) -> PersonSighting:
     """Track one person with a rig whose cameras' clocks are late by `offsets` [s]."""
-    alone = [shifted(k, offsets.get(k.camera, 0.0)) for k in one_person(rig, keypoints)]
-    channels = make_channels(body, rig, person_records(alone, choose_people(rig, alone)), [sigma] * len(alone))
+    body, alone = trial.body, [shifted(k, offsets.get(k.camera, 0.0)) for k in one_person(rig, trial.keypoints)]
+    channels = make_channels(body, rig, person_records(alone, choose_people(rig, alone)), [trial.sigma] * len(alone))
     subject = fit_subject(body, channels)
-    recording = Recording.of_keypoints(rig, alone, sigma=sigma, up=up)
-    motion = track(recording, body, subject=subject, smooth=False, progress=progress)
+    recording = Recording.of_keypoints(rig, alone, sigma=trial.sigma, up=trial.up)
+    motion = track(recording, body, subject=subject, smooth=False)
     uv = np.concatenate([motion.residuals[name].measured for name in channels.sources], axis=1)
     own = np.all((uv == channels.uv) | (np.isnan(uv) & np.isnan(channels.uv)), axis=-1)
     confidence = np.where(own, channels.confidence, channels.confidence[:, channels.partner])
@@ -126,8 +141,8 @@ def spread_frames(sighting: PersonSighting, most: int) -> NDArray:
     return good[np.unique(np.linspace(0, len(good) - 1, min(most, len(good))).astype(int))] if len(good) else good
 
 
-def pixel_frames(sighting: PersonSighting, frames: NDArray) -> tuple[PixelFrames, NDArray]:
-    """Measurements of some frames, and the pixels' velocities (F, N, 2) [px/s].
+def pixel_frames(sighting: PersonSighting, frames: NDArray) -> PixelFrames:
+    """Measurements of some frames, with the velocities of the pixels.
 
     Errors of a detector's points on one segment in one view come together (a hidden shoulder, a blurred face): n points
     of correlation ρ tell as much as n / (1 + (n − 1) ρ) of them (the design effect: L. Kish, Survey sampling, 1965),
@@ -137,10 +152,8 @@ def pixel_frames(sighting: PersonSighting, frames: NDArray) -> tuple[PixelFrames
     group = _groups(sighting)
     share = 1.0 / (1.0 + (np.bincount(group)[group] - 1) * togetherness(sighting))
     weight = sighting.confidence / np.square(c.sigma)
-    return (
-        PixelFrames(c.points, c.camera, c.column, np.nan_to_num(sighting.uv[frames]), weight[frames], share),
-        velocities(sighting)[frames],
-    )
+    uv, velocity = np.nan_to_num(sighting.uv[frames]), velocities(sighting)[frames]
+    return PixelFrames(c.points, c.camera, c.column, uv, weight[frames], share, velocity)
 
 
 def _groups(sighting: PersonSighting) -> NDArray:

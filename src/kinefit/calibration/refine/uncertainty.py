@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import BodyState
 from kinefit.calibration.refine.gauge import aligned, covariance_in_gauge
 from kinefit.calibration.refine.sightings import PersonSighting, correlation_time
-from kinefit.geometry.camera import Rig
-from kinefit.solvers.bundle.body_bundle import BodyBundle, fit_body_and_cameras
+from kinefit.solvers.bundle.body_bundle import BodyBundle, BundleState, fit_body_and_cameras
 from kinefit.solvers.bundle.cameras import CameraPrior, PointPixels, departure
 from kinefit.solvers.bundle.shape import PixelFrames, ShapeParameters
 
@@ -35,9 +32,8 @@ def chance(bundle: BodyBundle, prior: CameraPrior, seen: PersonSighting, frames:
 
 
 def bias(
-    model: ShapeParameters, bundle: BodyBundle, frames: PixelFrames, velocity: NDArray, prior: CameraPrior,
-    static: PointPixels,
-) -> NDArray:  # fmt: skip
+    model: ShapeParameters, bundle: BodyBundle, frames: PixelFrames, prior: CameraPrior, static: PointPixels
+) -> NDArray:
     """Covariance (C · 10, C · 10) of the cameras for errors that stay.
 
     A detector's points lie beside the anatomical ones, differently from each side. Grouped jackknife (M. Quenouille,
@@ -47,18 +43,17 @@ def bias(
     owner = frames.points.segments[frames.column]
     groups = np.unique(owner)
 
-    def fit(rig: Rig, states: Sequence[BodyState], theta: NDArray, x: NDArray, without: int | None) -> BodyBundle:
+    def fit(start: BundleState, without: int | None) -> BodyBundle:
         kept = np.ones(len(owner)) if without is None else (owner != without).astype(float)
-        part = replace(frames, uv=frames.uv[some], weight=frames.weight[some] * kept)
-        return fit_body_and_cameras(
-            model, rig, part, velocity[some], states, theta, prior, static=static, x_static=x,
-            offsets=bundle.offsets, max_iterations=6,
-        )
+        velocity = None if frames.velocity is None else frames.velocity[some]
+        part = replace(frames, uv=frames.uv[some], weight=frames.weight[some] * kept, velocity=velocity)
+        start = replace(start, offsets=bundle.offsets)
+        return fit_body_and_cameras(model, part, start, prior, static=static, max_iterations=6)
 
-    whole = fit(bundle.rig, [bundle.states[f] for f in some], bundle.theta, bundle.x_static, None)
+    whole = fit(replace(bundle, states=[bundle.states[f] for f in some]), None)
     away = []
     for group in groups:
-        part = fit(whole.rig, whole.states, whole.theta, whole.x_static, int(group))
+        part = fit(whole, int(group))
         row = departure(aligned(part.rig, whole.rig)[0], whole.rig)
         row[:, -1] = part.offsets - whole.offsets
         away.append(row.ravel())

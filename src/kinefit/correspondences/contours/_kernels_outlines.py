@@ -179,15 +179,14 @@ def match(model, image, reach, cosine, to_image, to_model):
 
 
 @jit
-def tangent_rows(camera, vertices, ends, share, owner, image, first, second, weight, data, segment, group):
+def tangent_rows(camera, vertices, ends, share, owner, image, weight, data, segment, group):
     """One row a pair: the pixel of a rim point should lie on the tangent of the outline's point; how many were written.
 
-    camera packed; vertices (V, 3) [m] in the world; of N rim points ends (N, 2), share (N,), owner (N,); image (4, M);
-    first, second (K,) numbers of rim and outline points; weight [1/px²]; row buffers as in `_kernels`.
+    camera packed; vertices (V, 3) [m] in the world; of N rim points ends (N, 2), share (N,), owner (N,); image (4, N),
+    the outline's point of each; weight [1/px²]; row buffers as in `_kernels`.
     """
     n = 0
-    for q in range(len(first)):
-        i, k = first[q], second[q]
+    for i in range(len(share)):
         one, two, t = ends[i, 0], ends[i, 1], share[i]
         x = (1.0 - t) * vertices[one, 0] + t * vertices[two, 0]
         y = (1.0 - t) * vertices[one, 1] + t * vertices[two, 1]
@@ -195,14 +194,14 @@ def tangent_rows(camera, vertices, ends, share, owner, image, first, second, wei
         ok, u, v, ux, uy, uz, vx, vy, vz = project_jacobian(camera, x, y, z)
         if not ok:
             continue
-        a, b = image[2, k], image[3, k]
+        a, b = image[2, i], image[3, i]
         gx, gy, gz = a * ux + b * vx, a * uy + b * vy, a * uz + b * vz
         square = gx * gx + gy * gy + gz * gz
         g = 1.0 / math.sqrt(square)
         data[0, n], data[1, n], data[2, n] = x, y, z
         data[3, n], data[4, n], data[5, n] = gx * g, gy * g, gz * g
-        data[6, n] = (a * (image[0, k] - u) + b * (image[1, k] - v)) * g
+        data[6, n] = (a * (image[0, i] - u) + b * (image[1, i] - v)) * g
         data[7, n] = weight * square
-        segment[n], group[n] = owner[i], q
+        segment[n], group[n] = owner[i], i
         n += 1
     return n

@@ -20,7 +20,6 @@ def morphed_rows(
     *,
     share: ArrayLike | None = None,
     sigma: ArrayLike = 0.01,
-    group: ArrayLike | None = None,
 ) -> Rows | DofRows:
     """One row a point, r ≈ n·∂x/∂δ δ, with all that a morph adds to the derivative.
 
@@ -34,7 +33,6 @@ def morphed_rows(
     residual : (K,) [m] how much further along it each point should lie; NaN for none.
     share : (K, C) barycentric coordinates.
     sigma : scalar or (K,) [m]
-    group : (K,) int, default each point by itself; see `Rows`.
     """
     n, r = np.asarray(direction, float), np.asarray(residual, float)
     chosen = np.asarray(index, np.int64)
@@ -46,9 +44,8 @@ def morphed_rows(
     if not np.all(deviation > 0):
         raise ObservationError("a standard deviation that is not positive", remedy="Give metres above 0.")
     part = np.ones(chosen.shape) if share is None else np.asarray(share, float)
-    ids = np.arange(len(r)) if group is None else np.asarray(group, np.int64)
     seen = np.isfinite(r) & np.isfinite(n).all(1)
-    chosen, n, r, part, ids = chosen[seen], n[seen], r[seen], part[seen], ids[seen]
+    chosen, n, r, part, ids = chosen[seen], n[seen], r[seen], part[seen], np.flatnonzero(seen)
     weight = 1.0 / deviation[seen] ** 2
     skin = pose.morphing.skin
     if pose.morphing.is_rigid and (skin.owners[chosen, 0] == skin.owners[chosen[:, :1], 0]).all():
@@ -73,7 +70,6 @@ def morphed_outline_rows(
     rim: Rim,
     camera: Camera,
     image: NDArray,
-    pairs: tuple[NDArray, NDArray],
     *,
     sigma: float = 2.0,
 ) -> Rows | DofRows:
@@ -82,18 +78,15 @@ def morphed_outline_rows(
     Parameters
     ----------
     pose : MorphedPose
-    rim : Rim of `pose.vertices` in this camera.
-    image : (4, M) outline of the silhouette: u, v [px], normal.
-    pairs : (K,), (K,) int, points of the rim and of the outline that belong together; see `outline_pairs`.
+    rim : Rim of `pose.vertices` in this camera, N points.
+    image : (4, N) the point of the silhouette's outline that each belongs to: u, v [px], normal.
     sigma : float [px] standard deviation of a pair.
     """
     if not sigma > 0:
         raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive one.")
-    i, k = pairs
-    chosen = rim.chosen(i)
-    n, away, size = toward_tangents(chosen.on(pose.vertices), camera, image[:, k])
-    share = np.stack([1.0 - chosen.share, chosen.share], axis=1)
-    return morphed_rows(pose, chosen.vertices, n, away, share=share, sigma=sigma / size)
+    n, away, size = toward_tangents(rim.on(pose.vertices), camera, image)
+    share = np.stack([1.0 - rim.share, rim.share], axis=1)
+    return morphed_rows(pose, rim.vertices, n, away, share=share, sigma=sigma / size)
 
 
 def toward_tangents(x_world: NDArray, camera: Camera, image: NDArray) -> tuple[NDArray, NDArray, NDArray]:

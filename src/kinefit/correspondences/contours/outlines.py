@@ -48,7 +48,6 @@ def outline_rows(
     vertices_world: NDArray,
     camera: Camera,
     image: NDArray,
-    pairs: tuple[NDArray, NDArray],
     *,
     sigma: float = 2.0,
     by: str = "pixels",
@@ -57,37 +56,34 @@ def outline_rows(
 
     By "pixels", one row a pair: the rim point's pixel should lie on the tangent of the outline, so that outlines glide
     along each other. By "rays", two rows a pair: the rim point should lie on the ray of the outline's point (P1's
-    constraint). The rows of one pair bear its number as their measurement id.
+    constraint). The rows of one pair bear its number as their measurement id. `outline_pairs` finds pairs.
 
     Parameters
     ----------
-    rim : Rim of the body at this state in this camera.
+    rim : Rim of the body at this state in this camera, N points.
     vertices_world : (V, 3) [m] of the mesh at this state.
     camera : Camera, of the image's size.
-    image : (4, M) outline of the silhouette: u, v [px], normal.
-    pairs : (K,), (K,) int, points of the rim and of the outline that belong together; see `outline_pairs`.
+    image : (4, N) the point of the silhouette's outline that each belongs to: u, v [px], normal.
     sigma : float [px] standard deviation of a pair.
     """
     if by not in ("pixels", "rays"):
         raise ObservationError(f"rows by '{by}'", remedy='Write by="pixels" or by="rays".')
     if not sigma > 0:
         raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive one.")
-    i, k = pairs
-    count = len(i)
+    count = len(rim)
     data, segment, group = _kernels.buffers(2 * count)
     if by == "pixels":
         used = kernels.tangent_rows(
-            camera.packed, np.ascontiguousarray(vertices_world), rim.vertices, rim.share, rim.segment, image, i, k,
-            1.0 / sigma**2, data, segment, group,
+            camera.packed, np.ascontiguousarray(vertices_world), rim.vertices, rim.share, rim.segment,
+            np.ascontiguousarray(image), 1.0 / sigma**2, data, segment, group,
         )  # fmt: skip
         return Rows(np.ascontiguousarray(data[:, :used]), segment[:used], group[:used])
     frames, _ = body.tree.forward(state.T_world_root, state.angles)
-    owner, points = rim.segment[i], rim.chosen(i).on(vertices_world)
-    f = frames[owner]
+    f, points = frames[rim.segment], rim.on(vertices_world)
     rest = np.ascontiguousarray(np.einsum("nij,ni->nj", f[:, :9].reshape(-1, 3, 3), points - f[:, 9:]))
-    rays = line_along(camera.centre_world, camera.ray(image[:2, k].T))
+    rays = line_along(camera.centre_world, camera.ray(image[:2].T))
     focal = np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
     depth = points @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
     weight = np.where(depth > 0.0, (focal / (depth * sigma)) ** 2, 0.0)
-    used = _kernels.ray_rows(frames, owner, rest, rays, weight, data, segment, group, 0)
+    used = _kernels.ray_rows(frames, rim.segment, rest, rays, weight, data, segment, group, 0)
     return Rows(np.ascontiguousarray(data[:, :used]), segment[:used], group[:used])

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from kinefit.correspondences.contours import _kernels_outlines as kernels
 from kinefit.geometry.camera import Camera
-from kinefit.rendering import Canvas, Raster
+from kinefit.rendering import Canvas, Raster, lens_of
 
 _ROOM = 20000  # rim points of one image, at most
 _NEAR = 0.05  # [m] depth by which a limb's surface one pixel inside of its rim may be nearer than the rim
@@ -53,6 +53,12 @@ class Window(NamedTuple):
         wide, high = ((n + 2 * margin + 1) * scale for n in (right - left, bottom - top))
         size = math.ceil(wide / _CELL) * _CELL, math.ceil(high / _CELL) * _CELL
         return cls(float(math.floor(left - margin)), float(math.floor(top - margin)), size, scale)
+
+    def lens(self, camera: Camera) -> NDArray:
+        """(4,) [px] focal lengths and principal point of the window."""
+        fx, fy, cx, cy = lens_of(camera)
+        offset = cx - self.left + 0.5, cy - self.top + 0.5
+        return np.array([fx, fy, *offset]) * self.scale - (0.0, 0.0, 0.5, 0.5)
 
 
 class Triangles(Protocol):
@@ -171,7 +177,7 @@ class RimFinder:
         others : vertices (W, 3) [m] in the world and faces (U, 3) of other bodies
             The body is not seen behind them, has no outline beside them, and the virtual image has -2 where they are.
         """
-        x, uv, K = np.empty((len(vertices_world), 3)), np.empty((len(vertices_world), 2)), camera.matrix
+        x, uv = np.empty((len(vertices_world), 3)), np.empty((len(vertices_world), 2))
         kernels.seen(camera.packed, np.ascontiguousarray(vertices_world), x, uv)
         last, moved = self._last, np.inf
         if last is not None and last[0] is camera and stale > 0.0:
@@ -184,13 +190,12 @@ class RimFinder:
             if w.size not in self._canvases:
                 self._canvases[w.size] = Canvas(w.size)
             canvas = self._canvases[w.size]
-            fx, fy = K[0, 0] * w.scale, K[1, 1] * w.scale
-            cx, cy = (K[0, 2] - w.left + 0.5) * w.scale - 0.5, (K[1, 2] - w.top + 0.5) * w.scale - 0.5
-            drawn = canvas.draw(x, self.faces, fx, fy, cx, cy, cull=True)
+            lens = w.lens(camera)
+            drawn = canvas.draw(x, self.faces, lens, cull=True)
             for vertices, faces in others:
                 there = np.empty((len(vertices), 3))
                 kernels.seen(camera.packed, np.ascontiguousarray(vertices), there, np.empty((len(vertices), 2)))
-                other = Canvas(w.size).draw(there, np.ascontiguousarray(faces, np.int32), fx, fy, cx, cy, cull=True)
+                other = Canvas(w.size).draw(there, np.ascontiguousarray(faces, np.int32), lens, cull=True)
                 drawn.face[(other.face >= 0) & (other.depth < drawn.depth)] = _OTHER
             self._last = camera, uv, drawn, w
             self.window = w

@@ -7,23 +7,18 @@ import math
 from kinefit._jit import jit
 from kinefit.geometry._kernels_camera import HEIGHT, ROT, TRANS, WIDTH, project_jacobian
 
-UNSEEN, HIDDEN, EMPTY, MATCHED = 0, 1, 2, 3
-
 
 @jit
 def depth_image_rows(
-    frames, owner, rest, normal, camera, depth, rays, shown, ratio, skin, before, behind, facing, weight,
-    data, segment, group, start, verdict,
+    frames, owner, rest, normal, camera, depth, rays, shown, ratio, skin, reach, facing, weight,
+    data, segment, group, start,
 ):  # fmt: skip
-    """One row for each sample that the sensor saw, along the sample's normal; and a verdict for every sample.
+    """One row for each sample that the sensor saw, along the sample's normal; the next free line.
 
     owner (N,), rest and normal (3, N) in the root frame at rest; camera packed; depth (H, W) [m], 0 for none; rays
     (2, H, W): x/z and y/z of every pixel in the camera; shown (h, w) [m]: the body's own depth at `ratio` of the size,
-    inf for none; skin [m]: how far a sample may lie behind it; before, behind [m]: how far the measurement may lie on
-    either side; facing: least cosine between normal and line of sight; weight [1/m²].
-    Out: verdict (N,) UNSEEN (turned away, beside the picture, behind the body itself, a hole), HIDDEN (something was
-    measured in front), EMPTY (the sensor saw through it), MATCHED.
-    Returns the next free line.
+    inf for none; skin [m]: how far a sample may lie behind it; reach [m]: how far the measurement may lie on either
+    side; facing: least cosine between normal and line of sight; weight [1/m²].
     """
     r00, r01, r02 = camera[ROT], camera[ROT + 1], camera[ROT + 2]
     r10, r11, r12 = camera[ROT + 3], camera[ROT + 4], camera[ROT + 5]
@@ -34,7 +29,6 @@ def depth_image_rows(
     rows, columns = shown.shape
     i = start
     for k in range(owner.size):
-        verdict[k] = UNSEEN
         f = frames[owner[k]]
         a, b, c = normal[0, k], normal[1, k], normal[2, k]
         nx, ny, nz = f[0] * a + f[1] * b + f[2] * c, f[3] * a + f[4] * b + f[5] * c, f[6] * a + f[7] * b + f[8] * c
@@ -60,15 +54,8 @@ def depth_image_rows(
             continue
         iu, iv = int(u + 0.5), int(v + 0.5)
         m = depth[iv, iu]
-        if m <= 0.0:
+        if m <= 0.0 or m < zc - reach or m > zc + reach:
             continue
-        if m < zc - before:
-            verdict[k] = HIDDEN
-            continue
-        if m > zc + behind:
-            verdict[k] = EMPTY
-            continue
-        verdict[k] = MATCHED
         mx, my = m * rays[0, iv, iu] - t0, m * rays[1, iv, iu] - t1
         mz = m - t2
         qx = r00 * mx + r10 * my + r20 * mz

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, BodyState
-from kinefit.correspondences import _kernels, targets
+from kinefit.correspondences import _kernels
 from kinefit.correspondences.occupancy import _kernels_space as kernels
 from kinefit.correspondences.occupancy.depth_image import SurfaceSamples
 from kinefit.errors import ObservationError
@@ -88,8 +87,7 @@ class FreeSpace:
 
 
 def free_space_rows(
-    body: Body,
-    state: BodyState,
+    frames: NDArray,
     samples: SurfaceSamples,
     space: FreeSpace,
     camera: Camera,
@@ -98,7 +96,6 @@ def free_space_rows(
     tolerance: float = 0.1,
     reach: float = 0.5,
     chosen: NDArray | None = None,
-    frames: NDArray | None = None,
 ) -> Rows:
     """One row for each sample in space that the sensor saw through: sideways to the edge of the nearest cell that fits.
 
@@ -108,6 +105,7 @@ def free_space_rows(
 
     Parameters
     ----------
+    frames : (S, 12) of the segments: `body.tree.forward(state.T_world_root, state.angles)[0]`, or of joints that move.
     samples : SurfaceSamples
     space : FreeSpace of the camera's image
     camera : Camera
@@ -121,7 +119,6 @@ def free_space_rows(
         Beyond it no row: so far sideways lies another part, or another person.
     chosen : (N,) int64, optional
         To be filled with the cell that every sample is drawn to, -1 for none; see `FreeSpace.middle`.
-    frames : (S, 12), optional, of a body whose joints move with its angles.
     """
     if space.depth.shape != (camera.size[1], camera.size[0]):
         problem = f"a depth image of {space.depth.shape[::-1]} px, camera {camera.name} has {camera.size}"
@@ -129,7 +126,6 @@ def free_space_rows(
     sigma = 10.0 * space.cell if sigma is None else sigma
     if not sigma > 0:
         raise ObservationError(f"the standard deviation of free space is {sigma} px", remedy="Give a positive one.")
-    frames = targets.of_segments(body, state, frames)
     data, segment, group = _kernels.buffers(len(samples))
     chosen = np.empty(len(samples), np.int64) if chosen is None else chosen
     end = kernels.free_space_rows(

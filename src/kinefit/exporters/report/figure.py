@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,40 +23,45 @@ _BONE = 0.02  # [m] radius of a bone that has no surface
 _DEEP = 0.35  # [m] how far a camera's pyramid reaches
 
 
+class Capsules(NamedTuple):
+    """C capsules: points (2 C) on the body, their ends two by two; radii (C, 2) [m] of both; colours (C) "#0072b2"."""
+
+    points: PointSet
+    radii: NDArray
+    colours: list[str]
+
+
 def figure(motion: Motion, rig: Rig | None = None) -> Html:
     """The body as it moves, with the cameras of a rig; the floor lies under the lowest foot."""
     R = rotation_between_up(motion.up, "z")
-    points, ends, radii, owners, colours = _capsules(motion.body)
+    capsules = _capsules(motion.body)
     step = max(1, round(motion.rate / RATE), -(-len(motion) // MOST))
     frames = np.arange(0, len(motion), step)
     T = se3.transform(R, np.zeros(3))
-    x = motion.body.trajectories(T @ motion.Ts_world_root[frames], motion.angles[frames], points)
-    floor = float(np.percentile((x[..., 2] - _reach(ends, radii, len(points))).min(axis=1), 5))
+    x = motion.body.trajectories(T @ motion.Ts_world_root[frames], motion.angles[frames], capsules.points)
+    floor = float(np.percentile((x[..., 2] - capsules.radii.ravel()).min(axis=1), 5))
     cameras = [] if rig is None else [_pyramid(camera.name, camera, R) for camera in rig]
-    lost = motion.lost[frames][:, owners]
+    lost = motion.lost[frames][:, capsules.points.segments[::2]]
     return player(
-        x, ends, radii, rate=motion.rate / step, start=float(motion.times[0]), colours=colours, floor=floor,
-        cameras=cameras, dimmed=lost,
+        x, capsules, rate=motion.rate / step, start=float(motion.times[0]), floor=floor, cameras=cameras, dimmed=lost
     )  # fmt: skip
 
 
 def live_figure(body: Body) -> tuple[Html, PointSet]:
     """A figure that a page moves by `move(points, lost)`, at rest; and its capsules' ends on the body, two by two."""
-    points, ends, radii, _, colours = _capsules(body)
+    capsules = _capsules(body)
     T = se3.transform(rotation_between_up("y", "z"), np.zeros(3))
-    x = body.trajectories(T[None], body.rest_state().angles[None], points)
-    floor = float((x[0, :, 2] - _reach(ends, radii, len(points))).min())
-    return player(x, ends, radii, rate=1.0, colours=colours, floor=floor), points
+    x = body.trajectories(T[None], body.rest_state().angles[None], capsules.points)
+    floor = float((x[0, :, 2] - capsules.radii.ravel()).min())
+    return player(x, capsules, rate=1.0, floor=floor), capsules.points
 
 
 def player(
     x: NDArray,
-    ends: NDArray,
-    radii: NDArray,
+    capsules: Capsules,
     *,
     rate: float,
     start: float = 0.0,
-    colours: list[str],
     floor: float = 0.0,
     cameras: list[dict[str, Any]] | None = None,
     dimmed: NDArray | None = None,
@@ -65,12 +70,10 @@ def player(
 
     Parameters
     ----------
-    x : (F, P, 3) [m] points over time.
-    ends : (C, 2) int, the points that each capsule joins.
-    radii : (C, 2) [m] of both ends.
+    x : (F, 2 C, 3) [m] ends of the capsules over time.
+    capsules : Capsules
     rate : float [Hz]
     start : float [s] time of the first frame.
-    colours : (C,) such as "#0072b2".
     floor : float [m] height of the floor's grid.
     cameras : list of {"name", "points": (5, 3) centre and corners}, optional
     dimmed : (F, C) bool, optional
@@ -81,8 +84,9 @@ def player(
     whole = np.round((x - 0.5 * (low + high)) / quantum).astype("<i2")
     data = {
         "rate": rate, "start": start, "frames": len(x), "points": x.shape[1], "quantum": quantum,
-        "middle": 0.5 * (low + high), "low": low, "high": high, "floor": floor, "ends": ends, "radii": radii,
-        "colours": colours, "cameras": cameras or [], "x": _packed(whole),
+        "middle": 0.5 * (low + high), "low": low, "high": high, "floor": floor, "radii": capsules.radii,
+        "ends": np.arange(x.shape[1]).reshape(-1, 2), "colours": capsules.colours,
+        "cameras": cameras or [], "x": _packed(whole),
         "dimmed": _packed(np.packbits(dimmed)) if dimmed is not None and dimmed.any() else "",
     }  # fmt: skip
     return Html(f'<div class="player" id="figure"><script type="application/json">{to_json(data)}</script></div>')
@@ -92,8 +96,8 @@ def _packed(array: NDArray) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
 
 
-def _capsules(body: Body) -> tuple[PointSet, NDArray, NDArray, NDArray, list[str]]:
-    """Points, ends (C, 2), radii (C, 2), owners (C,) and colours (C,) of a body's surfaces, or of its bones."""
+def _capsules(body: Body) -> Capsules:
+    """Those of a body's surfaces, or of its bones."""
     tree = body.tree
     limbs = [limb for c in body.surfaces for limb in _limbs(c, body)]
     if limbs:
@@ -104,9 +108,8 @@ def _capsules(body: Body) -> tuple[PointSet, NDArray, NDArray, NDArray, list[str
     else:
         points, _, _ = bones(body)
         radii = np.full((len(points) // 2, 2), _BONE)
-    owners = np.asarray(points.segments)[::2]
-    colours = ["#%02x%02x%02x" % side_colour(tree.segments[s]) for s in owners]  # noqa: UP031
-    return points, np.arange(len(points)).reshape(-1, 2), radii, owners, colours
+    colours = ["#%02x%02x%02x" % side_colour(tree.segments[s]) for s in points.segments[::2]]  # noqa: UP031
+    return Capsules(points, radii, colours)
 
 
 def _limbs(c: Surface, body: Body) -> list[tuple[int, NDArray, NDArray]]:
@@ -129,13 +132,6 @@ def _limbs(c: Surface, body: Body) -> list[tuple[int, NDArray, NDArray]]:
         return [(c.segment, np.stack([start, end]), radii[:, 0])]
     beside = (radii[:, wide] - radii[:, thin]).clip(0)[:, None] * c.axes[wide]
     return [(c.segment, np.stack([start, end]) + k * beside, radii.min(axis=1)) for k in (-1, 0, 1)]
-
-
-def _reach(ends: NDArray, radii: NDArray, count: int) -> NDArray:
-    """(P,) [m] largest radius around each point."""
-    out = np.zeros(count)
-    np.maximum.at(out, ends.ravel(), radii.ravel())
-    return out
 
 
 def _pyramid(name: str, camera: Any, R: NDArray) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import FEWEST, GIVE, MarkerSet
 from kinefit.errors import ObservationError
+from kinefit.geometry.se3 import nearest_rotation
 from kinefit.identification.model.model import MarkerJoint, MarkerModel
 
 NOISE = 0.001
@@ -103,7 +104,7 @@ def skeleton_of(labels: Sequence[str], marker_set: MarkerSet) -> Skeleton:
     return Skeleton(names, tuple(parents), own, places, joints, unknown, tuple(give), ranges)
 
 
-def similarity(x: NDArray, y: NDArray, prior: NDArray, scaled: bool = True) -> tuple[float, NDArray, NDArray]:
+def similarity(x: NDArray, y: NDArray, prior: NDArray) -> tuple[float, NDArray, NDArray]:
     """Scale s, rotation R, translation t with s R x + t = y, least squares; what the points leave open as in `prior`.
 
     Parameters
@@ -114,10 +115,8 @@ def similarity(x: NDArray, y: NDArray, prior: NDArray, scaled: bool = True) -> t
     a, b = x - x.mean(0), y - y.mean(0)
     size = float((a * a).sum())
     cross = b.T @ a + (1e-4 * size + 1e-12) * prior
-    u, _, vt = np.linalg.svd(cross)
-    d = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    R = (u * d) @ vt
-    scale = float(np.sqrt((b * b).sum() / size)) if scaled and len(x) > 1 and size > 0 else 1.0
+    R = nearest_rotation(cross)
+    scale = float(np.sqrt((b * b).sum() / size)) if len(x) > 1 and size > 0 else 1.0
     return scale, R, y.mean(0) - scale * R @ x.mean(0)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.geometry.se3 import exp_so3, log_so3
+from kinefit.geometry.se3 import exp_so3, log_so3, nearest_rotation
 from kinefit.identification.model.model import MarkerJoint
 from kinefit.solvers.rigid_clusters import local, middle
 
@@ -104,8 +104,7 @@ def _turns(Rp: NDArray, Rc: NDArray, good: NDArray) -> tuple[NDArray, NDArray, N
     relative = relative[np.isfinite(relative).all((1, 2))]
     if not len(relative):
         return None
-    u, _, vt = np.linalg.svd(relative.mean(0))
-    mean = (u * [1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    mean = nearest_rotation(relative.mean(0))
     turns = log_so3(np.einsum("ji,fjk->fik", mean, relative))
     _, axes = np.linalg.eigh(turns.T @ turns)
     return mean, turns @ axes, axes

@@ -60,8 +60,6 @@ def match_along_rays(
     deformation: ArrayLike,
     *,
     window: int | ArrayLike = WINDOW,
-    steps: int = STEPS,
-    tolerance: float = TOLERANCE,
 ) -> RayMatches:
     """Find windows of the first camera's image in all others at once.
 
@@ -71,7 +69,7 @@ def match_along_rays(
     points : (N, 2) [px] centres of the windows in the first image
     distance : (N,) [m] along their rays to start with, right to about two pixels; NaN leaves a point out
     deformation : (N, C - 1, 2, 2) of the window into each other image, to start with; NaN leaves that image out
-    window, steps, tolerance : as in `match`; the side of all windows or of each
+    window : as in `match`, the side of all windows or of each
     """
     at, start = places(points), np.array(distance, float)
     maps = np.array(deformation, float)
@@ -91,7 +89,7 @@ def match_along_rays(
     starts = np.concatenate([start[:, None], maps.reshape(len(at), -1)], axis=1)
     noise = np.mean([image.noise**2 for image in images[1:]])
     kernels.match_rays(
-        images[0].coefficients, stack, sizes, rig.packed[1:].copy(), at, origin, rays, starts, halves, steps, tolerance,
+        images[0].coefficients, stack, sizes, rig.packed[1:].copy(), at, origin, rays, starts, halves, STEPS, TOLERANCE,
         float(images[0].noise**2 / (images[0].noise**2 + noise)), float(images[0].noise**2), out, each,
     )  # fmt: skip
     status = out[:, kernels.STATE].astype(np.int64)

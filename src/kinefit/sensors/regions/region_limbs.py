@@ -114,9 +114,7 @@ class Limbs:
         x = self._posed(_with(state, own, angles)) @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
         if w.size not in self._canvases:
             self._canvases[w.size] = Canvas(w.size)
-        K = camera.matrix
-        cx, cy = (K[0, 2] - w.left + 0.5) * w.scale - 0.5, (K[1, 2] - w.top + 0.5) * w.scale - 0.5
-        drawn = self._canvases[w.size].draw(x, self._faces, K[0, 0] * w.scale, K[1, 1] * w.scale, cx, cy)
+        drawn = self._canvases[w.size].draw(x, self._faces, w.lens(camera))
         return kernels.likelihood(
             seen.image, seen.bins, seen.ratios.logs, drawn.face, self._label, w.left, w.top, w.scale
         )

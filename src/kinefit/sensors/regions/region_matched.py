@@ -56,12 +56,12 @@ class RegionMatched(Matched):
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """One row a line: the pixel of the body's point should lie, across the contour, where that is."""
         seams = [] if self.seams is None else [self.seams.rows(scene, self.off, self.sure, self.loss)]
-        camera, pairs = scene.placed(self.measurement.of.camera), (np.arange(len(self.rim)),) * 2
+        camera = scene.placed(self.measurement.of.camera)
         if not scene.surface.morphing.is_rigid:
-            blended = morphed_outline_rows(scene.pose, self.rim, camera, self.place, pairs, sigma=1.0)
+            blended = morphed_outline_rows(scene.pose, self.rim, camera, self.place, sigma=1.0)
             return [replace(blended, weight=blended.weight * self.weight[blended.group], loss=self.loss), *seams]
         state, x = scene.state, scene.pose.vertices
-        rows = outline_rows(scene.body, state, self.rim, x, camera, self.place, pairs, sigma=1.0)
+        rows = outline_rows(scene.body, state, self.rim, x, camera, self.place, sigma=1.0)
         rows.data[7] *= self.weight[rows.group]
         return [replace(rows, loss=self.loss), *seams]
 

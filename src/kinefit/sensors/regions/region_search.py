@@ -21,6 +21,7 @@ from kinefit.images import _kernels_regions as kernels
 from kinefit.images.regions import SearchSettings
 from kinefit.rendering import NEAR
 from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.regions.region_image import Coloured
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import inverse
 
@@ -66,15 +67,15 @@ class Seeker:
 
 
 def region_starts(
-    scene: Scene, camera: Camera, seeker: Seeker, image: NDArray, bins: NDArray, ratio: NDArray,
-    information: NDArray | None, told: Evidence, s: SearchSettings, *, rigid: bool = True,
+    scene: Scene, camera: Camera, seeker: Seeker, seen: Coloured, information: NDArray | None, told: Evidence,
+    s: SearchSettings, *, rigid: bool = True,
 ) -> list[BodyState]:  # fmt: skip
     """States from which a fit may as well begin, the best first; none where the body is where it was expected.
 
     Parameters
     ----------
     scene : where the body is expected
-    image, bins, ratio : (H, W, 3) uint8 RGB, and the log ratio (B,) of each bin of colours
+    seen : Coloured image, with the log ratio of each bin of colours
     information : (n, n) of where it is expected, None where nothing is known
     told : what the image says of the state that was found from there
     rigid : whether the body is; one that is not is sought only if it is not where it was found, as a whole
@@ -106,7 +107,7 @@ def region_starts(
     if wide < 2 or tall < 2:
         return []
     cells, (left, top) = np.empty((tall, wide)), (int(first[0]), int(first[1]))
-    kernels.ratio_map(image, bins, ratio, left, top, step, cells)
+    kernels.ratio_map(seen.image, seen.bins, seen.ratios.whole, left, top, step, cells)
     K, half = camera.matrix, 0.5 * (step - 1)
     lens = np.array([K[0, 0] / step, K[1, 1] / step, (K[0, 2] - left - half) / step, (K[1, 2] - top - half) / step,
                      NEAR])  # fmt: skip

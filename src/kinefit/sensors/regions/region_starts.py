@@ -55,8 +55,8 @@ class Starts:
     ) -> list[BodyState]:
         """Of the body as a whole; see `region_starts`."""
         return region_starts(
-            scene, camera, self._seeker, seen.image, seen.bins, seen.ratios.whole, information, told,
-            self._settings.regions.search, rigid=not self._jointed,
+            scene, camera, self._seeker, seen, information, told, self._settings.regions.search,
+            rigid=not self._jointed,
         )  # fmt: skip
 
     def limbs(

@@ -114,10 +114,8 @@ class RegionSensor(Sensor):
         m.seen = Coloured(frame.image, self.bins, self.ratios)
         return m
 
-    def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:
+    def learn(self, measurement: RegionMeasurement, scene: Scene, sure: bool) -> None:
         """Blend in the colours of a step in which the body was seen; and how far it was from where it was expected."""
-        if not isinstance(measurement, RegionMeasurement):
-            return
         if measurement.waits(scene):
             self.colours, self._known = RegionColours.none(self.count, self.regions), sure
             self._know(measurement, scene)

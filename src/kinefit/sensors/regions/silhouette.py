@@ -196,15 +196,13 @@ class SilhouetteMatched(Matched):
 
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """One row a pair: the pixel of the body's point should lie on the tangent of the image's outline."""
-        numbers, camera = np.arange(len(self.rim)), scene.placed(self.measurement.camera)
-        pairs = numbers, numbers
+        camera = scene.placed(self.measurement.camera)
         if scene.surface.morphing.is_rigid:
             rows = outline_rows(
-                scene.body, scene.state, self.rim, scene.pose.vertices, camera, self.tangents, pairs,
-                sigma=self.row_sigma,
+                scene.body, scene.state, self.rim, scene.pose.vertices, camera, self.tangents, sigma=self.row_sigma
             )  # fmt: skip
             return [replace(rows, loss=self.loss)]
-        blended = morphed_outline_rows(scene.pose, self.rim, camera, self.tangents, pairs, sigma=self.row_sigma)
+        blended = morphed_outline_rows(scene.pose, self.rim, camera, self.tangents, sigma=self.row_sigma)
         return [replace(blended, loss=self.loss)]
 
     def evidence(self, scene: Scene) -> Evidence:

@@ -67,9 +67,9 @@ class DepthImageSensor(Sensor):
         """
         return DepthImageMeasurement(self, frame, scene)
 
-    def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:
+    def learn(self, measurement: DepthImageMeasurement, scene: Scene, sure: bool) -> None:
         """Let the background learn from a whole image, with the body where it was found."""
-        if self.background is None or not isinstance(measurement, DepthImageMeasurement) or measurement.is_compact:
+        if self.background is None or measurement.is_compact:
             return
         shown = measurement.drawn_alone(scene)
         self.background.learn(np.abs(measurement.depth), shown, measurement.box, sure)
@@ -166,18 +166,17 @@ class DepthImageMeasurement(Measurement):
 
     def match(self, scene: Scene, reach: float) -> DepthImageMatched:
         """Nearest points of the surface, the visible samples' pixels, and where samples in free space should go."""
-        body, state, samples, s, sigma = scene.body, scene.state, scene.surface.samples, self.of.settings, self.sigma
+        samples, s, sigma = scene.surface.samples, self.of.settings, self.sigma
         bound, depth, camera = max(reach, AGREES * sigma), self.depth, scene.placed(self.camera)
         shown, space = self._drawn(scene)
         measured = along(np.ascontiguousarray(self._points.T, float), self.camera, scene)
         points = surface_rows(
-            body, state, measured, max_distance=bound, sigma=sigma / np.sqrt(self._share / 2.0),
+            scene.body, scene.state, measured, max_distance=bound, sigma=sigma / np.sqrt(self._share / 2.0),
             viewpoint=camera.centre_world, frames=scene.frames,
         )  # fmt: skip
         pixels = depth_image_rows(
-            body, state, samples, camera, depth, shown, before=bound, behind=bound, sigma=self._sample_sigma,
-            frames=scene.frames,
-        )  # fmt: skip
+            scene.frames, samples, camera, depth, shown, reach=bound, sigma=self._sample_sigma
+        )
         # A point that noise has put behind a limb's middle is nearest to its far side and makes no row, so that nearest
         # points draw thin limbs towards the sensor: by 2 to 5 cm with deviations of 3 cm. Pixels do not.
         blur = min(_LIMB / (4.0 * sigma), 1.0) ** 2 if bound <= max(s.near, AGREES * sigma) else 1.0

@@ -67,8 +67,8 @@ class SurfacePairs:
         points, normals = self.anchors.on(scene.body)
         measured = self.x_world if self.camera is None else along(self.x_world, self.camera, scene)
         made = anchored_rows(
-            scene.body, scene.state, self.anchors.segment, points, normals, measured, weight=self.weight,
-            at_surface=self.at_surface, frames=scene.frames,
+            scene.frames, self.anchors.segment, points, normals, measured, weight=self.weight,
+            at_surface=self.at_surface,
         )  # fmt: skip
         return replace(made, loss=geman_mcclure(self.scale * np.sqrt(self.weight)))
 
@@ -106,9 +106,8 @@ class FreePairs:
         """
         chosen = np.empty(len(samples), np.int64)
         made = free_space_rows(
-            scene.body, scene.state, samples, space, camera, tolerance=tolerance, sigma=sigma, chosen=chosen,
-            frames=scene.frames,
-        )  # fmt: skip
+            scene.frames, samples, space, camera, tolerance=tolerance, sigma=sigma, chosen=chosen
+        )
         hand = np.where(scene.surface.fingers, 1 + samples.segment, 0)
         air, there = (np.bincount(hand[some], minlength=1 + hand.max(initial=0)) for some in (made.group, seen))
         folded = air > there
@@ -122,8 +121,8 @@ class FreePairs:
         """One row a sample at a scene's state."""
         points, _ = self.anchors.on(scene.body)
         made = target_rows(
-            scene.body, scene.state, self.anchors.segment, points, scene.placed(self.camera), self.target,
-            slack=self.slack, sigma=self.sigma, frames=scene.frames,
+            scene.frames, self.anchors.segment, points, scene.placed(self.camera), self.target, slack=self.slack,
+            sigma=self.sigma,
         )  # fmt: skip
         return _on_joints(scene, replace(made, loss=SQUARED))
 

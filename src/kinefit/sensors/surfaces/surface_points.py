@@ -68,13 +68,13 @@ class SurfacePointSensor(Sensor):
             frame.sensor, frame.time, ids, frame.x_world[order], mean + self.slide**2, self.slide, anchors, turns
         )
 
-    def learn(self, measurement: Measurement, scene: Scene, sure: bool) -> None:
+    def learn(self, measurement: SurfacePointMeasurement, scene: Scene, sure: bool) -> None:
         """Anchor new points on limbs that have settled; let go of those that left the limb they were given to.
 
         A point is let go where its place on the segment is far from where it is seen, while most points of the same
         segment agree: it belongs to another limb, or its path went astray. Its next frame gives it to the nearest.
         """
-        if not sure or not isinstance(measurement, SurfacePointMeasurement):
+        if not sure:
             return
         lost = measurement.strayed(scene)
         if lost:

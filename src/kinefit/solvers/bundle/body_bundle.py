@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
 from kinefit.geometry.camera import Rig
-from kinefit.losses import Loss, geman_mcclure
+from kinefit.losses import geman_mcclure
 from kinefit.solvers import _kernels_linear
 from kinefit.solvers.bundle import _kernels_shape
 from kinefit.solvers.bundle.border_frames import POSTURE
@@ -29,10 +29,12 @@ from kinefit.solvers.bundle.shape import PixelFrames, ShapeParameters
 from kinefit.solvers.equations import dense_pattern
 from kinefit.solvers.least_squares import LEAST_SCALED_DAMPING, relax
 
+_TOLERANCE = 1e-3  # share of the cost that a last iteration takes away
+
 
 @dataclass(frozen=True, eq=False)
-class BodyBundle:
-    """Cameras, shape and poses that agree best.
+class BundleState:
+    """Cameras, shape and poses.
 
     Parameters
     ----------
@@ -40,86 +42,77 @@ class BodyBundle:
     offsets : (C,) [s]
     theta : (p,) shape parameters.
     states : of all frames.
-    x_static : (P, 3) [m]
-    cost : float
-    S : (C · 10, C · 10) information of the data about the cameras, all else taken out.
+    x_static : (P, 3) [m] points that do not move.
     """
 
     rig: Rig
     offsets: NDArray
     theta: NDArray
-    states: tuple[BodyState, ...]
+    states: Sequence[BodyState]
     x_static: NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class BodyBundle(BundleState):
+    """Cameras, shape and poses that agree best.
+
+    Parameters
+    ----------
+    cost : float
+    S : (C · 10, C · 10) information of the data about the cameras, all else taken out.
+    """
+
     cost: float
     S: NDArray
 
 
 def fit_body_and_cameras(
     model: ShapeParameters,
-    rig: Rig,
     frames: PixelFrames,
-    velocity: NDArray,
-    states: Sequence[BodyState],
-    theta: NDArray,
+    start: BundleState,
     prior: CameraPrior,
     *,
     static: PointPixels | None = None,
-    x_static: NDArray | None = None,
-    offsets: NDArray | None = None,
-    loss: Loss | None = None,
     max_iterations: int = 15,
-    tolerance: float = 1e-3,
 ) -> BodyBundle:
     """Cameras, shape and poses of least robust pixel error (Schur complement: poses and static points taken out).
 
     Parameters
     ----------
     model : ShapeParameters with its prior.
-    velocity : (F, N, 2) [px/s] of the pixels, for time offsets.
-    states, theta, rig, x_static (P, 3) [m], offsets (C,) [s] : where to start.
+    frames : PixelFrames, with velocities where time offsets are estimated.
+    start : BundleState
     prior : CameraPrior
-    static : PointPixels of points that do not move.
+    static : PointPixels of the points that do not move.
     """
-    loss = loss or geman_mcclure()
+    loss = geman_mcclure()
     tree, n, p = model.body.tree, model.body.tree.n_dofs, len(model.mean)
-    groups, size = len(model.body.scale_groups), len(rig) * COLUMNS
+    groups, size = len(model.body.scale_groups), len(start.rig) * COLUMNS
     posture = POSTURE * tree.posture_precision
     chain, depth = dense_pattern(n) if tree.coupled else (tree.chain, tree.depth)
     shape_prior = model.prior
     precision, freedom = prior.precision, prior.freedom
     owner = frames.points.segments
-    offsets = np.zeros(len(rig)) if offsets is None else offsets
-    x_static = np.zeros((0, 3)) if x_static is None else x_static
     if static is None:
         static = PointPixels(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
 
-    def target(offsets: NDArray, f: int) -> NDArray:
-        return frames.uv[f] - offsets[frames.camera, None] * velocity[f]
-
-    def cost_of(
-        rig: Rig, offsets: NDArray, theta: NDArray, states: Sequence[BodyState], x: NDArray
-    ) -> float:
-        moved, rest, _ = model.geometry(theta)
-        away, bent = prior.departure(rig, offsets), theta - model.mean
+    def cost_of(at: BundleState) -> float:
+        moved, rest, _ = model.geometry(at.theta)
+        away, bent, pixels = prior.departure(at.rig, at.offsets), at.theta - model.mean, frames.with_offsets(at.offsets)
         total = float(precision @ away**2 + bent @ shape_prior @ bent)
-        total += robust_cost(residuals(rig, offsets, static, x), static.weight, loss)[0]
-        for f, state in enumerate(states):
+        total += robust_cost(residuals(at.rig, at.offsets, static, at.x_static), static.weight, loss)[0]
+        for f, state in enumerate(at.states):
             placed, _ = moved.forward(state.T_world_root, state.angles)
             total += tree.posture_cost(state.angles, POSTURE) + _kernels_shape.frame_cost(
-                owner, rest, rig.packed, frames.camera, frames.column, target(offsets, f), frames.weight[f],
+                owner, rest, at.rig.packed, frames.camera, frames.column, pixels.uv[f], frames.weight[f],
                 frames.shares, placed, loss.kind, loss.scale,
             )  # fmt: skip
         return total
 
-    def systems_of(
-        rig: Rig, offsets: NDArray, theta: NDArray, states: Sequence[BodyState]
-    ) -> list[tuple[NDArray, NDArray]]:
-        out = []
-        for f, state in enumerate(states):
-            H, g = model.equations(
-                theta, state, rig, frames.camera, frames.column, target(offsets, f), frames.weight[f], loss=loss,
-                share=frames.shares, freedom=freedom, velocity=velocity[f],
-            )
+    def systems_of(at: BundleState) -> list[tuple[NDArray, NDArray]]:
+        out, pixels = [], frames.with_offsets(at.offsets)
+        for f, state in enumerate(at.states):
+            H, g = model.equations(at.theta, state, at.rig, pixels, f, loss=loss, freedom=freedom)
             H[6:n, 6:n] += posture
             g[6:n] -= posture @ (state.angles - tree.usual)
             if not tree.root_free:
@@ -129,11 +122,11 @@ def fit_body_and_cameras(
         return out
 
     def reduced(
-        systems: list[tuple[NDArray, NDArray]], theta: NDArray, rig: Rig, offsets: NDArray, x: NDArray, damping: float
+        systems: list[tuple[NDArray, NDArray]], at: BundleState, damping: float
     ) -> tuple[NDArray, NDArray, NDArray, Reduced]:
-        points = reduce_points(rig, offsets, freedom, static, x, loss, damping)
+        points = reduce_points(at.rig, at.offsets, freedom, static, at.x_static, loss, damping)
         S, b = np.zeros((p + size, p + size)), np.zeros(p + size)
-        S[:p, :p], b[:p] = shape_prior, shape_prior @ (model.mean - theta)
+        S[:p, :p], b[:p] = shape_prior, shape_prior @ (model.mean - at.theta)
         S[p:, p:], b[p:] = points.S, points.b
         kept = np.empty((len(systems), p + size + 1, n))
         for f, (H, g) in enumerate(systems):
@@ -143,32 +136,30 @@ def fit_body_and_cameras(
                 kept[f] = 0.0
         return np.tril(S) + np.tril(S, -1).T, b, kept, points
 
-    cost, damping = cost_of(rig, offsets, theta, states, x_static), 1e-3
-    states = list(states)
+    now, cost, damping = start, cost_of(start), 1e-3
     for _ in range(max_iterations):
-        systems, before = systems_of(rig, offsets, theta, states), cost
+        systems, before = systems_of(now), cost
         while damping < 1e5:
-            S, b, kept, points = reduced(systems, theta, rig, offsets, x_static, damping)
+            S, b, kept, points = reduced(systems, now, damping)
             S[range(p, p + size), range(p, p + size)] += precision
-            b[p:] -= precision * prior.departure(rig, offsets)
+            b[p:] -= precision * prior.departure(now.rig, now.offsets)
             delta = np.linalg.solve(S + damping * np.diag(np.diag(S)), b)
             by_camera = delta[p:].reshape(-1, COLUMNS)
-            new_theta = theta + delta[:p]
-            new_theta[:groups] = np.clip(new_theta[:groups], 0.2, 5.0)
+            theta = now.theta + delta[:p]
+            theta[:groups] = np.clip(theta[:groups], 0.2, 5.0)
             moves = kept[:, -1] - delta @ kept[:, :-1]
-            new_states = [s.retract(m, (tree.lower, tree.upper)) for s, m in zip(states, moves, strict=True)]
-            new_rig, new_offsets = moved_rig(rig, by_camera), offsets + by_camera[:, TIME]
-            new_x = x_static + points.points_step(delta[p:])
-            new = cost_of(new_rig, new_offsets, new_theta, new_states, new_x)
-            if new < cost:
-                rig, offsets, theta, states, x_static = new_rig, new_offsets, new_theta, new_states, new_x
-                cost, damping = new, relax(damping)
+            new = BundleState(
+                moved_rig(now.rig, by_camera), now.offsets + by_camera[:, TIME], theta,
+                [s.retract(m, (tree.lower, tree.upper)) for s, m in zip(now.states, moves, strict=True)],
+                now.x_static + points.points_step(delta[p:]),
+            )  # fmt: skip
+            if (fallen := cost_of(new)) < cost:
+                now, cost, damping = new, fallen, relax(damping)
                 break
             damping *= 10.0
-        if not before - cost > tolerance * cost:
+        if not before - cost > _TOLERANCE * cost:
             break
-    last = systems_of(rig, offsets, theta, states)
-    S, _, _, _ = reduced(last, theta, rig, offsets, x_static, LEAST_SCALED_DAMPING)
+    S, _, _, _ = reduced(systems_of(now), now, LEAST_SCALED_DAMPING)
     body, across, cameras = S[:p, :p], S[:p, p:], S[p:, p:]
     S = cameras - across.T @ np.linalg.solve(body, across)
-    return BodyBundle(rig, offsets, theta, tuple(states), x_static, cost, S)
+    return BodyBundle(now.rig, now.offsets, now.theta, tuple(now.states), now.x_static, cost, S)

@@ -8,7 +8,7 @@ factors held: no sensor needs to know of a parameter.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,10 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
-from kinefit.losses import SQUARED, Loss
 from kinefit.solvers import _kernels_linear
 from kinefit.solvers.bundle.border_frames import (
-    POSTURE,
     SETTLING,
     BorderedProblem,
     FrameEquations,
@@ -101,9 +99,7 @@ def solve(
     prior: Prior,
     steps: NDArray,
     *,
-    shares: Mapping[str, float] | None = None,
-    loss: Loss = SQUARED,
-    posture: float = POSTURE,
+    weighing: Weighing | None = None,
     max_iterations: int = 20,
     settling: int = SETTLING,
     tolerance: float = 1e-4,
@@ -117,10 +113,7 @@ def solve(
     states : K, to start from; limits of joints hold.
     prior : Prior
     steps : (p,) of the central differences; parameters are in units of which one is about a metre or a radian.
-    shares : {sensor: 0..1}, optional
-        How much a sensor's rows count, where its errors last from frame to frame; 1 for those not named.
-    loss : Loss of rows without their own.
-    posture : share of the body's posture prior that holds the poses.
+    weighing : how much sensors and the posture prior count, and the loss of rows without their own.
     settling : steps that poses take by themselves, at most, after each one with the parameters.
     tolerance : stop when the predicted fall of the cost is below this share of it.
 
@@ -129,7 +122,7 @@ def solve(
     ObservationError
         A sensor whose rows differ in number between two worlds; rows that the body cannot take.
     """
-    task = _Task(problem, prior, np.asarray(steps, float), Weighing(shares or {}, loss, posture))
+    task = _Task(problem, prior, np.asarray(steps, float), weighing or Weighing())
     theta, bounds = np.array(theta, float), limits(problem.body(theta))
     states = [s.retract(np.zeros(6 + len(s.angles)), bounds) for s in states]
     frames, states = settle(problem, theta, states, task.weighing, settling)

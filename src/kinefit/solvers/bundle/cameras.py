@@ -29,8 +29,7 @@ def moved_camera(camera: Camera, delta: NDArray) -> Camera:
         k = np.zeros(4) if k.size == 0 else k
         k[:2] += delta[RADIAL]
     T = se3.exp(delta[POSE]) @ camera.T_camera_world
-    u, _, vt = np.linalg.svd(T[:3, :3])  # many small turns must not add up to a shear
-    T[:3, :3] = u @ vt
+    T[:3, :3] = se3.nearest_rotation(T[:3, :3])  # many small turns must not add up to a shear
     return replace(camera, matrix=matrix, distortion=k, T_camera_world=T)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -37,6 +37,7 @@ class PixelFrames:
     weight : (F, N) [1/px²], 0 where unseen.
     share : (N,) in 0..1, optional
         How much of a measurement counts beyond the loss: below 1 for points whose errors come together.
+    velocity : (F, N, 2) [px/s] of the pixels, where time offsets are estimated; default: 0.
     """
 
     points: PointSet
@@ -45,6 +46,11 @@ class PixelFrames:
     uv: NDArray
     weight: NDArray
     share: NDArray | None = None
+    velocity: NDArray | None = None
+
+    def with_offsets(self, offsets: NDArray) -> PixelFrames:
+        """What cameras (C,) whose clocks are late by `offsets` [s] would have seen in time."""
+        return self if self.velocity is None else replace(self, uv=self.uv - offsets[self.camera, None] * self.velocity)
 
     @property
     def shares(self) -> NDArray:
@@ -109,14 +115,12 @@ class ShapeParameters:
         return scaled, self.points.points * factor[owner][:, None] + shifts + scaled.rest[owner], shifts
 
     def equations(
-        self, theta: NDArray, state: BodyState, rig: Rig, camera: NDArray, column: NDArray, uv: NDArray,
-        weight: NDArray, *, loss: Loss = SQUARED, share: NDArray | None = None, freedom: NDArray | None = None,
-        velocity: NDArray | None = None,
-    ) -> tuple[NDArray, NDArray]:
-        """One frame's pixels as H (n + p, n + p; lower triangle) and g: degrees of freedom, then shape, then cameras.
+        self, theta: NDArray, state: BodyState, rig: Rig, pixels: PixelFrames, f: int, *, loss: Loss = SQUARED,
+        freedom: NDArray | None = None,
+    ) -> tuple[NDArray, NDArray]:  # fmt: skip
+        """Frame f's pixels as H (n + p, n + p; lower triangle) and g: degrees of freedom, then shape, then cameras.
 
-        camera, column (N,) int, uv (N, 2) [px] and weight (N,) [1/px²] as in `PixelFrames`. With `freedom` (C, 10) the
-        cameras' parameters follow (see `solvers.cameras`); velocity (N, 2) [px/s] of the pixels tells of their times.
+        With `freedom` (C, 10) the cameras' parameters follow (see `solvers.cameras`).
         """
         tree, body = self.body.tree, self.body
         moved, rest, _ = self.geometry(theta)
@@ -126,11 +130,11 @@ class ShapeParameters:
         H, g = np.zeros((size, size)), np.zeros(size)
         _kernels_shape.frame_system(
             tree.parents, tree.dof_parent, tree.last_dof, tree.offsets, body.segment_scale, len(body.scale_groups),
-            self.points.segments, rest, self.points.points, self.shift, self.mirror, rig.packed, camera, column, uv,
-            weight, np.ones(len(weight)) if share is None else share, placed, screws,
+            self.points.segments, rest, self.points.points, self.shift, self.mirror, rig.packed, pixels.camera,
+            pixels.column, pixels.uv[f], pixels.weight[f], pixels.shares, placed, screws,
             np.ascontiguousarray(state.T_world_root[:3, 3]), loss.kind, loss.scale,
             np.empty((0, 0)) if freedom is None else freedom, -1 if freedom is None else first,
-            np.zeros(uv.shape) if velocity is None else velocity, H, g,
+            np.zeros(pixels.uv[f].shape) if pixels.velocity is None else pixels.velocity[f], H, g,
         )  # fmt: skip
         return H, g
 
