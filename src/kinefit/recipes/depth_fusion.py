@@ -15,6 +15,8 @@ from kinefit.bodies import Body, BodyState
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.observations import Frame
+from kinefit.sensors.settings import TrackSettings
+from kinefit.subject.subject import Progress
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.video import track
 
@@ -30,6 +32,8 @@ def depth_fusion(
     up: str = "z",
     start: BodyState | None = None,
     size: bool = True,
+    settings: TrackSettings | None = None,
+    progress: Progress | None = None,
 ) -> Motion:
     """Motion of a person from what any sensors saw, step by step.
 
@@ -43,6 +47,7 @@ def depth_fusion(
     up : vertical axis of the world
     start : state of the first step; default: sought.
     size : whether the person's size is found from the first depth images (some seconds of one core each).
+    settings : TrackSettings
 
     Raises
     ------
@@ -54,4 +59,4 @@ def depth_fusion(
     recording = Recording.of_frames(
         steps, rig, rate=rate, sigma=sigma, up=up, start=None if start is None else (0, start)
     )
-    return track(recording, body, size=size and start is None, smooth=False)
+    return track(recording, body, size=size and start is None, smooth=False, settings=settings, progress=progress)
