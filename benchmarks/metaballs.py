@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tests.bodies.surfaces.test_body_skin import crossings
+from tests.bodies.surfaces.skins.test_body_skin import crossings
 
 from benchmarks.figures import amount, figure
 from benchmarks.retarget import validated

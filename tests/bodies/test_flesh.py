@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.bodies.test_anny import made_up
+from tests.bodies.anny.test_anny import made_up
 
 from kinefit.bodies.anny import AnnyModel
 from kinefit.bodies.flesh import with_flesh

@@ -279,7 +279,7 @@ def test_an_argument_of_track_acts_or_is_refused(kind, name, folder):
 
 
 def test_every_argument_is_tried():
-    others = {"progress", "checkpoint"}  # see test_progress_is_told, tests/tracking/test_checkpoint.py
+    others = {"progress", "checkpoint"}  # see test_progress_is_told, tests/tracking/checkpoints/test_checkpoint.py
     assert set(ARGUMENTS) | {"recording", "body"} | others == set(inspect.signature(track).parameters)
     assert set(inspect.signature(track_take).parameters) <= {*ARGUMENTS, "take", "view"} | others  # test_people.py
 

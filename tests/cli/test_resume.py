@@ -3,7 +3,7 @@
 import os
 
 from click.testing import CliRunner
-from tests.tracking.test_checkpoint import assert_same
+from tests.tracking.checkpoints.test_checkpoint import assert_same
 
 from kinefit import read_motion
 from kinefit.batch import one

@@ -32,7 +32,7 @@ NOT_RUN = {
     ("one-camera", ""): "needs a video of a real person; tests/cli/test_init.py goes this way with a recording",
     ("recipes/silhouettes", "kinefit track"): "shows one camera of four; tests/tracking/test_kinds.py has such takes",
     ("regions", "kinefit track"): "needs video and mesh of one object; tests/tracking/test_kinds.py has such takes",
-    ("surfaces", "kinefit surface calib.toml a=a.mp4"): "minutes; tests/cli/test_surface.py follows videos",
+    ("surfaces", "kinefit surface calib.toml a=a.mp4"): "minutes; tests/cli/surfaces/test_surface.py follows videos",
     ("surfaces", "kinefit surface calib.toml left=left.mp4"): "the same",
     ("surfaces", "kinefit surface calib.toml 201"): "the same, with states",
     ("surfaces", "kinefit track"): "tests/tracking/test_surface_takes.py tracks such takes",

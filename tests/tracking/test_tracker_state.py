@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.sensors import region_arm, test_surface_points
+from tests.sensors import region_arm
+from tests.sensors.surfaces import test_surface_points
+from tests.tracking.checkpoints.test_checkpoint import Killed, assert_same
 from tests.tracking.movements import BODY, RATE, STILL, a_motion, a_rig, cloud_frame
-from tests.tracking.test_checkpoint import Killed, assert_same
 from tests.tracking.test_contract import MIXES, SEEN, SIGMA
 
 from kinefit import Recording, track

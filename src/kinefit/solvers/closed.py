@@ -61,10 +61,11 @@ def null_space(A: NDArray, c: NDArray, held: NDArray) -> Null:
 
 
 def onto(
-    body: Body, state: BodyState, constraint: Constraint, *, limits: bool = True, steps: int = _BACK
+    body: Body, state: BodyState, constraint: Constraint, *, limits: bool = True, locked: NDArray | None = None,
+    steps: int = _BACK,
 ) -> tuple[BodyState, float]:  # fmt: skip
     """The state nearest to one at which the equations hold, and by how much the worst of them is off still."""
-    bounds, fixed = bounds_of(body, limits), lock(body, None)
+    bounds, fixed = bounds_of(body, limits), lock(body, locked)
     c, A = constraint(state)
     worst, best = float(np.abs(c).max(initial=0.0)), float(c @ c)
     for _ in range(steps):

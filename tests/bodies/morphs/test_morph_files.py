@@ -191,7 +191,7 @@ def test_a_part_goes_with_its_morphs():
 
 
 def test_the_docs_example_is_a_body():
-    text = (Path(__file__).parents[2] / "docs" / "morphing.md").read_text("utf-8")
+    text = (Path(__file__).parents[3] / "docs" / "morphing.md").read_text("utf-8")
     example = next(block for block in text.split("```toml\n")[1:]).partition("```")[0]
     assert [type(m) for m in parse_body(example).morphs] == [LocalMorph, JointMotion]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.oracle import central_differences, design
 from tests.sensors.scenes import at, ring
-from tests.sensors.test_depth_image import SETTINGS, TRUTH, apart, found, moving, scene
+from tests.sensors.surfaces.test_depth_image import SETTINGS, TRUTH, apart, found, moving, scene
 from tests.tracking.movements import BODY, cloud_frame, turned
 
 from kinefit.bodies import load_body

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.oracle import central_differences, design
 from tests.sensors.scenes import posture, ring
-from tests.sensors.test_depth_image import apart, softened
+from tests.sensors.surfaces.test_depth_image import apart, softened
 
 from kinefit.bodies import load_body
 from kinefit.bodies.morphs.morphing import Morphing

@@ -7,8 +7,8 @@ from benchmarks.regions_cat import truth
 from benchmarks.regions_scene import away
 from benchmarks.silhouettes_cat import take_by_silhouettes
 from click.testing import CliRunner
+from tests.sensors.regions.test_silhouette import calibration, silhouettes
 from tests.sensors.scenes import posture, ring
-from tests.sensors.test_silhouette import calibration, silhouettes
 
 from kinefit import load_body, read_motion
 from kinefit.bodies import BodyState
