@@ -168,7 +168,7 @@ def _stride(trial: Markers) -> int:
 def _worn(placed: MarkerPlacement, x: NDArray, seen: NDArray) -> tuple[MarkerPlacement, NDArray, NDArray]:
     """Without markers that are never seen."""
     keep = seen.any(axis=0)
-    return placed.select(np.array(placed.points.names)[keep]), x[:, keep], seen[:, keep]
+    return placed.select(placed.points.names[k] for k in np.flatnonzero(keep)), x[:, keep], seen[:, keep]
 
 
 def _first_size(body: Body, placed: MarkerPlacement, x: NDArray) -> float:

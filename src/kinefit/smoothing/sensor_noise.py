@@ -118,8 +118,9 @@ def other_noise(
                 weights = [r.weight * squares_of(r)[1] / scale**2 for r in points]
                 places = residuals.add(f, m, points, [r.residual for r in points], weights)
                 for rows, w, at in zip(points, weights, places):
-                    index = np.vstack([np.full(len(w), f - span.start), at])
-                    felt[m.sensor].append((index, w, design(body, scene.state, rows), m.lasts / rows.weight))
+                    counts, index = w > 0.0, np.vstack([np.full(len(w), f - span.start), at])
+                    J = design(body, scene.state, rows)[counts]
+                    felt[m.sensor].append((index[:, counts], w[counts], J, m.lasts / rows.weight[counts]))
             if surface:
                 settings = others.settings  # also where the fit takes surfaces for exact
                 beside = max(settings.skin_shift, _EXACT), settings.skin_turn
@@ -130,7 +131,7 @@ def other_noise(
         sums = {}
         for sensor, parts in felt.items():
             sums[sensor] = _summed(parts, information[span])
-            stated[sensor] += [np.vstack([at[1:], lasts])[:, w > 0.0] for at, w, _, lasts in parts]
+            stated[sensor] += [np.vstack([at[1:], lasts]) for at, _, _, lasts in parts]
         for f in looked_at.intersection(range(span.start, span.stop)):
             alone = covariance_alone(body, BodyState(roots[f], angles[f]), _square(information[f]) + pixels(f))
             for sensor, (push, weight) in sums.items():
@@ -164,7 +165,7 @@ def _summed(parts: Sequence[_Felt], information: NDArray) -> tuple[NDArray, NDAr
     at, w, J = (np.concatenate([p[i] for p in parts], axis=-1 if i < 2 else 0) for i in range(3))
     whitened = np.sqrt(w)[:, None] * J
     _kernels_border.packed_grams(whitened, np.searchsorted(at[0], np.arange(len(information) + 1)), information)
-    shape = len(information), *(at[1:].max(axis=1) + 1)
+    shape = len(information), *(at[1:].max(axis=1, initial=0) + 1)
     index, push = np.ravel_multi_index(tuple(at), shape), np.zeros((int(np.prod(shape)), J.shape[1]))
     _kernels_border.add_weighted(J, w, index, push)
     return push.reshape(*shape, -1), np.bincount(index, w, len(push)).reshape(shape)

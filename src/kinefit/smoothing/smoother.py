@@ -29,8 +29,10 @@ from kinefit.smoothing.tracked_frames import TrackedFrames, exchanged, without_b
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.smoothing.windows import parts, solved, solved_surely
 from kinefit.solvers.closed import Constraint, on_null_space, onto
-from kinefit.solvers.equations import inverse
+from kinefit.solvers.equations import variances
+from kinefit.solvers.trajectory import _kernels_smoothing
 
+_STRETCH_FRAMES = 100  # whose information is computed at once
 _PARTS = 6  # of a long take, from which its process noise is estimated
 _ENOUGH = 6  # pixels that hold a root, or points in space of half as many rows; with fewer a frame is lost
 _LOOKS = 2  # at where the soles rest, the second with them held
@@ -183,22 +185,22 @@ def _observed(take: SmoothTake, channels: Channels, others: OtherSensors | None)
     """Coordinates (F, D) that each frame observes: by all sensors, by all but keypoints; rows of the latter (F,)."""
     tree, (T, D) = take.body.tree, take.angles.shape
     prior = np.diag(np.concatenate([np.full(6, 1.0), 1.0 / np.square(tree.spread)]))
-    more, rows = np.zeros_like(prior), np.zeros(T)
-    out = [np.zeros((T, D), bool), np.zeros((T, D), bool)]
-    for f in range(T):
-        one = take.part(slice(f, f + 1))
-        packed, _, _ = one.seen(channels.sigma).equations(take.body)(one.roots, one.angles)
-        pixels = np.zeros_like(prior)
-        for k in range(len(tree.depth)):
-            above = tree.chain[k, : tree.depth[k] + 1]
-            pixels[k, above] = pixels[above, k] = packed[0, k, : tree.depth[k] + 1]
+    out, rows = [np.zeros((T, D), bool), np.zeros((T, D), bool)], np.zeros(T)
+    for start in range(0, T, _STRETCH_FRAMES):
+        frames = range(start, min(start + _STRETCH_FRAMES, T))
+        span = slice(frames.start, frames.stop)
+        part = take.part(span)
+        packed, _, _ = part.seen(channels.sigma).equations(take.body)(part.roots, part.angles)
+        both = np.zeros((len(frames), *prior.shape))
+        _kernels_smoothing.add_packed(packed, tree.chain, tree.depth, both)
+        both += np.tril(both, -1).transpose(0, 2, 1)
+        found = [both]
         if others is not None:
-            linear = others.linearised(take.body, take.roots, take.angles, frames=range(f, f + 1))
-            more, rows[f] = linear.H[0], linear.rows[0]
-        for which, H in enumerate((pixels + more, more)):
-            if which == 0 or others is not None:
-                std = np.sqrt(np.maximum(np.diag(inverse(H + prior)), 0.0))[6:]
-                out[which][f] = std <= BLIND * tree.spread
+            linear = others.linearised(take.body, take.roots, take.angles, frames=frames)
+            found, rows[span] = [both + linear.H, linear.H], linear.rows
+        for observed, matrices in zip(out, found):
+            variance = np.array([variances(H + prior)[6:] for H in matrices])
+            observed[span] = variance <= np.square(BLIND * tree.spread)
     return out, rows
 
 

@@ -135,9 +135,8 @@ class MarkerMatched(Matched):
 
 def of_points(body: Body, points: PointSet, square: NDArray) -> Evidence:
     """Evidence of points with squared residuals (K,) in variances."""
-    tree, out = body.tree, np.zeros((2, len(body.tree.segments)))
-    for s, place, far in zip(points.segments, points.points, square >= AGREES**2):
-        out[int(far), s] += SHOWN
-        if tree.parents[s] >= 0 and np.linalg.norm(place) < _AT_JOINT:
-            out[int(far), tree.parents[s]] += SHOWN
-    return Evidence(*out)
+    above = body.tree.parents[points.segments]
+    at_joint = (above >= 0) & (np.linalg.norm(points.points, axis=1) < _AT_JOINT)
+    segment, far = np.concatenate([points.segments, above[at_joint]]), square >= AGREES**2
+    far = np.concatenate([far, far[at_joint]])
+    return Evidence(*(SHOWN * np.bincount(segment[which], minlength=len(body.tree.segments)) for which in (~far, far)))
