@@ -91,7 +91,7 @@ class StereoRectifier:
             raise CalibrationError(problem, place=place, remedy=remedy)
 
     def rectify(self, left: NDArray, right: NDArray) -> tuple[NDArray, NDArray]:
-        """Both images (h, w) or (h, w, 3) uint8 as the rectified views see them, (H, W) or (H, W, 3)."""
+        """Both images (h, w) or (h, w, 3) RGB uint8 as the rectified views see them, (H, W) or (H, W, 3)."""
         out = []
         for image, camera, maps in zip((left, right), (self.left, self.right), self._maps):
             if image.ndim not in (2, 3) or image.shape[1::-1] != camera.size or image.dtype != np.uint8:
@@ -107,7 +107,7 @@ class StereoRectifier:
         Matches that differ from right to left by more than a pixel, that have a rival within 10 %, and patches of
         fewer than 100 pixels are dropped (OpenCV's advice for all three).
         """
-        views = [v if v.ndim == 2 else cv2.cvtColor(v, cv2.COLOR_BGR2GRAY) for v in self.rectify(left, right)]
+        views = [v if v.ndim == 2 else cv2.cvtColor(v, cv2.COLOR_RGB2GRAY) for v in self.rectify(left, right)]
         matcher = cv2.StereoSGBM.create(
             minDisparity=self._least, numDisparities=self._count, blockSize=_BLOCK, P1=8 * _BLOCK**2,
             P2=32 * _BLOCK**2, disp12MaxDiff=1, preFilterCap=31, uniquenessRatio=10, speckleWindowSize=100,
