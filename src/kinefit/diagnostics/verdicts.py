@@ -198,14 +198,13 @@ def side_findings(views: KeypointViews) -> list[Finding]:
     found = {name: frames for name, frames in found.items() if len(frames)}
     if not found:
         return [Finding("good", "sides", "Left and right agree in all cameras and frames.")]
-    total = len(views)
-    told = [f"{len(frames)} of {total} frames of {name} ({frame_ranges(frames, 6)})" for name, frames in found.items()]
+    exchanges = [f"{len(f)} of {len(views)} frames of {name} ({frame_ranges(f, 6)})" for name, f in found.items()]
     most = max(found, key=lambda name: len(found[name]))
     often = len(found[most]) > 0.5 * len(views)
     remedy = (
         f"Is the image of {most} mirrored?" if often else "Nothing: tracking puts it right from the other cameras."
     )
-    text = f"The detector took left for right in {listed(told)}."
+    text = f"The detector took left for right in {listed(exchanges)}."
     sure = "Sure: exchanged, they fit the other cameras."
     return [Finding("doubt" if often else "note", "sides", text, tuple(found), sure, remedy)]
 

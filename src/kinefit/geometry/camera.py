@@ -21,7 +21,7 @@ from kinefit.geometry.se3 import inverse
 
 MODELS = ("radtan", "fisheye")
 _COEFFICIENTS = {"radtan": (0, 4, 5, 8), "fisheye": (0, 4)}
-_MOST = 1e9  # that a distortion coefficient may be; no lens comes near
+_MAX_DISTORTION = 1e9  # largest coefficient; those of lenses are far smaller
 
 
 def _read_only(array: ArrayLike) -> NDArray:
@@ -100,8 +100,8 @@ class Camera:
                 f"{k.size} distortion coefficients for the model {self.model}",
                 f"Give {', '.join(map(str, _COEFFICIENTS[self.model]))} (no thin prism, no tilt).",
             )
-        if np.abs(k).max(initial=0.0) > _MOST:
-            raise self._error(f"a distortion coefficient of {np.abs(k).max():.3g}", "Calibrate it again.")
+        if np.abs(k).max(initial=0.0) > _MAX_DISTORTION:
+            raise self._error(f"a distortion coefficient of {np.abs(k).max():.3g}", "Calibrate it again, or repair it.")
         R = T[:3, :3]
         if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0 or np.any(T[3] != (0, 0, 0, 1)):
             raise self._error("rotation is not orthonormal and right-handed", "Give the rotation world to camera.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,6 @@ from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channel_residuals import ChannelResiduals
 from kinefit.smoothing.linearised import OtherSensors, squares_of
 from kinefit.smoothing.spool import Spool
-from kinefit.solvers import _kernels_border
 from kinefit.solvers.bundle.border_frames import gram
 from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, product
 from kinefit.solvers.trajectory.variance_components import VarianceComponents, variance_components
@@ -27,10 +26,10 @@ from kinefit.solvers.trajectory.variance_components import VarianceComponents, v
 _RIGID = 1e-6, 1e-6  # [m], [rad] of a body without joints: it is its surface, and no bone lies below
 _EXACT = 1e-4  # [m] as good as 0
 _LEVERAGE_FRAMES = 40  # of a take, in which the leverage of each channel is computed
-_STRETCH_FRAMES = 100  # whose rows are summed at once
 
-_Felt = tuple[NDArray, NDArray, NDArray, NDArray]
-"""N rows of a match: frame, channel and axis (3, N), weight w (N,), derivatives J (N, n), lasting variance (N,)."""
+
+_Push = tuple[str, NDArray, NDArray, NDArray]
+"""Of rows of one sensor in one frame: its name; channels and axes (2, R), Σ w J (R, n) and Σ w (R,) of each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,96 +97,60 @@ def other_noise(
     half : frames to either side that motion ties to a frame
     surfaces : whether errors of surfaces as wholes count
     """
-    T, n = len(roots), body.tree.n_dofs
-    upper = np.triu_indices(n)
+    T = len(roots)
+    upper = np.triu_indices(body.tree.n_dofs)
     information, skins, lasting = np.zeros((3, T, len(upper[0])))
-    residuals, pushes = ChannelResiduals(), Spool[dict[str, NDArray]]()
+    residuals, pushes = ChannelResiduals(), Spool[list[_Push]]()
     hidden, stated = defaultdict[str, list[NDArray]](list), defaultdict[str, list[NDArray]](list)
     looked_at = set(np.linspace(0, T - 1, min(_LEVERAGE_FRAMES, T)).astype(int).tolist())
-    length = max(_STRETCH_FRAMES, half)
-    spans = [slice(start, min(start + length, T)) for start in range(0, T, length)]
-    for span in spans:
-        felt = defaultdict[str, list[_Felt]](list)
-        for f in range(span.start, span.stop):
-            scene, surface = others.scene(f, roots, angles), list[Rows]()
-            for m in matched[f]:
-                scale = others.scale.get(m.sensor, 1.0)
-                made = [r for r in rows_at(m, scene) if isinstance(r, Rows | DofRows) and len(r)]
-                points = [r for r in made if m.of_points or isinstance(r, DofRows)]
-                surface += [r.weaker(scale) for r in made if isinstance(r, Rows) and not m.of_points]
-                weights = [r.weight * squares_of(r)[1] / scale**2 for r in points]
-                places = residuals.add(f, m, points, [r.residual for r in points], weights)
-                for rows, w, at in zip(points, weights, places):
-                    counts, index = w > 0.0, np.vstack([np.full(len(w), f - span.start), at])
-                    J = design(body, scene.state, rows)[counts]
-                    felt[m.sensor].append((index[:, counts], w[counts], J, m.lasts / rows.weight[counts]))
-            if surface:
-                settings = others.settings  # also where the fit takes surfaces for exact
-                beside = max(settings.skin_shift, _EXACT), settings.skin_turn
-                skin = skin_of(scene, surface, *(beside if body.tree.coordinates else _RIGID), matched[f])
-                information[f] += skin.information[upper]
-                if surfaces:
-                    skins[f] += gram(skin.pushes, skin.pushes)[upper]
-        sums = {}
-        for sensor, parts in felt.items():
-            sums[sensor] = _summed(parts, information[span])
-            stated[sensor] += [np.vstack([at[1:], lasts]) for at, _, _, lasts in parts]
-        for f in looked_at.intersection(range(span.start, span.stop)):
-            alone = covariance_alone(body, BodyState(roots[f], angles[f]), _square(information[f]) + pixels(f))
-            for sensor, (push, weight) in sums.items():
-                seen = weight[f - span.start] > 0.0
-                of_frame, w = push[f - span.start][seen], weight[f - span.start][seen]
-                hidden[sensor].append(np.vstack([*np.nonzero(seen), leverages(of_frame / w[:, None], of_frame, alone)]))
-        pushes.append({sensor: push for sensor, (push, _) in sums.items()})
+    for f in range(T):
+        scene, surface, pushed = others.scene(f, roots, angles), list[Rows](), list[_Push]()
+        for m in matched[f]:
+            scale = others.scale.get(m.sensor, 1.0)
+            made = [r for r in rows_at(m, scene) if isinstance(r, Rows | DofRows) and len(r)]
+            points = [r for r in made if m.of_points or isinstance(r, DofRows)]
+            surface += [r.weaker(scale) for r in made if isinstance(r, Rows) and not m.of_points]
+            weights = [r.weight * squares_of(r)[1] / scale**2 for r in points]
+            for rows, w, at in zip(points, weights, residuals.add(f, m, points, [r.residual for r in points], weights)):
+                felt = w > 0.0
+                J, w, at = design(body, scene.state, rows)[felt], w[felt], at[:, felt]
+                information[f] += gram(J, w[:, None] * J)[upper]
+                pushed.append((m.sensor, *_summed(at, w[:, None] * J, w)))
+                stated[m.sensor].append(np.vstack([at, m.lasts / rows.weight[felt]]))
+        if surface:
+            settings = others.settings  # also where the fit takes surfaces for exact
+            beside = max(settings.skin_shift, _EXACT), settings.skin_turn
+            skin = skin_of(scene, surface, *(beside if body.tree.coordinates else _RIGID), matched[f])
+            information[f] += skin.information[upper]
+            if surfaces:
+                skins[f] += gram(skin.pushes, skin.pushes)[upper]
+        if f in looked_at:
+            alone = covariance_alone(body, scene.state, _square(information[f]) + pixels(f))
+            for sensor, at, push, weight in pushed:
+                hidden[sensor].append(np.vstack([at, leverages(push / weight[:, None], push, alone)]))
+        pushes.append(pushed)
     found, variance = {}, {}
     for sensor, (values, _) in residuals.arrays(T).items():
         leverage = _means(hidden[sensor], values.shape[1:]).mean(axis=1)
         one = variance_components(values, others.times, leverage=leverage, jitter_leverage=leverage / (2 * half + 1))
         stated_here = _means(stated[sensor], values.shape[1:])
         found[sensor], variance[sensor] = one, np.maximum(one.lasting[:, None] ** 2, stated_here)
-    held = dict[int, dict[str, NDArray]]()
-    for k, span in enumerate(spans):
-        lasting[span] = _window_means([skins], [slice(0, T)], span, half)
-        near = range(max(k - 1, 0), min(k + 2, len(spans)))
-        held = {j: held[j] if j in held else pushes[j] for j in near}
-        for sensor, of in variance.items():
-            pushed = [_padded(held[j].get(sensor), (spans[j].stop - spans[j].start, *of.shape, n)) for j in near]
-            mean = _window_means(pushed, [spans[j] for j in near], span, half)
-            shared = found[sensor].shared[0][:, None] * mean.sum(axis=1)
-            own = (np.sqrt(of)[..., None] * mean).reshape(len(mean), -1, n)
-            both = np.concatenate([own, shared], axis=1)
-            _kernels_border.packed_grams(both.reshape(-1, n), np.arange(len(both) + 1) * both.shape[1], lasting[span])
+    for f, (near, sums) in enumerate(_window_means(pushes, half, variance, body.tree.n_dofs)):
+        pushed_by = [skins[near].mean(axis=0)]
+        for sensor, mean in sums.items():
+            shared = found[sensor].shared[0][:, None] * mean.sum(axis=0)
+            both = np.concatenate([(np.sqrt(variance[sensor])[..., None] * mean).reshape(-1, mean.shape[2]), shared])
+            pushed_by.append(gram(both, both)[upper])
+        lasting[f] = np.sum(pushed_by, axis=0)
     return OtherNoise(information, lasting, found)
 
 
-def _summed(parts: Sequence[_Felt], information: NDArray) -> tuple[NDArray, NDArray]:
-    """Σ w J (F, C, A, n) and Σ w (F, C, A) of each channel and axis; `information` (F, n (n + 1) / 2) is added to."""
-    at, w, J = (np.concatenate([p[i] for p in parts], axis=-1 if i < 2 else 0) for i in range(3))
-    whitened = np.sqrt(w)[:, None] * J
-    _kernels_border.packed_grams(whitened, np.searchsorted(at[0], np.arange(len(information) + 1)), information)
-    shape = len(information), *(at[1:].max(axis=1, initial=0) + 1)
-    index, push = np.ravel_multi_index(tuple(at), shape), np.zeros((int(np.prod(shape)), J.shape[1]))
-    _kernels_border.add_weighted(J, w, index, push)
-    return push.reshape(*shape, -1), np.bincount(index, w, len(push)).reshape(shape)
-
-
-def _padded(values: NDArray | None, shape: tuple[int, ...]) -> NDArray:
-    """Values in the first places of a larger array of zeros."""
-    out = np.zeros(shape)
-    if values is not None:
-        out[tuple(slice(0, size) for size in values.shape)] = values
-    return out
-
-
-def _window_means(parts: Sequence[NDArray], spans: Sequence[slice], span: slice, half: int) -> NDArray:
-    """Means over so many frames to either side of each frame of a span, of values that are given in spans."""
-    first, last = spans[0].start, spans[-1].stop
-    frames = np.arange(span.start, span.stop)
-    low, high = np.maximum(frames - half, first) - first, np.minimum(frames + half + 1, last) - first
-    values = np.concatenate(parts)[low[0] : high[-1]]
-    sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
-    count = (high - low).reshape(-1, *(1,) * (values.ndim - 1))
-    return np.asarray((sums[high - low[0]] - sums[low - low[0]]) / count)
+def _summed(at: NDArray, push: NDArray, weight: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Each channel and axis (2, R) of N rows once, with the sums of the rows' pushes (R, n) and weights (R,)."""
+    at, index = np.unique(at, axis=1, return_inverse=True)
+    index, out = index.ravel(), np.zeros((at.shape[1], push.shape[1]))
+    np.add.at(out, index, push)
+    return at, out, np.bincount(index, weight, at.shape[1])
 
 
 def _means(entries: Sequence[NDArray], shape: tuple[int, ...]) -> NDArray:
@@ -198,6 +161,20 @@ def _means(entries: Sequence[NDArray], shape: tuple[int, ...]) -> NDArray:
     np.add.at(count, at, 1.0)
     np.add.at(total, at, value)
     return np.where(count > 0, total / np.maximum(count, 1), np.mean(value) if len(value) else 0.0)
+
+
+def _window_means(
+    pushes: Spool[list[_Push]], half: int, channels: Mapping[str, NDArray], n: int
+) -> Iterator[tuple[slice, dict[str, NDArray]]]:
+    """Of every frame those so near that motion ties them to it, and each sensor's mean pushes (C, A, n) over them."""
+    T, sums = len(pushes), {sensor: np.zeros((*of.shape, n)) for sensor, of in channels.items()}
+    for last in range(T + half):
+        for f, sign in ((last, 1.0), (last - 2 * half - 1, -1.0)):
+            for sensor, at, push, _ in pushes[f] if 0 <= f < T else ():
+                sums[sensor][at[0], at[1]] += sign * push
+        if last >= half:
+            near = slice(max(last - 2 * half, 0), min(last + 1, T))
+            yield near, {sensor: total / (near.stop - near.start) for sensor, total in sums.items()}
 
 
 def _square(packed: NDArray) -> NDArray:

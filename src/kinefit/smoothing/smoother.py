@@ -32,7 +32,7 @@ from kinefit.solvers.closed import Constraint, on_null_space, onto
 from kinefit.solvers.equations import variances
 from kinefit.solvers.trajectory import _kernels_smoothing
 
-_STRETCH_FRAMES = 100  # whose information is computed at once
+_MATRIX_FRAMES = 100  # whose matrices over all degrees of freedom are made at once: some 2 MB of each
 _PARTS = 6  # of a long take, from which its process noise is estimated
 _ENOUGH = 6  # pixels that hold a root, or points in space of half as many rows; with fewer a frame is lost
 _LOOKS = 2  # at where the soles rest, the second with them held
@@ -186,21 +186,19 @@ def _observed(take: SmoothTake, channels: Channels, others: OtherSensors | None)
     tree, (T, D) = take.body.tree, take.angles.shape
     prior = np.diag(np.concatenate([np.full(6, 1.0), 1.0 / np.square(tree.spread)]))
     out, rows = [np.zeros((T, D), bool), np.zeros((T, D), bool)], np.zeros(T)
-    for start in range(0, T, _STRETCH_FRAMES):
-        frames = range(start, min(start + _STRETCH_FRAMES, T))
-        span = slice(frames.start, frames.stop)
-        part = take.part(span)
+    for some in stretches(T, _MATRIX_FRAMES):
+        part = take.part(some)
         packed, _, _ = part.seen(channels.sigma).equations(take.body)(part.roots, part.angles)
-        both = np.zeros((len(frames), *prior.shape))
+        both = np.zeros((len(part.roots), *prior.shape))
         _kernels_smoothing.add_packed(packed, tree.chain, tree.depth, both)
         both += np.tril(both, -1).transpose(0, 2, 1)
         found = [both]
         if others is not None:
-            linear = others.linearised(take.body, take.roots, take.angles, frames=frames)
-            found, rows[span] = [both + linear.H, linear.H], linear.rows
+            linear = others.linearised(take.body, take.roots, take.angles, frames=range(some.start, some.stop))
+            found, rows[some] = [both + linear.H, linear.H], linear.rows
         for observed, matrices in zip(out, found):
             variance = np.array([variances(H + prior)[6:] for H in matrices])
-            observed[span] = variance <= np.square(BLIND * tree.spread)
+            observed[some] = variance <= np.square(BLIND * tree.spread)
     return out, rows
 
 

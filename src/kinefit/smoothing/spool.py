@@ -21,9 +21,10 @@ STRETCH = 2000
 """Frames of which arrays over all channels are made at once."""
 
 
-def stretches(frames: int) -> list[slice]:
-    """Of a take, so long that what is computed of all channels in one stays small."""
-    return [slice(start, min(start + STRETCH, frames)) for start in range(0, max(frames, 1), STRETCH)]
+def stretches(frames: int, length: int | None = None) -> list[slice]:
+    """Of a take, each of `length` frames at most; default: what is computed of all channels in one stays small."""
+    length = length or STRETCH
+    return [slice(start, min(start + length, frames)) for start in range(0, max(frames, 1), length)]
 
 
 class Store:

@@ -19,29 +19,6 @@ def gram(A, B, out):
 
 
 @jit
-def add_weighted(A, w, index, out):
-    """Add w[i] A[i], rows of A (N, n), to row index[i] of out (M, n)."""
-    for i in range(w.size):
-        for k in range(A.shape[1]):
-            out[index[i], k] += w[i] * A[i, k]
-
-
-@jit
-def packed_grams(A, ends, out):
-    """Add to out (F, n (n + 1) / 2) the upper triangle of Aᵀ A of rows ends[f] .. ends[f + 1] of A (N, n)."""
-    n = A.shape[1]
-    for f in range(out.shape[0]):
-        for i in range(ends[f], ends[f + 1]):
-            first = 0
-            for k in range(n):
-                a = A[i, k]
-                if a != 0.0:
-                    for j in range(k, n):
-                        out[f, first + j - k] += a * A[i, j]
-                first += n - k
-
-
-@jit
 def solve(A, right):
     """Solve A x = right in place, A (n, n) symmetric and positive, right (n, m); False where it is not positive."""
     n, m = right.shape

@@ -91,7 +91,7 @@ def shifted(record: Keypoints, offset: float) -> Keypoints:
 
 @dataclass(frozen=True, eq=False)
 class PersonTrial:
-    """What cameras saw of the person by whom they are calibrated.
+    """Keypoints of the person who calibrates the cameras, and how they are fitted.
 
     Parameters
     ----------
