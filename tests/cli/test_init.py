@@ -206,8 +206,15 @@ def test_joints_are_clicked_in_the_browser(folder, monkeypatch):
                 page.send(told)
                 seen["answers"].append(json.loads(page.recv(20.0)))
 
-    monkeypatch.setattr("webbrowser.open", lambda url: threading.Thread(target=browser, args=(url,)).start())
+    threads = []
+
+    def opened(url):
+        threads.append(threading.Thread(target=browser, args=(url,)))
+        threads[-1].start()
+
+    monkeypatch.setattr("webbrowser.open", opened)
     answer = run("init", folder, "--click", "--force")
+    threads[0].join(20.0)  # the command may end before the browser has read its last answer
     assert answer.exit_code == 0, answer.output
     assert seen["asked"]["cameras"] == ["cam01", "cam02", "cam03", "cam04"] and "r_knee" in seen["asked"]["joints"]
     assert seen["picture"] == (960, 544, 3) and "unsafe" not in seen["policy"]

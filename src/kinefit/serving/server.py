@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
-from websockets.frames import CloseCode
-from websockets.frames import Frame as Message
+from websockets.frames import CloseCode, Frame
 from websockets.http11 import Request, Response
 
 from kinefit.errors import ExportError
@@ -102,7 +101,7 @@ class Connection(ServerConnection):
 
     def process_event(self, event: Any) -> None:
         """Count frames of every kind: messages, parts of them, pings."""
-        if not isinstance(event, Message) or self._count(1.0):
+        if not isinstance(event, Frame) or self._count(1.0):
             super().process_event(event)
 
     def _count(self, cost: float) -> bool:
