@@ -1,4 +1,4 @@
-"""What is found of the errors of channels, against truth: `python -m benchmarks.smoothing channels`.
+"""What is found of the errors of channels, against truth: `python -m benchmarks.video channels`.
 
 A humanoid waves for two seconds. Each draw gives 90 markers on it errors of one kind, or a range sensor's distance
 from a post to a wrist white noise, with no marker beyond the elbow; the take is smoothed, the body known.

@@ -12,6 +12,7 @@ PARTS = {
     "detect": "the built-in detector",
     "smoothing": "whole takes at once",
     "error_bars": "truth within the error bars",
+    "channels": "what is found of the errors of markers and of a range sensor",
     "posture": "hips, spine and pelvis: what the posture prior tells",
 }
 
