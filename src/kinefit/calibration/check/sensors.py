@@ -89,7 +89,7 @@ def fit_sensors(
     seen = with_names(take, seen)
     recording, body = recording_of(replace(take, start=None), seen, load_body(take.body))
     alone = replace(
-        recording, steps=recording.keypoints_at, markers=(), marker_sets=(), depth={}, on_body=(), backgrounds={}
+        recording, steps=recording.keypoints_at, markers=(), depth={}, on_body=(), backgrounds={}
     )  # fmt: skip
     person = fit_person(body, channels_of(recording, body, TrackSettings()), height=take.height, progress=progress)
     motion = track(alone, body, subject=person, progress=progress)
