@@ -256,7 +256,7 @@ class _PlacementProblem:
         surfaces = self.body.surfaces if any(f.sensor in self.depth for seen in frames for f in seen) else ()
         if any(isinstance(s, TaperedCylinder) for s in surfaces) and not self.body.skin:
             out.append(CylinderShape(self.body))
-        sets = {name: std for name, std in self.recording.marker_sets if std is not None}
+        sets = {m.marker_set: m.std for m in self.recording.markers if m.std is not None}
         out += [PointOffsets(self.body, name, std) for name, std in sets.items()]
         detected = dict.fromkeys(k.keypoint_set for k in self.recording.keypoints)
         return out + [PointOffsets(self.body, name, _DETECTOR) for name in detected]
