@@ -21,10 +21,10 @@ settings.load_profile("kinefit")
 
 
 def pytest_configure(config):
-    """Compile the common kernels once where the cache is empty, before each worker compiles its own."""
+    """Compile the common kernels once where the cache has none of this Python, before each worker compiles its own."""
     starts_workers = getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput")
     folder = kernel_folder() if starts_workers else None
-    if folder is not None and not any(folder.rglob("*.nbc")):
+    if folder is not None and not any(folder.rglob(f"*.py{sys.version_info[0]}{sys.version_info[1]}.*nbc")):
         print("compiling the kernels, once for all workers ...", flush=True)
         subprocess.run([sys.executable, "-m", "kinefit", "warmup"], check=True, capture_output=True)
 
