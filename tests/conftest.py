@@ -1,6 +1,7 @@
-"""What all tests share: real recordings, and settings of hypothesis."""
+"""What all tests share: real recordings, a drawn take, and settings of hypothesis."""
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -42,3 +43,22 @@ def data_dir() -> Callable[[str], Path]:
         return folder
 
     return find
+
+
+@pytest.fixture(scope="session")
+def drawn_take(tmp_path_factory) -> Path:
+    """The take file of a synthetic take of two seconds, drawn once; not to be changed."""
+    from kinefit.simulation import write_synthetic_take
+
+    return write_synthetic_take(tmp_path_factory.mktemp("drawn"))
+
+
+@pytest.fixture(scope="session")
+def copy_take(drawn_take) -> Callable[[Path], Path]:
+    """Copy the drawn take into a folder; gives its take file, which a test may damage."""
+
+    def copy(folder: Path) -> Path:
+        shutil.copytree(drawn_take.parent, folder, dirs_exist_ok=True)
+        return folder / "take.toml"
+
+    return copy
