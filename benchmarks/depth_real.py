@@ -28,7 +28,7 @@ def run() -> None:
                 figure(f"real_{name}_{what}", None, unit, goal, "no recording")
             continue
         distances, shares = [], []
-        for depth, camera, start, body in fitted(images[0][: amount(None, 2)], images[1]):
+        for depth, camera, start, body in fitted(images[0][: amount(None, 1)], images[1]):
             distance, share = explained(body, start.state, camera, depth)
             distances.append(distance)
             shares.append(share)

@@ -28,7 +28,7 @@ from kinefit.photogrammetry.strain import Strain, strain
 WINDOWS = (13, 21, 35)
 STEP, EDGE = 10, 20  # [px] of the grid, and of its first windows' borders from the edges
 SEED = [1006, 306]
-STRAIN_WINDOWS, STRAIN_STEP = (21, 25, 29, 35), 5
+STRAIN_WINDOWS, STRAIN_STEP = (21, 25, 29, 35), amount(5, 10)
 
 
 class Sample:

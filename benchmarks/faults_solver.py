@@ -12,10 +12,11 @@ from kinefit import fit_marker_subject, fit_markers, load_body, read_markers
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.calibration.people.floor import centre_of_mass
 from kinefit.losses import SQUARED
-from kinefit.markers.poses import LOSS, POSTURE, columns, sequence_both_ways
+from kinefit.markers.poses import columns, sequence_both_ways
+from kinefit.sensors.settings import MARKER_LOSS
 from kinefit.solvers.sequence import fit_sequence
 
-SETTINGS: dict[str, dict[str, Any]] = {"squared": {"loss": SQUARED}, "robust": {"loss": LOSS, "posture": POSTURE}}
+SETTINGS: dict[str, dict[str, Any]] = {"squared": {"loss": SQUARED}, "robust": {"loss": MARKER_LOSS, "posture": 1.0}}
 """Losses of the simulated take; the second is what `fit_markers` takes."""
 
 MAX_GAIN = 1e-4

@@ -161,7 +161,7 @@ def one_frame() -> None:
             continue
         column = [markers.names.index(n) for n in learn_model(markers).labels]
         x = markers.positions[:, column]
-        for hidden in (False, True) * 4:
+        for hidden in (False, True) * amount(4, 1):
             f = int(rng.integers(5, len(markers) - 5))
             seen = np.flatnonzero(np.isfinite(x[f - 2 : f + 3, :, 0]).all(0))
             a = int(rng.choice(seen))
@@ -195,7 +195,7 @@ def in_gaps() -> None:
             continue
         column = [markers.names.index(n) for n in learn_model(markers).labels]
         x = markers.positions[:, column]
-        for way, (_, a_before, b_around, a_after, hidden) in [*enumerate(ways)] * 2:
+        for way, (_, a_before, b_around, a_after, hidden) in [*enumerate(ways)] * amount(2, 1):
             f = int(rng.integers(5, len(markers) - 5))
             seen = np.flatnonzero(np.isfinite(x[f - 2 : f + 3, :, 0]).all(0))
             a = int(rng.choice(seen))
@@ -211,7 +211,7 @@ def in_gaps() -> None:
             found = audit_take(replace(markers, positions=positions))
             pair = {markers.names[column[a]], markers.names[column[b]]}
             hits[way] += any(set(g.labels) == pair and abs(g.first - f) + abs(g.last - f) <= 2 for g in found)
-        tried += 2
+        tried += amount(2, 1)
     for (what, *_), count in zip(ways, hits):
         print(f"# exchanges in gaps, {what}: {count} of {tried}")
     why = "" if tried else "no recordings: set KINEFIT_DATA"

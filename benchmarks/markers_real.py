@@ -30,7 +30,7 @@ from kinefit.identification.take.takes import identify_take
 from kinefit.observations import Markers
 
 FRAMES = int(os.environ.get("FRAMES", amount(60, 2)))
-QUICK = tuple(case for case in CASES if case.name in ("sprint", "run", "clusters 61"))
+QUICK = tuple(case for case in CASES if case.name in ("run", "clusters 61"))
 VARIANTS: dict[str, dict[str, Any]] = {"all": {}, "10 % removed": {"missing": 0.1}, "ten ghosts": {"ghosts": 10}}
 
 

@@ -22,7 +22,7 @@ from kinefit.identification.model.model import MarkerModel
 LARGE = "nimblephysics/data__osim__WeirdFormatTests__markers.trc"
 """61 markers, most of them in clusters."""
 
-FRAMES = amount(20, 4)
+FRAMES = amount(20, 2)
 
 
 def run() -> None:
@@ -59,10 +59,10 @@ def whole_take() -> None:
     if taught is None or take is None:
         figure("markers_60s", None, "s", "<= 20", "the recording is absent")
         return
-    x = np.concatenate([take.positions, take.positions[::-1]])[: amount(7200, 400)]
+    x = np.concatenate([take.positions, take.positions[::-1]])[: amount(7200, 200)]
     labelled = replace(take, positions=x, residual=None)
     model = learn_model(taught)
-    both(model, broken(replace(labelled, positions=x[:240])).markers)  # compiled
+    both(model, broken(replace(labelled, positions=x[: amount(240, 60)])).markers)  # compiled
     points = broken(labelled).markers
     wall, start = time.perf_counter(), time.process_time()
     named = both(model, points)

@@ -27,7 +27,7 @@ from kinefit.identification.model.model import MarkerModel
 from kinefit.recipes.sapm import sapm
 
 POSES = int(os.environ.get("POSES", amount(200, 1)))
-CLEAN = int(os.environ.get("CLEAN", amount(2000, 20)))
+CLEAN = int(os.environ.get("CLEAN", amount(2000, 5)))
 Identifier = Callable[[MarkerModel, NDArray], NDArray]
 
 

@@ -65,7 +65,7 @@ def run() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for name, file in amount(list(TAKES.items()), [("61 markers", TAKES["61 markers"])]):
             halves = load((file, 0.0, 0.45)), load((file, 0.55, 1.0))
-            for taught, asked in (halves, halves[::-1]):
+            for taught, asked in (halves, halves[::-1])[: amount(2, 1)]:
                 if taught is None or asked is None:
                     continue
                 written = Path(folder) / "set.toml"

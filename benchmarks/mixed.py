@@ -27,7 +27,7 @@ SIMULATED = {
     "sensors": mixed_figures.sensors, "intervals": mixed_figures.intervals, "smoothing": mixed_figures.smoothing,
 }  # fmt: skip
 GROUPS = (*SIMULATED, "misfit", "real", "memory")
-DRAWS, QUICK_DRAWS, QUICK_SECONDS = 30, 1, 0.6
+DRAWS, QUICK_DRAWS, QUICK_SECONDS = 30, 1, 0.4
 
 
 def main() -> None:

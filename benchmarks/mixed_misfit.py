@@ -46,6 +46,7 @@ from kinefit.solvers.bundle.shape import mirror_points
 
 TURN, SHIFT = np.radians(2.0), 0.03  # [rad], [m]
 WALK, SECONDS = 2.0, 6.0  # [m], [s]
+QUICK_SECONDS = 2.0  # [s] of the quick form
 DRAWS = 4  # of each shape and misfit
 FAULT = 2  # exit code of `kinefit check --strict`
 SHAPES, SENSORS = ("own", "other"), ("depth", "markers")
@@ -242,7 +243,7 @@ def run(quick: bool = False, first: int = 5) -> None:
     for shape in shapes:
         for draw in range(first, first + (1 if quick else DRAWS)):
             for sensor in (SENSORS[SHAPES.index(shape)],) if quick else SENSORS:
-                seen += outcomes(draw, shape, (sensor,))
+                seen += outcomes(draw, shape, (sensor,), QUICK_SECONDS if quick else SECONDS)
     for shape in SHAPES:
         own = [o for o in seen if o.shape == shape]
         quiet = [o.found for o in own if not o.wrong]

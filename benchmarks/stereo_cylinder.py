@@ -70,7 +70,7 @@ def run() -> None:
         print(f"# 1 to {k}: turned by {angle:.3f} degrees; a coordinate {rms:.4f} mm")
         figure(f"cylinder_rigid_motion_{k}", float(np.sqrt(np.nanmean(lengths**2))), "mm RMS in space", "<= 0.02")
     seeds, spent = sift_seeds(first, states[0][1], (rig.cameras[0], rig.cameras[1])), []
-    for _ in range(3):
+    for _ in range(amount(3, 1)):
         began = time.process_time()
         matches = grow(first, states[0][1], grid, seeds)
         spent.append(time.process_time() - began)

@@ -26,14 +26,14 @@ from kinefit.simulation import simulate_keypoints, studio_rig
 
 TRIAL = "video_balancing_4cam"
 DETECTORS = ("openpose", "mediapipe")
-FRAMES = amount("== 100", "== 50")
+FRAMES = amount("== 100", "== 25")
 GOALS = {"openpose": 9.0, "mediapipe": 11.0}
 NOISE = {"noise_px": 3.0, "outliers": 0.1, "missing": 0.1}
 
 
 def take_text(folder: Path, detector: str) -> str:
     """Take file of the real trial with one detector's keypoints."""
-    lines = ['[take]\nname = "balancing"\nup = "z"\n' + amount("", "frames = [0, 50]\n")]
+    lines = ['[take]\nname = "balancing"\nup = "z"\n' + amount("", "frames = [0, 25]\n")]
     lines.append(f'[calibration]\nfile = "{folder}/Calib_refined_static.toml"\nunit = "m"\n')
     for c in range(1, 5):
         camera = f"cam0{c}"

@@ -1,6 +1,7 @@
-"""What all tests share: real recordings, and settings of hypothesis."""
+"""What all tests share: real recordings, a drawn take, and settings of hypothesis."""
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -21,10 +22,10 @@ settings.load_profile("kinefit")
 
 
 def pytest_configure(config):
-    """Compile the common kernels once where the cache is empty, before each worker compiles its own."""
+    """Compile the common kernels once where the cache has none of this Python, before each worker compiles its own."""
     starts_workers = getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput")
     folder = kernel_folder() if starts_workers else None
-    if folder is not None and not any(folder.rglob("*.nbc")):
+    if folder is not None and not any(folder.rglob(f"*.py{sys.version_info[0]}{sys.version_info[1]}.*nbc")):
         print("compiling the kernels, once for all workers ...", flush=True)
         subprocess.run([sys.executable, "-m", "kinefit", "warmup"], check=True, capture_output=True)
 
@@ -42,3 +43,22 @@ def data_dir() -> Callable[[str], Path]:
         return folder
 
     return find
+
+
+@pytest.fixture(scope="session")
+def drawn_take(tmp_path_factory) -> Path:
+    """The take file of a synthetic take of two seconds, drawn once; not to be changed."""
+    from kinefit.simulation import write_synthetic_take
+
+    return write_synthetic_take(tmp_path_factory.mktemp("drawn"))
+
+
+@pytest.fixture(scope="session")
+def copy_take(drawn_take) -> Callable[[Path], Path]:
+    """Copy the drawn take into a folder; gives its take file, which a test may damage."""
+
+    def copy(folder: Path) -> Path:
+        shutil.copytree(drawn_take.parent, folder, dirs_exist_ok=True)
+        return folder / "take.toml"
+
+    return copy

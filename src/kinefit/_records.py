@@ -1,4 +1,4 @@
-"""Records as bytes, and files of them: plain values, arrays and classes of a list, each record with its checksum.
+"""Records as bytes, and files of them: plain values, arrays and classes of a list; a file with a key has checksums.
 
 Reading runs nothing. A record names its class by a number in the reader's own list, its attributes are set without a
 constructor, and no array holds objects. The checksum of a record covers its bytes, its place in the file and the key of
@@ -25,6 +25,7 @@ _PLAIN = {type(None), bool, float, str, bytes}
 _LIST, _TUPLE, _MAPPING, _ARRAY, _SCALAR, _LARGE, _REFERENCE, _RECORD = range(8)  # _RECORD + k: the k-th class
 _INT64 = 2**63  # what msgpack holds of whole numbers; a generator of random numbers has longer ones
 _HEAD = struct.Struct("<IBI16s")  # bytes that follow, tag, number, checksum
+_NO_CHECKSUM = bytes(16)
 _ERRORS = (msgspec.MsgspecError, ValueError, TypeError, LookupError, AttributeError, RecursionError)
 
 Refer = Callable[[Any], int | str]
@@ -149,12 +150,12 @@ class RecordFile:
     Parameters
     ----------
     file : open to be read and written, exclusively
-    key : up to 64 bytes, on which every checksum depends
+    key : up to 64 bytes, on which every checksum depends; default: no checksums, for a file that ends with the process
     start : byte at which the first record begins
     name : path for messages
     """
 
-    def __init__(self, file: IO[bytes], key: bytes = b"", *, start: int = 0, name: str | Path = "") -> None:
+    def __init__(self, file: IO[bytes], key: bytes | None = None, *, start: int = 0, name: str | Path = "") -> None:
         self._file, self._key, self.start, self.end, self.name = file, key, start, start, str(name)
 
     def append(self, data: bytes, tag: int = 0, number: int = 0) -> int:
@@ -209,5 +210,7 @@ class RecordFile:
         return (tag, number, data) if checksum == self._checksum(at, tag, number, data) else None
 
     def _checksum(self, at: int, tag: int, number: int, data: bytes) -> bytes:
+        if self._key is None:
+            return _NO_CHECKSUM
         place = struct.pack("<QQ", at, tag << 32 | number)
         return hashlib.blake2b(data, digest_size=16, key=self._key, salt=place).digest()

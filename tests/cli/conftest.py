@@ -1,22 +1,12 @@
-"""A small synthetic take, drawn once and copied for every test."""
-
-import shutil
+"""A small synthetic take, copied for every test."""
 
 import pytest
 
-from kinefit.simulation import write_synthetic_take
-
-
-@pytest.fixture(scope="session")
-def drawn_take(tmp_path_factory):
-    return write_synthetic_take(tmp_path_factory.mktemp("drawn"))
-
 
 @pytest.fixture
-def take(drawn_take, tmp_path):
+def take(copy_take, tmp_path):
     """A take file of its own, which a test may damage."""
-    shutil.copytree(drawn_take.parent, tmp_path / "take")
-    return tmp_path / "take" / "take.toml"
+    return copy_take(tmp_path / "take")
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from kinefit.readers.take.file import TABLES, read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
-from kinefit.simulation import cut, write_synthetic_take
+from kinefit.simulation import cut
 from kinefit.simulation.movements import movement, people
 from kinefit.simulation.recordings import write_recording
 from kinefit.smoothing.online.known_noise import KnownNoise
@@ -37,10 +37,10 @@ QUICK = TrackSettings(search=False, smooth_rounds=1)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(tmp_path_factory, copy_take):
     """One movement as four kinds of takes: four cameras, a depth camera, silhouettes with a start, markers alone."""
     root = tmp_path_factory.mktemp("kinds")
-    cameras = write_synthetic_take(root / "keypoints")
+    cameras = copy_take(root / "keypoints")
     cameras.write_text(cameras.read_text().replace("rate = 30.0", f"rate = 30.0\nframes = [0, {FRAMES}]"))
     truth = cut(movement("wave", people()[2].body, rate=10.0), 0, FRAMES)
     seen = write_recording(truth, root / "depth", ("tof", "keypoints"))

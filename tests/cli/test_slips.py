@@ -102,6 +102,7 @@ def test_after_refine_the_next_command_works_as_printed(take, change, monkeypatc
     path = take.with_name("calibration.toml")
     pattern = r"(?ms)(^\[cam02\].*?^rotation = \[)([^,]*)"
     path.write_text(re.sub(pattern, lambda m: f"{m[1]}{float(m[2]) + 0.03}", path.read_text(), count=1))
+    change(take, "[take]\n", "[take]\nframes = [0, 30]\n")
     folder = take.parent.rename(take.parent.with_name("my take"))
     monkeypatch.chdir(folder.parent)
     told = run("check", "my take/take.toml", "--refine")
@@ -111,10 +112,11 @@ def test_after_refine_the_next_command_works_as_printed(take, change, monkeypatc
     assert run(*words, "--no-overlays", "--no-report", "--formats", "motion").exit_code == 0
 
 
-def test_a_calibration_that_cannot_be_put_into_the_take_says_what_to_write(take):
+def test_a_calibration_that_cannot_be_put_into_the_take_says_what_to_write(take, change):
     path = take.with_name("calibration.toml")
     pattern = r"(?ms)(^\[cam02\].*?^rotation = \[)([^,]*)"
     path.write_text(re.sub(pattern, lambda m: f"{m[1]}{float(m[2]) + 0.01}", path.read_text(), count=1))
+    change(take, "[take]\n", "[take]\nframes = [0, 30]\n")
     text = take.read_text().replace('[calibration]\nfile = "calibration.toml"\n', "")
     take.write_text('calibration = { file = "calibration.toml" }\n' + text)
     told = run("check", take, "--refine")

@@ -15,7 +15,7 @@ from kinefit.findings import FINDINGS, Finding, faults_of, of_provenance
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
-from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig, write_synthetic_take
+from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 
 MOTION = squat_and_wave(duration=4.0)  # 120 frames
 RIG = studio_rig(MOTION)
@@ -197,8 +197,8 @@ def test_an_error_of_tracking_tells_the_fault_as_its_cause():
     )
 
 
-def test_a_camera_that_sees_other_people_alone_is_no_fault(tmp_path):
-    take = write_synthetic_take(tmp_path)
+def test_a_camera_that_sees_other_people_alone_is_no_fault(tmp_path, copy_take):
+    take = copy_take(tmp_path)
     entry = kinefit.read_take(take)
     seen = kinefit.load_observations(entry)
     gone = [replace(k, points=k.points * np.nan, confidence=0.0 * k.confidence) if k.camera == "cam03" else k
@@ -209,8 +209,8 @@ def test_a_camera_that_sees_other_people_alone_is_no_fault(tmp_path):
     assert [(f.kind, f.cameras) for f in nobody] == [("coverage", ("cam03",))]
 
 
-def test_track_take_keeps_what_it_found(tmp_path):
-    take = write_synthetic_take(tmp_path)
+def test_track_take_keeps_what_it_found(tmp_path, copy_take):
+    take = copy_take(tmp_path)
     text = take.read_text()
     take.write_text(text.replace("[take]\n", "[take]\nframes = [0, 12]\n"))
     motion, _ = kinefit.track_take(take, smooth=False)

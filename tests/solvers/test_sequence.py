@@ -7,10 +7,12 @@ from tests.oracle import posture, random_unit
 
 from kinefit.bodies import BodyState, load_body
 from kinefit.correspondences import plane_rows, point_rows
+from kinefit.correspondences.parameters import prior_rows
 from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, huber
+from kinefit.solvers.equations import variances
 from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.solvers.sequence import Planes, fit_sequence
+from kinefit.solvers.sequence import Planes, certainty, fit_sequence
 
 # Two ways to one minimum stop where a step would win 1e-12 of the cost. Where points hardly hold a joint, such a step
 # may move it a little: a measurement that differs by 1e-12 m can end 3e-6 m away. So the costs tell, sharply, that the
@@ -49,6 +51,25 @@ def test_points_give_what_frame_by_frame_gives(loss, limits):
         np.testing.assert_allclose(BODY.positions(found, POINTS), BODY.positions(fit.state, POINTS), atol=SAME_PLACE)
         start = fit.state
     assert np.all(result.iterations[1:] <= 8)
+
+
+def test_the_posture_prior_is_that_of_every_other_fit():
+    """Trunk and hips are coupled in it, which are on different branches."""
+    assert BODY.tree.coupled
+    states, x, _ = sway(frames=4)
+    x[:, np.isin(POINTS.segments, [BODY.tree.segment(n) for n in ("abdomen", "thorax", "thigh_r", "shank_l")])] = np.nan
+    start = BODY.usual_state(states[0].T_world_root)
+    found = fit_sequence(BODY, start, POINTS, x, posture=1.0, tolerance=1e-12)
+    for f, state in enumerate(states_of(found)):
+        seen = np.isfinite(x[f, :, 0])
+        shown = POINTS.select([POINTS.names[k] for k in np.flatnonzero(seen)])
+        make = lambda s: [point_rows(BODY, s, shown, x[f, seen], sigma=0.005), prior_rows(BODY, s)]  # noqa: B023
+        fit = levenberg_marquardt(BODY, start, make, tolerance=1e-12, max_iterations=100)
+        assert found.costs[f] == pytest.approx(fit.equations.cost, rel=SAME_COST)
+        np.testing.assert_allclose(state.angles, fit.state.angles, atol=1e-5)
+        start = fit.state
+    sure = certainty(BODY, found.Ts_world_root, found.angles, POINTS, x, posture=1.0)
+    np.testing.assert_allclose(sure.dof_std[-1] ** 2, variances(fit.equations.matrix), rtol=1e-3)
 
 
 @pytest.mark.parametrize("loss", SETTINGS)

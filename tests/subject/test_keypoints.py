@@ -11,7 +11,7 @@ from kinefit.errors import TakeError
 from kinefit.observations import Keypoints
 from kinefit.readers.take.file import read_take
 from kinefit.sensors.channels import make_channels
-from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig, write_synthetic_take
+from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.solvers.bundle.shape import mirror_points
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.parameters import World
@@ -157,9 +157,9 @@ def test_a_worse_detector_beside_a_better_one_does_no_harm():
 
 
 @pytest.fixture(scope="module")
-def two_takes(tmp_path_factory):
+def two_takes(tmp_path_factory, copy_take):
     folder = tmp_path_factory.mktemp("takes")
-    trial = write_synthetic_take(folder)
+    trial = copy_take(folder)
     text = trial.read_text("utf-8").replace("[take]", f'[take]\nsubject = "{trial.name}"', 1)
     (folder / "second.toml").write_text(text, "utf-8")
     return trial, folder / "second.toml"

@@ -23,7 +23,7 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.surfaces import AnnyShape, CylinderShape, shape_of
 
-FRAMES = 9
+FRAMES = 6
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "anny.md"
 
 

@@ -8,15 +8,15 @@ from kinefit.errors import TakeError
 from kinefit.geometry import se3
 from kinefit.observations import KeypointFrame, MarkerFrame
 from kinefit.readers.take.load import load_observations
-from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig, write_synthetic_take
+from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.subject.parameters import World
 from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.tracking.cameras import as_found, sentences
 
 
 @pytest.fixture(scope="module")
-def take(tmp_path_factory):
-    return write_synthetic_take(tmp_path_factory.mktemp("cameras"))
+def take(tmp_path_factory, copy_take):
+    return copy_take(tmp_path_factory.mktemp("cameras"))
 
 
 def stating(take, text):

@@ -33,7 +33,7 @@ def test_markers_alone_in_memory_tell_the_size():
     """As a take of the same markers does."""
     steps = worn(BODY.landmarks.names)
     recording = Recording.of_frames(steps, Rig(()), rate=RATE / 3, up="y")
-    assert [len(m) for m in recording.markers] == [30] and recording.marker_sets == (("", None),)
+    assert [(len(m.markers), m.marker_set, m.std) for m in recording.markers] == [(30, "", None)]
     motion = track(recording, BODY, settings=STILL)
     ratio = [motion.body.segment_lengths()[n] / length for n, length in BODY.segment_lengths().items()]
     assert np.abs(np.array(ratio) / LARGER - 1.0).max() < 0.02
@@ -45,7 +45,7 @@ def test_markers_alone_in_memory_tell_the_size():
 def test_frames_may_have_some_of_the_markers():
     names = BODY.landmarks.names
     steps = [[marker_frame(i, names[: 4 + i])] for i in range(3)]
-    markers = Recording.of_frames(steps, a_rig(), rate=RATE).markers[0]
+    markers = Recording.of_frames(steps, a_rig(), rate=RATE).markers[0].markers
     assert markers.names == names[:6]
     assert np.isfinite(markers.positions).all(axis=2).sum(axis=1).tolist() == [4, 5, 6]
     np.testing.assert_array_equal(markers.positions[1, :5], steps[1][0].positions)

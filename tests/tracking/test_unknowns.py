@@ -8,6 +8,7 @@ from tests.oracle import rig_around
 
 from kinefit import Keypoints, Markers, load_body
 from kinefit.geometry.camera import Rig
+from kinefit.observations import NamedMarkers
 from kinefit.subject.parameters import KnownLengths, PointOffsets, SegmentScales, World
 from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.subject.subject import Subject
@@ -25,7 +26,7 @@ SIZED = Subject(BODY.scaled(SCALES), SCALES)
 def a_recording(marker_set=SET, std=None):
     names = BODY.markers(SET).names
     markers = Markers(names, 10.0, np.zeros((4, len(names), 3)), up="z", unit="m")
-    return Recording(0.1 * np.arange(4), 10.0, Rig(()), markers=(markers,), marker_sets=((marker_set, std),))
+    return Recording(0.1 * np.arange(4), 10.0, Rig(()), markers=(NamedMarkers("mocap", markers, marker_set, std=std),))
 
 
 def test_cameras_are_sought_from_their_calibration_and_begin_where_they_were_found():

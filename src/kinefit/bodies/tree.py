@@ -25,6 +25,19 @@ def _frozen(array: object, dtype: type = float) -> NDArray:
     return out
 
 
+def _paths(parent: NDArray) -> tuple[NDArray, NDArray]:
+    """What stands from the first down to each of n (n, m), then -1, and its number (n,), from the next above (n,)."""
+    depth = np.zeros(len(parent), np.int64)
+    for k in range(1, len(parent)):
+        depth[k] = depth[parent[k]] + 1
+    out = np.full((len(parent), int(depth.max()) + 1), -1)
+    for k in range(len(parent)):
+        if k:
+            out[k] = out[parent[k]]
+        out[k, depth[k]] = k
+    return out, depth
+
+
 @dataclass(frozen=True, eq=False)
 class KinematicTree:
     """A tree of segments; parents come before children, coordinates in the order of their segments.
@@ -169,20 +182,40 @@ class KinematicTree:
     @cached_property
     def depth(self) -> NDArray:
         """(n,) how many degrees of freedom stand above each one."""
-        out = np.zeros(self.n_dofs, np.int64)
-        for k in range(1, self.n_dofs):
-            out[k] = out[self.dof_parent[k]] + 1
-        return _frozen(out, np.int64)
+        return _frozen(_paths(self.dof_parent)[1], np.int64)
 
     @cached_property
     def chain(self) -> NDArray:
         """(n, m) degrees of freedom from the root down to each one: the pattern of the normal matrix; then -1."""
-        out = np.full((self.n_dofs, int(self.depth.max()) + 1), -1)
-        for k in range(self.n_dofs):
-            if k:
-                out[k] = out[self.dof_parent[k]]
-            out[k, self.depth[k]] = k
-        return _frozen(out, np.int64)
+        return _frozen(_paths(self.dof_parent)[0], np.int64)
+
+    @cached_property
+    def coupled_pattern(self) -> tuple[NDArray, NDArray, NDArray]:
+        """Chain and depth of the normal matrix with the posture prior in it; (n, m) places of `chain` in that chain.
+
+        They are the paths of its elimination tree: as `chain` and `depth` where the prior couples nothing; else what is
+        coupled, and what elimination makes meet, stands above each other, too.
+        """
+        meets = np.zeros((self.n_dofs, self.n_dofs), bool)
+        np.put_along_axis(meets, np.maximum(self.chain, 0), True, axis=1)
+        meets[6:, 6:] |= self.posture_precision != 0.0
+        parent = np.full(self.n_dofs, -1, np.int64)
+        for k in range(self.n_dofs - 1, 0, -1):
+            above = np.flatnonzero(meets[k, :k])
+            parent[k] = above[-1]
+            meets[parent[k], above] = True
+        chain, depth = _paths(parent)
+        place = [np.searchsorted(row[: d + 1], own) for row, d, own in zip(chain, depth, self.chain)]
+        return _frozen(chain, np.int64), _frozen(depth, np.int64), _frozen(place, np.int64)
+
+    @cached_property
+    def posture_entries(self) -> tuple[NDArray, NDArray]:
+        """Lower triangle of `posture_precision`: (E, 3) row, column, place in `coupled_pattern`; (E,) values."""
+        chain, depth, _ = self.coupled_pattern
+        row, column = np.nonzero(np.tril(self.posture_precision))
+        place = [np.searchsorted(chain[6 + i, : depth[6 + i] + 1], 6 + j) for i, j in zip(row, column)]
+        entries = np.column_stack([row, column, np.array(place, np.int64)])
+        return _frozen(entries, np.int64), _frozen(self.posture_precision[row, column])
 
     @cached_property
     def ball_joints(self) -> tuple[slice, ...]:

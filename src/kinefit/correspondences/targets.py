@@ -19,12 +19,15 @@ def weights(sigma: ArrayLike, present: NDArray, what: str) -> NDArray:
     sigma = np.asarray(sigma, float)
     if sigma.shape not in ((), present.shape):
         raise ObservationError(f"deviations of {what} have shape {sigma.shape}", remedy=f"Give {present.shape}.")
-    sigma = np.broadcast_to(sigma, present.shape)
-    if not np.all(sigma[present] > 0):
+    out = np.zeros(present.shape)
+    if not present.any():
+        return out
+    told = sigma[present] if sigma.shape else sigma
+    if not (told > 0).all():
         remedy = "Leave out what was not measured, or give it a large one."
         raise ObservationError(f"the standard deviation of {what} must be positive", remedy=remedy)
-    safe = np.where(present, sigma, 1.0)
-    return np.where(present, 1.0 / safe**2, 0.0)
+    out[present] = 1.0 / told**2
+    return out
 
 
 def fill(

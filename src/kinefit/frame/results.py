@@ -32,7 +32,8 @@ class FrameResult:
     joint_std : (S, 3) [m]
         Of every joint centre along the world's axes; inf likewise.
     segment_quality : (S,) in 0..1
-        Share of what the sensors can see of a segment that agrees with them; 0 where they see nothing of it.
+        Share of what the sensors can see of a segment that agrees with them; 0 where they see nothing of it, nor of its
+        neighbours on both sides.
     lost : (S,) bool
         Segments that what was measured speaks against.
     hidden : (S,) bool
@@ -122,6 +123,6 @@ def judged(
     support = float(told.agreeing.sum()) / total if total > 0.0 else 0.0
     std = deviations(scene.body, scene.state, covariance, observed)
     return FrameResult(
-        scene.time, scene.state, *std, told.quality, told.lost, told.hidden, support, iterations, tuple(matched),
-        scene.measurements,
+        scene.time, scene.state, *std, told.quality_in(scene.body.tree), told.lost, told.hidden, support, iterations,
+        tuple(matched), scene.measurements,
     )  # fmt: skip

@@ -52,8 +52,8 @@ class Sensors:
     rig : Rig
     rate : float [Hz] of the frames
     sigma : {sensor: standard deviation}
-        [m] of depth, clouds and markers, [px] of keypoints, and of silhouettes as "silhouette CAMERA",
-        of regions as "region CAMERA".
+        [m] of depth, clouds and markers, of one marker as "SENSOR MARKER"; [px] of keypoints, of silhouettes as
+        "silhouette CAMERA", of regions as "region CAMERA".
     settings : TrackSettings
     own : sensors of one's own
     on_body : depth cameras whose images show nothing but the body: no background is learnt
@@ -229,7 +229,8 @@ class Sensors:
 
     def _markers(self, name: str) -> MarkerSensor:
         s = self.settings
-        return MarkerSensor(name, self.sigma.get(name, s.marker), s.loss, s.near)
+        each = {key.removeprefix(f"{name} "): v for key, v in self.sigma.items() if key.startswith(f"{name} ")}
+        return MarkerSensor(name, self.sigma.get(name, s.marker), s.marker_loss, s.near, each)
 
     def _depth(self, name: str) -> DepthImageSensor:
         camera, s = self.rig[name], self.settings

@@ -13,9 +13,11 @@ from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.marker_sets import find_placement
 from kinefit.errors import TrackingError
 from kinefit.losses import Loss
-from kinefit.markers.poses import LOSS, POSTURE, columns, sequence_both_ways
+from kinefit.markers.poses import columns, sequence_both_ways
 from kinefit.motion import UP_AXES, Motion, Residuals
 from kinefit.observations import Markers
+from kinefit.sensors.points.markers import of_points
+from kinefit.sensors.settings import MARKER_LOSS
 from kinefit.smoothing.gaps import bridged
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.solvers.sequence import Certainty, certainty, fit_sequence
@@ -36,7 +38,7 @@ def fit_markers(
     marker_set: str | PathLike[str] | None = None,
     *,
     sigma: ArrayLike = 0.005,
-    loss: Loss = LOSS,
+    loss: Loss = MARKER_LOSS,
     limits: bool = True,
     up: str | None = None,
 ) -> Motion:
@@ -75,7 +77,7 @@ def fit_markers(
     sure = certainty(body, roots, angles, points, x, sigma=sigma, loss=loss, posture=1.0)
     angles = unwrap(body.tree, angles)
     roots, angles = _bridged(body, points, x, sigma, roots, angles, sure, markers.rate, loss, limits)
-    return _motion(body, markers, points, x, roots, angles, sure, up)
+    return _motion(body, markers, points, x, sigma, roots, angles, sure, up)
 
 
 def _misfit(body: Body, points: PointSet, x: NDArray, sigma: NDArray, roots: NDArray, angles: NDArray) -> NDArray:
@@ -127,7 +129,7 @@ def _bridged(
         inside = bool(((angles[a:b] >= tree.lower) & (angles[a:b] <= tree.upper)).all())  # not in another chart
         fit = fit_sequence(  # the rest of the chain settles about what is now known
             body, BodyState(roots[a], angles[a]), points, x[a:b], sigma=sigma, loss=loss, limits=limits and inside,
-            posture=POSTURE, usual=meant[a:b],
+            posture=1.0, usual=meant[a:b],
         )  # fmt: skip
         roots[a:b], angles[a:b] = fit.Ts_world_root, fit.angles
     worse = again & (_misfit(body, points, x, sigma, roots, angles) > before + _WORSE)
@@ -136,30 +138,22 @@ def _bridged(
 
 
 def _motion(
-    body: Body, markers: Markers, points: PointSet, x: NDArray, roots: NDArray, angles: NDArray, sure: Certainty,
-    up: str | None,
-) -> Motion:
-    tree, segments = body.tree, len(body.tree.segments)
+    body: Body, markers: Markers, points: PointSet, x: NDArray, sigma: NDArray, roots: NDArray, angles: NDArray,
+    sure: Certainty, up: str | None,
+) -> Motion:  # fmt: skip
+    """Quality as of every other track: the share of what shows a segment that agrees with it."""
     dof_std = np.array(sure.dof_std)
-    dof_std[:, 6:][dof_std[:, 6:] > _PRIOR * tree.spread] = np.inf
-    quality = np.stack([_share(sure.factors, points.segments == s) for s in range(segments)], axis=1)
-    bare_segments = ~np.isin(np.arange(segments), points.segments)
-    for s in np.flatnonzero(bare_segments):  # one without markers is known by its neighbours, if it has any beyond
-        beyond = [c for c in np.flatnonzero(tree.parents == s) if not bare_segments[c]]
-        if beyond and tree.parents[s] >= 0:
-            quality[:, s] = np.minimum(quality[:, tree.parents[s]], quality[:, beyond].max(axis=1))
+    dof_std[:, 6:][dof_std[:, 6:] > _PRIOR * body.tree.spread] = np.inf
     values = x - body.trajectories(roots, angles, points)
+    told = of_points(body, points, np.square(values / sigma[:, None]).sum(axis=2))
+    quality = told.quality_in(body.tree)
     residuals = Residuals(points.names, points.segments, values, sure.factors, "m", x, np.zeros(len(x), bool))
     return Motion(
         body=body, rate=markers.rate, times=markers.times, Ts_world_root=roots, angles=angles, dof_std=dof_std,
-        joint_std=sure.joint_std, quality=sure.factors.mean(axis=1), segment_quality=quality,
+        joint_std=sure.joint_std, quality=quality.mean(axis=1), segment_quality=quality,
         residuals={"markers": residuals}, up=up or markers.up or upright(roots),
         name=Path(markers.source).stem or "markers",
     )  # fmt: skip
-
-
-def _share(weights: NDArray, mine: NDArray) -> NDArray:
-    return weights[:, mine].mean(axis=1) if mine.any() else np.zeros(len(weights))
 
 
 def upright(roots: NDArray) -> str:

@@ -15,13 +15,8 @@ from kinefit.geometry import se3
 from kinefit.initialization.from_points import aligned_root
 from kinefit.losses import SQUARED, Loss, geman_mcclure
 from kinefit.observations import Markers
+from kinefit.sensors.settings import MARKER_LOSS
 from kinefit.solvers.sequence import fit_sequence
-
-LOSS = geman_mcclure(5.0)
-"""Of a marker: three residuals in one, which are 1.7 standard deviations long on average."""
-
-POSTURE = 0.1
-"""Share of the posture prior in a frame's fit: enough to decide what the markers leave open."""
 
 _FEWEST = 6  # markers of a frame to start from
 _ROUGH = 0.03  # [m] how far a body that is not yet the subject's may be off
@@ -48,7 +43,7 @@ def columns(markers: Markers, names: Sequence[str]) -> NDArray:
 
 
 def sequence_both_ways(
-    body: Body, points: PointSet, x: NDArray, sigma: NDArray, *, loss: Loss = LOSS, limits: bool = True
+    body: Body, points: PointSet, x: NDArray, sigma: NDArray, *, loss: Loss = MARKER_LOSS, limits: bool = True
 ) -> tuple[NDArray, NDArray]:
     """Roots (F, 4, 4) and angles (F, D) of all frames, from the one that shows most, onwards and backwards.
 
@@ -58,7 +53,7 @@ def sequence_both_ways(
         No frame shows enough markers to start from.
     """
     first, state = _start(body, points, x, sigma)
-    given: dict[str, Any] = {"sigma": sigma, "loss": loss, "limits": limits, "posture": POSTURE}
+    given: dict[str, Any] = {"sigma": sigma, "loss": loss, "limits": limits, "posture": 1.0}
     after = fit_sequence(body, state, points, x[first:], **given)
     state = BodyState(after.Ts_world_root[0], after.angles[0])
     before = fit_sequence(body, state, points, x[: first + 1][::-1], **given)

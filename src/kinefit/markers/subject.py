@@ -15,10 +15,11 @@ from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.marker_sets import MarkerPlacement, find_placement
 from kinefit.errors import ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
-from kinefit.markers.poses import LOSS, columns, sequence_both_ways
+from kinefit.markers.poses import columns, sequence_both_ways
 from kinefit.observations import Markers
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.points.markers import MarkerMeasurement, MarkerSensor
+from kinefit.sensors.settings import MARKER_LOSS
 from kinefit.subject import fit as joint
 from kinefit.subject.parameters import PointOffsets, SegmentScales
 from kinefit.subject.subject import SubjectFit
@@ -58,6 +59,7 @@ class MarkerSubject:
     moved : (K,) [m] how far each marker was found from where the set has it; far ones may be mislabelled.
     rms : float [m] of all residuals (lengths) of the frames used, outliers left out.
     frames : how many were used.
+    fit : of lengths and places together.
     """
 
     body: Body
@@ -68,6 +70,7 @@ class MarkerSubject:
     moved: NDArray
     rms: float
     frames: int
+    fit: SubjectFit
 
     @property
     def points(self) -> PointSet:
@@ -79,7 +82,7 @@ class MarkerSubject:
 def fit_marker_subject(
     body: Body,
     trials: Markers | Sequence[Markers],
-    marker_set: str | PathLike[str] | None = None,
+    marker_set: str | PathLike[str] | MarkerPlacement | None = None,
     *,
     frames: int = 80,
     height: float | None = None,
@@ -156,7 +159,7 @@ def fit_marker_subject(
     return MarkerSubject(
         replace(whole, marker_sets=named), placed.name, scales, scales * found.std[:groups], sigma,
         np.linalg.norm(theta[groups:].reshape(-1, 3), axis=1), float(np.sqrt(np.mean(residuals[inlier] ** 2))),
-        len(chosen),
+        len(chosen), found,
     )  # fmt: skip
 
 
@@ -216,8 +219,8 @@ def _moved(body: Body, points: PointSet, roots: NDArray, angles: NDArray, x: NDA
 def _measured(placed: MarkerPlacement, x: NDArray, sigma: NDArray) -> list[Measurement]:
     """Markers (K, 3) [m] of one frame, those that were seen, each as sure as it sits on its segment."""
     here = np.flatnonzero(np.isfinite(x).all(axis=1))
-    sensor = MarkerSensor("markers", sigma[here], LOSS, joint.REACH[-1])
     names = tuple(placed.points.names[k] for k in here)
+    sensor = MarkerSensor("markers", 1.0, MARKER_LOSS, joint.REACH[-1], dict(zip(names, sigma[here].tolist())))
     return [MarkerMeasurement(sensor, names, np.ascontiguousarray(x[here]), placed.name, 0.0)]
 
 

@@ -7,7 +7,7 @@ one sensor, `frames` what it saw at one time.
 from kinefit.observations.colours import ColourVideo
 from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.observations.detections import MEDIAPIPE_33, Detections
-from kinefit.observations.features import KeypointVideo, LineVideo
+from kinefit.observations.features import KeypointVideo, LineVideo, NamedMarkers
 from kinefit.observations.frames import (
     KEYPOINTS,
     ColourFrame,
@@ -45,6 +45,7 @@ __all__ = [
     "MarkerEvent",
     "MarkerFrame",
     "Markers",
+    "NamedMarkers",
     "PointCloud",
     "SilhouetteFrame",
     "SilhouetteVideo",

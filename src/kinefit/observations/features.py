@@ -1,4 +1,4 @@
-"""Recordings of what was made out in one camera's images: some points of the body, or lines of known objects."""
+"""Recordings of named features: points of the body or lines of known objects in an image, markers in space."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
 from kinefit.observations.depth import _Recording, checked_times
-from kinefit.observations.frames import KeypointFrame, LineFrame
+from kinefit.observations.frames import KeypointFrame, LineFrame, MarkerFrame
+from kinefit.observations.recordings import Markers
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,3 +98,31 @@ class LineVideo(_Recording):
         """Frame number `i`, negative ones from the end."""
         i = range(len(self))[i]
         return LineFrame(self.sensor, float(self.times[i]), self.names, self.landmarks, self.ends[i])
+
+
+@dataclass(frozen=True, eq=False)
+class NamedMarkers:
+    """A marker recording with the names that a body's marker set has for its labels.
+
+    Parameters
+    ----------
+    sensor : name of the sensor
+    markers : Markers, with those names
+    marker_set : of the body, "" for its landmarks
+    time_offset : float [s]
+    std : (K,) [m] by which the set's markers may sit elsewhere on this person; None where the body has their places
+    """
+
+    sensor: str
+    markers: Markers
+    marker_set: str
+    time_offset: float = 0.0
+    std: NDArray | None = None
+
+    def at(self, time: float) -> MarkerFrame | None:
+        """The frame nearest to a time [s], None where there is none within half a frame."""
+        k = round((time - self.time_offset) * self.markers.rate)
+        if not 0 <= k < len(self.markers):
+            return None
+        own = k / self.markers.rate + self.time_offset
+        return MarkerFrame(self.sensor, own, self.markers.names, self.markers.positions[k], self.marker_set)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies import KinematicTree
 from kinefit.motion import BELIEVED
 
 # On a rendered body tracked into 260 lost part-frames, 99 % are flagged at 0.03 % false alarms with it and BELIEVED;
@@ -21,7 +22,7 @@ class Evidence:
 
     Parameters
     ----------
-    agreeing, contrary : (S,)
+    agreeing, contrary : (S,), or (F, S) of many frames
         In outlines of the segment: 1 where a depth image shows all of it. A keypoint or a marker counts `SHOWN`, which
         is just enough to call a segment seen.
     elsewhere : (S,) bool, optional
@@ -52,6 +53,17 @@ class Evidence:
         """(S,) in 0..1: share of what is seen of a segment that speaks for it; 0 where nothing is."""
         seen = self.agreeing + self.contrary
         return self.agreeing / np.where(seen > 0.0, seen, 1.0)
+
+    def quality_in(self, tree: KinematicTree) -> NDArray:
+        """`quality`; a segment that nothing shows, between one above and one below, has that of the worse of these."""
+        own, hidden = self.quality, self.hidden
+        out = own.copy()
+        for s in np.flatnonzero(hidden.reshape(-1, hidden.shape[-1]).any(axis=0)):
+            below = np.flatnonzero(tree.parents == s)
+            if len(below) and tree.parents[s] >= 0:
+                known = np.minimum(own[..., tree.parents[s]], own[..., below].max(axis=-1))
+                out[..., s] = np.where(hidden[..., s], known, own[..., s])
+        return out
 
     @property
     def hidden(self) -> NDArray:

@@ -8,6 +8,9 @@ from kinefit.images.regions import RegionSettings
 from kinefit.losses import Loss, geman_mcclure
 from kinefit.observations import KEYPOINT_SIGMA
 
+MARKER_LOSS = geman_mcclure(5.0)
+"""Of a marker: three residuals in one, which are 1.6 standard deviations long on average; those of a keypoint 1.25."""
+
 
 @dataclass(frozen=True)
 class TrackSettings:
@@ -76,7 +79,8 @@ class TrackSettings:
         How abruptly a body moves: one standard deviation.
     velocity_memory : float [s]
         How long a velocity lasts that nothing confirms.
-    loss : Loss of keypoints and markers, in their standard deviations.
+    loss : Loss of keypoints, in their standard deviations.
+    marker_loss : Loss of markers, likewise.
     pause : float [s]
         A longer gap between frames leaves the velocity unknown; a clock that goes back further was set.
     search : bool
@@ -131,6 +135,7 @@ class TrackSettings:
     root_acceleration: float = 15.0
     velocity_memory: float = 0.1
     loss: Loss = field(default_factory=geman_mcclure)
+    marker_loss: Loss = MARKER_LOSS
     pause: float = 1.0
     search: bool = True
     support: float = 0.5

@@ -29,16 +29,47 @@ def gather(order, x, n, weight, target, normal, weights):
 
 
 @jit
+def spread(C, depth, place, wide_depth, H):
+    """H in the pattern of `C` into a wider one, where C[k, t] stands at H[k, place[k, t]]."""
+    for k in range(depth.size):
+        for t in range(wide_depth[k] + 1):
+            H[k, t] = 0.0
+        for t in range(depth[k] + 1):
+            H[k, place[k, t]] = C[k, t]
+
+
+@jit
+def add_posture(share, pair, precision, usual, angles, H, g):
+    """Add a share of a Gaussian about `usual` (D,) to H and g; returns its cost.
+
+    pair (E, 3): two angles, the second no later, and where they meet in H's row of the first; precision (E,).
+    """
+    cost = 0.0
+    for e in range(precision.size):
+        i, j, p = pair[e, 0], pair[e, 1], share * precision[e]
+        H[6 + i, pair[e, 2]] += p
+        a, b = usual[i] - angles[i], usual[j] - angles[j]
+        g[6 + i] += p * b
+        cost += p * a * b
+        if i != j:
+            g[6 + j] += p * a
+            cost += p * a * b
+    return cost
+
+
+@jit
 def fit_sequence(
     parents, dof_start, chain, depth, prismatic, axes, rest_joints, lower, upper, locked,
     owner, rest, target, weight, plane_owner, plane_rest, plane_order, plane_x, plane_n, plane_w,
-    usual, posture, kind, scale, max_iterations, tolerance, damping_share, roots, angles, costs, iterations,
+    usual, posture, prior_pairs, prior, wide, wide_depth, place, kind, scale, max_iterations, tolerance, damping_share,
+    roots, angles, costs, iterations,
 ):  # fmt: skip
     """Fit all frames, each from the last one's solution; roots[0], angles[0] hold the start and are overwritten.
 
     owner (K,), rest (K, 3), target (F, K, 3) [m], weight (F, K) [1/m²]; planes sorted by segment: plane_owner (P,),
     plane_rest (3, P); not sorted, NaN where not measured: plane_x, plane_n (F, P, 3); plane_order (P,) sorts them.
-    Each angle is drawn towards usual (F, D) with weight posture (D,).
+    The angles are drawn towards usual (F, D) by the share `posture` of a prior, see `add_posture`; with it the pattern
+    of H is wide, wide_depth, see `spread`.
     roots (F, 4, 4), angles (F, D), costs (F,), iterations (F,) are filled. Damping starts at `damping_share` of the
     mean diagonal of H in the first frame and is carried on. An iteration that is predicted to win less than
     `tolerance` of the cost ends a frame.
@@ -49,8 +80,8 @@ def fit_sequence(
     data, segment, group = np.empty((8, size)), np.empty(size, np.int64), np.empty(size, np.int64)
     factor, blocks = np.empty(size), np.empty((n_segments, 27))
     frames, screws = np.empty((n_segments, 12)), np.empty((n_angles, 6))
-    H, g, other_H, other_g = np.empty(chain.shape), np.empty(n), np.empty(chain.shape), np.empty(n)
-    L, delta = np.empty(chain.shape), np.empty(n)
+    H, g, other_H, other_g = np.empty(wide.shape), np.empty(n), np.empty(wide.shape), np.empty(n)
+    C, L, delta = np.empty(chain.shape), np.empty(wide.shape), np.empty(n)
     planes = plane_owner.size
     target_lines, normal_lines, plane_weight = np.empty((3, planes)), np.empty((3, planes)), np.empty(planes)
     root, q = roots[0].copy(), angles[0].copy()
@@ -73,19 +104,17 @@ def fit_sequence(
             )  # fmt: skip
             new_cost = assemble(
                 data, segment, group, count, kind, scale, trial_root[:3, 3], parents, dof_start, chain, depth, screws,
-                factor, blocks, other_H, other_g,
+                factor, blocks, C, other_g,
             )  # fmt: skip
-            for d in range(n_angles):
-                away = usual[f, d] - trial_q[d]
-                other_H[6 + d, depth[6 + d]] += posture[d]
-                other_g[6 + d] += posture[d] * away
-                new_cost += posture[d] * away * away
+            spread(C, depth, place, wide_depth, other_H)
+            if posture > 0.0:
+                new_cost += add_posture(posture, prior_pairs, prior, usual[f], trial_q, other_H, other_g)
             if first:
                 cost = new_cost
                 H, other_H, g, other_g = other_H, H, other_g, g
                 mean = 1e-300
                 for i in range(n):
-                    mean += H[i, depth[i]] / n
+                    mean += H[i, wide_depth[i]] / n
                 least, most = LEAST_DAMPING * mean, damping_share * mean
                 if not 0.0 <= damping <= most:  # a frame that fitted exactly leaves it high
                     damping = most
@@ -100,12 +129,12 @@ def fit_sequence(
             used = attempt
             if attempt == max_iterations:
                 break
-            predicted = damped_step(H, g, damping, chain, depth, q, lower, upper, locked, L, delta)
+            predicted = damped_step(H, g, damping, wide, wide_depth, q, lower, upper, locked, L, delta)
             for _ in range(_TRIES):
                 if predicted >= 0.0:
                     break
                 damping = 10.0 * damping
-                predicted = damped_step(H, g, damping, chain, depth, q, lower, upper, locked, L, delta)
+                predicted = damped_step(H, g, damping, wide, wide_depth, q, lower, upper, locked, L, delta)
             retract(root, q, delta, lower, upper, new_root, new_q)
             if predicted <= tolerance * cost + 1e-30:
                 break  # not worth another look: the model holds this close, so the step is taken as it is
@@ -123,18 +152,19 @@ def fit_sequence(
 @jit
 def certainties(
     parents, dof_start, dof_parent, last_dof, chain, depth, prismatic, axes, rest_joints,
-    owner, rest, target, weight, posture, kind, scale, roots, angles, dof_std, joint_std, factors,
+    owner, rest, target, weight, usual, posture, prior_pairs, prior, wide, wide_depth, place, kind, scale,
+    roots, angles, dof_std, joint_std, factors,
 ):  # fmt: skip
     """How sure fitted frames are: dof_std (F, n), joint_std (F, S, 3), and robust factors (F, K), 0 where unseen.
 
-    Points as in `fit_sequence`; posture (D,) weights. A frame that cannot be inverted is infinite.
+    Points, prior and patterns as in `fit_sequence`. A frame that cannot be inverted is infinite.
     """
     n_segments, n_angles, points = parents.size, axes.shape[0], owner.size
     n = n_angles + 6
     data, segment, group = np.empty((8, 3 * points)), np.empty(3 * points, np.int64), np.empty(3 * points, np.int64)
     factor, blocks = np.empty(3 * points), np.empty((n_segments, 27))
     frames, screws = np.empty((n_segments, 12)), np.empty((n_angles, 6))
-    C, g, P = np.empty(chain.shape), np.empty(n), np.empty((n, n))
+    C, H, g, P = np.empty(chain.shape), np.empty(wide.shape), np.empty(n), np.empty((n, n))
     moves, column = np.empty((n_segments, 3, n)), np.empty(n)
     for f in range(roots.shape[0]):
         forward(parents, dof_start, prismatic, axes, rest_joints, roots[f], angles[f], frames, screws)
@@ -147,9 +177,10 @@ def certainties(
             factors[f, k] = 0.0
         for i in range(count):
             factors[f, group[i]] = factor[i]
-        for d in range(n_angles):
-            C[6 + d, depth[6 + d]] += posture[d]
-        if not invert(C, chain, depth, P):
+        spread(C, depth, place, wide_depth, H)
+        if posture > 0.0:
+            add_posture(posture, prior_pairs, prior, usual, angles[f], H, g)
+        if not invert(H, wide, wide_depth, P):
             dof_std[f] = np.inf
             joint_std[f] = np.inf
             continue

@@ -14,7 +14,8 @@ def middle(values: NDArray, axis: int | tuple[int, ...]) -> NDArray:
     """Median of what is not NaN along an axis; NaN, with no warning, where nothing is left."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        return np.asarray(np.nanmedian(values, axis=axis))
+        median = np.nanmedian if np.isnan(values).any() else np.median  # the same, several times as fast
+        return np.asarray(median(values, axis=axis))
 
 
 def rigid_frames(

@@ -76,7 +76,7 @@ def fit_sequence(
     planes : Planes
         Tangent planes for other points, as well or instead.
     posture : float
-        Weight of the usual posture, as a share of 1/spread²: it decides what the measurements leave open.
+        Share of the body's posture prior, couplings included: it decides what the measurements leave open.
     usual : (F, D) or (D,) [rad or m]
         The posture meant; default: the body's.
     damping : float
@@ -113,8 +113,8 @@ def fit_sequence(
         np.ascontiguousarray(body.points_rest(p.points)[p_order].T),
         p_order, np.ascontiguousarray(p.x_world), np.ascontiguousarray(p.normal), 1.0 / p.sigma**2,
         np.ascontiguousarray(np.broadcast_to(tree.usual if usual is None else usual, angles.shape), float),
-        posture / np.square(tree.spread),
-        loss.kind, loss.scale, max_iterations, tolerance, damping, roots, angles, costs, iterations,
+        posture, *tree.posture_entries, *tree.coupled_pattern, loss.kind, loss.scale, max_iterations, tolerance,
+        damping, roots, angles, costs, iterations,
     )  # fmt: skip
     return SequenceFit(roots, angles, costs, iterations)
 
@@ -158,8 +158,8 @@ def certainty(
     dof_std, joint_std, factors = np.empty((F, n)), np.empty((F, S, 3)), np.empty(seen.shape)
     _certainties(
         tree.parents, tree.dof_start, tree.dof_parent, tree.last_dof, tree.chain, tree.depth, tree.prismatic, tree.axes,
-        tree.rest, points.segments, body.points_rest(points), np.nan_to_num(x), weight,
-        posture / np.square(tree.spread), loss.kind, loss.scale, np.ascontiguousarray(Ts_world_root, float),
+        tree.rest, points.segments, body.points_rest(points), np.nan_to_num(x), weight, tree.usual, posture,
+        *tree.posture_entries, *tree.coupled_pattern, loss.kind, loss.scale, np.ascontiguousarray(Ts_world_root, float),
         np.ascontiguousarray(angles, float), dof_std, joint_std, factors,
     )  # fmt: skip
     return Certainty(dof_std, joint_std, factors)

@@ -91,9 +91,9 @@ class CylinderShape:
 
     def apply(self, world: World, values: NDArray) -> World:
         """The body with these cylinders."""
-        sizes = np.asarray(values, float).reshape(-1, 6)
+        sizes = np.asarray(values, float).reshape(-1, 6).tolist()
         surfaces = tuple(
-            _shaped(s, sizes[g]) if isinstance(s, TaperedCylinder) else s
+            _shaped(s, tuple(sizes[g])) if isinstance(s, TaperedCylinder) else s
             for s, g in zip(world.body.surfaces, self._groups[1], strict=True)
         )
         return replace(world, body=replace(world.body, surfaces=surfaces))
@@ -160,15 +160,17 @@ class Girths:
         """The body with these girths."""
         size = np.zeros((len(self.body.scale_groups), 6))
         size[list(self._groups), :4] = np.tile(np.reshape(values, (-1, 2)), 2)
+        sizes = [tuple(one) for one in size.tolist()]
         surfaces = tuple(
-            _shaped(s, size[self.body.segment_scale[s.segment]]) if isinstance(s, TaperedCylinder) else s
+            _shaped(s, sizes[self.body.segment_scale[s.segment]]) if isinstance(s, TaperedCylinder) else s
             for s in world.body.surfaces
         )
         return replace(world, body=replace(world.body, surfaces=surfaces))
 
 
-def _shaped(surface: TaperedCylinder, size: NDArray) -> Surface:
-    (a0, b0), (a1, b1) = (np.exp(size[:4].reshape(2, 2)) * surface.radii).tolist()
+@lru_cache(maxsize=4096)  # of two worlds that differ in one parameter, most surfaces are the same
+def _shaped(surface: TaperedCylinder, size: tuple[float, ...]) -> Surface:
+    (a0, b0), (a1, b1) = (np.exp(np.reshape(size[:4], (2, 2))) * surface.radii).tolist()
     a = surface.axes[0]
     start, end = (np.add(at, shift * a) for at, shift in zip((surface.start, surface.end), size[4:]))
     return replace(

@@ -29,6 +29,7 @@ from kinefit.observations import (
     LiftedFrame,
     MarkerFrame,
     Markers,
+    NamedMarkers,
     sensor_of,
 )
 from kinefit.observations.arrays import is_number
@@ -55,10 +56,9 @@ class Recording:
     keypoints : records of the person's keypoints among what the steps show, whole, for the subject fit
     followed : who of several people that is, where the cameras see others
     sigma : {sensor: standard deviation}, [px] of cameras' keypoints ("CAMERA SET" of one of several detectors) and of
-        "silhouette CAMERA", else [m]
+        "silhouette CAMERA", else [m]; "SENSOR MARKER" of one marker
     sensors : of one's own, see `kinefit.sensors.base`
     markers : labelled recordings among what the steps show, whole, for the subject fit
-    marker_sets : of each, its marker set on the body, and how far [m] each marker may sit elsewhere; None for nowhere
     depth : some of the first images of the depth sensor that comes first, by step, for the subject fit
     on_body : depth cameras whose images show nothing but the body
     backgrounds : {depth camera: (H, W) [m]} of the empty scene
@@ -77,8 +77,7 @@ class Recording:
     followed: PersonKeypoints | None = None
     sigma: Mapping[str, float] = field(default_factory=dict)
     sensors: tuple[Sensor, ...] = ()
-    markers: tuple[Markers, ...] = ()
-    marker_sets: tuple[tuple[str, NDArray | None], ...] = ()
+    markers: tuple[NamedMarkers, ...] = ()
     depth: Mapping[int, DepthFrame] = field(default_factory=dict)
     on_body: tuple[str, ...] = ()
     backgrounds: Mapping[str, NDArray] = field(default_factory=dict)
@@ -160,6 +159,14 @@ class Recording:
         """Whether in the first steps any other sensor than the keypoints' detectors sees something."""
         return any(len(self.steps(i)) > len(self.keypoints_at(i)) for i in range(min(len(self), _FIRST_STEPS)))
 
+    @property
+    def markers_alone(self) -> bool:
+        """Whether one marker system is the only sensor."""
+        if len(self.markers) != 1 or self.keypoints or self.depth or self.sensors or self.backgrounds:
+            return False
+        first = range(min(len(self), _FIRST_STEPS))
+        return all(f.sensor == self.markers[0].sensor for i in first for f in self.steps(i))
+
     def keypoints_at(self, i: int) -> list[KeypointFrame]:
         """The keypoints among what is seen at a step: a frame of every record, or none where no point is seen."""
         return keypoint_frames(self.keypoints, i, float(self.times[i]))
@@ -205,19 +212,19 @@ class Recording:
         if len(timed) < len(told):  # evenly beyond the ends
             times = np.where(np.isfinite(told), times, times[timed[0]] + (np.arange(len(told)) - timed[0]) / rate)
         sigma = dict(sigma or {})
+        worn = _marker_records(steps, rate)
         there = {*rig.names, *(sensor_of(f) for seen in steps for f in seen)}
+        there |= {f"{m.sensor} {name}" for m in worn for name in m.markers.names}
         for name in sigma:
             if name not in there:
                 remedy = "Leave its standard deviation out, or correct its name."
                 raise ObservationError(choices("sensor", name, sorted(there)), remedy=remedy)
         records = keypoint_records(steps, rate, start=float(times[0]))
         others = [[f for f in seen if not isinstance(f, KeypointFrame)] for seen in steps]
-        worn = _marker_records(steps, rate)
-        known = {"markers": tuple(m for m, _ in worn), "marker_sets": tuple((name, None) for _, name in worn)}
         return cls(
             times, rate, rig, keypoints=records, sigma=sigma,
             steps=lambda i: [*others[i], *keypoint_frames(records, i, float(times[i]))],
-            depth=_first_depth(steps, rate), **{**known, **more},
+            depth=_first_depth(steps, rate), **{"markers": worn, **more},
         )  # fmt: skip
 
     def part(self, frames: slice) -> Recording:
@@ -291,8 +298,8 @@ def keypoint_records(steps: Sequence[Sequence[Any]], rate: float, *, start: floa
     return tuple(out)
 
 
-def _marker_records(steps: Sequence[Sequence[Any]], rate: float) -> list[tuple[Markers, str]]:
-    """Markers of single frames as whole recordings, one for each sensor and marker set, which is named beside it."""
+def _marker_records(steps: Sequence[Sequence[Any]], rate: float) -> tuple[NamedMarkers, ...]:
+    """Markers of single frames as whole recordings, one for each sensor and marker set."""
     seen: dict[tuple[str, str], dict[int, MarkerFrame]] = {}
     for i, frames in enumerate(steps):
         for f in frames:
@@ -304,8 +311,8 @@ def _marker_records(steps: Sequence[Sequence[Any]], rate: float) -> list[tuple[M
         positions = np.full((len(steps), len(names), 3), np.nan)
         for i, f in frames_of.items():
             positions[i, [names.index(n) for n in f.names]] = f.positions
-        out.append((Markers(names, rate, positions, source=sensor), marker_set))
-    return out
+        out.append(NamedMarkers(sensor, Markers(names, rate, positions, source=sensor), marker_set))
+    return tuple(out)
 
 
 _SIZES, _FIRST = 4, 5.0  # depth images from which a person's size is found, spread over so much of the beginning [s]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.closures import has_unknown_gear
+from kinefit.bodies.marker_sets import MarkerPlacement
 from kinefit.errors import KinefitError, ObservationError, TrackingError
 from kinefit.frame.results import FrameResult
 from kinefit.geometry.camera import Rig
@@ -106,13 +107,15 @@ def fitted_to_person(
         person = person if subject is None else _wearing(person, subject)
         return _by_all(person, body, settings, progress, size=False) if unknown else person
     if cameras >= 2:
-        found = fit_subject(
+        by_keypoints = fit_subject(
             body, channels_of(recording, body, settings), frames=frames or 25, height=height, trial=trial,
             cameras=settings.camera_std, view_bias=settings.view_bias and not others, progress=progress,
         )  # fmt: skip
-        person = _wearing(person, found, **_gear_of(body, found))
-    elif recording.markers and recording.marker_sets[0][0]:
-        person = _by_markers(person, height, progress)
+        person = _wearing(person, by_keypoints, **_gear_of(body, by_keypoints))
+    elif recording.markers and recording.markers[0].marker_set:
+        person, found = _by_markers(person, height, progress)
+        if recording.markers_alone and not unknown:
+            return replace(person, joint=(found,))
     else:
         if height:
             scales = np.full(len(body.scale_groups), height / body.stature)
@@ -136,12 +139,18 @@ def _gear_of(body: Body, found: Subject) -> dict[str, Any]:
     return {"shape": {n: [round(found.fit.value(n)[0], 4), round(float(std[n]), 4)] for n in names}}
 
 
-def _by_markers(person: SizedPerson, height: float | None, progress: Progress | None) -> SizedPerson:
-    """Lengths and the markers' own places, from the markers alone."""
-    r, body = person.recording, person.subject.body
-    found = fit_marker_subject(body, r.markers[0], r.marker_sets[0][0], height=height, progress=progress)
+def _by_markers(
+    person: SizedPerson, height: float | None, progress: Progress | None
+) -> tuple[SizedPerson, SubjectFit]:
+    """Lengths, the markers' own places and how far each moves on its segment, from one marker system alone."""
+    r, body, worn = person.recording, person.subject.body, person.recording.markers[0]
+    name, points = worn.marker_set, body.markers(worn.marker_set)
+    placed = name if worn.std is None else MarkerPlacement(name, points, worn.std)
+    found = fit_marker_subject(body, worn.markers, placed, height=height, progress=progress)
     subject = Subject(found.body, found.scales, length_share=found.scale_std / found.scales)
-    return _wearing(person, subject, markers={"rms_m": round(found.rms, 4), "frames": found.frames})
+    each = {f"{worn.sensor} {name}": float(s) for name, s in zip(found.points.names, found.sigma)}
+    person = replace(person, recording=replace(r, sigma={**r.sigma, **each}))
+    return _wearing(person, subject, markers={"rms_m": round(found.rms, 4), "frames": found.frames}), found.fit
 
 
 def _by_depth(person: SizedPerson, progress: Progress | None) -> SizedPerson:

@@ -47,7 +47,8 @@ class Tracker:
     rig : Rig of all cameras, depth cameras among them; without cameras `Rig(())`.
     rate : float [Hz] of the frames, about: a longer gap counts as frames dropped.
     sigma : {sensor: standard deviation}
-        [m] of depth, clouds and markers, [px] of keypoints, and of silhouettes as "silhouette CAMERA".
+        [m] of depth, clouds, markers ("SENSOR MARKER" of one), [px] of keypoints, and of silhouettes as
+        "silhouette CAMERA".
     up : vertical axis of the world ("z", "-y", ...) or (3,) upwards in it, for a start with no pose given.
     on_body : depth cameras whose images show nothing but the body: no background is learnt.
     settings : TrackSettings

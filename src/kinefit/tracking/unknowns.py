@@ -53,7 +53,7 @@ def of_points(
     calibrated : Rig of the calibration, from which the recording's may have been moved; default: it is the recording's
     cameras : (2,) [m, rad] how sure it is; default: exact
     """
-    sets = {name: std for name, std in recording.marker_sets if name}
+    sets = {m.marker_set: m.std for m in recording.markers if m.marker_set}
     if not sets and recording.alone is None:
         return None
     worn = {name: subject.body.markers(name) for name in sets}  # a fit from markers leaves those that were seen

@@ -11,7 +11,7 @@ from kinefit.exporters import write_markers, write_motion
 from kinefit.observations import Markers
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.simulation import squat_and_wave, write_synthetic_take
+from kinefit.simulation import squat_and_wave
 from kinefit.simulation.movements import movement, people
 from kinefit.tracking.takes.take import track_take
 from kinefit.tracking.takes.take_recording import recording_of
@@ -101,9 +101,9 @@ def test_what_is_wrong_is_named(folder, tmp_path, line, match):
         track_take(path)
 
 
-def test_markers_beside_keypoints_count(tmp_path):
+def test_markers_beside_keypoints_count(tmp_path, copy_take):
     """Markers of three joints, 1 mm: where they are, the fused take is nearer to the truth than keypoints alone."""
-    truth, take = squat_and_wave(), write_synthetic_take(tmp_path)
+    truth, take = squat_and_wave(), copy_take(tmp_path)
     x = truth.positions(truth.body.landmarks.select(MARKERS))
     x = x + 0.001 * np.random.default_rng(0).standard_normal(x.shape)
     write_markers(Markers(MARKERS, truth.rate, x, up=truth.up), tmp_path / "few.trc")

@@ -43,8 +43,8 @@ def placed_set_names() -> tuple[str, ...]:
     return set_names(placed=True)
 
 
-def placement(body: Body, marker_set: str | PathLike[str]) -> MarkerPlacement:
-    """A marker set on a body: one of the catalogue, one of the body's own, or a file of your own (.toml).
+def placement(body: Body, marker_set: str | PathLike[str] | MarkerPlacement) -> MarkerPlacement:
+    """A marker set on a body: one of the catalogue, one of the body's own, a file of your own (.toml), or as given.
 
     Markers on segments or landmarks that the body does not have are left out.
 
@@ -55,6 +55,8 @@ def placement(body: Body, marker_set: str | PathLike[str]) -> MarkerPlacement:
     FileError
         A file that cannot be read, or is no marker set, or one that tells no places on a body.
     """
+    if isinstance(marker_set, MarkerPlacement):
+        return marker_set
     name = str(marker_set)
     if name in body.marker_sets:
         points = body.markers(name)
@@ -68,7 +70,9 @@ def placement(body: Body, marker_set: str | PathLike[str]) -> MarkerPlacement:
     return placed(body, record)
 
 
-def find_placement(body: Body, labels: Iterable[str], marker_set: str | PathLike[str] | None = None) -> MarkerPlacement:
+def find_placement(
+    body: Body, labels: Iterable[str], marker_set: str | PathLike[str] | MarkerPlacement | None = None
+) -> MarkerPlacement:
     """The markers of a set that are among the labels; default: of the set that shares most labels.
 
     Which label stands for which marker is told by `labels.matched`.
@@ -94,7 +98,7 @@ def find_placement(body: Body, labels: Iterable[str], marker_set: str | PathLike
         )
     if best is None or len(best.points) < FEWEST:
         count = 0 if best is None else len(best.points)
-        sets = f"set '{marker_set}'" if marker_set else "any marker set"
+        sets = f"set '{getattr(marker_set, 'name', marker_set)}'" if marker_set else "any marker set"
         raise ObservationError(
             f"only {count} of the labels are known to {sets}: {_listed(labels)}",
             remedy=f"Sets: {', '.join(str(n) for n in [*body.marker_sets, *placed_set_names()])}; or a file (--set): "

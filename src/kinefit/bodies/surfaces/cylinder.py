@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -91,6 +91,7 @@ class TaperedCylinder:
         first, last = (float(np.sqrt(a * b)) for a, b in self.radii)
         return first, last
 
+    @lru_cache(maxsize=4096)  # noqa: B019 (small, and those of one body are asked for again and again)
     def scaled(self, factor: float) -> TaperedCylinder:
         """The cylinder stretched about its segment's joint."""
         start, end, radii = (tuple((factor * np.array(v)).tolist()) for v in (self.start, self.end, self.radii))

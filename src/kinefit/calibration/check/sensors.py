@@ -89,7 +89,7 @@ def fit_sensors(
     seen = with_names(take, seen)
     recording, body = recording_of(replace(take, start=None), seen, load_body(take.body))
     alone = replace(
-        recording, steps=recording.keypoints_at, markers=(), marker_sets=(), depth={}, on_body=(), backgrounds={}
+        recording, steps=recording.keypoints_at, markers=(), depth={}, on_body=(), backgrounds={}
     )  # fmt: skip
     person = fit_person(body, channels_of(recording, body, TrackSettings()), height=take.height, progress=progress)
     motion = track(alone, body, subject=person, progress=progress)
@@ -256,7 +256,7 @@ class _PlacementProblem:
         surfaces = self.body.surfaces if any(f.sensor in self.depth for seen in frames for f in seen) else ()
         if any(isinstance(s, TaperedCylinder) for s in surfaces) and not self.body.skin:
             out.append(CylinderShape(self.body))
-        sets = {name: std for name, std in self.recording.marker_sets if std is not None}
+        sets = {m.marker_set: m.std for m in self.recording.markers if m.std is not None}
         out += [PointOffsets(self.body, name, std) for name, std in sets.items()]
         detected = dict.fromkeys(k.keypoint_set for k in self.recording.keypoints)
         return out + [PointOffsets(self.body, name, _DETECTOR) for name in detected]

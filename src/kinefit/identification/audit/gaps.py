@@ -62,8 +62,8 @@ def exchanges_in_gaps(
 
 def _goes(places: _ExpectedPlaces, a: int, b: int, rows: slice, least: float = 0.0) -> bool:
     """Whether a label is off its own place by more than `least` in all frames, and much nearer to another's."""
-    own, across = np.array([*places.off(a, a, rows, b)]), np.array([*places.off(a, b, rows)])
-    return bool(own.min() > least and across.max() < min(BETTER * own.min(), _MAX_ACROSS))
+    own = np.array([*places.off(a, a, rows, b)]).min()
+    return bool(own > least) and all(off < min(BETTER * own, _MAX_ACROSS) for off in places.off(a, b, rows))
 
 
 def _spans(positions: NDArray, least: float) -> list[tuple[int, int, int]]:
@@ -97,6 +97,7 @@ class _ExpectedPlaces:
         self.positions, self.deviation, self.seen = positions, deviation, np.isfinite(positions[..., 0])
         known = np.isfinite(deviation).sum(axis=1)
         self.order = [row[:n].tolist() for row, n in zip(np.argsort(deviation, axis=1), known)]  # NaN comes last
+        self._carried: dict[tuple[int, ...], NDArray] = {}
 
     def off(self, label: int, place: int, rows: slice, other: int | None = None) -> Iterator[float]:
         """[m] how far a label is from the place of one, frame after frame; NaN where that is not known.
@@ -112,6 +113,13 @@ class _ExpectedPlaces:
         peers = [k for k in self.order[label] if self.seen[frame, k] and k not in without][:_CARRIERS]
         if len(peers) < 3:
             return np.full(3, np.nan)
+        key = label, frame, rows.start, rows.stop, *peers  # the same whichever other labels are in question
+        if key not in self._carried:
+            self._carried[key] = self._by(label, frame, rows, peers)
+        return self._carried[key]
+
+    def _by(self, label: int, frame: int, rows: slice, peers: list[int]) -> NDArray:
+        """The same, carried by some labels."""
         shown = np.flatnonzero(self.seen[:, [label, *peers]].all(axis=1))
         sides = [shown[shown < rows.start][-_MAX_NEAR:], shown[shown >= rows.stop][:_MAX_NEAR]]
         near = np.concatenate(sides)

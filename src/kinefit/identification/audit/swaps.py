@@ -35,7 +35,7 @@ def place_costs(positions: NDArray, mean: NDArray, deviation: NDArray) -> tuple[
     own = np.zeros((frames, count, count), np.float32)
     for i in range(count):
         z = (d - mean[i].astype(np.float32)) / (TAIL * deviation[i]).astype(np.float32)  # (F, q, k)
-        z = np.nan_to_num(np.minimum(z * z, MOST**2), copy=False)
+        z = np.fmax(np.minimum(z * z, MOST**2), np.float32(0.0))  # 0 for what is not seen
         z[:, :, i] = 0.0
         z[:, np.arange(count), np.arange(count)] = 0.0
         cost[:, i] = z.sum(-1)

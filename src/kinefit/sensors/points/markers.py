@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,15 +27,18 @@ class MarkerSensor(Sensor):
     Parameters
     ----------
     name : str
-    sigma : float, or (M,) of markers that are always the same [m] standard deviation, with what it moves on the skin
+    sigma : float [m] standard deviation along each axis, with what a marker moves on the skin
     loss : Loss of a marker, in its standard deviations
     near : float [m] correspondence distance at which the loss holds as it is; it is wider while all is far off
+    each : {marker: float} [m] of those that have a sigma of their own
     """
 
     places_points = True
 
-    def __init__(self, name: str, sigma: float | NDArray, loss: Loss, near: float) -> None:
-        self.name, self.sigma, self.loss, self.near = name, sigma, loss, near
+    def __init__(
+        self, name: str, sigma: float, loss: Loss, near: float, each: Mapping[str, float] = MappingProxyType({})
+    ) -> None:
+        self.name, self.sigma, self.loss, self.near, self.each = name, sigma, loss, near, each
 
     def prepare(self, frame: MarkerFrame, scene: Scene) -> MarkerMeasurement:
         """Those markers that the body has and that were seen.
@@ -71,7 +75,7 @@ class MarkerMeasurement(Measurement):
     ) -> None:
         self.sensor, self.time, self.of = of.name, time, of
         self.names, self.x_world, self.marker_set = names, x_world, marker_set
-        self.weight = np.ones(len(names)) / np.square(of.sigma)
+        self.weight = 1.0 / np.square([of.each.get(name, of.sigma) for name in names])
         self._points: tuple[Body, PointSet] | None = None
 
     def points_of(self, body: Body) -> PointSet:
@@ -134,9 +138,11 @@ class MarkerMatched(Matched):
 
 
 def of_points(body: Body, points: PointSet, square: NDArray) -> Evidence:
-    """Evidence of points with squared residuals (K,) in variances."""
+    """Evidence of points with squared residuals (..., K) in variances, NaN for those that were not seen."""
     above = body.tree.parents[points.segments]
-    at_joint = (above >= 0) & (np.linalg.norm(points.points, axis=1) < _AT_JOINT)
-    segment, far = np.concatenate([points.segments, above[at_joint]]), square >= AGREES**2
-    far = np.concatenate([far, far[at_joint]])
-    return Evidence(*(SHOWN * np.bincount(segment[which], minlength=len(body.tree.segments)) for which in (~far, far)))
+    at_joint = np.flatnonzero((above >= 0) & (np.linalg.norm(points.points, axis=1) < _AT_JOINT))
+    speaks = np.zeros((len(points), len(body.tree.segments)))
+    speaks[np.arange(len(points)), points.segments] = SHOWN
+    speaks[at_joint, above[at_joint]] += SHOWN
+    with np.errstate(invalid="ignore"):
+        return Evidence((square < AGREES**2) @ speaks, (square >= AGREES**2) @ speaks)

@@ -26,7 +26,6 @@ from kinefit.solvers.bundle.cameras import (
     robust_cost,
 )
 from kinefit.solvers.bundle.shape import PixelFrames, ShapeParameters
-from kinefit.solvers.equations import dense_pattern
 from kinefit.solvers.least_squares import LEAST_SCALED_DAMPING, relax
 
 _TOLERANCE = 1e-3  # share of the cost that a last iteration takes away
@@ -89,7 +88,7 @@ def fit_body_and_cameras(
     tree, n, p = model.body.tree, model.body.tree.n_dofs, len(model.mean)
     groups, size = len(model.body.scale_groups), len(start.rig) * COLUMNS
     posture = POSTURE * tree.posture_precision
-    chain, depth = dense_pattern(n) if tree.coupled else (tree.chain, tree.depth)
+    chain, depth, _ = tree.coupled_pattern
     shape_prior = model.prior
     precision, freedom = prior.precision, prior.freedom
     owner = frames.points.segments

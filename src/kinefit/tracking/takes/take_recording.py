@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from kinefit.images.depth_scene import background_model
 from kinefit.initialization.from_silhouettes import coarse_to_fine
 from kinefit.motion import UP_AXES
 from kinefit.multiview.people import PersonTrack
-from kinefit.observations import DepthFrame, DepthVideo, MarkerFrame, Markers, SilhouetteFrame
+from kinefit.observations import DepthFrame, DepthVideo, NamedMarkers, SilhouetteFrame
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
@@ -29,34 +29,6 @@ from kinefit.tracking.recording import Recording, spread
 
 _EMPTY = 30  # images of an empty scene that are looked at: more add nothing
 _SIZES, _FIRST = 4, 5.0  # depth images from which a person's size is found, spread over so much of the beginning [s]
-
-
-@dataclass(frozen=True, eq=False)
-class NamedMarkers:
-    """A marker recording with the names that a body's marker set has for its labels.
-
-    Parameters
-    ----------
-    sensor : name of the sensor
-    markers : Markers, with those names
-    marker_set : of the body, "" for its landmarks
-    time_offset : float [s]
-    std : (K,) [m] by which the set's markers may sit elsewhere on this person; None where the body has their places
-    """
-
-    sensor: str
-    markers: Markers
-    marker_set: str
-    time_offset: float
-    std: NDArray | None
-
-    def at(self, time: float) -> MarkerFrame | None:
-        """The frame nearest to a time [s], None where there is none within half a frame."""
-        k = round((time - self.time_offset) * self.markers.rate)
-        if not 0 <= k < len(self.markers):
-            return None
-        own = k / self.markers.rate + self.time_offset
-        return MarkerFrame(self.sensor, own, self.markers.names, self.markers.positions[k], self.marker_set)
 
 
 def recording_of(
@@ -101,10 +73,9 @@ def recording_of(
             problem = f"{sensor} shares no time with the take's steps, {times[0]:.2f} to {times[-1]:.2f} s"
             raise ObservationError(problem, remedy="Set its time_offset, or the take's frames.")
     recording = Recording(
-        times, rate, rig, steps=steps, sigma=_sigma(take, seen, stereo), markers=tuple(m.markers for m in marked),
-        marker_sets=tuple((m.marker_set, m.std) for m in marked), depth=_first_depth(depth, seen),
-        on_body=tuple(v.sensor for v in depth if v.on_body), backgrounds=_backgrounds(depth), start=start, up=take.up,
-        name=take.name, sensors=_surface_sensors(take, seen),
+        times, rate, rig, steps=steps, sigma=_sigma(take, seen, stereo), markers=tuple(marked),
+        depth=_first_depth(depth, seen), on_body=tuple(v.sensor for v in depth if v.on_body),
+        backgrounds=_backgrounds(depth), start=start, up=take.up, name=take.name, sensors=_surface_sensors(take, seen),
     )  # fmt: skip
     if seen.keypoints:
         bare = not (videos or marked or recording.sensors)  # else what a network lifted adds nothing
