@@ -1,20 +1,19 @@
-"""Error bars of real marker takes: a marker that is left out lies inside them: `python -m benchmarks.markers markers_left_out`.
+"""Error bars of real marker takes against markers that are left out: `python -m benchmarks.markers markers_left_out`.
 
 Subject: `fit_marker_subject` of other takes of the same person. They give the size, and every marker's place on its
 segment; of the take itself no marker's place is calibrated. Then, of every third marker in turn: the take is tracked
 without it (`track`, smoothed), and its place, carried by the fitted motion, is compared with where it was seen, along
 each axis of the world. What is stated has three parts: the deviation of that point of the body (a segment without a
-joint of its own, welded to the marker's segment at its place, so that `Motion.joint_std` has it); what the take's other
-markers show that a marker is off by, in all frames and in each (bias, drift and jitter of `sensor noise`), since they
-were calibrated on the same other takes; and how far the marker moved on its segment in those (`MarkerSubject.sigma`),
-where that is more. Markers that were wrongly labelled in the file (`benchmarks.marker_takes`) are put right.
+joint of its own, welded to the marker's segment at its place, so that `Motion.joint_std` has it); how well the other
+takes determine the marker's place (`MarkerSubject.place_std`); and what the take's other markers show that a marker is
+off by, in all frames and in each (bias, drift and jitter of `sensor noise`), or how far the marker moved on its segment
+in the other takes (`MarkerSubject.sigma`), whichever is more.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,29 +31,24 @@ GROUPS = {
     "trunk": ("pelvis", "lumbar", "torso", "thorax", "head", "neck", "clavicle"),
     "arms": ("upperarm", "forearm", "hand"), "thighs": ("thigh",), "shanks": ("shank",), "feet": ("foot", "toes"),
 }  # fmt: skip
-STANFORD = "forces_nimblephysics/subject4/{}.trc"
-TAKES = {
-    "squats": (("static1", "walking1"), "squats1"), "walk": (("static1", "squats1"), "walking2"),
-    "jump": (("static1", "squats1"), "DJ2"),
+STANFORD, BMC, PYCGM = "forces_nimblephysics/subject4/{}.trc", "markers_bmc_run/run/ExpData/{}.trc", "markers_pycgm/{}"
+CASES = {
+    "squats": (STANFORD, ("static1", "walking1"), "squats1"),
+    "walk": (STANFORD, ("static1", "squats1"), "walking2"),
+    "jump": (STANFORD, ("static1", "squats1"), "DJ2"),
+    "run": (BMC, ("static_run",), "motion_capture_run"),
+    "plug-in-gait": (PYCGM, ("Test_Files/Static_trial.c3d",), "Test_Files/Movement_trial.c3d"),
 }  # fmt: skip
-"""Name: takes that calibrate, and the take that is asked, of one person in one session."""
-
-OTHERS = {
-    "run of BMClab": (("markers_bmc_run/run/ExpData/static_run.trc",), "markers_bmc_run/run/ExpData/motion_capture_run.trc"),
-    "plug-in-gait": (
-        ("markers_pycgm/Test_Files/Static_trial.c3d",), "markers_pycgm/Test_Files/Movement_trial.c3d",
-    ),
-}  # fmt: skip
-"""Static trial alone before a take of another laboratory: its markers are where they were put, in one posture."""
+"""Name: where a person's takes lie, those that calibrate, and the one that is asked. The last two know a static trial
+alone: their markers' places come from one posture."""
 
 
 def run() -> None:
     """Print how often markers that are left out lie inside their stated 95 % intervals."""
-    cases = {name: (tuple(STANFORD.format(n) for n in some), STANFORD.format(one)) for name, (some, one) in TAKES.items()}
     inside: dict[str, list[NDArray]] = {group: [] for group in GROUPS}
     absent, takes = [], {}
-    for name, (known, asked) in list((cases | OTHERS).items())[: amount(None, 1)]:
-        paths = [data(path) for path in (*known, asked)]
+    for name, (folder, known, asked) in list(CASES.items())[: amount(None, 1)]:
+        paths = [data(folder.format(file)) for file in (*known, asked)]
         if None in paths:
             absent.append(name)
             continue
@@ -96,8 +90,10 @@ def left_out(known: Sequence[Markers], take: Markers) -> dict[str, tuple[str, ND
         s = body.tree.segment(welded(label))
         noise = motion.provenance["sensor noise"]["markers"]
         own = sum(noise[f"{part} [m]"] ** 2 for part in ("bias", "drift", "jitter"))
-        stated = np.sqrt(motion.joint_std[:, s] ** 2 + max(own, subject.sigma[k] ** 2))
-        z = (take.positions[:, take.names.index(label)] - motion.segment_poses()[:, s, :3, 3]) / stated
+        Ts = motion.segment_poses()[:, s]
+        place = np.square(Ts[:, :3, :3]) @ subject.place_std[k] ** 2
+        stated = np.sqrt(motion.joint_std[:, s] ** 2 + max(own, subject.sigma[k] ** 2) + place)
+        z = (take.positions[:, take.names.index(label)] - Ts[:, :3, 3]) / stated
         out[label] = body.tree.segments[body.tree.parents[s]], z[np.isfinite(z).all(axis=1)]
     return out
 

@@ -240,7 +240,7 @@ class FrameFit:
         s, n = self.settings, self.body.tree.n_dofs
         if s.skin_shift <= 0.0 or n == 6 or all(m.of_points for m in matched):
             return np.zeros((n, n))
-        _, surface, points = rows_by_kind(scene, matched, None, 0, without)
+        _, surface, points = _kinds(scene, matched, None, 0, without)
         if not surface:
             return np.zeros((n, n))
         skin = skin_of(scene, surface, s.skin_shift, s.skin_turn, matched)
@@ -284,7 +284,7 @@ def rows_of(
     points : rows of points that are not among the matches
     without : of each match the segments (S,) bool whose rows weigh nothing
     """
-    parts, surface, points = rows_by_kind(scene, matched, scale, points, without)
+    parts, surface, points = _kinds(scene, matched, scale, points, without)
     if not surface or takes_surfaces_for_exact(scene, settings, points):
         return [*parts, *surface]
     return [*parts, skin_of(scene, surface, settings.skin_shift, settings.skin_turn).rows()]
@@ -295,7 +295,7 @@ def takes_surfaces_for_exact(scene: Scene, settings: TrackSettings, points: int)
     return settings.skin_shift <= 0.0 or points < scene.body.tree.n_dofs
 
 
-def rows_by_kind(
+def _kinds(
     scene: Scene, matched: Sequence[Matched], scale: Mapping[str, float] | None, points: int, without: Without
 ) -> tuple[list[AnyRows], list[Rows], int]:
     """Rows of all but surfaces, rows of surfaces, and how many of points there are."""

@@ -12,7 +12,7 @@ which is what remains once e is eliminated.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -68,30 +68,6 @@ class Skin:
     def exact_information(self) -> NDArray:
         """(n, n) Jᵀ H J where surfaces are taken for exact."""
         return self.jacobian.reshape(-1, self.n).T @ (self.exact @ self.jacobian).reshape(-1, self.n)
-
-    def shown(
-        self, spread: NDArray, alone: Callable[[NDArray], NDArray], *, exact: bool
-    ) -> tuple[NDArray, NDArray]:
-        """The surfaces' own errors (S, 6) that rows show where segments contradict each other, and their variances.
-
-        Normal equations of pose and errors together, about a fit. Its gradient vanishes: that of points is what that of
-        surfaces lacks; where surfaces are exact, they alone are asked.
-
-        Parameters
-        ----------
-        spread : (6,) [m, rad] standard deviations of the errors before anything is seen, not those of the fit
-        alone : information (n, n) of surfaces -> covariance of the pose, with all else that is known
-        exact : whether the fit took surfaces for exact
-        """
-        H, J, before = self.exact, self.jacobian, np.diag(spread**-2.0)
-        given = np.linalg.inv(H + before)  # covariance of the errors, the pose given
-        g = np.einsum("sij,sj->si", H + np.diag(self.sigma**-2.0), self.sigma**2 * self.g)
-        kept = before @ given
-        P = alone(J.reshape(-1, self.n).T @ (kept @ H @ J).reshape(-1, self.n))
-        pull = np.einsum("sin,si->n", J, np.einsum("sij,sj->si", kept, g) - (0.0 if exact else self.g))
-        errors = np.einsum("sij,sj->si", given, g - np.einsum("sij,sjn,n->si", H, J, P @ pull))
-        by_pose = given @ H @ J
-        return errors, np.einsum("sii->si", given) + np.einsum("sin,nm,sim->si", by_pose, P, by_pose, optimize=True)
 
     @property
     def pushes(self) -> NDArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure
-from kinefit.frame.fit import rows_by_kind, rows_of_points, takes_surfaces_for_exact
+from kinefit.frame.fit import rows_of_points, takes_surfaces_for_exact
 from kinefit.frame.results import ANYWHERE
-from kinefit.frame.skin import Skin, skin_of
+from kinefit.frame.skin import skin_of
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channel_residuals import ChannelResiduals
@@ -23,12 +23,10 @@ from kinefit.smoothing.spool import Spool
 from kinefit.solvers.bundle.border_frames import gram
 from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, product
 from kinefit.solvers.trajectory.variance_components import VarianceComponents, variance_components
-from kinefit.subject.parameters import place_spread
 
 _RIGID = 1e-6, 1e-6  # [m], [rad] of a body without joints: it is its surface, and no bone lies below
 _EXACT = 1e-4  # [m] as good as 0
 _LEVERAGE_FRAMES = 40  # of a take, in which the leverage of each channel is computed
-_SURFACE_FRAMES, _SURFACE_ROUNDS = 16, 10  # that tell how far surfaces are off; it changes by hardly 1 % from then on
 _STATED_LOOKS = 5.0  # channels along one axis, nothing of which is followed, that a stated lasting error counts for
 
 
@@ -104,13 +102,9 @@ def other_noise(
     T = len(roots)
     upper = np.triu_indices(body.tree.n_dofs)
     information, skins, lasting = np.zeros((3, T, len(upper[0])))
-    settings = others.settings
-    stated_skin = max(settings.skin_shift, _EXACT), settings.skin_turn  # also where the fit takes surfaces for exact
-    if not body.tree.coordinates:
-        stated_skin = _RIGID
-    spread = surface_spread(body, others, matched, roots, angles, pixels, stated_skin) if surfaces else None
     residuals, pushes = ChannelResiduals(), Spool[list[_Push]]()
     hidden, stated = defaultdict[str, list[NDArray]](list), defaultdict[str, list[NDArray]](list)
+    independent = set[str]()
     looked_at = set(np.linspace(0, T - 1, min(_LEVERAGE_FRAMES, T)).astype(int).tolist())
     for f in range(T):
         scene, surface, pushed = others.scene(f, roots, angles), list[Rows](), list[_Push]()
@@ -126,14 +120,16 @@ def other_noise(
                 information[f] += gram(J, w[:, None] * J)[upper]
                 pushed.append((m.sensor, *_summed(at, w[:, None] * J, w)))
                 stated[m.sensor].append(np.vstack([at, m.lasts / rows.weight[felt]]))
+                independent |= {m.sensor} if m.independent else set()
         if surface:
-            skin = skin_of(scene, surface, *stated_skin, matched[f])
+            settings = others.settings
+            beside = max(settings.skin_shift, _EXACT), settings.skin_turn
+            skin = skin_of(scene, surface, *(beside if body.tree.coordinates else _RIGID), matched[f])
             exact = takes_surfaces_for_exact(scene, settings, int(others.points[f]) + rows_of_points(scene, matched[f]))
             information[f] += (skin.exact_information if exact else skin.information)[upper]
-            if spread is not None:
-                skin = replace(skin, sigma=spread)  # of the errors; H' stays as the fit has it
-                whole = skin.exact_pushes if exact else skin.pushes
-                skins[f] += gram(whole, whole)[upper]
+            if surfaces:
+                pushed_by_skin = skin.exact_pushes if exact else skin.pushes
+                skins[f] += gram(pushed_by_skin, pushed_by_skin)[upper]
         if f in looked_at:
             alone = covariance_alone(body, scene.state, _square(information[f]) + pixels(f))
             for sensor, at, push, weight in pushed:
@@ -143,7 +139,8 @@ def other_noise(
     for sensor, (values, _) in residuals.arrays(T).items():
         leverage = _means(hidden[sensor], values.shape[1:]).mean(axis=1)
         one = variance_components(values, others.times, leverage=leverage, jitter_leverage=leverage / (2 * half + 1))
-        found[sensor], variance[sensor] = one, _lasting(one, leverage, _means(stated[sensor], values.shape[1:]))
+        found[sensor] = one
+        variance[sensor] = _lasting(one, leverage, _means(stated[sensor], values.shape[1:]), sensor in independent)
     for f, (near, sums) in enumerate(_window_means(pushes, half, variance, body.tree.n_dofs)):
         pushed_by = [skins[near].mean(axis=0)]
         for sensor, mean in sums.items():
@@ -154,43 +151,15 @@ def other_noise(
     return OtherNoise(information, lasting, found)
 
 
-def surface_spread(
-    body: Body, others: OtherSensors, matched: Sequence[tuple[Matched, ...]], roots: NDArray, angles: NDArray,
-    pixels: Callable[[int], NDArray], stated: tuple[float, float],
-) -> NDArray:  # fmt: skip
-    """(6,) [m, rad] standard deviations by which segments' surfaces are shifted and turned about their bones.
-
-    Segments are joined, so that their surfaces' errors contradict each other: of some frames that tells how large they
-    are, beginning with what is stated (`place_spread`). Of a body without joints it stays as stated.
-    """
-    seen = list[tuple[Skin, Callable[[NDArray], NDArray], bool]]()
-    spread = np.repeat(stated, 3)
-    frames = np.unique(np.linspace(0, len(roots) - 1, min(_SURFACE_FRAMES, len(roots))).astype(int))
-    for f in frames if body.tree.coordinates else ():
-        scene = others.scene(f, roots, angles)
-        points, surface, count = rows_by_kind(scene, matched[f], others.scale, int(others.points[f]), None)
-        if surface:
-            known = pixels(f) + normal_equations(body, scene.state, points).matrix
-            exact = takes_surfaces_for_exact(scene, others.settings, count)
-            alone = lambda H, known=known, state=scene.state: covariance_alone(body, state, known + H)
-            seen.append((skin_of(scene, surface, *stated, matched[f]), alone, exact))
-    for _ in range(_SURFACE_ROUNDS if seen else 0):
-        found = [skin.shown(spread, alone, exact=exact) for skin, alone, exact in seen]
-        moved, variance = np.sqrt(np.mean([e**2 for e, _ in found], axis=0)), np.mean([v for _, v in found], axis=0)
-        parts = (slice(0, 3), stated[0]), (slice(3, 6), stated[1])
-        of_parts = [place_spread(moved[:, p], variance[:, p], float(spread[p][0]), value) for p, value in parts]
-        spread = np.repeat(of_parts, 3)
-    return spread
-
-
-def _lasting(found: VarianceComponents, leverage: NDArray, stated: NDArray) -> NDArray:
+def _lasting(found: VarianceComponents, leverage: NDArray, stated: NDArray, independent: bool) -> NDArray:
     """(C, A) variance of what lasts: as estimated, and what is stated beyond it as far as residuals do not show it.
 
-    Residuals of channels and axes (C, A) of which a fit follows the shares `leverage` (C,) say as much as so many
-    channels of which it follows nothing; what is stated counts for `_STATED_LOOKS` of them.
+    Residuals of independent channels, of which a fit follows the shares `leverage` (C,), say as much as so many
+    channels of which it follows nothing; what is stated counts for `_STATED_LOOKS` of them. What channels have in
+    common a fit follows: there all that is stated counts.
     """
     estimated = found.lasting[:, None] ** 2
-    looks = stated.shape[1] * float(np.sum(np.clip(1.0 - leverage, 0.0, 1.0)))
+    looks = stated.shape[1] * float(np.sum(np.clip(1.0 - leverage, 0.0, 1.0))) if independent else 0.0
     unseen = _STATED_LOOKS / (_STATED_LOOKS + looks)
     return np.asarray(estimated + unseen * np.maximum(stated - estimated, 0.0))
 
