@@ -3,11 +3,11 @@
 Subject: `fit_marker_subject` of other takes of the same person. They give the size, and every marker's place on its
 segment; of the take itself no marker's place is calibrated. Then, of every third marker in turn: the take is tracked
 without it (`track`, smoothed), and its place, carried by the fitted motion, is compared with where it was seen, along
-each axis of the world. What is stated has three parts: the deviation of that point of the body (a segment without a
-joint of its own, welded to the marker's segment at its place, so that `Motion.joint_std` has it); how well the other
-takes determine the marker's place (`MarkerSubject.place_std`); and what the take's other markers show that a marker is
-off by, in all frames and in each (bias, drift and jitter of `sensor noise`), or how far the marker moved on its segment
-in the other takes (`MarkerSubject.sigma`), whichever is more.
+each axis of the world. What is stated has two parts. One is the deviation of that point of the body: a segment without
+a joint of its own is welded to the marker's segment at its place, so that `Motion.joint_std` has it. The other is what
+a marker is off by, as the take's other markers show it (bias, drift and jitter of `sensor noise`): their places were
+calibrated on the same other takes, so that their bias has the deviation of a place. It is at least as much as the
+marker moved on its segment in those takes (`MarkerSubject.sigma`). Infinite deviations are left out.
 """
 
 from __future__ import annotations
@@ -58,10 +58,10 @@ def run() -> None:
             inside[group].append(np.abs(z) <= SIGMAS)
             print(f"#   {name}, {label} ({segment}): {100 * np.mean(np.abs(z) <= SIGMAS):.0f} %, error over deviation "
                   f"{np.sqrt(np.mean(z**2)):.2f}")  # fmt: skip
-        takes[name] = np.concatenate([np.abs(z).ravel() <= SIGMAS for _, z in found.values()])
+        takes[name] = np.concatenate([np.abs(z) <= SIGMAS for _, z in found.values()])
         print(f"# {name}: {len(found)} markers, {100 * takes[name].mean():.1f} % inside", flush=True)
     reason = f"recordings absent: {', '.join(absent)}" if absent else ""
-    shares = {g: 100 * float(np.mean(np.concatenate([i.ravel() for i in some]))) for g, some in inside.items() if some}
+    shares = {g: 100 * float(np.mean(np.concatenate(some))) for g, some in inside.items() if some}
     for group in GROUPS:
         value = None if reason else shares.get(group)
         figure(f"left_out_markers_inside_{group}_least", value, "%", ">= 90", reason, whole=EVERY == 3)
@@ -72,7 +72,7 @@ def run() -> None:
 
 
 def left_out(known: Sequence[Markers], take: Markers) -> dict[str, tuple[str, NDArray]]:
-    """Label: its segment, and (F, 3) how many stated deviations it was seen from where the motion has it."""
+    """Label: its segment, and how many stated deviations it was seen from where the motion has it, (N,) of all axes."""
     subject = fit_marker_subject(load_body("humanoid"), known)
     points, body = subject.points, with_points(subject)
     take = middle(take)
@@ -90,11 +90,11 @@ def left_out(known: Sequence[Markers], take: Markers) -> dict[str, tuple[str, ND
         s = body.tree.segment(welded(label))
         noise = motion.provenance["sensor noise"]["markers"]
         own = sum(noise[f"{part} [m]"] ** 2 for part in ("bias", "drift", "jitter"))
-        Ts = motion.segment_poses()[:, s]
-        place = np.square(Ts[:, :3, :3]) @ subject.place_std[k] ** 2
-        stated = np.sqrt(motion.joint_std[:, s] ** 2 + max(own, subject.sigma[k] ** 2) + place)
-        z = (take.positions[:, take.names.index(label)] - Ts[:, :3, 3]) / stated
-        out[label] = body.tree.segments[body.tree.parents[s]], z[np.isfinite(z).all(axis=1)]
+        stated = np.sqrt(motion.joint_std[:, s] ** 2 + max(own, subject.sigma[k] ** 2))
+        z = (take.positions[:, take.names.index(label)] - motion.segment_poses()[:, s, :3, 3]) / stated
+        z = z[np.isfinite(z) & np.isfinite(stated)]
+        if len(z):
+            out[label] = body.tree.segments[body.tree.parents[s]], z
     return out
 
 

@@ -55,7 +55,6 @@ class MarkerSubject:
     scales : (G,) of the generic body.
     scale_std : (G,) standard deviation of each.
     sigma : (K,) [m] how far each marker moved on its segment, along each axis.
-    place_std : (K, 3) [m] standard deviation of each marker's place along its segment's axes.
     moved : (K,) [m] how far each marker was found from where the set has it; far ones may be mislabelled.
     rms : float [m] of all residuals (lengths) of the frames used, outliers left out.
     frames : how many were used.
@@ -66,7 +65,6 @@ class MarkerSubject:
     scales: NDArray
     scale_std: NDArray
     sigma: NDArray
-    place_std: NDArray
     moved: NDArray
     rms: float
     frames: int
@@ -153,12 +151,12 @@ def fit_marker_subject(
         sigma = np.clip(_noise(residuals, len(chosen), body.tree.n_dofs), floor, _MOST)
         progress("marker offsets", turn + 1, _ROUNDS)
     inlier, scales = residuals < 5.0 * 1.7 * sigma, np.exp(theta[:groups])
-    whole, shifts = body.scaled(scales), theta[groups:].reshape(-1, 3)
+    whole = body.scaled(scales)
     named = {**whole.marker_sets, **fitted.marker_sets}
     return MarkerSubject(
         replace(whole, marker_sets=named), placed.name, scales, scales * found.std[:groups], sigma,
-        found.std[groups:].reshape(-1, 3), np.linalg.norm(shifts, axis=1),
-        float(np.sqrt(np.mean(residuals[inlier] ** 2))), len(chosen),
+        np.linalg.norm(theta[groups:].reshape(-1, 3), axis=1), float(np.sqrt(np.mean(residuals[inlier] ** 2))),
+        len(chosen),
     )  # fmt: skip
 
 
