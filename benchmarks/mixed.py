@@ -1,9 +1,10 @@
 """Sensors together, through take files.
 
-`python -m benchmarks.mixed [--quick] [--draws N] [--each K] [--mixes A,B] [--only GROUP] [--no-log]`.
+`python -m benchmarks.mixed [--quick] [--draws N] [--first N] [--each K] [--mixes A,B] [--only GROUP] [--no-log]`.
 
 Groups, each with its figures: "sensors" (each sensor helps), "intervals" (the truth lies inside the stated 95 %
-interval), "smoothing" (it helps every mix), "misfit" (sensors whose calibrations do not fit each other), "real" (a
+interval), "alone" (the same of markers and of silhouettes alone, smoothed, where it is asked for), "smoothing" (it
+helps every mix), "misfit" (sensors whose calibrations do not fit each other), "real" (a
 second sensor never harms the balancing trial), "memory" (what each frame of a long take needs). The first three are of
 simulated takes: see `benchmarks.mixed_takes` for the person, motion and sensors, `benchmarks.mixed_runs` for the mixes
 and conditions, `benchmarks.mixed_figures` for definitions. True surface: Anny; fitted body: the catalogue's humanoid of
@@ -24,7 +25,8 @@ from kinefit.assets import anny_files
 from kinefit.errors import AssetError
 
 SIMULATED = {
-    "sensors": mixed_figures.sensors, "intervals": mixed_figures.intervals, "smoothing": mixed_figures.smoothing,
+    "sensors": mixed_figures.sensors, "intervals": mixed_figures.intervals, "alone": mixed_figures.alone,
+    "smoothing": mixed_figures.smoothing,
 }  # fmt: skip
 GROUPS = (*SIMULATED, "misfit", "real", "memory")
 DRAWS, QUICK_DRAWS, QUICK_SECONDS = 30, 1, 0.4
@@ -35,12 +37,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.mixed", description="Figures of sensors together.")
     parser.add_argument("--quick", action="store_true", help="one draw, short takes, fewer runs; within two minutes")
     parser.add_argument("--draws", type=int, default=None, help=f"simulated takes (default {DRAWS})")
+    parser.add_argument("--first", type=int, default=0, help="number of the first draw (default 0)")
+    parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
     parser.add_argument("--each", type=int, help="so many takes of each draw, in turn, in place of all: of intervals")
     parser.add_argument("--mixes", help=f"only some of {', '.join(MIXES)}, separated by commas")
     parser.add_argument("--only", choices=GROUPS, help="one group of figures")
     parser.add_argument("--no-log", action="store_true", help="do not write the figures to the log")
     told = parser.parse_args()
-    groups = (told.only,) if told.only else GROUPS
+    groups = (told.only,) if told.only else tuple(group for group in GROUPS if group != "alone")
     draws = told.draws or (QUICK_DRAWS if told.quick else DRAWS)
     simulated = [group for group in groups if group in SIMULATED]
     if simulated:
@@ -54,10 +58,12 @@ def main() -> None:
         if unknown := set(mixes) - set(MIXES):
             parser.error(f"no mix {', '.join(sorted(unknown))}; there are: {', '.join(MIXES)}")
         runs = [run for run in mixed_figures.runs_of(simulated, told.quick) if run[0] in mixes]
-        if told.each is not None and (simulated != ["intervals"] or told.each < 1):
-            parser.error("--each K, at least one, goes with --only intervals: other figures compare takes of a draw")
+        if told.each is not None and (simulated not in (["intervals"], ["alone"]) or told.each < 1):
+            parser.error("--each K, at least one, goes with --only intervals or alone: others compare takes of a draw")
         begin = time.perf_counter()
-        outcomes = track_draws(draws, round(RATE * (QUICK_SECONDS if told.quick else SECONDS)), runs, told.each)
+        frames = round(RATE * (QUICK_SECONDS if told.quick else SECONDS))
+        which = range(told.first, told.first + draws)
+        outcomes = track_draws(which, frames, runs, told.each, told.workers)
         print(f"# {draws} draws, {told.each or len(runs)} takes of each, {time.perf_counter() - begin:.0f} s")
         mixed_figures.table(outcomes)
         for group in simulated:

@@ -28,6 +28,7 @@ PAIRS = (
     ("cameras", "cameras_silhouettes"), ("cameras", "cameras_depth"), ("cameras", "cameras_markers"),
     ("cameras_silhouettes", "all"), ("cameras_depth", "all"), ("cameras_markers", "all"),
 )  # fmt: skip
+ALONE = ("markers_alone", "markers_sparse", "silhouettes_alone")
 QUICK = ("cameras", "markers_alone")  # mixes of which a take needs a second
 SAMPLES, FEWEST, SIGMAS = 2000, 200, 1.96
 NOISE = 0.3  # [m/s²] that no smoothing need improve
@@ -106,6 +107,22 @@ def intervals(told: Told) -> None:
     figure("runs_that_failed", float(len(missing)), "runs", "== 0")
     if missing:
         print(f"# {whole}")
+
+
+def alone(told: Told) -> None:
+    """Print how often the truth lies inside the stated 95 % interval of takes of one kind of sensor, by group."""
+    for mix, draws in ((mix, told[mix, "smoothed"]) for mix in ALONE if (mix, "smoothed") in told):
+        outcomes, reason = _of(told, (mix, "smoothed"))
+        shares: dict[str, list[float]] = {"joints": [], "angles": []}
+        for (group, what), counts in _counts(draws if outcomes else []).items():
+            low, value, high = _interval(lambda rows: rows[:, 0].sum() / max(rows[:, 1].sum(), 1.0), counts, sides=2)
+            print(f"# {mix} {group} {what}: {100 * value:.1f} % ({100 * low:.1f} to {100 * high:.1f})")
+            shares[what].append(100 * value)
+        print(f"# {mix}: {len(outcomes)} draws", flush=True)
+        for what, values in shares.items():
+            name = f"{mix}_{what}_inside"
+            figure(f"{name}_lowest_group", min(values, default=None), "%", ">= 90", reason)
+            figure(f"{name}_highest_group", max(values, default=None), "%", "<= 98", reason)
 
 
 def smoothing(told: Told) -> None:
@@ -209,7 +226,7 @@ def _mean(values: Sequence[float] | NDArray) -> float:
 def runs_of(groups: Sequence[str], quick: bool) -> list[Run]:
     """Runs that some groups of figures need; quickly, what the sensors add, and all conditions of two fast mixes."""
     mixes = [mix for mix in MIXES if not quick or mix in QUICK]
-    out: list[Run] = []
+    out: list[Run] = [(mix, "smoothed") for mix in ALONE if "alone" in groups]
     if "sensors" in groups:
         out += [(mix, "smoothed") for mix in dict.fromkeys(name for pair in PAIRS for name in pair)]
     if "smoothing" in groups:

@@ -147,7 +147,7 @@ def spoiled(recording: Recording, draw: int) -> Recording:
 
 def draw_runs(draw: int, frames: int, runs: Sequence[Run]) -> dict[Run, Outcome | str]:
     """Record one draw, and track it in every run."""
-    recording, out = record(draw, frames), {}
+    recording, out = record(draw, frames, depth=any("depth" in MIXES[mix] for mix, _ in runs)), {}
     seen = {mix: observable(recording.truth, recording.rig, MIXES[mix]) for mix in dict.fromkeys(m for m, _ in runs)}
     with tempfile.TemporaryDirectory() as work:
         for mix, condition in runs:
@@ -177,13 +177,15 @@ def some_of(runs: Sequence[Run], draw: int, each: int | None) -> list[Run]:
     return [runs[mixed[(draw * each + k) % len(runs)]] for k in range(each)]
 
 
-def track_draws(draws: int, frames: int, runs: Sequence[Run], each: int | None = None, workers: int = 2) -> Told:
+def track_draws(
+    draws: range, frames: int, runs: Sequence[Run], each: int | None = None, workers: int = 2
+) -> Told:  # fmt: skip
     """All runs of all draws, or so many of each, in as many processes of one thread each."""
     os.environ |= dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    told: list[dict[Run, Outcome | str]] = [{} for _ in range(draws)]
+    told: list[dict[Run, Outcome | str]] = [{} for _ in draws]
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        jobs = {pool.submit(draw_runs, draw, frames, some_of(runs, draw, each)): draw for draw in range(draws)}
+        jobs = {pool.submit(draw_runs, draw, frames, some_of(runs, draw, each)): k for k, draw in enumerate(draws)}
         for done, job in enumerate(as_completed(jobs), 1):
             told[jobs[job]] = job.result()
-            print(f"  {done} of {draws} draws", end="\r", file=sys.stderr, flush=True)
+            print(f"  {done} of {len(draws)} draws", end="\r", file=sys.stderr, flush=True)
     return {run: [one.get(run) for one in told] for run in runs}

@@ -149,8 +149,11 @@ def moved(name: str, body: Body, frames: int, random: np.random.Generator) -> Mo
     return replace(motion, Ts_world_root=T)
 
 
-def record(draw: int, frames: int = round(RATE * SECONDS)) -> Recording:
-    """One draw: person, motion, errors of calibration and sensors; the same number gives the same."""
+def record(draw: int, frames: int = round(RATE * SECONDS), *, depth: bool = True) -> Recording:
+    """One draw: person, motion, errors of calibration and sensors; the same number gives the same.
+
+    Without depth images, which take nearly all of the time, where no take has any.
+    """
     random = np.random.default_rng([13, draw])
     names = (EXERCISE, *(n for n, entry in MOTIONS.items() if data(entry[0]) is not None))
     truth = moved(names[draw % len(names)], person(random), frames, random)
@@ -161,13 +164,16 @@ def record(draw: int, frames: int = round(RATE * SECONDS)) -> Recording:
     told = Rig(tuple(camera.with_pose(_error(random) @ camera.T_camera_world) for camera in both))
     bare = SimulatedScene(truth, truth.body.skin)  # type: ignore[arg-type]
     masks = np.array([[_mask(bare, i, camera, random) for i in range(len(truth))] for camera in rig])
+    if not depth:
+        none = np.zeros((0, *SENSOR.size[::-1]), np.uint16)
+        return Recording(truth, both, told, detected(truth, both, draw), masks, none, none, _markers(truth, random))
     around = replace(bare, room=room(truth, front))
-    depth = _counts(simulate_depth(truth, front, SENSOR, seed=draw, scene=around), len(truth))
+    video = _counts(simulate_depth(truth, front, SENSOR, seed=draw, scene=around), len(truth))
     T = np.array(truth.Ts_world_root)
     T[:, 1, 3] -= AWAY
     gone = replace(around, motion=replace(truth, Ts_world_root=T))
     empty = _counts(simulate_depth(gone.motion, front, SENSOR, seed=draw + 10_000, scene=gone), EMPTY)
-    return Recording(truth, both, told, detected(truth, both, draw), masks, depth, empty, _markers(truth, random))
+    return Recording(truth, both, told, detected(truth, both, draw), masks, video, empty, _markers(truth, random))
 
 
 def detected(

@@ -1,17 +1,24 @@
 """Information and lasting errors of other sensors are those of their definitions."""
 
+from copy import copy
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from kinefit import MarkerFrame, Recording
+from kinefit.bodies.surfaces import body_mesh, segment_middles
+from kinefit.frame.fit import rows_of
+from kinefit.frame.results import ANYWHERE
 from kinefit.geometry.camera import Rig
-from kinefit.sensors.base import rows_at
+from kinefit.rows import Rows
+from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import squat_and_wave
 from kinefit.smoothing import sensor_noise
 from kinefit.smoothing.linearised import squares_of
 from kinefit.smoothing.smoother import as_tracked
-from kinefit.solvers.equations import design
+from kinefit.solvers.equations import block_diagonal, design, normal_equations
 from kinefit.tracking.run import run
 
 HALF = 3
@@ -39,7 +46,7 @@ def test_information_and_lasting_errors_are_sums_over_rows_and_frames(tracked):
     found = sensor_noise.other_noise(
         body, take.others, matched, take.roots, take.angles, lambda f: none, half=HALF
     )  # fmt: skip
-    pushes, stated, channels = [], {}, {}
+    pushes, stated, channels, followed = [], {}, {}, {}
     for f, several in enumerate(matched):
         scene, information = take.others.scene(f, take.roots, take.angles), np.zeros((n, n))
         pushes.append({})
@@ -47,18 +54,83 @@ def test_information_and_lasting_errors_are_sums_over_rows_and_frames(tracked):
             (rows,) = rows_at(m, scene)
             J, w = design(body, scene.state, rows), rows.weight * squares_of(rows)[1]
             information += J.T @ (w[:, None] * J)
+            posterior = np.linalg.inv(
+                information + block_diagonal(np.eye(6) / ANYWHERE**2, body.tree.posture_precision)
+            )
+            left = 1.0 - np.sum((np.eye(len(J)) - J @ posterior @ (w[:, None] * J).T) ** 2, axis=1)
             for i, group in enumerate(rows.group):
                 channel = channels.setdefault(m.channels[group], len(channels))
                 pushes[-1][channel, i % 3] = w[i] * J[i]
                 stated.setdefault((channel, i % 3), []).append(m.lasts / rows.weight[i])
+                followed.setdefault(channel, []).append(left[i])
         assert np.allclose(found.pooled(f, 0)[0], information, rtol=1e-9, atol=1e-9 * information.max())
     (components,) = found.components.values()
+    unseen = 5.0 / (5.0 + 3.0 * sum(1.0 - np.mean(values) for values in followed.values()))  # of what is stated
+    assert 0.03 < unseen < 0.3
     for f in range(T):
         near = pushes[max(f - HALF, 0) : f + HALF + 1]
         expected, shared = np.zeros((n, n)), np.zeros((3, n))
         for (channel, axis), values in stated.items():
             mean = sum((of.get((channel, axis), np.zeros(n)) for of in near), np.zeros(n)) / len(near)
             shared[axis] += components.shared[0][axis] * mean
-            expected += max(components.lasting[channel] ** 2, np.mean(values)) * np.outer(mean, mean)
+            lasting = components.lasting[channel] ** 2
+            lasting += unseen * max(np.mean(values) - lasting, 0.0)
+            expected += lasting * np.outer(mean, mean)
         expected += shared.T @ shared
-        assert np.allclose(found.pooled(f, 0)[1], expected, rtol=1e-8, atol=1e-9 * expected.max())
+        assert np.allclose(found.pooled(f, 0)[1], expected, rtol=1e-4, atol=1e-5 * expected.max())
+
+
+class Surface(Matched):
+    """Points of two segments' surfaces, each 5 mm off along its normal."""
+
+    sensor, of_points, error = "surface", False, 0.0
+
+    def __init__(self, body, state, seed):
+        random = np.random.default_rng(seed)
+        self.segment = np.repeat([body.tree.segment("thigh_r"), body.tree.segment("shank_r")], 40)
+        centre = body.tree.segment_poses(state.T_world_root[None], state.angles[None])[0, self.segment, :3, 3]
+        self.point = centre + random.normal(0.0, 0.1, (80, 3))
+        normal = random.normal(size=(80, 3))
+        self.normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+    def rows(self, scene):
+        return [Rows.of(self.segment, self.point, self.normal, 0.005 + self.error, 1.0 / 0.01**2)]
+
+
+@pytest.mark.parametrize("points", [0, 100])
+def test_surfaces_move_the_pose_as_refitting_does(tracked, points):
+    body, take, _ = tracked
+    T, n, settings = len(take.roots), body.tree.n_dofs, TrackSettings()
+    others = replace(take.others, points=np.full(T, points), scale={})
+    matched = [(Surface(body, others.scene(f, take.roots, take.angles).state, f),) for f in range(T)]
+    none = np.zeros((n, n))
+    found = sensor_noise.other_noise(body, others, matched, take.roots, take.angles, lambda f: none, half=0)
+    scene, (surface,) = others.scene(5, take.roots, take.angles), matched[5]
+    information, lasting = found.pooled(5, 0)
+    alone = sensor_noise.covariance_alone(body, scene.state, information)
+
+    def equations(error):
+        """That a fit solves, with the surface elsewhere by an error [m] of each row."""
+        moved = copy(surface)
+        moved.error = error
+        return normal_equations(body, scene.state, rows_of(scene, [moved], settings, points=points))
+
+    as_it_is = equations(0.0)
+    expected = np.zeros((n, n))
+    for segment in np.unique(surface.segment):
+        centre = middle_of(scene, body, segment)
+        arm = np.cross(surface.point - centre, surface.normal)
+        for lever, sigma in ((surface.normal, settings.skin_shift), (arm, settings.skin_turn)):
+            for k in range(3):
+                error = np.where(surface.segment == segment, sigma * lever[:, k], 0.0)
+                answer = alone @ (equations(error).gradient - as_it_is.gradient)
+                expected += np.outer(answer, answer)
+    assert np.allclose(alone @ lasting @ alone, expected, rtol=1e-4, atol=1e-6 * expected.max())
+    assert np.allclose(information, as_it_is.matrix, rtol=1e-6, atol=1e-6 * as_it_is.matrix.max())
+
+
+def middle_of(scene, body, segment):
+    """(3,) [m] middle of a segment's surface, in the world."""
+    mesh = body_mesh(body)
+    middle = segment_middles(mesh.vertices, mesh.segment, len(body.tree.segments))[segment]  # in the world at rest
+    return scene.frames[segment, :9].reshape(3, 3) @ middle + scene.frames[segment, 9:]

@@ -18,7 +18,15 @@ from kinefit.sensors.points.markers import MarkerMeasurement, MarkerSensor
 from kinefit.solvers.bundle.border_frames import differences
 from kinefit.subject.lasting import Seen, excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
-from kinefit.subject.parameters import KNOWN_SIZE, UNKNOWN_SIZE, PointOffsets, SegmentScales, World, stacked
+from kinefit.subject.parameters import (
+    KNOWN_SIZE,
+    UNKNOWN_SIZE,
+    PointOffsets,
+    SegmentScales,
+    World,
+    place_spread,
+    stacked,
+)
 from kinefit.subject.sensor_parameters import CameraExtrinsics, OwnUnknowns
 
 
@@ -200,3 +208,17 @@ def test_errors_of_a_surface_last_over_a_segment():
 def test_a_few_rows_tell_nothing_of_their_errors():
     frames = [[seen("rope", [ParameterRows(np.zeros(1, int), np.full(1, 5.0), np.ones(1))])] for _ in range(5)]
     assert excess(frames, 0.0) == {}
+
+
+@pytest.mark.parametrize("true", [0.003, 0.008, 0.03])
+def test_the_spread_of_places_is_that_of_the_truth(true):
+    random, noise, spread = np.random.default_rng(4), 0.002, 0.01
+    measured_at = random.normal(0.0, true, 400) + random.normal(0.0, noise, 400)
+    for _ in range(50):
+        share = spread**2 / (spread**2 + noise**2)
+        spread = place_spread(share * measured_at, np.full(400, share * noise**2), spread, 0.01)
+    assert spread == pytest.approx(true, rel=0.2)
+
+
+def test_places_that_nothing_measures_spread_as_is_believed():
+    assert place_spread(np.zeros(9), np.full(9, 0.02**2), 0.02, 0.01) == pytest.approx(0.01)

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from tests.oracle import rig_around
 
-from kinefit import Keypoints, Markers, load_body
+from kinefit import Keypoints, MarkerFrame, Markers, load_body, track
 from kinefit.geometry.camera import Rig
 from kinefit.observations import NamedMarkers
+from kinefit.simulation import squat_and_wave
 from kinefit.subject.parameters import KnownLengths, PointOffsets, SegmentScales, World
 from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.subject.subject import Subject
@@ -102,3 +103,19 @@ def test_surfaces_tell_lengths_only_where_points_do_not(lengths, expected):
 
 def test_a_body_of_known_size_leaves_nothing_to_find():
     assert of_all(a_recording(), SIZED.body, size=False, lengths=True, surfaces=True) is None
+
+
+def test_markers_places_are_as_far_off_as_the_take_shows():
+    random = np.random.default_rng(2)
+    motion = squat_and_wave(BODY, rate=5.0, duration=3.0)
+    points = BODY.markers("HANIM_45")
+    z = {}
+    for off in (0.004, 0.016):
+        worn = replace(points, points=points.points + random.normal(0.0, off, points.points.shape))
+        x = motion.positions(worn) + random.normal(0.0, 0.001, (len(motion), len(points), 3))
+        steps = [[MarkerFrame("m", t, points.names, at, "HANIM_45")] for t, at in zip(motion.times, x)]
+        found = track(Recording.of_frames(steps, Rig(()), rate=5.0, up=motion.up), BODY)
+        error = found.segment_poses()[..., :3, 3] - motion.segment_poses()[..., :3, 3]
+        known = np.isfinite(found.joint_std)
+        z[off] = np.sqrt(np.mean((error / found.joint_std)[known] ** 2))
+    assert all(0.42 < value < 1.1 for value in z.values()), z

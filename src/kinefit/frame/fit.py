@@ -285,9 +285,14 @@ def rows_of(
     without : of each match the segments (S,) bool whose rows weigh nothing
     """
     parts, surface, points = _kinds(scene, matched, scale, points, without)
-    if surface and settings.skin_shift > 0.0 and points >= scene.body.tree.n_dofs:
-        return [*parts, skin_of(scene, surface, settings.skin_shift, settings.skin_turn).rows()]
-    return [*parts, *surface]
+    if not surface or takes_surfaces_for_exact(scene, settings, points):
+        return [*parts, *surface]
+    return [*parts, skin_of(scene, surface, settings.skin_shift, settings.skin_turn).rows()]
+
+
+def takes_surfaces_for_exact(scene: Scene, settings: TrackSettings, points: int) -> bool:
+    """Whether a fit with so many rows of points leaves out that surfaces lie only about where they should."""
+    return settings.skin_shift <= 0.0 or points < scene.body.tree.n_dofs
 
 
 def _kinds(

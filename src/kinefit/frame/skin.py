@@ -65,6 +65,11 @@ class Skin:
         return self.jacobian.reshape(-1, self.n).T @ (self.H @ self.jacobian).reshape(-1, self.n)
 
     @property
+    def exact_information(self) -> NDArray:
+        """(n, n) Jᵀ H J where surfaces are taken for exact."""
+        return self.jacobian.reshape(-1, self.n).T @ (self.exact @ self.jacobian).reshape(-1, self.n)
+
+    @property
     def pushes(self) -> NDArray:
         """(7 S, n) how each standard deviation of the surface's error pushes the degrees of freedom."""
         return self._pushes(self.H)

@@ -21,7 +21,7 @@ from kinefit.sensors.base import Measurement
 from kinefit.sensors.points.markers import MarkerMeasurement, MarkerSensor
 from kinefit.sensors.settings import MARKER_LOSS
 from kinefit.subject import fit as joint
-from kinefit.subject.parameters import PointOffsets, SegmentScales
+from kinefit.subject.parameters import PointOffsets, SegmentScales, place_spread
 from kinefit.subject.subject import SubjectFit
 
 Progress = Callable[[str, int, int], None]
@@ -29,16 +29,14 @@ Progress = Callable[[str, int, int], None]
 _LEAST, _MOST = 0.005, 0.03  # [m] no marker is held to be better fixed or looser than this
 _FAR = 0.5  # share of its distance from the set's place that a marker's spread is at least
 _SLIDES = 0.1  # share of a marker's spread: one on soft parts, which may sit anywhere, slides more than one on a bone
-_INDEPENDENT = 1.0
-"""How many frames with errors of their own all the frames of one trial count for.
-
-What a marker is off by lasts: skin slides with the posture, and a joint is not quite a ball or a hinge. So many frames
-tell little more than their extremes do. Of 0.5, 1, 2, 4, 16 and 80 the joint centres of four laboratories' subjects are
-met best from 0.5 to 2 (15 to 16 mm, as they are); by 16 they are led astray (20 mm). This and the constants above were
-chosen in eight rounds on the same twelve pairs of trials that `benchmarks.markers_fit` reports on: its figures are no
-test on recordings that were held back.
-"""
 _SIZES = 0.3, 3.0  # of a person, as a share of the generic body's: beyond is a wrong unit
+_SAME = 0.2
+"""[rad] all angles together: in postures that differ by less, skin has slid alike, and a frame more tells nothing.
+
+Of 0, 0.2, 0.4 and 0.8 the knees and ankles of two laboratories' subjects are met best with it: 16.8, 13.3, 14.6 and 13.7
+mm. This and the constants above were chosen on trials that `benchmarks.markers_fit` reports on: its figures are no test
+on recordings that were held back.
+"""
 _POSTURES = 40  # random ones, in which the generic body's distances are looked up
 _RATE = 30.0  # [Hz] enough to follow a person from frame to frame
 _ENOUGH = 300  # frames of a trial, of which the most different are taken
@@ -133,7 +131,7 @@ def fit_marker_subject(
     lengths, groups = SegmentScales(generic, known, size), len(body.scale_groups)
     sigma = floor = np.hypot(_LEAST, _SLIDES * placed.spread)
     theta = np.concatenate([lengths.mean, np.zeros(3 * len(placed.points))])
-    fitted = generic.scaled(np.exp(lengths.mean))
+    fitted, wider = generic.scaled(np.exp(lengths.mean)), 1.0
     for turn in range(_ROUNDS):
         looseness = np.hypot(sigma, placed.spread) if turn == 0 else sigma
         roots, angles, good = _all_poses(fitted, fitted.markers(placed.name), x, starts, looseness)
@@ -143,13 +141,16 @@ def fit_marker_subject(
         if turn == 0:
             theta[groups:] = _moved(fitted, fitted.markers(placed.name), roots[good], angles[good], x[good]).ravel()
         away = np.linalg.norm(theta[groups:].reshape(-1, 3), axis=1)
-        spread = np.maximum(placed.spread, _FAR * away)  # one that sits elsewhere is believed, if it does so lastingly
+        # One that sits elsewhere is believed, if it does so lastingly.
+        spread = np.maximum(wider * placed.spread, _FAR * away)
         found = joint.fit_subject(
             generic, Rig(()), [_measured(placed, x[f], sigma) for f in chosen],
             [BodyState(roots[f], angles[f]) for f in chosen], (lengths, PointOffsets(generic, placed.name, spread)),
-            start=theta, reach=joint.REACH[-1:], rounds=1, looks=_INDEPENDENT * sum(len(p) > 0 for p in parts),
+            start=theta, reach=joint.REACH[-1:], rounds=1,
         )  # fmt: skip
         theta, fitted = found.mean, found.body
+        stated = np.repeat(placed.spread, 3)
+        wider = place_spread(theta[groups:] / stated, np.square(found.std[groups:] / stated), wider, 1.0)
         residuals = _residuals(found, placed.name, x[chosen])
         sigma = np.clip(_noise(residuals, len(chosen), body.tree.n_dofs), floor, _MOST)
         progress("marker offsets", turn + 1, _ROUNDS)
@@ -258,7 +259,7 @@ def _spread_frames(seen: NDArray, angles: NDArray, good: NDArray, count: int) ->
     a = angles[usable]
     chosen = [int(np.argmax(seen[usable].sum(axis=1)))]
     distance = np.sum((a - a[chosen[0]]) ** 2, axis=1)
-    while len(chosen) < count:
+    while len(chosen) < count and distance.max() > _SAME**2:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.sum((a - a[chosen[-1]]) ** 2, axis=1))
     return np.sort(usable[chosen])

@@ -103,6 +103,7 @@ class Matched(ABC):
     of_points : whether its rows are single points, each with errors of its own; else those of one segment err alike.
     shows_surface : whether it shows a surface as a whole, and so what is not where it should be.
     lasts : share 0..1 of a point's stated variance that lasts, and so does not average out over time
+    independent : whether each channel errs by itself in it, so that residuals show how much lasts
     turns : {segment: (3,) [rad] in its frame}, one standard deviation by which all that it says of a segment's surface
         is turned against the bone, for as long as the take lasts
     places : (M,) set and name of the body's points that these channels are of, "" for landmarks, where every row
@@ -115,6 +116,7 @@ class Matched(ABC):
     of_points: bool = True
     shows_surface: bool = False
     lasts: float = 0.0
+    independent: bool = False
     turns: Mapping[int, NDArray] = MappingProxyType({})
     places: Sequence[tuple[str, str]] | None = None
     cameras: NDArray | None = None

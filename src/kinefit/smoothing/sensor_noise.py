@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure
+from kinefit.frame.fit import rows_of_points, takes_surfaces_for_exact
 from kinefit.frame.results import ANYWHERE
 from kinefit.frame.skin import skin_of
 from kinefit.rows import DofRows, Rows
@@ -26,6 +27,7 @@ from kinefit.solvers.trajectory.variance_components import VarianceComponents, v
 _RIGID = 1e-6, 1e-6  # [m], [rad] of a body without joints: it is its surface, and no bone lies below
 _EXACT = 1e-4  # [m] as good as 0
 _LEVERAGE_FRAMES = 40  # of a take, in which the leverage of each channel is computed
+_STATED_LOOKS = 5.0  # channels along one axis, nothing of which is followed, that a stated lasting error counts for
 
 
 _Push = tuple[str, NDArray, NDArray, NDArray]
@@ -102,6 +104,7 @@ def other_noise(
     information, skins, lasting = np.zeros((3, T, len(upper[0])))
     residuals, pushes = ChannelResiduals(), Spool[list[_Push]]()
     hidden, stated = defaultdict[str, list[NDArray]](list), defaultdict[str, list[NDArray]](list)
+    independent = set[str]()
     looked_at = set(np.linspace(0, T - 1, min(_LEVERAGE_FRAMES, T)).astype(int).tolist())
     for f in range(T):
         scene, surface, pushed = others.scene(f, roots, angles), list[Rows](), list[_Push]()
@@ -117,13 +120,16 @@ def other_noise(
                 information[f] += gram(J, w[:, None] * J)[upper]
                 pushed.append((m.sensor, *_summed(at, w[:, None] * J, w)))
                 stated[m.sensor].append(np.vstack([at, m.lasts / rows.weight[felt]]))
+                independent |= {m.sensor} if m.independent else set()
         if surface:
-            settings = others.settings  # also where the fit takes surfaces for exact
+            settings = others.settings
             beside = max(settings.skin_shift, _EXACT), settings.skin_turn
             skin = skin_of(scene, surface, *(beside if body.tree.coordinates else _RIGID), matched[f])
-            information[f] += skin.information[upper]
+            exact = takes_surfaces_for_exact(scene, settings, int(others.points[f]) + rows_of_points(scene, matched[f]))
+            information[f] += (skin.exact_information if exact else skin.information)[upper]
             if surfaces:
-                skins[f] += gram(skin.pushes, skin.pushes)[upper]
+                pushed_by_skin = skin.exact_pushes if exact else skin.pushes
+                skins[f] += gram(pushed_by_skin, pushed_by_skin)[upper]
         if f in looked_at:
             alone = covariance_alone(body, scene.state, _square(information[f]) + pixels(f))
             for sensor, at, push, weight in pushed:
@@ -133,8 +139,8 @@ def other_noise(
     for sensor, (values, _) in residuals.arrays(T).items():
         leverage = _means(hidden[sensor], values.shape[1:]).mean(axis=1)
         one = variance_components(values, others.times, leverage=leverage, jitter_leverage=leverage / (2 * half + 1))
-        stated_here = _means(stated[sensor], values.shape[1:])
-        found[sensor], variance[sensor] = one, np.maximum(one.lasting[:, None] ** 2, stated_here)
+        found[sensor] = one
+        variance[sensor] = _lasting(one, leverage, _means(stated[sensor], values.shape[1:]), sensor in independent)
     for f, (near, sums) in enumerate(_window_means(pushes, half, variance, body.tree.n_dofs)):
         pushed_by = [skins[near].mean(axis=0)]
         for sensor, mean in sums.items():
@@ -143,6 +149,19 @@ def other_noise(
             pushed_by.append(gram(both, both)[upper])
         lasting[f] = np.sum(pushed_by, axis=0)
     return OtherNoise(information, lasting, found)
+
+
+def _lasting(found: VarianceComponents, leverage: NDArray, stated: NDArray, independent: bool) -> NDArray:
+    """(C, A) variance of what lasts: as estimated, and what is stated beyond it as far as residuals do not show it.
+
+    Residuals of independent channels, of which a fit follows the shares `leverage` (C,), say as much as so many
+    channels of which it follows nothing; what is stated counts for `_STATED_LOOKS` of them. What channels have in
+    common a fit follows: there all that is stated counts.
+    """
+    estimated = found.lasting[:, None] ** 2
+    looks = stated.shape[1] * float(np.sum(np.clip(1.0 - leverage, 0.0, 1.0))) if independent else 0.0
+    unseen = _STATED_LOOKS / (_STATED_LOOKS + looks)
+    return np.asarray(estimated + unseen * np.maximum(stated - estimated, 0.0))
 
 
 def _summed(at: NDArray, push: NDArray, weight: NDArray) -> tuple[NDArray, NDArray, NDArray]:

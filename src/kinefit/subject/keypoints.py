@@ -25,13 +25,12 @@ from kinefit.subject import fit as joint
 from kinefit.subject.gear import Gear
 from kinefit.subject.lasting import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
-from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales, World
+from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales, World, place_spread
 from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.subject.subject import Progress, Subject, SubjectFit
 from kinefit.subject.view_bias import SeenFrames, learn_view_bias
 
 _SHIFT = 0.01  # [m] how far a detector's points stand from the anatomical ones, before a take is seen
-_BELIEF = 5.0  # axes of points that this counts for
 _POSTURE = 0.1  # share of the posture prior: frames of a take are a few independent postures at the most
 _UNTOLD = 1.6  # variance of shapes found, over what they state: limits, weights and priors are taken for known there.
 # Measured on twenty known people with BODY_25B (`benchmarks.error_bars`); MEDIAPIPE_33 is the check.
@@ -111,9 +110,9 @@ def _fitted(
 
     And the detectors' bias by view, which the first round tells and the others do without.
 
-    How far points stand from where the body has them is found as MacKay (1992) finds a prior's width, beginning with
-    one centimetre, which counts as much as `_BELIEF` points seen along one axis. What a detector errs by lasts, and
-    would move cameras: their calibration counts for more by the excess of the round before.
+    How far points stand from where the body has them is found from the take (`place_spread`), beginning with one
+    centimetre. What a detector errs by lasts, and would move cameras: their calibration counts for more by the excess
+    of the round before.
     """
     spread, excess_of, start, gear, bias = _SHIFT, 1.0, None, Gear(body), ViewBias()
     bare = body if body.morphs else replace(body, surfaces=(), skin=None)  # surfaces would be stretched for nothing
@@ -144,8 +143,7 @@ def _fitted(
         covariance = inverse(prior + found.information / excess_of)
         moved, open_to = found.mean - found.prior.mean, np.isclose(np.diag(prior), spread**-2)
         open_to[of_body:] = False
-        told = float(np.sum(np.maximum(1.0 - np.diag(covariance)[open_to] / spread**2, 0.0)))
-        spread = float(np.sqrt((np.sum(moved[open_to] ** 2) + _BELIEF * _SHIFT**2) / (told + _BELIEF)))
+        spread = place_spread(moved[open_to], np.diag(covariance)[open_to], spread, _SHIFT)
         excess_of = max(excess_of, 1.0)
     prior_world = World(body, channels.rig)
     found = replace(found, body=Worlds(prior_world, parameters).at(found.mean).body, prior_world=prior_world)

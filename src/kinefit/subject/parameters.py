@@ -25,6 +25,7 @@ UNKNOWN_SIZE, KNOWN_SIZE = 0.2, 0.02
 
 _MIDDLE = 0.002  # [m] standard deviation of a point in the middle to either side
 _STEP = 1e-4  # [m, rad, logarithm] from which derivatives are taken
+_BELIEF = 5.0  # measured coordinates for which a stated spread of places counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,6 +276,21 @@ class PointOffsets:
         old = body.markers(self.name)
         moved = PointSet(old.names, old.segments, old.points + self.shifts(values))
         return replace(world, body=replace(body, marker_sets={**body.marker_sets, self.name: moved}))
+
+
+def place_spread(moved: NDArray, variance: NDArray, spread: float, believed: float) -> float:
+    """Standard deviation of how far points stand from their places on a body, as MacKay (1992) finds a prior's width.
+
+    Parameters
+    ----------
+    moved, variance : (p,) [m], [m²] found with the prior standard deviation `spread`, and how certain that is
+    spread, believed : [m] standard deviations; `believed` before a take is seen, which counts as much as five
+        coordinates that a take measures
+
+    All may be in any other unit, such as the standard deviation of each point.
+    """
+    measured = float(np.sum(np.maximum(1.0 - variance / spread**2, 0.0)))
+    return float(np.sqrt((np.sum(moved**2) + _BELIEF * believed**2) / (measured + _BELIEF)))
 
 
 def stacked(parameters: Sequence[Parameters]) -> tuple[tuple[str, ...], NDArray, NDArray, NDArray]:

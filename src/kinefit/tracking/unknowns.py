@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.geometry.camera import Rig
 from kinefit.subject.gear import Gear
-from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales, World
+from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales, World, place_spread
 from kinefit.subject.sensor_parameters import CameraExtrinsics, OwnUnknowns
-from kinefit.subject.subject import Subject
+from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.subject.surfaces import shape_of
 from kinefit.tracking.recording import Recording
 
@@ -34,6 +34,27 @@ class Unknowns:
     world: World
     parameters: tuple[Parameters, ...]
     start: NDArray
+
+    def with_places_of(self, found: SubjectFit, stated: Unknowns) -> Unknowns:
+        """The same from where a fit of them ended, with the spread of markers' places that it found.
+
+        How far the markers of a set stand from their places on this person, as a multiple of what is stated, is one
+        number of the take (`place_spread`); a multiple of 1 is believed beforehand.
+
+        Parameters
+        ----------
+        found : a fit of these unknowns
+        stated : with the spreads that are stated
+        """
+        parameters, first, variance = list(self.parameters), 0, np.diag(found.covariance)
+        for k, (one, before) in enumerate(zip(self.parameters, stated.parameters)):
+            own = slice(first, first := first + len(one.names))
+            if isinstance(one, PointOffsets) and isinstance(before, PointOffsets) and one.name in one.body.marker_sets:
+                std, factor = (1.0 / np.sqrt(np.diag(p.information)) for p in (before, one))
+                ratio = float(np.median(factor / std))
+                wider = place_spread(found.mean[own] / std, variance[own] / std**2, ratio, 1.0)
+                parameters[k] = replace(one, std=wider * np.asarray(before.std))
+        return replace(self, parameters=tuple(parameters), start=found.mean)
 
 
 def of_points(

@@ -101,6 +101,7 @@ class MarkerMatched(Matched):
     measurement: MarkerMeasurement
     loss: Loss
     lasts = 1.0  # a marker system's own noise is a tenth of what markers are off by: skin, and where they were put on
+    independent = True
 
     @property
     def sensor(self) -> str:  # type: ignore[override]
