@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -11,16 +12,17 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.limbs import limbs
 from kinefit.errors import KinefitError, TrackingError
-from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.camera import Camera
 from kinefit.initialization.depth_search import PostureSearch
 from kinefit.initialization.from_depth import Start, start_from_points
 from kinefit.initialization.from_points import pose_from_points
 from kinefit.initialization.from_rays import starts_from_rays
-from kinefit.observations import DepthFrame, Frame, PointCloud
+from kinefit.observations import DepthFrame, PointCloud, by_record
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import joined
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.surfaces.depth_view import camera_at
+from kinefit.sensors.visibility.parting import without_others
 
 GAIN = 0.01  # of the score, a hundredth of the person's pixels, that another pose must explain more
 LEAP = 0.05  # the same, for a limb that would be somewhere else: a forearm is about this much of a person
@@ -60,14 +62,11 @@ def starts_from_views(
     faced before.
     """
     starts: list[Start] = []
-    for frame in frames:
-        view = _view(scene.rig, frame)
-        if view is not None and not starts:
-            try:
-                empty = (backgrounds or {}).get(view[1].name)
-                starts = start_from_points(scene.body, *view, background=empty, up=up, count=count, forward=forward)
-            except KinefitError:
-                continue
+    for view in _views(scene, frames):
+        with suppress(KinefitError):
+            empty = (backgrounds or {}).get(view[1].name)
+            starts = start_from_points(scene.body, *view, background=empty, up=up, count=count, forward=forward)
+            break
     points, x, _ = known_points(measurements, scene)
     known = np.isfinite(x).all(axis=1)
     if known.any():
@@ -126,10 +125,12 @@ def dofs_of_limbs(body: Body, lost: NDArray) -> NDArray:
     return np.concatenate([np.zeros(6, bool), np.isin(body.tree.owners, sorted(away))])
 
 
-def _view(rig: Rig, frame: Frame) -> tuple[NDArray | None, Camera, NDArray | None] | None:
-    """Points, camera and image to search."""
-    if isinstance(frame, DepthFrame):
-        return None, rig[frame.sensor], frame.depth
-    if isinstance(frame, PointCloud) and frame.on_body and frame.segment is None and len(frame):
-        return frame.points, camera_at(frame.points, frame.viewpoint), None
-    return None
+def _views(scene: Scene, frames: Sequence[Any]) -> Iterator[tuple[NDArray | None, Camera, NDArray | None]]:
+    """Points, camera and image of all that can be searched, without the other bodies of the scene."""
+    seen = by_record(frames)
+    for frame in seen[DepthFrame]:
+        camera = scene.rig[frame.sensor]
+        yield None, camera, without_others(frame, scene.others, camera).depth
+    for cloud in seen[PointCloud]:
+        if cloud.on_body and cloud.segment is None and len(cloud):
+            yield cloud.points, camera_at(cloud.points, cloud.viewpoint), None

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
-from kinefit.observations.arrays import check_seen, frozen, numbers
+from kinefit.observations.arrays import check_seen, frozen, numbers, typical_depth
 
 _FARTHEST = 100.0  # [m] that any depth camera measures; a tenth of a metre in millimetres
-
-
-def _typical(depth: NDArray) -> float:
-    """Median [m] of what was measured in some 300 pixels of an image, 0 where that is nothing."""
-    few = depth[:: depth.shape[0] // 16 + 1, :: depth.shape[1] // 20 + 1].flatten()
-    few.sort()
-    first = int(few.searchsorted(0.0, "right"))
-    return float(few[(first + len(few)) // 2]) if first < len(few) else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +47,7 @@ class DepthFrame:
             )
         if not (depth.min() >= 0.0 and depth.max() < np.inf):
             depth[~((depth > 0.0) & (depth < np.inf))] = 0.0
-        typical = _typical(depth)
+        typical = typical_depth(depth)
         if typical > _FARTHEST:
             problem = f"millimetres taken for metres? A depth image of {self.sensor} shows things {typical:.0f} m away"
             raise ObservationError(problem, remedy="Give metres: 0.001 times an image in millimetres.")
@@ -345,3 +339,11 @@ _NAMES = {
 def sensor_of(frame: object) -> str:
     """Name of the sensor that a frame is of: where several see with one camera, with what is seen there."""
     return _NAMES.get(type(frame), "{}").format(getattr(frame, "sensor", ""))
+
+
+def by_record(frames: Iterable[Any]) -> Mapping[type, list[Any]]:
+    """Frames of one time, sorted by their record: `by_record(frames)[DepthFrame]`, empty where there is none."""
+    out = defaultdict[type, list[Any]](list)
+    for frame in frames:
+        out[type(frame)].append(frame)
+    return out
