@@ -122,11 +122,7 @@ def fitted_body(
     sigmas = [sigma.get(k.camera, KEYPOINT_SIGMA) for k in records]
     recording = Recording.of_keypoints(rig, records, sigma=sigmas, up=up)
     settings = replace(settings, view_bias=False)  # which the session's own frames do without, too
-    person = fitted_to_person(
-        recording, body, settings, subject=None, trial=None, height=height, size=True,
-        frames=None, progress=None,
-    )  # fmt: skip
-    return person.subject.body
+    return fitted_to_person(recording, body, settings, height=height).subject.body
 
 
 def _with_lifted(record: Keypoints, steps: Sequence[Sequence[Any]]) -> Keypoints:

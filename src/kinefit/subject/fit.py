@@ -102,10 +102,9 @@ def fit_subject(
     for used in range(1, rounds + 1):
         frames = MatchedFrames(worlds, steps, times, velocities, theta, states, reach[min(used, len(reach)) - 1])
         early, before = anew or used < min(len(reach), rounds), theta
-        iterations, settling = coarse if early else (_ITERATIONS, SETTLING)
         solved = solve(
-            frames, theta, states, prior, step, weighing=Weighing(shares, loss, posture), max_iterations=iterations,
-            settling=settling,
+            frames, theta, states, prior, step, weighing=Weighing(shares, loss, posture),
+            iterations=coarse if early else (_ITERATIONS, SETTLING),
         )  # fmt: skip
         theta, states, moved = solved.theta, solved.states, solved.theta - before
         if not early and solved.converged and moved @ (prior.information + solved.information) @ moved < _DONE**2:
@@ -114,9 +113,8 @@ def fit_subject(
         told = excess(frames.seen(theta, states), _followed(body, solved))
         shares = {sensor: 1.0 / max(told.get(sensor, 1.0), 1.0) for sensor in sensors}
         if min(shares.values()) < 1.0:
-            solved = solve(
-                frames, theta, states, prior, step, weighing=Weighing(shares, loss, posture), max_iterations=_ITERATIONS
-            )
+            weighing = Weighing(shares, loss, posture)
+            solved = solve(frames, theta, states, prior, step, weighing=weighing, iterations=(_ITERATIONS, SETTLING))
     world = worlds.at(solved.theta)
     return SubjectFit(
         world.body, world.rig, world.values, names, solved.theta, inverse(prior.information + solved.information),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -35,9 +35,28 @@ from kinefit.tracking.recording import spread
 from kinefit.tracking.residuals import Remains
 
 
+@dataclass(frozen=True, eq=False)
+class Estimation:
+    """How the poses of single frames become a motion.
+
+    Parameters
+    ----------
+    smooth : fit all frames together with a motion prior
+    contacts : hold the soles still where they rest on a level floor, when smoothing
+    eye : (3,) [m] of the camera that is the only sensor: soles are then held where they hardly move in its image
+    lag : [s], instead of smoothing: each frame knows of those before it, and of later ones so far ahead alone
+    noise : that is known beforehand, for a lag
+    """
+
+    smooth: bool = True
+    contacts: bool = False
+    eye: NDArray | None = None
+    lag: float | None = None
+    noise: KnownNoise | None = None
+
+
 def motion_of(
-    frames: TrackedFrames, subject: Subject, settings: TrackSettings, *, smooth: bool = True, contacts: bool = False,
-    lag: float | None = None, noise: KnownNoise | None = None, up: str = "z", eye: NDArray | None = None,
+    frames: TrackedFrames, subject: Subject, settings: TrackSettings, how: Estimation, *, up: str = "z",
     name: str = "motion", told: Mapping[str, Any] | None = None, found: Sequence[SubjectFit] = (),
 ) -> Motion:  # fmt: skip
     """The motion of what was tracked.
@@ -47,27 +66,23 @@ def motion_of(
     frames : TrackedFrames
     subject : Subject, with the body; its lengths are taken for exact where it does not tell how sure they are.
     settings : TrackSettings
-    smooth : fit all frames together with a motion prior
-    contacts : hold the soles still where they rest on a level floor, when smoothing
-    lag : [s], instead of smoothing: each frame knows of those before it, and of later ones so far ahead alone
-    noise : that is known beforehand, for a lag
     up, name : of the motion
-    eye : (3,) [m] of the camera that is the only sensor: soles are then held where they hardly move in its image
     told : what else there is to tell, for `Motion.provenance`
     found : what all sensors were fitted with together, with its covariance
     """
     body, rate, results = subject.body, frames.rate, frames.results
+    smooth, lag, eye = how.smooth, how.lag, how.eye
     provenance: dict[str, Any] = dict(told or {})
     shared = None
     matched: Sequence[tuple[Matched, ...]] | None = None  # of all sensors but the keypoints
     if smooth:
-        done = smooth_results(body, frames, settings, contacts=contacts or eye is not None, up=up, eye=eye)
+        done = smooth_results(body, frames, settings, contacts=how.contacts or eye is not None, up=up, eye=eye)
         results, take, weight, shared = done.results, done.take, done.weight, done.shared
         provenance["smoothing"] = done.provenance
         matched = done.matched
     else:
         if lag is not None:
-            results, matched, provenance["fixed lag"] = _behind(frames, body, settings, lag, noise)
+            results, matched, provenance["fixed lag"] = _behind(frames, body, settings, lag, how.noise)
         take = as_tracked(body, replace(frames, results=results), settings)
         sigma = take.channels.sigma
         weight = take.confidence / np.square(sigma) * take.factors(sigma, take.fitted(take.roots, take.angles))

@@ -29,7 +29,7 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.mobility import check_closed
 from kinefit.subject.subject import Subject
-from kinefit.tracking.motions import motion_of
+from kinefit.tracking.motions import Estimation, motion_of
 from kinefit.tracking.recovery import Recovery
 from kinefit.tracking.session import Session, axis_of, up_vector
 
@@ -195,11 +195,9 @@ class Tracker:
         if contacts and not smooth:
             raise ObservationError("contacts without smoothing", remedy="Leave smooth as it is: contacts need it.")
         frames = self._session.frames(self.body, self.scene_of, self.apart)
-        subject = Subject(self.body, np.ones(len(self.body.scale_groups)))
+        subject, how = Subject.as_is(self.body), Estimation(smooth=smooth, contacts=contacts)
         told = {"frames": {"dropped": self.dropped, "late": self.late}}
-        return motion_of(
-            frames, subject, self.settings, smooth=smooth, contacts=contacts, up=axis_of(self.up), name=name, told=told
-        )
+        return motion_of(frames, subject, self.settings, how, up=axis_of(self.up), name=name, told=told)
 
     def update(
         self, frames: Sequence[Any], time: float | None = None, *, others: Sequence[Scene] = ()

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from os import PathLike
 
-import numpy as np
-
 from kinefit._arguments import checked
 from kinefit.calibration.check.loading import load_leniently
 from kinefit.calibration.check.sensor_verdicts import sensor_findings
@@ -56,17 +54,14 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
         if seen is not None and seen.rig is not None:
             missing += lens_findings(seen.rig)
         return Check(take.name, ranked(missing), loaded.take, seen)
-    accuracy: dict[str, float] = {}
-    for entry in loaded.take.keypoints:
-        accuracy[entry.camera] = min(entry.sigma, accuracy.get(entry.camera, np.inf))
-    rig = seen.rig
+    rig, named = seen.rig, {entry.camera for entry in loaded.take.keypoints}
     with TakePictures(loaded.take, seen) as pictures:
         one = follow(rig, seen.keypoints, take.person or _SHOWS_MOST, pictures=pictures)
     seen = replace(seen, keypoints=one.keypoints)
+    begun = Check(take.name, (*loaded.findings, *_others(one, take.person is not None)), loaded.take, seen)
     check = check_keypoints(
-        rig.select(tuple(n for n in rig.names if n in accuracy)), seen.keypoints, body=take.body, up=take.up,
-        height=take.height, accuracy=accuracy, name=take.name, take=loaded.take, observations=seen,
-        found=(*loaded.findings, *_others(one, take.person is not None)), progress=progress,
+        rig.select(tuple(n for n in rig.names if n in named)), seen.keypoints, body=take.body, up=take.up,
+        height=take.height, begun=begun, progress=progress,
     )  # fmt: skip
     return _with_sensors(check, progress)
 
