@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import check_shape
 from kinefit.errors import ObservationError
 
 _SHARE = 0.5  # of an array, of which a part keeps the whole in memory; less is copied
@@ -24,8 +25,27 @@ def numbers(values: Any, dtype: type | None = float, what: str = "an observation
         raise ObservationError(problem, remedy="Give an array, or lists of numbers of one length.") from error
 
 
-def frozen(values: Any, dtype: type = float, what: str = "an observation") -> NDArray:
-    """Numbers that nobody can write: a copy, or the array itself where its owner is read-only already (`sealed`)."""
+def frozen(
+    values: Any, dtype: type = float, what: str = "an observation", shape: Sequence[int | str] | None = None,
+    file: str | None = None,
+) -> NDArray:  # fmt: skip
+    """Numbers that nobody can write: a copy, or the array itself where its owner is read-only already (`sealed`).
+
+    ObservationError where they are no numbers, or of another shape than is asked for: see `check_shape`.
+    """
+    out = _read_only(values, dtype, what)
+    if shape is not None:
+        check_shape(out, shape, what, file=file)
+    return out
+
+
+def freeze(record: object, **values: Any) -> None:
+    """Set fields of a frozen record that is being made."""
+    for name, value in values.items():
+        object.__setattr__(record, name, value)
+
+
+def _read_only(values: Any, dtype: type, what: str) -> NDArray:
     if isinstance(values, np.ndarray) and values.dtype == dtype and not values.flags.writeable:
         owner = values.base if type(values.base) is np.ndarray else values
         alone = type(owner) is np.ndarray and (owner.base is None or isinstance(owner.base, mmap))

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._arguments import checked
+from kinefit._arguments import check_shape, checked
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
@@ -93,8 +93,7 @@ def fit_subject(
     names, mean, information, step = stacked(parameters)
     worlds, prior = Worlds(World(body, rig), parameters), Prior(mean, information)
     theta = np.array(mean if start is None else start, float)
-    if theta.shape != mean.shape:
-        raise ObservationError(f"a start of shape {theta.shape}", remedy=f"Give ({len(mean)},): {', '.join(names)}.")
+    check_shape(theta, mean.shape, f"a start for {', '.join(names)}")
     sensors = tuple({m.sensor: None for several in steps for m in several})
     anew = not all(m.settled for several in steps for m in several)
     shares = {} if looks is None else dict.fromkeys(sensors, min(looks / len(steps), 1.0))

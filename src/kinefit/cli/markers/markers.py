@@ -192,7 +192,7 @@ def fit(
 ) -> None:  # fmt: skip
     """Fit a body to markers: size and marker places from all frames, then angles in each."""
     from kinefit.cli._summary import print_summary
-    from kinefit.cli.markers._fit import FORMATS, fit_file
+    from kinefit.cli.markers._fit import FORMATS, MarkerFitOptions, fit_file
     from kinefit.cli.markers._name import identify_file
 
     out = out or take.with_name(f"{take.stem}-kinefit")
@@ -205,10 +205,8 @@ def fit(
             labelled, named, files = identify_file(take, list(subjects), target, unit=unit, step=step)
             source, unit = files["markers"], None
         known = Path(body) if Path(body).suffix else body
-        found = fit_file(
-            source, known, out, static=static, marker_set=marker_set, height=height, unit=unit, up=up, limits=limits,
-            formats=chosen, step=step,
-        )  # fmt: skip
+        options = MarkerFitOptions(known, static, marker_set, height, up, limits)
+        found = fit_file(source, out, options, unit=unit, formats=chosen, step=step)
     if subjects:
         _tell(labelled, named)
     for motion, _ in found.values():
