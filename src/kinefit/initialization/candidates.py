@@ -1,4 +1,7 @@
-"""Where a body may be when nothing is known before: from markers, from keypoints of several cameras, from depth."""
+"""Where a body may be when nothing is known before: from markers, from keypoints of several cameras, from depth.
+
+A start from rays on which points lie, such as those of one camera's keypoints, and from other sensors' rows.
+"""
 
 from __future__ import annotations
 

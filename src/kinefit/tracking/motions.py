@@ -122,7 +122,7 @@ def motion_of(
         provenance[CAMERAS] = cameras
     elsewhere = any(one.cameras is not None for one in found)
     last, detectors = with_lasting_errors(
-        results, subject, take, weight, rate, noise_of_others, answers,
+        results, subject, take, weight, noise_of_others, answers,
         cameras=None if elsewhere else settings.camera_std, shared=shared,
     )  # fmt: skip
     if channels.sources:

@@ -1,4 +1,10 @@
-"""Who is who in one frame of unlabelled markers: the model's labels, each with the point it is, or none."""
+"""Who is who in one frame of unlabelled markers: the model's labels, each with the point it is, or none.
+
+What the turns of a body's joints say for and against explanations of a frame: learnt axes and limits.
+
+The search looks at a segment beside its parent alone; here whole explanations that come near each other are compared.
+A turn that a segment's own points do not tell comes from its parent's, so that toes are held by the knee's axis.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,11 @@
-"""Where else a body may be than where its contour was found: as a whole, a limb mirrored, a limb somewhere else."""
+"""Where else a body may be than where its contour was found: as a whole, a limb mirrored, a limb somewhere else.
+
+Limbs that lean towards the camera or away from it by the same angle look nearly the same: both are looked at.
+
+A segment's end mirrored in depth about its joint has nearly the same contour; only its size in the image, some percent,
+and what it hides tell one from the other (Sminchisescu and Triggs, Kinematic jump processes, CVPR 2003). A limb that
+passes through the image's plane may come out of it on either side, and be followed on the wrong one from then on.
+"""
 
 from __future__ import annotations
 

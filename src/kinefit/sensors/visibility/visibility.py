@@ -3,6 +3,12 @@
 Every segment is drawn by itself, so that at each pixel the foremost segment and what would be seen without it are
 known. A measurement supports a segment only where the body without it would not explain it as well: an arm that has
 slipped into the trunk agrees with the trunk's surface, but nothing that was measured needs it.
+
+Where limbs' segments begin: the joints between them, of which an image may show nothing.
+
+A tube that is slid along itself covers what it covered before, but for its ends. So a segment may agree with nearly all
+that was measured of it and have its joint at another place. Its first third tells: where less than half of it is seen,
+beside the image or where nothing was measured, the joint may be a sixth of the segment away: 4 cm of a forearm.
 """
 
 from __future__ import annotations
