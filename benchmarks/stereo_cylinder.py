@@ -20,7 +20,7 @@ from benchmarks.figures import amount, data, figure
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
 from kinefit.photogrammetry.region_growing import Grid, grow
-from kinefit.photogrammetry.seeding.seeds import sift_seeds
+from kinefit.photogrammetry.seeding.unaided import sift_seeds
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.states import measure_states, rigid_motion
 from kinefit.photogrammetry.surface import MeasuredSurface, measure

@@ -13,9 +13,9 @@ from numbers import Integral, Real
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from kinefit.errors import ObservationError
+from kinefit.errors import KinefitError, ObservationError
 
 F = TypeVar("F", bound=Callable[..., Any])
 Test = Callable[[Any], bool]
@@ -72,6 +72,34 @@ def renamed(**new_names: str) -> Callable[[F], F]:
         return typing.cast(F, call)
 
     return decorate
+
+
+def check_shape(
+    array: NDArray, shape: Sequence[int | str], what: str, *, finite: bool = False,
+    error: type[KinefitError] = ObservationError, file: str | None = None, remedy: str = "",
+) -> None:  # fmt: skip
+    """Raise an error that names an array of another shape than this one, in which a text stands for any length."""
+    fits = len(shape) == array.ndim and all(isinstance(m, str) or m == n for m, n in zip(shape, array.shape))
+    if not fits or (finite and not np.isfinite(array).all()):
+        wanted = f"({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"
+        problem = f"{what} of shape {array.shape}" + ", with numbers that are not finite" * fits
+        raise error(problem, file=file or None, remedy=remedy or f"Give {wanted}{', finite' * finite}.")
+
+
+def shaped(values: ArrayLike, shape: Sequence[int | str], what: str, **options: Any) -> NDArray:
+    """Contiguous floats of a shape; `options` and errors as of `check_shape`."""
+    array = np.ascontiguousarray(values, float)
+    check_shape(array, shape, what, **options)
+    return array
+
+
+def rgb_image(image: ArrayLike, what: str = "an image") -> NDArray:
+    """(H, W, 3) uint8; ObservationError for an image of another shape or type, or without pixels."""
+    pixels = np.asarray(image)
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size or pixels.dtype != np.uint8:
+        problem = f"{what} of shape {pixels.shape} and type {pixels.dtype}"
+        raise ObservationError(problem, remedy="Give (height, width, 3), RGB of uint8.")
+    return pixels
 
 
 @cache

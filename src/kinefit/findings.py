@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 Severity = Literal["fault", "doubt", "note", "good"]
 SEVERITIES: tuple[Severity, ...] = ("fault", "doubt", "note", "good")
@@ -72,13 +74,18 @@ def listed(names: Iterable[str]) -> str:
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1] if names else "none"
 
 
+def runs_of(flags: NDArray, gap: int = 1) -> list[tuple[int, int]]:
+    """(start, stop) of the runs of true flags (F,); runs with fewer than `gap` frames between them are one."""
+    return _joined(np.flatnonzero(flags), gap)
+
+
+def _joined(at: NDArray, gap: int = 1) -> list[tuple[int, int]]:
+    """(start, stop) of the runs of ascending numbers."""
+    parts = np.split(at, np.flatnonzero(np.diff(at) > max(gap, 1)) + 1) if len(at) else []
+    return [(int(part[0]), int(part[-1]) + 1) for part in parts]
+
+
 def frame_ranges(frames: Iterable[int], most: int = 12) -> str:
     """Frames in ascending order as "3, 7-9"; at most so many stretches."""
-    runs: list[list[int]] = []
-    for f in frames:
-        if runs and f == runs[-1][1] + 1:
-            runs[-1][1] = f
-        else:
-            runs.append([f, f])
-    texts = [f"{a}" if a == b else f"{a}-{b}" for a, b in runs]
+    texts = [f"{a}" if a + 1 == b else f"{a}-{b - 1}" for a, b in _joined(np.array(list(frames), int))]
     return ", ".join(texts[:most]) + (f" and {len(texts) - most} more stretches" if len(texts) > most else "")

@@ -22,7 +22,7 @@ def failing(monkeypatch):
 
         @click.command()
         @_screen.verbose_option
-        def command(verbose):
+        def command():
             raise error
 
         monkeypatch.setattr("kinefit.cli.warmup.warmup", command)

@@ -8,7 +8,7 @@ from kinefit.errors import ObservationError
 from kinefit.photogrammetry._kernels_growing import pop, push
 from kinefit.photogrammetry.matching.correlation import search_box
 from kinefit.photogrammetry.region_growing import Grid, Seeds, grow
-from kinefit.photogrammetry.seeding.seeds import sift_seeds
+from kinefit.photogrammetry.seeding.unaided import sift_seeds
 from kinefit.photogrammetry.spline_image import SplineImage
 
 DEFORM = np.array([[1.08, 0.06], [-0.05, 0.94]])

@@ -329,7 +329,7 @@ BAD = {
         ),
         "negative",
     ),
-    "a match that is no match": (lambda m, s, r: {"a": 1}, "gave a dict"),
+    "a match that is no match": (lambda m, s, r: {"a": 1}, "gave is a dict"),
     "rows that are no rows": (lambda m, s, r: RowsOf(lambda scene: np.zeros(3)), "ndarray"),
     "nothing": (lambda m, s, r: RowsOf(lambda scene: None), "NoneType"),
 }  # fmt: skip

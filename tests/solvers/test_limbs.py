@@ -80,7 +80,7 @@ def test_a_limb_is_moved_as_its_points_are():
 
 def test_bad_pairs_are_told():
     x = np.zeros((2, 3))
-    with pytest.raises(ObservationError, match="shapes"):
+    with pytest.raises(ObservationError, match="pairs of shape"):
         absolute_orientation(x, x[:1], np.ones(2), np.zeros(2, int), 1)
     with pytest.raises(ObservationError, match="not finite"):
         absolute_orientation(x + np.nan, x, np.ones(2), np.zeros(2, int), 1)

@@ -13,7 +13,7 @@ from kinefit.frame.prediction import belief
 from kinefit.losses import SQUARED, geman_mcclure, huber
 from kinefit.simulation import squat_and_wave, studio_rig
 from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.solvers.pixels import fit_pixels
+from kinefit.solvers.pixels import PixelPoints, fit_pixels
 
 BODY = load_body("humanoid")
 RIG = studio_rig(squat_and_wave())
@@ -56,7 +56,7 @@ def test_it_takes_the_steps_of_levenberg_marquardt(loss, wrong, most):
 
         fit = levenberg_marquardt(BODY, state, rows, **given)
         found, H, cost, tried = fit_pixels(
-            BODY, state, RIG, points, camera, uv, weight, loss, state, information, **given
+            BODY, state, RIG, PixelPoints(points, camera, uv, weight, loss), (state, information), **given
         )
         assert tried == fit.iterations
         assert cost == pytest.approx(fit.equations.cost, rel=1e-9)
@@ -68,6 +68,6 @@ def test_what_is_not_finite_is_left_to_those_who_tell_why():
     state, points, camera, uv, weight, information = seen(3)
     uv[0], weight[0] = np.nan, 1.0
     assert fit_pixels(
-        BODY, state, RIG, points, camera, uv, weight, SQUARED, state, information, max_iterations=5, tolerance=1e-4,
-        damping=1e-3,
+        BODY, state, RIG, PixelPoints(points, camera, uv, weight, SQUARED), (state, information), max_iterations=5,
+        tolerance=1e-4, damping=1e-3,
     ) is None  # fmt: skip

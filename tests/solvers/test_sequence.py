@@ -172,5 +172,5 @@ def test_wrong_shapes_are_told():
     states, x, _ = sway(2)
     with pytest.raises(ObservationError, match=rf"shape \(2, 5, 3\).*{len(POINTS)}, 3"):
         fit_sequence(BODY, states[0], POINTS, x[:, :5])
-    with pytest.raises(ObservationError, match="planes have shapes"):
+    with pytest.raises(ObservationError, match="of planes of shape"):
         fit_sequence(BODY, states[0], planes=Planes(POINTS, x, x[:, :5]))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from tests.tracking.movements import BODY, a_motion, a_rig
 
-from kinefit.tracking.others import OtherPeople
+from kinefit.tracking.run import OtherPeople
 
 
 def test_somebody_is_where_the_motion_has_him_at_that_time():

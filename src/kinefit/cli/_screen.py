@@ -30,14 +30,14 @@ _STYLES = {"fault": "bold red", "doubt": "yellow", "note": "cyan", "good": "gree
 
 
 def verbose_option(command: Callable) -> Callable:
-    """Add `-v` to a command."""
+    """Add `-v` to a command, which asks `is_verbose` for it."""
 
-    def remember(ctx: click.Context, parameter: click.Parameter, value: bool) -> bool:
+    def remember(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
         ctx.meta[_VERBOSE] = value
-        return value
 
     text = "Show more: the points of every camera, and where an error arose."
-    return click.option("-v", "--verbose", is_flag=True, callback=remember, help=text)(command)
+    option = click.option("-v", "--verbose", is_flag=True, expose_value=False, callback=remember, help=text)
+    return option(command)
 
 
 def token_option(command: Callable) -> Callable:

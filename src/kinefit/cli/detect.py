@@ -28,7 +28,7 @@ Examples:
 @click.option("--force", is_flag=True, help="Do it again where it is done already.")
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="Folder for videos given without a take.")
 @_screen.verbose_option
-def detect(inputs: tuple[Path, ...], people: int, masks: bool, force: bool, out: Path | None, verbose: bool) -> None:
+def detect(inputs: tuple[Path, ...], people: int, masks: bool, force: bool, out: Path | None) -> None:
     """Find people, their 33 keypoints and their outlines in every picture of the videos.
 
     Give one TAKE (.toml), or VIDEO files. A take without [[keypoints]] then needs none: `kinefit track` takes what lies

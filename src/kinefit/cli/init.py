@@ -30,7 +30,7 @@ _COLOURS = {"sure": "green", "likely": "cyan", "guess": "yellow", "open": "bold 
 @_screen.verbose_option
 def init(
     folder: Path, out: Path | None, force: bool, clicked: bool, points: Path | None, step: int | None,
-    body: str | None, browser: bool, verbose: bool,
+    body: str | None, browser: bool,
 ) -> None:
     """Write a first take file from what lies in FOLDER: calibration, videos, keypoints, markers.
 

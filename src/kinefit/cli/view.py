@@ -39,7 +39,7 @@ Examples:
 @_screen.verbose_option
 def view(
     sources: tuple[Path, ...], take: Path | None, port: int, host: str, token: str | None, browser: bool,
-    html: Path | None, verbose: bool,
+    html: Path | None,
 ) -> None:
     """Show a motion, a take or a folder of results as a 3D scene in the browser.
 

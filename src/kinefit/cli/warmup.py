@@ -25,7 +25,7 @@ _PROCESSES = 2  # more would compile the kernels that the parts share once more,
 
 @click.command(short_help="Compile the kernels now, so that the first track does not wait.", epilog=_EXAMPLES)
 @_screen.verbose_option
-def warmup(verbose: bool) -> None:
+def warmup() -> None:
     """Compile the kernels now, so that the first track does not wait; they are kept for later runs."""
     from kinefit._jit import kernel_folder
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import shaped
 from kinefit.correspondences import _kernels_surface as kernels
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
@@ -96,8 +97,4 @@ def target_rows(
 
 
 def _checked(array: NDArray, count: int, columns: int = 3) -> NDArray:
-    out = np.ascontiguousarray(array, float)
-    if out.shape != (count, columns):
-        problem = f"{count} points of a surface with an array of shape {out.shape}"
-        raise ObservationError(problem, remedy=f"Give ({count}, {columns}).")
-    return out
+    return shaped(array, (count, columns), f"{count} points of a surface with an array")

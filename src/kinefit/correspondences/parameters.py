@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import shaped
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences import targets
-from kinefit.errors import ObservationError
 from kinefit.rows import ParameterRows
 
 
@@ -59,9 +59,7 @@ def prediction_rows(body: Body, state: BodyState, predicted: BodyState, *, sigma
     sigma : (6 + D,) [m, rad]
         Standard deviation of the prediction; inf for a degree of freedom that is not predicted.
     """
-    sigma = np.asarray(sigma, float)
-    if sigma.shape != (body.tree.n_dofs,):
-        raise ObservationError(f"sigma of a prediction has shape {sigma.shape}", remedy=f"Give ({body.tree.n_dofs},).")
+    sigma = shaped(sigma, (body.tree.n_dofs,), "sigma of a prediction")
     w = targets.weights(sigma, np.ones(len(sigma), bool), "predictions")
     held = np.flatnonzero(w > 0.0)
     return ParameterRows(held, state.difference(predicted)[held], w[held])

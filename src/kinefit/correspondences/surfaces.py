@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import shaped
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.surfaces.closest.nearest import nearest_lines
 from kinefit.correspondences import _kernels, targets
 from kinefit.correspondences._kernels_surface import surface_rows as fill
-from kinefit.errors import ObservationError
 from kinefit.rows import Rows
 
 
@@ -48,16 +48,12 @@ def surface_rows(
     ObservationError
         As `nearest`; a viewpoint that is no point.
     """
-    x = np.asarray(x_world, float)
-    if x.ndim != 2:
-        raise ObservationError(f"points on surfaces have shape {x.shape}", remedy="Give (N, 3).")
-    x, present = targets.array(x, 3, len(x), "points on surfaces")
+    x = shaped(x_world, ("N", 3), "points on surfaces")
+    present = np.isfinite(x).all(axis=1)
     weight = targets.weights(sigma, present, "points on surfaces")
     eye, least = np.zeros(3), -np.inf
     if viewpoint is not None:
-        eye, least = np.asarray(viewpoint, float), 0.0
-        if eye.shape != (3,) or not np.isfinite(eye).all():
-            raise ObservationError(f"the viewpoint is no point: {viewpoint}", remedy="Give three numbers in metres.")
+        eye, least = shaped(viewpoint, (3,), "a viewpoint", finite=True), 0.0
     frames = targets.of_segments(body, state, frames)
     lines = targets.lines(x)
     distance, normal, owner = nearest_lines(body, frames, lines, max_distance, segment, exact=exact)

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import check_shape, shaped
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences import _kernels
 from kinefit.errors import ObservationError
-from kinefit.geometry.camera import Rig
+from kinefit.geometry.camera import Camera, Rig
 from kinefit.rows import Rows
 
 
@@ -51,10 +52,14 @@ def of_segments(body: Body, state: BodyState, frames: NDArray | None = None) -> 
 
 def array(values: ArrayLike, columns: int, count: int, what: str) -> tuple[NDArray, NDArray]:
     """(K, columns) contiguous floats and which rows are finite; NaN means not measured."""
-    out = np.ascontiguousarray(values, dtype=float)
-    if out.shape != (count, columns):
-        raise ObservationError(f"{what} have shape {out.shape}", remedy=f"Give ({count}, {columns}).")
+    out = shaped(values, (count, columns), what)
     return out, np.isfinite(out).all(axis=1)
+
+
+def check_depth_image(depth: NDArray, camera: Camera) -> None:
+    """ObservationError for a depth image of another size than its camera's."""
+    remedy = "Give the camera of this image, or camera.scaled(size)."
+    check_shape(depth, camera.size[::-1], f"a depth image of camera {camera.name}", remedy=remedy)
 
 
 def lines(vectors: NDArray) -> NDArray:

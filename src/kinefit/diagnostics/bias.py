@@ -31,8 +31,8 @@ class CameraBias:
     bias, std : (2,) [px]
         Median of predicted minus seen, with its standard error, which counts each keypoint once: a detector misses a
         point of the body alike in every frame.
-    alone, alone_std : (2,) [px]
-        The same, predicted from the other cameras only; NaN where these are fewer than two.
+    alone : (2,) [px]
+        The bias, predicted from the other cameras only; NaN where these are fewer than two.
     spread : float [px]
         Median distance of the points from the bias.
     outliers : float
@@ -45,7 +45,6 @@ class CameraBias:
     bias: NDArray
     std: NDArray
     alone: NDArray
-    alone_std: NDArray
     spread: float
     outliers: float
     count: int
@@ -65,14 +64,14 @@ def camera_biases(views: KeypointViews) -> tuple[CameraBias, ...]:
         used = agree[:, :, c] & np.isfinite(x[..., 0])
         d = np.where(used[..., None], camera.project(x) - views.uv[:, :, c], np.nan)
         bias, std = _middle(d)
-        alone = alone_std = np.full(2, np.nan)
+        alone = np.full(2, np.nan)
         if len(views.rig) > 2:
-            alone, alone_std = _middle(from_others(views, c) - views.uv[:, :, c], limit=views.limit)
+            alone, _ = _middle(from_others(views, c) - views.uv[:, :, c], limit=views.limit)
         apart = np.linalg.norm(d - bias, axis=-1)[used]
         told = seen & np.isfinite(x[..., 0])
         out.append(
             CameraBias(
-                camera.name, bias, std, alone, alone_std, float(np.median(apart)) if len(apart) else np.nan,
+                camera.name, bias, std, alone, float(np.median(apart)) if len(apart) else np.nan,
                 1.0 - float(used.sum() / told.sum()) if told.any() else np.nan, int(used.sum()),
             )
         )  # fmt: skip

@@ -61,7 +61,7 @@ class Check:
     """
 
     name: str
-    findings: tuple[Finding, ...]
+    findings: tuple[Finding, ...] = ()
     take: Take | None = None
     observations: Observations | None = None
     views: KeypointViews | None = None
@@ -89,11 +89,7 @@ def check_keypoints(
     body: str | Body = "humanoid",
     up: str = "z",
     height: float | None = None,
-    accuracy: Mapping[str, float] | None = None,
-    name: str = "take",
-    take: Take | None = None,
-    observations: Observations | None = None,
-    found: tuple[Finding, ...] = (),
+    begun: Check | None = None,
     quick: bool = False,
     progress: Progress | None = None,
 ) -> Check:
@@ -106,20 +102,21 @@ def check_keypoints(
     body : name or file of the body whose bone lengths give the person's height, or the body.
     up : str, vertical axis of the world.
     height : float [m] stature, where it is known.
-    accuracy : {camera: [px]} of the keypoints; default 8.
-    take, observations : that the keypoints are of, for remedies and for the images that they are in.
-    found : findings made before, kept among the others.
+    begun : name, take and observations that the keypoints are of, for their standard deviations, remedies and images;
+        its findings are kept among the others.
     quick : bool, whether a second must do: clocks are compared in the liveliest of some stretches of the recording,
         left and right in some frames.
     """
-    file, step = take.path if take else Path(f"{name}.toml"), progress or (lambda *_: None)
-    findings, known = [*found, *lens_findings(rig)], {"take": take, "observations": observations}
+    begun = begun or Check("take")
+    take, observations = begun.take, begun.observations
+    file, step = take.path if take else Path(f"{begun.name}.toml"), progress or (lambda *_: None)
+    findings = [*begun.findings, *lens_findings(rig)]
 
     def done(what: int) -> None:
         step("checking", what, _STEPS)
 
     def ended(views: KeypointViews | None = None, **more: object) -> Check:
-        return Check(name, ranked(findings), views=views, **known, **more)  # type: ignore[arg-type]
+        return replace(begun, findings=ranked(findings), views=views, **more)  # type: ignore[arg-type]
 
     done(0)
     try:
@@ -174,7 +171,7 @@ def check_keypoints(
     findings += distortion_findings(some)
     offsets = {c.name: c.time_offset for c in take.cameras} if take else {}
     findings += time_findings(times, offsets, fast_pixels(stepped), confirmed=bool(late))
-    findings += bias_findings(biases, disagreement(some) if len(views.rig) > 2 else None, accuracy or {}, file)
+    findings += bias_findings(biases, disagreement(some) if len(views.rig) > 2 else None, _sigmas(take), file)
     findings += side_findings(views) + placement_findings(views.rig, x[np.isfinite(x).all(-1)])
     covered = coverage(some, x)
     findings += coverage_findings(covered)
@@ -182,6 +179,12 @@ def check_keypoints(
     findings = explained(findings)
     whole = None if quick else meet(views)[0]
     return ended(views, x_world=whole, biases=biases, coverage=covered, times=times, frames_late=late)
+
+
+def _sigmas(take: Take | None) -> dict[str, float]:
+    """[px] of each camera's keypoints, the least of its detectors'; empty without a take."""
+    entries = sorted(take.keypoints if take else (), key=lambda entry: -entry.sigma)
+    return {entry.camera: entry.sigma for entry in entries}
 
 
 def _thinned(record: Keypoints) -> Keypoints:

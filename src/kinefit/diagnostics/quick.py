@@ -9,7 +9,7 @@ import numpy as np
 
 from kinefit.bodies import Body
 from kinefit.diagnostics.images import fit_image
-from kinefit.diagnostics.keypoints import check_keypoints
+from kinefit.diagnostics.keypoints import Check, check_keypoints
 from kinefit.diagnostics.person import size_findings
 from kinefit.errors import KinefitError
 from kinefit.findings import FINDINGS, Finding, as_records, faults_of
@@ -43,17 +43,14 @@ def input_findings(take: Take, seen: Observations, keypoints: Sequence[Keypoints
     for entry in take.cameras:
         if entry.image in _STATED:
             findings += fit_image(entry, rig[entry.name].size, take.rate, frames=1)[1]
-    sigma: dict[str, float] = {}
-    for source in take.keypoints:
-        sigma[source.camera] = min(source.sigma, sigma.get(source.camera, np.inf))
     everybody, here = _with_somebody(seen.keypoints), _with_somebody(keypoints)
     shown = [k for k in keypoints if k.camera in here or k.camera not in everybody]  # a camera may see others alone
     cameras = tuple(name for name in rig.names if any(k.camera == name for k in shown))
     if len(cameras) > 1:
+        begun = Check(take.name, take=take, observations=seen)
         findings += check_keypoints(
-            rig.select(cameras), shown, body=body, up=take.up, height=take.height, accuracy=sigma, name=take.name,
-            take=take, observations=seen, quick=True,
-        ).findings  # fmt: skip
+            rig.select(cameras), shown, body=body, up=take.up, height=take.height, begun=begun, quick=True
+        ).findings
     return faults_of(findings)
 
 

@@ -74,11 +74,8 @@ class ErrorBarCoverage:
 
 def coverage(truth: Motion, result: Motion, *, sigmas: float = 2.0) -> ErrorBarCoverage:
     """Share of joint centres and angles whose truth lies within so many standard deviations; 0.954 is right for two."""
-    turned = _comparable(truth, result)
-    shift = np.abs(turned.segment_poses()[..., :3, 3] - truth.segment_poses()[..., :3, 3])
-    angles = angle_errors(truth, result)
-    angles = np.abs(np.where(truth.body.tree.prismatic, angles, np.radians(angles)))
-    return ErrorBarCoverage(_share(shift, sigmas * turned.joint_std), _share(angles, sigmas * turned.dof_std[:, 6:]))
+    (shift, joints), (angles, dofs) = _errors_and_bars(truth, result, sigmas)
+    return ErrorBarCoverage(_share(shift, joints), _share(angles, dofs))
 
 
 def coverage_of_groups(truth: Motion, result: Motion, *, sigmas: float = 1.96) -> dict[str, ErrorBarCoverage]:
@@ -86,19 +83,23 @@ def coverage_of_groups(truth: Motion, result: Motion, *, sigmas: float = 1.96) -
 
     A joint belongs to the group of the segment that it moves.
     """
+    (shift, joints), (angles, dofs) = _errors_and_bars(truth, result, sigmas)
+    out = {}
+    for g, name in enumerate(truth.body.scale_groups):
+        segments = truth.body.segment_scale == g
+        own = segments[truth.body.tree.owners]
+        covered = _share(shift[:, segments], joints[:, segments]), _share(angles[:, own], dofs[:, own])
+        out[name] = ErrorBarCoverage(*covered)
+    return out
+
+
+def _errors_and_bars(truth: Motion, result: Motion, sigmas: float) -> tuple[tuple[NDArray, NDArray], ...]:
+    """Errors of joint centres (F, S, 3) [m] and of angles (F, D) [rad, m], each with its bars."""
     turned = _comparable(truth, result)
     shift = np.abs(turned.segment_poses()[..., :3, 3] - truth.segment_poses()[..., :3, 3])
     angles = angle_errors(truth, result)
     angles = np.abs(np.where(truth.body.tree.prismatic, angles, np.radians(angles)))
-    out = {}
-    for g, name in enumerate(truth.body.scale_groups):
-        segments = truth.body.segment_scale == g
-        dofs = segments[truth.body.tree.owners]
-        out[name] = ErrorBarCoverage(
-            _share(shift[:, segments], sigmas * turned.joint_std[:, segments]),
-            _share(angles[:, dofs], sigmas * turned.dof_std[:, 6:][:, dofs]),
-        )
-    return out
+    return (shift, sigmas * turned.joint_std), (angles, sigmas * turned.dof_std[:, 6:])
 
 
 def _share(errors: NDArray, bars: NDArray) -> float:

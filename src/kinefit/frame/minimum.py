@@ -15,7 +15,7 @@ from kinefit.sensors.base import Matched
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.closed import Constraint, closed_fit
 from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.solvers.pixels import fit_pixels
+from kinefit.solvers.pixels import PixelPoints, fit_pixels
 
 _LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already
 _OPEN = 0.01  # [m, rad] by which a start may be off what closes it, and the first fit's standard deviation of that
@@ -78,8 +78,8 @@ def _of_keypoints(
     layout = one.measurement.layout
     if len(scene.rig) < len(layout.channels.rig):
         return None
+    seen = PixelPoints(layout.points_of(scene.body), layout.channels.camera, one.uv, one.weight, one.loss)
     fit = fit_pixels(
-        scene.body, scene.state, scene.rig, layout.points_of(scene.body), layout.channels.camera, one.uv, one.weight,
-        one.loss, *held, max_iterations=most, tolerance=tolerance, damping=_LIGHT,
-    )  # fmt: skip
+        scene.body, scene.state, scene.rig, seen, held, max_iterations=most, tolerance=tolerance, damping=_LIGHT
+    )
     return None if fit is None else Minimum(scene.at(fit[0]), *fit[1:])

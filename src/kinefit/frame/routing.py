@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, cast, get_args
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,6 @@ from kinefit.observations import (
     KEYPOINTS,
     ColourFrame,
     DepthFrame,
-    Frame,
     KeypointFrame,
     LiftedFrame,
     LineFrame,
@@ -27,6 +26,7 @@ from kinefit.observations import (
 from kinefit.observations.arrays import is_number
 from kinefit.sensors.base import Matched, Measurement, Sensor, named, rows_at
 from kinefit.sensors.channel_names import ChannelNames
+from kinefit.sensors.checks import of_kind
 from kinefit.sensors.points.image_lines import ImageLineSensor
 from kinefit.sensors.points.keypoints import KeypointSensor
 from kinefit.sensors.points.lifted import LiftedSensor
@@ -81,9 +81,10 @@ class Sensors:
             raise ObservationError(f"standard deviations of {', '.join(bad)}", remedy="Give positive ones.")
         self._sensors: dict[str, Sensor] = {}
         for sensor in own:
-            if not isinstance(sensor, Sensor) or not isinstance(sensor.name, str) or not sensor.name:
+            of_kind(sensor, Sensor, "a sensor of one's own", "Derive it from Sensor, and give it a name.")
+            if not isinstance(getattr(sensor, "name", None), str) or not sensor.name:
                 problem = f"a sensor of one's own, {type(sensor).__name__}, has no name"
-                raise ObservationError(problem, remedy="Derive it from Sensor, and give it a name.")
+                raise ObservationError(problem, remedy="Give it one, as its frames have it in `sensor`.")
             if sensor.name in self._sensors:
                 raise ObservationError(f"two sensors are named '{sensor.name}'", remedy="Give each its own name.")
             self._sensors[sensor.name] = sensor
@@ -256,9 +257,10 @@ class Sensors:
 
 
 def _checked(m: Any, sensor: str) -> Measurement:
-    if not isinstance(m, Measurement) or getattr(m, "sensor", None) != sensor:
-        problem = f"`prepare` of sensor '{sensor}' gave a {type(m).__name__}"
-        raise ObservationError(problem, remedy="It must return a Measurement with the name of its `sensor`.")
+    remedy = "It must return a Measurement with the name of its `sensor`."
+    of_kind(m, Measurement, f"what `prepare` of sensor '{sensor}' gave", remedy)
+    if getattr(m, "sensor", None) != sensor:
+        raise ObservationError(f"`prepare` of sensor '{sensor}' gave a measurement of another", remedy=remedy)
     if not np.isfinite(getattr(m, "time", np.nan)):
         raise ObservationError(f"a measurement of sensor '{sensor}' has no time", remedy="Give it in seconds.")
     return m
@@ -280,14 +282,14 @@ def time_of(frames: Sequence[Any], time: float | None, own: Sensors) -> float:
     if time is not None and not is_number(time):
         raise ObservationError(f"a time that is a {type(time).__name__}", remedy="Give seconds.")
     for frame in frames:
-        if isinstance(frame, Frame):
+        if type(frame) in own._makers:
             continue
         if not is_number(getattr(frame, "time", 0.0)):
             raise ObservationError(f"a frame whose time is a {type(frame.time).__name__}", remedy="Give seconds.")
         if isinstance(frame, Measurement):
             continue
         if not isinstance(getattr(frame, "sensor", None), str):
-            kinds = ", ".join(kind.__name__ for kind in get_args(Frame))
+            kinds = ", ".join(kind.__name__ for kind in own._makers)
             problem = f"a {type(frame).__name__} among the frames"
             raise ObservationError(problem, remedy=f"Give {kinds}, a Measurement, or a frame of a sensor of your own.")
         if frame.sensor not in own._own:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import shaped
 from kinefit.errors import ObservationError
 from kinefit.geometry._kernels_triangulation import triangulate_points
 from kinefit.geometry.camera import Rig
@@ -56,9 +57,7 @@ def triangulate_robust(
 
 
 def _run(rig: Rig, points_px: ArrayLike, weights: ArrayLike | None, limit: float) -> tuple[NDArray, NDArray, NDArray]:
-    points = np.array(points_px, dtype=float, order="C")
-    if points.ndim != 3 or points.shape[1:] != (len(rig), 2):
-        raise ObservationError(f"points have shape {points.shape}", remedy=f"Give (points, {len(rig)} cameras, 2).")
+    points = np.array(shaped(points_px, ("points", len(rig), 2), "points"))
     seen = np.isfinite(points).all(-1)
     weight = np.ones(seen.shape) if weights is None else np.array(weights, dtype=float, order="C")
     if weight.shape != seen.shape or np.any(weight[seen] < 0) or not np.isfinite(weight[seen]).all():

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import rgb_image, shaped
 from kinefit.errors import ObservationError
 from kinefit.images import _kernels_silhouette as kernels
 
@@ -30,10 +31,7 @@ def outline(mask: ArrayLike, *, level: float = _HALF) -> NDArray:
 
 def colour_mask(image: ArrayLike, low: ArrayLike, high: ArrayLike) -> NDArray:
     """(H, W) uint8, 255 where a picture (H, W, 3) has a colour between low and high (3,), without single pixels."""
-    pixels, low, high = np.asarray(image), np.asarray(low, float), np.asarray(high, float)
-    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint8 or low.shape != (3,) or high.shape != (3,):
-        problem = f"an image {pixels.shape} of {pixels.dtype} with thresholds {low.shape} and {high.shape}"
-        raise ObservationError(problem, remedy="Give (height, width, 3) of uint8, and three numbers each.")
+    pixels, (low, high) = rgb_image(image), (shaped(v, (3,), "a threshold") for v in (low, high))
     if not np.all(low <= high):
         raise ObservationError(f"thresholds {low} to {high} leave no colour", remedy="Give the lower ones first.")
     return np.asarray(cv2.morphologyEx(cv2.inRange(pixels, low, high), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)))

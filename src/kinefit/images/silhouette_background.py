@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import rgb_image
 from kinefit.errors import ObservationError
 
 _FLOOR = 3.0  # [grey levels] least noise of a camera: rounding and compression
@@ -38,14 +39,14 @@ class BackgroundPlate:
     def __init__(
         self, plate: ArrayLike, *, threshold: float = 4.0, shadow: float = 0.5, noise: float | None = None
     ) -> None:
-        self.plate = _smooth(_colour(plate))
+        self.plate = _smooth(rgb_image(plate))
         self.threshold, self.shadow, self.noise = threshold, shadow, noise
         self._square = np.einsum("ijk,ijk->ij", self.plate, self.plate) + 1.0
 
     @classmethod
     def of(cls, images: Iterable[NDArray], **options: float) -> BackgroundPlate:
         """From pictures in which the body stands at different places: their median, pixel by pixel."""
-        stack = [_colour(image) for image in images]
+        stack = [rgb_image(image) for image in images]
         if not stack:
             raise ObservationError("no pictures to learn the background from", remedy="Give ten or more.")
         return cls(np.median(stack, axis=0).astype(np.uint8), **options)
@@ -63,7 +64,7 @@ class BackgroundPlate:
         ObservationError
             A picture of another size.
         """
-        picture = _smooth(_colour(image))
+        picture = _smooth(rgb_image(image))
         if picture.shape != self.plate.shape:
             problem = f"a picture of {picture.shape[1::-1]} px, the background has {self.size}"
             raise ObservationError(problem, remedy="Take both with the same camera and settings.")
@@ -90,14 +91,6 @@ def cleaned(mask: NDArray, *, share: float = _SHARE) -> NDArray:
         small[0] = False
         out[small[labels]] = 255 - value
     return out
-
-
-def _colour(image: ArrayLike) -> NDArray:
-    picture = np.asarray(image)
-    if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
-        problem = f"a picture of shape {picture.shape} and type {picture.dtype}"
-        raise ObservationError(problem, remedy="Give (height, width, 3) of uint8.")
-    return picture
 
 
 def _smooth(picture: NDArray) -> NDArray:

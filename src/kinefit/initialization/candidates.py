@@ -1,8 +1,12 @@
-"""Where a body may be when nothing is known before: from markers, from keypoints of several cameras, from depth."""
+"""Where a body may be when nothing is known before: from markers, from keypoints of several cameras, from depth.
+
+A start from rays on which points lie, such as those of one camera's keypoints, and from other sensors' rows.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -10,17 +14,20 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.limbs import limbs
+from kinefit.correspondences import prior_rows
 from kinefit.errors import KinefitError, TrackingError
-from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.camera import Camera
 from kinefit.initialization.depth_search import PostureSearch
 from kinefit.initialization.from_depth import Start, start_from_points
 from kinefit.initialization.from_points import pose_from_points
-from kinefit.initialization.from_rays import starts_from_rays
-from kinefit.observations import DepthFrame, Frame, PointCloud
+from kinefit.observations import DepthFrame, PointCloud, by_record
+from kinefit.rows import AnyRows
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import joined
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.surfaces.depth_view import camera_at
+from kinefit.sensors.visibility.parting import without_others
+from kinefit.solvers.least_squares import levenberg_marquardt
 
 GAIN = 0.01  # of the score, a hundredth of the person's pixels, that another pose must explain more
 LEAP = 0.05  # the same, for a limb that would be somewhere else: a forearm is about this much of a person
@@ -60,14 +67,11 @@ def starts_from_views(
     faced before.
     """
     starts: list[Start] = []
-    for frame in frames:
-        view = _view(scene.rig, frame)
-        if view is not None and not starts:
-            try:
-                empty = (backgrounds or {}).get(view[1].name)
-                starts = start_from_points(scene.body, *view, background=empty, up=up, count=count, forward=forward)
-            except KinefitError:
-                continue
+    for view in _views(scene, frames):
+        with suppress(KinefitError):
+            empty = (backgrounds or {}).get(view[1].name)
+            starts = start_from_points(scene.body, *view, background=empty, up=up, count=count, forward=forward)
+            break
     points, x, _ = known_points(measurements, scene)
     known = np.isfinite(x).all(axis=1)
     if known.any():
@@ -126,10 +130,71 @@ def dofs_of_limbs(body: Body, lost: NDArray) -> NDArray:
     return np.concatenate([np.zeros(6, bool), np.isin(body.tree.owners, sorted(away))])
 
 
-def _view(rig: Rig, frame: Frame) -> tuple[NDArray | None, Camera, NDArray | None] | None:
-    """Points, camera and image to search."""
-    if isinstance(frame, DepthFrame):
-        return None, rig[frame.sensor], frame.depth
-    if isinstance(frame, PointCloud) and frame.on_body and frame.segment is None and len(frame):
-        return frame.points, camera_at(frame.points, frame.viewpoint), None
-    return None
+def _views(scene: Scene, frames: Sequence[Any]) -> Iterator[tuple[NDArray | None, Camera, NDArray | None]]:
+    """Points, camera and image of all that can be searched, without the other bodies of the scene."""
+    seen = by_record(frames)
+    for frame in seen[DepthFrame]:
+        camera = scene.rig[frame.sensor]
+        yield None, camera, without_others(frame, scene.others, camera).depth
+    for cloud in seen[PointCloud]:
+        if cloud.on_body and cloud.segment is None and len(cloud):
+            yield cloud.points, camera_at(cloud.points, cloud.viewpoint), None
+
+
+_HEADINGS = 4
+"""Headings about the vertical at which fits begin: from each a fit reaches minima within 45 degrees."""
+
+_MIN_POINTS = 6
+_ITERATIONS, _TOLERANCE = 60, 1e-4
+
+
+def starts_from_rays(
+    scene: Scene, points: PointSet, rays: NDArray, measurements: Sequence[Measurement], up: NDArray
+) -> list[BodyState]:
+    """States that fit all measurements, in order of increasing cost; none where fewer than six rays are known.
+
+    The body begins upright on the mean ray, as far away as its size on the rays says, at several headings. The rows of
+    all measurements then decide: rays alone leave a body that is smaller and nearer, a range or a contact does not.
+
+    Parameters
+    ----------
+    scene : of the body, in any state
+    points : PointSet of K points
+    rays : (K, 2, 3) origin [m] and unit direction in the world of the ray on which each point lies; NaN where unknown
+    measurements : of which all rows are used
+    up : (3,) unit, upwards in the world
+    """
+    known = np.isfinite(rays).all(axis=(1, 2))
+    if known.sum() < _MIN_POINTS:
+        return []
+    body, (origin, direction) = scene.body, rays[known].swapaxes(0, 1)
+    rest = body.positions(body.usual_state(np.eye(4)), points)[known]
+    axis = direction.mean(axis=0)
+    axis /= np.linalg.norm(axis)
+    angle = np.sqrt(np.mean(np.sum(np.square(direction - axis), axis=1)))
+
+    def rows(state: BodyState) -> list[AnyRows]:
+        here = scene.at(state, measurements=tuple(measurements))
+        return [*(r for m in measurements for r in m.match(here, np.inf).rows(here)), prior_rows(body, state)]
+
+    fits = []
+    for heading in _headings(axis, up):
+        T = np.eye(4)
+        T[:3, :3] = np.stack([heading, up, np.cross(heading, up)], axis=1)
+        x = rest @ T[:3, :3].T
+        across = (x - x.mean(axis=0)) @ (np.eye(3) - np.outer(axis, axis))
+        distance = np.sqrt(np.mean(np.sum(np.square(across), axis=1))) / max(angle, 1e-6)
+        T[:3, 3] = origin.mean(axis=0) + distance * axis - x.mean(axis=0)
+        start = body.usual_state(T)
+        fits.append(levenberg_marquardt(body, start, rows, max_iterations=_ITERATIONS, tolerance=_TOLERANCE))
+    return [fit.state for fit in sorted(fits, key=lambda fit: fit.equations.cost)]
+
+
+def _headings(axis: NDArray, up: NDArray) -> list[NDArray]:
+    """(3,) horizontal directions, the first of them against the viewing axis."""
+    forward = (axis @ up) * up - axis
+    if np.linalg.norm(forward) < 1e-6:  # seen from above
+        forward = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    forward /= np.linalg.norm(forward)
+    side = np.cross(up, forward)
+    return [np.cos(a) * forward + np.sin(a) * side for a in 2.0 * np.pi * np.arange(_HEADINGS) / _HEADINGS]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -91,8 +91,8 @@ def coarse_to_fine(
             result = fit.run(there, None, sensors.measurements(frames, there)).result
             now = result.state
         there = fits[-1][2].at(now)
-        last = [m for m in fits[-1][1].measurements(frames, there) if isinstance(m, SilhouetteMeasurement)]
-        overlap = float(np.mean([m.overlap(there) for m in last]))
+        last = fits[-1][1].measurements(frames, there)
+        overlap = float(np.mean([cast(SilhouetteMeasurement, m).overlap(there) for m in last]))
         if best is None or overlap > best.overlap + _GAIN:
             best = FarFit(result, overlap)
     assert best is not None

@@ -14,7 +14,7 @@ from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_text
 from kinefit.exporters.pictures.detections import write_detections
 from kinefit.geometry.camera import Rig
-from kinefit.observations import MEDIAPIPE_33, Detections, KeypointFrame, LiftedFrame
+from kinefit.observations import MEDIAPIPE_33, Detections, KeypointFrame, LiftedFrame, by_record
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.take.file import Take
 
@@ -58,9 +58,10 @@ class SeenRecord:
 
     def keep(self, frames: Sequence[Any]) -> None:
         """Keep what the person's cameras saw in one step."""
-        lifted = {f.sensor: f.x for f in frames if isinstance(f, LiftedFrame)}
-        for f in frames:
-            if isinstance(f, KeypointFrame) and f.names == MEDIAPIPE_33:
+        seen = by_record(frames)
+        lifted = {f.sensor: f.x for f in seen[LiftedFrame]}
+        for f in seen[KeypointFrame]:
+            if f.names == MEDIAPIPE_33:
                 x = lifted.get(f.sensor, np.full((_K, 3), np.nan))
                 row = np.concatenate([[f.time], f.uv.ravel(), f.confidence, x.ravel()])
                 try:

@@ -16,7 +16,7 @@ from kinefit.bodies import Body
 from kinefit.errors import KinefitError
 from kinefit.frame.results import FrameResult
 from kinefit.geometry.camera import Rig
-from kinefit.observations import KEYPOINT_SIGMA, KeypointFrame, Keypoints, LiftedFrame
+from kinefit.observations import KEYPOINT_SIGMA, KeypointFrame, Keypoints, LiftedFrame, by_record
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation.warm import warm_keypoints
 from kinefit.tracking.recording import Recording, keypoint_records
@@ -61,7 +61,8 @@ class LiveSize:
             return None
         if self._future is not None:
             return self._found() if self._future.done() else None
-        seen = [f for f in frames if isinstance(f, KeypointFrame | LiftedFrame)]
+        kinds = by_record(frames)
+        seen = [*kinds[KeypointFrame], *kinds[LiftedFrame]]
         if seen and result is not None and result.support > _SEEN and result.time >= self._next:
             self._steps.append(seen)
             self._next = result.time + _BETWEEN
@@ -121,19 +122,14 @@ def fitted_body(
     sigmas = [sigma.get(k.camera, KEYPOINT_SIGMA) for k in records]
     recording = Recording.of_keypoints(rig, records, sigma=sigmas, up=up)
     settings = replace(settings, view_bias=False)  # which the session's own frames do without, too
-    person = fitted_to_person(
-        recording, body, settings, subject=None, trial=None, height=height, size=True,
-        frames=None, progress=None,
-    )  # fmt: skip
-    return person.subject.body
+    return fitted_to_person(recording, body, settings, height=height).subject.body
 
 
 def _with_lifted(record: Keypoints, steps: Sequence[Sequence[Any]]) -> Keypoints:
     """The same with its points lifted to space, where there are any."""
     lifted = np.full((*record.points.shape[:3], 3), np.nan)
-    key = record.camera, record.keypoint_set, record.names
     for i, step in enumerate(steps):
-        for f in step:
-            if isinstance(f, LiftedFrame) and (f.sensor, f.keypoint_set, f.names) == key:
+        for f in by_record(step)[LiftedFrame]:
+            if (f.sensor, f.keypoint_set, f.names) == (record.camera, record.keypoint_set, record.names):
                 lifted[i, 0] = f.x
     return replace(record, lifted=lifted) if np.isfinite(lifted).any() else record

@@ -12,6 +12,7 @@ from kinefit._arguments import checked
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.marker_sets import find_placement
 from kinefit.errors import TrackingError
+from kinefit.findings import runs_of
 from kinefit.losses import Loss
 from kinefit.markers.poses import columns, sequence_both_ways
 from kinefit.motion import UP_AXES, Motion, Residuals
@@ -94,8 +95,7 @@ def _tried_anew(
     roots, angles = roots.copy(), angles.copy()
     misfit = _misfit(body, points, x, sigma, roots, angles)
     bad = misfit > max(_OFF * float(np.median(misfit)), 3.0)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], bad.astype(int), [0]]))).reshape(-1, 2)
-    for a, b in edges[np.argsort(edges[:, 0] - edges[:, 1], kind="stable")][:_MOST_RUNS]:
+    for a, b in sorted(runs_of(bad), key=lambda run: run[0] - run[1])[:_MOST_RUNS]:
         try:
             other_roots, other_angles = sequence_both_ways(body, points, x[a:b], sigma, loss=loss, limits=limits)
         except TrackingError:
@@ -125,7 +125,7 @@ def _bridged(
     before, measured = _misfit(body, points, x, sigma, roots, angles), angles
     roots, angles = np.array(roots), np.where(told | ~some, angles, meant)
     again = ~lost & ~told[:, some].all(axis=1)
-    for a, b in np.flatnonzero(np.diff(np.concatenate([[0], again.astype(int), [0]]))).reshape(-1, 2):
+    for a, b in runs_of(again):
         inside = bool(((angles[a:b] >= tree.lower) & (angles[a:b] <= tree.upper)).all())  # not in another chart
         fit = fit_sequence(  # the rest of the chain settles about what is now known
             body, BodyState(roots[a], angles[a]), points, x[a:b], sigma=sigma, loss=loss, limits=limits and inside,

@@ -33,9 +33,9 @@ _SIZES = 0.3, 3.0  # of a person, as a share of the generic body's: beyond is a 
 _SAME = 0.2
 """[rad] all angles together: in postures that differ by less, skin has slid alike, and a frame more tells nothing.
 
-Of 0, 0.2, 0.4 and 0.8 the knees and ankles of two laboratories' subjects are met best with it: 16.8, 13.3, 14.6 and 13.7
-mm. This and the constants above were chosen on trials that `benchmarks.markers_fit` reports on: its figures are no test
-on recordings that were held back.
+Of 0, 0.2, 0.4 and 0.8 the knees and ankles of two laboratories' subjects are met best with it: 16.8, 13.3, 14.6 and
+13.7 mm. This and the constants above were chosen on trials that `benchmarks.markers_fit` reports on: its figures are no
+test on recordings that were held back.
 """
 _POSTURES = 40  # random ones, in which the generic body's distances are looked up
 _RATE = 30.0  # [Hz] enough to follow a person from frame to frame

@@ -19,6 +19,7 @@ from kinefit.observations.frames import (
     MarkerFrame,
     PointCloud,
     SilhouetteFrame,
+    by_record,
     sensor_of,
 )
 from kinefit.observations.recordings import KEYPOINT_SIGMA, Keypoints, MarkerEvent, Markers, SkeletonMotion
@@ -52,5 +53,6 @@ __all__ = [
     "SkeletonMotion",
     "SurfacePointFrame",
     "SurfacePointVideo",
+    "by_record",
     "sensor_of",
 ]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import check_shape
 from kinefit.errors import ObservationError
 
 _SHARE = 0.5  # of an array, of which a part keeps the whole in memory; less is copied
@@ -24,8 +25,27 @@ def numbers(values: Any, dtype: type | None = float, what: str = "an observation
         raise ObservationError(problem, remedy="Give an array, or lists of numbers of one length.") from error
 
 
-def frozen(values: Any, dtype: type = float, what: str = "an observation") -> NDArray:
-    """Numbers that nobody can write: a copy, or the array itself where its owner is read-only already (`sealed`)."""
+def frozen(
+    values: Any, dtype: type = float, what: str = "an observation", shape: Sequence[int | str] | None = None,
+    file: str | None = None,
+) -> NDArray:  # fmt: skip
+    """Numbers that nobody can write: a copy, or the array itself where its owner is read-only already (`sealed`).
+
+    ObservationError where they are no numbers, or of another shape than is asked for: see `check_shape`.
+    """
+    out = _read_only(values, dtype, what)
+    if shape is not None:
+        check_shape(out, shape, what, file=file)
+    return out
+
+
+def freeze(record: object, **values: Any) -> None:
+    """Set fields of a frozen record that is being made."""
+    for name, value in values.items():
+        object.__setattr__(record, name, value)
+
+
+def _read_only(values: Any, dtype: type, what: str) -> NDArray:
     if isinstance(values, np.ndarray) and values.dtype == dtype and not values.flags.writeable:
         owner = values.base if type(values.base) is np.ndarray else values
         alone = type(owner) is np.ndarray and (owner.base is None or isinstance(owner.base, mmap))
@@ -54,3 +74,11 @@ def check_seen(sensor: Any, time: Any, names: Any = ()) -> None:
     if isinstance(names, str) or not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):
         problem = f"the names of '{sensor}' are a {type(names).__name__}"
         raise ObservationError(problem, remedy="Give a tuple of texts.")
+
+
+def typical_depth(depth: NDArray) -> float:
+    """Median [m] of what was measured in some 300 pixels of an image, 0 where that is nothing."""
+    few = depth[:: depth.shape[0] // 16 + 1, :: depth.shape[1] // 20 + 1].flatten()
+    few.sort()
+    first = int(few.searchsorted(0.0, "right"))
+    return float(few[(first + len(few)) // 2]) if first < len(few) else 0.0

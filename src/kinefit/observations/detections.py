@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit._image_headers import MAX_IMAGE_PIXELS
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import ImageFrame
-from kinefit.observations.arrays import frozen
+from kinefit.observations.arrays import freeze, frozen
 from kinefit.observations.recordings import Keypoints
 
 _FACE = "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer left_ear right_ear"
@@ -69,12 +69,10 @@ class Detections:
                 f"starts of masks {starts.shape} and runs {runs.shape}", file=self.source or None,
                 remedy="Give (frames, people, 33, 2), (frames, people, 33), (frames * people + 1,) starts, (N,) runs.",
             )
-        lifted = None if self.lifted is None else frozen(self.lifted)
-        if lifted is not None and lifted.shape != (*points.shape[:3], 3):
-            raise ObservationError(
-                f"detections of camera {self.camera} have shape {points.shape} with lifted landmarks {lifted.shape}",
-                file=self.source or None, remedy="Give (frames, people, 33, 3).",
-            )  # fmt: skip
+        lifted = self.lifted
+        if lifted is not None:
+            what = f"lifted landmarks of camera {self.camera}"
+            lifted = frozen(lifted, float, what, (*points.shape[:3], 3), self.source)
         ends = np.concatenate([[0], np.cumsum(runs, dtype=np.int64)])[starts]
         sizes, pixels = np.diff(ends)[np.diff(starts) > 0], math.prod(self.size)
         if min(self.size) < 1 or pixels > MAX_IMAGE_PIXELS or np.any(sizes != pixels):
@@ -82,11 +80,7 @@ class Detections:
                 f"masks of {', '.join(map(str, np.unique(sizes)[:3])) or 'no'} pixels in images of {self.size}",
                 file=self.source or None, remedy="Give runs that sum up to the image's pixels.",
             )  # fmt: skip
-        object.__setattr__(self, "points", points)
-        object.__setattr__(self, "confidence", confidence)
-        object.__setattr__(self, "mask_runs", runs)
-        object.__setattr__(self, "mask_starts", starts)
-        object.__setattr__(self, "lifted", lifted)
+        freeze(self, points=points, confidence=confidence, mask_runs=runs, mask_starts=starts, lifted=lifted)
 
     def within(self, first: int, frames: int) -> Detections:
         """The same as frames from `first` on of a video of so many; nobody is seen in the others."""

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import check_shape, rgb_image
 from kinefit.errors import ObservationError
-from kinefit.observations.arrays import check_seen, frozen, numbers
+from kinefit.observations.arrays import check_seen, freeze, frozen, numbers, typical_depth
 
 _FARTHEST = 100.0  # [m] that any depth camera measures; a tenth of a metre in millimetres
-
-
-def _typical(depth: NDArray) -> float:
-    """Median [m] of what was measured in some 300 pixels of an image, 0 where that is nothing."""
-    few = depth[:: depth.shape[0] // 16 + 1, :: depth.shape[1] // 20 + 1].flatten()
-    few.sort()
-    first = int(few.searchsorted(0.0, "right"))
-    return float(few[(first + len(few)) // 2]) if first < len(few) else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +48,7 @@ class DepthFrame:
             )
         if not (depth.min() >= 0.0 and depth.max() < np.inf):
             depth[~((depth > 0.0) & (depth < np.inf))] = 0.0
-        typical = _typical(depth)
+        typical = typical_depth(depth)
         if typical > _FARTHEST:
             problem = f"millimetres taken for metres? A depth image of {self.sensor} shows things {typical:.0f} m away"
             raise ObservationError(problem, remedy="Give metres: 0.001 times an image in millimetres.")
@@ -92,15 +87,11 @@ class PointCloud:
 
     def __post_init__(self) -> None:
         check_seen(self.sensor, self.time)
-        points = numbers(self.points, float, f"a cloud of {self.sensor}")
-        if points.ndim != 2 or points.shape[1] != 3:
-            raise ObservationError(f"a cloud of {self.sensor} has shape {points.shape}", remedy="Give (points, 3).")
+        points = frozen(self.points, float, f"a cloud of {self.sensor}", ("points", 3))
         object.__setattr__(self, "points", frozen(points[np.isfinite(points).all(axis=1)]))
         if self.viewpoint is not None:
-            eye = frozen(self.viewpoint, float, f"the viewpoint of {self.sensor}")
-            if eye.shape != (3,) or not np.isfinite(eye).all():
-                problem = f"a cloud of {self.sensor} has the viewpoint {self.viewpoint}"
-                raise ObservationError(problem, remedy="Give three numbers in metres, or None.")
+            eye = frozen(self.viewpoint, float, what := f"the viewpoint of a cloud of {self.sensor}")
+            check_shape(eye, (3,), what, finite=True)
             object.__setattr__(self, "viewpoint", eye)
 
     def __len__(self) -> int:
@@ -132,15 +123,9 @@ class KeypointFrame:
 
     def __post_init__(self) -> None:
         check_seen(self.sensor, self.time, self.names)
-        what = f"a record of keypoints of {self.sensor}"
-        uv, confidence = frozen(self.uv, float, what), frozen(self.confidence, float, what)
-        if uv.shape != (len(self.names), 2) or confidence.shape != (len(self.names),):
-            raise ObservationError(
-                f"keypoints of {self.sensor} have shape {uv.shape} with confidence {confidence.shape}",
-                remedy=f"Give ({len(self.names)}, 2) and ({len(self.names)},).",
-            )
-        object.__setattr__(self, "uv", uv)
-        object.__setattr__(self, "confidence", confidence)
+        what, count = f"keypoints of {self.sensor}", len(self.names)
+        confidence = frozen(self.confidence, float, f"the confidence of {what}", (count,))
+        freeze(self, uv=frozen(self.uv, float, what, (count, 2)), confidence=confidence)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,12 +150,7 @@ class MarkerFrame:
 
     def __post_init__(self) -> None:
         check_seen(self.sensor, self.time, self.names)
-        positions = frozen(self.positions, float, f"a record of markers of {self.sensor}")
-        if positions.shape != (len(self.names), 3):
-            raise ObservationError(
-                f"markers of {self.sensor} have shape {positions.shape}", remedy=f"Give ({len(self.names)}, 3)."
-            )
-        object.__setattr__(self, "positions", positions)
+        freeze(self, positions=frozen(self.positions, float, f"markers of {self.sensor}", (len(self.names), 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,11 +260,7 @@ class ColourFrame:
 
     def __post_init__(self) -> None:
         check_seen(self.sensor, self.time)
-        image = np.asarray(self.image)
-        if image.ndim != 3 or image.shape[2] != 3 or not image.size or image.dtype != np.uint8:
-            problem = f"an image of {self.sensor} has shape {image.shape} and type {image.dtype}"
-            raise ObservationError(problem, remedy="Give (height, width, 3), RGB of uint8.")
-        object.__setattr__(self, "image", np.ascontiguousarray(image))
+        freeze(self, image=np.ascontiguousarray(rgb_image(self.image, f"an image of {self.sensor}")))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -319,15 +295,9 @@ class LiftedFrame:
 
     def __post_init__(self) -> None:
         check_seen(self.sensor, self.time, self.names)
-        what = f"a record of lifted landmarks of {self.sensor}"
-        x, uv = frozen(self.x, float, what), frozen(self.uv, float, what)
-        if x.shape != (len(self.names), 3) or uv.shape != (len(self.names), 2):
-            raise ObservationError(
-                f"lifted landmarks of {self.sensor} have shape {x.shape} and pixels {uv.shape}",
-                remedy=f"Give ({len(self.names)}, 3) and ({len(self.names)}, 2).",
-            )
-        object.__setattr__(self, "x", x)
-        object.__setattr__(self, "uv", uv)
+        what, count = f"lifted landmarks of {self.sensor}", len(self.names)
+        uv = frozen(self.uv, float, f"pixels of {what}", (count, 2))
+        freeze(self, x=frozen(self.x, float, what, (count, 3)), uv=uv)
 
 
 Frame = DepthFrame | PointCloud | KeypointFrame | MarkerFrame | SilhouetteFrame | LineFrame | ColourFrame | LiftedFrame
@@ -345,3 +315,11 @@ _NAMES = {
 def sensor_of(frame: object) -> str:
     """Name of the sensor that a frame is of: where several see with one camera, with what is seen there."""
     return _NAMES.get(type(frame), "{}").format(getattr(frame, "sensor", ""))
+
+
+def by_record(frames: Iterable[Any]) -> Mapping[type, list[Any]]:
+    """Frames of one time, sorted by their record: `by_record(frames)[DepthFrame]`, empty where there is none."""
+    out = defaultdict[type, list[Any]](list)
+    for frame in frames:
+        out[type(frame)].append(frame)
+    return out

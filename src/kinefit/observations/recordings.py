@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import ObservationError
-from kinefit.observations.arrays import check_seen, frozen
+from kinefit.observations.arrays import check_seen, freeze, frozen
 
 KEYPOINT_SIGMA = 8.0
 """[px] Standard deviation of a keypoint of confidence 1 where none is given: what detectors err by in images of
@@ -52,22 +51,13 @@ class Keypoints:
 
     def __post_init__(self) -> None:
         check_seen(self.camera, self.rate, self.names)
-        points, confidence = frozen(self.points), frozen(self.confidence)
-        if points.ndim != 4 or points.shape[2:] != (len(self.names), 2) or confidence.shape != points.shape[:3]:
-            raise ObservationError(
-                f"keypoints of camera {self.camera} have shape {points.shape} with confidence {confidence.shape}",
-                file=self.source or None,
-                remedy=f"Give (frames, people, {len(self.names)}, 2) and (frames, people, {len(self.names)}).",
-            )
-        lifted = None if self.lifted is None else frozen(self.lifted)
-        if lifted is not None and lifted.shape != (*points.shape[:3], 3):
-            raise ObservationError(
-                f"keypoints of camera {self.camera} have shape {points.shape} with lifted ones {lifted.shape}",
-                file=self.source or None, remedy="Give (frames, people, names, 3).",
-            )  # fmt: skip
-        object.__setattr__(self, "points", points)
-        object.__setattr__(self, "confidence", confidence)
-        object.__setattr__(self, "lifted", lifted)
+        what = f"keypoints of camera {self.camera}"
+        points = frozen(self.points, float, what, ("frames", "people", len(self.names), 2), self.source)
+        shape, lifted = points.shape[:3], self.lifted
+        confidence = frozen(self.confidence, float, f"the confidence of {what}", shape, self.source)
+        if lifted is not None:
+            lifted = frozen(lifted, float, f"lifted {what}", (*shape, 3), self.source)
+        freeze(self, points=points, confidence=confidence, lifted=lifted)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -147,14 +137,7 @@ class Markers:
 
     def __post_init__(self) -> None:
         check_seen(self.source, self.rate, self.names)
-        positions = frozen(self.positions)
-        if positions.ndim != 3 or positions.shape[1:] != (len(self.names), 3):
-            raise ObservationError(
-                f"markers have shape {positions.shape} for {len(self.names)} names",
-                file=self.source or None,
-                remedy=f"Give (frames, {len(self.names)}, 3).",
-            )
-        object.__setattr__(self, "positions", positions)
+        freeze(self, positions=frozen(self.positions, float, "markers", ("frames", len(self.names), 3), self.source))
         if self.residual is not None:
             object.__setattr__(self, "residual", frozen(self.residual))
 

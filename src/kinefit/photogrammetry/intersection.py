@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import CalibrationError, ObservationError
+from kinefit._arguments import check_shape
+from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
 
@@ -55,9 +56,8 @@ def intersect(rig: Rig, uv: NDArray, covariance: NDArray) -> Intersections:
     CalibrationError
         Cameras whose rays are all but parallel where they meet: nothing tells a distance.
     """
-    if uv.ndim != 3 or uv.shape[1:] != (len(rig), 2) or covariance.shape != (*uv.shape, 2):
-        problem = f"places {uv.shape}, covariances {covariance.shape} for {len(rig)} cameras"
-        raise ObservationError(problem, remedy="Give (N, C, 2) and (N, C, 2, 2).")
+    check_shape(uv, ("N", len(rig), 2), "places")
+    check_shape(covariance, (*uv.shape, 2), "covariances of places")
     seen = np.isfinite(uv).all(axis=2) & np.isfinite(covariance).all(axis=(2, 3))
     points = triangulate(rig, np.where(seen[..., None], uv, np.nan))
     good = np.isfinite(points).all(axis=1) & (seen.sum(axis=1) >= 2)

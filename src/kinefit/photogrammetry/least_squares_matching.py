@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import shaped
 from kinefit.errors import ObservationError
 from kinefit.photogrammetry.matching import _kernels_matching as kernels
 from kinefit.photogrammetry.matching.noise_correlation import variance_factor
@@ -132,10 +133,7 @@ def halves_of(window: int | ArrayLike, count: int) -> NDArray[np.int64]:
 
 def places(points: ArrayLike) -> NDArray:
     """(N, 2) [px] as the kernels take them."""
-    out = np.array(points, float, order="C")
-    if out.ndim != 2 or out.shape[1] != 2:
-        raise ObservationError(f"points of shape {out.shape}", remedy="Give (N, 2) in pixels.")
-    return out
+    return np.array(shaped(points, ("N", 2), "points"))
 
 
 def match(

@@ -13,7 +13,7 @@ from kinefit.errors import ObservationError
 from kinefit.geometry import lines
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.images.depth import to_points
-from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud
+from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud, by_record
 from kinefit.recipes._voodoo_boxes import Boxes, in_body_box
 
 _COLUMNS = 160  # of a depth image that take part, about: those of the time-of-flight camera of P2
@@ -69,26 +69,24 @@ def sight_of(frames: Sequence[Frame], body: Body, rig: Rig, weights: Mapping[str
     for name, weight in weights.items():
         if not 0.0 <= weight < np.inf:
             raise ObservationError(f"the weight of {name} is {weight}", remedy="Give 0 or more.")
+    seen, of = by_record(frames), {f.sensor: weights.get(f.sensor, 1.0) for f in frames}
     clouds: list[list] = [[], [], []]  # free, on the body, on a limb: (points, weight, limb)
-    found: list[list] = [[], []]  # places and lines: (points of the body, values, weights)
-    for frame in frames:
-        weight = weights.get(frame.sensor, 1.0)
-        if isinstance(frame, DepthFrame):
-            step = max(frame.size[0] // _COLUMNS, 1)
-            clouds[0].append((to_points(frame.depth, rig[frame.sensor], step=step), weight, -1))
-        elif isinstance(frame, PointCloud):
-            limb = -1 if frame.segment is None else body.tree.segment(frame.segment)
-            clouds[2 if limb >= 0 else int(frame.on_body)].append((frame.points, weight, limb))
-        elif isinstance(frame, MarkerFrame):
-            known = body.markers(frame.marker_set) if frame.marker_set else body.landmarks
-            found[0].append(_named(known, frame.names, frame.positions, weights, weight))
-        elif isinstance(frame, KeypointFrame):
-            known = body.keypoints(frame.keypoint_set) if frame.keypoint_set else body.landmarks
-            found[1].append(_named(known, frame.names, _rays(frame, rig[frame.sensor]), weights, weight))
+    for f in seen[DepthFrame]:
+        step = max(f.size[0] // _COLUMNS, 1)
+        clouds[0].append((to_points(f.depth, rig[f.sensor], step=step), of[f.sensor], -1))
+    for f in seen[PointCloud]:
+        limb = -1 if f.segment is None else body.tree.segment(f.segment)
+        clouds[2 if limb >= 0 else int(f.on_body)].append((f.points, of[f.sensor], limb))
+    sets = [body.markers(f.marker_set) if f.marker_set else body.landmarks for f in seen[MarkerFrame]]
+    places = [_named(k, f.names, f.positions, weights, of[f.sensor]) for k, f in zip(sets, seen[MarkerFrame])]
+    sets = [body.keypoints(f.keypoint_set) if f.keypoint_set else body.landmarks for f in seen[KeypointFrame]]
+    rays = [
+        _named(k, f.names, _rays(f, rig[f.sensor]), weights, of[f.sensor]) for k, f in zip(sets, seen[KeypointFrame])
+    ]
     x = [np.concatenate([p for p, _, _ in part] or [np.zeros((0, 3))]) for part in clouds]
     w = [np.concatenate([np.full(len(p), a) for p, a, _ in part] or [np.zeros(0)]) for part in clouds]
     limbs = np.concatenate([np.full(len(p), k) for p, _, k in clouds[2]] or [np.zeros(0, np.int64)])
-    return Sight(x[0], w[0], x[1], w[1], x[2], w[2], limbs, *_all(found[0], 3), *_all(found[1], 6))
+    return Sight(x[0], w[0], x[1], w[1], x[2], w[2], limbs, *_all(places, 3), *_all(rays, 6))
 
 
 def _rays(frame: KeypointFrame, camera: Camera) -> NDArray:

@@ -12,7 +12,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit.errors import ObservationError
+from kinefit._arguments import shaped
 from kinefit.identification.model.model import MarkerModel
 from kinefit.recipes._sapm_steps import MANY, candidate_table, coarse_updates, errors, mean_distance, nearest, triples
 
@@ -57,9 +57,7 @@ def sapm(model: MarkerModel, points: ArrayLike, *, epsilon: float = 0.1, beta: f
     ObservationError
         Points of the wrong shape or not finite.
     """
-    at = np.asarray(points, float)
-    if at.ndim != 2 or at.shape[1] != 3 or not np.isfinite(at).all():
-        raise ObservationError(f"points of shape {at.shape}, or not finite", remedy="Give (N, 3) [m] without gaps.")
+    at = shaped(points, ("N", 3), "points", finite=True)
     subject = SapmProblem(model, at, epsilon, beta)
     size = [len(m) for m in model.segments]
     root = max(range(len(size)), key=lambda s: (size[s], sum(s in (j.parent, j.child) for j in model.joints)))

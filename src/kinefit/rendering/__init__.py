@@ -14,6 +14,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import check_shape, shaped
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh
 from kinefit.errors import ObservationError
@@ -102,9 +103,8 @@ class Canvas:
     ) -> Raster:
         if not np.isfinite(lens).all() or min(lens[0], lens[1], lens[4]) <= 0.0:
             raise ObservationError(f"a lens of {lens} (fx, fy, cx, cy, near)", remedy="fx, fy and near are positive.")
-        x, f = np.ascontiguousarray(vertices, dtype=float), np.ascontiguousarray(faces)
-        if x.ndim != 2 or x.shape[1] != 3 or f.ndim != 2 or f.shape[1] != 3:
-            raise ObservationError(f"vertices {x.shape} and faces {f.shape}", remedy="Give (V, 3) and (T, 3).")
+        x, f = shaped(vertices, ("V", 3), "vertices"), np.ascontiguousarray(faces)
+        check_shape(f, ("T", 3), "faces")
         if self._room.shape[1] < len(x):
             self._room = np.empty((6, len(x)))
         given = [array.view() for array in (x, T_camera_frame, f.astype(np.int32, copy=False))]

@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
-from kinefit.errors import ObservationError
 from kinefit.rows import AnyRows, PairRows, ParameterRows
-from kinefit.sensors.checks import check_rows, named
+from kinefit.sensors.checks import check_rows, named, of_kind
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.surfaces.depth_view import DepthView
@@ -295,9 +294,8 @@ def matched_by(measurement: Measurement, scene: Scene, reach: float) -> Matched:
     """
     with named(measurement.sensor):
         matched = measurement.match(scene.at_time(measurement.time), reach)
-    if not isinstance(matched, Matched):
-        problem = f"`match` of sensor '{measurement.sensor}' gave a {type(matched).__name__}"
-        raise ObservationError(problem, remedy="It must return a Matched, such as RowsOf(function).")
+    what = f"what `match` of sensor '{measurement.sensor}' gave"
+    of_kind(matched, Matched, what, "It must return a Matched, such as RowsOf(function).")
     if not matched.sensor:
         object.__setattr__(matched, "sensor", measurement.sensor)
     object.__setattr__(matched, "time", measurement.time)

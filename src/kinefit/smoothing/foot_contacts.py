@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
+from kinefit.findings import runs_of
 from kinefit.motion import UP_AXES
 
 _SOLE = 0.04  # [m] above the lowest landmark of the body at rest, up to which one counts as of a sole
@@ -79,7 +80,8 @@ def find_contacts(
             lowest = np.quantile(height[slow, p], 0.1)
             floor = float(np.median(height[slow & (height[:, p] < lowest + _LOW), p]))
             near = np.abs(height[:, p] - floor) < _LOW
-        for run in _runs((speed[:, p] < _LETS_GO) & near, 1):
+        for start, stop in runs_of((speed[:, p] < _LETS_GO) & near):
+            run = slice(start, stop)
             if np.count_nonzero(slow[run]) < _LEAST * rate:
                 continue
             middle = np.median(x[run, p], axis=0)
@@ -99,7 +101,3 @@ def _speeds(x: NDArray, rate: float, eye: NDArray | None) -> NDArray:
     return np.asarray(np.linalg.norm(moved, axis=2) * rate)
 
 
-def _runs(on: NDArray, least: int) -> list[slice]:
-    """Stretches of at least so many frames that are on."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]])))
-    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= least]

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
+from kinefit.findings import runs_of
 
 _BACK = 5  # frames over which the motion at the ends of a gap is taken
 
@@ -22,10 +23,9 @@ def bridged(roots: NDArray, angles: NDArray, lost: NDArray, memory: float) -> tu
     memory : float [frames] in which a velocity forgets itself by 1/e.
     """
     roots, angles = np.array(roots), np.array(angles)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], lost.astype(int), [0]])))
-    for start, stop in edges.reshape(-1, 2):
-        before = _leaving(roots, angles, lost, int(start) - 1, -1)
-        after = _leaving(roots, angles, lost, int(stop), 1)
+    for start, stop in runs_of(lost):
+        before = _leaving(roots, angles, lost, start - 1, -1)
+        after = _leaving(roots, angles, lost, stop, 1)
         for f in range(start, stop):
             share = (f - start + 1) / (stop - start + 1)
             state = None

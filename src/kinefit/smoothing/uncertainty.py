@@ -67,7 +67,7 @@ class Lasting:
 
 
 def with_lasting_errors(
-    results: Sequence[FrameResult], subject: Subject, take: SmoothTake, weight: NDArray, rate: float,
+    results: Sequence[FrameResult], subject: Subject, take: SmoothTake, weight: NDArray,
     others: OtherNoise | None = None, answers: Sequence[Answers] = (), *,
     cameras: tuple[float, float] | None = None, shared: SharedErrors | None = None,
 ) -> tuple[Iterator[FrameResult], VarianceComponents]:  # fmt: skip
@@ -84,7 +84,7 @@ def with_lasting_errors(
     cameras : (2,) standard deviations [m], [rad] of the cameras' poses, where neither the subject nor the answers know
     shared : what points of one segment err by together, as the fit took it; None: each for itself
     """
-    body, channels = subject.body, take.channels
+    body, channels, rate = subject.body, take.channels, 1.0 / take.dt
     shared = shared or SharedErrors.none(len(channels.column))
     layout = Layout(channels.with_points(body), body)
     half, n = round(TIED * rate), body.tree.n_dofs

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,35 @@ class Step:
 def relax(damping: float) -> float:
     """Reduce the λ that scales the diagonal of H, after a step that lowered the cost."""
     return max(0.1 * damping, LEAST_SCALED_DAMPING)
+
+
+State = TypeVar("State")
+
+
+def descend(
+    state: State, cost_of: Callable[[State], float], step: Callable[[State, float], State | None], *, iterations: int,
+    tolerance: float, damping: float = 1e-4, most: float = 1e8,
+) -> tuple[State, float]:  # fmt: skip
+    """Where a cost is least, and that cost, by steps whose damping grows until they lower it.
+
+    Parameters
+    ----------
+    step : (state, λ) -> the state after a step with λ times the diagonal of H added to it; None where there is none
+    tolerance : stop when a step lowers the cost by less than this share of it.
+    damping, most : first λ, and the one at which nothing is left to be gained.
+    """
+    cost = cost_of(state)
+    for _ in range(iterations):
+        before = cost
+        while damping < most:
+            there = step(state, damping)
+            if there is not None and (new := cost_of(there)) < cost:
+                state, cost, damping = there, new, relax(damping)
+                break
+            damping *= 10.0
+        if not before - cost > tolerance * cost:
+            break
+    return state, cost
 
 
 def _step(eq: Equations, damping: float, bounds: tuple[NDArray, NDArray], locked: NDArray) -> tuple[NDArray, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import check_shape
 from kinefit.errors import ObservationError
 from kinefit.geometry import se3
 
@@ -37,9 +38,8 @@ def absolute_orientation(
         Pairs that do not match, are not finite, or have a negative weight.
     """
     n = len(source)
-    if source.shape != (n, 3) or target.shape != (n, 3) or weight.shape != (n,) or limb.shape != (n,):
-        shapes = f"{source.shape}, {target.shape}, {weight.shape}, {limb.shape}"
-        raise ObservationError(f"pairs of shapes {shapes}", remedy="Give (N, 3), (N, 3), (N,), (N,).")
+    for array, shape in ((source, (n, 3)), (target, (n, 3)), (weight, (n,)), (limb, (n,))):
+        check_shape(array, shape, "pairs")
     if not np.isfinite([source.sum(), target.sum(), weight.sum()]).all() or (n and weight.min() < 0.0):
         raise ObservationError("pairs are not finite, or have a negative weight", remedy="Leave out what is unknown.")
     total = np.bincount(limb, weight, count)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,9 +14,19 @@ from kinefit.solvers import _kernels_pixels
 from kinefit.solvers.equations import dense_pattern, lock
 
 
+class PixelPoints(NamedTuple):
+    """N points of a body in `camera` (N,) of a rig: `uv` (N, 2) [px], `weight` (N,) [1/px²], a loss of one scale."""
+
+    points: PointSet
+    camera: NDArray
+    uv: NDArray
+    weight: NDArray
+    loss: Loss
+
+
 def fit_pixels(
-    body: Body, state: BodyState, rig: Rig, points: PointSet, camera: NDArray, uv: NDArray, weight: NDArray,
-    loss: Loss, predicted: BodyState, information: NDArray, *, max_iterations: int, tolerance: float, damping: float,
+    body: Body, state: BodyState, rig: Rig, seen: PixelPoints, held: tuple[BodyState, NDArray], *,
+    max_iterations: int, tolerance: float, damping: float,
 ) -> tuple[BodyState, NDArray, float, int] | None:  # fmt: skip
     """The minimum of Σ ρ over pixels, of what a prediction says and of the prior posture, from a state on.
 
@@ -23,9 +35,7 @@ def fit_pixels(
 
     Parameters
     ----------
-    points : PointSet of N points, seen in `camera` (N,) int of the rig at `uv` (N, 2) [px], `weight` (N,) [1/px²]
-    loss : Loss of one scale
-    predicted, information : a state, and the information (n, n) of it
+    held : a predicted state, and the information (n, n) of it
     max_iterations, tolerance, damping : as of `levenberg_marquardt`
 
     Returns
@@ -33,14 +43,15 @@ def fit_pixels(
     The state, its normal matrix (n, n), the cost and the steps tried; None where something is not finite.
     """
     tree, n = body.tree, body.tree.n_dofs
-    held, precision = tree.held_by_posture
+    (predicted, information), (posed, precision) = held, tree.held_by_posture
     roots, angles = np.empty((2, 4, 4)), np.empty((2, n - 6))
     roots[0], angles[0] = state.T_world_root, state.angles
     H, g = np.empty((2, n, n)), np.empty((2, n))
     best, cost, tried = _kernels_pixels.minimum(
         tree.parents, tree.dof_start, tree.prismatic, tree.axes, tree.rest, tree.chain, tree.depth, *dense_pattern(n),
-        tree.lower, tree.upper, lock(body, None), points.segments, body.points_rest(points), rig.packed, camera, uv,
-        weight, loss.kind, float(loss.scale), predicted.T_world_root, predicted.angles, information, held, tree.usual,
+        tree.lower, tree.upper, lock(body, None), seen.points.segments, body.points_rest(seen.points), rig.packed,
+        seen.camera, seen.uv, seen.weight, seen.loss.kind, float(seen.loss.scale), predicted.T_world_root,
+        predicted.angles, information, posed, tree.usual,
         precision if precision.ndim == 2 else np.diag(precision), roots, angles, H, g, max_iterations, tolerance,
         damping,
     )  # fmt: skip

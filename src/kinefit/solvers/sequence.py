@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import check_shape
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, Loss
@@ -87,18 +88,15 @@ def fit_sequence(
     tree = body.tree
     count = len(planes.x_world) if x_world is None and planes is not None else len(np.asarray(x_world))
     x = np.zeros((count, 0, 3)) if x_world is None else np.array(x_world, float, order="C")
-    if x.shape != (count, len(points), 3):
-        raise ObservationError(f"measured points have shape {x.shape}", remedy=f"Give (frames, {len(points)}, 3).")
+    check_shape(x, (count, len(points), 3), "measured points")
     seen = np.isfinite(x).all(axis=2)
     if not np.all(np.asarray(sigma, float) > 0) or (planes is not None and not planes.sigma > 0):
         raise ObservationError("the standard deviation of points and planes must be positive")
     weight = np.where(seen, 1.0 / np.square(np.broadcast_to(np.asarray(sigma, float), seen.shape[1:])), 0.0)
     order = np.argsort(points.segments, kind="stable")  # rows of one segment in one run
     p = planes or Planes(_NO_POINTS, np.zeros((count, 0, 3)), np.zeros((count, 0, 3)))
-    if p.x_world.shape != p.normal.shape or p.x_world.shape != (count, len(p.points), 3):
-        raise ObservationError(
-            f"planes have shapes {p.x_world.shape} and {p.normal.shape}", remedy=f"Give ({count}, {len(p.points)}, 3)."
-        )
+    for name, array in (("points", p.x_world), ("normals", p.normal)):
+        check_shape(array, (count, len(p.points), 3), f"{name} of planes")
     p_order = np.argsort(p.points.segments, kind="stable")
     lower, upper = bounds_of(body, limits)
     roots, angles = np.empty((count, 4, 4)), np.empty((count, len(tree.coordinates)))

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._arguments import checked
+from kinefit._arguments import check_shape, checked
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
@@ -93,8 +93,7 @@ def fit_subject(
     names, mean, information, step = stacked(parameters)
     worlds, prior = Worlds(World(body, rig), parameters), Prior(mean, information)
     theta = np.array(mean if start is None else start, float)
-    if theta.shape != mean.shape:
-        raise ObservationError(f"a start of shape {theta.shape}", remedy=f"Give ({len(mean)},): {', '.join(names)}.")
+    check_shape(theta, mean.shape, f"a start for {', '.join(names)}")
     sensors = tuple({m.sensor: None for several in steps for m in several})
     anew = not all(m.settled for several in steps for m in several)
     shares = {} if looks is None else dict.fromkeys(sensors, min(looks / len(steps), 1.0))
@@ -102,10 +101,9 @@ def fit_subject(
     for used in range(1, rounds + 1):
         frames = MatchedFrames(worlds, steps, times, velocities, theta, states, reach[min(used, len(reach)) - 1])
         early, before = anew or used < min(len(reach), rounds), theta
-        iterations, settling = coarse if early else (_ITERATIONS, SETTLING)
         solved = solve(
-            frames, theta, states, prior, step, weighing=Weighing(shares, loss, posture), max_iterations=iterations,
-            settling=settling,
+            frames, theta, states, prior, step, weighing=Weighing(shares, loss, posture),
+            iterations=coarse if early else (_ITERATIONS, SETTLING),
         )  # fmt: skip
         theta, states, moved = solved.theta, solved.states, solved.theta - before
         if not early and solved.converged and moved @ (prior.information + solved.information) @ moved < _DONE**2:
@@ -114,9 +112,8 @@ def fit_subject(
         told = excess(frames.seen(theta, states), _followed(body, solved))
         shares = {sensor: 1.0 / max(told.get(sensor, 1.0), 1.0) for sensor in sensors}
         if min(shares.values()) < 1.0:
-            solved = solve(
-                frames, theta, states, prior, step, weighing=Weighing(shares, loss, posture), max_iterations=_ITERATIONS
-            )
+            weighing = Weighing(shares, loss, posture)
+            solved = solve(frames, theta, states, prior, step, weighing=weighing, iterations=(_ITERATIONS, SETTLING))
     world = worlds.at(solved.theta)
     return SubjectFit(
         world.body, world.rig, world.values, names, solved.theta, inverse(prior.information + solved.information),

@@ -132,6 +132,11 @@ class Subject:
     sets: tuple[str, ...] = ()
     view_bias: ViewBias | None = None
 
+    @classmethod
+    def as_is(cls, body: Body) -> Subject:
+        """A body that is the person's already."""
+        return cls(body, np.ones(len(body.scale_groups)))
+
     @property
     def length_std(self) -> dict[str, float]:
         """[m] standard deviation of each length, from one segment's joint to the next's: "thigh_l-shank_l"."""

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._mapped import release
+from kinefit._mapped import release, room
 from kinefit.bodies import Body, BodyState
 from kinefit.frame.results import FrameResult
 from kinefit.losses import SQUARED
@@ -32,12 +32,30 @@ from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.tracking.agreement import LOOKS, cameras_apart, contradictions
 from kinefit.tracking.cameras import CAMERAS, as_told
 from kinefit.tracking.recording import spread
-from kinefit.tracking.residuals import Remains
+
+
+@dataclass(frozen=True, eq=False)
+class Estimation:
+    """How the poses of single frames become a motion.
+
+    Parameters
+    ----------
+    smooth : fit all frames together with a motion prior
+    contacts : hold the soles still where they rest on a level floor, when smoothing
+    eye : (3,) [m] of the camera that is the only sensor: soles are then held where they hardly move in its image
+    lag : [s], instead of smoothing: each frame knows of those before it, and of later ones so far ahead alone
+    noise : that is known beforehand, for a lag
+    """
+
+    smooth: bool = True
+    contacts: bool = False
+    eye: NDArray | None = None
+    lag: float | None = None
+    noise: KnownNoise | None = None
 
 
 def motion_of(
-    frames: TrackedFrames, subject: Subject, settings: TrackSettings, *, smooth: bool = True, contacts: bool = False,
-    lag: float | None = None, noise: KnownNoise | None = None, up: str = "z", eye: NDArray | None = None,
+    frames: TrackedFrames, subject: Subject, settings: TrackSettings, how: Estimation, *, up: str = "z",
     name: str = "motion", told: Mapping[str, Any] | None = None, found: Sequence[SubjectFit] = (),
 ) -> Motion:  # fmt: skip
     """The motion of what was tracked.
@@ -47,27 +65,23 @@ def motion_of(
     frames : TrackedFrames
     subject : Subject, with the body; its lengths are taken for exact where it does not tell how sure they are.
     settings : TrackSettings
-    smooth : fit all frames together with a motion prior
-    contacts : hold the soles still where they rest on a level floor, when smoothing
-    lag : [s], instead of smoothing: each frame knows of those before it, and of later ones so far ahead alone
-    noise : that is known beforehand, for a lag
     up, name : of the motion
-    eye : (3,) [m] of the camera that is the only sensor: soles are then held where they hardly move in its image
     told : what else there is to tell, for `Motion.provenance`
     found : what all sensors were fitted with together, with its covariance
     """
     body, rate, results = subject.body, frames.rate, frames.results
+    smooth, lag, eye = how.smooth, how.lag, how.eye
     provenance: dict[str, Any] = dict(told or {})
     shared = None
     matched: Sequence[tuple[Matched, ...]] | None = None  # of all sensors but the keypoints
     if smooth:
-        done = smooth_results(body, frames, settings, contacts=contacts or eye is not None, up=up, eye=eye)
+        done = smooth_results(body, frames, settings, contacts=how.contacts or eye is not None, up=up, eye=eye)
         results, take, weight, shared = done.results, done.take, done.weight, done.shared
         provenance["smoothing"] = done.provenance
         matched = done.matched
     else:
         if lag is not None:
-            results, matched, provenance["fixed lag"] = _behind(frames, body, settings, lag, noise)
+            results, matched, provenance["fixed lag"] = _behind(frames, body, settings, lag, how.noise)
         take = as_tracked(body, replace(frames, results=results), settings)
         sigma = take.channels.sigma
         weight = take.confidence / np.square(sigma) * take.factors(sigma, take.fitted(take.roots, take.angles))
@@ -108,7 +122,7 @@ def motion_of(
         provenance[CAMERAS] = cameras
     elsewhere = any(one.cameras is not None for one in found)
     last, detectors = with_lasting_errors(
-        results, subject, take, weight, rate, noise_of_others, answers,
+        results, subject, take, weight, noise_of_others, answers,
         cameras=None if elsewhere else settings.camera_std, shared=shared,
     )  # fmt: skip
     if channels.sources:
@@ -179,3 +193,80 @@ def _residuals(
         remains.add(f, (rest for m in matched for rest in leftovers_at(m, scene)))
     remains.release()
     return remains.residuals()
+
+
+@dataclass(eq=False)
+class _OfSensor:
+    """Columns of names, and arrays (F, K, ...) of which the last axis but one grows with them."""
+
+    unit: str
+    surface: bool
+    swapped: NDArray
+    arrays: dict[str, NDArray]
+    place: dict[str, int] = field(default_factory=dict)
+    segments: list[int] = field(default_factory=list)
+
+
+class Remains:
+    """Collects what is left over of F frames, in any order.
+
+    Parameters
+    ----------
+    frames : F
+    """
+
+    def __init__(self, frames: int) -> None:
+        self._frames = frames
+        self._of: dict[str, _OfSensor] = {}
+
+    def add(self, f: int, leftovers: Iterable[Leftover]) -> None:
+        """Of frame `f`; of several of one sensor the last counts."""
+        for rest in {rest.label: rest for rest in leftovers}.values():
+            of = self._of.get(rest.label)
+            if of is None:
+                of = self._of[rest.label] = self._empty(rest)
+            columns = self._columns(of, rest)
+            for name, values in (("values", rest.values), ("weights", rest.weights), ("measured", rest.measured)):
+                of.arrays[name][f, columns] = values
+            of.swapped[f] = rest.swapped
+            if of.surface and rest.rms is not None and rest.count is not None:
+                of.arrays["rms"][f, columns], of.arrays["count"][f, columns] = rest.rms, rest.count
+
+    def release(self) -> None:
+        """Give back the memory of what was added so far: it lies in files where it is much."""
+        for of in self._of.values():
+            release(*of.arrays.values())
+
+    def residuals(self, frames: Sequence[int] | None = None) -> dict[str, Residuals]:
+        """Of all frames, or of some of them, by sensor."""
+        which = slice(None) if frames is None or len(frames) == self._frames else np.asarray(frames, np.int64)
+        return {
+            label: Residuals(
+                names=tuple(of.place), segments=np.array(of.segments, np.int64), unit=of.unit,
+                swapped=of.swapped[which], **{name: array[which] for name, array in of.arrays.items()},
+            )
+            for label, of in self._of.items()
+        }  # fmt: skip
+
+    def _empty(self, rest: Leftover) -> _OfSensor:
+        F, N = self._frames, rest.values.shape[1]
+        arrays = {"values": np.empty((F, 0, N)), "weights": np.empty((F, 0)), "measured": np.empty((F, 0, N))}
+        surface = rest.count is not None
+        if surface:
+            arrays |= {"rms": np.empty((F, 0)), "count": np.empty((F, 0))}
+        return _OfSensor(rest.unit, surface, np.zeros(F, bool), arrays)
+
+    def _columns(self, of: _OfSensor, rest: Leftover) -> list[int]:
+        """Places of its names; new ones are unseen in all frames so far."""
+        before = len(of.place)
+        for name, segment in zip(rest.names, rest.segments):
+            if name not in of.place:
+                of.place[name] = len(of.place)
+                of.segments.append(int(segment))
+        more = len(of.place) - before
+        if more:
+            for name, array in of.arrays.items():
+                of.arrays[name] = larger = room((len(array), before + more, *array.shape[2:]))
+                larger[:, :before] = array
+                larger[:, before:] = 0.0 if name in ("weights", "count") else np.nan
+        return [of.place[name] for name in rest.names]

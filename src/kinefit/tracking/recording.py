@@ -22,6 +22,7 @@ from kinefit.multiview.one_camera import lifted_alone
 from kinefit.multiview.people import PersonTrack
 from kinefit.observations import (
     KEYPOINT_SIGMA,
+    KEYPOINTS,
     DepthFrame,
     Frame,
     KeypointFrame,
@@ -30,6 +31,7 @@ from kinefit.observations import (
     MarkerFrame,
     Markers,
     NamedMarkers,
+    by_record,
     sensor_of,
 )
 from kinefit.observations.arrays import is_number
@@ -202,8 +204,7 @@ class Recording:
         of_kind(steps, Sequence, "steps", "Give a list of steps, each a list of frames.", each=Sequence)
         if not (is_number(rate) and 0.0 < rate < np.inf):
             raise ObservationError(f"steps at {rate} Hz", remedy="Give a positive rate.")
-        for i, seen in enumerate(steps):
-            _check_names(i, seen)
+        by_source = frames_by_source(steps)
         told = [float(np.mean([f.time for f in seen])) if len(seen) else np.nan for seen in steps]
         timed = np.flatnonzero(np.isfinite(told))
         if not len(timed):
@@ -212,7 +213,11 @@ class Recording:
         if len(timed) < len(told):  # evenly beyond the ends
             times = np.where(np.isfinite(told), times, times[timed[0]] + (np.arange(len(told)) - timed[0]) / rate)
         sigma = dict(sigma or {})
-        worn = _marker_records(steps, rate)
+        worn = tuple(
+            NamedMarkers(source[0], Markers(names, rate, x, source=source[0]), source[1])
+            for source, frames in by_source[MarkerFrame].items()
+            for names, x in [_stacked(frames, len(steps), "positions")]
+        )
         there = {*rig.names, *(sensor_of(f) for seen in steps for f in seen)}
         there |= {f"{m.sensor} {name}" for m in worn for name in m.markers.names}
         for name in sigma:
@@ -220,11 +225,11 @@ class Recording:
                 remedy = "Leave its standard deviation out, or correct its name."
                 raise ObservationError(choices("sensor", name, sorted(there)), remedy=remedy)
         records = keypoint_records(steps, rate, start=float(times[0]))
-        others = [[f for f in seen if not isinstance(f, KeypointFrame)] for seen in steps]
+        others = [[f for f in seen if sensor_of(f) != KEYPOINTS] for seen in steps]
         return cls(
             times, rate, rig, keypoints=records, sigma=sigma,
             steps=lambda i: [*others[i], *keypoint_frames(records, i, float(times[i]))],
-            depth=_first_depth(steps, rate), **{"markers": worn, **more},
+            depth=_first_depth(by_source[DepthFrame], rate), **{"markers": worn, **more},
         )  # fmt: skip
 
     def part(self, frames: slice) -> Recording:
@@ -253,13 +258,37 @@ def _seen_in(records: Sequence[Keypoints], times: NDArray, i: int) -> Sequence[A
     return [*seen, *keypoint_frames(records, i, time)]
 
 
-def _check_names(step: int, seen: Sequence[Any]) -> None:
-    """Refuse two frames of one sensor in a step that are of the same points."""
-    told = [(type(f), f.sensor, *(getattr(f, part, "") for part in _PARTS)) for f in seen]
-    for one in told:
-        if isinstance(seen[told.index(one)], get_args(Frame)) and told.count(one) > 1:
-            problem = f"two frames of sensor '{one[1]}' in step {step}"
-            raise ObservationError(problem, remedy="Give each sensor its own name, or each time its own step.")
+def frames_by_source(steps: Sequence[Sequence[Any]]) -> Mapping[type, Mapping[tuple[str, str], Mapping[int, Any]]]:
+    """Frames of kinefit's records: {record: {(sensor, set or segment of its points): {step: frame}}}.
+
+    Raises
+    ------
+    ObservationError
+        Two frames of one sensor in a step that are of the same points.
+    """
+    out: dict[type, dict[tuple[str, str], dict[int, Any]]] = {record: {} for record in get_args(Frame)}
+    for i, seen in enumerate(steps):
+        for record, frames in by_record(seen).items():
+            for f in frames if record in out else ():
+                part = next((getattr(f, name) for name in _PARTS if hasattr(f, name)), "") or ""
+                own = out[record].setdefault((f.sensor, part), {})
+                if i in own:
+                    problem = f"two frames of sensor '{f.sensor}' in step {i}"
+                    raise ObservationError(problem, remedy="Give each sensor its own name, or each time its own step.")
+                own[i] = f
+    return out
+
+
+def _stacked(frames: Mapping[int, Any], count: int, *values: str) -> tuple[Any, ...]:
+    """Names of all points in frames by their step, and each of their `values` at `count` steps: NaN where unseen."""
+    names = tuple(dict.fromkeys(n for f in frames.values() for n in f.names))
+    shapes = [getattr(next(iter(frames.values())), value).shape[1:] for value in values]
+    out = [np.full((count, len(names), *shape), np.nan) for shape in shapes]
+    for i, f in frames.items():
+        places = [names.index(n) for n in f.names]
+        for array, value in zip(out, values):
+            array[i, places] = getattr(f, value)
+    return names, *out
 
 
 def _cut(record: Keypoints, frames: slice) -> Keypoints:
@@ -283,48 +312,22 @@ def keypoint_records(steps: Sequence[Sequence[Any]], rate: float, *, start: floa
     ----------
     rate : float [Hz] of the steps, of which the first is at `start` [s]
     """
-    seen: dict[tuple[str, str, tuple[str, ...]], dict[int, KeypointFrame]] = {}
-    for i, frames in enumerate(steps):
-        for f in frames:
-            if isinstance(f, KeypointFrame):
-                seen.setdefault((f.sensor, f.keypoint_set, f.names), {})[i] = f
     out = []
-    for (camera, name, names), frames_of in seen.items():
-        points = np.full((len(steps), 1, len(names), 2), np.nan)
-        confidence = np.zeros(points.shape[:3])
-        for i, f in frames_of.items():
-            points[i, 0], confidence[i, 0] = f.uv, f.confidence
-        out.append(Keypoints(camera, name, names, rate, points, confidence, time_offset=start))
-    return tuple(out)
-
-
-def _marker_records(steps: Sequence[Sequence[Any]], rate: float) -> tuple[NamedMarkers, ...]:
-    """Markers of single frames as whole recordings, one for each sensor and marker set."""
-    seen: dict[tuple[str, str], dict[int, MarkerFrame]] = {}
-    for i, frames in enumerate(steps):
-        for f in frames:
-            if isinstance(f, MarkerFrame):
-                seen.setdefault((f.sensor, f.marker_set), {})[i] = f
-    out = []
-    for (sensor, marker_set), frames_of in seen.items():
-        names = tuple(dict.fromkeys(n for f in frames_of.values() for n in f.names))
-        positions = np.full((len(steps), len(names), 3), np.nan)
-        for i, f in frames_of.items():
-            positions[i, [names.index(n) for n in f.names]] = f.positions
-        out.append(NamedMarkers(sensor, Markers(names, rate, positions, source=sensor), marker_set))
+    for (camera, name), frames in frames_by_source(steps)[KeypointFrame].items():
+        names, uv, confidence = _stacked(frames, len(steps), "uv", "confidence")
+        seen = np.nan_to_num(confidence[:, None])
+        out.append(Keypoints(camera, name, names, rate, uv[:, None], seen, time_offset=start))
     return tuple(out)
 
 
 _SIZES, _FIRST = 4, 5.0  # depth images from which a person's size is found, spread over so much of the beginning [s]
 
 
-def _first_depth(steps: Sequence[Sequence[Any]], rate: float) -> dict[int, DepthFrame]:
+def _first_depth(cameras: Mapping[Any, Mapping[int, DepthFrame]], rate: float) -> dict[int, DepthFrame]:
     """Some of the first images of the depth camera that comes first, by step."""
-    shown = {i: f for i, seen in enumerate(steps) for f in seen if isinstance(f, DepthFrame)}
-    sensor = next((f.sensor for f in shown.values()), None)
-    mine = [i for i, f in shown.items() if f.sensor == sensor]
-    mine = [i for i in mine if i <= mine[0] + _FIRST * rate]
-    return {mine[k]: shown[mine[k]] for k in spread(len(mine), _SIZES)}
+    shown = next(iter(cameras.values()), {})
+    some = [i for i in shown if i <= next(iter(shown)) + _FIRST * rate]
+    return {some[k]: shown[some[k]] for k in spread(len(some), _SIZES)}
 
 
 def spread(count: int, most: int) -> NDArray:

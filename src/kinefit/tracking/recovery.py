@@ -122,13 +122,13 @@ class Recovery:
         search: PostureSearch | None = None,
     ) -> FrameResult | None:  # fmt: skip
         """A start from what shows a whole person; `search`, where much about the result is left out by it."""
-        scene = tracker.scene_of(self.body.usual_state(np.eye(4)), time)
-        own = tracker.sensors
+        state, own = self.body.usual_state(np.eye(4)), tracker.sensors
+        scene = tracker.scene_of(state, time).at(state, others=tracker.others)
         elapsed = abs(time - self._good[0])
         known = self._root if elapsed <= _TURN + 1e-6 else None
         here = None if result is None or _astray(result, self.settings.poor) else result.state.T_world_root
         for state in starts_from_views(
-            scene, tracker.alone(frames), self.up, own.measurements(frames, scene, points=True),
+            scene, frames, self.up, own.measurements(frames, scene, points=True),
             backgrounds=own.stated, forward=None if known is None else known[:3, 0],
         ):  # fmt: skip
             if known is not None and _gone(state.T_world_root, known) > _STRIDE + _SPEED * elapsed:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from kinefit._mapped import release
-from kinefit.bodies import Body
-from kinefit.errors import TrackingError
+from kinefit._records import restore_state, save_state
+from kinefit.bodies import Body, BodyState
+from kinefit.errors import FileError, TrackingError
+from kinefit.geometry.camera import Rig
+from kinefit.motion import Motion
 from kinefit.sensors.points.view_bias import ViewBias
+from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.spool import Spool
 from kinefit.smoothing.tracked_frames import TrackedFrames
@@ -19,11 +25,9 @@ from kinefit.subject.subject import Progress
 from kinefit.tracking.checkpoints.checkpoint import Checkpoint
 from kinefit.tracking.checkpoints.frame_file import KINDS
 from kinefit.tracking.checkpoints.so_far import append_rows
-from kinefit.tracking.others import OtherPeople
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.session import KeptFrame
 from kinefit.tracking.tracker import Tracker
-from kinefit.tracking.tracker_state import restore_tracker, save_tracker
 
 _GIVE_UP = 150  # steps without a start before the first one: five seconds at 30 Hz, some minutes of searching
 _EVERY = 300  # steps after which a checkpoint is written: ten seconds of video, a second of work or half a minute
@@ -177,3 +181,56 @@ def run(
             raise
         stopped = True
     return frames.tracked(tracker, recording, stopped=stopped)
+
+
+class OtherPeople:
+    """Scenes of other people at any time of a recording.
+
+    Parameters
+    ----------
+    motions : in the recording's world and time; one whose body has no surfaces hides nothing
+    rig : Rig of all cameras
+    within : float [s], how far the nearest frame of a motion may be
+    """
+
+    def __init__(self, motions: Sequence[Motion], rig: Rig, within: float) -> None:
+        self.motions, self.within = tuple(m for m in motions if m.body.surfaces), within
+        self._scenes = [Scene(m.body, m.body.usual_state(np.eye(4)), rig) for m in self.motions]
+
+    def at(self, time: float) -> list[Scene]:
+        """Everybody who is there at a time [s]."""
+        out = []
+        for motion, scene in zip(self.motions, self._scenes):
+            k = int(np.argmin(np.abs(motion.times - time)))
+            if abs(motion.times[k] - time) <= self.within and np.isfinite(motion.Ts_world_root[k]).all():
+                out.append(scene.at(BodyState(motion.Ts_world_root[k], motion.angles[k]), time=time))
+        return out
+
+
+def save_tracker(tracker: Tracker) -> dict[str, Any]:
+    """The state of a tracker between two steps, without images: plain values, arrays and records of `record_classes`.
+
+    The last result is not part of it: an update that comes too late right after a restored state returns None.
+    """
+    return {
+        "tracker": save_state(tracker), "prediction": save_state(tracker._prediction),
+        "recovery": save_state(tracker._recovery), "sensors": tracker.sensors.save_state(),
+    }  # fmt: skip
+
+
+def restore_tracker(tracker: Tracker, state: Mapping[str, Any]) -> None:
+    """Set a tracker, made anew, to the state of another of the same body and sensors.
+
+    Raises
+    ------
+    FileError
+        What is no state of such a tracker.
+    """
+    try:
+        restore_state(tracker, state["tracker"])
+        restore_state(tracker._prediction, state["prediction"])
+        restore_state(tracker._recovery, state["recovery"])
+        tracker.sensors.restore_state(state["sensors"])
+    except (TypeError, ValueError, LookupError, AttributeError) as error:
+        remedy = "Run again: every frame is then computed anew."
+        raise FileError("a state of a tracker that kinefit did not write", remedy=remedy) from error

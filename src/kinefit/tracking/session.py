@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import check_shape
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError, choices
 from kinefit.frame.results import FrameResult
@@ -177,6 +178,5 @@ def up_vector(up: str | ArrayLike) -> NDArray:
     if isinstance(up, str) and up not in UP_AXES:
         raise ObservationError(choices("vertical axis", up, UP_AXES))
     vector = numbers(UP_AXES[up] if isinstance(up, str) else up, float, "up")
-    if vector.shape != (3,):
-        raise ObservationError(f"up has shape {vector.shape}", remedy="Give three numbers, such as (0, 0, 1).")
+    check_shape(vector, (3,), "up")
     return vector

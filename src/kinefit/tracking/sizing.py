@@ -73,10 +73,11 @@ def channels_of(recording: Recording, body: Body, settings: TrackSettings) -> Ch
 
 
 def fitted_to_person(
-    recording: Recording, body: Body, settings: TrackSettings, *, subject: Subject | None,
-    trial: Subject | None, height: float | None, size: bool, frames: int | None, progress: Progress | None,
+    recording: Recording, body: Body, settings: TrackSettings, *, subject: Subject | None = None,
+    trial: Subject | None = None, height: float | None = None, frames: int | None = None,
+    progress: Progress | None = None,
 ) -> SizedPerson:  # fmt: skip
-    """The body in the person's size and shape; arguments as of `track`.
+    """The body in the person's size and shape, where no subject has it already; arguments as of `track`.
 
     Raises
     ------
@@ -95,17 +96,16 @@ def fitted_to_person(
         raise TrackingError(problem, remedy=f"{remedy}: kinefit detect --force finds them in the video.")
     ignored = {"a height": height, "a trial of the same person": trial, "shape_frames": frames}
     for what, given in ignored.items():
-        if given is not None and (subject is not None or not size):
-            known = "a subject that is known already" if subject is not None else "a body that is taken as it is"
-            raise ObservationError(f"{what} with {known}", remedy=f"Leave {what} out: it would be ignored.")
+        if given is not None and subject is not None:
+            problem = f"{what} with a subject that is known already, or a body that is taken as it is"
+            raise ObservationError(problem, remedy=f"Leave {what} out: it would be ignored.")
         if given is not None and cameras < 2 and given is not height:
             problem = f"{what} is for lengths from keypoints, and this recording has none of two cameras"
             raise ObservationError(problem, remedy="Leave it out, or add [[keypoints]] of two cameras.")
-    subject_as_is = Subject(body, np.ones(len(body.scale_groups)))
-    person = SizedPerson(recording, subject_as_is, recording.start, calibrated=recording.rig)
+    person = SizedPerson(recording, Subject.as_is(body), recording.start, calibrated=recording.rig)
     unknown = any(s.unknowns for s in recording.sensors) or has_unknown_gear(body if subject is None else subject.body)
-    if subject is not None or not size:
-        person = person if subject is None else _wearing(person, subject)
+    if subject is not None:
+        person = _wearing(person, subject)
         return _by_all(person, body, settings, progress, size=False) if unknown else person
     if cameras >= 2:
         by_keypoints = fit_subject(

@@ -21,17 +21,15 @@ from kinefit.frame.results import FrameResult
 from kinefit.frame.routing import Sensors, time_of
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
-from kinefit.observations import DepthFrame
 from kinefit.observations.arrays import is_number
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Measurement, Sensor, named
 from kinefit.sensors.checks import of_kind
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.visibility.parting import without_others
 from kinefit.solvers.mobility import check_closed
 from kinefit.subject.subject import Subject
-from kinefit.tracking.motions import motion_of
+from kinefit.tracking.motions import Estimation, motion_of
 from kinefit.tracking.recovery import Recovery
 from kinefit.tracking.session import Session, axis_of, up_vector
 
@@ -87,7 +85,7 @@ class Tracker:
         if unknown:
             names = [sensor.name for sensor in self.sensors.own]
             raise ObservationError(choices("sensor of one's own", unknown[0], names), remedy="Leave its values out.")
-        self._others: tuple[Scene, ...] = ()
+        self.others: tuple[Scene, ...] = ()
         self.dropped = self.late = 0
         self._last: FrameResult | None = None
         self._time: float | None = None
@@ -198,11 +196,9 @@ class Tracker:
         if contacts and not smooth:
             raise ObservationError("contacts without smoothing", remedy="Leave smooth as it is: contacts need it.")
         frames = self._session.frames(self.body, self.scene_of, self.apart)
-        subject = Subject(self.body, np.ones(len(self.body.scale_groups)))
+        subject, how = Subject.as_is(self.body), Estimation(smooth=smooth, contacts=contacts)
         told = {"frames": {"dropped": self.dropped, "late": self.late}}
-        return motion_of(
-            frames, subject, self.settings, smooth=smooth, contacts=contacts, up=axis_of(self.up), name=name, told=told
-        )
+        return motion_of(frames, subject, self.settings, how, up=axis_of(self.up), name=name, told=told)
 
     def update(
         self, frames: Sequence[Any], time: float | None = None, *, others: Sequence[Scene] = ()
@@ -232,7 +228,7 @@ class Tracker:
         of_kind(others, Sequence, "others", "Give a list of scenes, as `scene_of` returns them.", each=Scene)
         kept = copy(self._prediction), self._last, self._seen.copy()
         before = self._time, self._recovery.clocks(), self.dropped, *kept
-        learnt, self._others = self.sensors.learnt(), tuple(others)
+        learnt, self.others = self.sensors.learnt(), tuple(others)
         try:
             return self._updated(frames, time)
         except BaseException:  # as if they had never come
@@ -241,7 +237,7 @@ class Tracker:
             self.sensors.unlearn(learnt)
             raise
         finally:
-            self._others = ()
+            self.others = ()
 
     def _updated(self, frames: Sequence[Any], time: float) -> FrameResult | None:
         steps = self._steps(time)
@@ -261,7 +257,7 @@ class Tracker:
         result = self._recovery.run(self, time, frames, measurements, result)
         self._last = result
         if result is not None:
-            moving = {"velocity": self.speed, "measurements": tuple(measurements), "others": self._others}
+            moving = {"velocity": self.speed, "measurements": tuple(measurements), "others": self.others}
             scene = self._scene.at(result.state, time=time, covariance=covariance, **moving)
             self.sensors.check_channels(result.matched, scene)
             for m in measurements:
@@ -286,12 +282,8 @@ class Tracker:
         """Rows that keep parts of the body from running into each other."""
         return self._fit.apart(scene)
 
-    def alone(self, frames: Sequence[Any]) -> list[Any]:
-        """Frames in which this body may be sought: depth images without the other bodies of the update at hand."""
-        return [without_others(f, self._others, self.rig[f.sensor]) if isinstance(f, DepthFrame) else f for f in frames]
-
     def _scene_of(self, frames: Sequence[Any], state: BodyState, time: float) -> tuple[Scene, list[Measurement]]:
-        scene = self._scene.at(state, time=time, velocity=self.speed, others=self._others)
+        scene = self._scene.at(state, time=time, velocity=self.speed, others=self.others)
         measurements = self.sensors.measurements(frames, scene)
         return scene.at(state, measurements=tuple(measurements)), measurements
 

@@ -13,7 +13,7 @@ from kinefit.smoothing.online.known_noise import KnownNoise
 from kinefit.subject.subject import Progress, Subject
 from kinefit.tracking.checkpoints.checkpoint import Checkpoint
 from kinefit.tracking.checkpoints.interrupted import TrackingInterrupted
-from kinefit.tracking.motions import motion_of
+from kinefit.tracking.motions import Estimation, motion_of
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import run
 from kinefit.tracking.sizing import fitted_to_person
@@ -89,10 +89,10 @@ def track(
     if checkpoint is not None and foreign:
         problem = "a checkpoint with sensors of one's own, whose state nobody can keep"
         raise ObservationError(problem, remedy="Leave the checkpoint out.")
+    known = Subject.as_is(body) if subject is None and not size else subject
     person = fitted_to_person(
-        recording, body, settings, subject=subject, trial=trial, height=height, size=size, frames=shape_frames,
-        progress=progress,
-    )  # fmt: skip
+        recording, body, settings, subject=known, trial=trial, height=height, frames=shape_frames, progress=progress
+    )
     tracked = run(
         person.recording, person.subject.body, settings, start=person.start, values=person.values,
         view_bias=person.subject.view_bias, progress=progress, checkpoint=checkpoint,
@@ -102,12 +102,13 @@ def track(
     told = {**person.told, **others, "frames": {"dropped": tracker.dropped, "late": tracker.late}}
     if (family := person.subject.body.family) is not None:
         told["body shape"] = {name: round(value, 3) for name, value in family.shape.items()}
-    motion = motion_of(
-        tracked, person.subject, settings, smooth=smooth and lag is None and tracked.complete, contacts=contacts,
-        eye=None if recording.alone is None else recording.alone.centre_world,
-        lag=lag if tracked.complete else None, noise=noise, up=recording.up, name=recording.name, told=told,
-        found=person.joint,
+    how = Estimation(
+        smooth and lag is None and tracked.complete, contacts,
+        None if recording.alone is None else recording.alone.centre_world, lag if tracked.complete else None, noise,
     )  # fmt: skip
+    motion = motion_of(
+        tracked, person.subject, settings, how, up=recording.up, name=recording.name, told=told, found=person.joint
+    )
     if not tracked.complete:
         raise TrackingInterrupted(motion, len(recording))
     return motion

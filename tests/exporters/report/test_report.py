@@ -22,10 +22,10 @@ from kinefit.exporters.report.moments import (
     listed,
     never_observed,
     shared_by_prior,
-    stretches,
 )
 from kinefit.exporters.report.pictures import close_up, report_frames
 from kinefit.exporters.report.report import trust_sentence, write_report
+from kinefit.findings import runs_of
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Residuals
@@ -194,9 +194,9 @@ def test_angles_that_share_a_bend_by_the_prior_are_named_and_why(tmp_path):
 
 def test_stretches_and_lists():
     flags = np.array([1, 0, 1, 1, 0, 0, 0, 1], bool)
-    assert stretches(flags) == [(0, 1), (2, 4), (7, 8)]
-    assert stretches(flags, gap=2) == [(0, 4), (7, 8)]
-    assert stretches(np.zeros(5, bool)) == []
+    assert runs_of(flags) == [(0, 1), (2, 4), (7, 8)]
+    assert runs_of(flags, gap=2) == [(0, 4), (7, 8)]
+    assert runs_of(np.zeros(5, bool)) == []
     assert listed(["a"]) == "a" and listed(["a", "b", "c"]) == "a, b and c"
     assert listed(list("abcdefg")) == "a, b, c, d and 3 more"
 

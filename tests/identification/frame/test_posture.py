@@ -6,8 +6,7 @@ from scipy.optimize import minimize
 
 from kinefit.geometry.se3 import exp_so3, log_so3
 from kinefit.identification.frame._kernels_posture import inverse, turn_costs, turn_of, turned_by
-from kinefit.identification.frame.identify import identify
-from kinefit.identification.frame.posture import posture_of
+from kinefit.identification.frame.identify import identify, posture_of
 from kinefit.identification.frame.synthetic import synthetic_body
 from kinefit.identification.model.learn import learn_model
 from kinefit.observations import Markers

@@ -7,8 +7,7 @@ from tests.photogrammetry import scenes
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.photogrammetry.region_growing import Grid
-from kinefit.photogrammetry.seeding.ray_seeds import ray_seeds
-from kinefit.photogrammetry.seeding.unaided import grow_between, grow_over_time
+from kinefit.photogrammetry.seeding.unaided import grow_between, grow_over_time, ray_seeds
 from kinefit.photogrammetry.spline_image import SplineImage
 
 TEXTURE = scenes.Texture(0.005, 3)

@@ -10,9 +10,9 @@ from kinefit.frame.trust import leapt
 from kinefit.observations import DepthFrame
 from kinefit.rendering import render_body
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.regions.region_flips import Flips
 from kinefit.sensors.regions.region_limbs import Limbs
 from kinefit.sensors.regions.region_seams import Seams
+from kinefit.sensors.regions.region_starts import Flips
 from kinefit.sensors.regions.regions import RegionSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings

@@ -21,7 +21,7 @@ from kinefit.smoothing.unwrap import continued, unwrap
 from kinefit.solvers.equations import block_diagonal
 from kinefit.solvers.trajectory.marginal import leave
 from kinefit.solvers.trajectory.motion_prior import MotionPrior
-from kinefit.solvers.trajectory.smoothing import blocks, smooth
+from kinefit.solvers.trajectory.smoothing import smooth
 from kinefit.subject.subject import Subject
 from kinefit.tracking.session import KeptFrame
 
@@ -119,18 +119,8 @@ def test_what_left_a_window_is_not_forgotten():
     for f in range(4):
         own = H[f] + np.diag(np.concatenate([np.zeros(6), 1.0 / spread**2]))
         four = slice(f, f + 4)
-        entering = leave(
-            BODY,
-            roots[four],
-            angles[four],
-            own,
-            g[f],
-            posture,
-            np.zeros(N, bool),
-            *prior.rows(3),
-            blocks(BODY),
-            entering,
-        )
+        states = roots[four], angles[four]
+        entering = leave(BODY, states, own, g[f], posture, np.zeros(N, bool), prior.rows(3), entering)
     rest = smooth(BODY, roots[4:], angles[4:], equations(4), prior, dense=True, tolerance=1e-12, entering=entering)
     np.testing.assert_allclose(rest.angles, full.angles[4:], atol=1e-6)
     np.testing.assert_allclose(rest.roots, full.roots[4:], atol=1e-6)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import check_shape
 from kinefit.errors import BodyError
 
 Vector = tuple[float, float, float]
@@ -45,9 +46,8 @@ class TaperedCylinder:
 
     def __post_init__(self) -> None:
         start, end, radii = (np.array(v, float) for v in (self.start, self.end, self.radii))
-        if start.shape != (3,) or end.shape != (3,) or radii.shape != (2, 2):
-            problem = f"a cylinder has ends of shape {start.shape} and {end.shape} and radii of shape {radii.shape}"
-            raise BodyError(problem, remedy="Give (3,), (3,) and (2, 2).")
+        for array, shape, what in ((start, (3,), "an end"), (end, (3,), "an end"), (radii, (2, 2), "radii")):
+            check_shape(array, shape, f"{what} of a cylinder", error=BodyError)
         if not np.isfinite([start.sum(), end.sum(), radii.sum()]).all() or radii.min() <= 0:
             problem = f"a cylinder from {start.tolist()} to {end.tolist()} has radii {radii.tolist()}"
             raise BodyError(problem, remedy="Give positive radii in metres, and finite ends.")

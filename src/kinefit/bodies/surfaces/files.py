@@ -7,12 +7,13 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
-from kinefit.bodies.surfaces.fourier_files import fourier_surface
+from kinefit.bodies.surfaces.fourier import FourierSurface
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.surfaces.metaballs import Metaballs
-from kinefit.bodies.surfaces.obj import mesh_surface
+from kinefit.bodies.surfaces.obj import mesh_surface, surface_of_file
 from kinefit.errors import BodyError
 from kinefit.geometry.se3 import exp_so3
 
@@ -80,11 +81,7 @@ def surfaces_of(
             out.append(mesh_surface(path, segment, unit=record.unit, mirror=record.mirror, place=place))
             continue
         if is_series:
-            assert record.fourier is not None and record.grid is not None
-            out.append(fourier_surface(
-                Path(source).parent / record.fourier, segment, grid=record.grid, closed=record.closed,
-                orders=record.orders, nodes=record.nodes, unit=record.unit, mirror=record.mirror, place=place,
-            ))  # fmt: skip
+            out.append(_series(record, segment, source, place))
             continue
         if record.balls:
             out.append(_metaballs(record, segment, source, place))
@@ -96,6 +93,25 @@ def surfaces_of(
         except BodyError as error:
             raise BodyError(error.problem, file=source, place=place, remedy=error.remedy) from error
     return out
+
+
+def _series(record: SurfaceRecord, segment: int, source: str, place: str) -> MeshSurface:
+    """Free form (P1 2.3) of a file of points x,y,z, a row of the grid after the other, as a Fourier series."""
+    assert record.fourier is not None and record.grid is not None
+    path, grid = Path(source).parent / record.fourier, record.grid
+
+    def read() -> tuple[NDArray, NDArray]:
+        try:
+            points = np.loadtxt(path, delimiter=",", ndmin=2)
+        except (OSError, ValueError) as error:
+            raise BodyError(f"points that cannot be read: {error}", remedy="Write lines of x,y,z.") from error
+        if points.shape != (grid[0] * grid[1], 3):
+            problem = f"{points.shape[0]} lines of {points.shape[1]} numbers for a grid of {grid[0]} x {grid[1]}"
+            raise BodyError(problem, remedy="Write x,y,z of every point, and the grid's two counts.")
+        series = FourierSurface.of(points.reshape(*grid, 3), closed=record.closed, orders=record.orders)
+        return series.triangles(record.nodes or grid)
+
+    return surface_of_file(path, segment, read, unit=record.unit, mirror=record.mirror, place=place)
 
 
 def _metaballs(record: SurfaceRecord, segment: int, source: str, place: str) -> Metaballs:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,3 +135,16 @@ def _check(vertices: NDArray, faces: NDArray, open_edges: NDArray) -> None:
         if volume <= 0.0:
             problem = f"a mesh's part of {len(part)} faces is inside out or flat (volume {volume:.3g} m³)"
             raise BodyError(problem, remedy="List the corners of its faces the other way round; leave out inner walls.")
+
+
+@cache
+def tube_faces(along: int, around: int) -> NDArray:
+    """(T, 3) faces of `along` rings of `around` quads, and a fan on each end; its two middles are the last vertices."""
+    j = np.arange(around)
+    following, bottom, top = (j + 1) % around, (along + 1) * around, (along + 1) * around + 1
+    rows = np.arange(along)[:, None] * around
+    one, two, three, four = rows + j, rows + following, rows + around + following, rows + around + j
+    sides = np.stack([np.stack([one, two, three], -1), np.stack([one, three, four], -1)], 2).reshape(-1, 3)
+    low = np.stack([np.full(around, bottom), following, j], -1)
+    high = np.stack([np.full(around, top), along * around + j, along * around + following], -1)
+    return np.concatenate([sides, low, high])

@@ -8,13 +8,12 @@ cross-sections by ray casting (P4, section 3.1), whose faces stay the same when 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.bodies.surfaces.mesh import MeshSurface, tube_faces
 from kinefit.bodies.surfaces.obj import LONGEST
 from kinefit.errors import BodyError
 
@@ -180,7 +179,7 @@ def _mesh(centres: NDArray, radii: NDArray, weights: NDArray, axes: NDArray) -> 
     rays = np.tile(ways, (_RINGS, 1))
     rings = starts + _first_outside(starts, rays, 3.0 * float(radii.max()) + reach, balls)[:, None] * rays
     poles = np.stack([spine[0] - ends[0] * along, spine[-1] + ends[1] * along])
-    return np.concatenate([rings, poles]), _faces()
+    return np.concatenate([rings, poles]), tube_faces(_RINGS - 1, _AROUND)
 
 
 def _spine(centres: NDArray, radii: NDArray, axes: NDArray) -> tuple[NDArray, NDArray]:
@@ -213,18 +212,6 @@ def _first_outside(starts: NDArray, ways: NDArray, reach: float, balls: tuple[ND
         here, there = (_log_field(starts + s[:, None] * ways, *balls) - np.log(LEVEL) for s in (at, at + step))
         at = np.clip(at - step * here / np.where(np.abs(there - here) > 1e-15, there - here, -1e-15), low, high)
     return at
-
-
-@cache
-def _faces() -> NDArray:
-    j, following = np.arange(_AROUND), (np.arange(_AROUND) + 1) % _AROUND
-    rows = _AROUND * np.arange(_RINGS - 1)[:, None]
-    one, two, three, four = rows + j, rows + following, rows + _AROUND + following, rows + _AROUND + j
-    sides = np.stack([np.stack([one, two, three], -1), np.stack([one, three, four], -1)], 2).reshape(-1, 3)
-    bottom, top, last = _RINGS * _AROUND, _RINGS * _AROUND + 1, (_RINGS - 1) * _AROUND
-    low = np.stack([np.full(_AROUND, bottom), following, j], -1)
-    high = np.stack([np.full(_AROUND, top), last + j, last + following], -1)
-    return np.concatenate([sides, low, high])
 
 
 class BallTable(NamedTuple):

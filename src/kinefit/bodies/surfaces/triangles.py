@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
-from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.bodies.surfaces.mesh import MeshSurface, tube_faces
 from kinefit.errors import BodyError
 
 if TYPE_CHECKING:
@@ -69,14 +69,7 @@ def triangles(surface: TaperedCylinder | MeshSurface, around: int = 20, along: i
     centres = surface.start + surface.length * t * axis
     rings = centres[:, None] + (at[:, :1] * np.cos(angle))[..., None] * a + (at[:, 1:] * np.sin(angle))[..., None] * b
     vertices = np.concatenate([rings.reshape(-1, 3), centres[[0, -1]]])
-    j = np.arange(around)
-    following, bottom, top = (j + 1) % around, (along + 1) * around, (along + 1) * around + 1
-    rows = np.arange(along)[:, None] * around
-    one, two, three, four = rows + j, rows + following, rows + around + following, rows + around + j
-    sides = np.stack([np.stack([one, two, three], -1), np.stack([one, three, four], -1)], 2).reshape(-1, 3)
-    low = np.stack([np.full(around, bottom), following, j], -1)
-    high = np.stack([np.full(around, top), along * around + j, along * around + following], -1)
-    return vertices, np.concatenate([sides, low, high])
+    return vertices, tube_faces(along, around).copy()
 
 
 def body_mesh(body: Body, *, around: int = 20, along: int = 6) -> BodyMesh:

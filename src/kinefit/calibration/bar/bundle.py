@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.calibration.board.bundle import moved_camera, pixel_columns
+from kinefit.calibration.board.bundle import CameraEquations, moved_camera, pixel_columns
 from kinefit.geometry.camera import Rig
-from kinefit.solvers.least_squares import relax
+from kinefit.solvers.least_squares import descend
 
 POSE = 6
 INTERIOR = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
@@ -56,35 +56,14 @@ class BarBundle:
 
 
 @dataclass(frozen=True, eq=False)
-class _BarEquations:
-    """Normal equations: cameras' H, b; places' Hp (F, 6, 6), bp; cross (F, 6, n)."""
-
-    H: NDArray
-    b: NDArray
-    Hp: NDArray
-    bp: NDArray
-    cross: NDArray
-    cost: float
+class _BarEquations(CameraEquations):
     residuals: NDArray
     misfit: NDArray  # (F,) [m] of the distance
     squares: float  # weighted squares of pixels alone
     count: int  # pixel coordinates
 
-    def reduced(self, free: NDArray, damping: float) -> tuple[NDArray, NDArray, NDArray]:
-        """The cameras' equations with the places taken out, and the places' inverses."""
-        diagonal = np.einsum("fii->fi", self.Hp)
-        inverse = np.linalg.inv(self.Hp + np.eye(6) * (damping * diagonal + 1e-12 * diagonal.max())[:, None, :])
-        S = self.H + np.diag(damping * np.diag(self.H) + ~free)
-        weighted = inverse @ self.cross
-        S = S - np.tensordot(self.cross, weighted, axes=([0, 1], [0, 1]))
-        return S, self.b - np.einsum("fij,fi->j", weighted, self.bp), inverse
 
-    def step(self, free: NDArray, damping: float) -> tuple[NDArray, NDArray]:
-        """Change of the cameras (n,) and of the ends (F, 6)."""
-        S, b, inverse = self.reduced(free, damping)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
-        delta = scale * np.linalg.solve(S * np.outer(scale, scale) + 1e-14 * np.eye(len(S)), scale * b)
-        return delta, (inverse @ (self.bp - self.cross @ delta)[..., None])[..., 0]
+_Linearised = tuple[Rig, NDArray, _BarEquations]
 
 
 class BarProblem:
@@ -108,38 +87,28 @@ class BarProblem:
     def adjust(self, rig: Rig, x_world: NDArray, *, rounds: int = 4, iterations: int = 15) -> tuple[Rig, NDArray]:
         """Damped Gauss-Newton to the least cost, the variance components anew in every round."""
         for _ in range(rounds):
-            rig, x_world, system = self._solve(rig, x_world, iterations)
+            begin, stop = (rig, x_world, self.system(rig, x_world)), 1e-7
+            found, _ = descend(begin, lambda at: at[2].cost, self._step, iterations=iterations, tolerance=stop)
+            rig, x_world, system = found
             before = self.sigma, self.scatter
             self._components(rig, system)
             if abs(self.sigma / before[0] - 1) < 0.02 and abs(self.scatter / before[1] - 1) < 0.1:
                 break
         return rig, x_world
 
-    def _solve(self, rig: Rig, x_world: NDArray, iterations: int) -> tuple[Rig, NDArray, _BarEquations]:
-        system, damping, free = self.system(rig, x_world), 1e-4, self.free.ravel()
-        for _ in range(iterations):
-            before = system.cost
-            while damping < 1e8:
-                delta, d_ends = system.step(free, damping)
-                try:
-                    parts = delta.reshape(self.free.shape)
-                    new_rig = Rig(tuple(moved_camera(c, d, self.interiors) for c, d in zip(rig, parts)))
-                except (ValueError, ArithmeticError, np.linalg.LinAlgError):
-                    damping *= 10.0
-                    continue
-                new_x = x_world + d_ends.reshape(x_world.shape)
-                new = self.system(new_rig, new_x)
-                if new.cost < system.cost:
-                    rig, x_world, system, damping = new_rig, new_x, new, relax(damping)
-                    break
-                damping *= 10.0
-            if not before - system.cost > 1e-7 * system.cost:
-                break
-        return rig, x_world, system
+    def _step(self, now: _Linearised, damping: float) -> _Linearised | None:
+        cameras, ends = now[2].step(damping)
+        try:
+            parts = zip(now[0], cameras.reshape(self.free.shape))
+            rig = Rig(tuple(moved_camera(c, d, self.interiors) for c, d in parts))
+        except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+            return None
+        x_world = now[1] + ends.reshape(now[1].shape)
+        return rig, x_world, self.system(rig, x_world)
 
     def _components(self, rig: Rig, system: _BarEquations) -> None:
         """Variances of pixels and distance, each from its squares and its share of the redundancy."""
-        cov, ends = self._covariances(rig, system)
+        cov, ends = system.covariances()
         prior = self._prior(rig)[0]
         x = self._normals
         of_length = np.einsum("fi,fij,fj->f", x, ends, x) / self.scatter**2
@@ -150,19 +119,10 @@ class BarProblem:
         left = max(1.0 - float(np.mean(of_length)), 0.05)
         self.scatter = max(square / np.sqrt(left), _LEAST_SCATTER * self.length)
 
-    def _covariances(self, rig: Rig, system: _BarEquations) -> tuple[NDArray, NDArray]:
-        free = self.free.ravel()
-        S, _, inverse = system.reduced(free, 0.0)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
-        cov = np.linalg.pinv(S * np.outer(scale, scale), hermitian=True, rcond=1e-15) * np.outer(scale, scale)
-        cov = np.where(np.outer(free, free), cov, 0.0)
-        gain = inverse @ system.cross
-        return cov, inverse + gain @ cov @ np.swapaxes(gain, 1, 2)
-
     def result(self, rig: Rig, x_world: NDArray) -> BarBundle:
         """With covariances, at what `adjust` gave."""
         system = self.system(rig, x_world)
-        cov, ends = self._covariances(rig, system)
+        cov, ends = system.covariances()
         prior = self._prior(rig)[0]
         share = np.clip(prior * np.diag(cov), 0.0, 1.0)
         return BarBundle(rig, x_world, system.residuals, self.sigma, self.scatter, cov, ends, share)
@@ -220,7 +180,7 @@ class BarProblem:
         if self.interiors:
             cost += self._square_pixels(rig, H, b)
         misfit, more = self._distances(x_world, Hp, bp)
-        return _BarEquations(H, b, Hp, bp, cross, cost + more, residuals, misfit, squares, total)
+        return _BarEquations(H, b, Hp, bp, cross, self.free.ravel(), cost + more, residuals, misfit, squares, total)
 
     def _square_pixels(self, rig: Rig, H: NDArray, b: NDArray) -> float:
         """Add fx - fy = 0 of each camera; its cost."""

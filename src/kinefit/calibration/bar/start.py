@@ -5,7 +5,7 @@ No image tells which of the two targets is which: every step tries both orders a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -124,23 +124,33 @@ def epipolar(a: NDArray, b: NDArray, limit: float) -> tuple[NDArray, NDArray, ND
     exchanged : (M,) bool, where the targets of b stand the other way round.
     inside : (M,) bool, places that agree.
     """
+    return _consensus(a, b, _eight_points, _order_costs, limit, rounds=10, least=4)
+
+
+def _consensus(
+    a: NDArray, b: NDArray, model_of: Callable[[NDArray, NDArray], NDArray],
+    costs: Callable[[NDArray, NDArray, NDArray], NDArray], limit: float, *, rounds: int, least: int,
+) -> tuple[NDArray, NDArray, NDArray]:  # fmt: skip
+    """The model of pairs a (M, 2, n) and b (M, 2, 2), whose order is unknown, that most agree with; see `epipolar`.
+
+    It is found from four pairs at a time, then from all that agree, in so many rounds, while `least` do.
+    """
     rng, M = np.random.default_rng(0), len(a)
     sample = rng.integers(0, M, (_HYPOTHESES, 4))
     swap = rng.random((_HYPOTHESES, 4)) < 0.5
     bs = np.where(swap[:, :, None, None], b[sample][:, :, ::-1], b[sample])
-    F = _eight_points(a[sample].reshape(_HYPOTHESES, 8, 2), bs.reshape(_HYPOTHESES, 8, 2))
+    models = model_of(a[sample].reshape(_HYPOTHESES, 8, -1), bs.reshape(_HYPOTHESES, 8, 2))
     few = np.unique(np.linspace(0, M - 1, min(M, 150)).astype(int))
-    best = int(np.argmin(np.minimum(_order_costs(F, a[few], b[few]).min(axis=0), 2 * limit**2).sum(axis=1)))
-    Fs, exchanged = F[best][None], np.zeros(M, bool)
-    inside = np.ones(M, bool)
-    for _ in range(10):
-        straight, crossed = _order_costs(Fs, a, b)[:, 0]
+    best = int(np.argmin(np.minimum(costs(models, a[few], b[few]).min(axis=0), 2 * limit**2).sum(axis=1)))
+    model, exchanged, inside = models[best][None], np.zeros(M, bool), np.ones(M, bool)
+    for _ in range(rounds):
+        straight, crossed = costs(model, a, b)[:, 0]
         exchanged, inside = crossed < straight, np.minimum(straight, crossed) < 2 * limit**2
-        if inside.sum() < 4:
+        if inside.sum() < least:
             break
-        ordered = np.where(exchanged[:, None, None], b[:, ::-1], b)
-        Fs = _eight_points(a[inside].reshape(1, -1, 2), ordered[inside].reshape(1, -1, 2))
-    return Fs[0], exchanged, inside
+        ordered = np.where(exchanged[:, None, None], b[:, ::-1], b)[inside]
+        model = model_of(a[inside].reshape(1, 2 * inside.sum(), -1), ordered.reshape(1, -1, 2))
+    return model[0], exchanged, inside
 
 
 def _eight_points(a: NDArray, b: NDArray) -> NDArray:
@@ -256,23 +266,12 @@ def resect(camera: Camera, x_world: NDArray, uv: NDArray, known: bool) -> tuple[
     if len(uv) < FEWEST:
         return camera, 0.0
     p, limit = flat(camera, uv, known), near(camera, known)
-    rng, K, M = np.random.default_rng(0), _HYPOTHESES, len(uv)
-    sample = rng.integers(0, M, (K, 4))
-    swap = rng.random((K, 4)) < 0.5
-    ps = np.where(swap[:, :, None, None], p[sample][:, :, ::-1], p[sample])
     middle, size = x_world.mean(axis=(0, 1)), max(float(x_world.std()), 1e-9)
-    x = np.concatenate([(x_world - middle) / size, np.ones((M, 2, 1))], axis=2)
-    P = _direct(x[sample].reshape(K, 8, 4), ps.reshape(K, 8, 2))
-    few = np.unique(np.linspace(0, M - 1, min(M, 150)).astype(int))
-    best = int(np.argmin(np.minimum(_projected(P, x[few], p[few]).min(axis=0), 2 * limit**2).sum(axis=1)))
-    P, inside, ordered = P[best][None], np.ones(M, bool), p
-    for _ in range(8):
-        straight, crossed = _projected(P, x, p)[:, 0]
-        inside = np.minimum(straight, crossed) < 2 * limit**2
-        if inside.sum() < 6:
-            return camera, 0.0
-        ordered = np.where((crossed < straight)[:, None, None], p[:, ::-1], p)
-        P = _direct(x[inside].reshape(1, -1, 4), ordered[inside].reshape(1, -1, 2))
+    x = np.concatenate([(x_world - middle) / size, np.ones((len(uv), 2, 1))], axis=2)
+    _, exchanged, inside = _consensus(x, p, _direct, _projected, limit, rounds=8, least=6)
+    if inside.sum() < 6:
+        return camera, 0.0
+    ordered = np.where(exchanged[:, None, None], p[:, ::-1], p)
     best_cost, best_camera = np.inf, camera
     for focal in np.ones(1) if known else _FOCALS:
         image = np.ascontiguousarray(ordered[inside].reshape(-1, 2) / focal)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.calibration.board.detection import grey_image
 from kinefit.calibration.board.sources import Frames, NumberedImages, evenly, opened, sample
 from kinefit.errors import CalibrationError
 
@@ -71,7 +72,7 @@ def find_bars(
             own, ends, counts = set(camera.numbers), {}, []
             for i, frame in enumerate(wanted):
                 if frame in own:
-                    found = targets_in(_grey(camera.read(frame)), still)
+                    found = targets_in(grey_image(camera.read(frame)), still)
                     counts.append(len(found))
                     if len(found) == 2:
                         ends[frame] = found
@@ -129,12 +130,8 @@ def _centroid(weight: NDArray) -> tuple[NDArray, float]:
 
 
 def _still(camera: NumberedImages | Frames) -> NDArray | None:
-    images = [_grey(image) for image in sample(camera, _SAMPLES)]
+    images = [grey_image(image) for image in sample(camera, _SAMPLES)]
     return np.median(images, axis=0).astype(np.float32) if len(images) >= 5 else None
-
-
-def _grey(image: NDArray) -> NDArray:
-    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
 
 
 def _refuse(name: str, counts: list[int]) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.solvers.least_squares import relax
+from kinefit.solvers.least_squares import descend
 
 _POSE = 6
 _HUBER = 1.345  # standard deviations: 95 % efficient where errors are normal (Huber, 1981)
@@ -93,7 +93,7 @@ def adjust_boards(
             break
     problem = _BoardProblem(corners, interiors, jitter)
     system = problem.system(rig, Ts_world_board)
-    position_std, focal_std = _deviations(system)
+    position_std, focal_std = _deviations(system, len(rig))
     left = residuals(rig, Ts_world_board, corners)
     return BoardBundle(rig, Ts_world_board, left, system.within, jitter, position_std, focal_std)
 
@@ -138,37 +138,51 @@ def pixel_columns(camera: Camera, x_camera: NDArray, interiors: bool) -> tuple[N
 
 
 @dataclass(frozen=True, eq=False)
-class _BoardEquations:
-    """Normal equations: cameras' H (C, P, C, P), b; boards' Hb (F, 6, 6), bb; cross (F, 6, C, P); what is free."""
+class CameraEquations:
+    """Normal equations: H, b of n parameters of cameras; Hf (F, 6, 6), bf of frames; cross (F, 6, n); free (n,)."""
 
     H: NDArray
     b: NDArray
-    Hb: NDArray
-    bb: NDArray
+    Hf: NDArray
+    bf: NDArray
     cross: NDArray
     free: NDArray
     cost: float
+
+    def reduced(self, damping: float) -> tuple[NDArray, NDArray, NDArray]:
+        """The cameras' equations with the frames' unknowns taken out, and the inverses of these (F, 6, 6)."""
+        diagonal = np.einsum("fii->fi", self.Hf)
+        inverse = np.linalg.inv(self.Hf + np.eye(6) * (damping * diagonal + 1e-12 * diagonal.max() + 1e-12)[:, None, :])
+        weighted = inverse @ self.cross
+        S = self.H + np.diag(damping * np.diag(self.H) + ~self.free)
+        S = S - np.tensordot(self.cross, weighted, axes=([0, 1], [0, 1]))
+        return S, self.b - np.einsum("fij,fi->j", weighted, self.bf), inverse
+
+    def step(self, damping: float) -> tuple[NDArray, NDArray]:
+        """Change of the cameras (n,) and of the frames' unknowns (F, 6)."""
+        S, b, inverse = self.reduced(damping)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))  # coefficients and metres differ by many orders
+        delta = scale * np.linalg.solve(S * np.outer(scale, scale) + 1e-14 * np.eye(len(S)), scale * b)
+        return delta, (inverse @ (self.bf - self.cross @ delta)[..., None])[..., 0]
+
+    def covariances(self) -> tuple[NDArray, NDArray]:
+        """(n, n) of the cameras, zero where they are fixed, and (F, 6, 6) of the frames' unknowns."""
+        S, _, inverse = self.reduced(0.0)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
+        cov = np.linalg.pinv(S * np.outer(scale, scale), hermitian=True, rcond=1e-15) * np.outer(scale, scale)
+        cov = np.where(np.outer(self.free, self.free), cov, 0.0)
+        gain = inverse @ self.cross
+        return cov, inverse + gain @ cov @ np.swapaxes(gain, 1, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class _BoardEquations(CameraEquations):
     within: NDArray
     eta: NDArray  # (V, 6)
     spread: NDArray  # (V, 6) variances of η
 
-    def reduced(self, damping: float) -> tuple[NDArray, NDArray, NDArray]:
-        """The cameras' equations with the boards taken out, and the boards' inverses."""
-        n = self.free.size
-        cross = self.cross.reshape(-1, 6, n)
-        diagonal = np.einsum("fii->fi", self.Hb)
-        inverse = np.linalg.inv(self.Hb + np.eye(6) * (damping * diagonal + 1e-12 * diagonal.max() + 1e-12)[:, None, :])
-        H = self.H.reshape(n, n)
-        S = H + np.diag(damping * np.diag(H) + ~self.free.ravel()) - np.einsum("fij,fik->jk", cross, inverse @ cross)
-        return S, self.b.ravel() - np.einsum("fij,fi->j", inverse @ cross, self.bb), inverse
 
-    def step(self, damping: float) -> tuple[NDArray, NDArray]:
-        """Change of the cameras (C, P) and of the boards (F, 6)."""
-        S, b, inverse = self.reduced(damping)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))  # coefficients and metres differ by many orders
-        delta = scale * np.linalg.solve(S * np.outer(scale, scale) + 1e-14 * np.eye(len(S)), scale * b)
-        right = self.bb - self.cross.reshape(*self.bb.shape, -1) @ delta
-        return delta.reshape(self.free.shape), (inverse @ right[..., None])[..., 0]
+_Linearised = tuple[Rig, NDArray, _BoardEquations]
 
 
 class _BoardProblem:
@@ -185,21 +199,17 @@ class _BoardProblem:
 
     def solve(self, rig: Rig, Ts_world_board: NDArray, max_iterations: int) -> tuple[Rig, NDArray]:
         """Damped Gauss-Newton to the least cost."""
-        system, damping = self.system(rig, Ts_world_board), 1e-3
-        for _ in range(max_iterations):
-            before = system.cost
-            while damping < 1e8:
-                d_cameras, d_boards = system.step(damping)
-                new_rig = Rig(tuple(moved_camera(camera, d, self.interiors) for camera, d in zip(rig, d_cameras)))
-                new_boards = np.stack([T @ se3.exp(d) for T, d in zip(Ts_world_board, d_boards)])
-                new = self.system(new_rig, new_boards)
-                if new.cost < system.cost:
-                    rig, Ts_world_board, system, damping = new_rig, new_boards, new, relax(damping)
-                    break
-                damping *= 10.0
-            if not before - system.cost > 1e-6 * system.cost:
-                break
-        return rig, Ts_world_board
+
+        def step(now: _Linearised, damping: float) -> _Linearised:
+            cameras, boards = now[2].step(damping)
+            parts = zip(now[0], cameras.reshape(len(rig), -1))
+            new_rig = Rig(tuple(moved_camera(camera, d, self.interiors) for camera, d in parts))
+            new_boards = np.stack([T @ se3.exp(d) for T, d in zip(now[1], boards)])
+            return new_rig, new_boards, self.system(new_rig, new_boards)
+
+        begin = rig, Ts_world_board, self.system(rig, Ts_world_board)
+        found, _ = descend(begin, lambda at: at[2].cost, step, iterations=max_iterations, damping=1e-3, tolerance=1e-6)
+        return found[:2]
 
     def jitter_of(self, rig: Rig, Ts_world_board: NDArray) -> tuple[float, float]:
         """Standard deviations (shift, turn) of η over the views of frames that two or more cameras saw."""
@@ -244,7 +254,9 @@ class _BoardProblem:
             bb[f] += M[P:-1, -1]
             cross[f, :, c] += M[P:-1, :P]
             within[start:stop], cost = left, cost + more
-        return _BoardEquations(H, b, Hb, bb, cross, free, cost, within, eta, spread)
+        n = free.size
+        cameras = H.reshape(n, n), b.ravel(), Hb, bb, cross.reshape(F, 6, n), free.ravel()
+        return _BoardEquations(*cameras, cost, within, eta, spread)
 
     def _view(self, G: NDArray, P: int) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
         """One view's equations with η taken out; its residuals at the best η, η itself, its variances, the cost."""
@@ -262,12 +274,8 @@ class _BoardProblem:
         return M, rest, eta, np.diag(inverse), float(cost)
 
 
-def _deviations(system: _BoardEquations) -> tuple[NDArray, NDArray]:
+def _deviations(system: _BoardEquations, cameras: int) -> tuple[NDArray, NDArray]:
     """Standard deviations of the cameras' places [m] and focal lengths [px]."""
-    free = system.free
-    S = system.reduced(0.0)[0]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
-    covariance = np.linalg.pinv(S * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
-    variance = np.where(free, np.diag(covariance).reshape(free.shape), 0.0)
-    focal = variance[:, _POSE] if free.shape[1] > _POSE else np.zeros(len(free))
+    variance = np.diag(system.covariances()[0]).reshape(cameras, -1)
+    focal = variance[:, _POSE] if variance.shape[1] > _POSE else np.zeros(cameras)
     return np.sqrt(variance[:, :3].sum(axis=1)), np.sqrt(focal)

@@ -166,7 +166,7 @@ class Finder:
 
     def find(self, image: NDArray, frame: int) -> BoardView | None:
         """The board in a picture (H, W, 3) RGB or (H, W) grey; None where it is not seen."""
-        grey = _grey(image)
+        grey = grey_image(image)
         if self.board.kind == "checkerboard":
             return self._checkerboard(grey, frame)
         for way in self._ways:
@@ -257,7 +257,7 @@ def with_dictionary(board: Board, images: Sequence[NDArray]) -> Board:
 
 def fitting_boards(board: Board, images: Sequence[NDArray]) -> list[Board]:
     """Other boards that some pictures show: of another dictionary, the legacy pattern, or another size; best first."""
-    greys = [_grey(image) for image in images]
+    greys = [grey_image(image) for image in images]
     found: dict[Board, int] = {}
     if board.kind == "charuco":
         for name in _dictionaries_seen(board, greys)[:2]:
@@ -283,7 +283,7 @@ def _dictionaries_seen(board: Board, images: Iterable[NDArray]) -> list[str]:
     for name in DICTIONARIES:  # the dictionaries of one family begin alike
         if len(_dictionary(name).bytesList) >= needed:
             families.setdefault(name.partition("_")[0] if name[1] == "X" else name, name)
-    greys = [grey for image in images for grey in (_grey(image), 255 - _grey(image))]
+    greys = [grey for image in images for grey in (grey_image(image), 255 - grey_image(image))]
     counts = {}
     for name in families.values():
         detector = cv2.aruco.ArucoDetector(_dictionary(name))
@@ -293,5 +293,6 @@ def _dictionaries_seen(board: Board, images: Iterable[NDArray]) -> list[str]:
     return sorted((name for name, count in counts.items() if count >= 4), key=lambda name: -counts[name])
 
 
-def _grey(image: NDArray) -> NDArray:
+def grey_image(image: NDArray) -> NDArray:
+    """(H, W) of an image in colour (RGB), or in grey already."""
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from os import PathLike
+from pathlib import Path
 
-import numpy as np
+import msgspec
 
 from kinefit._arguments import checked
-from kinefit.calibration.check.loading import load_leniently
 from kinefit.calibration.check.sensor_verdicts import sensor_findings
 from kinefit.calibration.check.sensors import fit_sensors
+from kinefit.diagnostics.images import finding_of, fit_image
 from kinefit.diagnostics.keypoints import Check, Progress, check_keypoints
 from kinefit.diagnostics.scene import lens_findings
 from kinefit.diagnostics.sensor_fit import SensorAlignment
 from kinefit.errors import KinefitError, command
 from kinefit.findings import Finding, ranked
+from kinefit.geometry.camera import Rig
 from kinefit.multiview.followed import PersonKeypoints, follow
+from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.take.file import Take, read_take
+from kinefit.readers.take.load import Observations, load_observations
 from kinefit.readers.take.one_camera import is_alone
 from kinefit.readers.take.pictures import TakePictures
 
@@ -56,17 +62,14 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
         if seen is not None and seen.rig is not None:
             missing += lens_findings(seen.rig)
         return Check(take.name, ranked(missing), loaded.take, seen)
-    accuracy: dict[str, float] = {}
-    for entry in loaded.take.keypoints:
-        accuracy[entry.camera] = min(entry.sigma, accuracy.get(entry.camera, np.inf))
-    rig = seen.rig
+    rig, named = seen.rig, {entry.camera for entry in loaded.take.keypoints}
     with TakePictures(loaded.take, seen) as pictures:
         one = follow(rig, seen.keypoints, take.person or _SHOWS_MOST, pictures=pictures)
     seen = replace(seen, keypoints=one.keypoints)
+    begun = Check(take.name, (*loaded.findings, *_others(one, take.person is not None)), loaded.take, seen)
     check = check_keypoints(
-        rig.select(tuple(n for n in rig.names if n in accuracy)), seen.keypoints, body=take.body, up=take.up,
-        height=take.height, accuracy=accuracy, name=take.name, take=loaded.take, observations=seen,
-        found=(*loaded.findings, *_others(one, take.person is not None)), progress=progress,
+        rig.select(tuple(n for n in rig.names if n in named)), seen.keypoints, body=take.body, up=take.up,
+        height=take.height, begun=begun, progress=progress,
     )  # fmt: skip
     return _with_sensors(check, progress)
 
@@ -97,3 +100,117 @@ def _with_sensors(check: Check, progress: Progress | None) -> Check:
             text = f"Whether other sensors fit the videos cannot be told: {error.problem}."
             found = [Finding("note", "sensor", text, remedy=error.remedy or "")]
     return replace(check, findings=ranked([*check.findings, *found]), sensors=fits)
+
+
+_ATTEMPTS = 12  # each goes round one obstacle
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """What could be read.
+
+    Parameters
+    ----------
+    take : Take
+        As it must be written to be read: with the remedies of the findings.
+    observations : Observations or None
+        None where not even two cameras are left.
+    findings : tuple of Finding
+    """
+
+    take: Take
+    observations: Observations | None
+    findings: tuple[Finding, ...]
+
+
+def load_leniently(take: Take) -> Loaded:
+    """Read a take; what cannot be read is left out or guessed, and told."""
+    if take.calibration is None:
+        return Loaded(
+            take,
+            None,
+            (Finding("fault", "load", "The take names no cameras.", remedy="Add [[camera]] and [calibration]."),),
+        )
+    try:
+        rig = read_calibration(take.calibration.file, unit=take.calibration.unit)
+    except KinefitError as error:
+        return Loaded(take, None, (finding_of(error),))
+    findings: list[Finding] = []
+    take = _known_cameras(take, rig, findings)
+    cameras = []
+    for entry in take.cameras:
+        fitting, found = fit_image(entry, rig[entry.name].size, take.rate)
+        cameras.append(fitting)
+        findings += found
+    take = replace(take, cameras=tuple(cameras))
+    take = _framed_keypoints(take, rig, findings)
+    for _ in range(_ATTEMPTS):
+        try:
+            return Loaded(take, load_observations(take), tuple(findings))
+        except KinefitError as error:
+            findings.append(finding_of(error))
+            around = _without(take, error)
+            if around is None:
+                break
+            take = around
+    return Loaded(take, None, tuple(findings))
+
+
+def _known_cameras(take: Take, rig: Rig, findings: list[Finding]) -> Take:
+    """Without cameras that the calibration lacks."""
+    strange = [entry.name for entry in take.cameras if entry.name not in rig]
+    for name in strange:
+        text = f"{name} is not in the calibration, which has {', '.join(rig.names)}; it is left out."
+        remedy = "Correct its name in the take, or calibrate it too."
+        findings.append(Finding("fault", "load", text, (name,), remedy=remedy))
+    return _only(take, [entry.name for entry in take.cameras if entry.name in rig]) if strange else take
+
+
+def _only(take: Take, names: list[str]) -> Take:
+    return replace(
+        take, cameras=tuple(c for c in take.cameras if c.name in names),
+        keypoints=tuple(k for k in take.keypoints if k.camera in names),
+    )  # fmt: skip
+
+
+def _framed_keypoints(take: Take, rig: Rig, findings: list[Finding]) -> Take:
+    """With `frame` for keypoints that lack it and need it: detectors run on the video."""
+    entries = {entry.name: entry for entry in take.cameras}
+    out = []
+    for source in take.keypoints:
+        entry = entries[source.camera]
+        differs = entry.image != "as calibrated" or entry.rotation != 0
+        if source.frame is None and differs and source.format != "detect":
+            text = (
+                f"It is not stated in which image the keypoints of {source.camera} are: the video's, the calibration's?"
+            )
+            remedy = 'Write frame = "video" (as taken here) or frame = "calibration" into its [[keypoints]].'
+            findings.append(Finding("doubt", "frame", text, (source.camera,), remedy=remedy))
+            source = msgspec.structs.replace(source, frame="video")
+        out.append(source)
+    return replace(take, keypoints=tuple(out))
+
+
+def _without(take: Take, error: KinefitError) -> Take | None:
+    """The take with a way round an error: other frames, or without the file at fault; None where there is none."""
+    frames = re.search(r"frames = \[(\d+), (\d+)\]", error.remedy or "")
+    if frames and error.file == take.path:
+        cut = int(frames[1]), int(frames[2])
+        return replace(take, frames=cut) if take.frames != cut else None
+    for source in take.keypoints:
+        if any(_within(error.file, file) for file in (source.file, *_of_camera(take, source.camera)) if file) or (
+            source.camera in (error.place or "").replace(",", " ").split() and "keypoints" in (error.place or "")
+        ):
+            left = [entry.camera for entry in take.keypoints if entry is not source]
+            return _only(take, left) if len(set(left)) >= 2 else None
+    return None
+
+
+def _of_camera(take: Take, name: str) -> Iterator[Path]:
+    for entry in take.cameras:
+        if entry.name == name and entry.video:
+            yield entry.video
+
+
+def _within(file: object, place: Path) -> bool:
+    return isinstance(file, str | Path) and (Path(file) == place or place in Path(file).parents)

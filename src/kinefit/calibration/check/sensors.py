@@ -23,7 +23,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.identification.take.named import with_names
 from kinefit.motion import Motion
-from kinefit.observations import DepthFrame, MarkerFrame
+from kinefit.observations import sensor_of
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.sensors.base import Measurement
@@ -139,10 +139,7 @@ class _PlacementProblem:
 
     def seen(self, frame: int) -> list[Any]:
         """What the sensors saw in a frame of the motion."""
-        every = self.recording.steps(frame + self.first)
-        return [
-            f for f in every if isinstance(f, MarkerFrame) or (isinstance(f, DepthFrame) and f.sensor in self.depth)
-        ]
+        return [f for f in self.recording.steps(frame + self.first) if sensor_of(f) in self.origins]
 
     def chosen(self, most: int) -> NDArray:
         """Frames to fit, in which the person was tracked and a sensor saw something."""

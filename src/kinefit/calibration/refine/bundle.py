@@ -19,7 +19,9 @@ from kinefit.solvers.bundle.cameras import (
     residuals,
     robust_cost,
 )
-from kinefit.solvers.least_squares import relax
+from kinefit.solvers.least_squares import descend
+
+_At = tuple[Rig, NDArray, NDArray]  # cameras, time offsets, points
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,33 +67,26 @@ def bundle_adjust(
         Stop when an iteration lowers the cost by less than this share.
     """
     loss = loss or geman_mcclure()
-    offsets = np.zeros(len(rig)) if offsets is None else offsets
+    begin: _At = rig, np.zeros(len(rig)) if offsets is None else offsets, x
     precision, freedom = prior.precision, prior.freedom
 
     def cost_of(rig: Rig, offsets: NDArray, x: NDArray) -> float:
         away = prior.departure(rig, offsets)
         return robust_cost(residuals(rig, offsets, pixels, x), pixels.weight, loss)[0] + float(precision @ away**2)
 
-    cost, damping, system = cost_of(rig, offsets, x), 1e-4, None
-    for _ in range(max_iterations):
-        before = cost
-        while damping < 1e6:
-            system = reduce_points(rig, offsets, freedom, pixels, x, loss, damping)
-            S = system.S + np.diag(precision)
-            b = system.b - precision * prior.departure(rig, offsets)
-            delta = np.linalg.solve(S + damping * np.diag(np.diag(S)) + 1e-12 * np.eye(len(S)), b)
-            by_camera = delta.reshape(-1, COLUMNS)
-            try:
-                new_rig = moved_rig(rig, by_camera)
-            except ValueError:
-                damping *= 10.0
-                continue
-            new_x, new_offsets = x + system.points_step(delta), offsets + by_camera[:, TIME]
-            new = cost_of(new_rig, new_offsets, new_x)
-            if new < cost:
-                rig, x, offsets, cost, damping = new_rig, new_x, new_offsets, new, relax(damping)
-                break
-            damping *= 10.0
-        if not before - cost > tolerance * cost:
-            break
-    return Bundle(rig, offsets, x, cost, reduce_points(rig, offsets, freedom, pixels, x, loss).S)
+    def step(now: _At, damping: float) -> _At | None:
+        rig, offsets, x = now
+        system = reduce_points(rig, offsets, freedom, pixels, x, loss, damping)
+        S = system.S + np.diag(precision)
+        b = system.b - precision * prior.departure(rig, offsets)
+        delta = np.linalg.solve(S + damping * np.diag(np.diag(S)) + 1e-12 * np.eye(len(S)), b)
+        by_camera = delta.reshape(-1, COLUMNS)
+        try:
+            return moved_rig(rig, by_camera), offsets + by_camera[:, TIME], x + system.points_step(delta)
+        except ValueError:
+            return None
+
+    found, cost = descend(
+        begin, lambda at: cost_of(*at), step, iterations=max_iterations, tolerance=tolerance, most=1e6
+    )
+    return Bundle(*found, cost, reduce_points(*found[:2], freedom, pixels, found[2], loss).S)

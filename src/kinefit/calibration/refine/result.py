@@ -24,7 +24,7 @@ class CameraChange:
     Parameters
     ----------
     residual_before, residual_after : float [px] median over its keypoints, of the body tracked.
-    bias_before, bias_after : (2,) [px] median shift, measured minus fitted.
+    bias_after : (2,) [px] median shift, measured minus fitted.
     turn, shift : float [rad], [m] how far it was turned and moved.
     focal : float, change of the focal length as a share.
     time : float [s] to add to its times.
@@ -35,7 +35,6 @@ class CameraChange:
 
     residual_before: float
     residual_after: float
-    bias_before: NDArray
     bias_after: NDArray
     turn: float
     shift: float
@@ -121,7 +120,7 @@ def changes_of(
         out[name] = CameraChange(
             residual_before=float(np.median(np.linalg.norm(before, axis=-1))),
             residual_after=float(np.median(np.linalg.norm(after, axis=-1))),
-            bias_before=np.median(before, axis=0), bias_after=np.median(after, axis=0),
+            bias_after=np.median(after, axis=0),
             turn=float(np.linalg.norm(moved[c, 3:6])),
             shift=float(np.linalg.norm(rig.cameras[c].centre_world - old.cameras[c].centre_world)),
             focal=float(np.expm1(moved[c, FOCAL])), time=float(offsets[c]),

@@ -44,7 +44,7 @@ _MAGNIFIED = 200  # times: residuals in the picture of coverage
 @_screen.verbose_option
 def bar(
     sources: tuple[Path, ...], length: float, length_sigma: float | None, out: Path, interiors: Path | None,
-    floor: str | None, distance: str | None, size: str | None, max_frames: int, overwrite: bool, verbose: bool,
+    floor: str | None, distance: str | None, size: str | None, max_frames: int, overwrite: bool,
 ) -> None:
     """Lenses, places and scale from a bar with two bright targets that is waved through the volume.
 

@@ -25,7 +25,7 @@ Examples:
 @click.option("--time-offsets", is_flag=True, help="Find the time offset of each camera too.")
 @_screen.verbose_option
 def people(
-    take: Path, out: Path | None, height: float | None, focal: bool, time_offsets: bool, verbose: bool
+    take: Path, out: Path | None, height: float | None, focal: bool, time_offsets: bool
 ) -> None:
     """Find where the cameras stand from the people in view.
 

@@ -64,7 +64,7 @@ def calibrate() -> None:
 @_screen.verbose_option
 def board(
     sources: tuple[Path, ...], spec: str, out: Path, interiors: Path | None, interiors_only: bool, floor: str | None,
-    max_frames: int, overwrite: bool, verbose: bool,
+    max_frames: int, overwrite: bool,
 ) -> None:
     """Intrinsics and extrinsics from a checkerboard or ChArUco board.
 

@@ -34,10 +34,9 @@ _PRINTED = ("camera", "bias u, v [px]", "±", "spread", "late [frames]", "l/r ex
 )
 @click.option("--strict", is_flag=True, help="Exit code 2 where there is a fault.")
 @_screen.verbose_option
-@click.pass_context
 def check(
-    ctx: click.Context, take: Path, out: Path | None, refine: bool, focal: bool, distortion: bool, time_offsets: bool,
-    points: Path | None, strict: bool, verbose: bool,
+    take: Path, out: Path | None, refine: bool, focal: bool, distortion: bool, time_offsets: bool,
+    points: Path | None, strict: bool,
 ) -> None:  # fmt: skip
     """Find out what is wrong with a recording, how sure that is, and what would fix it.
 
@@ -78,7 +77,7 @@ def check(
                 )
             except KinefitError as error:
                 failed = error
-    _print(found, verbose)
+    _print(found)
     write_text(out, check_page(found, refinement=refined, up=entry.up))
     _screen.say(f"\nWritten: {out}")
     if failed is not None:
@@ -86,10 +85,10 @@ def check(
     if refined is not None:
         write_refined(found, refined, take)
     if strict and found.faults:
-        ctx.exit(2)
+        click.get_current_context().exit(2)
 
 
-def _print(found: Check, verbose: bool) -> None:
+def _print(found: Check) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -97,11 +96,11 @@ def _print(found: Check, verbose: bool) -> None:
 
     _screen.say(f"\n{found.name}: {verdict(found)}")
     for one in found.findings:
-        if one.severity == "good" and not verbose:
+        if one.severity == "good" and not _screen.is_verbose():
             continue
         _screen.tell_finding(one)
     good = [one for one in found.findings if one.severity == "good"]
-    if good and not verbose:
+    if good and not _screen.is_verbose():
         _screen.say(f"\nin order: {', '.join(dict.fromkeys(one.kind for one in good))} (-v says more)")
     columns, rows = camera_rows(found)
     if rows:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
-from os import PathLike
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,35 +22,41 @@ FORMATS = ("motion", "mot", "osim", "trc", "bvh", "glb", "markers")
 _MARKERS = "markers.trc"  # what was measured, in OpenSim's world: with body.osim and its marker set, IK runs there too
 
 
+@dataclass(frozen=True)
+class MarkerFitOptions:
+    """How markers are fitted.
+
+    Parameters
+    ----------
+    body : a name of the catalogue or a body file: generic, it is brought to the subject's size.
+    static : C3D or TRC file, optional
+        A static trial of the same subject (or several people), from which size and offsets come together with the file.
+    marker_set : str, optional
+        Name of a marker set or a file of one; default: the one that shares most labels.
+    height : float [m], optional, of the subject, barefoot.
+    up : str, optional, vertical axis of the world where the file does not state it; default: found from the markers.
+    limits : bool, whether joints stay within their ranges.
+    """
+
+    body: str | Path = "humanoid"
+    static: Path | None = None
+    marker_set: str | None = None
+    height: float | None = None
+    up: str | None = None
+    limits: bool = True
+
+
 def fit_file(
-    path: str | PathLike[str],
-    body: Body | str | PathLike[str] = "humanoid",
-    out: str | PathLike[str] | None = None,
-    *,
-    static: str | PathLike[str] | None = None,
-    marker_set: str | None = None,
-    height: float | None = None,
-    unit: str | None = None,
-    up: str | None = None,
-    limits: bool = True,
-    formats: Iterable[str] = FORMATS,
-    step: Step | None = None,
-) -> dict[str, tuple[Motion, dict[str, Path]]]:
+    path: Path, out: Path | None = None, options: MarkerFitOptions | None = None, *, unit: str | None = None,
+    formats: Iterable[str] = FORMATS, step: Step | None = None,
+) -> dict[str, tuple[Motion, dict[str, Path]]]:  # fmt: skip
     """Fit a file of labelled markers and write what was found.
 
     Parameters
     ----------
     path : C3D or TRC file with labels; several people bear their names as prefixes ("Anna:LASI").
-    body : Body, a name of the catalogue or a body file: generic, it is brought to the subject's size.
     out : folder, default beside the file: NAME-kinefit; with several people one folder for each in it.
-    static : C3D or TRC file, optional
-        A static trial of the same subject (or several people), from which size and offsets come together with `path`.
-    marker_set : str, optional
-        Name of a marker set or a file of one; default: the one that shares most labels.
-    height : float [m], optional, of the subject, barefoot.
     unit : str, optional, of files that state none or a wrong one.
-    up : str, optional, vertical axis of the world where the file does not state it; default: found from the markers.
-    limits : bool, whether joints stay within their ranges.
     formats : names of `results.NAMES`, and "markers" for the measured ones as OpenSim takes them.
     step : (what, done, total) -> None, told of progress.
 
@@ -70,23 +75,25 @@ def fit_file(
     from kinefit.markers.subject import fit_marker_subject
     from kinefit.readers.markers import read_markers
 
-    step = step or (lambda what, done, total: None)
-    source, formats = Path(path), tuple(formats)
-    folder = Path(out) if out is not None else source.with_name(f"{source.stem}-kinefit")
+    step, formats, options = step or (lambda what, done, total: None), tuple(formats), options or MarkerFitOptions()
+    folder = out if out is not None else path.with_name(f"{path.stem}-kinefit")
     unknown = [name for name in formats if name not in (*results.NAMES, "markers")]
     if unknown:
         raise ExportError(_results.no_format(unknown[0], (*results.NAMES, "markers")), remedy="Leave it out.")
     _results.check_folder(folder)
-    generic = body if isinstance(body, Body) else load_body(Path(body) if isinstance(body, PathLike) else body)
-    people = split_people(read_markers(source, unit=unit))
-    trials = split_people(read_markers(static, unit=unit)) if static else {}
+    generic = load_body(options.body)
+    people = split_people(read_markers(path, unit=unit))
+    trials = split_people(read_markers(options.static, unit=unit)) if options.static else {}
     found: dict[str, tuple[Motion, dict[str, Path]]] = {}
     for person, markers in people.items():
         trial = trials.get(person) or (next(iter(trials.values())) if len(trials) == 1 == len(people) else None)
         subject = fit_marker_subject(
-            generic, [markers] if trial is None else [trial, markers], marker_set, height=height, progress=step
+            generic, [markers] if trial is None else [trial, markers], options.marker_set, height=options.height,
+            progress=step,
+        )  # fmt: skip
+        motion = fit_markers(
+            subject.body, markers, subject.marker_set, sigma=subject.sigma, limits=options.limits, up=options.up
         )
-        motion = fit_markers(subject.body, markers, subject.marker_set, sigma=subject.sigma, limits=limits, up=up)
         files: dict[str, Path] = {}
         own = folder / person if len(people) > 1 else folder
         plain = [name for name in formats if name not in ("markers", "osim")]

@@ -54,7 +54,7 @@ Examples:
 @_screen.verbose_option
 def learn(
     takes: tuple[Path, ...], out: Path | None, name: str | None, marker_set: str | None, no_set: bool,
-    frame: int | None, unit: str | None, verbose: bool,
+    frame: int | None, unit: str | None,
 ) -> None:  # fmt: skip
     """Learn a subject's markers from labelled takes, best one in which every joint moves."""
     from kinefit.cli._results import check_file
@@ -90,7 +90,7 @@ Examples:
 @click.option("--name", help="Of the set.  [default: of the file]")
 @_unit
 @_screen.verbose_option
-def write_set(takes: tuple[Path, ...], out: Path | None, name: str | None, unit: str | None, verbose: bool) -> None:
+def write_set(takes: tuple[Path, ...], out: Path | None, name: str | None, unit: str | None) -> None:
     """Write a first marker set for labels that the catalogue does not know.
 
     TAKES are labelled takes of one subject in which joints move. Labels are paired left and right, those with words
@@ -127,7 +127,7 @@ Examples:
 @_unit
 @_screen.verbose_option
 def identify(
-    take: Path, subjects: tuple[Path, ...], out: Path | None, fill: bool, rest: bool, unit: str | None, verbose: bool
+    take: Path, subjects: tuple[Path, ...], out: Path | None, fill: bool, rest: bool, unit: str | None
 ) -> None:
     """Name the points of an unlabelled take.
 
@@ -188,11 +188,11 @@ Examples:
 @_screen.verbose_option
 def fit(
     take: Path, out: Path | None, subjects: tuple[Path, ...], static: Path | None, body: str, marker_set: str | None,
-    height: float | None, up: str | None, limits: bool, formats: str | None, unit: str | None, verbose: bool,
+    height: float | None, up: str | None, limits: bool, formats: str | None, unit: str | None,
 ) -> None:  # fmt: skip
     """Fit a body to markers: size and marker places from all frames, then angles in each."""
     from kinefit.cli._summary import print_summary
-    from kinefit.cli.markers._fit import FORMATS, fit_file
+    from kinefit.cli.markers._fit import FORMATS, MarkerFitOptions, fit_file
     from kinefit.cli.markers._name import identify_file
 
     out = out or take.with_name(f"{take.stem}-kinefit")
@@ -205,14 +205,12 @@ def fit(
             labelled, named, files = identify_file(take, list(subjects), target, unit=unit, step=step)
             source, unit = files["markers"], None
         known = Path(body) if Path(body).suffix else body
-        found = fit_file(
-            source, known, out, static=static, marker_set=marker_set, height=height, unit=unit, up=up, limits=limits,
-            formats=chosen, step=step,
-        )  # fmt: skip
+        options = MarkerFitOptions(known, static, marker_set, height, up, limits)
+        found = fit_file(source, out, options, unit=unit, formats=chosen, step=step)
     if subjects:
         _tell(labelled, named)
     for motion, _ in found.values():
-        print_summary(motion, points=verbose)
+        print_summary(motion, points=_screen.is_verbose())
     _screen.say("\nWritten:")
     written = [files] if subjects else []
     for path in (path for group in (*written, *(w for _, w in found.values())) for path in group.values()):
@@ -233,7 +231,7 @@ Examples:
 @click.pass_context
 def audit(
     ctx: click.Context, takes: tuple[Path, ...], subject: Path | None, marker_set: str | None, strict: bool,
-    unit: str | None, verbose: bool,
+    unit: str | None,
 ) -> None:  # fmt: skip
     """Find swapped labels, and markers off their segment, in takes that somebody labelled."""
     from kinefit.bodies.marker_sets import load_marker_set

@@ -33,7 +33,7 @@ _NAMES = {"3d": "3D (depth)", "2d": "2D (face, hands)", "fusion": "fusion"}
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the people and of the sensors' errors.")
 @_screen.verbose_option
 def evaluate(
-    suite: str, count: int, method: str, sensor: str, start: str, rate: float, seed: int, verbose: bool
+    suite: str, count: int, method: str, sensor: str, start: str, rate: float, seed: int
 ) -> None:  # fmt: skip
     """Track simulated sequences of known motion and grade each 0 (lost), 1 (acceptable) or 2 (good).
 
@@ -61,7 +61,7 @@ def evaluate(
     _screen.say()
     for text, holds in conclusions(summaries).items():
         _screen.say(f"{'yes' if holds else 'NO ':3}  {text}")
-    if verbose:
+    if _screen.is_verbose():
         _screen.say()
         for line in _movements(list(summaries.values())):
             _screen.say(line)

@@ -105,7 +105,7 @@ def _format(ctx: click.Context, parameter: click.Parameter, value: str | None) -
 @click.option("--rest", metavar="POSE", help="Rest pose: body (arms hanging, facing x) or t (a T facing z).")
 @_screen.verbose_option
 def export(
-    motion: Path, format: str | None, character: Path | None, table: Path | None, out: Path | None, verbose: bool,
+    motion: Path, format: str | None, character: Path | None, table: Path | None, out: Path | None,
     **choices: str | None,
 ) -> None:
     """Write a motion file, as `kinefit track` leaves it, in another format, or on another character."""

@@ -25,7 +25,7 @@ Examples:
 @click.option("--azimuth", type=float, default=100.0, show_default=True, help="[deg] of the camera from the fall line.")
 @_screen.verbose_option
 def replay(
-    source: Path, out: Path, slope: float, heading: float, speed: float, gain: float, azimuth: float, verbose: bool
+    source: Path, out: Path, slope: float, heading: float, speed: float, gain: float, azimuth: float
 ) -> None:
     """Put a motion on a slope, add a translation that changes with time, and write it as a video or a motion."""
     from kinefit.cli._results import check_file

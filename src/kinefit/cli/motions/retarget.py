@@ -27,7 +27,7 @@ Examples:
 )
 @_screen.verbose_option
 def retarget(
-    recording: Path, asf: Path | None, out: Path | None, rate: float | None, table: Path | None, verbose: bool
+    recording: Path, asf: Path | None, out: Path | None, rate: float | None, table: Path | None
 ) -> None:
     """Put a recorded motion onto the humanoid, by the directions of its bones."""
     from kinefit.cli._results import check_file

@@ -52,7 +52,7 @@ def _frames(ctx: click.Context, parameter: click.Parameter, value: str | None) -
 def simulate(
     motion: Path, out: Path, sensors: tuple[str, ...], body: str | None, asf: Path | None, rate: float | None,
     frames: tuple[int, int | None] | None, distance: float | None, azimuth: float, height: float, no_room: bool,
-    seed: int, verbose: bool,
+    seed: int,
 ) -> None:  # fmt: skip
     """Render what sensors in front of a person would have seen of a MOTION (.npz of kinefit, .bvh or .amc).
 

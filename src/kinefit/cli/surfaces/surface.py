@@ -50,7 +50,6 @@ def surface(
     calibration: Path, views: tuple[str, ...], out: Path, unit: str, window: str, step: int, mask: Path | None,
     seeds: Path | None, least: float | None, gauge: float | None, incremental: bool, still: int | None,
     smooth: float, flat: float | None, motion: Path | None, field: str | None,
-    verbose: bool,
 ) -> None:  # fmt: skip
     """Measure a surface that two cameras or more see: points with standard deviations, a mesh, displacement, strain.
 

@@ -42,7 +42,7 @@ Exit codes: 0 where all takes are done, 2 where some have failed (the others are
 @click.pass_context
 def batch(
     ctx: click.Context, patterns: tuple[str, ...], out: Path, workers: int | None, cluster: str | None, retries: int,
-    choices: Choices, wanted: bool, verbose: bool,
+    choices: Choices, wanted: bool,
 ) -> None:
     """Track every take that PATTERN means, as `kinefit track` would, and write summary.html over all of them.
 

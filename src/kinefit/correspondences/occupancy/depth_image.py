@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from kinefit.correspondences import _kernels
 from kinefit.correspondences.occupancy import _kernels_depth_image
+from kinefit.correspondences.targets import check_depth_image
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.rows import Rows
@@ -77,9 +78,7 @@ def depth_image_rows(
     ObservationError
         An image of another size than the camera's, a standard deviation that is not positive.
     """
-    if depth.shape != (camera.size[1], camera.size[0]):
-        problem = f"a depth image of {depth.shape[1]}x{depth.shape[0]} px, camera {camera.name} has {camera.size}"
-        raise ObservationError(problem, remedy="Give the camera of this image, or camera.scaled(size).")
+    check_depth_image(depth, camera)
     if not sigma > 0:
         raise ObservationError(f"the standard deviation of a depth image is {sigma} m", remedy="Give a positive one.")
     data, segment, group = _kernels.buffers(len(samples))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from kinefit.correspondences import _kernels
 from kinefit.correspondences.occupancy import _kernels_space as kernels
 from kinefit.correspondences.occupancy.depth_image import SurfaceSamples
+from kinefit.correspondences.targets import check_depth_image
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.rows import Rows
@@ -120,9 +121,7 @@ def free_space_rows(
     chosen : (N,) int64, optional
         To be filled with the cell that every sample is drawn to, -1 for none; see `FreeSpace.middle`.
     """
-    if space.depth.shape != (camera.size[1], camera.size[0]):
-        problem = f"a depth image of {space.depth.shape[::-1]} px, camera {camera.name} has {camera.size}"
-        raise ObservationError(problem, remedy="Give the camera of this image, or camera.scaled(size).")
+    check_depth_image(space.depth, camera)
     sigma = 10.0 * space.cell if sigma is None else sigma
     if not sigma > 0:
         raise ObservationError(f"the standard deviation of free space is {sigma} px", remedy="Give a positive one.")

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT
 from kinefit.exporters.report.angles import thinned
-from kinefit.exporters.report.moments import DOUBTFUL, Moment, frame_residuals, stretches
+from kinefit.exporters.report.moments import DOUBTFUL, Moment, frame_residuals
 from kinefit.exporters.report.page import SERIES, Html, joined, moment, plot, shaded, table
+from kinefit.findings import runs_of
 from kinefit.motion import Motion, Residuals
 
 UNITS = {"px": (1.0, "px"), "m": (1000.0, "mm")}
@@ -64,7 +65,7 @@ def sensor_table(motion: Motion, fits: Sequence[SensorFit]) -> Html:
     rows = []
     for f in fits:
         shift = [f"{v:+.1f}" for v in f.shift] + ["–"] * (3 - len(f.shift))
-        swaps = stretches(np.asarray(motion.residuals[f.name].swapped, bool), round(0.1 * motion.rate))
+        swaps = runs_of(np.asarray(motion.residuals[f.name].swapped, bool), round(0.1 * motion.rate))
         links = [moment(motion.times[a], f"{motion.times[a]:.2f} s") for a, _ in swaps[:6]]
         told = joined(f"{f.swapped} frames: ", Html(", ".join(links)), " …" if len(swaps) > 6 else "") if swaps else "–"
         rows.append(

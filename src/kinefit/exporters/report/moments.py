@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT
+from kinefit.findings import runs_of
 from kinefit.motion import Motion, Residuals
 
 DOUBTFUL = 0.5  # quality below which the measurements support less than half of the body
@@ -132,15 +133,6 @@ def listed(names: Sequence[str], most: int = 4) -> str:
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
-def stretches(flags: NDArray, gap: int = 1) -> list[tuple[int, int]]:
-    """(start, stop) of the runs of true flags (F,); runs with fewer than `gap` frames between them are one."""
-    at = np.flatnonzero(flags)
-    if not len(at):
-        return []
-    cuts = np.flatnonzero(np.diff(at) > max(gap, 1))
-    return [(int(a), int(b) + 1) for a, b in zip(at[np.r_[0, cuts + 1]], at[np.r_[cuts, -1]])]
-
-
 def frame_residuals(residuals: Residuals) -> NDArray:
     """(F,) median length of a sensor's residuals in each frame, NaN where it saw nothing."""
     norms = residuals.norms
@@ -151,12 +143,12 @@ def frame_residuals(residuals: Residuals) -> NDArray:
 
 
 def _runs(motion: Motion, flags: NDArray) -> list[tuple[int, int]]:
-    return stretches(flags, round(_GAP * motion.rate))
+    return runs_of(flags, round(_GAP * motion.rate))
 
 
 def _whole_body(motion: Motion) -> Iterable[_Doubt]:
     nobody = motion.quality <= 0
-    for start, stop in stretches(nobody):
+    for start, stop in runs_of(nobody):
         yield _Doubt("nobody", start, stop, (start + stop) // 2, stop - start)
     for start, stop in _runs(motion, (motion.quality < DOUBTFUL) & ~nobody):
         q = np.where(nobody[start:stop], 1.0, motion.quality[start:stop])

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import MarkerSet, find_marker_set
 from kinefit.errors import ObservationError
+from kinefit.findings import runs_of
 from kinefit.identification.audit.gaps import exchanges_in_gaps
 from kinefit.identification.audit.plausible import elsewhere, places_of_model, places_of_set, swapped_throughout
-from kinefit.identification.audit.swaps import JOIN, best_run, crossings, glitches, pair_gain, runs, swap_gains
+from kinefit.identification.audit.swaps import JOIN, best_run, crossings, glitches, pair_gain, swap_gains
 from kinefit.identification.model.learn import learn_model
 from kinefit.identification.model.model import MarkerModel
 from kinefit.identification.take.consistency import Consistency
@@ -309,7 +310,8 @@ def _strays(positions: NDArray, model: MarkerModel, labels: Sequence[str]) -> li
     cost = agree.own(positions)
     out = []
     for k, label in enumerate(labels):
-        for first, last in runs(cost[:, k] > STRAY):
+        for first, stop in runs_of(cost[:, k] > STRAY, JOIN):
+            last = stop - 1
             typical = middle(cost[first : last + 1], axis=0)
             if last - first + 1 < LEAST_FRAMES or typical[k] < np.nanmax(typical):
                 continue

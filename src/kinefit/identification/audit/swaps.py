@@ -152,10 +152,3 @@ def glitches(
     return found
 
 
-def runs(flags: NDArray, join: int = JOIN) -> list[tuple[int, int]]:
-    """First and last of each run of true flags; runs less than `join` apart are one."""
-    at = np.flatnonzero(flags)
-    if not len(at):
-        return []
-    cut = np.flatnonzero(np.diff(at) > join)
-    return [(int(at[a]), int(at[b])) for a, b in zip([0, *(cut + 1)], [*cut, len(at) - 1])]

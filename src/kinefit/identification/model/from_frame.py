@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit._arguments import checked
+from kinefit._arguments import checked, shaped
 from kinefit.bodies.marker_sets import FEWEST, GIVE, MarkerSet
 from kinefit.errors import ObservationError
 from kinefit.geometry.se3 import nearest_rotation
@@ -224,9 +224,7 @@ def model_from_frame(
     ObservationError
         Shapes do not agree, a label is there twice, the set does not fit the labels, or the root has no three markers.
     """
-    at = np.asarray(positions, float)
-    if at.shape != (len(labels), 3):
-        raise ObservationError(f"positions have shape {at.shape} for {len(labels)} labels", remedy="Give (M, 3) [m].")
+    at = shaped(positions, (len(labels), 3), "positions")
     real = [i for i, label in enumerate(labels) if not marker_set.is_computed(label) and not label.startswith("*")]
     seen = [i for i in real if np.isfinite(at[i]).all()]
     labels, at, gaps = [labels[i] for i in seen], at[seen], tuple(labels[i] for i in real if i not in seen)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.findings import runs_of
 from kinefit.identification.model.model import MarkerModel
 from kinefit.solvers.rigid_clusters import rigid_frames
 
@@ -158,12 +158,7 @@ def fill_gaps(
 
 def gaps_of(seen: NDArray) -> list[tuple[int, int]]:
     """First and last of each gap (F,) that has both ends."""
-    edges = np.flatnonzero(np.diff(seen.astype(int)))
-    out = []
-    for a, b in pairwise(edges):
-        if seen[a] and not seen[a + 1]:
-            out.append((int(a) + 1, int(b)))
-    return out
+    return [(start, stop - 1) for start, stop in runs_of(~seen) if start and stop < len(seen)]
 
 
 def _with_segment(peers: NDArray, ends: NDArray, x: NDArray) -> NDArray | None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import find_marker_set
 from kinefit.errors import ObservationError
+from kinefit.findings import runs_of
 from kinefit.identification.frame.beliefs import Beliefs
 from kinefit.identification.frame.identify import Identification, IdentifySettings, identify
 from kinefit.identification.model.model import MarkerModel
@@ -217,11 +218,9 @@ def list_doubts(
     out = []
     for m, label in enumerate(labels):
         unsure = seen[:, m] & (confidence[:, m] < certain)
-        at = np.flatnonzero(unsure)
-        for own in np.split(at, np.flatnonzero(np.diff(at) > 10) + 1):
-            if not len(own):
-                continue
-            first, last, least = int(own[0]), int(own[-1]), float(confidence[own, m].min())
+        for first, stop in runs_of(unsure, 10):
+            last, own = stop - 1, first + np.flatnonzero(unsure[first:stop])
+            least = float(confidence[own, m].min())
             stray = float(np.nanmax(np.append(off[own, m], 0.0)))
             kind = "off" if stray > STRAY else "unsure"
             text = f"{label} in frames {first} to {last}: " + (

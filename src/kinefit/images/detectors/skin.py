@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import rgb_image
 from kinefit.errors import ObservationError
 from kinefit.images.detectors.detection import Follower
 from kinefit.images.detectors.models import Models
@@ -114,9 +115,7 @@ class SkinTracker:
         self._rest = _histogram(bins[from_face > 3.0])
 
     def _check(self, image: NDArray) -> None:
-        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            problem = f"a picture of shape {image.shape} and type {image.dtype}"
-            raise ObservationError(problem, remedy="Give (height, width, 3) in 8 bits, RGB.")
+        rgb_image(image)
 
     def _chroma(self, image: NDArray) -> NDArray:
         """(h, w) bin of every pixel of the small picture; takes note of what moves in it."""

@@ -3,11 +3,16 @@
 Bones are those of Unity's humanoid, resting as a T that faces z; the world is Unity's: left-handed, x right, y up, z
 forward. From kinefit's right-handed world with y up it comes by x -> -x, hence a quaternion (w, x, y, z) becomes
 (w, x, -y, -z). Source: VMC protocol specification 2.7 (addresses /VMC/Ext/OK, /T, /Root/Pos, /Bone/Pos).
+
+Open Sound Control 1.0: messages and bundles as bytes, as much of it as VMC needs (strings, int32, float32).
 """
 
 from __future__ import annotations
 
 import socket
+import struct
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -19,7 +24,6 @@ from kinefit.errors import BodyError, ExportError
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
 from kinefit.geometry import se3
 from kinefit.live.packets import PosePacket
-from kinefit.live.receivers import osc
 from kinefit.motion import rotation_between_up
 
 _TRUNK = {"pelvis": "Hips", "abdomen": "Spine", "thorax": "Chest", "neck": "Neck", "head": "Head"}
@@ -30,9 +34,34 @@ _SIDES = {
 BONES = _TRUNK | {f"{k}_{s}": words["Side"] + v for k, v in _SIDES.items() for s, words in SIDES.items()}
 """Segment -> bone of Unity's humanoid."""
 
+
+_AT_ONCE = struct.pack(">Q", 1)  # the time tag that says: now
+
+
+def osc_message(address: str, *values: str | int | float) -> bytes:
+    """One message with its arguments."""
+    kinds = "".join("s" if isinstance(v, str) else "i" if isinstance(v, int) else "f" for v in values)
+    data = b"".join([
+        _text(v) if kind == "s" else struct.pack(">" + kind, v) for kind, v in zip(kinds, values)
+    ])  # fmt: skip
+    return _text(address) + _text("," + kinds) + data
+
+
+def osc_bundle(messages: Sequence[bytes]) -> bytes:
+    """Messages that belong together."""
+    return b"".join([b"#bundle\0", _AT_ONCE, *(struct.pack(">i", len(one)) + one for one in messages)])
+
+
+@lru_cache(maxsize=1000)  # the same addresses and bones in every pose
+def _text(value: str) -> bytes:
+    """A string, ended by a zero and filled up to a multiple of four bytes."""
+    data = value.encode() + b"\0"
+    return data + b"\0" * (-len(data) % 4)
+
+
 _MOST = 1400  # [bytes] of one packet on most networks
 _NOTHING = (0.0,) * 7  # place and turn, of which the bones' messages are made once, and the numbers put behind
-_ROOT = osc.message("/VMC/Ext/Root/Pos", "root", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+_ROOT = osc_message("/VMC/Ext/Root/Pos", "root", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class Vmc:
@@ -79,14 +108,14 @@ class Vmc:
                 above = int(parents[above])
             lowest.append(above)
         self._heads = [
-            osc.message("/VMC/Ext/Bone/Pos", BONES[segments[s]], *_NOTHING)[: -4 * len(_NOTHING)] for s in kept
+            osc_message("/VMC/Ext/Bone/Pos", BONES[segments[s]], *_NOTHING)[: -4 * len(_NOTHING)] for s in kept
         ]
         self._segments, self._above = np.array(kept), np.array(lowest)
 
     def pose(self, posed: PosePacket, packet: bytes) -> None:
         """Send a pose; where the network is busy, it is left out and counted in `unsent`."""
         if posed.result is None or self._rest is None:
-            self._send(osc.bundle([osc.message("/VMC/Ext/OK", 0)]))
+            self._send(osc_bundle([osc_message("/VMC/Ext/OK", 0)]))
             return
         for data in self.packets(posed.Ts_world_segment, posed.time):
             self._send(data)
@@ -104,7 +133,7 @@ class Vmc:
         size = 4 * numbers.shape[1]
         data = numbers.astype(">f4").tobytes()
         bones = [head + data[k * size : (k + 1) * size] for k, head in enumerate(self._heads)]
-        ok, now = osc.message("/VMC/Ext/OK", 1), osc.message("/VMC/Ext/T", float(time))
+        ok, now = osc_message("/VMC/Ext/OK", 1), osc_message("/VMC/Ext/T", float(time))
         return _parts([ok, now, _ROOT, *bones])
 
     def close(self) -> None:
@@ -122,8 +151,8 @@ def _parts(messages: list[bytes]) -> list[bytes]:
     out, part, size = [], list[bytes](), 0
     for one in messages:
         if part and size + len(one) + 4 > _MOST:
-            out.append(osc.bundle(part))
+            out.append(osc_bundle(part))
             part, size = [], 0
         part.append(one)
         size += len(one) + 4
-    return [*out, osc.bundle(part)]
+    return [*out, osc_bundle(part)]

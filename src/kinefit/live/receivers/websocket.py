@@ -7,17 +7,23 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping
+from html import escape
+from importlib import resources
 from typing import Any
 
 import msgspec
+import numpy as np
 from websockets.exceptions import ConnectionClosed
 
 from kinefit.bodies import Body
+from kinefit.exporters.report.figure import live_figure
+from kinefit.exporters.report.page import to_json
 from kinefit.live.packets import PosePacket
-from kinefit.live.receivers.page import live_page
 from kinefit.live.wishes import Answer
+from kinefit.motion import rotation_between_up
 from kinefit.serving.access import Access
-from kinefit.serving.server import Connection, PageServer
+from kinefit.serving.policy import inline_policy
+from kinefit.serving.server import Connection, Page, PageServer
 
 _MAX_WAITING_ANSWERS = 100  # of a client that does not read them: then it is disconnected
 Ask = Callable[[bytes, Answer], None]
@@ -155,3 +161,29 @@ async def _send(connection: Connection, client: _Client) -> None:
                 await connection.send(packet.decode())
     except ConnectionClosed:
         return
+
+
+_WAITING = '<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="1"><p>waiting for the body'
+
+
+def live_page(title: str, body: Body | None, up: str) -> Page:
+    """Self-contained HTML; without a body it loads itself again until there is one."""
+    if body is None:
+        return Page(_WAITING.encode())
+    figure, capsules = live_figure(body)
+    report = resources.files("kinefit.exporters.report")
+    own = resources.files("kinefit.live.receivers")
+    places = {
+        "segments": np.asarray(capsules.segments), "points": np.asarray(capsules.points),
+        "turn": rotation_between_up(up, "z"),
+    }  # fmt: skip
+    style = (report / "page.css").read_text("utf-8") + (own / "page.css").read_text("utf-8")
+    scripts = [(room / name).read_text("utf-8") for room, name in ((report, "player.js"), (own, "page.js"))]
+    html = (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f'<meta name="viewport" content="width=device-width"><style>{style}</style></head><body><main>'
+        f'<h1>{escape(title)}</h1><p id="told">waiting</p>{figure}<p id="sensors"></p></main>'
+        f'<script type="application/json" id="capsules">{to_json(places)}</script>'
+        f"{''.join(f'<script>{script}</script>' for script in scripts)}</body></html>"
+    )
+    return Page(html.encode(), policy=inline_policy(scripts, [style], "connect-src 'self'"))

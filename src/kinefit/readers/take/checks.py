@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -120,17 +120,19 @@ def _values(take: Take) -> None:
             refuse(f"no file of {source.format} keypoints", place, 'Write file = "...", or format = "detect".')
         if source.face is not None and not all(v > 0 for v in source.face[2:]):
             refuse(f"face = {list(source.face)}", place, "Give [left, top, width, height] in pixels of the video.")
-        if not 0 < source.sigma < 1e4 or (source.rate is not None and not 0 < source.rate < 1e6):
-            refuse(f"sigma {source.sigma} px, rate {source.rate} Hz", place, "Give positive numbers.")
         if source.frames is not None and not -_MOST < source.frames[0] < source.frames[1] < _MOST:
             refuse(f"frames {list(source.frames)}", place, "Give [first, one after the last].")
     for region in take.regions:
         if region.sigma is not None and not 0 < region.sigma < 1e4:
             refuse(f"sigma {region.sigma} px", f"region of camera {region.camera}", "Give a positive number.")
+    keypoints: tuple[Any, ...] = (*take.keypoints, *take.skin)
+    for kind, entries in (("keypoints", keypoints), ("silhouette", take.silhouettes), ("lines", take.lines)):
+        for e in entries:
+            if not 0 < e.sigma < 1e4 or (e.rate is not None and not 0 < e.rate < 1e6):
+                problem = f"sigma {e.sigma} px, rate {e.rate} Hz"
+                refuse(problem, f"{kind} of camera {e.camera}", "Give positive numbers.")
     for shape in take.silhouettes:
         place = f"silhouette of camera {shape.camera}"
-        if not 0 < shape.sigma < 1e4 or (shape.rate is not None and not 0 < shape.rate < 1e6):
-            refuse(f"sigma {shape.sigma} px, rate {shape.rate} Hz", place, "Give positive numbers.")
         if shape.file is None and shape.format == "masks":
             refuse("no file of masks", place, 'Write file = "..." (a folder), or another format.')
         if shape.format == "threshold":
@@ -142,8 +144,6 @@ def _values(take: Take) -> None:
             refuse(f"smooth = {shape.smooth:g} px", place, "Give a positive number.")
     for lines in take.lines:
         place = f"lines of camera {lines.camera}"
-        if not 0 < lines.sigma < 1e4 or (lines.rate is not None and not 0 < lines.rate < 1e6):
-            refuse(f"sigma {lines.sigma} px, rate {lines.rate} Hz", place, "Give positive numbers.")
         for name, own in lines.landmarks.items():
             if not 1 <= len(set(own)) == len(own) <= 2:
                 refuse(f"line '{name}' has {len(own)} landmarks", place, "Give the two ends of an edge, or one point.")

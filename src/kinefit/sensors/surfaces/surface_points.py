@@ -21,6 +21,7 @@ from kinefit.errors import ObservationError
 from kinefit.observations import SurfacePointFrame
 from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments
+from kinefit.sensors.checks import of_kind
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.surfaces.surface_match import SurfacePairs
 
@@ -53,9 +54,7 @@ class SurfacePointSensor(Sensor):
 
     def prepare(self, frame: SurfacePointFrame, scene: Scene) -> SurfacePointMeasurement:
         """Points with an anchor first, then new ones, no more than `most`."""
-        if not isinstance(frame, SurfacePointFrame):
-            problem = f"a {type(frame).__name__} for the sensor '{self.name}'"
-            raise ObservationError(problem, remedy="Give a SurfacePointFrame.")
+        of_kind(frame, SurfacePointFrame, f"a frame of the sensor '{self.name}'", "Give what it saw in such a record.")
         known = np.array([int(i) in self.anchors for i in frame.ids], bool)
         order = np.concatenate([np.flatnonzero(known), np.flatnonzero(~known)])
         if len(order) > self.most:

@@ -29,7 +29,7 @@ from kinefit.solvers.equations import block_diagonal
 from kinefit.solvers.trajectory import _kernels_smoothing
 from kinefit.solvers.trajectory.marginal import Entering, leave
 from kinefit.solvers.trajectory.motion_prior import MotionPrior
-from kinefit.solvers.trajectory.smoothing import Equations, Smoothed, blocks, posterior, smooth
+from kinefit.solvers.trajectory.smoothing import Equations, Smoothed, posterior, smooth
 
 _BEFORE = 0.3  # [s] of frames before the lag that are still linearised anew
 _TRIED = 3  # steps of a window: it begins where the last one ended
@@ -204,11 +204,9 @@ class FixedLag:
         g[6:] += weight @ (usual[0] - angles[0])
         at_limit = (angles[0] <= lower[0]) | (angles[0] >= upper[0])
         held = np.concatenate([np.full(6, not self.body.tree.root_free), at_limit])
-        past, strength = replace(self._prior, liveliness=self._livelier).rows(3)
+        motion = replace(self._prior, liveliness=self._livelier).rows(3)
         share = block_diagonal(np.zeros((6, 6)), self._share - weight)
-        self._entering = leave(
-            self.body, roots, angles, H, g, share, held, past, strength, blocks(self.body), self._entering
-        )
+        self._entering = leave(self.body, (roots, angles), H, g, share, held, motion, self._entering)
         del self._frames[0]
         self._livelier = self._livelier[1:]
 

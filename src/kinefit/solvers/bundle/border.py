@@ -100,8 +100,7 @@ def solve(
     steps: NDArray,
     *,
     weighing: Weighing | None = None,
-    max_iterations: int = 20,
-    settling: int = SETTLING,
+    iterations: tuple[int, int] = (20, SETTLING),
     tolerance: float = 1e-4,
 ) -> Bordered:
     """Minimise Σ share·ρ(w r²) over K poses and the parameters that they share, prior and postures included.
@@ -114,7 +113,7 @@ def solve(
     prior : Prior
     steps : (p,) of the central differences; parameters are in units of which one is about a metre or a radian.
     weighing : how much sensors and the posture prior count, and the loss of rows without their own.
-    settling : steps that poses take by themselves, at most, after each one with the parameters.
+    iterations : steps with the parameters, and those that poses take by themselves after each one, at most.
     tolerance : stop when the predicted fall of the cost is below this share of it.
 
     Raises
@@ -123,15 +122,15 @@ def solve(
         A sensor whose rows differ in number between two worlds; rows that the body cannot take.
     """
     task = _Task(problem, prior, np.asarray(steps, float), weighing or Weighing())
-    theta, bounds = np.array(theta, float), limits(problem.body(theta))
+    theta, bounds, (most, settling) = np.array(theta, float), limits(problem.body(theta)), iterations
     states = [s.retract(np.zeros(6 + len(s.angles)), bounds) for s in states]
     frames, states = settle(problem, theta, states, task.weighing, settling)
     cost, blocks, near = task.cost(theta, frames), None, None
     mean = float(np.mean([np.trace(f.H) / len(f.H) for f in frames])) if frames else 1.0
     least = _kernels_linear.LEAST_DAMPING * mean
-    damping, growth, converged, iterations, far = _FIRST * mean, 2.0, False, 0, 0.0
-    while iterations < max_iterations and not converged:
-        iterations += 1
+    damping, growth, converged, tried, far = _FIRST * mean, 2.0, False, 0, 0.0
+    while tried < most and not converged:
+        tried += 1
         if blocks is None:  # not before it is needed: derivatives by θ are most of the work
             blocks = task.blocks(theta, states, frames, near)
         delta, moves, predicted = task.step(theta, blocks, damping)
@@ -156,7 +155,7 @@ def solve(
         last = task.blocks(theta, states, frames, near) if blocks is None else blocks
         return _information(last, len(theta), lock(problem.body(theta), None))
 
-    return Bordered(theta, tuple(states), prior, cost, iterations, converged, told)
+    return Bordered(theta, tuple(states), prior, cost, tried, converged, told)
 
 
 @dataclass(frozen=True, eq=False)

@@ -61,23 +61,29 @@ def start_of(
     return out.reshape(3 * p, 3 * p)
 
 
+def blocks(body: Body) -> tuple[NDArray, NDArray]:
+    """First column (n,) and width (n,) of each line of a block of the prior: the root's turn is one of three."""
+    first, width = np.arange(body.tree.n_dofs), np.ones(body.tree.n_dofs, np.int64)
+    first[3:6], width[3:6] = 3, 3
+    return first, width
+
+
 def leave(
-    body: Body, roots: NDArray, angles: NDArray, H: NDArray, g: NDArray, posture: NDArray, held: NDArray,
-    past: NDArray, weight: NDArray, blocks: tuple[NDArray, NDArray], entering: Entering | None,
+    body: Body, states: tuple[NDArray, NDArray], H: NDArray, g: NDArray, posture: NDArray, held: NDArray,
+    motion: tuple[NDArray, NDArray], entering: Entering | None,
 ) -> Entering:  # fmt: skip
     """Take the first of four frames out of the equations.
 
     Parameters
     ----------
-    roots, angles : (4, 4, 4), (4, D)
+    states : roots (4, 4, 4) and angles (4, D)
     H, g : (n, n), (n,) of all that the first frame measured, posture prior included
     posture : (n, n) what the posture prior's weight in a covariance is more than in the fit
     held : (n,) bool, degrees of freedom of the first frame that stand at a limit
-    past, weight : (3, 2), (3, n) of the three steps between them, see `MotionPrior.rows`
-    blocks : of the prior's blocks, see `solvers.smoothing.blocks`
+    motion : past (3, 2) and weight (3, n) of the three steps between them, see `MotionPrior.rows`
     entering : what the first three frames bring along; the first two steps are in it.
     """
-    n = len(g)
+    n, (roots, angles), (past, weight) = len(g), states, motion
     weight = np.array(weight)
     A, b = np.zeros((4, n, 4, n)), np.zeros((4, n))
     if entering is not None:
@@ -89,9 +95,8 @@ def leave(
     b[0] += g
     steps, band = np.empty((3, n)), np.zeros((4, 4, n, 3))
     _kernels_smoothing.velocities(roots, angles, steps)
-    _kernels_smoothing.add_motion(steps, np.ascontiguousarray(past), weight, *blocks, band, b)
-    motion = _unpacked(band, *blocks)
-    A += motion
+    _kernels_smoothing.add_motion(steps, np.ascontiguousarray(past), weight, *blocks(body), band, b)
+    A += _unpacked(band, *blocks(body))
     A_covariance = np.array(A)
     if entering is not None:
         A_covariance[:3, :, :3] += (entering.H_covariance - entering.H).reshape(3, n, 3, n)

@@ -20,7 +20,7 @@ from kinefit.errors import ObservationError
 from kinefit.solvers._kernels_linear import LEAST_DAMPING, adapt
 from kinefit.solvers.equations import dense_pattern
 from kinefit.solvers.trajectory import _kernels_band, _kernels_smoothing
-from kinefit.solvers.trajectory.marginal import Entering, start_of
+from kinefit.solvers.trajectory.marginal import Entering, blocks, start_of
 from kinefit.solvers.trajectory.motion_prior import MotionPrior
 
 _NEVER = 1e12  # of damping, beyond which no step is small enough
@@ -84,13 +84,6 @@ class Posterior:
     following: NDArray
     change_variance: NDArray
     log_determinant: float
-
-
-def blocks(body: Body) -> tuple[NDArray, NDArray]:
-    """First column (n,) and width (n,) of each line of a block of the prior: the root's turn is one of three."""
-    first, width = np.arange(body.tree.n_dofs), np.ones(body.tree.n_dofs, np.int64)
-    first[3:6], width[3:6] = 3, 3
-    return first, width
 
 
 def smooth(

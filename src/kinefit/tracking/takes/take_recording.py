@@ -18,7 +18,7 @@ from kinefit.images.depth_scene import background_model
 from kinefit.initialization.from_silhouettes import coarse_to_fine
 from kinefit.motion import UP_AXES
 from kinefit.multiview.people import PersonTrack
-from kinefit.observations import DepthFrame, DepthVideo, NamedMarkers, SilhouetteFrame
+from kinefit.observations import DepthFrame, DepthVideo, NamedMarkers, SilhouetteFrame, by_record
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
@@ -95,7 +95,7 @@ def from_afar(recording: Recording, body: Body, settings: TrackSettings | None) 
     if recording.start is None:
         return recording
     step, state = recording.start
-    shown = [f for f in recording.steps(step) if isinstance(f, SilhouetteFrame)]
+    shown = by_record(recording.steps(step))[SilhouetteFrame]
     if not shown:
         return recording
     found = coarse_to_fine(body, recording.rig, shown, state, sigma=recording.sigma, settings=settings)

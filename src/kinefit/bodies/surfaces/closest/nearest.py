@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kinefit._arguments import shaped
 from kinefit.bodies.surfaces.closest._kernels_cylinder import nearest_on_cylinders, nearest_on_cylinders_exact
 from kinefit.bodies.surfaces.closest._kernels_grid import nearest_on_grids
 from kinefit.bodies.surfaces.closest._kernels_metaballs import nearest_on_metaballs
@@ -59,9 +60,7 @@ def nearest(
     ObservationError
         Points of the wrong shape or not finite, a bound that is not positive, a segment that is not there.
     """
-    x = np.asarray(x_world, float)
-    if x.ndim != 2 or x.shape[1] != 3:
-        raise ObservationError(f"points have shape {x.shape}", remedy="Give (N, 3).")
+    x = shaped(x_world, ("N", 3), "points")
     lines = np.ascontiguousarray(x.T)
     frames, _ = body.tree.forward(state.T_world_root, state.angles)
     distance, normal, segment = nearest_lines(body, frames, lines, max_distance, only, exact=exact)
