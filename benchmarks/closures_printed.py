@@ -1,7 +1,9 @@
-"""The pedal of P3 3.1, and a snowboarder, by colours of rendered images: the system of (6), (18), (19), and without.
+"""A pedal and a snowboarder by colours of rendered images: the paper's system of (6), (18) and (19) (P3 3.2).
 
-Of the pedal thigh and shank are seen, the crank is not. Starts are closed poses 8.6 degrees of the crank away. The factor of the
-closure's equations was chosen at cranks of 0.85 and 1 rad (10 of 1, 3, 10, 30, 100); the six here are others. The snowboarder's left boot is tied to its binding by four pairs; knees and hips start 0.1 rad off.
+Of the pedal of P3 3.1 thigh and shank are seen, the crank is not. Starts are closed poses 8.6 degrees of the crank
+away. The factor of the closure's equations was chosen at cranks of 0.85 and 1 rad (10 of 1, 3, 10, 30, 100); the six
+here are others. The snowboarder's left boot is tied to its binding by four pairs of points; knees and hips start 0.1
+rad off.
 """
 
 from __future__ import annotations
