@@ -6,6 +6,7 @@ from benchmarks.figures import run_parts
 
 PARTS = {
     "closures_planar": "the planar pedal example: closed form, explicit chain, soft and hard closures",
+    "closures_printed": "pedal and snowboarder by colours, closed by the paper's equations (18) and (19)",
     "closures_mobility": "Gruebler's count, rank and mobility of the catalogue's bodies",
     "closures_people": "a cyclist and a snowboarder, simulated, with closures and without",
     "closures_gear": "dimensions of gear that are estimated",

@@ -18,6 +18,7 @@ from kinefit.correspondences.closures import closed_at, hard_equations
 from kinefit.rows import AnyRows
 from kinefit.solvers.closed import closed_fit, onto
 from kinefit.solvers.least_squares import levenberg_marquardt
+from kinefit.solvers.mobility import mobility
 
 UNIT = 0.15
 """[m]"""
@@ -77,11 +78,23 @@ def explicit(crank: float) -> tuple[NDArray, NDArray]:
     return np.stack([joint, foot]), np.array([hip, np.arctan2(-shank[0], shank[1]) - hip, crank])
 
 
+SIGMAS = (0.05, 0.5, 1.0, 2.0, 5.0)
+"""[mm] standard deviations of the soft closure."""
+
+CHOSEN = 0.5  # [mm] the default of a body file, chosen by seeds 201 to 212 (docs/closed-chains.md)
+OTHER_DRAWS = range(301, 313)  # seeds that no choice was made by
+
+
 def run() -> None:
     """Print the figures."""
     hard = pedal('mode = "hard"')
+    count = mobility(hard, planar=True)
+    figure("planar pedal: Gruebler's count in its plane", count.gruebler, "freedoms", f"== {count.mobility}")
     closed_form(hard)
-    against_explicit(hard, {"0.05 mm": pedal('mode = "soft"\nsigma = 0.00005'), "5 mm": pedal('mode = "soft"')})
+    soft = {f"{sigma:g} mm": pedal(f'mode = "soft"\nsigma = {1e-3 * sigma}') for sigma in SIGMAS}
+    assert pedal("").closures[0].sigma == 1e-3 * CHOSEN
+    against_explicit(hard, soft)
+    other_draws(soft)
 
 
 def closed_form(body: Body) -> None:
@@ -108,15 +121,38 @@ def closed_form(body: Body) -> None:
 
 
 def against_explicit(hard: Body, soft: dict[str, Body]) -> None:
-    """All fitted to noisy points of joint and foot, the explicit chain as well; where the foot is, compared.
+    """The worst over the whole turn of the crank, hard closures as well; within 5 mm is what the paper found."""
+    off = {name: 1e3 * far.max() for name, far in fitted(7, {**soft, "hard": hard}, amount(181, 7)).items()}
+    for sigma in soft:
+        name = f"planar pedal: foot by soft closure ({sigma}) against the explicit chain, worst"
+        figure(name, off[sigma], "mm", "<= 1" if sigma == "0.05 mm" else "<= 5")
+    name = "planar pedal: foot by hard closure against the explicit chain, worst"
+    figure(name, 1e-3 * off["hard"], "m", "<= 1e-6")
 
-    Soft closures by their standard deviation: 5 mm is the default of a body file. All start within some hundredths of a
-    radian of the explicit chain's solution: about the stretched leg a second minimum is near.
+
+def other_draws(soft: dict[str, Body]) -> None:
+    """How often the foot is within 5 mm, over other errors of the points."""
+    draws = [fitted(seed, soft, amount(181, 7)) for seed in amount(OTHER_DRAWS, OTHER_DRAWS[:1])]
+    for sigma in soft:
+        worst = [1e3 * draw[sigma].max() for draw in draws]
+        far = 1e3 * np.concatenate([draw[sigma] for draw in draws])
+        rms, within = float(np.sqrt(np.mean(far**2))), 100.0 * float(np.mean(far <= 5.0))
+        print(f"  {sigma}: RMS {rms:.2f} mm, worst of a draw {min(worst):.1f} to {max(worst):.1f} mm, {within:.2f} %")
+        if sigma == f"{CHOSEN:g} mm":
+            what = f"soft closure ({sigma}), 12 other draws"
+            figure(f"planar pedal: poses within 5 mm of the explicit chain, {what}", within, "%", ">= 99.8")
+            figure(f"planar pedal: foot against the explicit chain, {what}, worst", max(worst), "mm", "<= 5")
+
+
+def fitted(seed: int, bodies: dict[str, Body], count: int) -> dict[str, NDArray]:
+    """How far (count,) [m] the foot is from the explicit chain's, both fitted to noisy points of joint and foot.
+
+    All start within some hundredths of a radian of the explicit chain's solution: about the stretched leg a second
+    minimum is near.
     """
-    random, bodies = np.random.default_rng(7), {**soft, "hard": hard}
-    off = dict.fromkeys(bodies, 0.0)
-    points = hard.landmarks.select(("joint", "foot"))
-    for crank in np.linspace(-np.pi, np.pi, amount(181, 7)):
+    random, off = np.random.default_rng(seed), {name: np.zeros(count) for name in bodies}
+    points = next(iter(bodies.values())).landmarks.select(("joint", "foot"))
+    for k, crank in enumerate(np.linspace(-np.pi, np.pi, count)):
         x, _ = explicit(crank)
         seen = x + random.normal(scale=0.005, size=x.shape) * [1.0, 1.0, 0.0]
         cost = lambda c, seen=seen: float(np.sum((explicit(c)[0] - seen) ** 2))
@@ -132,12 +168,8 @@ def against_explicit(hard: Body, soft: dict[str, Body]) -> None:
                 fit = levenberg_marquardt(body, start, rows, max_iterations=200, tolerance=1e-15)
             else:
                 fit = closed_fit(body, start, rows, equations, max_iterations=200, tolerance=1e-15)
-            got = body.positions(fit.state, points)[1]
-            off[name] = max(off[name], float(np.linalg.norm(got - wanted)))
-    for sigma, goal in zip(soft, ("<= 1", "<= 5"), strict=True):  # within 5 mm is what the paper found
-        name = f"planar pedal: foot by soft closure ({sigma}) against the explicit chain, worst"
-        figure(name, 1e3 * off[sigma], "mm", goal)
-    figure("planar pedal: foot by hard closure against the explicit chain, worst", off["hard"], "m", "<= 1e-6")
+            off[name][k] = np.linalg.norm(body.positions(fit.state, points)[1] - wanted)
+    return off
 
 
 def rows_of(body: Body, state: BodyState, points, seen: NDArray) -> list[AnyRows]:

@@ -38,6 +38,8 @@ def test_a_body_is_checked(kinefit, tmp_path):
     (tmp_path / "leg.toml").write_text(LEG)
     told = kinefit("check", "leg.toml").output
     assert "Gruebler: F = 0" in told and "mobility: 1" in told and "over-constrained" in told and "along z" in told
+    told = kinefit("check", "leg.toml", "--planar").output
+    assert "Gruebler: F = 1" in told and "2 of 2 equations; mobility: 1" in told and "both agree" in told
     (tmp_path / "far.toml").write_text(LEG.replace("at = [0.0, 0.6, 0.0]", "at = [0.0, 1.6, 0.0]"))
     told = kinefit("check", "far.toml")
     assert told.exit_code == 2 and "'foot' by 700.0 mm" in " ".join(told.output.split())

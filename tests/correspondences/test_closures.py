@@ -3,12 +3,26 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.oracle import slow_positions
+from tests.oracle import central_differences, design, slow_positions
+from tests.solvers.test_closed import LEG
 
-from kinefit.bodies import BodyState, load_body
+from kinefit.bodies import BodyState, load_body, parse_body
+from kinefit.bodies.closures import known_gear
 from kinefit.correspondences import _kernels_closures as kernels
-from kinefit.correspondences.closures import STIFF, closed_at, closure_rows, owners
+from kinefit.correspondences import point_rows
+from kinefit.correspondences.closures import (
+    STIFF,
+    closed_at,
+    closure_rows,
+    closure_targets,
+    closure_values,
+    hard_equations,
+    owners,
+)
+from kinefit.errors import BodyError
 from kinefit.geometry import se3
+from kinefit.solvers.closed import onto
+from kinefit.solvers.equations import normal_equations
 
 
 def turned(body, state, segment):
@@ -63,3 +77,63 @@ def test_weights_are_those_of_the_deviations():
         wanted += [np.hypot(STIFF if not c.turn_std else 0.0, c.turn_std)] * (c.rows - 3)
         np.testing.assert_allclose(std, wanted, rtol=1e-9)
     assert np.all(rows.group == -1)  # no closure is ever an outlier
+
+
+def paper_rows(body, state):
+    """Equations (18) and (19), weighted as hard closures are."""
+    return point_rows(body, state, *closure_targets(body, state), sigma=STIFF)
+
+
+TO_THE_WORLD = LEG.replace('to = "pedal"', "at = [0.1, 0.7, 0.0]")
+
+
+@pytest.mark.parametrize("text", [LEG, TO_THE_WORLD])
+def test_the_papers_equations_have_the_gradient_of_the_closures(text):
+    body = parse_body(text)
+    state = BodyState(np.eye(4), np.array([0.3, -0.9, 0.8]))
+    printed, joint = (normal_equations(body, state, make(body, state)) for make in (paper_rows, closure_rows))
+    assert np.linalg.norm(closure_values(body, state)) > 0.05
+    np.testing.assert_allclose(printed.gradient, joint.gradient, rtol=1e-9, atol=1e-4)
+    if "to =" in text.split("[[closure]]")[1]:  # each of the two equations has the whole distance
+        assert printed.cost == pytest.approx(2.0 * joint.cost)
+    else:
+        np.testing.assert_allclose(printed.matrix, joint.matrix, rtol=1e-9, atol=1e-4)
+
+
+def test_the_papers_equations_hold_a_closed_pair_in_place():
+    """The closures have rank 2 of the pedal's 3 freedoms and leave its crank; (18) and (19) have rank 3."""
+    body = parse_body(LEG)
+    state, _ = onto(body, BodyState(np.eye(4), np.array([0.5, -0.8, 1.0])), hard_equations(body))
+    rows = paper_rows(body, state)
+    np.testing.assert_allclose(rows.residual, 0.0, atol=1e-9)
+    joint, printed = closed_at(body, state).jacobian, design(rows, body, state)
+    assert [np.linalg.matrix_rank(J[:, 6:], tol=1e-6) for J in (joint, printed)] == [2, 3]
+
+
+@pytest.mark.parametrize("name", ["snowboarder", "cyclist"])
+def test_derivatives_of_the_papers_equations(name):
+    body, random = known_gear(load_body(name)), np.random.default_rng(5)
+    state = body.usual_state().retract(random.normal(scale=0.3, size=body.tree.n_dofs))
+    points, x_world = closure_targets(body, state)
+    rows = point_rows(body, state, points, x_world)
+    expected = central_differences(lambda s: point_rows(body, s, points, x_world).residual, body, state)
+    np.testing.assert_allclose(-design(rows, body, state), expected, atol=1e-7)
+
+
+def test_four_pairs_of_points_are_a_rigid_closure():
+    body = known_gear(load_body("snowboarder"))
+    closed, off = onto(body, body.usual_state(), hard_equations(body))
+    assert off < 1e-9
+    np.testing.assert_allclose(paper_rows(body, closed).residual, 0.0, atol=1e-9)
+    J = design(paper_rows(body, closed), body, closed)
+    ranks = [np.linalg.matrix_rank(A, tol=1e-6) for A in (J[:12] - J[12:], closed_at(body, closed).jacobian)]
+    assert ranks == [6, 6]
+
+
+def test_what_the_paper_has_no_equation_for_is_named():
+    line = parse_body(LEG.replace('mode = "hard"', 'kind = "line"\naxis = "x"'))
+    with pytest.raises(BodyError, match="closure 'foot' is a line"):
+        closure_targets(line, line.usual_state())
+    rider = load_body("cyclist")
+    with pytest.raises(BodyError, match="'cyclist' has gear that is to be estimated"):
+        closure_targets(rider, rider.usual_state())

@@ -1,15 +1,20 @@
 """The paper's region-based cycle, on rendered pictures; its densities against their definitions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 from tests.recipes.test_silhouettes import pictures, rig, state
+from tests.solvers.test_closed import LEG
 
-from kinefit.bodies import BodyState, load_body
-from kinefit.errors import ObservationError
+from kinefit.bodies import BodyState, load_body, parse_body
+from kinefit.correspondences.closures import closure_values, hard_equations
+from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.recipes import _colour_densities as densities
 from kinefit.recipes.regions import pose_from_regions, track_regions
+from kinefit.solvers.closed import onto
 
 BODY, RIG = load_body("arm"), rig()
 
@@ -54,6 +59,52 @@ def test_forces_cancel_and_the_rule_ends_the_cycles():
     fit = pose_from_regions(BODY, state(BODY, 0), RIG, images(0), epsilon=0.05)
     assert fit.converged and fit.cycles < 60
     assert not pose_from_regions(BODY, state(BODY, 0), RIG, images(1), epsilon=1e-12, cycles=5).converged
+
+
+SURFACES = {
+    'name = "hip", type = "revolute", axes = ["z"] }': "{ end = [0.0, 0.45, 0.0], radii = [0.07, 0.05] }",
+    "range = [[-170, 0]] }": "{ end = [0.0, 0.3, 0.0], radii = [0.05, 0.035] }",
+}
+
+
+def pedal():
+    """The pedal whose thigh and shank are seen and whose crank is not; closed poses a tenth of a turn apart."""
+    text = LEG
+    for joint, surface in SURFACES.items():
+        text = text.replace(joint, f"{joint}\nsurface = {surface}")
+    body = parse_body(text)
+    T, equations, states = np.eye(4), hard_equations(body), []
+    T[1, 3] = -0.3
+    for crank in (0.85, 1.0):
+        open_leg = BodyState(T, np.array([0.4, -0.9, crank]))
+        states.append(onto(body, open_leg, equations, locked=np.arange(9) == 8)[0])
+    return body, *states
+
+
+def test_closures_hold_a_foot_on_its_pedal():
+    """A shift of 1 px is 10 mm, a tenth of which the factor allows; the crank, which nobody sees, follows the foot."""
+    body, begun, truth = pedal()
+    seen = pictures(body, truth, RIG)
+    gap, crank = {}, {}
+    for name, one in {"closed": body, "open": replace(body, closures=())}.items():
+        fit = pose_from_regions(one, begun, RIG, seen)
+        gap[name] = float(np.linalg.norm(closure_values(body, fit.state)))
+        crank[name] = np.degrees(abs(fit.state.angles[2] - truth.angles[2]))
+    assert gap["closed"] < 0.001 and gap["open"] > 0.015
+    assert crank["closed"] < 1.0 and crank["open"] > 8.0
+
+
+def test_too_strong_a_factor_holds_the_body_in_place():
+    body, begun, truth = pedal()
+    fit = pose_from_regions(body, begun, RIG, pictures(body, truth, RIG), closure_factor=100.0)
+    assert fit.state.angles[2] - begun.angles[2] < 0.1 * (truth.angles[2] - begun.angles[2])
+
+
+def test_a_closure_that_the_paper_does_not_have_is_named():
+    line = parse_body(LEG.replace('mode = "hard"', 'kind = "line"\naxis = "x"'))
+    body = replace(pedal()[0], closures=line.closures)
+    with pytest.raises(BodyError, match="closure 'foot' is a line"):
+        pose_from_regions(body, pedal()[1], RIG, pictures(body, pedal()[1], RIG))
 
 
 def test_the_energy_is_that_of_equation_8():

@@ -30,6 +30,50 @@ def test_a_planar_linkage_in_space_is_over_constrained():
     assert "closure 'foot' has 3 equations, of which 2 say what no other does (in question: along z)" in m.redundant
 
 
+def test_in_its_plane_the_pedal_is_a_four_bar_linkage_of_one_freedom():
+    """N = 3, g = 4: F = 3 (3 - 4) + 4 = 1."""
+    m = mobility(parse_body(LEG), planar=True)
+    assert (m.links, m.joints, m.equations, m.gruebler, m.rank, m.mobility) == (3, 4, 2, 1, 2, 1)
+    assert m.agrees and not m.redundant
+
+
+ROD = LEG.replace('to = "pedal"', "at = [0.1, 0.7, 0.0]").replace('mode = "hard"', 'kind = "line"\naxis = "y"')
+HOLDS = 'name = "axis", type = "revolute", at = [0.0, 0.6, 0.0], axes = ["z"]'
+BAR = """
+[[segment]]
+name = "bar"
+parent = "shank"
+joint = { name = "ankle", type = "revolute", at = [0.0, 0.2, 0.0], axes = ["z"] }
+
+[landmarks]
+"""
+FIVE_BARS = LEG.replace("\n[landmarks]\n", BAR).replace('foot = { segment = "shank"', 'foot = { segment = "bar"')
+
+
+@pytest.mark.parametrize(
+    "text, links, joints, freedoms",
+    [
+        (ROD, 3, 4, 2),  # a slider and crank of thigh and shank, and the crank of the pedal, which turns freely
+        (LEG.replace(HOLDS, HOLDS.replace("revolute", "fixed").replace(', axes = ["z"]', "")), 3, 4, 0),
+        (FIVE_BARS.replace("0.3, 0.0] }", "0.1, 0.0] }"), 4, 5, 2),
+        (LEG.replace('mode = "hard"', 'kind = "rigid"\nmode = "hard"'), 3, 4, 0),
+    ],
+)
+def test_planar_linkages_move_as_gruebler_says(text, links, joints, freedoms):
+    m = mobility(parse_body(text), planar=True)
+    assert (m.links, m.joints, m.gruebler, m.mobility) == (links, joints, freedoms, freedoms)
+
+
+def test_a_body_that_leaves_the_plane_has_no_planar_count():
+    with pytest.raises(BodyError, match="'snowboarder' does not move in a plane"):
+        mobility(load_body("snowboarder"), planar=True)
+    with pytest.raises(BodyError, match="does not move in a plane"):
+        mobility(parse_body(LEG.replace('name = "hip", type = "revolute", axes = ["z"]', HIP)), planar=True)
+
+
+HIP = 'name = "hip", type = "revolute", axes = ["x"]'
+
+
 def test_a_closure_that_is_said_twice_is_named():
     body = load_body("snowboarder")
     again = replace(body, closures=(*body.closures, replace(body.closures[0], name="again")))

@@ -56,13 +56,14 @@ def copy(name: str, file: Path | None) -> None:
 
 @body.command(short_help="Degrees of freedom, and whether closures hold together.")
 @click.argument("file")
-def check(file: str) -> None:
+@click.option("--planar", is_flag=True, help="Count in the plane in which the body moves: 3 in place of 6.")
+def check(file: str, planar: bool) -> None:
     """Gruebler's count of a body beside the rank of what closes it; what follows from what; what contradicts what."""
     from kinefit.bodies import load_body
     from kinefit.solvers.mobility import check_closed, mobility
 
     one = load_body(file)
-    m = mobility(one)
+    m = mobility(one, planar=planar)
     _screen.say(f"body '{one.name}': {m.links} links, {m.joints} joints, {m.open_dofs} degrees of freedom as a tree")
     for c in one.closures:
         where = f"'{c.to}'" if c.to else "a place in the world" + (" that is estimated" if c.place_std > 0.0 else "")

@@ -1,4 +1,4 @@
-"""What closes chains of a body, as rows (P3 3.2, eqs. 15-19).
+"""What closes chains of a body, as rows (P3 3.2, eq. 15, linearised in both of its points).
 
 A point x_a of one segment stays at x_b of another (or of the world) along the directions n of b's frame:
 
@@ -7,6 +7,10 @@ A point x_a of one segment stays at x_b of another (or of the world) along the d
 Both twists act at x_a, since n turns with b. A rigid closure also has e = log((R_b R_turn)ᵀ R_a), with
 δe = J_l⁻¹(e) (R_b R_turn)ᵀ (δω_a − δω_b). Soft closures are rows of their standard deviation, as in the paper; hard
 ones are equations for `solvers.closed`, or rows of `STIFF` where a quadratic cost is asked for.
+
+The paper linearises (15) as (18) and (19) instead: each point is drawn to where the other one stands, which counts as
+constant. That is `point_rows` of `closure_targets`. Both have the same gradient −Jᵀ W c, and so the same solution.
+Their matrices differ: Jₐᵀ W Jₐ + J_bᵀ W J_b also holds the pair in place, where (Jₐ − J_b)ᵀ W (Jₐ − J_b) does not.
 """
 
 from __future__ import annotations
@@ -17,14 +21,18 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, BodyState
-from kinefit.bodies.closures import with_dimensions
+from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies.closures import has_unknown_gear, with_dimensions
 from kinefit.correspondences import _kernels_closures
+from kinefit.errors import BodyError
 from kinefit.geometry import se3
 from kinefit.rows import DofRows
 
 STIFF = 1e-4
 """[m, rad] standard deviation of a hard closure where it enters a quadratic cost; what is solved is then made exact."""
+
+_RIGID_PAIRS = 0.1 * np.concatenate([np.zeros((1, 3)), np.eye(3)])
+"""(4, 3) [m] from a rigid closure's landmark to the points of its segment that stand for it: about a boot's width."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +149,53 @@ def closed_at(body: Body, state: BodyState) -> Closed:
 def closure_rows(body: Body, state: BodyState) -> DofRows:
     """Rows of all closures of a body, r = −c: soft ones by their standard deviation, hard ones by `STIFF`."""
     return closed_at(body, state).rows()
+
+
+def closure_targets(body: Body, state: BodyState) -> tuple[PointSet, NDArray]:
+    """Points of a body's closures, and where each should lie, as the paper linearises them (P3 3.2, eqs. 18, 19).
+
+    A pair of points gives two: either one should lie where the other one stands. A place in the world gives one, (18)
+    alone. A rigid closure is four pairs, as the paper ties a boot to its binding.
+
+    Returns
+    -------
+    points : PointSet of K points.
+    x_world : (K, 3) [m], constant in a step.
+
+    Raises
+    ------
+    BodyError
+        A line or a plane, which the paper does not have; gear that is to be estimated.
+    """
+    if has_unknown_gear(body):
+        problem = f"body '{body.name}' has gear that is to be estimated, which equations (18) and (19) cannot do"
+        raise BodyError(problem, remedy="Give `known_gear(body)`, with its dimensions and places as they are.")
+    points, x_world = [body.landmarks.select(())], [np.zeros((0, 3))]
+    for c in body.closures:
+        if c.kind not in ("point", "rigid"):
+            problem = f"closure '{c.name}' is a {c.kind}, which is no pair of points as in equations (18) and (19)"
+            raise BodyError(problem, remedy='Write kind = "point" or "rigid", or take `closure_rows`.')
+        shifts = _RIGID_PAIRS if c.kind == "rigid" else _RIGID_PAIRS[:1]
+        turned = shifts @ se3.exp_so3(np.array(c.turn)).T
+        held = _shifted(body.landmarks, c.point, shifts)
+        if c.to:
+            other = _shifted(body.landmarks, c.to, turned)
+            points += [held, other]
+            x_world += [body.positions(state, other), body.positions(state, held)]
+        else:
+            points.append(held)
+            x_world.append(np.array(c.place) + turned)
+    joined = PointSet(
+        tuple(name for p in points for name in p.names), np.concatenate([p.segments for p in points]),
+        np.concatenate([p.points for p in points]),
+    )  # fmt: skip
+    return joined, np.concatenate(x_world)
+
+
+def _shifted(landmarks: PointSet, name: str, shifts: NDArray) -> PointSet:
+    """Points of a landmark's segment at shifts (k, 3) [m] from it."""
+    same = landmarks.select((name,) * len(shifts))
+    return PointSet(same.names, same.segments, same.points + shifts)
 
 
 def soft_closures(body: Body, state: BodyState) -> list[DofRows]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
@@ -73,44 +74,58 @@ def fit_markers(
         sigma = np.asarray(sigma, float)[[own.index(n) for n in points.names]]
     x = columns(markers, points.names)
     sigma = np.broadcast_to(np.asarray(sigma, float), len(points))
-    roots, angles = sequence_both_ways(body, points, x, sigma, loss=loss, limits=limits)
-    roots, angles = _tried_anew(body, points, x, sigma, roots, angles, loss, limits)
+    worn = _Worn(body, points, x, sigma, loss, limits)
+    roots, angles = _tried_anew(worn, *worn.poses(slice(None)))
     sure = certainty(body, roots, angles, points, x, sigma=sigma, loss=loss, posture=1.0)
-    angles = unwrap(body.tree, angles)
-    roots, angles = _bridged(body, points, x, sigma, roots, angles, sure, markers.rate, loss, limits)
-    return _motion(body, markers, points, x, sigma, roots, angles, sure, up)
+    roots, angles = _bridged(worn, roots, unwrap(body.tree, angles), sure, markers.rate)
+    return _motion(worn, roots, angles, sure, markers, up)
 
 
-def _misfit(body: Body, points: PointSet, x: NDArray, sigma: NDArray, roots: NDArray, angles: NDArray) -> NDArray:
-    """(F,) mean misfit of a frame's markers in standard deviations, none counting for more than ten."""
-    off = np.linalg.norm(x - body.trajectories(roots, angles, points), axis=2) / sigma
-    seen = np.isfinite(off)
-    return np.where(seen, np.minimum(np.nan_to_num(off), 10.0), 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+@dataclass(frozen=True, eq=False)
+class _Worn:
+    """Points on a body, seen at x (F, K, 3) [m], NaN where not, with sigma (K,) [m]; loss, and whether limits hold."""
+
+    body: Body
+    points: PointSet
+    x: NDArray
+    sigma: NDArray
+    loss: Loss
+    limits: bool
+
+    def poses(self, frames: slice) -> tuple[NDArray, NDArray]:
+        """Roots and angles of some frames, with no pose given."""
+        return sequence_both_ways(
+            self.body, self.points, self.x[frames], self.sigma, loss=self.loss, limits=self.limits
+        )  # fmt: skip
+
+    def misfit(self, roots: NDArray, angles: NDArray, frames: slice = slice(None)) -> NDArray:
+        """Mean misfit of each of these frames' markers in standard deviations, none counting for more than ten."""
+        off = np.linalg.norm(self.x[frames] - self.body.trajectories(roots, angles, self.points), axis=2) / self.sigma
+        seen = np.isfinite(off)
+        return np.where(seen, np.minimum(np.nan_to_num(off), 10.0), 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
 
 
-def _tried_anew(
-    body: Body, points: PointSet, x: NDArray, sigma: NDArray, roots: NDArray, angles: NDArray, loss: Loss, limits: bool
-) -> tuple[NDArray, NDArray]:
+def _tried_anew(worn: _Worn, roots: NDArray, angles: NDArray) -> tuple[NDArray, NDArray]:
     """Frames that fit far worse than the others, fitted from nowhere where that does better."""
     roots, angles = roots.copy(), angles.copy()
-    misfit = _misfit(body, points, x, sigma, roots, angles)
+    misfit = worn.misfit(roots, angles)
     bad = misfit > max(_OFF * float(np.median(misfit)), 3.0)
     for a, b in sorted(runs_of(bad), key=lambda run: run[0] - run[1])[:_MOST_RUNS]:
+        some = slice(a, b)
         try:
-            other_roots, other_angles = sequence_both_ways(body, points, x[a:b], sigma, loss=loss, limits=limits)
+            other_roots, other_angles = worn.poses(some)
         except TrackingError:
             continue
-        better = _misfit(body, points, x[a:b], sigma, other_roots, other_angles) < 0.9 * misfit[a:b]
-        roots[a:b][better], angles[a:b][better] = other_roots[better], other_angles[better]
+        better = worn.misfit(other_roots, other_angles, some) < 0.9 * misfit[some]
+        roots[some][better], angles[some][better] = other_roots[better], other_angles[better]
     return roots, angles
 
 
 def _bridged(
-    body: Body, points: PointSet, x: NDArray, sigma: NDArray, roots: NDArray, angles: NDArray, sure: Certainty,
-    rate: float, loss: Loss, limits: bool,
+    worn: _Worn, roots: NDArray, angles: NDArray, sure: Certainty, rate: float
 ) -> tuple[NDArray, NDArray]:
     """Poses whose untold angles follow from the frames around them; the others stay as measured."""
-    tree = body.tree
+    tree, x = worn.body.tree, worn.x
     lost = ~((sure.dof_std[:, :3].max(axis=1) < _HELD) & (sure.dof_std[:, 3:6].max(axis=1) < _TOLD))
     enough = np.minimum(np.where(tree.prismatic, _HELD, _TOLD), _PRIOR * tree.spread)
     told = (sure.dof_std[:, 6:] < enough) & ~lost[:, None]
@@ -122,30 +137,30 @@ def _bridged(
     for d in np.flatnonzero(some):
         meant[:, d] = np.interp(frames, frames[told[:, d]], angles[told[:, d], d])
     held, (roots, _) = roots, bridged(roots, meant, lost, _MEMORY * rate)
-    before, measured = _misfit(body, points, x, sigma, roots, angles), angles
+    before, measured = worn.misfit(roots, angles), angles
     roots, angles = np.array(roots), np.where(told | ~some, angles, meant)
     again = ~lost & ~told[:, some].all(axis=1)
     for a, b in runs_of(again):
         inside = bool(((angles[a:b] >= tree.lower) & (angles[a:b] <= tree.upper)).all())  # not in another chart
         fit = fit_sequence(  # the rest of the chain settles about what is now known
-            body, BodyState(roots[a], angles[a]), points, x[a:b], sigma=sigma, loss=loss, limits=limits and inside,
-            posture=1.0, usual=meant[a:b],
+            worn.body, BodyState(roots[a], angles[a]), worn.points, x[a:b], sigma=worn.sigma, loss=worn.loss,
+            limits=worn.limits and inside, posture=1.0, usual=meant[a:b],
         )  # fmt: skip
         roots[a:b], angles[a:b] = fit.Ts_world_root, fit.angles
-    worse = again & (_misfit(body, points, x, sigma, roots, angles) > before + _WORSE)
+    worse = again & (worn.misfit(roots, angles) > before + _WORSE)
     roots[worse], angles[worse] = held[worse], measured[worse]
     return roots, unwrap(tree, angles) if again.any() else angles
 
 
 def _motion(
-    body: Body, markers: Markers, points: PointSet, x: NDArray, sigma: NDArray, roots: NDArray, angles: NDArray,
-    sure: Certainty, up: str | None,
-) -> Motion:  # fmt: skip
+    worn: _Worn, roots: NDArray, angles: NDArray, sure: Certainty, markers: Markers, up: str | None
+) -> Motion:
     """Quality as of every other track: the share of what shows a segment that agrees with it."""
+    body, points, x = worn.body, worn.points, worn.x
     dof_std = np.array(sure.dof_std)
     dof_std[:, 6:][dof_std[:, 6:] > _PRIOR * body.tree.spread] = np.inf
     values = x - body.trajectories(roots, angles, points)
-    told = of_points(body, points, np.square(values / sigma[:, None]).sum(axis=2))
+    told = of_points(body, points, np.square(values / worn.sigma[:, None]).sum(axis=2))
     quality = told.quality_in(body.tree)
     residuals = Residuals(points.names, points.segments, values, sure.factors, "m", x, np.zeros(len(x), bool))
     return Motion(

@@ -1,10 +1,10 @@
-"""Pose from regions as Rosenhahn, Schmaltz et al. print it (P3 2.3, 2.4): densities, signs, rays, until forces cancel.
+"""Pose from regions as Rosenhahn, Schmaltz et al. print it (P3 2.3, 2.4, 3.2): densities, signs, rays, closed chains.
 
 1. The projected body splits every image into what it covers and the rest; the densities p₁, p₂ of both regions' colours
    in CIELab are Parzen estimates, or mixtures of Gaussians (the paper leaves the form open).
 2. Points of the silhouette at which p₁ > p₂ are shifted along the outward normal, the others inwards (2.4.2).
 3. The pose and the joint angles that bring the body's points onto the rays of the shifted points follow in least
-   squares (eqs. 6, 7).
+   squares (eqs. 6, 7). Closures of the body are attached to that system, times a strong factor (eqs. 18, 19).
 4. Again, until the pose's average change over up to three iterations is below ε. Energy (8) is told, not minimised.
 
 The tracker (`[[region]]` in a take) beside it takes the likelihood of all places along a line in place of a sign,
@@ -22,6 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.surfaces import body_mesh
 from kinefit.bodies.surfaces.triangles import BodyMesh
+from kinefit.correspondences import point_rows
+from kinefit.correspondences.closures import closure_targets
 from kinefit.correspondences.contours.outlines import outline_rows
 from kinefit.correspondences.contours.rims import RimFinder
 from kinefit.errors import ObservationError, choices
@@ -54,9 +56,9 @@ class RegionFit:
 def pose_from_regions(
     body: Body, state: BodyState, rig: Rig, images: Mapping[str, ArrayLike], *, densities: str = "parzen",
     mesh: BodyMesh | None = None, finder: RimFinder | None = None, shift: float = 1.0, cycles: int = 60,
-    epsilon: float = 1e-3,
+    epsilon: float = 1e-3, closure_factor: float = 10.0,
 ) -> RegionFit:  # fmt: skip
-    """Pose and joint angles from the colours inside and outside of the body (P3 2.4).
+    """Pose and joint angles from the colours inside and outside of the body (P3 2.4), closures held (P3 3.2).
 
     Parameters
     ----------
@@ -67,9 +69,14 @@ def pose_from_regions(
     shift : float [px] by which a point is shifted; the paper does not state it.
     cycles : int, at most.
     epsilon : float, of the pose's average change (metres and radians) over three iterations, which ends the cycles.
+    closure_factor : float > 0 of the closures' equations (18) and (19), over the root mean square of those of (6). The
+        paper has "a strong weighting factor". The equations count where points of closures stand as constant: from
+        about 30 on they hold the body in place.
 
     Raises
     ------
+    BodyError
+        Closures that are no pairs of points; gear that is to be estimated.
     ObservationError
         Densities of another form; an image of another size than its camera's; nothing of the body is in view.
     """
@@ -97,7 +104,9 @@ def pose_from_regions(
         rows, energy = Rows.concat(*parts), float(np.mean(told))
         if not len(rows):
             raise ObservationError("nothing of the body is in view", remedy="Start nearer to where it is.")
-        step = gauss_newton(body, state, rows, damping=1e-6 * float(np.sum(rows.weight)))
+        damping, sigma = 1e-6 * float(np.sum(rows.weight)), float(np.mean(rows.weight)) ** -0.5 / closure_factor
+        rows = Rows.concat(rows, point_rows(body, state, *closure_targets(body, state), sigma=sigma))
+        step = gauss_newton(body, state, rows, damping=damping)
         state, changes = step.state, [*changes, step.delta]
         converged = len(changes) >= 3 and float(np.linalg.norm(np.mean(changes[-3:], axis=0))) < epsilon
     return RegionFit(state, energy, len(changes), converged)

@@ -3,6 +3,14 @@
 Gruebler: N moving links and g joints of fᵢ freedoms leave F = 6 (N − g) + Σ fᵢ; every joint of the tree is one, and
 every closure another. That count knows of no geometry. The rank of the closures' Jacobian at closed poses does: where
 equations follow from others, the body moves more freely than F says, and is over-constrained.
+
+In the plane, 3 stands in place of 6, and a closure takes only what acts in the plane. The paper's pedal (3.1) has the
+moving links thigh, shank and crank, N = 3; the ground does not count. Its joints are hip, knee, the crank's axis and
+the foot on the pedal, g = 4, one freedom each: F = 3 (3 − 4) + 4 = 1, the crank's angle. As a point on a circle (eq.
+12), which takes one of three freedoms, N = 2, g = 3 and F = 3 (2 − 3) + 1 + 1 + 2 = 1 again. In space F = 0.
+
+The paper's "rank g − F" holds if g counts the freedoms of the open chain, the unknowns of the fit: 3 − 1 = 2 for the
+pedal. With g of (9), closures included, it does not.
 """
 
 from __future__ import annotations
@@ -24,6 +32,7 @@ from kinefit.solvers.equations import lock
 from kinefit.solvers.least_squares import levenberg_marquardt
 
 _RANK = 1e-6  # of the largest singular value of the Jacobian: generic poses of the catalogue's have 1e-3 and more
+_FLAT = 1e-6  # sine of the angle by which a joint may lean out of the plane of a planar count
 _MOVE = 0.02  # [m, rad] of a step along a direction that the Jacobian leaves free
 _MOVES = 0.5  # share of such a step that must be left once the equations hold again
 _POSES = 4  # closed poses that are looked at
@@ -41,7 +50,7 @@ class Mobility:
     links : N, segments that move
     joints : g, those of the tree and closures
     open_dofs : degrees of freedom of the open tree, its root included
-    equations : how many the closures are
+    equations : how many the closures are, in the plane of a planar count
     gruebler : F
     rank : of the closures' Jacobian at closed poses
     mobility : freedoms with which the closed body moves by finite steps
@@ -63,21 +72,26 @@ class Mobility:
         return self.gruebler == self.mobility
 
 
-def mobility(body: Body, seed: int = 0) -> Mobility:
+def mobility(body: Body, seed: int = 0, *, planar: bool = False) -> Mobility:
     """Of a body, with or without closures.
+
+    Parameters
+    ----------
+    seed : int of the random closed poses.
+    planar : whether Gruebler's count is that of a mechanism in a plane, 3 in place of 6.
 
     Raises
     ------
     BodyError
-        Closures that contradict each other: no pose satisfies them.
+        Closures that contradict each other: no pose satisfies them. A planar count of a body that leaves a plane.
     """
     fixed, tree = lock(body, None), body.tree
     count = int(np.sum(~fixed))
     links = len(tree.segments) - (0 if tree.root_free else 1)
     joints = links + len(body.closures)
-    taken = len(owners(body)) if body.closures else 0
-    freedoms = count + sum(6 - c.rows for c in body.closures)
-    F = 6 * (links - joints) + freedoms
+    taken = sum(_in_plane(body) if planar else (c.rows for c in body.closures))
+    space = 3 if planar else 6
+    F = space * (links - joints) + count + space * len(body.closures) - taken
     if not body.closures:
         return Mobility(links, joints, count, 0, F, 0, count, ())
     poses = closed_poses(body, seed)
@@ -89,8 +103,26 @@ def mobility(body: Body, seed: int = 0) -> Mobility:
     best = int(np.argmax(ranks))
     return Mobility(
         links, joints, count, taken, F, ranks[best], moves[best],
-        _redundant(body, closed_at(body, poses[best]).jacobian[:, ~fixed]),
+        () if F == moves[best] else _redundant(body, closed_at(body, poses[best]).jacobian[:, ~fixed]),
     )  # fmt: skip
+
+
+def _in_plane(body: Body) -> list[int]:
+    """How many freedoms in the plane of the body's motion each closure takes away."""
+    state, tree = body.usual_state(), body.tree
+    v, w = np.split(tree.forward(state.T_world_root, state.angles)[1], 2, axis=1)
+    turning = w[np.linalg.norm(w, axis=1) > 0.5]
+    normal = turning[0] / np.linalg.norm(turning[0]) if len(turning) else np.zeros(3)
+    if tree.root_free or not len(turning) or max(np.abs(np.cross(w, normal)).max(), np.abs(v @ normal).max()) > _FLAT:
+        problem = f"body '{body.name}' does not move in a plane"
+        remedy = "Count it in space, or fix its root, let joints turn about one direction, and slide across it."
+        raise BodyError(problem, remedy=remedy)
+    taken = []
+    for c in body.closures:
+        n = state.T_world_root[:3, :3].T @ normal if c.to else normal
+        across = c.directions - np.outer(c.directions @ n, n)
+        taken.append(int(np.linalg.matrix_rank(across, tol=_FLAT)) + (c.kind == "rigid"))
+    return taken
 
 
 def closed_poses(body: Body, seed: int = 0, most: int = _POSES) -> list[BodyState]:
@@ -126,7 +158,7 @@ def contradictory(body: Body, state: BodyState) -> BodyError:
             turned = f" and {np.degrees(turn):.1f} deg" if turn > 0.0 else ""
             told.append(f"'{c.name}' by {1e3 * off:.1f} mm{turned}")
     problem = f"closures of body '{body.name}' that contradict each other: in the best pose found they are off, "
-    remedy = "Correct the places of their landmarks and their joints' ranges, or make one of them soft."
+    remedy = "Correct the places of their landmarks and their joints' ranges, or give one of them a larger sigma."
     return BodyError(problem + ", ".join(told), remedy=remedy)
 
 

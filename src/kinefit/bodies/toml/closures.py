@@ -120,7 +120,8 @@ def _closure(body: Body, r: ClosureRecord, source: str) -> Closure:
         raise wrong(f"a {r.kind} closure with a turn", "Leave it out: only rigid closures hold turns.")
     if r.mode == "hard" and (r.sigma is not None or r.turn_sigma is not None):
         raise wrong("a hard closure with a standard deviation", 'Leave it out, or set mode = "soft".')
-    sigmas = (0.005 if r.sigma is None else r.sigma, 2.0 if r.turn_sigma is None else r.turn_sigma, r.std, r.turn_std)
+    sigma = Closure.sigma if r.sigma is None else r.sigma
+    sigmas = (sigma, 2.0 if r.turn_sigma is None else r.turn_sigma, r.std, r.turn_std)
     if not all(0.0 < s < np.inf for s in sigmas):
         raise wrong(f"standard deviations {sigmas}", "Give positive ones.")
     owner = body.landmarks.segments[list(names).index(r.point)]
