@@ -85,7 +85,7 @@ def test_what_every_sensor_has_learnt_is_kept(make, tmp_path, monkeypatch):
 
 #: Attributes that belong to one step, to what a tracker is made of, or to a live session.
 OF_A_STEP = {
-    Tracker: {"body", "_fit", "_scene", "_recovery", "_prediction", "_others", "_last"},
+    Tracker: {"body", "_fit", "_scene", "_recovery", "_prediction", "others", "_last"},
     Prediction: {"_halted", "_ahead", "_information"}, RegionSensor: {"_parts", "_starts"},
 }  # fmt: skip
 

@@ -225,7 +225,7 @@ def test_rows_leave_out_what_was_not_seen_and_refuse_nonsense():
     fewer = morphed_rows(pose, [1, 3, 4], n[:3], r[[0, 2, 3]])
     np.testing.assert_allclose(rows.weight, fewer.weight)
     np.testing.assert_allclose(rows.weight @ rows.residual, fewer.weight @ fewer.residual)
-    with pytest.raises(ObservationError, match="4 nodes with directions"):
+    with pytest.raises(ObservationError, match="directions of shape .3, 3.. Give .4, 3."):
         morphed_rows(pose, [1, 2, 3, 4], n[:3], r)
     with pytest.raises(ObservationError, match="standard deviation"):
         morphed_rows(pose, [1, 2, 3, 4], n, r, sigma=0.0)
