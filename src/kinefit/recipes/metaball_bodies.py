@@ -207,12 +207,13 @@ def _sigma_of_fields(
         problem = f"standard deviations of {len(each)} frames for {len(normals)}"
         raise ObservationError(problem, remedy="Give one number, or an array for each frame.")
     for s, n in zip((np.asarray(s, float) for s in each), normals):
-        s = np.sqrt(np.einsum("ni,nij,nj->n", n, s, n)) if s.shape == (len(n), 3, 3) else s
-        near = n.any(axis=1)
-        if s.shape not in ((), (len(n),)) or not (np.where(near, s, 1.0) > 0).all():
+        if s.shape == (len(n), 3, 3):  # a point that is beyond reach at the start has no normal
+            mean = np.trace(s, axis1=1, axis2=2) / 3.0
+            s = np.sqrt(np.where(n.any(axis=1), np.einsum("ni,nij,nj->n", n, s, n), mean))
+        if s.shape not in ((), (len(n),)) or not (s > 0).all():
             problem = f"standard deviations of shape {s.shape}, or not positive, for {len(n)} points"
             raise ObservationError(problem, remedy="Give positive ones (N,), or covariances (N, 3, 3).")
-        out.append(np.sqrt(slopes.mean()) * np.where(near, s, 1.0))
+        out.append(np.sqrt(slopes.mean()) * np.broadcast_to(s, len(n)))
     return out
 
 
