@@ -56,15 +56,19 @@ METHODS: dict[str, dict[str, Any]] = {
 
 
 class Errors(NamedTuple):
-    """RMS errors of one arm: logarithms of radii (3,) by limb, angles [deg] of arm and hand; its worst width."""
+    """RMS errors of one arm: logarithms of radii (3,) by limb, angles [deg] of arm and hand; its worst width.
+
+    `squares` is Σ (F − 1/2)², each point with the limb closest at the start, over that of the true arm.
+    """
 
     radii: NDArray
     arm: float
     hand: float
     width: float
+    squares: float
 
 
-LOST = Errors(np.full(3, np.inf), np.inf, np.inf, np.inf)
+LOST = Errors(np.full(3, np.inf), np.inf, np.inf, np.inf, np.inf)
 """Of an arm that ended without a surface."""
 
 
@@ -80,9 +84,9 @@ def run() -> None:
             e = found[name][-1]
             radii = ", ".join(f"{100 * v:.1f}" for v in e.radii)
             print(f"  seed {seed} {name}: radii {radii} % of upper arm, forearm, hand; widths {100 * e.width:.1f} %; "
-                  f"angles {e.arm:.2f} and {e.hand:.2f} deg", flush=True)  # fmt: skip
-    for name, errors_of in found.items():
-        held_out = [e for seed, e in zip(seeds, errors_of) if seed >= 24]
+                  f"angles {e.arm:.2f} and {e.hand:.2f} deg; squares {e.squares:.2f} of the truth's", flush=True)  # fmt: skip
+    for name in ("in_turn", "in_turn_helped", "at_once"):
+        held_out = [e for seed, e in zip(seeds, found[name]) if seed >= 24]
         why = "an arm ended without a surface"
         for limb, value in zip(LIMBS, _rms([e.radii for e in held_out])):
             figure(f"metaballs_radii_{limb}_{name}", 100 * float(value), "% RMS", "<= 5", why)
@@ -90,6 +94,9 @@ def run() -> None:
         figure(f"metaballs_widths_{name}", width, "% median of the worst", "<= 5", why)
         figure(f"metaballs_angles_arm_{name}", float(_rms([e.arm for e in held_out])), "deg RMS", "<= 2", why)
         figure(f"metaballs_angles_hand_{name}", float(_rms([e.hand for e in held_out])), "deg RMS", "<= 2", why)
+    for name in ("in_turn", "field_at_once"):
+        squares = float(np.median([e.squares for e in found[name]]))
+        figure(f"metaballs_squares_{name}", squares, "of those at the truth, median", "<= 1")
     for one, other in (("in_turn", "at_once"), ("field_at_once", "in_turn")):
         _paired(one, other, found)
     _time()
@@ -119,7 +126,14 @@ def _fitted(
         return LOST
     radii, angles = errors(found.body, found.states, body, truth)
     arm_and_hand = float(_rms(list(angles[:4]))), float(_rms(list(angles[4:])))
-    return Errors(np.sqrt(np.mean(radii**2, axis=1)), *arm_and_hand, widths(found.body, body))
+    generic = load_body("arm_metaballs")
+    of = [nearest(generic, s, x, max_distance=1.0).segment for s, x in zip(start, points)]
+    squares = [
+        sum(float(np.sum(field_rows(b, s, x, o).residual ** 2)) for s, x, o in zip(states, points, of))
+        for b, states in ((found.body, found.states), (body, truth))
+    ]
+    rms = np.sqrt(np.mean(radii**2, axis=1))
+    return Errors(rms, *arm_and_hand, widths(found.body, body), squares[0] / squares[1])
 
 
 def field_at_once(generic: Body, points: list[NDArray], start: list[BodyState]) -> MetaballBody:
