@@ -84,7 +84,7 @@ def run() -> None:
             e = found[name][-1]
             radii = ", ".join(f"{100 * v:.1f}" for v in e.radii)
             print(f"  seed {seed} {name}: radii {radii} % of upper arm, forearm, hand; widths {100 * e.width:.1f} %; "
-                  f"angles {e.arm:.2f} and {e.hand:.2f} deg; squares {e.squares:.2f} of the truth's", flush=True)  # fmt: skip
+                  f"angles {e.arm:.2f} and {e.hand:.2f} deg; squares {e.squares:.2f} of true", flush=True)  # fmt: skip
     for name in ("in_turn", "in_turn_helped", "at_once"):
         held_out = [e for seed, e in zip(seeds, found[name]) if seed >= 24]
         why = "an arm ended without a surface"
