@@ -89,7 +89,7 @@ def metaballs() -> NDArray:
     """(H, W, 3) BGR: points of an arm over the catalogue's arm, and over the fitted one."""
     generic, random = load_body("arm_metaballs"), np.random.default_rng(24)
     grown = tuple(
-        replace(s, radii=np.array(s.radii) * random.uniform(0.85, 1.15, s.radii.shape)) if isinstance(s, Metaballs)
+        s.changed(np.array(s.radii) * random.uniform(0.85, 1.15, s.radii.shape)) if isinstance(s, Metaballs)
         else s for s in generic.surfaces
     )  # fmt: skip
     true, points, starts = replace(generic, surfaces=grown), [], []
@@ -101,7 +101,7 @@ def metaballs() -> NDArray:
         points.append((f[:, :9].reshape(-1, 3, 3) @ rest[:, :, None])[..., 0] + f[:, 9:])
         off = random.normal(scale=0.07, size=len(state.angles))
         starts.append(BodyState(np.eye(4), np.clip(state.angles + off, true.tree.lower, true.tree.upper)))
-    found = metaball_bodies(generic, points, starts, locked=np.arange(6 + len(starts[0].angles)) < 6)
+    found = metaball_bodies(generic, points, starts)
     x = points[0]
     z, middle = np.array([0.0, 0.0, -1.0]), 0.5 * (x.min(axis=0) + x.max(axis=0))
     R = np.array([[1.0, 0, 0], [0, -1.0, 0], z])

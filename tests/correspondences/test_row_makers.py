@@ -24,7 +24,7 @@ from kinefit.bodies import BodyState, PointSet, TaperedCylinder, load_body
 from kinefit.bodies.closures import Closure
 from kinefit.bodies.morphs.morphing import JointMotion, LocalMorph, Morphing
 from kinefit.bodies.morphs.steering import Steering
-from kinefit.bodies.surfaces import SkinnedMesh
+from kinefit.bodies.surfaces import Metaballs, SkinnedMesh
 from kinefit.correspondences import (
     Bands,
     anchored_rows,
@@ -34,6 +34,7 @@ from kinefit.correspondences import (
     collision_rows,
     depth_image_rows,
     edge_rows,
+    field_rows,
     free_space_rows,
     image_line_rows,
     limit_rows,
@@ -150,6 +151,7 @@ CASES = {
         lambda state: free_space_rows(frames(s, state), *seen_through(s), sigma=2.0, tolerance=0.0, reach=np.inf)
     ),
     "surface_rows": lambda s: about_surfaces(s),
+    "field_rows": lambda s: in_fields(s),
     "anchored_rows": lambda s: (
         lambda state: anchored_rows(frames(s, state), *anchors(s), s.target[:, [1, 2, 0]], weight=s.sigma)
     ),
@@ -197,6 +199,18 @@ def about_surfaces(s):
     points = PointSet(tuple(f"{k}" for k in range(3 * count)), owner, random.normal(scale=0.2, size=(3 * count, 3)))
     x = slow_positions(body, s.state, points)
     return lambda state: surface_rows(body, state, x, segment=owner, max_distance=5.0, sigma=0.7, exact=True)
+
+
+def in_fields(s):
+    """Points in the fields of two metaballs on every segment, each known to be of one of them."""
+    random, count = np.random.default_rng(4), len(s.body.tree.segments)
+    surfaces = tuple(
+        Metaballs.of(k, [[0, 0, 0], [0.02, 0.1, 0]], random.uniform(0.2, 0.4, (2, 3))) for k in range(count)
+    )
+    body, owner = replace(s.body, surfaces=surfaces), np.repeat(np.arange(count), 3)
+    points = PointSet(tuple(f"{k}" for k in range(3 * count)), owner, random.normal(scale=0.2, size=(3 * count, 3)))
+    x, sigma = slow_positions(body, s.state, points), random.uniform(0.5, 2.0, 3 * count)
+    return lambda state: field_rows(body, state, x, owner, sigma=sigma)
 
 
 def morphed_skin(s):

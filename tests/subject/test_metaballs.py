@@ -1,14 +1,11 @@
-"""Radii of metaballs from points: of one limb, and with poses, in turn and at once."""
+"""Radii of metaballs from points of one limb, by distances and by the field; parameters of a subject fit."""
 
 import numpy as np
 import pytest
-from benchmarks.metaballs import arm, errors, joint
 
 from kinefit.bodies import load_body
-from kinefit.bodies.surfaces import Metaballs, nearest
 from kinefit.errors import BodyError, ObservationError
-from kinefit.recipes.metaball_bodies import metaball_bodies
-from kinefit.subject.metaballs import MetaballShape, fit_balls, grown
+from kinefit.subject.metaballs import MetaballShape, _fields, fit_balls, fit_field, grown, unmeshed
 from kinefit.subject.parameters import World
 from kinefit.subject.surfaces import shape_of
 
@@ -64,29 +61,28 @@ def test_parameters_change_radii_and_nothing_else():
         MetaballShape(load_body("arm"))
 
 
-@pytest.fixture(scope="module")
-def seen():
-    return arm(5, 2, 400)
+@pytest.mark.parametrize("weights", [False, True])
+def test_derivatives_of_the_field_agree_with_central_differences(weights):
+    """P4, eqs. 14 and 15: ∂F/∂θ = −∂(1/2 − F)/∂θ."""
+    rng = np.random.default_rng(1)
+    values, x, h = 0.1 * rng.normal(size=9 + 3 * weights), on(LIMB, 200, rng) + 0.02 * rng.normal(size=(200, 3)), 1e-6
+    J, _ = _fields(unmeshed(LIMB, values, weights), x, weights)
+    for k, e in enumerate(h * np.eye(len(values))):
+        above, below = (_fields(unmeshed(LIMB, values + s * e, weights), x, weights)[1] for s in (1, -1))
+        np.testing.assert_allclose(-J[:, k], (above - below) / (2 * h), atol=1e-8)
 
 
-def test_radii_and_poses_in_turn(seen):
-    body, points, truth, start = seen
-    locked = np.arange(6 + len(body.tree.coordinates)) < 6
-    found = metaball_bodies(BODY, points, start, sigma=0.001, locked=locked, iterations=4)
-    radii, angles = errors(found.body, found.states, body, truth)
-    assert found.rms < 0.0012 and angles.max() < 2.0 and np.sqrt(np.mean(radii**2)) < 0.12
-    assert set(found.radii_std) == {"upperarm_r", "forearm_r", "hand_r"}
-    with pytest.raises(ObservationError, match="no point lies near"):
-        metaball_bodies(BODY, [x + 9.0 for x in points], start)
-    with pytest.raises(ObservationError, match="1 poses"):
-        metaball_bodies(BODY, points, start[:1])
+@pytest.mark.parametrize("weights", [False, True])
+def test_radii_are_found_by_the_field(weights):
+    rng = np.random.default_rng(2)
+    values = 0.1 * rng.normal(size=9 + 3 * weights)
+    x = on(grown(LIMB, values, weights=weights), 1500, rng)
+    found, std = fit_field(LIMB, x, 0.01, np.zeros(len(values)), weights=weights, iterations=200)
+    np.testing.assert_allclose(found, values, atol=1e-5)
+    assert (std > 0).all() and std.max() < 0.1
 
 
-def test_radii_and_poses_at_once(seen):
-    body, points, truth, start = seen
-    fitted, states = joint(BODY, [points[0]], start[:1])
-    radii, angles = errors(fitted, states, body, truth[:1])
-    assert angles.max() < 2.0 and np.sqrt(np.mean(radii**2)) < 0.05
-    told = nearest(fitted, states[0], points[0], max_distance=0.05)
-    assert np.sqrt(np.mean(told.distance[told.segment >= 0] ** 2)) < 0.0013
-    assert all(isinstance(s, Metaballs) for s in fitted.surfaces)
+def test_a_prior_on_radii_is_a_help():
+    x = LIMB.centres[1] + 0.01 * np.random.default_rng(0).normal(size=(400, 3))
+    free, held = (fit_field(LIMB, x, 0.1, np.zeros(9), girth=g, iterations=60)[0] for g in (np.inf, 0.02))
+    assert np.abs(free).max() > 5.0 and np.abs(held).max() < 0.5

@@ -15,7 +15,7 @@ from kinefit.correspondences.pixels import pixel_rows
 from kinefit.correspondences.planes import plane_rows
 from kinefit.correspondences.points import point_rows
 from kinefit.correspondences.rays import ray_rows
-from kinefit.correspondences.surfaces import surface_rows
+from kinefit.correspondences.surfaces import field_rows, surface_rows
 
 __all__ = [
     "Bands",
@@ -26,6 +26,7 @@ __all__ = [
     "collision_rows",
     "depth_image_rows",
     "edge_rows",
+    "field_rows",
     "free_space_rows",
     "image_line_rows",
     "joint_bands",

@@ -1,4 +1,4 @@
-"""Point to surface: a measured point should lie on the body, anywhere or on one segment (P2 2.3)."""
+"""Point to surface: a measured point should lie on the body, anywhere or on one segment (P2 2.3; P4, eq. 15)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import shaped
 from kinefit.bodies import Body, BodyState
+from kinefit.bodies.surfaces import Metaballs
 from kinefit.bodies.surfaces.closest.nearest import nearest_lines
+from kinefit.bodies.surfaces.metaballs import LEVEL
 from kinefit.correspondences import _kernels, targets
 from kinefit.correspondences._kernels_surface import surface_rows as fill
 from kinefit.rows import Rows
@@ -60,3 +62,38 @@ def surface_rows(
     data, owners, group = _kernels.buffers(len(x))
     count = fill(lines, distance, normal, owner, weight, eye, least, data, owners, group)
     return Rows(np.ascontiguousarray(data[:, :count]), owners[:count], group[:count])
+
+
+def field_rows(
+    body: Body, state: BodyState, x_world: ArrayLike, segment: ArrayLike, *, sigma: ArrayLike = 1.0
+) -> Rows:
+    """One row a point: the field F of its segment's metaballs should be 1/2 there, r = F − 1/2 (P4, eqs. 14 and 15).
+
+    A segment that moves by δ along the field's slope n = ∇F lowers F at the point by n·δ. So n is no unit vector but
+    [1/m], and r has no unit. Derivatives are exact.
+
+    Parameters
+    ----------
+    x_world : (N, 3) [m]
+        Measured points; NaN for none. The rows' `group` is the index of the point.
+    segment : (N,) int, or one for all
+        Segment that each point belongs to; a point of a segment without metaballs, or of -1, makes no row.
+    sigma : scalar or (N,), no unit
+        Standard deviation of F at each point.
+
+    Raises
+    ------
+    ObservationError
+        Points or standard deviations of the wrong shape.
+    """
+    x, present = targets.array(x_world, 3, len(np.asarray(x_world)), "points in fields")
+    weight, owner = targets.weights(sigma, present, "points in fields"), np.broadcast_to(segment, len(x))
+    frames, slope, residual = targets.of_segments(body, state), np.zeros(x.shape), np.full(len(x), np.nan)
+    for limb in body.surfaces:
+        if isinstance(limb, Metaballs):
+            f, own = frames[limb.segment], present & (owner == limb.segment)
+            R = f[:9].reshape(3, 3)
+            d = limb.derivatives((x[own] - f[9:]) @ R - body.tree.rest[limb.segment])
+            slope[own], residual[own] = d.by_point @ R.T, d.value - LEVEL
+    used = np.flatnonzero(np.isfinite(residual))
+    return Rows.of(owner[used], x[used], slope[used], residual[used], weight[used], used)

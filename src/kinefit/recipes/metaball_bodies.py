@@ -1,15 +1,18 @@
 """P4's fit of a body of metaballs to points on a surface: shape and skeleton in turn (sections 3.3 and 4).
 
-Observations belong to the closest limb, weigh by their standard deviations (eq. 12), and ask that the limb's field is
-1/2 there (eq. 15). The skeleton's step moves all poses with the shape held, the shape's step all radii with the poses
-held; the paper found this to converge better than both at once. Both at once, beside any other sensor, is
-`subject.fit.fit_subject` with `MetaballShape`.
+Each observation belongs to the limb that is closest at the start (3.3) and asks that this limb's field is 1/2 there
+(eq. 15). Observations weigh by their standard deviations (eq. 12), and Σ vᵀ P v over all types is minimised (eqs. 10
+and 13). Steps of the skeleton, shape held, alternate with steps of the shape, skeleton held (4.2).
+
+`method="joint"` is the product's own fit: distances to the surface, shape and skeleton at once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,17 +20,51 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit._arguments import checked
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.surfaces import Metaballs, nearest
-from kinefit.correspondences import surface_rows
+from kinefit.correspondences import field_rows
 from kinefit.correspondences.parameters import prior_rows
 from kinefit.errors import ObservationError
-from kinefit.losses import huber
+from kinefit.geometry.camera import Rig
+from kinefit.losses import SQUARED, Loss
+from kinefit.observations import PointCloud
 from kinefit.rows import AnyRows
-from kinefit.solvers.least_squares import gauss_newton
-from kinefit.subject.metaballs import fit_balls
+from kinefit.sensors.scene import Scene
+from kinefit.sensors.settings import TrackSettings
+from kinefit.sensors.surfaces.point_cloud import PointCloudSensor
+from kinefit.solvers.least_squares import levenberg_marquardt
+from kinefit.subject.fit import fit_subject
+from kinefit.subject.metaballs import ROUNDS, MetaballShape, fit_field, grown, unmeshed
 
-_REACH = 0.1  # [m] farther from every limb a point is of something else
-_POSES = 4  # steps of the skeleton between two of the shape: by more, poses follow radii that are wrong
-_POSTURE = 20.0  # times the spread of the body's posture prior: it holds what no point tells, and nothing else
+OtherRows = Callable[[int, Body, BodyState], Iterable[AnyRows]]
+"""Rows of other types of observation: of a frame's number, the body and the pose."""
+
+_MAX_DISTANCE = 100.0  # [m] of a search that is to have no bound
+_MIN_SLOPE = 1e-9  # [1/m] of the field: points that are all farther off have no influence
+
+
+@dataclass(frozen=True)
+class MetaballHelps:
+    """What the paper does not have; all of it is off by default.
+
+    Parameters
+    ----------
+    reassign : whether the closest limb of each point is searched for again in every iteration.
+    max_distance : [m] from the body, beyond which a point belongs to no limb.
+    loss : robust loss of residuals in standard deviations.
+    girth : standard deviation of a prior on the radii's logarithms.
+    posture : standard deviation of a prior on the posture, in those of the body's own.
+    limits : whether joints keep to their limits.
+    """
+
+    reassign: bool = False
+    max_distance: float = _MAX_DISTANCE
+    loss: Loss = SQUARED
+    girth: float = np.inf
+    posture: float = np.inf
+    limits: bool = False
+
+
+AS_PRINTED = MetaballHelps()
+"""No help."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +75,7 @@ class MetaballBody:
     ----------
     body : Body with the radii found.
     states : K poses
-    radii_std : {segment: (p,)} standard deviations of the radii's logarithms, poses taken for known.
+    radii_std : {segment: (p,)} standard deviations of the radii's logarithms; alternating: with the poses held.
     rms : float [m] distance of the points from the surface.
     iterations : int, of both steps.
     """
@@ -52,8 +89,10 @@ class MetaballBody:
 
 @checked
 def metaball_bodies(
-    body: Body, points: Sequence[NDArray], states: Sequence[BodyState], *, sigma: float = 0.001, iterations: int = 30,
-    tolerance: float = 1e-4, weights: bool = False, locked: ArrayLike | None = None,
+    body: Body, points: Sequence[NDArray], states: Sequence[BodyState], *,
+    sigma: float | Sequence[ArrayLike] = 0.001, method: Literal["alternating", "joint"] = "alternating",
+    iterations: int = 30, tolerance: float = 1e-4, weights: bool = False, locked: ArrayLike | None = None,
+    others: OtherRows | None = None, helps: MetaballHelps = AS_PRINTED,
 ) -> MetaballBody:  # fmt: skip
     """Radii and poses from points on the surface in K frames.
 
@@ -62,64 +101,137 @@ def metaball_bodies(
     body : Body whose segments have metaballs.
     points : K arrays (N, 3) [m] in the world.
     states : K poses to begin with, near enough that each point is nearest to its own limb.
-    sigma : [m] standard deviation of a point.
+    sigma : [m] standard deviation of every point, or K of them: for all points, (N,), or (N, 3, 3) covariances [m²],
+        of which the part along the surface's normal at the start counts (eq. 12).
+    method : "alternating" as printed; "joint" minimises distances to the surface over poses and radii at once.
+    iterations : of the alternation: one damped step of every pose and one of every limb's shape.
     tolerance : change of poses [rad, m] and of radii (logarithm) below which it ends.
-    weights : whether the fields' weights are sought too.
+    weights : whether the fields' weights are sought too (eq. 14).
     locked : (6 + D,) bool, degrees of freedom that stay.
+    others : rows of other types of observation, for the skeleton (eqs. 11 to 13).
+    helps : MetaballHelps, for "alternating".
 
     Raises
     ------
     ObservationError
-        As many frames of points as poses are wanted; points of which none is near the body.
+        As many frames of points as poses are wanted; points of which none is near the body; arguments that "joint"
+        does not take.
     BodyError
-        A ball that collapses.
+        A ball that collapses; balls that do not melt into one.
     """
-    limbs = [k for k, s in enumerate(body.surfaces) if isinstance(s, Metaballs)]
+    limbs = [s for s in body.surfaces if isinstance(s, Metaballs)]
     if len(points) != len(states) or not points or not limbs:
         problem = f"{len(points)} frames of points, {len(states)} poses, {len(limbs)} limbs of metaballs"
         raise ObservationError(problem, remedy="Give a pose for each frame, and a body such as arm_metaballs.")
+    if method == "joint":
+        if not isinstance(sigma, int | float) or locked is not None or others is not None or helps != AS_PRINTED:
+            remedy = "Give one sigma alone, or use subject.fit.fit_subject."
+            raise ObservationError("the joint fit takes no locked, others or helps", remedy=remedy)
+        return _joint(body, points, states, sigma, weights)
     held = None if locked is None else np.asarray(locked, bool)
-    poses, std = list(states), dict[str, NDArray]()
-    rms, rounds, generic = np.inf, 0, body
+    told = [nearest(body, s, x, max_distance=helps.max_distance) for s, x in zip(states, points)]
+    of, sigmas = [n.segment for n in told], _sigma_of_fields(limbs, sigma, [n.normal for n in told])
+    first = [field_rows(body, s, x, o) for s, x, o in zip(states, points, of)]
+    if not any(np.abs(rows.direction).max(initial=0.0) > _MIN_SLOPE for rows in first):
+        raise ObservationError("no point lies near the body", remedy="Begin nearer; check the unit and the world.")
+    now, poses, std, rounds = body, list(states), dict[str, NDArray](), 0
+    damping: list[float | None] = [None] * len(poses)
+    shape = {limb.segment: np.zeros(limb.radii.size + len(limb.radii) * weights) for limb in limbs}
     for _ in range(iterations):
         rounds += 1
-        of = [nearest(body, s, x, max_distance=_REACH).segment for s, x in zip(poses, points)]
-        if all((o < 0).all() for o in of):
-            raise ObservationError("no point lies near the body", remedy="Begin nearer; check the unit and the world.")
         moved = 0.0
         for k, x in enumerate(points):
-            for _step in range(_POSES):
-                near = x[of[k] >= 0]
-                rows: list[AnyRows] = [
-                    surface_rows(body, poses[k], near, max_distance=_REACH, sigma=sigma, segment=of[k][of[k] >= 0]),
-                    prior_rows(body, poses[k], sigma=_POSTURE * body.tree.spread),
-                ]
-                step = gauss_newton(body, poses[k], rows, loss=huber(3.0), locked=held)
-                poses[k] = step.state
-                moved = max(moved, float(np.abs(step.delta).max()))
-                if step.norm < tolerance:
-                    break
-        surfaces, grown, squares, count = list(body.surfaces), 0.0, 0.0, 0
-        for i in limbs:
-            limb = surfaces[i]
-            assert isinstance(limb, Metaballs)
-            x_segment = np.concatenate([_in_segment(body, s, x[o == limb.segment], limb.segment)
-                                        for s, x, o in zip(poses, points, of)])  # fmt: skip
-            if len(x_segment) < 2 * limb.radii.size:
-                continue  # too little is seen of it: it stays as it is
-            found = fit_balls(generic.surfaces[i], x_segment, sigma, weights=weights)  # type: ignore[arg-type]
-            std[body.tree.segments[limb.segment]] = found.std
-            grown = max(grown, float(np.abs(np.log(found.limb.radii / limb.radii)).max()))
-            squares, count = squares + found.rms**2 * len(x_segment), count + len(x_segment)
-            surfaces[i] = found.limb
-        body = replace(body, surfaces=tuple(surfaces))
-        rms = float(np.sqrt(squares / max(count, 1)))
-        if max(moved, grown) < tolerance:
+            fit = levenberg_marquardt(
+                now, poses[k], partial(_rows, now, k, x, of[k], sigmas[k], others, helps), loss=helps.loss,
+                limits=helps.limits, locked=held, damping=damping[k], max_iterations=1,
+            )  # fmt: skip
+            moved = max(moved, float(np.abs(poses[k].difference(fit.state)).max()))
+            poses[k], damping[k] = fit.state, fit.damping
+        frames = [now.tree.forward(s.T_world_root, s.angles)[0] for s in poses]
+        for limb in limbs:
+            x, s = _of_limb(body, limb.segment, frames, points, of, sigmas)
+            if len(x) < shape[limb.segment].size:
+                continue  # too little is observed of it: it stays as it is
+            values, std[body.tree.segments[limb.segment]] = fit_field(
+                limb, x, s, shape[limb.segment], weights=weights, girth=helps.girth, loss=helps.loss,
+            )  # fmt: skip
+            moved = max(moved, float(np.abs(values - shape[limb.segment]).max()))
+            shape[limb.segment] = values
+        now = _shaped(body, lambda limb: unmeshed(limb, shape[limb.segment], weights))
+        if moved < tolerance:
             break
-    return MetaballBody(body, tuple(poses), std, rms, rounds)
+        if helps.reassign:  # without new meshes: on the way fields may be too weak to have one
+            of = [nearest(now, s, x, max_distance=helps.max_distance).segment for s, x in zip(poses, points)]
+    found = _shaped(body, lambda limb: grown(limb, shape[limb.segment], weights=weights))
+    return MetaballBody(found, tuple(poses), std, _rms(found, poses, points), rounds)
 
 
-def _in_segment(body: Body, state: BodyState, x: NDArray, segment: int) -> NDArray:
-    """Points (N, 3) of the world in a segment's frame."""
-    f = body.tree.forward(state.T_world_root, state.angles)[0][segment]
-    return (x - f[9:]) @ f[:9].reshape(3, 3) - body.tree.rest[segment]
+def _joint(
+    body: Body, points: Sequence[NDArray], states: Sequence[BodyState], sigma: float, weights: bool
+) -> MetaballBody:
+    """Distances to the surface, poses and shape at once, as takes have it."""
+    sensor, shape = PointCloudSensor("points", sigma, TrackSettings()), MetaballShape(body, weights=weights)
+    steps = [
+        [sensor.prepare(PointCloud("points", 0.1 * k, x), Scene(body, s, Rig(())))]
+        for k, (x, s) in enumerate(zip(points, states))
+    ]
+    rounds, coarse = ROUNDS
+    found = fit_subject(body, Rig(()), steps, states, [shape], rounds=rounds, coarse=coarse)
+    std, owner = np.sqrt(np.diag(found.covariance)), np.array([min(segments) for segments in shape.touches])
+    of_limb = {body.tree.segments[k]: std[owner == k] for k in np.unique(owner)}
+    return MetaballBody(found.body, found.states, of_limb, _rms(found.body, found.states, points), found.rounds)
+
+
+def _rows(
+    body: Body, frame: int, x: NDArray, segment: NDArray, sigma: NDArray, others: OtherRows | None,
+    helps: MetaballHelps, state: BodyState,
+) -> list[AnyRows]:  # fmt: skip
+    """Of one pose: points of the type of eq. 15, other types, and the prior that is a help."""
+    rows: list[AnyRows] = [field_rows(body, state, x, segment, sigma=sigma)]
+    if np.isfinite(helps.posture):
+        rows.append(prior_rows(body, state, sigma=helps.posture * body.tree.spread))
+    return rows if others is None else [*rows, *others(frame, body, state)]
+
+
+def _sigma_of_fields(
+    limbs: Sequence[Metaballs], sigma: float | Sequence[ArrayLike], normals: Sequence[NDArray]
+) -> list[NDArray]:
+    """K arrays (N,): standard deviations of the field at the points, p = 1 / σ² (eq. 12).
+
+    One slope [1/m] for the whole body turns metres into the field's unit, so that points of one σ have one weight, as
+    printed, and other types of observation are weighed in their own units.
+    """
+    slopes = np.concatenate([np.sum(limb.derivatives(limb.vertices).by_point ** 2, axis=1) for limb in limbs])
+    out, each = [], [sigma] * len(normals) if isinstance(sigma, int | float) else sigma
+    if len(each) != len(normals):
+        problem = f"standard deviations of {len(each)} frames for {len(normals)}"
+        raise ObservationError(problem, remedy="Give one number, or an array for each frame.")
+    for s, n in zip((np.asarray(s, float) for s in each), normals):
+        if s.shape == (len(n), 3, 3):  # a point that is beyond reach at the start has no normal
+            mean = np.trace(s, axis1=1, axis2=2) / 3.0
+            s = np.sqrt(np.where(n.any(axis=1), np.einsum("ni,nij,nj->n", n, s, n), mean))
+        if s.shape not in ((), (len(n),)) or not (s > 0).all():
+            problem = f"standard deviations of shape {s.shape}, or not positive, for {len(n)} points"
+            raise ObservationError(problem, remedy="Give positive ones (N,), or covariances (N, 3, 3).")
+        out.append(np.sqrt(slopes.mean()) * np.broadcast_to(s, len(n)))
+    return out
+
+
+def _of_limb(
+    body: Body, segment: int, frames: Sequence[NDArray], points: Sequence[NDArray], of: Sequence[NDArray],
+    sigmas: Sequence[NDArray],
+) -> tuple[NDArray, NDArray]:  # fmt: skip
+    """Points (N, 3) of a limb in its segment's frame, and their standard deviations (N,), of all frames."""
+    x = [(x[o == segment] - f[segment, 9:]) @ f[segment, :9].reshape(3, 3) for f, x, o in zip(frames, points, of)]
+    return np.concatenate(x) - body.tree.rest[segment], np.concatenate([s[o == segment] for s, o in zip(sigmas, of)])
+
+
+def _shaped(body: Body, shaped: Callable[[Metaballs], Metaballs]) -> Body:
+    """A body with other metaballs."""
+    return replace(body, surfaces=tuple(shaped(s) if isinstance(s, Metaballs) else s for s in body.surfaces))
+
+
+def _rms(body: Body, states: Sequence[BodyState], points: Sequence[NDArray]) -> float:
+    """[m] distance of all points from the surface."""
+    far = [nearest(body, s, x, max_distance=_MAX_DISTANCE).distance for s, x in zip(states, points)]
+    return float(np.sqrt(np.mean(np.concatenate(far) ** 2)))

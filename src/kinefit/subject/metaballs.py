@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -11,8 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body
 from kinefit.bodies.surfaces import Metaballs
 from kinefit.bodies.surfaces.closest._kernels_metaballs import nearest_on_metaballs
-from kinefit.bodies.surfaces.metaballs import pack_balls
+from kinefit.bodies.surfaces.metaballs import LEVEL, pack_balls
 from kinefit.errors import BodyError, ObservationError
+from kinefit.losses import SQUARED, Loss, huber
+from kinefit.solvers.equations import inverse
 from kinefit.solvers.least_squares import relax
 from kinefit.subject.parameters import World
 
@@ -144,10 +147,10 @@ class BallFit:
 def fit_balls(
     limb: Metaballs, x: ArrayLike, sigma: ArrayLike, *, weights: bool = False, girth: float = GIRTH
 ) -> BallFit:
-    """Radii, and weights, with which a limb's field is 1/2 at points on its surface (P4, eq. 15), by least squares.
+    """Radii, and weights, of the limb whose surface is nearest to points, by robust least squares.
 
-    A residual is the distance [m] of a point from where the field is 1/2; its derivatives by radii and weights are
-    exact: (∂F/∂p) / |∇F| at the nearest point of the surface.
+    A residual is the distance [m] of a point from where the field is 1/2, not the field itself as in P4, eq. 15
+    (`fit_field`). Its derivatives by radii and weights are exact: (∂F/∂p) / |∇F| at the nearest point of the surface.
     Robust (Huber), with a prior of `girth` about the radii that the limb has.
 
     Parameters
@@ -168,56 +171,113 @@ def fit_balls(
     if x.ndim != 2 or x.shape[1:] != (3,) or len(x) < count or not np.isfinite(x).all() or not (s > 0).all():
         problem = f"{len(x)} points of shape {x.shape} for {count} numbers of a limb"
         raise ObservationError(problem, remedy="Give more points (N, 3) about it, finite, with positive deviations.")
-    prior = np.concatenate([np.full(limb.radii.size, girth), np.full(count - limb.radii.size, _WEIGHT)]) ** -2.0
-    theta, damping, now = np.zeros(count), 1e-3, limb
-    H, b, cost, rms = _normal(now, x, s, weights)
-    tried = 0
-    for _ in range(_ITERATIONS):
+    prior = _prior(limb, weights, girth)
+    theta, H, r, tried = _least_squares(
+        lambda t: _distances(unmeshed(limb, t, weights), x, weights), np.zeros(count), prior, s**-2.0,
+        huber(_HUBER), limb.radii.size, np.log(_GONE), _ITERATIONS,
+    )  # fmt: skip
+    found = grown(limb, theta, weights=weights)
+    return BallFit(found, np.sqrt(np.diag(np.linalg.inv(H + np.diag(prior)))), float(np.sqrt(np.mean(r * r))), tried)
+
+
+def fit_field(
+    limb: Metaballs, x: ArrayLike, sigma: ArrayLike, values: ArrayLike, *, weights: bool = False,
+    girth: float = np.inf, loss: Loss = SQUARED, iterations: int = 1,
+) -> tuple[NDArray, NDArray]:  # fmt: skip
+    """Radii, and weights, that minimise Σ p (F − 1/2)² over points (P4, eqs. 10, 14 and 15), poses held.
+
+    F is the field of the limb at a point, and p = 1 / σ² (eq. 12). Its derivatives are exact. Steps are damped, and
+    at most 0.5 in a logarithm. As printed there is no prior, no robust loss and no bound: the defaults.
+
+    Parameters
+    ----------
+    x : (N, 3) [m] in the segment's frame.
+    sigma : (N,) or one, standard deviations of F at the points: no unit.
+    values : (p,) to start from: logarithms of factors on the limb's radii (3 K), then on its weights (K).
+    weights : whether weights are fitted too (eq. 14); radii alone otherwise (eq. 15).
+    girth : standard deviation of a prior on the radii's logarithms.
+    loss : Loss of residuals in standard deviations.
+    iterations : steps tried.
+
+    Returns
+    -------
+    values : (p,) logarithms, as for `grown`.
+    std : (p,) their standard deviations.
+    """
+    x, weight, start = np.asarray(x, float), np.asarray(sigma, float) ** -2.0, np.asarray(values, float)
+    prior = _prior(limb, weights, girth)
+    theta, H, _, _ = _least_squares(
+        lambda t: _fields(unmeshed(limb, t, weights), x, weights), start, prior, np.broadcast_to(weight, len(x)),
+        loss, limb.radii.size, -np.inf, iterations,
+    )  # fmt: skip
+    return theta, np.sqrt(np.diag(inverse(H + np.diag(prior))))
+
+
+def _prior(limb: Metaballs, weights: bool, girth: float) -> NDArray:
+    """(p,) inverse variances of the logarithms; weights have a prior where radii have one."""
+    of_weight = _WEIGHT if np.isfinite(girth) else np.inf
+    return np.repeat([girth, of_weight], [limb.radii.size, len(limb.weights) * weights]) ** -2.0
+
+
+def _least_squares(
+    residuals: Callable[[NDArray], tuple[NDArray, NDArray]], theta: NDArray, prior: NDArray, weight: NDArray,
+    loss: Loss, radii: int, lowest: float, iterations: int,
+) -> tuple[NDArray, NDArray, NDArray, int]:  # fmt: skip
+    """Levenberg-Marquardt on θ -> (J, r): where it ended, its normal matrix without the prior, r, steps tried."""
+
+    def normal(t: NDArray) -> tuple[NDArray, NDArray, float, NDArray]:
+        J, r = residuals(t)
+        rho, factor = loss.weigh(weight * r * r)
+        w = weight * factor
+        return J.T @ (w[:, None] * J), J.T @ (w * r) - prior * t, float(rho.sum() + prior @ t**2), r
+
+    H, b, cost, r = normal(theta)
+    damping, tried = 1e-3, 0
+    for _ in range(iterations):
         tried += 1
-        A, right = H + np.diag(prior), b - prior * theta
-        step = np.linalg.solve(A + damping * np.diag(np.diag(A)), right)
+        A = H + np.diag(prior)
+        scale = np.maximum(np.diag(A), 1e-12 * A.max() + 1e-300)  # a radius without influence stays
+        step = np.linalg.solve(A + damping * np.diag(scale), b)
         trial = theta + np.clip(step, -0.5, 0.5)
-        if trial[: limb.radii.size].min() < np.log(_GONE):
+        if trial[:radii].min() < lowest:
             damping *= 10.0
             if damping > 1e8:
-                k = int(np.argmin(trial[: limb.radii.size])) // 3
-                problem = f"ball {k + 1} of segment {limb.segment} collapses: a radius below a fifth of what it was"
+                k = int(np.argmin(trial[:radii])) // 3
+                problem = f"ball {k + 1} collapses: a radius falls below {np.exp(lowest):.2g} of what it was"
                 raise BodyError(problem, remedy="Give points about all of the limb, or fewer balls.")
             continue
-        there = _unmeshed(limb, trial, weights)
-        H2, b2, cost2, rms2 = _normal(there, x, s, weights)
-        if cost2 + prior @ trial**2 <= cost + prior @ theta**2:
-            theta, now, H, b, cost, rms, damping = trial, there, H2, b2, cost2, rms2, relax(damping)
+        H2, b2, cost2, r2 = normal(trial)
+        if cost2 <= cost:
+            theta, H, b, cost, r, damping = trial, H2, b2, cost2, r2, relax(damping)
             if np.abs(step).max() < _DONE:
                 break
         else:
             damping *= 10.0
             if damping > 1e8:
                 break
-    covariance = np.linalg.inv(H + np.diag(prior))
-    return BallFit(grown(limb, theta, weights=weights), np.sqrt(np.diag(covariance)), rms, tried)
+    return theta, H, r, tried
 
 
-def _unmeshed(limb: Metaballs, values: NDArray, weights: bool) -> Metaballs:
+def unmeshed(limb: Metaballs, values: NDArray, weights: bool) -> Metaballs:
     """As `grown`, with the old mesh: for its field alone."""
     radii, w = _scaled(limb, values, weights)
     return replace(limb, radii=radii, weights=w)
 
 
-def _normal(limb: Metaballs, x: NDArray, sigma: NDArray, weights: bool) -> tuple[NDArray, NDArray, float, float]:
-    """Normal matrix and right side by logarithms, robust cost, RMS distance [m]."""
+def _fields(limb: Metaballs, x: NDArray, weights: bool) -> tuple[NDArray, NDArray]:
+    """(N, p) derivatives of the field by the logarithms, and (N,) by how much it should grow: 1/2 − F."""
+    d = limb.derivatives(x)
+    J = (d.by_radii * limb.radii).reshape(len(x), -1)
+    return np.concatenate([J, d.by_weights * limb.weights], axis=1) if weights else J, LEVEL - d.value
+
+
+def _distances(limb: Metaballs, x: NDArray, weights: bool) -> tuple[NDArray, NDArray]:
+    """(N, p) how far the surface moves outwards by the logarithms, and (N,) [m] how far it should."""
     limbs, balls = pack_balls([limb.on(0)], np.zeros((1, 3)))
     r, normal, found = np.full(len(x), _REACH), np.zeros((3, len(x))), np.full(len(x), -1)
     here = np.concatenate([np.eye(3).ravel(), np.zeros(3)])[None]
     limbs[:, 6] = np.inf  # the mesh, from which the sphere about a limb is taken, is that of other radii
     nearest_on_metaballs(np.ascontiguousarray(x.T), here, limbs, balls, np.full(len(x), -1), r, normal, found)
-    d = limb.derivatives((x.T - np.where(found >= 0, r, 0.0) * normal).T)
-    slope = np.maximum(np.linalg.norm(d.by_point, axis=1), 1e-9)
-    J = (d.by_radii * limb.radii).reshape(len(x), -1)
-    if weights:
-        J = np.concatenate([J, d.by_weights * limb.weights], axis=1)
-    J = J / slope[:, None]  # how far the surface moves outwards
-    size = np.abs(r) / sigma
-    w = np.where(found >= 0, np.minimum(1.0, _HUBER / np.maximum(size, 1e-12)), 0.0) / sigma**2
-    cost = np.sum(np.where(size < _HUBER, size**2, _HUBER * (2 * size - _HUBER)))
-    return J.T @ (w[:, None] * J), J.T @ (w * r), float(cost), float(np.sqrt(np.mean(r * r)))
+    feet = (x.T - np.where(found >= 0, r, 0.0) * normal).T
+    slope = np.maximum(np.linalg.norm(limb.derivatives(feet).by_point, axis=1), 1e-9)
+    return np.where(found >= 0, 1.0 / slope, 0.0)[:, None] * _fields(limb, feet, weights)[0], r
