@@ -3,14 +3,13 @@
 Each observation belongs to the limb that is closest at the start (3.3) and asks that this limb's field is 1/2 there
 (eq. 15). Observations weigh by their standard deviations (eq. 12), and Σ vᵀ P v over all types is minimised (eqs. 10
 and 13). Steps of the skeleton, shape held, alternate with steps of the shape, skeleton held (4.2).
-
 `method="joint"` is the product's own fit: distances to the surface, shape and skeleton at once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
@@ -20,51 +19,26 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit._arguments import checked
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.surfaces import Metaballs, nearest
-from kinefit.correspondences import field_rows
-from kinefit.correspondences.parameters import prior_rows
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
-from kinefit.losses import SQUARED, Loss
 from kinefit.observations import PointCloud
-from kinefit.rows import AnyRows
+from kinefit.recipes._metaball_steps import (
+    AS_PRINTED,
+    MetaballHelps,
+    OtherRows,
+    check_influence,
+    points_of_limb,
+    pose_rows,
+    rms_distance,
+    shaped_body,
+    sigma_of_fields,
+)  # fmt: skip
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surfaces.point_cloud import PointCloudSensor
 from kinefit.solvers.least_squares import levenberg_marquardt
 from kinefit.subject.fit import fit_subject
 from kinefit.subject.metaballs import ROUNDS, MetaballShape, fit_field, grown, unmeshed
-
-OtherRows = Callable[[int, Body, BodyState], Iterable[AnyRows]]
-"""Rows of other types of observation: of a frame's number, the body and the pose."""
-
-_MAX_DISTANCE = 100.0  # [m] of a search that is to have no bound
-_MIN_SLOPE = 1e-9  # [1/m] of the field: points that are all farther off have no influence
-
-
-@dataclass(frozen=True)
-class MetaballHelps:
-    """What the paper does not have; all of it is off by default.
-
-    Parameters
-    ----------
-    reassign : whether the closest limb of each point is searched for again in every iteration.
-    max_distance : [m] from the body, beyond which a point belongs to no limb.
-    loss : robust loss of residuals in standard deviations.
-    girth : standard deviation of a prior on the radii's logarithms.
-    posture : standard deviation of a prior on the posture, in those of the body's own.
-    limits : whether joints keep to their limits.
-    """
-
-    reassign: bool = False
-    max_distance: float = _MAX_DISTANCE
-    loss: Loss = SQUARED
-    girth: float = np.inf
-    posture: float = np.inf
-    limits: bool = False
-
-
-AS_PRINTED = MetaballHelps()
-"""No help."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,26 +104,22 @@ def metaball_bodies(
         return _joint(body, points, states, sigma, weights)
     held = None if locked is None else np.asarray(locked, bool)
     told = [nearest(body, s, x, max_distance=helps.max_distance) for s, x in zip(states, points)]
-    of, sigmas = [n.segment for n in told], _sigma_of_fields(limbs, sigma, [n.normal for n in told])
-    first = [field_rows(body, s, x, o) for s, x, o in zip(states, points, of)]
-    if not any(np.abs(rows.direction).max(initial=0.0) > _MIN_SLOPE for rows in first):
-        raise ObservationError("no point lies near the body", remedy="Begin nearer; check the unit and the world.")
+    of, sigmas = [n.segment for n in told], sigma_of_fields(limbs, sigma, [n.normal for n in told])
+    check_influence(body, points, states, of)
     now, poses, std, rounds = body, list(states), dict[str, NDArray](), 0
     damping: list[float | None] = [None] * len(poses)
     shape = {limb.segment: np.zeros(limb.radii.size + len(limb.radii) * weights) for limb in limbs}
     for _ in range(iterations):
-        rounds += 1
-        moved = 0.0
+        rounds, moved = rounds + 1, 0.0
         for k, x in enumerate(points):
             fit = levenberg_marquardt(
-                now, poses[k], partial(_rows, now, k, x, of[k], sigmas[k], others, helps), loss=helps.loss,
-                limits=helps.limits, locked=held, damping=damping[k], max_iterations=1,
-            )  # fmt: skip
+                now, poses[k], partial(pose_rows, now, k, x, of[k], sigmas[k], others, helps), loss=helps.loss,
+                limits=helps.limits, locked=held, damping=damping[k], max_iterations=1)  # fmt: skip
             moved = max(moved, float(np.abs(poses[k].difference(fit.state)).max()))
             poses[k], damping[k] = fit.state, fit.damping
         frames = [now.tree.forward(s.T_world_root, s.angles)[0] for s in poses]
         for limb in limbs:
-            x, s = _of_limb(body, limb.segment, frames, points, of, sigmas)
+            x, s = points_of_limb(body, limb.segment, frames, points, of, sigmas)
             if len(x) < shape[limb.segment].size:
                 continue  # too little is observed of it: it stays as it is
             values, std[body.tree.segments[limb.segment]] = fit_field(
@@ -157,13 +127,13 @@ def metaball_bodies(
             )  # fmt: skip
             moved = max(moved, float(np.abs(values - shape[limb.segment]).max()))
             shape[limb.segment] = values
-        now = _shaped(body, lambda limb: unmeshed(limb, shape[limb.segment], weights))
+        now = shaped_body(body, lambda limb: unmeshed(limb, shape[limb.segment], weights))
         if moved < tolerance:
             break
         if helps.reassign:  # without new meshes: on the way fields may be too weak to have one
             of = [nearest(now, s, x, max_distance=helps.max_distance).segment for s, x in zip(poses, points)]
-    found = _shaped(body, lambda limb: grown(limb, shape[limb.segment], weights=weights))
-    return MetaballBody(found, tuple(poses), std, _rms(found, poses, points), rounds)
+    found = shaped_body(body, lambda limb: grown(limb, shape[limb.segment], weights=weights))
+    return MetaballBody(found, tuple(poses), std, rms_distance(found, poses, points), rounds)
 
 
 def _joint(
@@ -171,67 +141,10 @@ def _joint(
 ) -> MetaballBody:
     """Distances to the surface, poses and shape at once, as takes have it."""
     sensor, shape = PointCloudSensor("points", sigma, TrackSettings()), MetaballShape(body, weights=weights)
-    steps = [
-        [sensor.prepare(PointCloud("points", 0.1 * k, x), Scene(body, s, Rig(())))]
-        for k, (x, s) in enumerate(zip(points, states))
-    ]
+    clouds = [PointCloud("points", 0.1 * k, x) for k, x in enumerate(points)]
+    steps = [[sensor.prepare(cloud, Scene(body, s, Rig(())))] for cloud, s in zip(clouds, states)]
     rounds, coarse = ROUNDS
     found = fit_subject(body, Rig(()), steps, states, [shape], rounds=rounds, coarse=coarse)
     std, owner = np.sqrt(np.diag(found.covariance)), np.array([min(segments) for segments in shape.touches])
     of_limb = {body.tree.segments[k]: std[owner == k] for k in np.unique(owner)}
-    return MetaballBody(found.body, found.states, of_limb, _rms(found.body, found.states, points), found.rounds)
-
-
-def _rows(
-    body: Body, frame: int, x: NDArray, segment: NDArray, sigma: NDArray, others: OtherRows | None,
-    helps: MetaballHelps, state: BodyState,
-) -> list[AnyRows]:  # fmt: skip
-    """Of one pose: points of the type of eq. 15, other types, and the prior that is a help."""
-    rows: list[AnyRows] = [field_rows(body, state, x, segment, sigma=sigma)]
-    if np.isfinite(helps.posture):
-        rows.append(prior_rows(body, state, sigma=helps.posture * body.tree.spread))
-    return rows if others is None else [*rows, *others(frame, body, state)]
-
-
-def _sigma_of_fields(
-    limbs: Sequence[Metaballs], sigma: float | Sequence[ArrayLike], normals: Sequence[NDArray]
-) -> list[NDArray]:
-    """K arrays (N,): standard deviations of the field at the points, p = 1 / σ² (eq. 12).
-
-    One slope [1/m] for the whole body turns metres into the field's unit, so that points of one σ have one weight, as
-    printed, and other types of observation are weighed in their own units.
-    """
-    slopes = np.concatenate([np.sum(limb.derivatives(limb.vertices).by_point ** 2, axis=1) for limb in limbs])
-    out, each = [], [sigma] * len(normals) if isinstance(sigma, int | float) else sigma
-    if len(each) != len(normals):
-        problem = f"standard deviations of {len(each)} frames for {len(normals)}"
-        raise ObservationError(problem, remedy="Give one number, or an array for each frame.")
-    for s, n in zip((np.asarray(s, float) for s in each), normals):
-        if s.shape == (len(n), 3, 3):  # a point that is beyond reach at the start has no normal
-            mean = np.trace(s, axis1=1, axis2=2) / 3.0
-            s = np.sqrt(np.where(n.any(axis=1), np.einsum("ni,nij,nj->n", n, s, n), mean))
-        if s.shape not in ((), (len(n),)) or not (s > 0).all():
-            problem = f"standard deviations of shape {s.shape}, or not positive, for {len(n)} points"
-            raise ObservationError(problem, remedy="Give positive ones (N,), or covariances (N, 3, 3).")
-        out.append(np.sqrt(slopes.mean()) * np.broadcast_to(s, len(n)))
-    return out
-
-
-def _of_limb(
-    body: Body, segment: int, frames: Sequence[NDArray], points: Sequence[NDArray], of: Sequence[NDArray],
-    sigmas: Sequence[NDArray],
-) -> tuple[NDArray, NDArray]:  # fmt: skip
-    """Points (N, 3) of a limb in its segment's frame, and their standard deviations (N,), of all frames."""
-    x = [(x[o == segment] - f[segment, 9:]) @ f[segment, :9].reshape(3, 3) for f, x, o in zip(frames, points, of)]
-    return np.concatenate(x) - body.tree.rest[segment], np.concatenate([s[o == segment] for s, o in zip(sigmas, of)])
-
-
-def _shaped(body: Body, shaped: Callable[[Metaballs], Metaballs]) -> Body:
-    """A body with other metaballs."""
-    return replace(body, surfaces=tuple(shaped(s) if isinstance(s, Metaballs) else s for s in body.surfaces))
-
-
-def _rms(body: Body, states: Sequence[BodyState], points: Sequence[NDArray]) -> float:
-    """[m] distance of all points from the surface."""
-    far = [nearest(body, s, x, max_distance=_MAX_DISTANCE).distance for s, x in zip(states, points)]
-    return float(np.sqrt(np.mean(np.concatenate(far) ** 2)))
+    return MetaballBody(found.body, found.states, of_limb, rms_distance(found.body, found.states, points), found.rounds)
