@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kinefit import Markers, fit_markers, load_body
+from kinefit import MarkerFrame, Markers, Recording, fit_marker_subject, fit_markers, load_body, track
+from kinefit.bodies.marker_sets import bare
 from kinefit.errors import ObservationError
 from kinefit.evaluation import joint_errors
+from kinefit.geometry.camera import Rig
 from kinefit.simulation import squat_and_wave
 
 
@@ -30,6 +32,20 @@ def test_motion_is_recovered_with_gaps_and_a_ghost(recording):
     assert joint_errors(truth, motion)[known].max() < 0.03
     assert joint_errors(truth, motion)[known].mean() < 0.004
     assert motion.residuals["markers"].weights[30, 5] < 0.01
+
+
+def test_a_track_of_the_same_markers_agrees(recording):
+    """One subject fit, one prior, one loss, one meaning of quality; the track smooths each frame's own errors."""
+    _, markers = recording
+    body, names = load_body("humanoid"), tuple(bare(name) for name in markers.names)
+    subject = fit_marker_subject(body, markers, "HANIM_45")
+    fitted = fit_markers(subject.body, markers, subject.marker_set, sigma=subject.sigma)
+    steps = [[MarkerFrame("mocap", t, names, x, "HANIM_45")] for t, x in zip(markers.times, markers.positions)]
+    tracked = track(Recording.of_frames(steps, Rig(()), rate=markers.rate, up=markers.up), body)
+    np.testing.assert_allclose(tracked.body.tree.offsets, fitted.body.tree.offsets, atol=1e-9)
+    assert np.median(np.linalg.norm(tracked.joint_centres - fitted.joint_centres, axis=2)) < 0.002
+    assert abs(tracked.quality.mean() - fitted.quality.mean()) < 0.01
+    assert np.mean(tracked.lost != fitted.lost) < 0.01
 
 
 def test_error_bars_are_those_of_the_scatter(recording):

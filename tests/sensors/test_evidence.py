@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from kinefit.bodies import load_body
 from kinefit.sensors.evidence import BELIEVED, SHOWN, Evidence
 
 S = 10
@@ -15,6 +16,20 @@ def test_evidence_at_its_bounds():
     assert told.hidden.tolist() == [True, False, True, False, False, False]
     assert told.lost.tolist() == [False, False, False, False, True, False]
     np.testing.assert_allclose(told.quality, [0.0, 1.0, 0.5, 0.5, 0.49, 0.75])
+
+
+def test_an_unobserved_segment_between_two_observed_ones_has_the_lower_quality():
+    """In one frame and in many; one at the end of a chain has none."""
+    tree = load_body("humanoid").tree
+    pelvis, abdomen, thorax, hand = (tree.segment(n) for n in ("pelvis", "abdomen", "thorax", "hand_r"))
+    agreeing, contrary = np.zeros((2, 2, len(tree.segments)))
+    agreeing[:, [pelvis, thorax]], contrary[0, pelvis], contrary[1, thorax] = 1.0, 0.25, 1.0
+    quality = Evidence(agreeing, contrary).segment_quality(tree)
+    np.testing.assert_allclose(quality[:, abdomen], [0.8, 0.5])
+    assert (quality[:, hand] == 0.0).all()
+    np.testing.assert_array_equal(Evidence(agreeing[0], contrary[0]).segment_quality(tree), quality[0])
+    agreeing[:, thorax] = contrary[:, thorax] = 0.0  # nothing beyond it is observed
+    assert (Evidence(agreeing, contrary).segment_quality(tree)[:, abdomen] == 0.0).all()
 
 
 AMOUNTS = arrays(float, (2, S), elements=st.floats(0, 10))

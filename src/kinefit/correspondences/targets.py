@@ -23,11 +23,11 @@ def weights(sigma: ArrayLike, present: NDArray, what: str) -> NDArray:
     out = np.zeros(present.shape)
     if not present.any():
         return out
-    told = sigma[present] if sigma.shape else sigma
-    if not (told > 0).all():
+    stated = sigma[present] if sigma.shape else sigma
+    if not (stated > 0).all():
         remedy = "Leave out what was not measured, or give it a large one."
         raise ObservationError(f"the standard deviation of {what} must be positive", remedy=remedy)
-    out[present] = 1.0 / told**2
+    out[present] = 1.0 / stated**2
     return out
 
 

@@ -123,6 +123,6 @@ def judged(
     support = float(told.agreeing.sum()) / total if total > 0.0 else 0.0
     std = deviations(scene.body, scene.state, covariance, observed)
     return FrameResult(
-        scene.time, scene.state, *std, told.quality_in(scene.body.tree), told.lost, told.hidden, support, iterations,
-        tuple(matched), scene.measurements,
+        scene.time, scene.state, *std, told.segment_quality(scene.body.tree), told.lost, told.hidden, support,
+        iterations, tuple(matched), scene.measurements,
     )  # fmt: skip

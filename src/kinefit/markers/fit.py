@@ -74,16 +74,16 @@ def fit_markers(
         sigma = np.asarray(sigma, float)[[own.index(n) for n in points.names]]
     x = columns(markers, points.names)
     sigma = np.broadcast_to(np.asarray(sigma, float), len(points))
-    worn = _Worn(body, points, x, sigma, loss, limits)
-    roots, angles = _tried_anew(worn, *worn.poses(slice(None)))
+    data = _MarkerData(body, points, x, sigma, loss, limits)
+    roots, angles = _tried_anew(data, *data.poses(slice(None)))
     sure = certainty(body, roots, angles, points, x, sigma=sigma, loss=loss, posture=1.0)
-    roots, angles = _bridged(worn, roots, unwrap(body.tree, angles), sure, markers.rate)
-    return _motion(worn, roots, angles, sure, markers, up)
+    roots, angles = _bridged(data, roots, unwrap(body.tree, angles), sure, markers.rate)
+    return _motion(data, roots, angles, sure, markers, up)
 
 
 @dataclass(frozen=True, eq=False)
-class _Worn:
-    """Points on a body, seen at x (F, K, 3) [m], NaN where not, with sigma (K,) [m]; loss, and whether limits hold."""
+class _MarkerData:
+    """Markers on a body, measured at x (F, K, 3) [m], NaN for none, sigma (K,) [m]; loss, whether limits hold."""
 
     body: Body
     points: PointSet
@@ -105,27 +105,27 @@ class _Worn:
         return np.where(seen, np.minimum(np.nan_to_num(off), 10.0), 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
 
 
-def _tried_anew(worn: _Worn, roots: NDArray, angles: NDArray) -> tuple[NDArray, NDArray]:
+def _tried_anew(data: _MarkerData, roots: NDArray, angles: NDArray) -> tuple[NDArray, NDArray]:
     """Frames that fit far worse than the others, fitted from nowhere where that does better."""
     roots, angles = roots.copy(), angles.copy()
-    misfit = worn.misfit(roots, angles)
+    misfit = data.misfit(roots, angles)
     bad = misfit > max(_OFF * float(np.median(misfit)), 3.0)
     for a, b in sorted(runs_of(bad), key=lambda run: run[0] - run[1])[:_MOST_RUNS]:
         some = slice(a, b)
         try:
-            other_roots, other_angles = worn.poses(some)
+            other_roots, other_angles = data.poses(some)
         except TrackingError:
             continue
-        better = worn.misfit(other_roots, other_angles, some) < 0.9 * misfit[some]
+        better = data.misfit(other_roots, other_angles, some) < 0.9 * misfit[some]
         roots[some][better], angles[some][better] = other_roots[better], other_angles[better]
     return roots, angles
 
 
 def _bridged(
-    worn: _Worn, roots: NDArray, angles: NDArray, sure: Certainty, rate: float
+    data: _MarkerData, roots: NDArray, angles: NDArray, sure: Certainty, rate: float
 ) -> tuple[NDArray, NDArray]:
     """Poses whose untold angles follow from the frames around them; the others stay as measured."""
-    tree, x = worn.body.tree, worn.x
+    tree, x = data.body.tree, data.x
     lost = ~((sure.dof_std[:, :3].max(axis=1) < _HELD) & (sure.dof_std[:, 3:6].max(axis=1) < _TOLD))
     enough = np.minimum(np.where(tree.prismatic, _HELD, _TOLD), _PRIOR * tree.spread)
     told = (sure.dof_std[:, 6:] < enough) & ~lost[:, None]
@@ -137,31 +137,31 @@ def _bridged(
     for d in np.flatnonzero(some):
         meant[:, d] = np.interp(frames, frames[told[:, d]], angles[told[:, d], d])
     held, (roots, _) = roots, bridged(roots, meant, lost, _MEMORY * rate)
-    before, measured = worn.misfit(roots, angles), angles
+    before, measured = data.misfit(roots, angles), angles
     roots, angles = np.array(roots), np.where(told | ~some, angles, meant)
     again = ~lost & ~told[:, some].all(axis=1)
     for a, b in runs_of(again):
         inside = bool(((angles[a:b] >= tree.lower) & (angles[a:b] <= tree.upper)).all())  # not in another chart
         fit = fit_sequence(  # the rest of the chain settles about what is now known
-            worn.body, BodyState(roots[a], angles[a]), worn.points, x[a:b], sigma=worn.sigma, loss=worn.loss,
-            limits=worn.limits and inside, posture=1.0, usual=meant[a:b],
+            data.body, BodyState(roots[a], angles[a]), data.points, x[a:b], sigma=data.sigma, loss=data.loss,
+            limits=data.limits and inside, posture=1.0, usual=meant[a:b],
         )  # fmt: skip
         roots[a:b], angles[a:b] = fit.Ts_world_root, fit.angles
-    worse = again & (worn.misfit(roots, angles) > before + _WORSE)
+    worse = again & (data.misfit(roots, angles) > before + _WORSE)
     roots[worse], angles[worse] = held[worse], measured[worse]
     return roots, unwrap(tree, angles) if again.any() else angles
 
 
 def _motion(
-    worn: _Worn, roots: NDArray, angles: NDArray, sure: Certainty, markers: Markers, up: str | None
+    data: _MarkerData, roots: NDArray, angles: NDArray, sure: Certainty, markers: Markers, up: str | None
 ) -> Motion:
     """Quality as of every other track: the share of what shows a segment that agrees with it."""
-    body, points, x = worn.body, worn.points, worn.x
+    body, points, x = data.body, data.points, data.x
     dof_std = np.array(sure.dof_std)
     dof_std[:, 6:][dof_std[:, 6:] > _PRIOR * body.tree.spread] = np.inf
     values = x - body.trajectories(roots, angles, points)
-    told = of_points(body, points, np.square(values / worn.sigma[:, None]).sum(axis=2))
-    quality = told.quality_in(body.tree)
+    squares = np.square(values / data.sigma[:, None]).sum(axis=2)
+    quality = of_points(body, points, squares).segment_quality(body.tree)
     residuals = Residuals(points.names, points.segments, values, sure.factors, "m", x, np.zeros(len(x), bool))
     return Motion(
         body=body, rate=markers.rate, times=markers.times, Ts_world_root=roots, angles=angles, dof_std=dof_std,

@@ -30,7 +30,7 @@ _LEAST, _MOST = 0.005, 0.03  # [m] no marker is held to be better fixed or loose
 _FAR = 0.5  # share of its distance from the set's place that a marker's spread is at least
 _SLIDES = 0.1  # share of a marker's spread: one on soft parts, which may sit anywhere, slides more than one on a bone
 _SIZES = 0.3, 3.0  # of a person, as a share of the generic body's: beyond is a wrong unit
-_SAME = 0.2
+_MIN_DIFFERENCE = 0.2
 """[rad] all angles together: in postures that differ by less, skin has slid alike, and a frame more tells nothing.
 
 Of 0, 0.2, 0.4 and 0.8 the knees and ankles of two laboratories' subjects are met best with it: 16.8, 13.3, 14.6 and
@@ -131,7 +131,7 @@ def fit_marker_subject(
     lengths, groups = SegmentScales(generic, known, size), len(body.scale_groups)
     sigma = floor = np.hypot(_LEAST, _SLIDES * placed.spread)
     theta = np.concatenate([lengths.mean, np.zeros(3 * len(placed.points))])
-    fitted, wider = generic.scaled(np.exp(lengths.mean)), 1.0
+    fitted, spread_factor = generic.scaled(np.exp(lengths.mean)), 1.0
     for turn in range(_ROUNDS):
         looseness = np.hypot(sigma, placed.spread) if turn == 0 else sigma
         roots, angles, good = _all_poses(fitted, fitted.markers(placed.name), x, starts, looseness)
@@ -141,8 +141,8 @@ def fit_marker_subject(
         if turn == 0:
             theta[groups:] = _moved(fitted, fitted.markers(placed.name), roots[good], angles[good], x[good]).ravel()
         away = np.linalg.norm(theta[groups:].reshape(-1, 3), axis=1)
-        # One that sits elsewhere is believed, if it does so lastingly.
-        spread = np.maximum(wider * placed.spread, _FAR * away)
+        # A marker that is far from the set's place in all frames may have been placed there.
+        spread = np.maximum(spread_factor * placed.spread, _FAR * away)
         found = joint.fit_subject(
             generic, Rig(()), [_measured(placed, x[f], sigma) for f in chosen],
             [BodyState(roots[f], angles[f]) for f in chosen], (lengths, PointOffsets(generic, placed.name, spread)),
@@ -150,7 +150,8 @@ def fit_marker_subject(
         )  # fmt: skip
         theta, fitted = found.mean, found.body
         stated = np.repeat(placed.spread, 3)
-        wider = place_spread(theta[groups:] / stated, np.square(found.std[groups:] / stated), wider, 1.0)
+        variance = np.square(found.std[groups:] / stated)
+        spread_factor = place_spread(theta[groups:] / stated, variance, spread_factor, 1.0)
         residuals = _residuals(found, placed.name, x[chosen])
         sigma = np.clip(_noise(residuals, len(chosen), body.tree.n_dofs), floor, _MOST)
         progress("marker offsets", turn + 1, _ROUNDS)
@@ -254,12 +255,10 @@ def _spread_frames(seen: NDArray, angles: NDArray, good: NDArray, count: int) ->
     if not len(usable):
         return usable
     usable = usable[np.unique(np.linspace(0, len(usable) - 1, min(len(usable), 2000)).astype(int))]
-    if len(usable) <= count:
-        return usable
     a = angles[usable]
     chosen = [int(np.argmax(seen[usable].sum(axis=1)))]
     distance = np.sum((a - a[chosen[0]]) ** 2, axis=1)
-    while len(chosen) < count and distance.max() > _SAME**2:
+    while len(chosen) < count and distance.max() > _MIN_DIFFERENCE**2:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.sum((a - a[chosen[-1]]) ** 2, axis=1))
     return np.sort(usable[chosen])

@@ -103,8 +103,8 @@ def metaball_bodies(
             raise ObservationError("the joint fit takes no locked, others or helps", remedy=remedy)
         return _joint(body, points, states, sigma, weights)
     held = None if locked is None else np.asarray(locked, bool)
-    told = [nearest(body, s, x, max_distance=helps.max_distance) for s, x in zip(states, points)]
-    of, sigmas = [n.segment for n in told], sigma_of_fields(limbs, sigma, [n.normal for n in told])
+    closest = [nearest(body, s, x, max_distance=helps.max_distance) for s, x in zip(states, points)]
+    of, sigmas = [n.segment for n in closest], sigma_of_fields(limbs, sigma, [n.normal for n in closest])
     check_influence(body, points, states, of)
     now, poses, std, rounds = body, list(states), dict[str, NDArray](), 0
     damping: list[float | None] = [None] * len(poses)

@@ -54,8 +54,8 @@ class Evidence:
         seen = self.agreeing + self.contrary
         return self.agreeing / np.where(seen > 0.0, seen, 1.0)
 
-    def quality_in(self, tree: KinematicTree) -> NDArray:
-        """`quality`; a segment that nothing shows, between one above and one below, has that of the worse of these."""
+    def segment_quality(self, tree: KinematicTree) -> NDArray:
+        """`quality`, (..., S); an unobserved segment has the lower one of its parent and its best child."""
         own, hidden = self.quality, self.hidden
         out = own.copy()
         for s in np.flatnonzero(hidden.reshape(-1, hidden.shape[-1]).any(axis=0)):

@@ -29,7 +29,7 @@ def gather(order, x, n, weight, target, normal, weights):
 
 
 @jit
-def spread(C, depth, place, wide_depth, H):
+def widen(C, depth, place, wide_depth, H):
     """H in the pattern of `C` into a wider one, where C[k, t] stands at H[k, place[k, t]]."""
     for k in range(depth.size):
         for t in range(wide_depth[k] + 1):
@@ -69,7 +69,7 @@ def fit_sequence(
     owner (K,), rest (K, 3), target (F, K, 3) [m], weight (F, K) [1/m²]; planes sorted by segment: plane_owner (P,),
     plane_rest (3, P); not sorted, NaN where not measured: plane_x, plane_n (F, P, 3); plane_order (P,) sorts them.
     The angles are drawn towards usual (F, D) by the share `posture` of a prior, see `add_posture`; with it the pattern
-    of H is wide, wide_depth, see `spread`.
+    of H is wide, wide_depth, see `widen`.
     roots (F, 4, 4), angles (F, D), costs (F,), iterations (F,) are filled. Damping starts at `damping_share` of the
     mean diagonal of H in the first frame and is carried on. An iteration that is predicted to win less than
     `tolerance` of the cost ends a frame.
@@ -106,7 +106,7 @@ def fit_sequence(
                 data, segment, group, count, kind, scale, trial_root[:3, 3], parents, dof_start, chain, depth, screws,
                 factor, blocks, C, other_g,
             )  # fmt: skip
-            spread(C, depth, place, wide_depth, other_H)
+            widen(C, depth, place, wide_depth, other_H)
             if posture > 0.0:
                 new_cost += add_posture(posture, prior_pairs, prior, usual[f], trial_q, other_H, other_g)
             if first:
@@ -177,7 +177,7 @@ def certainties(
             factors[f, k] = 0.0
         for i in range(count):
             factors[f, group[i]] = factor[i]
-        spread(C, depth, place, wide_depth, H)
+        widen(C, depth, place, wide_depth, H)
         if posture > 0.0:
             add_posture(posture, prior_pairs, prior, usual, angles[f], H, g)
         if not invert(H, wide, wide_depth, P):

@@ -7,13 +7,16 @@ import pytest
 from tests.tracking.movements import BODY, a_motion, a_rig, marker_frame, turned
 
 from kinefit.bodies import PointSet
-from kinefit.errors import BodyError
+from kinefit.errors import BodyError, ObservationError
+from kinefit.frame.routing import Sensors
 from kinefit.losses import geman_mcclure
 from kinefit.observations import MarkerFrame
 from kinefit.sensors.evidence import SHOWN
 from kinefit.sensors.points.markers import MarkerSensor, of_points
 from kinefit.sensors.scene import Scene
+from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.least_squares import gauss_newton
+from kinefit.tracking.recording import Recording
 
 TRUTH = a_motion().state(0)
 SCENE = Scene(BODY, TRUTH, a_rig())
@@ -87,3 +90,14 @@ def test_markers_speak_for_and_against_where_segments_are():
         here = SCENE.at(state)
         told = measurement.match(here, NEAR).evidence(here)
         assert told.lost[arm] == lost and not told.hidden[arm]
+
+
+def test_a_marker_may_have_a_standard_deviation_of_its_own():
+    sigma = {"mocap": SIGMA, "mocap neck": 0.02, "other l_wrist": 1.0}
+    sensors = Sensors(a_rig(), 30.0, sigma, TrackSettings())
+    (measurement,) = sensors.measurements([marker_frame(0, NAMES)], SCENE)
+    np.testing.assert_allclose(measurement.weight**-0.5, [0.02 if n == "neck" else SIGMA for n in NAMES])
+    steps = [[marker_frame(0, NAMES)]]
+    assert Recording.of_frames(steps, a_rig(), rate=30.0, sigma={"mocap neck": 0.02}).sigma == {"mocap neck": 0.02}
+    with pytest.raises(ObservationError, match="no sensor 'mocap nose'"):
+        Recording.of_frames(steps, a_rig(), rate=30.0, sigma={"mocap nose": 0.02})

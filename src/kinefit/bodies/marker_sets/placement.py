@@ -75,7 +75,7 @@ def find_placement(
 ) -> MarkerPlacement:
     """The markers of a set that are among the labels; default: of the set that shares most labels.
 
-    Which label stands for which marker is told by `labels.matched`.
+    `labels.matched` decides which label stands for which marker. A `MarkerPlacement` is a set, too.
 
     Raises
     ------
@@ -98,7 +98,8 @@ def find_placement(
         )
     if best is None or len(best.points) < FEWEST:
         count = 0 if best is None else len(best.points)
-        sets = f"set '{getattr(marker_set, 'name', marker_set)}'" if marker_set else "any marker set"
+        given = marker_set.name if isinstance(marker_set, MarkerPlacement) else marker_set
+        sets = f"set '{given}'" if given else "any marker set"
         raise ObservationError(
             f"only {count} of the labels are known to {sets}: {_listed(labels)}",
             remedy=f"Sets: {', '.join(str(n) for n in [*body.marker_sets, *placed_set_names()])}; or a file (--set): "
