@@ -93,6 +93,7 @@ def plug_in_gait() -> None:
             turned[key] = rms(rotation_difference(motion, CHILD[joint] + "_" + side.lower(), *frames))
     for what, values in (("as they are", raw), ("each with its own zero", shifted), ("segments' axes aligned", turned)):
         print(f"# pycgm: sagittal angles, RMS difference [deg], {what}: {told(values)}")
+    figure("markers_pycgm_sagittal_as_they_are", float(np.mean(list(raw.values()))), "deg", "<= 12")
     worst = np.nanmax(np.abs(reference["LKneeAngles"][:, 1])), np.nanmax(np.abs(reference["RKneeAngles"][:, 1]))
     print(f"# pycgm: the reference's knees go {worst[0]:.0f} and {worst[1]:.0f} deg into varus or valgus as they bend:")
     print("#   its thigh wands turn the knee's axis, and with it the knee's centre; our knee is a hinge")
