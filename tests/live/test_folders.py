@@ -99,29 +99,33 @@ def test_a_folder_that_is_taken_away_ends_the_session_with_its_name(tmp_path):
 
 
 class Writer:
-    """Another program: puts the files of a recording into folders at a rate [Hz], as soon as somebody looks."""
+    """Another program: puts the files of a recording into folders at a rate [Hz], the second half after a first pose."""
 
     def __init__(self, recorded, rate):
         self.recorded, self.rate, self.written = recorded, rate, 0
-        self.thread = threading.Thread(target=self.run, daemon=True)
 
-    def run(self):
-        begin = time.monotonic()
+    def run(self, collected):
         for k, files in enumerate(self.recorded):
-            time.sleep(max(begin + k / self.rate - time.monotonic(), 0.0))
+            time.sleep(1 / self.rate)
+            if 2 * k == len(self.recorded):
+                wait(lambda: any(posed.result is not None for posed in collected.poses))
             for source, folder in files:
                 shutil.copyfile(source, folder / source.name)
                 self.written += 1
+
+
+def wait(until):
+    end = time.monotonic() + 20.0
+    while not until() and time.monotonic() < end:
+        time.sleep(0.02)
 
 
 def follow(take, writer, collected):
     session = live_session(read_take(take), [collected])
 
     def until_all_came():
-        writer.run()
-        until = time.monotonic() + 20.0
-        while sum(session.inbox.came.values()) < writer.written and time.monotonic() < until:
-            time.sleep(0.02)
+        writer.run(collected)
+        wait(lambda: sum(session.inbox.came.values()) >= writer.written)
         session.ask({"stop": True})  # after the step with what waits
 
     thread = threading.Thread(target=until_all_came, daemon=True)
