@@ -55,12 +55,13 @@ def test_it_takes_the_steps_of_levenberg_marquardt(loss, wrong, most):
             return [pixels, belief(at, state, information), prior_rows(BODY, at)]  # noqa: B023
 
         fit = levenberg_marquardt(BODY, state, rows, **given)
-        found, H, cost, tried = fit_pixels(
+        found, H, g, cost, tried = fit_pixels(
             BODY, state, RIG, PixelPoints(points, camera, uv, weight, loss), (state, information), **given
         )
         assert tried == fit.iterations
         assert cost == pytest.approx(fit.equations.cost, rel=1e-9)
         np.testing.assert_allclose(H, fit.equations.matrix, rtol=1e-6, atol=1e-7 * np.abs(H).max())
+        np.testing.assert_allclose(g, fit.equations.gradient, atol=1e-6 * np.abs(H).max())
         np.testing.assert_allclose(found.difference(fit.state), 0.0, atol=1e-7)
 
 

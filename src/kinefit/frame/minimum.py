@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from kinefit.bodies import BodyState
 from kinefit.correspondences.closures import closed_at
 from kinefit.rows import AnyRows
-from kinefit.sensors.base import Matched
+from kinefit.sensors.base import Matched, packed
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.closed import Constraint, closed_fit
 from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.solvers.pixels import PixelPoints, fit_pixels
+from kinefit.solvers.pixels import fit_pixels
 
 _LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already
 _OPEN = 0.01  # [m, rad] by which a start may be off what closes it, and the first fit's standard deviation of that
@@ -70,16 +70,10 @@ def _of_keypoints(
     scene: Scene, held: tuple[BodyState, NDArray], matched: Sequence[Matched], most: int, tolerance: float
 ) -> Minimum | None:
     """Without rows in between, where keypoints alone were measured of a body whose joints stay where they are."""
-    one = matched[0].pixels if len(matched) == 1 else None
-    if one is None or one.hidden or scene.body.closures or np.ndim(one.loss.scale):
+    seen = packed(matched, scene)
+    if seen is None:
         return None
-    if scene.morphing is not None or scene.at_time(one.time) is not scene:
-        return None
-    layout = one.measurement.layout
-    if len(scene.rig) < len(layout.channels.rig):
-        return None
-    seen = PixelPoints(layout.points_of(scene.body), layout.channels.camera, one.uv, one.weight, one.loss)
     fit = fit_pixels(
         scene.body, scene.state, scene.rig, seen, held, max_iterations=most, tolerance=tolerance, damping=_LIGHT
     )
-    return None if fit is None else Minimum(scene.at(fit[0]), *fit[1:])
+    return None if fit is None else Minimum(scene.at(fit.state), fit.H, fit.cost, fit.iterations)

@@ -236,7 +236,7 @@ def groups_of(
                 group.append(node)
         score = sum(float(surety[q][frame, p]) for q, p in group) / full
         # of all its pairs: one of them may have only half of the person in common
-        middle = np.median([c for (a, b), c in links.items() if a in group and b in group], axis=0)
+        middle = medians(np.array([c for (a, b), c in links.items() if a in group and b in group]).T)
         found.setdefault(frozenset(group), DetectionGroup(tuple(group), score, middle))
     nowhere = np.full(3, np.nan)
     return list(found.values()) or [
@@ -252,7 +252,8 @@ def _one_person(groups: Sequence[Sequence[DetectionGroup]], rate: float) -> list
         at = np.array([g.centre for g in there]).reshape(-1, 3)
         apart = np.linalg.norm(at[:, None] - centre, axis=-1)  # (groups, paths); NaN where a place is not known
         far = apart > STRIDE + SPEED * (unseen + 1) / rate
-        cost = np.where(far, _SWITCH * rate, _SWAY * np.nan_to_num(np.minimum(apart / STRIDE, 1)) ** 2)
+        sway = np.where(np.isnan(apart), 0.0, np.minimum(apart / STRIDE, 1))
+        cost = np.where(far, _SWITCH * rate, _SWAY * sway**2)
         total = value - cost
         before = total.argmax(axis=1)
         gained = total.max(axis=1) + [g.score for g in there]
@@ -274,9 +275,10 @@ def _one_person(groups: Sequence[Sequence[DetectionGroup]], rate: float) -> list
 def _distinct(value: NDArray, centre: NDArray, unseen: NDArray) -> list[int]:
     """The best paths that end at different places, the best first."""
     kept: list[int] = []
+    beside = np.linalg.norm(centre[:, None] - centre, axis=-1) < STRIDE
+    covered = beside & (unseen <= unseen[:, None])
     for path in np.argsort(-value, kind="stable"):
-        beside = np.linalg.norm(centre[kept] - centre[path], axis=-1) < STRIDE
-        if not np.any(beside & (unseen[kept] <= unseen[path])):
+        if not covered[path, kept].any():
             kept.append(int(path))
         if len(kept) == _PATHS:
             break

@@ -247,7 +247,8 @@ class _Search:
             if not mine or not tracks:
                 continue
             both = np.concatenate([self.uv[q][frame, mine], self.exchanged[q][frame, mine]])
-            as_is, turned = np.hsplit(distances(self.cameras[q], np.array(expected), both), 2)
+            off = distances(self.cameras[q], np.array(expected), both)
+            as_is, turned = off[:, : len(mine)], off[:, len(mine) :]
             turned[np.isinf(as_is)] = np.inf  # too little is seen to tell
             cost = np.minimum(as_is, turned)
             waited = np.array([abs(frame - t.last) for t in tracks])

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import check_shape, rgb_image
 from kinefit.errors import ObservationError
-from kinefit.observations.arrays import check_seen, freeze, frozen, numbers, typical_depth
+from kinefit.observations.arrays import check_seen, freeze, frozen, numbers, sealed, typical_depth
+from kinefit.observations.recordings import Keypoints
 
 _FARTHEST = 100.0  # [m] that any depth camera measures; a tenth of a metre in millimetres
 
@@ -120,6 +121,17 @@ class KeypointFrame:
     uv: NDArray
     confidence: NDArray
     keypoint_set: str = ""
+
+    @classmethod
+    def of_record(cls, record: Keypoints, frame: int, time: float) -> KeypointFrame:
+        """The person of a record of one, at a frame and a time [s]; what was checked with the record is so no more."""
+        made = object.__new__(cls)
+        uv, sure = (sealed(values[frame, 0].copy()) for values in (record.points, record.confidence))
+        freeze(
+            made, sensor=record.camera, time=time, names=record.names, uv=uv, confidence=sure,
+            keypoint_set=record.keypoint_set,
+        )  # fmt: skip
+        return made
 
     def __post_init__(self) -> None:
         check_seen(self.sensor, self.time, self.names)

@@ -258,9 +258,8 @@ def lasting(
         soft = (w * ~closed.hard)[:, None] * closed.jacobian
         other_lasting = other_lasting + soft.T @ closed.jacobian
     alone = covariance_alone(body, state, gram(J, pushed) + other_information)
-    source, axis = channels.source[rows.group], np.arange(len(rows)) % 2
-    sums = [[pushed[(source == q) & (axis == a)].sum(axis=0) for a in (0, 1)] for q in range(len(noise.shared))]
-    push = np.concatenate([np.empty((0, n)), *(np.array(p) * s[:, None] for p, s in zip(sums, noise.shared))])
+    of_axis = 2 * channels.source[rows.group] + np.arange(len(rows)) % 2
+    push = np.ravel(noise.shared)[:, None] * gram(np.eye(2 * len(noise.shared))[of_axis], pushed)
     last, share = (v[rows.group][:, None] * pushed for v in (noise.lasting * np.sqrt(1.0 - shared.share),
                                                             noise.lasting * np.sqrt(shared.share)))
     together = shared.sums(share, rows.group)

@@ -10,12 +10,23 @@ from kinefit._jit import jit
 @jit
 def gram(A, B, out):
     """Add Aᵀ B to out (n, m), for A (N, n) and B (N, m)."""
-    for i in range(A.shape[0]):
+    N = A.shape[0]
+    for i in range(0, N - 1, 2):  # two at a time: rows of one point have the same zeros
+        p, q = B[i], B[i + 1]
         for k in range(A.shape[1]):
-            a = A[i, k]
+            a, b = A[i, k], A[i + 1, k]
+            if a != 0.0 or b != 0.0:
+                line = out[k]
+                for j in range(line.size):
+                    line[j] += a * p[j] + b * q[j]
+    if N % 2:
+        p = B[N - 1]
+        for k in range(A.shape[1]):
+            a = A[N - 1, k]
             if a != 0.0:
-                for j in range(B.shape[1]):
-                    out[k, j] += a * B[i, j]
+                line = out[k]
+                for j in range(line.size):
+                    line[j] += a * p[j]
 
 
 @jit

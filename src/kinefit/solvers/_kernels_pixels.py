@@ -32,17 +32,26 @@ def add_joint(first, index, gap, precision, H, g):
 
 
 @jit
+def mirror(H):
+    """The upper triangle of H (n, n) from the lower."""
+    for i in range(H.shape[0]):
+        for j in range(i):
+            H[j, i] = H[i, j]
+
+
+@jit
 def minimum(
     parents, dof_start, prismatic, axes, rest, chain, depth, every, all_before, lower, upper, locked,
     owner, place, cameras, camera, uv, weight, kind, scale,
     predicted_root, predicted_angles, information, held, usual, precision,
-    roots, angles, H, g, most, tolerance, damping,
+    roots, angles, H, g, most, tolerance, damping, share,
 ):  # fmt: skip
     """Levenberg-Marquardt over pixels (as `pixel_rows`, with one robust loss), a predicted pose and a prior posture.
 
     Parameters: the tree; every (n, n) and all_before (n,) the dense pattern; owner, place, cameras, camera, uv, weight
     as of `pixel_rows`; predicted pose with its information (n, n); coordinates held (P,) towards usual (D,) with a
     precision (P, P). Two of each, roots (2, 4, 4), angles (2, D), H (2, n, n), g (2, n): the first state is the start.
+    The first damping is at least a share of H's mean diagonal.
     Returns which of the two is the minimum (-1 where something is not finite), its cost, and the steps tried. Of H the
     lower triangle is made.
     """
@@ -81,7 +90,7 @@ def minimum(
                 mean += A[k, k] / n
             mean += 1e-300
             least, nothing = LEAST_DAMPING * mean, 1e-16 * value
-            damping = max(damping, least)
+            damping = max(damping, share * mean, least)
             now, cost = new, value
         else:
             damping, growth = adapt(damping, growth, cost - value, predicted, least)

@@ -24,10 +24,20 @@ class PixelPoints(NamedTuple):
     loss: Loss
 
 
+class PixelFit(NamedTuple):
+    """Where it ended: the state, normal matrix `H` (n, n) and gradient `g` (n,) there, the cost, and the steps tried."""
+
+    state: BodyState
+    H: NDArray
+    g: NDArray
+    cost: float
+    iterations: int
+
+
 def fit_pixels(
-    body: Body, state: BodyState, rig: Rig, seen: PixelPoints, held: tuple[BodyState, NDArray], *,
-    max_iterations: int, tolerance: float, damping: float,
-) -> tuple[BodyState, NDArray, float, int] | None:  # fmt: skip
+    body: Body, state: BodyState, rig: Rig, seen: PixelPoints, held: tuple[BodyState, NDArray] | None, *,
+    max_iterations: int, tolerance: float, damping: float = 0.0, share: float = 0.0, posture: float = 1.0,
+) -> PixelFit | None:  # fmt: skip
     """The minimum of Σ ρ over pixels, of what a prediction says and of the prior posture, from a state on.
 
     The same steps as those of `levenberg_marquardt` with rows of these, but for rounding, in a fifth of the time: no
@@ -35,15 +45,18 @@ def fit_pixels(
 
     Parameters
     ----------
-    held : a predicted state, and the information (n, n) of it
+    held : a predicted state, and the information (n, n) of it; None for no prediction
     max_iterations, tolerance, damping : as of `levenberg_marquardt`
+    share : of H's mean diagonal, that the first damping is at least
+    posture : how much the prior posture counts
 
     Returns
     -------
-    The state, its normal matrix (n, n), the cost and the steps tried; None where something is not finite.
+    None where something is not finite.
     """
     tree, n = body.tree, body.tree.n_dofs
-    (predicted, information), (posed, precision) = held, tree.held_by_posture
+    predicted, information = held or (state, np.zeros((n, n)))
+    posed, precision = tree.held_by_posture
     roots, angles = np.empty((2, 4, 4)), np.empty((2, n - 6))
     roots[0], angles[0] = state.T_world_root, state.angles
     H, g = np.empty((2, n, n)), np.empty((2, n))
@@ -52,10 +65,10 @@ def fit_pixels(
         tree.lower, tree.upper, lock(body, None), seen.points.segments, body.points_rest(seen.points), rig.packed,
         seen.camera, seen.uv, seen.weight, seen.loss.kind, float(seen.loss.scale), predicted.T_world_root,
         predicted.angles, information, posed, tree.usual,
-        precision if precision.ndim == 2 else np.diag(precision), roots, angles, H, g, max_iterations, tolerance,
-        damping,
+        posture * (precision if precision.ndim == 2 else np.diag(precision)), roots, angles, H, g, max_iterations,
+        tolerance, damping, share,
     )  # fmt: skip
     if best < 0:
         return None
-    matrix = H[best]
-    return BodyState(roots[best], angles[best]), matrix + np.tril(matrix, -1).T, cost, tried
+    _kernels_pixels.mirror(H[best])
+    return PixelFit(BodyState(roots[best], angles[best]), H[best], g[best], cost, tried)

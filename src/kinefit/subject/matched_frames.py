@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.geometry.camera import Rig
 from kinefit.rows import AnyRows, Rows
-from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
+from kinefit.sensors.base import Matched, Measurement, matched_by, packed, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.bundle.border_frames import Part, apart
+from kinefit.solvers.pixels import PixelPoints
 from kinefit.subject.closure_moves import ClosureMoves, closing_rows
 from kinefit.subject.lasting import Seen
 from kinefit.subject.parameters import Parameters, World, stacked
@@ -164,6 +166,12 @@ class MatchedFrames:
             rows = self._rows((frame, i), measurement.sensor, matched, scene, world)
             out += [(measurement.sensor, part) for part in rows]
         return [*out, *((CLOSURES, rows) for rows in closing_rows(world.body, state))]
+
+    def packed(self, theta: NDArray, frame: int, state: BodyState) -> tuple[Rig, PixelPoints] | None:
+        """A frame's cameras and points, where keypoints are all that it has; else None."""
+        scene = self._scene(self._worlds.at(theta), frame, state)
+        seen = packed(self._matched[frame], scene)
+        return None if seen is None else (scene.rig, seen)
 
     def columns(self, theta: NDArray, steps: NDArray, states: Sequence[BodyState]) -> list[NDArray]:
         """(N, p) of every frame, as `border_frames.differences`: of points and of cameras, else NaN."""

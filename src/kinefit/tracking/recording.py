@@ -245,8 +245,7 @@ def keypoint_frames(keypoints: Sequence[Keypoints], i: int, time: float) -> list
     """A frame of every record of one person, at the i-th time [s]; none where no record shows any point then."""
     if not any((k.confidence[i, 0] > 0).any() for k in keypoints):
         return []
-    seen = [(k, k.points[i, 0], k.confidence[i, 0]) for k in keypoints]
-    return [KeypointFrame(k.camera, time, k.names, uv, sure, k.keypoint_set) for k, uv, sure in seen]
+    return [KeypointFrame.of_record(k, i, time) for k in keypoints]
 
 
 def _seen_in(records: Sequence[Keypoints], times: NDArray, i: int) -> Sequence[Any]:

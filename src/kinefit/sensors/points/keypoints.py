@@ -25,6 +25,7 @@ from kinefit.sensors.points.triangulation import rays, triangulated_frame
 from kinefit.sensors.points.view_bias import ViewBias
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.visibility.occlusion import SEEN, Hidden, hidden_points
+from kinefit.solvers.pixels import PixelPoints
 
 
 class KeypointSensor(Sensor):
@@ -198,6 +199,14 @@ class KeypointMatched(Matched):
             _kernels.pixel_rows, 2, points, scene.rig.packed, channels.camera, self.uv, self.weight
         )
         return [replace(rows, loss=self.loss), *(h.rows(scene, points) for h in self.hidden)]
+
+    def packed(self, scene: Scene) -> PixelPoints | None:
+        """Of a body whose joints stay where they are, where no other rows than those of pixels take part."""
+        layout, body = self.measurement.layout, scene.body
+        moving = body.closures or scene.morphing is not None
+        if moving or self.hidden or np.ndim(self.loss.scale) or len(scene.rig) < len(layout.channels.rig):
+            return None
+        return PixelPoints(layout.points_of(body), layout.channels.camera, self.uv, self.weight, self.loss)
 
     def squares(self, scene: Scene) -> NDArray:
         """(N,) squared distances in the image, in variances; 0 where unseen, inf where it could not be seen."""

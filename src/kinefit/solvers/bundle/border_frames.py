@@ -17,6 +17,7 @@ from kinefit.rows import AnyRows, Rows
 from kinefit.solvers import _kernels_border, _kernels_linear
 from kinefit.solvers.bundle.whitened import PoseScrews, columns, residuals, softening
 from kinefit.solvers.equations import dense_pattern, lock, normal_equations
+from kinefit.solvers.pixels import fit_pixels
 
 POSTURE = 0.01
 """Share of the body's posture prior that holds poses here: in full it would bend lengths."""
@@ -26,6 +27,7 @@ SETTLING = 6
 
 _FIRST = 1e-3  # damping to begin with, as a share of the pose's mean diagonal
 _SETTLED = 1e-3  # fall of a pose's cost at which it rests
+_RESTING = 1e-5  # the same, as a share of the cost, in one kernel: some hundred pixels cost about that many
 _FLOOR = 1e-9  # share of a pose's mean diagonal that holds what nothing measures
 
 Part = tuple[str, AnyRows]
@@ -37,7 +39,8 @@ class BorderedProblem(Protocol):
 
     It may have `touches`, of each parameter the segments on which alone rows can feel it, None for anywhere: those of
     different segments then share an evaluation. It may have `columns(theta, steps, states)`, what `differences` gives
-    as far as it is known without other worlds, NaN where it is not.
+    as far as it is known without other worlds, NaN where it is not. It may have `packed(theta, frame, state)`, a rig
+    and the points of a frame of which pixels alone are measured, None for any other: its pose settles in one kernel.
     """
 
     def body(self, theta: NDArray) -> Body:
@@ -158,8 +161,21 @@ def settle(
     problem: BorderedProblem, theta: NDArray, states: Sequence[BodyState], weighing: Weighing, steps: int = SETTLING
 ) -> tuple[list[FrameEquations], list[BodyState]]:
     """Every frame's pose brought near its own minimum: each has other angles that hardly anything holds."""
-    bounds, frames, out = limits(problem.body(theta)), [], []
+    body, frames, out = problem.body(theta), [], []
+    bounds, packed = limits(body), getattr(problem, "packed", None)
+    posture = weighing.most * weighing.posture
+    if any(share != 1.0 for share in weighing.shares.values()):
+        packed = None
     for f, state in enumerate(states):
+        of_pixels = None if packed is None else packed(theta, f, state)
+        found = None if of_pixels is None else fit_pixels(
+            body, state, *of_pixels, None, max_iterations=steps, tolerance=_RESTING, share=_FIRST, posture=posture
+        )  # fmt: skip
+        if found is not None:
+            state, H, g, cost, _ = found
+            out.append(state)
+            frames.append(FrameEquations(body, state, problem.parts(theta, f, state), weighing, H, g, cost))
+            continue
         frame = frame_at(problem, theta, f, state, weighing)
         mean = float(np.trace(frame.H)) / len(frame.H) + 1e-12
         damping, growth, least = _FIRST * mean, 2.0, _kernels_linear.LEAST_DAMPING * mean

@@ -133,7 +133,7 @@ def _outliers(residuals: NDArray, pool: NDArray) -> NDArray:
 def _shared(mean: NDArray, group: NDArray) -> tuple[NDArray, NDArray]:
     """(G, A) bias that each group shares, shrunk by its variance; (C, A) that of each channel's group, with sign."""
     shared, centre = np.zeros((int(group.max(initial=-1)) + 1, mean.shape[1])), np.zeros(mean.shape)
-    for g in range(len(shared)):
+    for g in np.flatnonzero(np.bincount(group, minlength=len(shared)) > 1):
         own = mean[group == g]
         away2 = (own - _medians(own, axis=0)) ** 2
         alike = away2 <= _chi_square(np.ones(1), _OUTLIER_QUANTILE) * _medians(away2, axis=0) / _NORMAL_MAD**2
@@ -228,6 +228,7 @@ def _medians(values: NDArray, axis: int | tuple[int, ...]) -> NDArray:
         columns = np.moveaxis(values, -1, 1).reshape(len(values) * values.shape[-1], *values.shape[1:-1])
     if not len(columns):
         return np.full(columns.shape[1:], np.nan)
-    ordered, count = np.sort(columns, axis=0), np.isfinite(columns).sum(axis=0)  # NaN comes last
-    middle = [np.take_along_axis(ordered, np.maximum(k, 0)[None], axis=0)[0] for k in ((count - 1) // 2, count // 2)]
-    return np.asarray(np.where(count > 0, 0.5 * (middle[0] + middle[1]), np.nan))
+    ordered, count = np.sort(columns, axis=0).reshape(len(columns), -1), np.isfinite(columns).sum(axis=0)
+    every, k = np.arange(ordered.shape[1]), count.ravel()  # NaN comes last
+    middle = 0.5 * (ordered[np.maximum(k - 1, 0) // 2, every] + ordered[k // 2, every])
+    return np.asarray(np.where(count > 0, middle.reshape(count.shape), np.nan))
