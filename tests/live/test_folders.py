@@ -99,7 +99,7 @@ def test_a_folder_that_is_taken_away_ends_the_session_with_its_name(tmp_path):
 
 
 class Writer:
-    """Another program: puts the files of a recording into folders at a rate [Hz], the second half after a first pose."""
+    """Another program: puts files of a recording into folders at a rate [Hz], the second half after a first pose."""
 
     def __init__(self, recorded, rate):
         self.recorded, self.rate, self.written = recorded, rate, 0

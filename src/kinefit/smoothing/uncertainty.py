@@ -247,7 +247,6 @@ def lasting(
     other_information, other_lasting : (n, n) of all sensors but the keypoints, see `OtherNoise`
     """
     body, channels, tree = layout.body, layout.channels, layout.body.tree
-    n = tree.n_dofs
     rows, J, pushed = pixel_columns(layout, state, weight, shared)
     frames, _ = tree.forward(state.T_world_root, state.angles)
     by_shape, stretch = known.columns(layout, rows, tree, frames)

@@ -25,7 +25,7 @@ class PixelPoints(NamedTuple):
 
 
 class PixelFit(NamedTuple):
-    """Where it ended: the state, normal matrix `H` (n, n) and gradient `g` (n,) there, the cost, and the steps tried."""
+    """Where it ended: the state, `H` (n, n) and `g` (n,) of its normal equations, the cost, and the steps tried."""
 
     state: BodyState
     H: NDArray

@@ -24,9 +24,11 @@ class Unpacked:
 def frames():
     motion = cut(squat_and_wave(), 0, 4)
     rig, body = studio_rig(motion), motion.body
-    channels = make_channels(body, rig, simulate_keypoints(motion, rig, "BODY_25B", noise_px=2.0), np.full(len(rig), 4.0))
+    records = simulate_keypoints(motion, rig, "BODY_25B", noise_px=2.0)
+    channels = make_channels(body, rig, records, np.full(len(rig), 4.0))
     sensor, layout = KeypointSensor(rig, {}, 0.0, geman_mcclure(), 0.03), Layout(channels, body)
-    steps = [[KeypointMeasurement(sensor, layout, uv, sure, 0.0)] for uv, sure in zip(channels.uv, channels.weight * 16)]
+    sure = channels.weight * 16
+    steps = [[KeypointMeasurement(sensor, layout, uv, w, 0.0)] for uv, w in zip(channels.uv, sure)]
     rng, states = np.random.default_rng(2), []
     for k in range(len(motion)):
         states.append(motion.state(k).retract(0.03 * rng.standard_normal(body.tree.n_dofs)))

@@ -168,10 +168,10 @@ def settle(
         packed = None
     for f, state in enumerate(states):
         of_pixels = None if packed is None else packed(theta, f, state)
-        found = None if of_pixels is None else fit_pixels(
-            body, state, *of_pixels, None, max_iterations=steps, tolerance=_RESTING, share=_FIRST, posture=posture
-        )  # fmt: skip
-        if found is not None:
+        if of_pixels is not None and (found := fit_pixels(
+            body, state, of_pixels[0], of_pixels[1], None,
+            max_iterations=steps, tolerance=_RESTING, share=_FIRST, posture=posture,
+        )):  # fmt: skip
             state, H, g, cost, _ = found
             out.append(state)
             frames.append(FrameEquations(body, state, problem.parts(theta, f, state), weighing, H, g, cost))
