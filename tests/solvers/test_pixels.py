@@ -13,7 +13,7 @@ from kinefit.frame.prediction import belief
 from kinefit.losses import SQUARED, geman_mcclure, huber
 from kinefit.simulation import squat_and_wave, studio_rig
 from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.solvers.pixels import PixelPoints, fit_pixels
+from kinefit.solvers.pixels import LIGHT, PixelPoints, fit_pixels
 
 BODY = load_body("humanoid")
 RIG = studio_rig(squat_and_wave())
@@ -47,14 +47,14 @@ def seen(seed, wrong=0):
 def test_it_takes_the_steps_of_levenberg_marquardt(loss, wrong, most):
     for seed in (1, 2):
         state, points, camera, uv, weight, information = seen(seed, wrong)
-        given = {"max_iterations": most, "tolerance": 1e-4, "damping": 1e-3}
+        given = {"max_iterations": most, "tolerance": 1e-4}
 
         def rows(at):
             measured = np.where((weight > 0)[:, None], uv, np.nan)  # noqa: B023
             pixels = replace(pixel_rows(BODY, at, points, RIG, camera, measured, sigma=SIGMA), loss=loss)  # noqa: B023
             return [pixels, belief(at, state, information), prior_rows(BODY, at)]  # noqa: B023
 
-        fit = levenberg_marquardt(BODY, state, rows, **given)
+        fit = levenberg_marquardt(BODY, state, rows, damping=LIGHT, **given)
         found, H, g, cost, tried = fit_pixels(
             BODY, state, RIG, PixelPoints(points, camera, uv, weight, loss), (state, information), **given
         )
@@ -70,5 +70,5 @@ def test_what_is_not_finite_is_left_to_those_who_tell_why():
     uv[0], weight[0] = np.nan, 1.0
     assert fit_pixels(
         BODY, state, RIG, PixelPoints(points, camera, uv, weight, SQUARED), (state, information), max_iterations=5,
-        tolerance=1e-4, damping=1e-3,
+        tolerance=1e-4,
     ) is None  # fmt: skip

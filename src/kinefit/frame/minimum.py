@@ -15,9 +15,8 @@ from kinefit.sensors.base import Matched, packed
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.closed import Constraint, closed_fit
 from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.solvers.pixels import fit_pixels
+from kinefit.solvers.pixels import LIGHT, fit_pixels
 
-_LIGHT = 1e-3  # first damping where a prediction holds every degree of freedom already
 _OPEN = 0.01  # [m, rad] by which a start may be off what closes it, and the first fit's standard deviation of that
 ROUGH = 10, 1e-2
 """Iterations and tolerance of a round whose loss is still wide: the next one begins there."""
@@ -52,7 +51,7 @@ def minimum(
     def at(state: BodyState) -> list[AnyRows]:
         return rows(scene.at(state))
 
-    body, start, damping, tried = scene.body, scene.state, None if held is None else _LIGHT, 0
+    body, start, damping, tried = scene.body, scene.state, None if held is None else LIGHT, 0
     if hard is None:
         fit = levenberg_marquardt(body, start, at, max_iterations=most, tolerance=tolerance, damping=damping)
     else:
@@ -74,6 +73,6 @@ def _of_keypoints(
     if seen is None:
         return None
     fit = fit_pixels(
-        scene.body, scene.state, scene.rig, seen, held, max_iterations=most, tolerance=tolerance, damping=_LIGHT
+        scene.body, scene.state, scene.rig, seen, held, max_iterations=most, tolerance=tolerance
     )
     return None if fit is None else Minimum(scene.at(fit.state), fit.H, fit.cost, fit.iterations)

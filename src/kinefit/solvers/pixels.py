@@ -13,6 +13,9 @@ from kinefit.losses import Loss
 from kinefit.solvers import _kernels_pixels
 from kinefit.solvers.equations import dense_pattern, lock
 
+LIGHT = 1e-3
+"""First damping where a prediction holds every degree of freedom already; without one, times H's mean diagonal."""
+
 
 class PixelPoints(NamedTuple):
     """N points of a body in `camera` (N,) of a rig: `uv` (N, 2) [px], `weight` (N,) [1/px²], a loss of one scale."""
@@ -36,7 +39,7 @@ class PixelFit(NamedTuple):
 
 def fit_pixels(
     body: Body, state: BodyState, rig: Rig, seen: PixelPoints, held: tuple[BodyState, NDArray] | None, *,
-    max_iterations: int, tolerance: float, damping: float = 0.0, share: float = 0.0, posture: float = 1.0,
+    max_iterations: int, tolerance: float, posture: float = 1.0,
 ) -> PixelFit | None:  # fmt: skip
     """The minimum of Σ ρ over pixels, of what a prediction says and of the prior posture, from a state on.
 
@@ -46,8 +49,7 @@ def fit_pixels(
     Parameters
     ----------
     held : a predicted state, and the information (n, n) of it; None for no prediction
-    max_iterations, tolerance, damping : as of `levenberg_marquardt`
-    share : of H's mean diagonal, that the first damping is at least
+    max_iterations, tolerance : as of `levenberg_marquardt`
     posture : how much the prior posture counts
 
     Returns
@@ -66,7 +68,7 @@ def fit_pixels(
         seen.camera, seen.uv, seen.weight, seen.loss.kind, float(seen.loss.scale), predicted.T_world_root,
         predicted.angles, information, posed, tree.usual,
         posture * (precision if precision.ndim == 2 else np.diag(precision)), roots, angles, H, g, max_iterations,
-        tolerance, damping, share,
+        tolerance, LIGHT, 0.0 if held else LIGHT,
     )  # fmt: skip
     if best < 0:
         return None

@@ -170,7 +170,7 @@ def settle(
         of_pixels = None if packed is None else packed(theta, f, state)
         if of_pixels is not None and (found := fit_pixels(
             body, state, of_pixels[0], of_pixels[1], None,
-            max_iterations=steps, tolerance=_RESTING, share=_FIRST, posture=posture,
+            max_iterations=steps, tolerance=_RESTING, posture=posture,
         )):  # fmt: skip
             state, H, g, cost, _ = found
             out.append(state)
