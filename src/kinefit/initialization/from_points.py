@@ -7,13 +7,14 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.rigid_pairs import rigid_pairs
-from kinefit.correspondences import point_rows, prior_rows
+from kinefit.correspondences import prior_rows
 from kinefit.errors import TrackingError
 from kinefit.geometry import se3
-from kinefit.losses import SQUARED, geman_mcclure
+from kinefit.losses import SQUARED, Loss, geman_mcclure
 from kinefit.rows import AnyRows, Rows
 from kinefit.solvers.bundle.shape import PROPORTIONS
 from kinefit.solvers.least_squares import levenberg_marquardt
+from kinefit.solvers.sequence import fit_sequence
 
 _NUMBERS = {3: "three", 6: "six"}
 
@@ -89,12 +90,12 @@ def aligned_root(body: Body, points: PointSet, x_world: NDArray) -> NDArray:
 
 
 def pose_from_points(
-    body: Body, points: PointSet, x_world: NDArray, *, sigma: float = 0.03, near: BodyState | None = None,
+    body: Body, points: PointSet, x_world: NDArray, *, sigma: float | NDArray = 0.03, near: BodyState | None = None,
     fewest: int = 6, robust: bool = True, covariance: NDArray | None = None,
 ) -> tuple[BodyState, float]:
     """State of a body from points (K, 3) [m], and the median distance left [m].
 
-    `sigma` [m] along each axis, or else a `covariance` (K, 3, 3) [m²] of each.
+    `sigma` [m] along each axis, one or (K,), or else a `covariance` (K, 3, 3) [m²] of each.
     `robust`: single points may be wrong. With no pose given two starts are tried, the prior mean laid on the points and
     turned about its long axis; the cheaper end wins. `near` is a start that is known to be close, the only one then.
 
@@ -114,24 +115,29 @@ def pose_from_points(
         own = np.arange(known.sum()).repeat(3)
 
     def rows(state: BodyState) -> list[AnyRows]:
-        if covariance is None:
-            return [point_rows(body, state, points, x_world, sigma=sigma), prior_rows(body, state)]
         x = body.positions(state, points)[known].repeat(3, axis=0)
         gap = np.einsum("ni,ni->n", axes, x_world[known].repeat(3, axis=0) - x)
         segments = points.segments[known].repeat(3)
         return [Rows.of(segments, x, axes, gap, 1.0 / variances, own), prior_rows(body, state)]
 
+    def fitted(start: BodyState, loss: Loss, most: int) -> tuple[float, BodyState]:
+        if covariance is not None:
+            found = levenberg_marquardt(body, start, rows, loss=loss, max_iterations=most, tolerance=1e-4)
+            return found.equations.cost, found.state
+        fit = fit_sequence(
+            body, start, points, x_world[None], sigma=sigma, loss=loss, posture=1.0, damping=0.1, max_iterations=most,
+            tolerance=1e-4,
+        )  # fmt: skip
+        return float(fit.costs[0]), BodyState(fit.Ts_world_root[0], fit.angles[0])
+
     starts = (
         [near] if near else [body.usual_state(aligned_root(body, points, x_world) @ _turn(a)) for a in (0.0, np.pi)]
     )
-    fits = []
-    for start in starts:
-        rough = start if near else levenberg_marquardt(body, start, rows, max_iterations=60, tolerance=1e-4).state
-        loss = geman_mcclure() if robust else SQUARED
-        fits.append(levenberg_marquardt(body, rough, rows, loss=loss, max_iterations=40, tolerance=1e-4))
-    best = min(fits, key=lambda fit: fit.equations.cost)
-    left = np.linalg.norm(body.positions(best.state, points)[known] - x_world[known], axis=1)
-    return best.state, float(np.median(left))
+    rough = [start if near else fitted(start, SQUARED, 60)[1] for start in starts]
+    fits = [fitted(start, geman_mcclure() if robust else SQUARED, 40) for start in rough]
+    state = min(fits, key=lambda fit: fit[0])[1]
+    left = np.linalg.norm(body.positions(state, points)[known] - x_world[known], axis=1)
+    return state, float(np.median(left))
 
 
 def _turn(angle: float) -> NDArray:

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.marker_sets import bare, matched
 from kinefit.errors import ObservationError, TrackingError
-from kinefit.geometry import se3
-from kinefit.initialization.from_points import aligned_root
-from kinefit.losses import SQUARED, Loss, geman_mcclure
+from kinefit.initialization.from_points import pose_from_points
+from kinefit.losses import Loss
 from kinefit.observations import Markers
 from kinefit.sensors.settings import MARKER_LOSS
 from kinefit.solvers.sequence import fit_sequence
@@ -62,10 +61,7 @@ def sequence_both_ways(
 
 
 def _start(body: Body, points: PointSet, x: NDArray, sigma: NDArray) -> tuple[int, BodyState]:
-    """The frame to start from, and its state, found with no pose given: the best of a few that show most.
-
-    The usual posture is laid on the markers, facing either way, and fitted without, then with a robust loss.
-    """
+    """The frame to start from, and its state, found with no pose given: the best of a few that show most."""
     count = np.isfinite(x).all(axis=2).sum(axis=1)
     if not count.max(initial=0) >= _FEWEST:
         raise TrackingError(
@@ -76,18 +72,7 @@ def _start(body: Body, points: PointSet, x: NDArray, sigma: NDArray) -> tuple[in
     spread = np.maximum(sigma, _ROUGH)
     best: tuple[float, int, BodyState] | None = None
     for frame in most[np.unique(np.linspace(0, len(most) - 1, min(len(most), 4)).astype(int))]:
-        upright, one = aligned_root(body, points, x[frame]), x[frame : frame + 1]
-        fits = []
-        for turn in (np.eye(3), np.diag([-1.0, 1.0, -1.0])):
-            state = body.usual_state(upright @ se3.transform(turn, np.zeros(3)))
-            for loss in (SQUARED, geman_mcclure()):
-                fit = fit_sequence(
-                    body, state, points, one, sigma=spread, loss=loss, posture=1.0, max_iterations=60, tolerance=1e-4
-                )
-                state = BodyState(fit.Ts_world_root[0], fit.angles[0])
-            fits.append((float(fit.costs[0]), state))
-        state = min(fits, key=lambda f: f[0])[1]
-        left = float(np.nanmedian(np.linalg.norm(x[frame] - body.positions(state, points), axis=1)))
+        state, left = pose_from_points(body, points, x[frame], sigma=spread)
         if best is None or left < best[0]:
             best = left, int(frame), state
         if left < _NEAR:

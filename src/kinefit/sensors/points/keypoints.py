@@ -128,8 +128,9 @@ class KeypointMeasurement(Measurement):
         if scene.measurements:
             sure = self.confidence[order] >= SEEN
             hidden = tuple(hidden_points(scene, self.layout.points_of(scene.body), channels.camera, sure))
-        loss = self.of.loss
-        loss = replace(loss, scale=loss.scale * max(reach / self.of.near, 1.0))
+        loss, near = self.of.loss, self.of.near
+        if reach > near:
+            loss = replace(loss, scale=loss.scale * reach / near)
         return KeypointMatched(self, uv, weight, swapped, loss, hidden, beside)
 
     def hints(self, scene: Scene) -> Hints:
