@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -68,9 +69,9 @@ class ImageFolder:
         return self._picture[1].copy()
 
 
-def images_in(path: Path) -> list[Path]:
-    """PNG and JPEG files of a folder or a pattern, in the order of the numbers in their names."""
-    return [file for file in listed(path) if file.suffix.lower() in ENDINGS]
+def images_in(path: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
+    """Files of a folder or a pattern that end so (PNG and JPEG), in the order of the numbers in their names."""
+    return [file for file in listed(path) if file.suffix.lower() in endings]
 
 
 def _check_numbers(files: list[Path]) -> None:

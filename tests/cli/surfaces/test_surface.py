@@ -70,6 +70,36 @@ def test_photographs_of_states_become_tables_meshes_and_pictures(folder, tmp_pat
     assert len(strains) > 20 and np.abs(strains).max() < 0.02
 
 
+@pytest.mark.parametrize(("kind", "scale"), [(np.uint16, 16), (np.float32, 1 / 255)])
+def test_folders_of_tiff_with_more_than_eight_bits(folder, tmp_path, kind, scale):
+    """12 bits in 16, as cameras for image correlation write them, and float: the same surface as of eight bits."""
+    found = []
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        for k in range(3):
+            grey = cv2.imread(str(folder / name / f"{k}.png"), cv2.IMREAD_GRAYSCALE)
+            cv2.imwrite(str(tmp_path / name / f"state_{k}.tif"), (grey.astype(float) * scale).astype(kind))
+    for place in (folder, tmp_path):
+        out = tmp_path / f"out{len(found)}"
+        words = [folder / "calib.toml", *(f"{name}={place / name}" for name in "ab")]
+        result = call(*words, "-o", out, "--step", 10, "--window", 17)
+        assert result.exit_code == 0, result.output
+        with (out / "points_002.csv").open() as file:
+            found.append(np.array([[float(row[f"{axis}_m"]) for axis in "xyz"] for row in csv.DictReader(file)]))
+    assert len(found[1]) > 100 and abs(len(found[0]) - len(found[1])) < 0.05 * len(found[0])
+    plane = se3.inverse(pose(2))
+    off = [np.abs(se3.apply(plane, x)[:, 2]).max() for x in found]
+    assert off[1] < max(1.5 * off[0], 1e-3)
+
+
+def test_values_that_no_light_has_are_refused(folder, tmp_path):
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        cv2.imwrite(str(tmp_path / name / "0.tif"), np.full((40, 40), np.nan, np.float32))
+    result = call(folder / "calib.toml", *(f"{name}={tmp_path / name}" for name in "ab"), "-o", tmp_path / "out")
+    assert isinstance(result.exception, FileError) and "0.tif" in str(result.exception)
+
+
 def read_vtk(path):
     """Points, triangles and scalars of a legacy VTK file, read by the format's own rules."""
     data, at, out = path.read_bytes(), 0, {}

@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from kinefit._pictures import read_picture
 from kinefit.errors import FileError, ObservationError, shortened
@@ -47,7 +49,7 @@ def read_views(calibration: Path, unit: str, views: Sequence[str]) -> tuple[Rig,
         place = Path(path)
         names.append(name)
         if place.is_dir() or "*" in place.name:
-            files = images_in(place)
+            files = images_in(place, PHOTOGRAPHS)
             if not files:
                 raise FileError("no images here", file=place, remedy="Name a photograph, a folder of them, or a video.")
             photographs.append(tuple(files))
@@ -60,13 +62,35 @@ def read_views(calibration: Path, unit: str, views: Sequence[str]) -> tuple[Rig,
         problem = f"{len(names)} views: {len(videos)} videos, photographs: {counts or 'none'}"
         raise ObservationError(problem, remedy="Give two views or more, all videos or all with as many photographs.")
     if photographs:
-        size = read_picture(photographs[0][0]).shape[1::-1]
+        size = read_photograph(photographs[0][0]).shape[1::-1]
     else:
         with Video(videos[0]) as video:
             size = video.size
     metres = float(unit) if _is_number(unit) else unit
     rig = read_calibration(calibration, unit=metres, image_size=size)
     return rig.select(tuple(names)), StateImages(tuple(names), tuple(photographs), tuple(videos))
+
+
+def read_photograph(path: Path) -> NDArray:
+    """An image (H, W) or (H, W, 3) RGB in 0..255: uint8, or float32 of a file with more bits, its brightest pixel 255.
+
+    Raises
+    ------
+    FileError
+        As `read_picture`; values that are not finite, or no light at all in more than eight bits.
+    """
+    if path.suffix.lower() in (".tif", ".tiff"):  # float is read in no other way
+        picture = read_picture(path, cv2.IMREAD_UNCHANGED)
+        picture = picture if picture.ndim == 2 else picture[..., 2::-1]
+    else:
+        picture = read_picture(path, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
+    if picture.dtype == np.uint8:
+        return picture
+    brightest = float(picture.max())
+    if not 0.0 < brightest < np.inf or picture.min() < 0.0:
+        problem = f"grey values from {picture.min():g} to {brightest:g}"
+        raise FileError(problem, file=path, remedy="Give photographs whose values are finite, 0 for black.")
+    return np.asarray(picture * np.float32(255.0 / brightest))
 
 
 def read_seeds(path: Path, views: int) -> list[Seeds]:

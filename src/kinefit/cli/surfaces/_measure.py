@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._pictures import read_picture
-from kinefit.cli.surfaces._files import PHOTOGRAPHS, StateImages, read_seeds
+from kinefit.cli.surfaces._files import PHOTOGRAPHS, StateImages, read_photograph, read_seeds
 from kinefit.errors import FileError, ObservationError, TrackingError
 from kinefit.exporters.surface_files import (
     point_columns,
@@ -29,7 +28,7 @@ from kinefit.photogrammetry.fields import field_camera, field_of
 from kinefit.photogrammetry.flat import measure_flat
 from kinefit.photogrammetry.least_squares_matching import windows_by_texture
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid
-from kinefit.photogrammetry.spline_image import SplineImage
+from kinefit.photogrammetry.spline_image import SplineImage, grey
 from kinefit.photogrammetry.states import measure_states, rigid_motion, surface_strain
 from kinefit.photogrammetry.surface import MeasuredSurface
 from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
@@ -119,7 +118,7 @@ def measure_one_camera(photographs: Sequence[Path], millimetres: float, wanted: 
     if named or wanted.seeds is not None or len(photographs) < 2:
         problem = f"--flat with {', '.join(named) or ('--seeds' if wanted.seeds else 'one photograph')}"
         raise ObservationError(problem, remedy="Name photographs of one camera, before and after, and nothing else.")
-    states = [spline_of(read_picture(path), wanted.field, wanted.smooth) for path in photographs]
+    states = [spline_of(read_photograph(path), wanted.field, wanted.smooth) for path in photographs]
     grid = Grid.of(states[0].size, wanted.step, mask=mask_of(wanted.mask, wanted.field))
     window = wanted.side(states[0], states[1], grid)
     surfaces = measure_flat(
@@ -153,13 +152,13 @@ class _States(Sequence[list[SplineImage]]):
     def __getitem__(self, k: Any) -> Any:
         if k not in self._kept:
             self._kept = {j: images for j, images in self._kept.items() if j == 0}
-            self._kept[k] = [spline_of(read_picture(files[k]), self._field, self._smooth) for files in self._files]
+            self._kept[k] = [spline_of(read_photograph(files[k]), self._field, self._smooth) for files in self._files]
         return self._kept[k]
 
 
 def _grey(path: Path, field: str | None) -> NDArray:
     """Grey values (H, W) of a photograph, or of a field of it."""
-    image = cv2.cvtColor(read_picture(path), cv2.COLOR_RGB2GRAY)
+    image = np.rint(grey(read_photograph(path))).astype(np.uint8)
     return image if field is None else field_of(image, field)  # type: ignore[arg-type]
 
 
