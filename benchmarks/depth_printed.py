@@ -6,7 +6,8 @@ Rows of one table, on the same sequences of seed 1 (settings were chosen on seed
 
 - `exclusive`, `adjacent`: two of the paper's three rules for points in several boxes (4.2.2), no floor, the ending of
   4.2.7 (a threshold of quality, or at most 15 steps), all other constants the defaults of `Settings`.
-- the same with the stop rule of ICP beside (3.2; at least three steps).
+- the same with the stop rule of ICP beside (3.2; at least three steps); and with all limbs moved at once, none with its
+  parent, and without `stay`, of which the paper says nothing.
 - `adjacent, tuned`: constants that the paper leaves open, chosen for this rule: a distance bound of 5 cm, and bands
   that weigh 0.3 times what is measured of a limb.
 - with helps: the floor's plane, and points to the nearest surface, which is none of the paper's rules.
@@ -44,6 +45,7 @@ def with_icp_stop(settings: Settings) -> Settings:
 ROWS = {
     "exclusive": PRINTED,
     "exclusive, ICP's stop rule": with_icp_stop(PRINTED),
+    "exclusive, each limb for itself": replace(PRINTED, down=False, stay=0.0),
     "adjacent": ADJACENT,
     "adjacent, tuned": TUNED,
     "adjacent, tuned, ICP's stop rule": with_icp_stop(TUNED),
