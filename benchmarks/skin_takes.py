@@ -26,7 +26,7 @@ from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 
 CAMERAS = tuple(range(4))
-SKIN = (1, 2, 3)  # camera 0 sees the person from behind
+SKIN = (1, 2, 3)  # camera 0 is so near that a hand hides the face
 _HANDS = re.compile(r"(wrist|pinky|index|thumb)", re.IGNORECASE)
 _FEET = re.compile(r"foot", re.IGNORECASE)
 _MIN_CONFIDENCE = 0.6  # of the network's keypoints that are held against a fit: below it hands are guessed

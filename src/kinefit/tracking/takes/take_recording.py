@@ -18,7 +18,7 @@ from kinefit.images.depth_scene import background_model
 from kinefit.initialization.from_silhouettes import coarse_to_fine
 from kinefit.motion import UP_AXES
 from kinefit.multiview.people import PersonTrack
-from kinefit.observations import DepthFrame, DepthVideo, NamedMarkers, SilhouetteFrame, by_record
+from kinefit.observations import DepthFrame, DepthVideo, KeypointVideo, NamedMarkers, SilhouetteFrame, by_record
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
@@ -65,6 +65,8 @@ def recording_of(
             k = video.at_step(first + i, rate)
             if k is not None:
                 out.append(video.frame(k))
+            elif isinstance(video, KeypointVideo):
+                out.append(video.unseen(float(times[i])))
         frames = (m.at(float(times[i])) for m in marked)
         return [*out, *(f for f in frames if f is not None)]
 
