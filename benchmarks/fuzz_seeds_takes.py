@@ -98,6 +98,11 @@ range = [0.5, 6.0]
 file = "surface.csv"
 time_offset = 0.0
 sigma = 0.01
+[[tracker]]
+file = "trackers.csv"
+points = { back = "thorax", wrist = "r_wrist" }
+mounts = { wrist = [0, 0, 90] }
+rotation_sigma = 2.0
 [[markers]]
 file = "a.trc"
 shift = [0.0, 0.1, 0.0]
@@ -140,6 +145,23 @@ def _surface_points(folder: Path) -> Seed:
         return [video.frame(i) for video in seen.surface_points for i in range(min(len(video), 3))]
 
     return Seed((folder / "surface.csv",), read)
+
+
+def _tracker_table(path: Path) -> None:
+    rows = [f"{i / 30:.4f},{n},0.1,0.2,{1 + 0.01 * i},1,0,0,0" for i in range(3) for n in ("back", "wrist")]
+    path.write_text("time_s,tracker,x,y,z,qw,qx,qy,qz\n" + "\n".join(rows) + "\n")
+
+
+def _trackers(folder: Path) -> Seed:
+    from kinefit.readers.body_trackers import read_body_trackers
+
+    _tracker_table(folder / "trackers.csv")
+
+    def read() -> object:
+        video = read_body_trackers(folder / "trackers.csv", ("back", "wrist"))
+        return [video.frame(i) for i in range(min(len(video), 3))]
+
+    return Seed((folder / "trackers.csv",), read)
 
 
 def _bar(folder: Path) -> Seed:
@@ -205,6 +227,7 @@ def _sensors(folder: Path) -> Seed:
             cv2.imwrite(str(folder / camera / f"{i}.png"), np.roll(picture, i, 1))
     cv2.imwrite(str(folder / "plate.png"), np.full((48, 64, 3), 90, np.uint8))
     np.save(folder / "cam01.npy", np.full((3, 33, 3), 0.9))
+    _tracker_table(folder / "trackers.csv")
     _surface_table(folder / "surface.csv")
     _norms_table(folder / "norms.csv")
     (folder / "lines.csv").write_text("frame,line,u1,v1,u2,v2\n0,hips,1,2,30,4\n1,back,1,2,30,4\n")
@@ -276,7 +299,7 @@ def _recording(read: str) -> Callable[[Path], Seed]:
 
 
 LATER: dict[str, Callable[[Path], Seed]] = {
-    "surface points": _surface_points, "bar": _bar, "norms": _norms, "surface seeds": _seeds,
+    "surface points": _surface_points, "trackers": _trackers, "bar": _bar, "norms": _norms, "surface seeds": _seeds,
     "metaballs toml": body_of("arm_metaballs"), "closures toml": body_of("cyclist"),
     "couplings toml": body_of("humanoid"), "lifter toml": body_of("weight_lifter"), "body skin": _skin,
     "take of all sensors": _sensors, "take of depth": _depth_take,

@@ -1,13 +1,14 @@
-"""Files that may hold anything: TOML and numpy archives are read here, within bounds of time and memory."""
+"""Files that may hold anything: TOML, tables and numpy archives are read here, within bounds of time and memory."""
 
 from __future__ import annotations
 
+import csv
 import os
 import re
 import tomllib
 import zipfile
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -27,6 +28,50 @@ def no_column(missing: Iterable[str], names: Iterable[str] | None) -> str:
     told = f"no column {', '.join(missing)}"
     other = next((mark for mark in (";", "\t") if any(mark in name for name in names or ())), None)
     return told if other is None else f"{told}: its columns are separated by {other!r}, not by commas"
+
+
+def read_table(
+    path: Path, columns: Sequence[str], remedy: str, *, text: str = "", optional: Sequence[str] = ()
+) -> tuple[list[str], NDArray]:
+    """Columns of a CSV table with a line of names; columns that are not asked for are not read.
+
+    Parameters
+    ----------
+    columns : of numbers, which the table must have
+    remedy : of the errors
+    text : name of a column of text; default: none is read
+    optional : further columns of numbers; NaN where the table has none of this name, or a cell is empty
+
+    Returns
+    -------
+    texts : (N,) of the column of text, without blanks around it; empty without such a column
+    values : (N, C) numbers of `columns`, then of `optional`; row k is line k + 2 of the file
+
+    Raises
+    ------
+    FileError
+        No such table, a column that it lacks, or a number that is none, with its line.
+    """
+    texts, rows = list[str](), list[list[float]]()
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            table = csv.reader(file)
+            names = [name.strip() for name in next(table, [])]
+            missing = [name for name in ([text] if text else []) + list(columns) if name not in names]
+            if missing:
+                raise FileError(no_column(missing, names), file=path, remedy=remedy)
+            at = [names.index(name) for name in columns]
+            more = [names.index(name) if name in names else None for name in optional]
+            for line, row in enumerate(table, 2):
+                try:
+                    cells = [np.nan if k is None or not row[k].strip() else float(row[k]) for k in more]
+                    rows.append([float(row[k]) for k in at] + cells)
+                    texts += [row[names.index(text)].strip()] if text else []
+                except (ValueError, IndexError):
+                    raise FileError("a number that is none", file=path, place=f"line {line}", remedy=remedy) from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise FileError(f"cannot be read: {error}", file=path, remedy=remedy) from None
+    return texts, np.array(rows).reshape(-1, len(columns) + len(optional))
 
 
 def repeated(names: Iterable[str]) -> list[str]:

@@ -24,6 +24,7 @@ from kinefit.evaluation.voodoo import (
     stretched_share,
     voodoo_method,
 )
+from kinefit.recipes.voodoo import Settings
 from kinefit.simulation.movements import movement, people
 from kinefit.simulation.retarget import known_motion
 
@@ -171,3 +172,14 @@ def test_the_command_prints_the_table():
     told = CliRunner().invoke(main, ["evaluate", "--count", "1", "--method", "voodoo", "-v"])
     assert told.exit_code == 0, told.output
     assert "mean grade" in told.stdout and "fusion: bowing and waving" in told.stdout and "point" in told.stdout
+
+
+def test_points_shared_among_adjacent_limbs_need_a_tighter_bound():
+    """By the paper's own rule, without the floor: with constants of other rules limbs are drawn into each other."""
+    run = sequence("wave", people(seed=2)[1], seed=2)
+    errors = []
+    tight = Settings(overlap="adjacent", bound=0.05, band=0.3, band_rule="points")
+    for settings in (Settings(overlap="adjacent"), tight):
+        fitted = voodoo_method(run, "fusion", run.truth.state(0), settings)
+        errors.append((grade(run.truth, fitted).grade, point_errors(run.truth, fitted).mean()))
+    assert errors[0][0] == 0 and errors[1][0] == 2 and errors[1][1] < 0.5 * errors[0][1]

@@ -16,6 +16,7 @@ from tests.tracking.test_contract import MIXES, SEEN, SIGMA
 from kinefit import Recording, track
 from kinefit.frame.prediction import Prediction
 from kinefit.geometry.camera import Rig
+from kinefit.observations import KeypointFrame
 from kinefit.sensors.base import Matched, Measurement, Sensor
 from kinefit.sensors.regions.regions import RegionSensor
 from kinefit.sensors.settings import TrackSettings
@@ -62,7 +63,20 @@ def mixed_recording():
     return Recording.of_frames(steps, a_rig(), rate=RATE, sigma=sigma, up="y", start=start), BODY, STILL
 
 
-@pytest.mark.parametrize("make", [mixed_recording, arm_recording, skin_recording])
+def colour_recording():
+    """Keypoints of a network, and a face and a hand by their colour in one of the cameras."""
+    given, body, settings = mixed_recording()
+
+    def steps(i):
+        points = body.landmarks.select(("nose_tip", "r_wrist"))
+        uv = given.rig["left"].project(body.positions(a_motion().state(i), points))
+        seen = KeypointFrame("left", float(given.times[i]), points.names, uv, np.full(2, 0.8))
+        return [*given.steps(i), seen]
+
+    return replace(given, steps=steps), body, settings
+
+
+@pytest.mark.parametrize("make", [mixed_recording, arm_recording, skin_recording, colour_recording])
 def test_what_every_sensor_has_learnt_is_kept(make, tmp_path, monkeypatch):
     monkeypatch.setattr(running, "_EVERY", 4)
     given, body, settings = make()

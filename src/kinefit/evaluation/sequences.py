@@ -120,6 +120,13 @@ def sequence(
 ) -> TruthSequence:
     """One movement of one person as its sensors saw it; see `sequences`."""
     truth = movement(name, with_hands(person.body), rate=rate, speed=person.speed)
+    return sequence_of(truth, person, sensor=sensor, room=room, seed=seed, number=number)
+
+
+def sequence_of(
+    truth: Motion, person: Performer, *, sensor: DepthSensor = TOF, room: bool = True, seed: int = 0, number: int = 0
+) -> TruthSequence:
+    """A known motion of a body `with_hands` as the sensors of the experiment saw it; see `sequences`."""
     camera = in_front(truth, sensor.camera(name="depth"), azimuth=person.azimuth, near=sensor.near, far=sensor.far)
     head = ColourSensor("colour", _HEAD_SIZE, _HEAD_SIZE[1] / sensor.size[1] * sensor.focal, samples=1)
     colour = beside(head.camera().with_pose(camera.T_camera_world), "colour", _BASELINE)

@@ -4,6 +4,7 @@ Readers make them, correspondences use them; nothing here opens a file or knows 
 one sensor, `frames` what it saw at one time.
 """
 
+from kinefit.observations.body_trackers import BodyTrackerFrame, BodyTrackerVideo
 from kinefit.observations.colours import ColourVideo
 from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.observations.detections import MEDIAPIPE_33, Detections
@@ -30,6 +31,8 @@ __all__ = [
     "KEYPOINTS",
     "KEYPOINT_SIGMA",
     "MEDIAPIPE_33",
+    "BodyTrackerFrame",
+    "BodyTrackerVideo",
     "CloudVideo",
     "ColourFrame",
     "ColourVideo",

@@ -52,6 +52,11 @@ class KeypointVideo(_Recording):
         uv, confidence = self.points(i)
         return KeypointFrame(self.sensor, float(self.times[i]), self.names, uv, confidence, self.keypoint_set)
 
+    def unseen(self, time: float) -> KeypointFrame:
+        """A frame at a time [s] without a frame of its own: no point is seen, and all frames have the same names."""
+        uv, confidence = np.full((len(self.names), 2), np.nan), np.zeros(len(self.names))
+        return KeypointFrame(self.sensor, time, self.names, uv, confidence, self.keypoint_set)
+
 
 @dataclass(frozen=True, eq=False)
 class LineVideo(_Recording):

@@ -83,7 +83,7 @@ def with_detections(take: Take, progress: Step | None = None, tell: Tell = warn)
     """The take with the built-in detector's keypoints where it asks for them, or has nothing but videos."""
     asked = any(entry.format == "detect" and entry.file is None for entry in take.keypoints)
     videos = any(camera.video for camera in take.cameras) and not (
-        take.depth or take.stereo or take.silhouettes or take.regions
+        take.depth or take.stereo or take.silhouettes or take.regions or take.trackers
     )
     if not asked and (take.keypoints or take.skin or take.lines or take.surface_points or not videos):
         return take

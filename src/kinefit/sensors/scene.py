@@ -144,6 +144,13 @@ class Scene:
             return self.morphing.pose(self.state).positions(points)
         return self.body.positions(self.state, points)
 
+    def segment_jacobian(self, segment: int) -> NDArray:
+        """(6, 6 + D) twist (v, ω) of a segment about the root's origin for each degree of freedom."""
+        if self.morphing is not None:
+            return self.morphing.pose(self.state).segment_jacobian(segment)
+        tree = self.body.tree
+        return tree.segment_jacobian(tree.forward(self.state.T_world_root, self.state.angles)[1], segment)
+
     def position(self, name: str) -> NDArray:
         """(3,) [m] a landmark of the body in the world."""
         return self.positions(self.body.landmarks.select((name,)))[0]

@@ -11,6 +11,7 @@ from kinefit.images.regions import Ratios, RegionColours
 from kinefit.losses import Loss
 from kinefit.sensors.base import Leftover, RowsOf
 from kinefit.sensors.displaced import Displaced, DisplacedMatched
+from kinefit.sensors.points.body_trackers import BodyTrackerMatched, BodyTrackerMeasurement
 from kinefit.sensors.points.image_lines import ImageLineMatched, ImageLineMeasurement
 from kinefit.sensors.points.keypoints import KeypointMatched, KeypointMeasurement
 from kinefit.sensors.points.lifted import LiftedMatched, LiftedMeasurement
@@ -33,5 +34,6 @@ CODEC = Codec([
     KeypointMatched, KeypointMeasurement, LiftedMatched, LiftedMeasurement, MarkerMatched, MarkerMeasurement, Hidden,
     PointCloudMatched, PointCloudMeasurement, Coloured, Kept, RegionMatched, Lines, Seams, RegionMeasurement,
     SilhouetteMatched, SilhouetteMeasurement, FreePairs, SurfacePairs, SurfacePointMatched, SurfacePointMeasurement,
+    BodyTrackerMatched, BodyTrackerMeasurement,
 ])  # fmt: skip
 """Writes and reads records of tracked frames. What belongs to all frames (bodies, sensors, cameras) is none of them."""

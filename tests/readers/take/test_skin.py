@@ -5,9 +5,11 @@ import cv2
 import numpy as np
 import pytest
 
+from kinefit.bodies import load_body
 from kinefit.errors import KinefitError, TakeError
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
+from kinefit.tracking.takes.take_recording import recording_of
 
 SKIN, WALL, SHIRT = (205, 150, 125), (130, 150, 140), (40, 60, 120)
 LEFT, RIGHT = np.array([220, 150]), np.array([100, 150])
@@ -80,6 +82,17 @@ def test_some_frames_of_a_later_camera_by_wrists(folder):
     (video,) = load(folder, entry, camera="time_offset = 0.1\n").skin
     np.testing.assert_allclose(video.times, 0.1 + np.arange(2, 6) / 30)
     assert video.names[1:] == ("l_wrist", "r_wrist") and video.at_step(5, 30.0) == 0 and video.at_step(9, 30.0) is None
+
+
+def test_steps_without_a_frame_have_the_same_names(folder):
+    """A smoother keeps the keypoints of all steps in one table."""
+    entry = SKIN_ENTRY + FACE + "frames = [5, 9]\n"
+    seen = load(folder, entry)
+    recording, _ = recording_of(read_take(folder / "take.toml"), seen, load_body("humanoid"))
+    frames = [recording.steps(i) for i in range(20)]
+    assert all([f.names for f in step] == [frames[5][0].names] for step in frames)
+    shown = [bool(np.isfinite(step[0].uv).any()) for step in frames]
+    assert np.flatnonzero(shown).tolist() == [5, 6, 7, 8] and frames[15][0].time == pytest.approx(0.5)
 
 
 def test_what_cannot_be_is_told(folder):

@@ -26,6 +26,7 @@ from kinefit.motion import Motion
 from kinefit.observations import sensor_of
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
+from kinefit.readers.take.surface_points import sensor_name
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.displaced import AXES, Displaced, displacement
 from kinefit.sensors.scene import Scene
@@ -38,7 +39,7 @@ from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.subject.surfaces import CylinderShape
 from kinefit.tracking.recording import Recording, spread
 from kinefit.tracking.sizing import channels_of
-from kinefit.tracking.takes.take_recording import marker_sensor, recording_of
+from kinefit.tracking.takes.take_recording import recording_of
 from kinefit.tracking.video import track
 
 FRAMES = 12
@@ -94,7 +95,8 @@ def fit_sensors(
     person = fit_person(body, channels_of(recording, body, TrackSettings()), height=take.height, progress=progress)
     motion = track(alone, body, subject=person, progress=progress)
     origins = {name: recording.rig[name].centre_world for name in depth}
-    origins |= {marker_sensor(take, k): entry.T_world_file[:3, 3] for k, entry in enumerate(take.markers)}
+    for k, entry in enumerate(take.markers):
+        origins[sensor_name("markers", take.markers, k)] = entry.T_world_file[:3, 3]
     problem = _PlacementProblem(recording, motion, person, frozenset(depth), origins)
     chosen = problem.chosen(frames)
     return problem.fits(chosen) if len(chosen) >= _FEWEST else ()

@@ -47,7 +47,7 @@ def check_enough(take: Take) -> None:
         With what to add.
     """
     others = (take.depth, take.stereo, take.markers, take.skin, take.silhouettes, take.regions, take.lines,
-              take.surface_points)  # fmt: skip
+              take.surface_points, take.trackers)  # fmt: skip
     refuse_streams(take)
     seeing = {entry.camera for entry in take.keypoints} or {entry.name for entry in take.cameras if entry.video}
     lifted = not take.keypoints or any(entry.format == "detect" for entry in take.keypoints)
@@ -150,19 +150,23 @@ def _values(take: Take) -> None:
         if not lines.landmarks:
             refuse("no landmarks", place, 'Write landmarks = { edge = ["r_asis", "l_asis"] }, one entry for each line.')
     for entry in take.markers:
-        place = f"markers {entry.file.name}"
-        if not 0 < entry.sigma < 1 or not abs(entry.time_offset) < 1e6:
-            refuse(f"sigma {entry.sigma} m, time offset {entry.time_offset} s", place, "Give metres and seconds.")
         if entry.unit is not None and worth(entry.unit, LENGTHS) is None:
-            refuse(choices("unit", entry.unit, LENGTHS), place, "Use one of these.")
-        if not (all(abs(v) < 1e4 for v in entry.shift) and all(abs(v) <= 360 for v in entry.turn)):
-            refuse(f"shift {list(entry.shift)}, turn {list(entry.turn)}", place, "Give metres and degrees.")
-    for surface in take.surface_points:
-        place = f"surface points {surface.file.name}"
-        if not 0 < surface.sigma < 1 or not abs(surface.time_offset) < 1e6:
-            refuse(f"sigma {surface.sigma} m, time offset {surface.time_offset} s", place, "Give metres and seconds.")
+            refuse(choices("unit", entry.unit, LENGTHS), f"markers {entry.file.name}", "Use one of these.")
+    for kind, table in _of_places(take):
+        place = f"{kind} {table.file.name}"
+        if not 0 < table.sigma < 1 or not abs(table.time_offset) < 1e6:
+            refuse(f"sigma {table.sigma} m, time offset {table.time_offset} s", place, "Give metres and seconds.")
+        shift, turn = getattr(table, "shift", (0.0,)), getattr(table, "turn", (0.0,))
+        if not (all(abs(v) < 1e4 for v in shift) and all(abs(v) <= 360 for v in turn)):
+            refuse(f"shift {list(shift)}, turn {list(turn)}", place, "Give metres and degrees.")
     for problem, place, remedy in (*odd_streams(take), *_odd_depth(take)):
         refuse(problem, place, remedy)
+
+
+def _of_places(take: Take) -> list[tuple[str, Any]]:
+    """Tables of places in space, each with the name of its kind for messages."""
+    kinds = (("markers", take.markers), ("surface points", take.surface_points), ("trackers", take.trackers))
+    return [(kind, table) for kind, tables in kinds for table in tables]
 
 
 def _is_size(size: tuple[int, int]) -> bool:
@@ -180,7 +184,7 @@ def _calibration(take: Take, entry: CalibrationEntry, refuse: Callable[[str, str
         refuse(told, place, "Give metres and degrees above 0, or 0 and 0 for an exact calibration, or neither.")
     elif not (shift < 1 and turn < 30):
         refuse(told, place, "Give metres below 1 and degrees below 30: a camera that is so far off needs calibration.")
-    others = (take.silhouettes, take.markers, take.depth, take.stereo, take.lines, take.skin)
+    others = (take.silhouettes, take.markers, take.depth, take.stereo, take.lines, take.skin, take.trackers)
     if not take.keypoints and any(others):
         refuse("position_sigma and rotation_sigma are for cameras with keypoints", place, "Leave both out.")
 
@@ -244,8 +248,8 @@ def _uses(take: Take) -> None:
 
 def _names(take: Take) -> None:
     """Names within the take agree, and there is something to see."""
-    shapes = (*take.silhouettes, *take.regions)
-    if not (take.cameras or take.keypoints or take.skin or take.markers or take.depth or take.surface_points or shapes):
+    shapes, places = (*take.silhouettes, *take.regions), _of_places(take)
+    if not (take.cameras or take.keypoints or take.skin or take.depth or places or shapes):
         remedy = "Add [[camera]] with [[keypoints]], [[depth]], or [[markers]]."
         raise TakeError("an empty take: it names no sensor", file=take.path, remedy=remedy)
     names = [entry.name for entry in take.cameras]
@@ -263,7 +267,7 @@ def _names(take: Take) -> None:
                 choices("camera", camera, names), file=take.path, place=f"{kind} of camera {camera}",
                 remedy=f'Add [[camera]] with name = "{camera}", or correct the name.',
             )
-    beside = (take.markers, take.depth, take.stereo, take.surface_points)  # of a world in which its place is not known
+    beside = (places, take.depth, take.stereo)  # of a world in which its place is not known
     if take.cameras and take.calibration is None and (len(take.cameras) > 1 or any(beside)):
         remedy = 'Add [calibration] with file = "...". One camera alone needs none.'
         raise TakeError("cameras without calibration", file=take.path, remedy=remedy)
@@ -302,6 +306,7 @@ def _names(take: Take) -> None:
     told += [(f"keypoints of camera {k.camera}", k.file, k.format, k.frames) for k in (*take.keypoints, *take.skin)]
     told += [(f"markers {m.file.name}", m.file, m.set) for m in take.markers]
     told += [(f"surface points {p.file.name}", p.file) for p in take.surface_points]
+    told += [(f"trackers {p.file.name}", p.file, sorted(p.points)) for p in take.trackers]
     for one in told:
         if told.count(one) > 1:
             remedy = "Leave one out: what is there twice would count twice."
@@ -330,8 +335,7 @@ def _files(take: Take) -> None:
     named += [(f"silhouette of camera {entry.camera}", entry.file) for entry in take.silhouettes]
     named += [(f"lines of camera {entry.camera}", entry.file) for entry in take.lines]
     named += [("[take] subject", take.subject), ("[take] start", take.start), ("[session] norms", take.session.norms)]
-    named += [("markers", entry.file) for entry in take.markers]
-    named += [("surface points", entry.file) for entry in take.surface_points]
+    named += [(kind, table.file) for kind, table in _of_places(take)]
     named += [(f"markers {entry.file.name}, model", entry.model) for entry in take.markers]
     named += [("[take] body", Path(take.body) if take.body.endswith((".toml", ".npz")) else None)]
     named += [(f"depth {entry.name}", entry.file) for entry in take.depth]

@@ -134,13 +134,10 @@ class SurfacePointsEntry(_Entry, frozen=True, kw_only=True):
     sigma: float = 0.01  # [m] standard deviation by which the surface slides on the bone, and the body's shape is off
 
 
-class MarkersEntry(_Entry, frozen=True, kw_only=True):
-    """`[[markers]]`: a marker recording."""
+class _PlacedEntry(_Entry, frozen=True, kw_only=True):
+    """A file of places in a world of its own."""
 
     file: Path
-    unit: str | None = None  # where the file does not state it
-    set: str | None = None  # the body's marker set that its labels belong to; default: the one that fits
-    model: Path | None = None  # of the subject, for markers without names; default: they have names
     time_offset: float = 0.0  # [s]
     sigma: float = 0.005  # [m] standard deviation
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [m] of the file's origin, in the world
@@ -150,6 +147,23 @@ class MarkersEntry(_Entry, frozen=True, kw_only=True):
     def T_world_file(self) -> NDArray:
         """(4, 4) [m] from the frame of the file to the world."""
         return se3.transform(se3.exp_so3(np.radians(self.turn)), np.array(self.shift))
+
+
+class MarkersEntry(_PlacedEntry, frozen=True, kw_only=True):
+    """`[[markers]]`: a marker recording."""
+
+    unit: str | None = None  # where the file does not state it
+    set: str | None = None  # the body's marker set that its labels belong to; default: the one that fits
+    model: Path | None = None  # of the subject, for markers without names; default: they have names
+
+
+class TrackerEntry(_PlacedEntry, frozen=True, kw_only=True):
+    """`[[tracker]]`: trackers fixed on the body, such as magnetic ones: poses of segments, or places of points."""
+
+    points: dict[str, str]  # of each tracker of the file: landmark of the body, or segment, whose origin it then is
+    mounts: dict[str, tuple[float, float, float]] = {}  # [deg] rotation vector, from a tracker's axes to its segment's
+    rotation_sigma: float = 2.0  # [deg] standard deviation of an orientation
+    mount_sigma: float = 0.0  # [deg] standard deviation of the mounts, which are then estimated; default: exact
 
 
 class DepthEntry(_Entry, frozen=True, kw_only=True):
@@ -205,6 +219,6 @@ TABLES: dict[str, type[msgspec.Struct]] = {
     "take": _Head, "session": SessionEntry, "start": StartEntry, "calibration": CalibrationEntry, "camera": CameraEntry,
     "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry, "stereo": StereoEntry,
     "silhouette": SilhouetteEntry, "region": RegionEntry, "lines": LinesEntry,
-    "surface_points": SurfacePointsEntry,
+    "surface_points": SurfacePointsEntry, "tracker": TrackerEntry,
 }  # fmt: skip
 """Every table of a take file, and its keys as the fields of a record."""

@@ -31,6 +31,7 @@ from kinefit.readers.take.entries import (
     StartEntry,
     StereoEntry,
     SurfacePointsEntry,
+    TrackerEntry,
     _Entry,
     _Head,
 )
@@ -52,6 +53,7 @@ __all__ = [
     "StereoEntry",
     "SurfacePointsEntry",
     "Take",
+    "TrackerEntry",
     "read_take",
 ]
 
@@ -70,6 +72,7 @@ class _TakeFile(_Entry, frozen=True, kw_only=True):
     region: tuple[RegionEntry, ...] = ()
     lines: tuple[LinesEntry, ...] = ()
     surface_points: tuple[SurfacePointsEntry, ...] = ()
+    tracker: tuple[TrackerEntry, ...] = ()
 
 
 _ONCE = ("take", "session", "start", "calibration")
@@ -107,7 +110,7 @@ class Take:
         Steps of the common time, t = step / rate.
     calibration : CalibrationEntry or None
     session : SessionEntry, whom and what the recording shows
-    cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines, surface_points : tuples
+    cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines, surface_points, trackers : tuples
         Of entries; `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
     """
 
@@ -134,6 +137,7 @@ class Take:
     skin: tuple[KeypointsEntry, ...] = ()
     lines: tuple[LinesEntry, ...] = ()
     surface_points: tuple[SurfacePointsEntry, ...] = ()
+    trackers: tuple[TrackerEntry, ...] = ()
     session: SessionEntry = field(default_factory=SessionEntry)
 
 
@@ -177,7 +181,7 @@ def read_take(path: str | PathLike[str]) -> Take:
         silhouettes=content.silhouette, regions=content.region,
         skin=tuple(k for k in content.keypoints if k.format == "skin"), lines=content.lines, start=head.start,
         pose=content.start, size=head.size, person=head.person, session=content.session,
-        surface_points=content.surface_points,
+        surface_points=content.surface_points, trackers=content.tracker,
     )  # fmt: skip
     check_take(take)
     return take

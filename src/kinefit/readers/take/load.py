@@ -14,6 +14,7 @@ from kinefit.errors import CalibrationError, ObservationError, TakeError, choice
 from kinefit.geometry import se3
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.observations import (
+    BodyTrackerVideo,
     CloudVideo,
     ColourVideo,
     DepthVideo,
@@ -24,6 +25,7 @@ from kinefit.observations import (
     SilhouetteVideo,
     SurfacePointVideo,
 )
+from kinefit.readers.body_trackers import read_body_trackers
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoints import read_keypoints
@@ -36,10 +38,10 @@ from kinefit.readers.take.one_camera import assumed_camera, is_alone, what_is_as
 from kinefit.readers.take.silhouettes import load_regions, load_silhouettes
 from kinefit.readers.take.skin import load_skin
 from kinefit.readers.take.streams import refuse_streams
-from kinefit.readers.take.surface_points import load_surface_points
+from kinefit.readers.take.surface_points import load_surface_points, sensor_name
 from kinefit.readers.video import Video, check_rates, common_frames
 
-_Timed = DepthVideo | CloudVideo | LineVideo | SurfacePointVideo
+_Timed = DepthVideo | CloudVideo | LineVideo | SurfacePointVideo | BodyTrackerVideo
 _Whole = _Timed | SilhouetteVideo | ColourVideo | KeypointVideo
 _LEVEL = 45.0  # [deg] turned by less, the axis of a marker file that was vertical still is the nearest to it
 
@@ -76,6 +78,8 @@ class Observations:
         In the order of `take.lines`, those frames that have lines.
     surface_points : tuple of SurfacePointVideo
         In the order of `take.surface_points`, whole, at their own rates.
+    trackers : tuple of BodyTrackerVideo
+        In the order of `take.trackers`, whole, at their own rates.
     notes : tuple of str
         What is worth saying: depth of another rate, frames that are missing.
     """
@@ -94,6 +98,7 @@ class Observations:
     skin: tuple[KeypointVideo, ...] = ()
     lines: tuple[LineVideo, ...] = ()
     surface_points: tuple[SurfacePointVideo, ...] = ()
+    trackers: tuple[BodyTrackerVideo, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
@@ -102,7 +107,8 @@ class Observations:
     ) -> tuple[_Whole, ...]:
         """Every recording with `at_step(step, rate)` and `frame(i)`: all but keypoints and markers."""
         return (
-            *self.depth, *self.clouds, *self.silhouettes, *self.regions, *self.skin, *self.lines, *self.surface_points
+            *self.depth, *self.clouds, *self.silhouettes, *self.regions, *self.skin, *self.lines, *self.surface_points,
+            *self.trackers,
         )  # fmt: skip
 
 
@@ -155,7 +161,12 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     skin = load_skin(take, images, {e.name: e.video for e in take.cameras if e.video is not None})
     lines = load_lines(take, images, rates)
     surfaces = load_surface_points(take)
-    recordings: tuple[_Timed, ...] = (*sensors.depth, *sensors.clouds, *surfaces)
+    trackers = tuple(
+        read_body_trackers(e.file, e.points, sensor_name("trackers", take.trackers, k), time_offset=e.time_offset,
+                           T_world_file=e.T_world_file)
+        for k, e in enumerate(take.trackers)
+    )  # fmt: skip
+    recordings: tuple[_Timed, ...] = (*sensors.depth, *sensors.clouds, *surfaces, *trackers)
     if not (lengths or lines or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
         raise TakeError("cameras, but nothing that they saw", file=take.path, remedy=remedy)
@@ -176,7 +187,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         keypoints=tuple(_cut(k, frames, entry.frames) for k, entry in zip(keypoints, take.keypoints)),
         videos={entry.name: entry.video for entry in take.cameras if entry.video is not None}, images=images,
         depth=sensors.depth, clouds=sensors.clouds, silhouettes=silhouettes,
-        regions=load_regions(take, rig, images), skin=skin, lines=lines, surface_points=surfaces,
+        regions=load_regions(take, rig, images), skin=skin, lines=lines, surface_points=surfaces, trackers=trackers,
         notes=(*sensors.notes(rate), *(what_is_assumed(take) if is_alone(take) else ())),
     )
 
@@ -194,7 +205,8 @@ def _check_times(
     for recording in recordings:
         first, last = float(recording.times[0]), float(recording.times[-1])
         if round(last * rate) < frames[0] or round(first * rate) >= frames[1]:
-            kinds = {LineVideo: "lines of camera", KeypointVideo: "keypoints of camera", SurfacePointVideo: "surface"}
+            kinds = {LineVideo: "lines of camera", KeypointVideo: "keypoints of camera", SurfacePointVideo: "surface",
+                     BodyTrackerVideo: "trackers"}  # fmt: skip
             raise ObservationError(
                 f"its images are from {first:.3g} to {last:.3g} s, the steps [{frames[0]}, {frames[1]}] of the take "
                 f"from {frames[0] / rate:.3g} to {(frames[1] - 1) / rate:.3g} s", file=take.path,

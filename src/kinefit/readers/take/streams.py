@@ -61,7 +61,8 @@ def odd_streams(take: Take) -> Iterator[tuple[str, str, str]]:
     recorded += [f"keypoints of camera {k.camera}" for k in (*take.keypoints, *take.skin) if k.stream is None]
     recorded += [f"depth {entry.name}" for entry in take.depth if entry.file is not None]
     tables = {"markers": take.markers, "stereo": take.stereo, "silhouette": take.silhouettes, "region": take.regions,
-              "lines": take.lines, "surface_points": take.surface_points}  # fmt: skip
+              "lines": take.lines, "surface_points": take.surface_points,
+              "tracker": take.trackers}  # fmt: skip
     recorded += [f"[[{name}]]" for name, entries in tables.items() if entries]
     seen = {entry.camera for entry in take.keypoints}
     blind = [entry.name for entry in take.cameras if entry.stream is None and entry.name not in seen]

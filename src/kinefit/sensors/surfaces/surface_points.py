@@ -110,13 +110,10 @@ class SurfacePointSensor(Sensor):
 
 def _turn(scene: Scene, segment: int) -> NDArray:
     """(3,) [rad] in its frame: standard deviation of how a segment is turned about its bone, by the scene's state."""
-    tree, bone = scene.body.tree, scene.body.segment_ends().get(segment)
+    bone = scene.body.segment_ends().get(segment)
     if bone is None or scene.covariance is None or not np.any(bone):
         return np.zeros(3)
-    if scene.morphing is not None:
-        J = scene.morphing.pose(scene.state).segment_jacobian(segment)
-    else:
-        J = tree.segment_jacobian(tree.forward(scene.state.T_world_root, scene.state.angles)[1], segment)
+    J = scene.segment_jacobian(segment)
     bone = bone / np.linalg.norm(bone)
     by = scene.frames[segment, :9].reshape(3, 3) @ bone @ J[3:]
     return np.asarray(bone * np.sqrt(max(by @ scene.covariance @ by, 0.0)))

@@ -7,15 +7,17 @@ damaged before its first state, or of another take.
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 from array import array
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from kinefit._records import RecordFile
 from kinefit.errors import ExportError, FileError, ObservationError
 from kinefit.sensors.base import Sensor
+from kinefit.sensors.layout import Layout, Stream
 from kinefit.smoothing.record_classes import CODEC
 from kinefit.smoothing.spool import Store
 
@@ -26,6 +28,7 @@ KINDS = RESULTS, MEASUREMENTS, LEFTOVERS = range(3)
 """Tags of the records of a frame."""
 
 _STATE = len(KINDS)  # tag of a state
+_LAYOUT = "layout "  # begins the names of layouts, their streams as JSON follow
 
 
 class FrameFile(Store):
@@ -51,6 +54,7 @@ class FrameFile(Store):
         seal = hashlib.sha256(head).digest()
         super().__init__(records=RecordFile(self._file, seal, start=len(head), name=path))
         self._path, self._known = path, dict[str, Any]()
+        self._layout_of: Callable[[Sequence[Stream]], Layout]
         self.at: int | None = None
         self.state: Any = None
         self.steps: list[int] = []
@@ -113,6 +117,10 @@ class FrameFile(Store):
         """The same of sensors, by their own names."""
         self._known |= {f"sensor {sensor.name}": sensor for sensor in sensors}
 
+    def name_layouts(self, layout_of: Callable[[Sequence[Stream]], Layout]) -> None:
+        """The same of the layouts of keypoints, by their streams: steps differ in which cameras saw something."""
+        self._layout_of = layout_of
+
     def close(self) -> None:
         """Close the file; its records cannot be read any more."""
         self._file.close()
@@ -128,8 +136,13 @@ class FrameFile(Store):
         for name, known in self._known.items():
             if known is thing:
                 return name
+        if isinstance(thing, Layout):
+            return _LAYOUT + json.dumps(thing.streams)
         problem = f"a checkpoint of frames with a {type(thing).__name__} of one's own, which nobody can keep"
         raise ObservationError(problem, remedy="Leave the checkpoint out.")
 
     def _resolve(self, reference: int | str) -> Any:
-        return self._known[str(reference)]
+        if (name := str(reference)).startswith(_LAYOUT):
+            streams = json.loads(name.removeprefix(_LAYOUT))
+            return self._layout_of([(camera, points, tuple(names)) for camera, points, names in streams])
+        return self._known[name]

@@ -61,7 +61,7 @@ def track_take(
     view = view or people_in_view(take)
     seen = with_names(take, view.seen if view else load_observations(take), progress=progress)
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
-    sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin)
+    sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin, take.trackers)
     alone = take.start or take.pose or any(sensors)
     if (take.silhouettes or take.regions or take.surface_points) and not alone:
         kind, table = ("silhouettes", "silhouette") if take.silhouettes else ("colours", "region")

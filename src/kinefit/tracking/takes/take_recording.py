@@ -18,11 +18,14 @@ from kinefit.images.depth_scene import background_model
 from kinefit.initialization.from_silhouettes import coarse_to_fine
 from kinefit.motion import UP_AXES
 from kinefit.multiview.people import PersonTrack
-from kinefit.observations import DepthFrame, DepthVideo, NamedMarkers, SilhouetteFrame, by_record
+from kinefit.observations import DepthFrame, DepthVideo, KeypointVideo, NamedMarkers, SilhouetteFrame, by_record
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.take.stereo import load_stereo, stereo_sigma
+from kinefit.readers.take.surface_points import sensor_name
+from kinefit.sensors.base import Sensor
+from kinefit.sensors.points.body_trackers import BodyTrackerSensor
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surfaces.surface_points import SurfacePointSensor
 from kinefit.tracking.recording import Recording, spread
@@ -62,6 +65,8 @@ def recording_of(
             k = video.at_step(first + i, rate)
             if k is not None:
                 out.append(video.frame(k))
+            elif isinstance(video, KeypointVideo):
+                out.append(video.unseen(float(times[i])))
         frames = (m.at(float(times[i])) for m in marked)
         return [*out, *(f for f in frames if f is not None)]
 
@@ -75,7 +80,8 @@ def recording_of(
     recording = Recording(
         times, rate, rig, steps=steps, sigma=_sigma(take, seen, stereo), markers=tuple(marked),
         depth=_first_depth(depth, seen), on_body=tuple(v.sensor for v in depth if v.on_body),
-        backgrounds=_backgrounds(depth), start=start, up=take.up, name=take.name, sensors=_surface_sensors(take, seen),
+        backgrounds=_backgrounds(depth), start=start, up=take.up, name=take.name,
+        sensors=_own_sensors(take, seen, body),
     )  # fmt: skip
     if seen.keypoints:
         bare = not (videos or marked or recording.sensors)  # else what a network lifted adds nothing
@@ -110,18 +116,27 @@ def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict
     out |= {f"region {entry.camera}": entry.sigma for entry in take.regions if entry.sigma is not None}
     out |= {f"lines {entry.camera}": entry.sigma for entry in take.lines}
     out |= {entry.camera: entry.sigma for entry in (*take.skin, *take.keypoints)}
-    return out | {marker_sensor(take, k): entry.sigma for k, entry in enumerate(take.markers)}
+    return out | {sensor_name("markers", take.markers, k): entry.sigma for k, entry in enumerate(take.markers)}
 
 
-def _surface_sensors(take: Take, seen: Observations) -> tuple[SurfacePointSensor, ...]:
-    """Sensors of tracked surfaces, which learn where on the body each point is."""
-    pairs = zip(take.surface_points, seen.surface_points)
-    return tuple(SurfacePointSensor(video.sensor, slide=entry.sigma) for entry, video in pairs)
-
-
-def marker_sensor(take: Take, k: int) -> str:
-    """Name of the sensor of the k-th [[markers]] of a take."""
-    return "markers" if len(take.markers) == 1 else f"markers {k + 1}"
+def _own_sensors(take: Take, seen: Observations, body: Body) -> tuple[Sensor, ...]:
+    """Sensors of tracked surfaces, which learn where on the body each point is, and of trackers on the body."""
+    out: list[Sensor] = [
+        SurfacePointSensor(v.sensor, slide=e.sigma) for e, v in zip(take.surface_points, seen.surface_points)
+    ]
+    for k, (entry, video) in enumerate(zip(take.trackers, seen.trackers)):
+        turn, mounts = np.radians(entry.rotation_sigma), {name: np.radians(m) for name, m in entry.mounts.items()}
+        try:
+            sensor = BodyTrackerSensor(
+                video.sensor, entry.points, sigma=entry.sigma, rotation_sigma=float(turn), mounts=mounts,
+                mount_sigma=float(np.radians(entry.mount_sigma)),
+            )  # fmt: skip
+            sensor.places(body, video.names)
+        except KinefitError as error:
+            place = f"[[tracker]] {k + 1}"
+            raise type(error)(error.problem, file=take.path, place=place, remedy=error.remedy) from error
+        out.append(sensor)
+    return tuple(out)
 
 
 def posed_start(take: Take, body: Body, frames: tuple[int, int]) -> tuple[int, BodyState] | None:
@@ -192,7 +207,7 @@ def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[NamedMark
         named = replace(
             markers, names=tuple(names[i] for i in here), positions=markers.positions[:, here]
         )
-        out.append(NamedMarkers(marker_sensor(take, k), named, own, entry.time_offset, std))
+        out.append(NamedMarkers(sensor_name("markers", take.markers, k), named, own, entry.time_offset, std))
     return out, body
 
 

@@ -1,0 +1,67 @@
+"""Trackers fixed on the body: a table of times, names, places and, where they were measured, quaternions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kinefit._files import read_table, repeated
+from kinefit.errors import FileError, ObservationError, choices
+from kinefit.geometry import se3
+from kinefit.observations import BodyTrackerVideo
+from kinefit.readers.units import rate_of
+
+_PLACE, _TURN = ("time_s", "x", "y", "z"), ("qw", "qx", "qy", "qz")
+_REMEDY = "Give a table with the columns time_s, tracker, x, y, z [s, m] and, for orientations, qw, qx, qy, qz."
+_MIN_QUATERNION_NORM = 0.5  # of a unit quaternion that was rounded, there is more
+
+
+def read_body_trackers(
+    path: Path, names: Iterable[str], sensor: str = "trackers", *, time_offset: float = 0.0,
+    T_world_file: ArrayLike | None = None,
+) -> BodyTrackerVideo:  # fmt: skip
+    """Named trackers of a table with the columns time_s, tracker, x, y, z [s, m], and qw, qx, qy, qz where measured.
+
+    Parameters
+    ----------
+    names : of the trackers that are read; rows of others are not
+    time_offset : float [s] added to the times
+    T_world_file : (4, 4) [m] from the frame of the table to the world; default: they are the same
+
+    Raises
+    ------
+    FileError
+        No such table, other columns, a number that is none, a quaternion that is none, a tracker twice at one time.
+    ObservationError
+        A name that the table does not have; a single time, of which no rate follows.
+    """
+    names, T = tuple(names), np.eye(4) if T_world_file is None else np.asarray(T_world_file, float)
+    told, values = read_table(path, _PLACE, _REMEDY, text="tracker", optional=_TURN)
+    for name in names:
+        if name not in told:
+            remedy = "Correct the name in `points` of this [[tracker]]."
+            raise ObservationError(choices("tracker", name, list(dict.fromkeys(told))), file=path, remedy=remedy)
+    turned = np.isfinite(values[:, 4:]).all(axis=1)
+    norm = np.linalg.norm(values[:, 4:], axis=1)
+    odd = ~np.isnan(values[:, 4:]).all(axis=1) & ~(turned & (np.abs(norm - 1.0) < _MIN_QUATERNION_NORM))
+    for bad, problem in (
+        (~np.isfinite(values[:, :4]).all(axis=1), "a number that is not finite"),
+        (odd, "qw, qx, qy, qz are no unit quaternion"),
+    ):
+        if bad.any():
+            place = f"line {int(np.argmax(bad)) + 2}"
+            raise FileError(problem, file=path, place=place, remedy="Leave the row out, or its quaternion empty.")
+    keys = [(t, name) for t, name in zip(values[:, 0].tolist(), told)]
+    if twice := repeated(f"{name} at {t:g} s" for t, name in keys):
+        raise FileError(f"{twice[0]} is there twice", file=path, remedy="Give each tracker one row at each time.")
+    times, frame = np.unique(values[:, 0], return_inverse=True)
+    x, R = np.full((len(times), len(names), 3), np.nan), np.full((len(times), len(names), 3, 3), np.nan)
+    for k, name in enumerate(names):
+        own = np.array([other == name for other in told])
+        x[frame[own], k] = se3.apply(T, values[own, 1:4])
+        R[frame[own & turned], k] = T[:3, :3] @ se3.rotation_from_quaternion(values[own & turned, 4:])
+    rate = rate_of(times, path, _REMEDY)
+    return BodyTrackerVideo(sensor, rate, times + time_offset, names, x, R, source=str(path))
