@@ -25,6 +25,7 @@ from kinefit.bodies.morphs.operators import (
 )
 from kinefit.bodies.morphs.steering import Steering
 from kinefit.bodies.state import BodyState
+from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.surfaces.skins import _kernels_skinning as kernels
 from kinefit.bodies.surfaces.skins.low_pass import low_pass
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
@@ -44,6 +45,7 @@ __all__ = [
 ]
 
 _AROUND, _ALONG = 20, 6  # of cylinders, as `body_mesh` takes them
+_PASSES = 40  # of the coarsest low-pass approximation of a mesh
 
 
 class Morphing:
@@ -115,12 +117,29 @@ class Morphing:
         """Some joint moves with an angle, so that frames are not those of the tree alone."""
         return bool(self._motions)
 
-    def low_pass(self, passes: int) -> Morphing:
-        """The same with a skin without high frequencies (`surfaces.low_pass`), which a fit may begin with (P1 2.4)."""
-        out, skin = copy(self), self.skin
-        shift = low_pass(skin.vertices, skin.faces, passes) - skin.vertices
-        out.skin = out.mesh = SkinnedMesh(skin.nodes + shift[:, None], skin.faces, skin.owners, skin.weights)
-        return out
+    def levels(self, count: int) -> list[Morphing]:
+        """Low-pass approximations from coarse to fine, the last one itself: what a fit goes through (P1 2.4).
+
+        Of surfaces that are Fourier series by their orders, of all other meshes by `low_pass`.
+        """
+        skin, out = self.skin, []
+        own = () if self.mesh is self.body.skin else self.body.surfaces
+        sizes = [len(triangles(s, _AROUND, _ALONG)[0]) for s in own]
+        if sum(sizes) != len(skin.nodes):  # a mesh of other points than the surfaces'
+            own = ()
+        series = {
+            sum(sizes[:k]): s.low_pass_shifts(count)
+            for k, s in enumerate(own) if isinstance(s, MeshSurface) and s.series is not None
+        }  # fmt: skip
+        for k in range(count - 1):
+            passes = round(_PASSES * ((count - 1 - k) / (count - 1)) ** 2)
+            shift = low_pass(skin.vertices, skin.faces, passes) - skin.vertices
+            for first, shifts in series.items():
+                shift[first : first + len(shifts[k])] = shifts[k]
+            smooth = copy(self)
+            smooth.skin = smooth.mesh = SkinnedMesh(skin.nodes + shift[:, None], skin.faces, skin.owners, skin.weights)
+            out.append(smooth)
+        return [*out, self]
 
     def _share(self, morph: LocalMorph) -> NDArray:
         """(V, 1) how much of each node belongs to segments that a local morph acts on."""
