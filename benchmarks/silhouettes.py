@@ -14,6 +14,7 @@ PARTS = {
     "silhouettes_refined": "the realistic skin refined by accurate poses, and with morphs, in a camera held out",
     "silhouettes_speed": "time a frame; the renderer beside others",
     "silhouettes_basin": "from how far off a pose is found, with and without coarse to fine",
+    "silhouettes_low_pass": "from how far off real poses are found, with low-pass surfaces and without",
     "silhouettes_car": "a car on a turntable",
     "silhouettes_cat": "a real toy by the silhouette of its colour",
     "silhouettes_contour": "pose of a closed 3D contour from an image's contour, real and rendered",
