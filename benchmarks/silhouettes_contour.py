@@ -229,7 +229,8 @@ class Command:
                 at, forward, upward = T[:3, 3].tolist(), T[:3, 0].tolist(), T[:3, 1].tolist()
                 (folder / "take.toml").write_text(
                     f'[take]\nrate = 30.0\nup = "-y"\nbody = "sheet.toml"\nsize = false\n[start]\nat = {at}\n'
-                    f'forward = {forward}\nupward = {upward}\nlow_pass = {str(low_pass).lower()}\n[calibration]\nfile = "rig.toml"\nunit = "m"\n'
+                    f'forward = {forward}\nupward = {upward}\nlow_pass = {str(low_pass).lower()}\n'
+                    '[calibration]\nfile = "rig.toml"\nunit = "m"\n'
                     f'[[camera]]\nname = "{name}"\nsize = [{width}, {height}]\n'
                     f'[[silhouette]]\ncamera = "{name}"\nfile = "masks"\nrate = 30.0\nsigma = 1.0\n'
                 )

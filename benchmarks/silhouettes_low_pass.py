@@ -6,6 +6,7 @@ its own whose `[start]` is off. References: the recording's poses of the toy, an
 
 from __future__ import annotations
 
+import re
 import tempfile
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from benchmarks.regions_cat import images, truth
 from benchmarks.regions_scene import away
 from benchmarks.silhouettes_cat import take_by_silhouettes
 from benchmarks.silhouettes_contour import off_by
-from benchmarks.silhouettes_track import take_text, tracked
+from benchmarks.silhouettes_track import FRAMES, take_text, tracked
 from kinefit.bodies.serial import save_body
 from kinefit.motion import Motion
 from kinefit.tracking.takes.take import track_take
@@ -78,12 +79,12 @@ def _found(folder: Path, motion: Motion, i: int, angles: NDArray, line: str) -> 
     degrees = np.degrees(np.clip(angles, tree.lower, tree.upper))
     listed = ", ".join(f"{name} = {value:.4f}" for name, value in zip(tree.coordinates, degrees))
     start = f"[start]\nat = {T[:3, 3].tolist()}\nforward = {T[:3, 0].tolist()}\nupward = {T[:3, 1].tolist()}\n"
-    text = take_text(folder, "masks", keypoints="frames = [0, 0]\n").replace("height = 1.75\n", "size = false\n")
-    text = "\n".join(row for row in text.split("\n"))
+    text = take_text(folder, "masks").replace("height = 1.75\n", "size = false\n")
+    text = re.sub(r"\[\[keypoints\]\]\n(.+ = .+\n)+", "", text)
     with tempfile.TemporaryDirectory() as work:
         save_body(body, Path(work) / "body.npz")
         text = text.replace("[take]\n", '[take]\nbody = "body.npz"\n', 1)
-        text = text.replace("frames = [0, 100]", f"frames = [{i}, {i + 1}]", 1)
+        text = text.replace(f"frames = [0, {FRAMES}]", f"frames = [{i}, {i + 1}]", 1)
         text = text.replace("[calibration]\n", f"{start}{line}angles = {{ {listed} }}\n[calibration]\n", 1)
         (Path(work) / "take.toml").write_text(text)
         found = track_take(Path(work) / "take.toml")[0].state(0)
