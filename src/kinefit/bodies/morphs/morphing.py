@@ -241,7 +241,8 @@ class Morphing:
         rise = r[:, None] * (-2.0 * (y - bulge.centre) / np.square(bulge.radii)) @ R[bone].T  # of r, in the world
         field = r[:, None] * (along @ R[owner])
         slopes = dict(pose.slopes)
-        slopes[6 + d] = slopes.get(6 + d, 0.0) + slope * field
+        none = np.zeros_like(field)
+        slopes[6 + d] = slopes.get(6 + d, none) + slope * field
         of_bone, centre = pose.segment_jacobian(bone), pose.state.T_world_root[:3, 3]
         for n in np.unique(owner[r > _FADED]):
             apart, own = pose.segment_jacobian(int(n)) - of_bone, owner == n
@@ -250,7 +251,7 @@ class Morphing:
                 more = np.sum(rise[own] * (v + np.cross(w, at[own] - centre)), axis=1)[:, None] * along
                 change = np.zeros_like(field)
                 change[own] = weight * (more - r[own, None] * np.cross(w, along)) @ R[n]
-                slopes[k] = slopes.get(k, 0.0) + change
+                slopes[int(k)] = slopes.get(int(k), none) + change
         shift = weight * field if pose.shift is None else pose.shift + weight * field
         return replace(pose, shift=shift, slopes=slopes)
 
