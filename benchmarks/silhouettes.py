@@ -8,6 +8,7 @@ PARTS = {
     "silhouettes_cga": "conformal geometric algebra",
     "silhouettes_morphing": "a morphing shoulder, rendered",
     "silhouettes_shoulders": "the real trial with shoulders that morph and with stiff ones, in a camera held out",
+    "silhouettes_collar_bones": "shoulders with joints of their own, rendered",
     "silhouettes_torso": "a man's torso into a woman's, with local morphs on top",
     "silhouettes_track": "the real trial by silhouettes alone",
     "silhouettes_anny": "the real trial on a realistic skin of the person's shape",

@@ -1,9 +1,9 @@
 """Time of a frame, from the images of four cameras to a judged pose; the renderer beside other ones.
 
 Rendered: colour pictures of a body in two colours, without noise. Real: the masks of the balancing trial, made smaller
-and outlined in each frame, with the humanoid as its take has it. Processor time of all threads, of each frame the least of
-several rounds, of these the median: a loaded machine counts more, so a reference, products of matrices, and the real
-frame beside the rendered one are printed along.
+and outlined in each frame, with the humanoid as its take has it. Processor time of all threads, the least of several
+rounds for each frame, the median of the frames: a loaded machine counts more, so a reference, products of matrices, and
+the real frame beside the rendered one are printed along.
 
 `KINEFIT_MODERNGL_PYTHON` and `KINEFIT_EMBREE_PYTHON` name interpreters that have moderngl (with a software OpenGL) and
 trimesh with embreex; without them those figures are not measured.
