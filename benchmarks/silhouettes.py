@@ -7,6 +7,7 @@ from benchmarks.figures import run_parts
 PARTS = {
     "silhouettes_cga": "conformal geometric algebra",
     "silhouettes_morphing": "a morphing shoulder, rendered",
+    "silhouettes_morphing_take": "the same shoulder by takes, every joint free",
     "silhouettes_shoulders": "the real trial with shoulders that morph and with stiff ones, in a camera held out",
     "silhouettes_collar_bones": "shoulders with joints of their own, rendered",
     "silhouettes_torso": "a man's torso into a woman's, with local morphs on top",
