@@ -66,7 +66,7 @@ def run() -> None:
         write_masks(folder, states)
         (folder / "stiff.toml").write_text(stiff())
         found = [np.degrees(np.abs(angles(folder, name, states[0]) - truth)) for name in (body.name, "stiff.toml")]
-    print(f"#   angle by angle, morphing {np.round(found[0].mean(axis=0), 2)}, stiff {np.round(found[1].mean(axis=0), 2)}")
+    print("#   angle by angle, morphing {}, stiff {}".format(*(np.round(error.mean(axis=0), 2) for error in found)))
     morphing, rigid = (float(error.mean()) for error in found)
     figure("morphing_arm_take_deg", morphing, "deg mean, by a take, every joint free", "<= 0.5")
     figure("morphing_arm_take_to_rigid", morphing / rigid, f"of the stiff body's {rigid:.2f} deg", "<= 0.5")
