@@ -75,7 +75,7 @@ def car(shape: FourierSurface) -> Body:
     )
     corners = PointSet(("front", "back", "left", "right"), np.zeros(4, int), half * np.array(
         [(1.0, 0.2, 0), (-1.0, 0.2, 0), (0, 0.2, -0.42), (0, 0.2, 0.42)]))  # fmt: skip
-    mesh = MeshSurface(0, vertices, faces)
+    mesh = MeshSurface(0, vertices, faces, series=shape, nodes=(128, 48))
     return Body("car", tree, ("free",), ("whole",), np.zeros(1, int), corners, surfaces=(mesh,))
 
 
@@ -139,22 +139,22 @@ def _basin(whole: FourierSurface, rig: Rig, accuracy: dict[str, float]) -> None:
     """From how far turned the car is found: the whole surface alone, and from low frequencies to all of them."""
     fine = Level(640, 0.03, 0.005, 1.0)
     levels = (Level(80, 0.12, 0.04, 1.4), Level(160, 0.06, 0.02, 1.2), fine)
-    bodies = [car(whole.low_pass(*orders)) for orders in ((2, 2), (5, 4))] + [car(whole)]
+    body = car(whole)
     kinds = {
-        "finest level alone": ([fine], bodies[-1:]),
-        "image coarse to fine": (levels, bodies[-1:] * 3),
-        "Fourier coarse to fine": ([level._replace(side=640) for level in levels], bodies),
-        "image and Fourier coarse to fine": (levels, bodies),
+        "finest level alone": ([fine], False),
+        "image coarse to fine": (levels, False),
+        "Fourier coarse to fine": ([level._replace(side=640) for level in levels], True),
+        "image and Fourier coarse to fine": (levels, True),
     }
     share = {kind: np.zeros(len(OFF)) for kind in kinds}
     for k, off in enumerate(OFF):
         rng = np.random.default_rng(k)
         for turn in rng.uniform(0, 2 * np.pi, TRIALS):
-            seen = [_seen(bodies[-1], placed(turn), rig, name, 0) for name in rig.names]
+            seen = [_seen(body, placed(turn), rig, name, 0) for name in rig.names]
             start = placed(turn + np.radians(off) * rng.choice([-1, 1]))
-            for kind, (steps, shapes) in kinds.items():
+            for kind, (steps, low_pass) in kinds.items():
                 found = coarse_to_fine(
-                    shapes[-1], rig, seen, start, sigma=accuracy, levels=steps, smooth=shapes, settings=SETTINGS
+                    body, rig, seen, start, sigma=accuracy, levels=steps, low_pass=low_pass, settings=SETTINGS
                 ).result.state
                 R = found.T_world_root[:3, :3].T @ placed(turn).T_world_root[:3, :3]
                 share[kind][k] += (np.trace(R) > 1 + 2 * np.cos(np.radians(2.0))) / TRIALS

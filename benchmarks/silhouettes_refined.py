@@ -107,7 +107,7 @@ def run() -> None:
               f"{a.distance.mean():.1f} and {b.distance.mean():.1f} mm", flush=True)  # fmt: skip
     once, again = (np.array([f[k] for f in found]) for k in (0, 1))
     (a, b), (c, d) = (
-        [np.array([getattr(f[k], field) for f in found]) for k in (2, 3)] for field in Shoulders._fields
+        [np.array([getattr(f[k], field) for f in found]) for k in (2, 3)] for field in Shoulders._fields[:2]
     )
     values = {"anny_refined_gain": gain(again, once), "anny_morphing_overlap_gain": gain(a, b),
               "anny_morphing_outline_gain": gain(-c, -d)}  # fmt: skip

@@ -53,6 +53,8 @@ def read(kind, text, folder):
         path.touch()
     for name in re.findall(r'mesh = "(.+?)"', text):
         (folder / name).write_text(BOX)
+    for name in re.findall(r'contour = "(.+?)"', text):
+        (folder / name).write_text("0.1,0.0,0.0\n0.0,0.1,0.0\n-0.1,0.0,0.0\n0.0,-0.1,0.0\n")
     for name in re.findall(r'weights = "(.+?)"', text):
         (folder / name).write_text("".join(f"{k + 1}, limb, 1\n" for k in range(8)))
     if 'body = "snowboarder.toml"' in text:  # as `kinefit body copy` leaves it

@@ -102,7 +102,7 @@ def test_a_body_that_morphs_is_fitted_as_such_from_low_frequencies_to_high():
 
     model = Morphing(body)
     seen = contours_of(model, posed(12.0), cameras)
-    fits = {name: pose_from_contours(own, posed(0.0), cameras, seen, passes=(8, 0), cycles=12)
+    fits = {name: pose_from_contours(own, posed(0.0), cameras, seen, levels=2, cycles=12)
             for name, own in (("morphing", body), ("stiff", replace(body, morphs=())))}  # fmt: skip
     off = {name: np.degrees(np.abs(fit.state.angles - posed(12.0).angles))[arms].mean() for name, fit in fits.items()}
     assert off["morphing"] < 4.0 and off["morphing"] < off["stiff"]

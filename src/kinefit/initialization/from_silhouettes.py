@@ -1,4 +1,4 @@
-"""A pose from silhouettes that are far off: coarse to fine in the image, in reach, and in which way outlines face."""
+"""A pose from silhouettes that are far off: coarse to fine in image, reach, normals and surface (P1 2.4)."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from kinefit.observations import SilhouetteFrame
 from kinefit.sensors.regions.silhouette import SilhouetteMeasurement
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.sensors.visibility.surface import TrackedSurface
 
 
 class Level(NamedTuple):
@@ -51,46 +52,50 @@ class FarFit(NamedTuple):
 def coarse_to_fine(
     body: Body, rig: Rig, frames: Sequence[SilhouetteFrame], state: BodyState, *,
     sigma: Mapping[str, float] | None = None, levels: Sequence[Level] = LEVELS,
-    smooth: Sequence[Body] = (), settings: TrackSettings | None = None,
+    low_pass: bool = True, settings: TrackSettings | None = None,
 ) -> FarFit:  # fmt: skip
     """Fit silhouettes of one time from a pose that may be tens of degrees off in every joint.
 
-    Coarse levels reach far, but may leave a pose that is near; so it is begun at every level in turn, and what overlaps
-    the silhouettes most is taken.
+    Coarse levels reach far, but may leave a pose that is near; so it is begun at every level in turn, with low-pass
+    approximations of the surface and without, and what overlaps the silhouettes most is taken.
 
     Parameters
     ----------
     sigma : {"silhouette CAMERA": standard deviation [px]}, others as in the settings.
     levels : the last one alone is what the tracker does from frame to frame.
-    smooth : the body for each level, such as low-pass approximations of a surface (P1 2.4); default: as it is.
+    low_pass : whether it is also begun with low-pass approximations of the body's surface (`Morphing.levels`, P1 2.4).
 
     Raises
     ------
     ObservationError
-        No silhouettes, or no levels, or another number of bodies.
+        No silhouettes, or no levels.
     """
     if not frames or not levels:
         raise ObservationError("no silhouettes to fit, or no levels", remedy="Give those of one camera or more.")
-    bodies = tuple(smooth) or (body,) * len(levels)
-    if len(bodies) != len(levels):
-        raise ObservationError(f"{len(bodies)} bodies for {len(levels)} levels", remedy="Give one body for each.")
     settings = settings or TrackSettings()
-    fits = []
-    for own_body, level in zip(bodies, levels):
-        steps = settings.iterations * _PATIENCE
-        own = replace(
-            settings, outline=level.side, far=level.far, near=level.near, angle=level.angle, iterations=steps
+    owns = [
+        replace(
+            settings, outline=level.side, far=level.far, near=level.near, angle=level.angle,
+            iterations=settings.iterations * _PATIENCE,
         )
-        first_scene = Scene(own_body, state, rig, samples=own.samples)
-        fits.append((FrameFit(own_body, own), Sensors(rig, 1.0, dict(sigma or {}), own), first_scene))
+        for level in levels
+    ]  # fmt: skip
+    whole = TrackedSurface(body, settings.samples)
+    fits = [(FrameFit(body, own), Sensors(rig, 1.0, dict(sigma or {}), own)) for own in owns]
+    plain = [Scene(body, state, rig, samples=settings.samples, surface=whole)] * len(levels)
+    chains = [(first, plain) for first in range(len(levels) - 1, -1, -1)]
+    if low_pass:
+        surfaces = [whole.with_shape(shape) for shape in whole.morphing.levels(len(levels))]
+        smooth = [Scene(body, state, rig, samples=settings.samples, surface=surface) for surface in surfaces]
+        chains += [(first, smooth) for first in range(len(levels) - 2, -1, -1)]
     best: FarFit | None = None
-    for first in range(len(levels) - 1, -1, -1):
+    for first, scenes in chains:
         now = state
-        for fit, sensors, scene in fits[first:]:
+        for (fit, sensors), scene in list(zip(fits, scenes))[first:]:
             there = scene.at(now)
             result = fit.run(there, None, sensors.measurements(frames, there)).result
             now = result.state
-        there = fits[-1][2].at(now)
+        there = plain[-1].at(now)
         last = fits[-1][1].measurements(frames, there)
         overlap = float(np.mean([cast(SilhouetteMeasurement, m).overlap(there) for m in last]))
         if best is None or overlap > best.overlap + _GAIN:

@@ -66,7 +66,7 @@ def pose_from_contours(
     rig: Rig,
     contours: Mapping[str, NDArray],
     *,
-    passes: Sequence[int] = (0,),
+    levels: int = 1,
     reach: float = 60.0,
     cycles: int = 30,
     tolerance: float = 1e-4,
@@ -78,8 +78,8 @@ def pose_from_contours(
     model : Body, with its skin and its morphs, or what was made of it once.
     state : BodyState to begin with, the last frame's.
     contours : camera -> (4, N) as `contour_points` gives them, in the image of the calibration.
-    passes : of the low-pass filter of the model's surface (`Morphing.low_pass`), one approximation after the other; 0
-        is the surface itself.
+    levels : how many approximations of the model's surface follow each other, low frequencies first, the surface
+        itself last (`Morphing.levels`); 1 is the surface alone.
     reach : float [px] beyond which no points are paired.
     cycles : int, at most, of each approximation.
     tolerance : float, of a step (metres and radians) that ends the cycles of one.
@@ -91,8 +91,7 @@ def pose_from_contours(
     """
     whole = Morphing(model) if isinstance(model, Body) else model
     error, done = np.nan, 0
-    for times in passes:
-        shape = whole.low_pass(times) if times else whole
+    for shape in whole.levels(levels):
         finder = RimFinder(shape.mesh)
         for _ in range(cycles):
             pose, parts = shape.pose(state), []
@@ -137,12 +136,12 @@ def track_contours(
     images: Iterable[Mapping[str, NDArray]],
     colours: Mapping[str, Sequence[ArrayLike]],
     *,
-    passes: Sequence[int] = (0,),
+    levels: int = 1,
 ) -> Iterator[PaperFit]:
     """Frame after frame, each from the last one's pose: images camera -> (H, W, 3), colours camera -> (low, high)."""
     model, state = Morphing(body), start
     for seen in images:
         contours = {name: contour_points(image, *colours[name]) for name, image in seen.items()}
-        fit = pose_from_contours(model, state, rig, contours, passes=passes)
+        fit = pose_from_contours(model, state, rig, contours, levels=levels)
         state = fit.state
         yield fit

@@ -90,8 +90,7 @@ class Scene:
         """
         if any(c is camera for c in self.rig.cameras) or camera.name not in self.rig:
             return camera
-        there = self.rig[camera.name]
-        return camera if np.array_equal(there.T_camera_world, camera.T_camera_world) else _placed(camera, there)
+        return _placed(camera, self.rig[camera.name])
 
     @property
     def surface(self) -> TrackedSurface:
@@ -178,4 +177,5 @@ class Scene:
 
 @lru_cache(maxsize=64)
 def _placed(camera: Camera, there: Camera) -> Camera:
-    return camera.with_pose(there.T_camera_world)
+    same = np.array_equal(there.T_camera_world, camera.T_camera_world)
+    return camera if same else camera.with_pose(there.T_camera_world)

@@ -286,3 +286,27 @@ def test_bases_do_not_go_round(tmp_path):
         (tmp_path / f"{name}.toml").write_text(f'[body]\nname = "{name}"\nbase = "{base}.toml"\n')
     with pytest.raises(BodyError, match="round in a circle"):
         load_body(tmp_path / "a.toml")
+
+
+def test_shoulders_with_joints_of_their_own_carry_their_bulges():
+    """P1 3.3: up and down, forward and back, both at once, about the collar bone; a file and its copies agree."""
+    body = load_body("humanoid_shoulders")
+    tree, mesh = body.tree, Morphing(body).mesh
+    trunk = mesh.segment == tree.segment("thorax")
+    rest = posed(body).vertices
+    found = {name: posed(body, **angles).vertices - rest for name, angles in {
+        "up": {"clav_elev_r": 20}, "down": {"clav_elev_r": -10}, "forward": {"clav_prot_r": 20},
+        "back": {"clav_prot_r": -15}, "both": {"clav_elev_r": 20, "clav_prot_r": 20}}.items()}  # fmt: skip
+    for axis, ahead, against in ((1, "up", "down"), (0, "forward", "back")):
+        assert found[ahead][trunk, axis].max() > 0.005 and found[against][trunk, axis].min() < -0.003
+        assert np.abs(found[ahead][trunk & (rest[:, 2] < -0.1)]).max() < 1e-4  # nothing on the other side
+    assert min(found["both"][trunk, k].max() for k in (0, 1)) > 0.005
+    raised, held = (posed(replace(body, morphs=tuple(replace(m, moves=moves) for m in body.morphs)), clav_elev_r=40)
+                    for moves in (True, False))  # fmt: skip
+    apart = np.linalg.norm(raised.vertices - held.vertices, axis=1)
+    assert apart[trunk].max() > 0.003 and apart[~trunk].max() == 0.0
+    entries = without_images(format_morphs(body.morphs, body.tree))
+    written = parse_body(f'[body]\nname = "again"\nbase = "humanoid"\nmirror = true\n{entries}')
+    for again in (body_from_arrays(body_to_arrays(body)), written):
+        angles = {"clav_elev_l": 25, "clav_prot_r": 10}
+        np.testing.assert_allclose(posed(again, **angles).vertices, posed(body, **angles).vertices, atol=1e-9)

@@ -175,6 +175,33 @@ def test_derivatives_by_differences(scene, blended):
         np.testing.assert_allclose(J[:, :, k], difference / (2 * h), atol=2e-8)
 
 
+@pytest.mark.parametrize("blended", [False, True])
+def test_a_bulge_that_moves_with_a_bone(scene, blended):
+    """P1 3.3: the nodes about the bone's place in this pose bulge, along its direction; derivatives by differences."""
+    body, mesh, state, operators = scene
+    tree, bone = body.tree, body.tree.segments[4]
+    mesh = random_skin(body) if blended else mesh
+    centre, radii, shift = np.array([0.05, 0.1, 0.0]), np.array([0.5, 0.6, np.inf]), np.array([0.03, 0.0, 0.05])
+    bulge = LocalMorph(centre, radii, shift, Steering(tree.coordinates[1], -2.0, 2.0), bone, moves=True)
+    alone = Morphing(body, mesh, [bulge])
+    pose, plain = alone.pose(state), Morphing(body, mesh, []).pose(state)
+    weight = bulge.steering.at(state.angles[1])[0]
+    R, t = plain.frames[4, :9].reshape(3, 3), plain.frames[4, 9:]
+    if not blended:
+        r = radial_basis((plain.vertices - t) @ R, tree.rest[4] + centre, radii)
+        np.testing.assert_allclose(pose.vertices, plain.vertices + weight * r[:, None] * (R @ shift), atol=1e-12)
+        still = Morphing(body, mesh, [LocalMorph(centre, radii, shift, bulge.steering, bone)]).pose(state)
+        assert np.abs(still.vertices - pose.vertices).max() > 0.005
+    model, index, h = Morphing(body, mesh, [*operators[:3], bulge]), np.arange(60), 1e-6
+    found, expected = model.pose(state).jacobian(index), []
+    for step in h * np.eye(tree.n_dofs):
+        ahead, back = (model.pose(state.retract(sign * step)).vertices for sign in (1.0, -1.0))
+        expected.append((ahead - back) / (2 * h))
+    np.testing.assert_allclose(found, np.moveaxis(expected, 0, -1), atol=1e-7)
+    with pytest.raises(BodyError, match="moves with no segment"):
+        LocalMorph(centre, radii, shift, bulge.steering, moves=True)
+
+
 def shoulder():
     """The humanoid whose right shoulder sinks and comes forward as the arm does, twice morphed (P1, figure 9)."""
     body = load_body("humanoid")

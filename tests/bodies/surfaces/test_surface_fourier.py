@@ -173,6 +173,28 @@ def test_bad_input_says_what_is_wrong(make, message):
         make()
 
 
+def test_a_body_file_names_a_contour(tmp_path):
+    """P1 2.2: a thin plate whose boundary is the curve, from points that are not evenly spaced, in millimetres."""
+    u = 2 * np.pi * np.arange(20_000) / 20_000
+    ring = np.stack([0.10 * np.cos(u), 0.02 * np.sin(2 * u), -0.06 * np.sin(u)], axis=-1)
+    some = np.sort(np.random.default_rng(3).choice(len(ring), 2000, replace=False))
+    np.savetxt(tmp_path / "loop.csv", 1e3 * ring[some], delimiter=",")
+    text = '[body]\nname = "loop"\n[[segment]]\nname = "loop"\njoint = { name = "free", type = "free" }\n'
+    text += 'surface = { contour = "loop.csv", unit = "mm", order = 12, mirror = true }\n'
+    (tmp_path / "loop.toml").write_text(text)
+    mesh = load_body(tmp_path / "loop.toml").surfaces[0]
+    assert mesh.open_edges == 0 and mesh.series.order == 12
+    front, back = mesh.vertices.reshape(2, -1, 3)
+    np.testing.assert_allclose(np.linalg.norm(front - back, axis=1), 0.001, atol=1e-9)
+    middle = 0.5 * (front + back)[:-1]
+    away = np.linalg.norm(middle[:, None] - ring * (1.0, 1.0, -1.0), axis=2).min(axis=1)
+    assert len(middle) == 256 and away.max() < 0.0005
+    (tmp_path / "loop.toml").write_text(text.replace("order = 12", "order = 200"))
+    with pytest.raises(BodyError, match="order 200 of a series that was sampled for 128") as caught:
+        load_body(tmp_path / "loop.toml")
+    assert str(caught.value.file).endswith("loop.csv")
+
+
 def test_a_body_file_names_a_series(tmp_path):
     u, v = np.meshgrid(np.arange(12) / 12, np.linspace(0, 1, 9), indexing="ij")
     r = 0.05 + 0.02 * np.sin(np.pi * v) + 0.004 * np.cos(6 * np.pi * u)

@@ -137,6 +137,28 @@ def test_a_start_at_a_later_step_tracks_both_ways(rigid):
     assert len(motion) == FRAMES and turned.max() < 1.5 and away.max() < 0.003
 
 
+@pytest.mark.parametrize("low_pass", ["", "low_pass = false\n"])
+def test_a_contour_by_the_command(tmp_path, low_pass):
+    """P1 2.2: a closed curve with no surface is found by its image in one camera, from 25 degrees off."""
+    u = 2 * np.pi * np.arange(200) / 200
+    r = 0.15 + 0.03 * np.cos(2 * u + 0.4) + 0.02 * np.sin(3 * u)
+    np.savetxt(tmp_path / "sheet.csv", np.stack([r * np.cos(u), r * np.sin(u), 0 * u], axis=1), delimiter=",")
+    text = BODY.replace('mesh = "pebble.obj"', 'contour = "sheet.csv"').replace("pebble", "sheet")
+    (tmp_path / "sheet.toml").write_text(text)
+    body, rig = load_body(str(tmp_path / "sheet.toml")), ring(1, size=(480, 360), f=500.0, away=0.9)
+    T = np.linalg.inv(rig["c0"].T_camera_world) @ se3.transform(se3.exp_so3([0.5, -0.4, 0.2]), [0.02, -0.03, 0.8])
+    mask = render_body(body, BodyState(T, np.zeros(0)), rig["c0"]).seen
+    seen = [[SilhouetteFrame("c0", 0.0, mask).mask] * 2]
+    start = T @ se3.transform(se3.exp_so3(np.radians(25.0) * np.array([0.6, 0.64, 0.48])), [0.02, 0.01, -0.02])
+    head = 'body = "sheet.toml"\nsize = false\n[start]\n' + low_pass + f"at = {start[:3, 3].tolist()}\n"
+    head += f"forward = {start[:3, 0].tolist()}\nupward = {start[:3, 1].tolist()}"
+    told = CliRunner().invoke(main, ["track", str(saved(tmp_path, rig, seen, head)), "-o", str(tmp_path / "out")])
+    assert told.exit_code == 0, told.output
+    found = read_motion(tmp_path / "out" / "motion.npz").Ts_world_root[0]
+    assert np.degrees(np.linalg.norm(se3.log_so3(found[:3, :3].T @ T[:3, :3]))) < 1.5
+    assert np.linalg.norm(found[:3, 3] - T[:3, 3]) < 0.004
+
+
 def test_a_person_who_is_put_by_angles(tmp_path):
     """The stated angles are taken, the others are the body's usual ones."""
     body, rig = load_body("humanoid"), ring()

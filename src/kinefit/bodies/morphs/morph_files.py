@@ -21,7 +21,7 @@ from kinefit.geometry import se3
 Vector = tuple[float, float, float]
 KINDS = {
     "joint": ({"segment"}, {"shift", "turn"}),  # what each needs, and may have
-    "local": ({"segment", "centre", "radii", "shift"}, {"on"}),
+    "local": ({"segment", "centre", "radii", "shift"}, {"on", "moves"}),
     "surface": ({"segment", "surface"}, set[str]()),
     "global": ({"target"}, {"unit"}),
 }
@@ -43,6 +43,7 @@ class MorphRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     centre: Vector | None = None
     radii: Vector | None = None
     on: list[str] | None = None
+    moves: bool | None = None
     surface: SurfaceRecord | list[SurfaceRecord] | None = None
     target: str | None = None
     unit: str | None = None
@@ -119,7 +120,7 @@ def _morph(record: MorphRecord, tree: KinematicTree, source: str) -> Operator:
         if not all(radius > 0.0 for radius in record.radii):
             raise BodyError(f"radii {list(record.radii)} of a bulge", remedy="Give positive ones; inf leaves one out.")
         placed = np.array(record.centre), np.array(record.radii), np.array(record.shift)
-        return LocalMorph(*placed, steering, record.segment, tuple(record.on or ()))
+        return LocalMorph(*placed, steering, record.segment, tuple(record.on or ()), bool(record.moves))
     if record.kind == "surface":
         assert record.segment
         surfaces = surfaces_of(record.surface, tree.segment(record.segment), source, "surface")
@@ -184,6 +185,7 @@ def _entry(morph: Operator, tree: KinematicTree) -> str:
         segment = morph.segment or tree.segments[0]
         own = [f'segment = "{segment}"', f"centre = {_numbers(morph.centre)}", f"radii = {_numbers(morph.radii)}"]
         own += [f"shift = {_numbers(morph.shift)}"] + [f"on = {list(morph.on)}".replace("'", '"')] * bool(morph.on)
+        own += ["moves = true"] * morph.moves
         kind = "local"
     elif isinstance(morph, SegmentMorph):
         kind, own = "surface", [f'segment = "{morph.segment}"', f"surface = {_surfaces(morph)}"]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -25,6 +25,7 @@ from kinefit.bodies.morphs.operators import (
 )
 from kinefit.bodies.morphs.steering import Steering
 from kinefit.bodies.state import BodyState
+from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.surfaces.skins import _kernels_skinning as kernels
 from kinefit.bodies.surfaces.skins.low_pass import low_pass
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
@@ -44,6 +45,8 @@ __all__ = [
 ]
 
 _AROUND, _ALONG = 20, 6  # of cylinders, as `body_mesh` takes them
+_FADED = 1e-6  # of a radial basis function: less of a bulge moves no node
+_PASSES = 40  # of the coarsest low-pass approximation of a mesh
 
 
 class Morphing:
@@ -93,11 +96,14 @@ class Morphing:
         for o, s in motions:
             self._motions.setdefault(s, []).append(o)
         self._fields: list[tuple[Steering, NDArray]] = []
+        self._bulges: list[tuple[LocalMorph, NDArray, int]] = []  # that move: placed at rest, shares of nodes, segment
         for o in self.operators:
             if isinstance(o, GlobalMorph):
                 self._fields.append((o.steering, o.field(x, parameters)))
             elif isinstance(o, SegmentMorph):
                 self._fields.append((o.steering, self._segment_field(o)))
+            elif isinstance(o, LocalMorph) and o.moves:
+                self._bulges.append((o.placed(tree), self._share(o)[:, 0], tree.segment(str(o.segment))))
             elif isinstance(o, LocalMorph):
                 self._fields.append((o.steering, self._share(o) * o.placed(tree).field(x, parameters)))
         above = np.eye(len(tree.segments), dtype=bool)
@@ -115,12 +121,29 @@ class Morphing:
         """Some joint moves with an angle, so that frames are not those of the tree alone."""
         return bool(self._motions)
 
-    def low_pass(self, passes: int) -> Morphing:
-        """The same with a skin without high frequencies (`surfaces.low_pass`), which a fit may begin with (P1 2.4)."""
-        out, skin = copy(self), self.skin
-        shift = low_pass(skin.vertices, skin.faces, passes) - skin.vertices
-        out.skin = out.mesh = SkinnedMesh(skin.nodes + shift[:, None], skin.faces, skin.owners, skin.weights)
-        return out
+    def levels(self, count: int) -> list[Morphing]:
+        """Low-pass approximations from coarse to fine, the last one itself: what a fit goes through (P1 2.4).
+
+        Of surfaces that are Fourier series by their orders, of all other meshes by `low_pass`.
+        """
+        skin, out = self.skin, []
+        own = () if self.mesh is self.body.skin else self.body.surfaces
+        sizes = [len(triangles(s, _AROUND, _ALONG)[0]) for s in own]
+        if sum(sizes) != len(skin.nodes):  # a mesh of other points than the surfaces'
+            own = ()
+        series = {
+            sum(sizes[:k]): s.low_pass_shifts(count)
+            for k, s in enumerate(own) if isinstance(s, MeshSurface) and s.series is not None
+        }  # fmt: skip
+        for k in range(count - 1):
+            passes = round(_PASSES * ((count - 1 - k) / (count - 1)) ** 2)
+            shift = low_pass(skin.vertices, skin.faces, passes) - skin.vertices
+            for first, shifts in series.items():
+                shift[first : first + len(shifts[k])] = shifts[k]
+            smooth = copy(self)
+            smooth.skin = smooth.mesh = SkinnedMesh(skin.nodes + shift[:, None], skin.faces, skin.owners, skin.weights)
+            out.append(smooth)
+        return [*out, self]
 
     def _share(self, morph: LocalMorph) -> NDArray:
         """(V, 1) how much of each node belongs to segments that a local morph acts on."""
@@ -194,7 +217,43 @@ class Morphing:
                 shift = weight * field if shift is None else shift + weight * field
             if slope:
                 slopes[6 + d] = slopes[6 + d] + slope * field if 6 + d in slopes else slope * field
-        return MorphedPose(self, state, frames, screws, shift, slopes, tuple(drives))
+        out = MorphedPose(self, state, frames, screws, shift, slopes, tuple(drives))
+        for bulge, share, segment in self._bulges:
+            out = self._bulged(out, bulge, share, segment)
+        return out
+
+    def _bulged(self, pose: MorphedPose, bulge: LocalMorph, share: NDArray, bone: int) -> MorphedPose:
+        """The pose with a bulge that goes along with a bone: r(y) of nodes y as the bone sees them in this pose.
+
+        Of a node x at rest on segment n, y = T_bone⁻¹ T_n x, and s r(y) R_nᵀ R_bone d is added to x. An angle that
+        moves n against the bone with (v, ω) changes y by R_boneᵀ (v + ω × T_n x), and turns R_nᵀ R_bone d by −ω.
+        """
+        d, weight, slope = self._steered(bulge.steering, pose.state)
+        if not weight and not slope:
+            return pose
+        skin, f = self.skin, pose.frames
+        owner = np.take_along_axis(skin.owners, skin.weights.argmax(axis=1)[:, None], axis=1)[:, 0]
+        R, t = f[:, :9].reshape(-1, 3, 3), f[:, 9:]
+        at = np.einsum("vij,vj->vi", R[owner], skin.vertices) + t[owner]
+        y = (at - t[bone]) @ R[bone]
+        r = share * radial_basis(y, bulge.centre, bulge.radii)
+        along = R[bone] @ np.asarray(bulge.shift, float)
+        rise = r[:, None] * (-2.0 * (y - bulge.centre) / np.square(bulge.radii)) @ R[bone].T  # of r, in the world
+        field = r[:, None] * (along @ R[owner])
+        slopes = dict(pose.slopes)
+        none = np.zeros_like(field)
+        slopes[6 + d] = slopes.get(6 + d, none) + slope * field
+        of_bone, centre = pose.segment_jacobian(bone), pose.state.T_world_root[:3, 3]
+        for n in np.unique(owner[r > _FADED]):
+            apart, own = pose.segment_jacobian(int(n)) - of_bone, owner == n
+            for k in np.flatnonzero(np.abs(apart).max(axis=0) > 0.0):
+                v, w = apart[:3, k], apart[3:, k]
+                more = np.sum(rise[own] * (v + np.cross(w, at[own] - centre)), axis=1)[:, None] * along
+                change = np.zeros_like(field)
+                change[own] = weight * (more - r[own, None] * np.cross(w, along)) @ R[n]
+                slopes[int(k)] = slopes.get(int(k), none) + change
+        shift = weight * field if pose.shift is None else pose.shift + weight * field
+        return replace(pose, shift=shift, slopes=slopes)
 
 
 @dataclass(frozen=True, eq=False)

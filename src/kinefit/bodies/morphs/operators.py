@@ -125,6 +125,13 @@ class LocalMorph:
     steering : Steering
     segment : str, that whose frame the centre is in; default: the root frame at rest.
     on : names of the segments whose nodes it moves; default: all.
+    moves : whether centre and shift go along with the segment, so that the nodes bulge that it gets to: a shoulder
+        blade under the skin. Else they are those near the centre at rest.
+
+    Raises
+    ------
+    BodyError
+        One that moves without a segment.
     """
 
     centre: NDArray
@@ -133,13 +140,18 @@ class LocalMorph:
     steering: Steering
     segment: str | None = None
     on: tuple[str, ...] = ()
+    moves: bool = False
+
+    def __post_init__(self) -> None:
+        if self.moves and self.segment is None:
+            raise BodyError("a bulge that moves with no segment", remedy="Name the segment that carries it.")
 
     def placed(self, tree: KinematicTree) -> LocalMorph:
         """With its centre in the root frame at rest."""
         if self.segment is None:
             return self
         centre = np.asarray(self.centre, float) + tree.rest[tree.segment(self.segment)]
-        return replace(self, centre=centre, segment=None)
+        return replace(self, centre=centre, segment=None, moves=False)
 
     def field(self, x: NDArray, parameters: NDArray | None) -> NDArray:
         """(V, 3) [m] shifts of the nodes x (V, 3), or of those at `parameters` (V, n), when all of it acts."""

@@ -7,6 +7,7 @@
     morphs/K/twist (6,)                      of a joint's motion
     morphs/K/target (V, 3)                   of a global morph [m]
     morphs/K/centre, radii (n,)  shift (3,)  on (N,)    of a local morph [m]
+    morphs/K/moves ()                        whether it goes along with its segment; older files lack it: false
     morphs/K/surfaces/...                    of a segment's second shape, as those of a body
     skin/nodes (V, K, 3)  faces (T, 3)  owners, weights (V, K)
 
@@ -47,7 +48,7 @@ def morphs_to_arrays(morphs: tuple[Operator, ...], surfaces: ToArrays) -> dict[s
         }  # fmt: skip
         own |= {name: np.array(getattr(morph, name), float) for name in _OWN[kind]}
         if isinstance(morph, LocalMorph):
-            own["on"] = np.array(list(morph.on), dtype=np.str_)
+            own["on"], own["moves"] = np.array(list(morph.on), dtype=np.str_), np.array(morph.moves)
         if isinstance(morph, SegmentMorph):
             own |= surfaces(morph.surfaces)
         out |= {f"morphs/{k}/{name}": array for name, array in own.items()}
@@ -98,7 +99,8 @@ def _morph(own: Mapping[str, NDArray], surfaces: FromArrays) -> Operator:
         return SegmentMorph(segment, surfaces(own), steering)
     if kind == "local":
         on = tuple(str(name) for name in own["on"])
-        return LocalMorph(own["centre"], own["radii"], own["shift"], steering, segment or None, on)
+        moves = bool(own.get("moves", False))
+        return LocalMorph(own["centre"], own["radii"], own["shift"], steering, segment or None, on, moves)
     raise BodyError(f"a morph of an unknown kind '{kind}'")
 
 

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
-from kinefit.bodies.surfaces.fourier import FourierSurface
+from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface, by_length
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.surfaces.metaballs import Metaballs
 from kinefit.bodies.surfaces.obj import mesh_surface, surface_of_file
 from kinefit.errors import BodyError
 from kinefit.geometry.se3 import exp_so3
 
+_CURVE_POINTS = 256  # along a contour: of a sheet of A4 one every 4 mm
 Vector = tuple[float, float, float]
 Section = float | tuple[float, float]
 
@@ -34,8 +35,9 @@ class SurfaceRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """`surface` of a segment: a tapered cylinder, its sections circles (one radius) or ellipses (two half axes).
 
     Or a mesh: the path of an OBJ file, seen from the body file's folder, with its unit. Or a Fourier series: the path
-    of a file of points, their grid, which parameters are closed, the orders kept, and the nodes of the mesh. Or
-    metaballs, from one end of the limb to the other.
+    of a file of points, their grid, which parameters are closed, the orders kept, and the nodes of the mesh. Or a
+    closed curve, the contour of a thin plate: the path of a file of points, and the order kept. Or metaballs, from one
+    end of the limb to the other.
     """
 
     end: Vector | None = None
@@ -43,6 +45,8 @@ class SurfaceRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     start: Vector = (0.0, 0.0, 0.0)
     side: Vector | None = None
     mesh: str | None = None
+    contour: str | None = None
+    order: int | None = None
     fourier: str | None = None
     grid: tuple[int, int] | None = None
     closed: tuple[bool, bool] = (True, True)
@@ -72,15 +76,16 @@ def surfaces_of(
     for record in [records] if isinstance(records, SurfaceRecord) else records or ():
         is_cylinder = record.end is not None and record.radii is not None
         is_series = record.fourier is not None and record.grid is not None
-        if is_cylinder + (record.mesh is not None) + is_series + bool(record.balls) != 1:
+        is_contour = record.contour is not None
+        if is_cylinder + (record.mesh is not None) + is_series + is_contour + bool(record.balls) != 1:
             remedy = "Give `end` and `radii` of a cylinder, or `mesh`, the path of an OBJ file, "
-            remedy += "or `fourier` and `grid`, or `balls`."
+            remedy += "or `fourier` and `grid`, or `contour`, or `balls`."
             raise BodyError("a surface needs one shape", file=source, place=place, remedy=remedy)
         if record.mesh is not None:
             path = Path(source).parent / record.mesh
             out.append(mesh_surface(path, segment, unit=record.unit, mirror=record.mirror, place=place))
             continue
-        if is_series:
+        if is_series or is_contour:
             out.append(_series(record, segment, source, place))
             continue
         if record.balls:
@@ -96,20 +101,22 @@ def surfaces_of(
 
 
 def _series(record: SurfaceRecord, segment: int, source: str, place: str) -> MeshSurface:
-    """Free form (P1 2.3) of a file of points x,y,z, a row of the grid after the other, as a Fourier series."""
-    assert record.fourier is not None and record.grid is not None
-    path, grid = Path(source).parent / record.fourier, record.grid
+    """Free form (P1 2.2, 2.3) as a Fourier series of a file of points x,y,z: a closed curve, or a grid row by row."""
+    path, grid = Path(source).parent / str(record.contour or record.fourier), record.grid
 
-    def read() -> tuple[NDArray, NDArray]:
+    def read() -> tuple[FourierCurve | FourierSurface, Any]:
         try:
             points = np.loadtxt(path, delimiter=",", ndmin=2)
         except (OSError, ValueError) as error:
             raise BodyError(f"points that cannot be read: {error}", remedy="Write lines of x,y,z.") from error
+        if record.contour is not None:
+            return FourierCurve.of(by_length(points, _CURVE_POINTS), record.order), _CURVE_POINTS
+        assert grid is not None
         if points.shape != (grid[0] * grid[1], 3):
             problem = f"{points.shape[0]} lines of {points.shape[1]} numbers for a grid of {grid[0]} x {grid[1]}"
             raise BodyError(problem, remedy="Write x,y,z of every point, and the grid's two counts.")
         series = FourierSurface.of(points.reshape(*grid, 3), closed=record.closed, orders=record.orders)
-        return series.triangles(record.nodes or grid)
+        return series, record.nodes or grid
 
     return surface_of_file(path, segment, read, unit=record.unit, mirror=record.mirror, place=place)
 

@@ -17,6 +17,7 @@ from kinefit.errors import BodyError
 from kinefit.geometry.cga import exp
 from kinefit.geometry.multivectors import Multivector
 
+_HALF_PLATE = 0.0005  # [m] half the thickness of the plate that a curve bounds: paper and tin, far below a pixel
 # l_1 = e1∧e2, l_2 = e2∧e3, l_3 = e3∧e1: each holds e_m, so that the part along e_m is the signal
 PLANES = tuple(Multivector((blade,), np.array([sign])) for blade, sign in ((3, 1.0), (6, 1.0), (5, -1.0)))
 
@@ -104,6 +105,23 @@ class FourierCurve:
     def phase_vectors(self) -> Multivector:
         """(3, 2N+1) vectors p_k^m of P1, each in the plane l_m."""
         return _phase_vectors(self.coefficients)
+
+    def triangles(self, count: int) -> tuple[NDArray, NDArray]:
+        """Vertices (2 count + 2, 3) [m] and faces (4 count, 3) of a thin plate that the curve bounds.
+
+        Both of its sides are fans from `count` points of the curve to their middle, half a millimetre to either side of
+        the curve; so its occluding contour is the curve, wherever the fans do not fold over.
+        """
+        ring = self.samples(count)
+        ring = np.concatenate([ring, ring.mean(axis=0, keepdims=True)])
+        spokes = ring[:-1] - ring[-1]
+        area = np.cross(spokes, np.roll(spokes, -1, axis=0)).sum(axis=0)
+        side = _HALF_PLATE * area / max(float(np.linalg.norm(area)), 1e-12)
+        j, back = np.arange(count), count + 1
+        after, middle = (j + 1) % count, np.full(count, count)
+        faces = [(j, after, middle), (back + after, back + j, back + middle)]  # front, back, and the edge in two halves
+        faces += [(back + j, after, j), (back + j, back + after, after)]
+        return np.concatenate([ring + side, ring - side]), np.concatenate([np.stack(f, -1) for f in faces])
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,9 +231,8 @@ class FourierSurface:
         return vertices, joined[:, ::-1].copy() if inside_out else joined
 
 
-def levels(curve_or_surface: FourierCurve | FourierSurface, count: int, lowest: int = 2) -> list:
+def levels(shape: FourierCurve | FourierSurface, count: int, lowest: int = 2) -> list:
     """Low-pass approximations from coarse to fine, the last one whole: what a fit goes through (P1 2.4)."""
-    shape = curve_or_surface
     orders = (shape.order,) if isinstance(shape, FourierCurve) else shape.orders
     out = []
     for step in np.linspace(0.0, 1.0, count) if count > 1 else [1.0]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies.surfaces.closest.grid import DistanceGrid, cell_size, distance_grid, parts
+from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface, levels
 from kinefit.errors import BodyError
 
 WELD = 1e-6  # [m] corners as near as that are one: what six decimals in a file leave apart
@@ -23,6 +25,8 @@ class MeshSurface:
     segment : int
     vertices : (V, 3) [m] in the segment's frame.
     faces : (T, 3) int, counter-clockwise as seen from outside.
+    series : FourierCurve or FourierSurface [m] that the mesh was made of, if it was.
+    nodes : of the series' `triangles`, whose vertices are those of the mesh.
 
     Raises
     ------
@@ -34,6 +38,8 @@ class MeshSurface:
     segment: int
     vertices: NDArray
     faces: NDArray
+    series: FourierCurve | FourierSurface | None = field(default=None, kw_only=True)
+    nodes: Any = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         vertices, faces = np.array(self.vertices, float), np.array(self.faces)
@@ -75,10 +81,27 @@ class MeshSurface:
 
     def mirrored(self) -> MeshSurface:
         """The mesh on the other side of the plane z = 0: a left limb's from the right one's."""
-        return MeshSurface(self.segment, self.vertices * (1.0, 1.0, -1.0), self.faces[:, ::-1])
+        flip = (1.0, 1.0, -1.0)
+        series = self._series_times(flip)
+        return MeshSurface(
+            self.segment, self.vertices * flip, self.faces[:, ::-1], series=series, nodes=self.nodes
+        )
+
+    def low_pass_shifts(self, count: int) -> list[NDArray]:
+        """(V, 3) [m] from its vertices to those of low-pass approximations of its series, coarse to fine (P1 2.4)."""
+        assert self.series is not None
+        vertices = [shape.triangles(self.nodes)[0] for shape in levels(self.series, count)]
+        return [v - vertices[-1] for v in vertices]
+
+    def _series_times(self, factor: ArrayLike) -> FourierCurve | FourierSurface | None:
+        """The series with its three signals multiplied by a factor, or by (3,)."""
+        if self.series is None:
+            return None
+        p = self.series.coefficients
+        return replace(self.series, coefficients=p * np.broadcast_to(factor, 3).reshape(3, *[1] * (p.ndim - 1)))
 
     def _like(self, segment: int, vertices: NDArray, factor: float) -> MeshSurface:
-        out = MeshSurface(segment, vertices, self.faces)
+        out = MeshSurface(segment, vertices, self.faces, series=self._series_times(factor), nodes=self.nodes)
         if "grid" in self.__dict__:
             out.__dict__["grid"] = self.grid if factor == 1.0 else self.grid.scaled(factor)
         return out

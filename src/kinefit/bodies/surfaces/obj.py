@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,25 +81,30 @@ def mesh_surface(
 
 
 def surface_of_file(
-    path: str | PathLike[str], segment: int, read: Callable[[], tuple[NDArray, NDArray]], *, unit: str, mirror: bool,
+    path: str | PathLike[str], segment: int, read: Callable[[], tuple[Any, Any]], *, unit: str, mirror: bool,
     place: str | None,
 ) -> MeshSurface:  # fmt: skip
     """Surface of a segment from vertices and triangles that a file gives in its unit; arguments as of `mesh_surface`.
 
     Parameters
     ----------
-    read : gives vertices (V, 3) in the file's unit, and triangles (T, 3).
+    read : gives vertices (V, 3) in the file's unit, and triangles (T, 3); or a Fourier series in it, and its nodes.
     """
     if unit not in UNITS:
         raise BodyError(choices("unit", unit, UNITS), file=path, place=place, remedy="Give one of these.")
     try:
-        vertices, faces = read()
-        vertices = vertices * UNITS[unit]
+        shape, nodes = read()
+        series = None
+        if isinstance(shape, np.ndarray):
+            vertices, faces = UNITS[unit] * shape, nodes
+        else:
+            series = replace(shape, coefficients=UNITS[unit] * shape.coefficients)
+            vertices, faces = series.triangles(nodes)
         length = float(np.ptp(vertices, axis=0).max())
         if length > LONGEST:
             remedy = 'State the unit of its file, such as unit = "mm".'
             raise BodyError(f"the mesh is {length:.4g} m long", remedy=remedy)
-        surface = MeshSurface(segment, vertices, faces)
+        surface = MeshSurface(segment, vertices, faces, series=series, nodes=series and nodes)
     except BodyError as error:
         where = ", ".join(text for text in (place, error.place) if text)
         raise BodyError(error.problem, file=path, place=where or None, remedy=error.remedy) from error

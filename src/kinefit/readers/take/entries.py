@@ -35,6 +35,7 @@ class StartEntry(_Entry, frozen=True, kw_only=True):
     upward: tuple[float, float, float] | None = None  # and its y; default: the take's `up`
     angles: dict[str, float] = {}  # [deg] or, of joints that slide, [m]; others are the body's usual ones
     step: int | None = None  # of the common time; default: the first
+    low_pass: bool = True  # whether silhouettes are also fitted with low-pass approximations of the surface first
 
 
 class SessionEntry(_Entry, frozen=True, kw_only=True):

@@ -39,6 +39,20 @@ def outline_camera(camera: Camera, settings: TrackSettings) -> Camera:
     return scaled(camera, 1.0 / max(round(max(camera.size) / settings.outline), 1))
 
 
+def averaged(mask: NDArray, size: tuple[int, int]) -> NDArray:
+    """A mask (H, W) averaged down to a size (width, height): by a whole factor first, as that is fast.
+
+    The factor is at most half of the whole one: what the second step then shares between pixels is small.
+    """
+    height, width = mask.shape
+    half = int(0.5 * min(width / size[0], height / size[1]))
+    whole = max(k for k in range(1, max(half, 1) + 1) if width % k == height % k == 0)
+    for step in ((width // whole, height // whole), size):
+        if mask.shape != step[::-1]:
+            mask = cv2.resize(mask, step, interpolation=cv2.INTER_AREA)
+    return mask
+
+
 class SilhouetteSensor(Sensor):
     """The silhouette in one camera: the body's occluding contour and the image's outline towards each other.
 
@@ -94,7 +108,7 @@ class SilhouetteMeasurement(Measurement):
         self.sensor, self.time, self.of, self.sigma = of.name, frame.time, of, of.sigma
         mask = frame.mask
         if of.scale < 1.0:
-            mask = cv2.resize(mask, self.camera.size, interpolation=cv2.INTER_AREA)
+            mask = averaged(mask, self.camera.size)
         vertices = scene.pose.vertices
         focal = float(np.sqrt(self.camera.matrix[0, 0] * self.camera.matrix[1, 1]))
         T = scene.placed(self.camera).T_camera_world
@@ -124,6 +138,8 @@ class SilhouetteMeasurement(Measurement):
 
     def _parted(self, mask: NDArray, scene: Scene) -> NDArray:
         """(h, w) bool, where the silhouette is another person's."""
+        if not scene.others:
+            return np.zeros(mask.shape, bool)
         own, others = (drawn_together(several, self.camera) for several in ([scene], scene.others))
         if own is None or others is None:
             return np.zeros(mask.shape, bool)

@@ -54,6 +54,12 @@ class TrackedSurface:
         self._rims: dict[Camera, RimFinder] = {}
         self._layers: dict[Camera, Layers] = {}
 
+    def with_shape(self, morphing: Morphing) -> TrackedSurface:
+        """The same body with another skin, such as a low-pass approximation of its own."""
+        out = TrackedSurface(self.body, self.count)
+        out.morphing = morphing
+        return out
+
     @cached_property
     def samples(self) -> SurfaceSamples:
         """Points spread over all of it."""

@@ -87,7 +87,7 @@ def track_take(
     if view is not None:
         recording = view.recording(recording, body, take.person, settings)
     if take.pose is not None:
-        recording = from_afar(recording, body, settings)
+        recording = from_afar(recording, body, settings, low_pass=take.pose.low_pass)
     findings = input_findings(take, seen, recording.followed.keypoints if recording.followed else (), body)
     try:
         motion = track(

@@ -96,7 +96,9 @@ def recording_of(
     return recording, body
 
 
-def from_afar(recording: Recording, body: Body, settings: TrackSettings | None) -> Recording:
+def from_afar(
+    recording: Recording, body: Body, settings: TrackSettings | None, *, low_pass: bool = True
+) -> Recording:
     """A recording whose start, which may be tens of degrees off, is fitted to the silhouettes of its step."""
     if recording.start is None:
         return recording
@@ -104,7 +106,9 @@ def from_afar(recording: Recording, body: Body, settings: TrackSettings | None) 
     shown = by_record(recording.steps(step))[SilhouetteFrame]
     if not shown:
         return recording
-    found = coarse_to_fine(body, recording.rig, shown, state, sigma=recording.sigma, settings=settings)
+    found = coarse_to_fine(
+        body, recording.rig, shown, state, sigma=recording.sigma, low_pass=low_pass, settings=settings
+    )
     return replace(recording, start=(step, found.result.state))
 
 
