@@ -1,7 +1,7 @@
 """Every row of docs/papers.md, tried once: `python -m benchmarks.papers`.
 
-A row's benchmark runs in its quick form; a row that names none is tried by its tests. The quick form of this area runs
-neither, as the other areas and the tests do: it checks that all that the page names is there.
+The parts of benchmarks that a row names run in their quick form; a row that names none is tried by its tests. The quick
+form of this area runs neither, as the other areas and the tests do: it checks that all that the page names is there.
 """
 
 from __future__ import annotations
@@ -24,30 +24,31 @@ ROWS = 53
 
 _ROOT = Path(__file__).resolve().parents[1]
 _ROW = re.compile(r"\| (P\d-\d+) \|")
-_BENCHMARK = re.compile(r"python -m benchmarks\.(\w+)((?: \w+)*)")
+_WORD = re.compile(r"[a-z]\w*")
+_TEST = re.compile(r"`((?:\w+/)*)(test_\w+\.py)?`")
 _LIMIT = 900.0  # [s] of one command
 
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the page: its item, its benchmarks as (area, parts), its tests below `tests`."""
+    """A row of the page: its item, the parts of benchmarks and the tests that it names."""
 
     item: str
-    benchmarks: tuple[tuple[str, tuple[str, ...]], ...]
+    parts: tuple[str, ...]
     tests: tuple[str, ...]
 
+    @property
     def commands(self) -> list[tuple[str, ...]]:
         """What tries it, as words after `python -m`."""
-        named = [(f"benchmarks.{area}", *parts, "--quick", "--no-log") for area, parts in self.benchmarks]
+        areas = areas_of_parts()
+        named = [(f"benchmarks.{areas[part]}", part, "--quick", "--no-log") for part in self.parts]
         return named or [("pytest", "-q", "-x", "-m", "slow or not slow", "-p", "no:cacheprovider", *self.tests)]
 
-    def absent(self) -> list[str]:
-        """Areas, parts and tests that are not there."""
-        out = [test for test in self.tests if not (_ROOT / test).exists()]
-        for area, parts in self.benchmarks:
-            known = import_module(f"benchmarks.{area}").PARTS if area in AREAS else {}
-            out += [f"{area} {part}" for part in parts or ("",) if (part and part not in known) or not known]
-        return out
+
+@cache
+def areas_of_parts() -> dict[str, str]:
+    """{part: area} of all benchmarks."""
+    return {part: area for area in AREAS for part in import_module(f"benchmarks.{area}").PARTS if "_" in part}
 
 
 def read_rows(text: str) -> list[Row]:
@@ -60,11 +61,11 @@ def read_rows(text: str) -> list[Row]:
         if found is None:
             continue
         tests, folder = [], ""
-        for where, name in re.findall(r"`((?:\w+/)*)(test_\w+\.py)?`", cells[header.index("test")]):
+        for where, name in _TEST.findall(cells[header.index("test")]):
             folder = where or folder
             tests.append(f"{folder}{name}" if folder.startswith("tests/") else f"tests/{folder}{name}")
-        benchmarks = {(area, tuple(parts.split())): None for area, parts in _BENCHMARK.findall(line)}
-        out.append(Row(found[1], tuple(benchmarks), tuple(tests)))
+        parts = dict.fromkeys(word for word in _WORD.findall(line) if word in areas_of_parts())
+        out.append(Row(found[1], tuple(parts), tuple(tests)))
     return out
 
 
@@ -87,14 +88,14 @@ def ended(command: tuple[str, ...]) -> bool:
 def run() -> None:
     """Print the figures."""
     rows = read_rows((_ROOT / "docs" / "papers.md").read_text("utf-8"))
-    absent = [f"{row.item}: {name}" for row in rows for name in row.absent()]
+    absent = [f"{row.item}: {test}" for row in rows for test in row.tests if not (_ROOT / test).exists()]
     if absent:
         raise ValueError(f"docs/papers.md names what is not there: {', '.join(absent)}")
-    idle = [row.item for row in rows if not (row.benchmarks or row.tests)]
+    idle = [row.item for row in rows if not (row.parts or row.tests)]
     figure("papers_rows", len(rows), "rows", f"== {ROWS}")
     figure("papers_without_trial", len(idle), f"rows {' '.join(idle)}".strip(), "== 0")
     for row in rows:
-        good = None if quick() else float(all(map(ended, row.commands())))
+        good = None if quick() else float(all(map(ended, row.commands)))
         figure(f"papers_{row.item.replace('-', '_').lower()}", good, "ended", "== 1", LEFT_OUT)
 
 
