@@ -41,14 +41,15 @@ class Row:
     def commands(self) -> list[tuple[str, ...]]:
         """What tries it, as words after `python -m`."""
         areas = areas_of_parts()
-        named = [(f"benchmarks.{areas[part]}", part, "--quick", "--no-log") for part in self.parts]
+        named: list[tuple[str, ...]] = [(f"benchmarks.{areas[part]}", part, "--quick", "--no-log") for part in self.parts]
         return named or [("pytest", "-q", "-x", "-m", "slow or not slow", "-p", "no:cacheprovider", *self.tests)]
 
 
 @cache
 def areas_of_parts() -> dict[str, str]:
     """{part: area} of all benchmarks."""
-    return {part: area for area in AREAS for part in import_module(f"benchmarks.{area}").PARTS if "_" in part}
+    areas = {area: getattr(import_module(f"benchmarks.{area}"), "PARTS", {}) for area in AREAS}
+    return {part: area for area, parts in areas.items() for part in parts if "_" in part}
 
 
 def read_rows(text: str) -> list[Row]:
