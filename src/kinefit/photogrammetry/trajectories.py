@@ -1,7 +1,8 @@
 """Paths of surface points: velocity and acceleration, and filters that truncate what is no motion of a surface.
 
 The filters are those of D'Apuzzo et al. (1999), section 2.4.2: bounds on velocity and acceleration, and uniformity of
-the velocity in a small region of space and time.
+the velocity in a small region of space and time. `filtered` applies both, with the neighbourhood heuristics that the
+paper names as its next step: paths that were cut no longer judge their neighbours, and a point without neighbours goes.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from kinefit.errors import ObservationError
 
 _OUTLYING = 5.0  # robust deviations of a velocity from its surroundings
 _LEAST_NEIGHBOURS = 3
+_MAX_ROUNDS = 10  # of the second filter: each may cut what the paths cut before had made look uniform
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +94,24 @@ def uniform(paths: Trajectories, *, radius: float, frames: int = 1, limit: float
     Parameters
     ----------
     radius : [m] of the surroundings; `frames` before and after belong to them
-    limit : [m/s] of the difference; default: five robust deviations of all differences
+    limit : [m/s] of the difference; default: `uniformity_limit`
     """
+    off = _differences(paths, radius, frames)
+    return paths.live & ~(off > (_limit(off) if limit is None else limit))
+
+
+def uniformity_limit(paths: Trajectories, *, radius: float, frames: int = 1) -> float:
+    """[m/s]: five robust deviations of all differences of velocity between points and their surroundings."""
+    return _limit(_differences(paths, radius, frames))
+
+
+def _limit(off: NDArray) -> float:
+    told = off[np.isfinite(off)]
+    return float(_OUTLYING * 1.4826 * np.median(told)) if len(told) else np.inf
+
+
+def _differences(paths: Trajectories, radius: float, frames: int) -> NDArray:
+    """(F, P) [m/s] of each velocity to the median of its surroundings; NaN where they are fewer than three."""
     velocity, live = paths.velocity, paths.live
     off = np.full(live.shape, np.nan)
     for k in range(len(live)):
@@ -109,7 +127,52 @@ def uniform(paths: Trajectories, *, radius: float, frames: int = 1, limit: float
             near = (np.abs(places - paths.x_world[k, p]).max(axis=1) <= radius) & (names != p)
             if near.sum() >= _LEAST_NEIGHBOURS:
                 off[k, p] = np.linalg.norm(velocity[k, p] - np.median(speeds[near], axis=0))
-    if limit is None:
-        told = off[np.isfinite(off)]
-        limit = float(_OUTLYING * 1.4826 * np.median(told)) if len(told) else np.inf
-    return live & ~(off > limit)
+    return off
+
+
+def accompanied(paths: Trajectories, *, radius: float) -> NDArray[np.bool_]:
+    """(F, P) where three other points or more are within a radius [m] at the same time: nothing else can be judged."""
+    live = paths.live
+    out = np.zeros_like(live)
+    for k in range(len(live)):
+        index = np.flatnonzero(live[k])
+        for p in index:
+            near = np.abs(paths.x_world[k, index] - paths.x_world[k, p]).max(axis=1) <= radius
+            out[k, p] = near.sum() > _LEAST_NEIGHBOURS  # itself among them
+    return out
+
+
+def filtered(
+    paths: Trajectories, *, radius: float, bounds: tuple[float, float] | None = None
+) -> tuple[Trajectories, dict[str, int]]:
+    """Paths after both filters and the neighbourhood heuristics, and how many places each one cut off.
+
+    The second filter is repeated with the paths that are left until it cuts none, its limit being that of the first
+    round; then points without neighbours are cut off.
+
+    Parameters
+    ----------
+    radius : [m] of the surroundings
+    bounds : of speed [m/s] and acceleration [m/s²]; None: the first filter is left out
+
+    Raises
+    ------
+    ObservationError
+        A bound that is not positive.
+    """
+    counts, kept = {"bounds": 0, "uniformity": 0, "neighbours": 0}, paths
+
+    def cut(name: str, good: NDArray[np.bool_]) -> bool:
+        nonlocal kept
+        before, kept = int(kept.live.sum()), kept.kept(good)
+        counts[name] += before - int(kept.live.sum())
+        return int(kept.live.sum()) < before
+
+    if bounds is not None:
+        cut("bounds", within_bounds(kept, speed=bounds[0], acceleration=bounds[1]))
+    limit = uniformity_limit(kept, radius=radius)
+    for _ in range(_MAX_ROUNDS):
+        if not cut("uniformity", uniform(kept, radius=radius, limit=limit)):
+            break
+    cut("neighbours", accompanied(kept, radius=radius))
+    return kept, counts
