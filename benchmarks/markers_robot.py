@@ -1,10 +1,10 @@
 """A robot's markers named: a six-axis arm, a tree and a marker set of one's own, through the commands (P5, section 1).
 
 The body file, the marker set and every recording are written here; places of the markers on the links are drawn once.
-The model is learnt from one labelled frame (`kinefit markers learn --frame`). Random poses are named one by one, with a
-tenth of the markers missing and five extra points; a motion of smooth random angles, its columns shuffled and broken, is
-named by `kinefit markers identify`, and tracked by `kinefit track` with `model` in `[[markers]]`. Noise is 0.5 mm. Where
-the base stands is not given.
+The model is learnt from one labelled frame (`kinefit markers learn --frame`). Random poses are named one by one, a
+tenth of the markers missing, five extra points; a motion of smooth random angles, its columns shuffled and broken, is
+named by `kinefit markers identify`, and tracked by `kinefit track` with `model` in `[[markers]]`. Noise is 0.5 mm.
+Where the base stands is not given.
 """
 
 from __future__ import annotations
@@ -62,8 +62,10 @@ def make_robot(folder: Path, seed: int = 0) -> Robot:
     placed, at_rest = [], np.zeros(3)
     for k, (name, joint, axis, end, radius, count) in enumerate(LINKS):
         at_rest = at_rest + joint
-        hang = (f'name = "axis_{k}", type = "revolute", at = {list(joint)}, axes = ["{axis}"], coordinates = ["q{k}"], '
-                f"range = [[{-RANGES[name]}, {RANGES[name]}]]") if axis else 'name = "ground", type = "free"'  # fmt: skip
+        hang = 'name = "ground", type = "free"'
+        if axis:
+            hang = (f'name = "axis_{k}", type = "revolute", at = {list(joint)}, axes = ["{axis}"], '
+                    f'coordinates = ["q{k}"], range = [[{-RANGES[name]}, {RANGES[name]}]]')  # fmt: skip
         parent = f'parent = "{LINKS[k - 1][0]}"\n' if k else ""
         body.append(f'[[segment]]\nname = "{name}"\n{parent}scale = "fixed"\njoint = {{ {hang} }}\n'
                     f"surface = {{ end = {list(end)}, radii = [{0.8 * radius}, {0.7 * radius}] }}")  # fmt: skip
