@@ -34,7 +34,7 @@ def run() -> None:
         figure(f"{begin}: left leg in the worst frame with closures", float(legs[0].max()), "mm", "<= 50")
         figure(f"{begin}: left leg in the worst frame without", float(legs[1].max()), "mm", ">= 0")
         wrong = [100 * float(np.mean(leg > OFF)) for leg in legs]
-        print(f"  left leg more than {OFF} mm off: {wrong[0]:.0f} % of the frames with closures, {wrong[1]:.0f} % without")
+        print(f"  left leg beyond {OFF} mm: {wrong[0]:.0f} % of the frames with closures, {wrong[1]:.0f} % without")
 
 
 if __name__ == "__main__":
