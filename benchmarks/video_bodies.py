@@ -85,7 +85,7 @@ ANGLES = {"elbows_knees": ("elbow", "knee"), "pronation": ("pro_sup",), "wrists"
 
 def run() -> None:
     """Print the figures."""
-    for kind, looks in (("arm", 1), ("body", 1), *amount([("body", LOOKS)], [])):
+    for kind, looks in (("body", 1), ("arm", 1), *amount([("body", LOOKS)], [])):
         found: dict[str, list[float]] = {}
         for seed in (42, 43, 44)[: amount(3, 1)]:
             with tempfile.TemporaryDirectory() as place:

@@ -105,7 +105,7 @@ def test_both_filters_and_the_neighbours_in_turn():
     x[8:, 2, 2] += 0.5
     paths = Trajectories(np.arange(12) / 30.0, x, np.full_like(x, 1e-4), np.zeros((12, 20, 2, 2)))
     assert not accompanied(paths, radius=0.1)[:, 7].any() and accompanied(paths, radius=0.1)[:8, :4].all()
-    kept, cut = filtered(paths, radius=0.1, bounds=(2.0, 100.0))
+    kept, cut = filtered(paths, radius=0.1, bounds=(2.0, 100.0), neighbours=True)
     assert not kept.live[:, 7].any() and not kept.live[7:, 4].any() and not kept.live[8:, 2].any()
     assert cut["bounds"] >= 4 and cut["uniformity"] >= 5 and cut["neighbours"] == 12
     good = np.setdiff1d(np.arange(20), [2, 4, 7])
@@ -124,5 +124,7 @@ def test_paths_that_were_cut_no_longer_judge_their_neighbours():
     once = paths.kept(uniform(paths, radius=0.1))
     assert once.live[:, -2].all() and not once.live[:, -4:-2].any()
     kept, cut = filtered(paths, radius=0.1)
+    assert (kept.live == once.live).all() and cut["neighbours"] == 0
+    kept, cut = filtered(paths, radius=0.1, neighbours=True)
     assert not kept.live[:, wrong].any() and cut["neighbours"] == 12  # the last one is alone
     assert kept.live[:, :-4].all()

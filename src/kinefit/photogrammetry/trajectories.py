@@ -1,8 +1,8 @@
 """Paths of surface points: velocity and acceleration, and filters that truncate what is no motion of a surface.
 
 The filters are those of D'Apuzzo et al. (1999), section 2.4.2: bounds on velocity and acceleration, and uniformity of
-the velocity in a small region of space and time. `filtered` applies both, with the neighbourhood heuristics that the
-paper names as its next step: paths that were cut no longer judge their neighbours, and a point without neighbours goes.
+the velocity in a small region of space and time. `filtered` applies both, and where it is asked to the neighbourhood heuristics that
+the paper names as its next step: paths that were cut no longer judge their neighbours, and lone points go.
 """
 
 from __future__ import annotations
@@ -156,17 +156,16 @@ def accompanied(paths: Trajectories, *, radius: float) -> NDArray[np.bool_]:
 
 
 def filtered(
-    paths: Trajectories, *, radius: float, bounds: tuple[float, float] | None = None
+    paths: Trajectories, *, radius: float, bounds: tuple[float, float] | None = None, neighbours: bool = False
 ) -> tuple[Trajectories, dict[str, int]]:
-    """Paths after both filters and the neighbourhood heuristics, and how many places each one cut off.
-
-    The second filter is repeated with the paths that are left until it cuts none, its limit being that of the first
-    round; then points without neighbours are cut off.
+    """Paths after the paper's filters, and how many places each one cut off.
 
     Parameters
     ----------
     radius : [m] of the surroundings
     bounds : of speed [m/s] and acceleration [m/s²]; None: the first filter is left out
+    neighbours : whether the second filter is repeated with the paths that are left until it cuts none, its limit being
+        that of the first round, and points without neighbours are cut off then; a limb with few points is lost by it
 
     Raises
     ------
@@ -184,10 +183,11 @@ def filtered(
     if bounds is not None:
         cut("bounds", within_bounds(kept, speed=bounds[0], acceleration=bounds[1]))
     limit = None
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(_MAX_ROUNDS if neighbours else 1):
         off = _differences(kept, radius, 1)
         limit = _limit(off) if limit is None else limit
         if not cut("uniformity", kept.live & ~(off > limit)):
             break
-    cut("neighbours", accompanied(kept, radius=radius))
+    if neighbours:
+        cut("neighbours", accompanied(kept, radius=radius))
     return kept, counts

@@ -58,6 +58,7 @@ class Wanted:
     smooth: float
     motion: Path | None = None
     bounds: tuple[float, float] | None = None
+    neighbours: bool = False
 
     def side_of_all(self) -> int:
         """Side of the windows [px], of all."""
@@ -260,7 +261,9 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
     speed = float(np.nanpercentile(np.linalg.norm(paths.velocity, axis=2), 99)) if len(paths.times) > 1 else 0.0
     kept, cut = paths, dict[str, int]()
     if len(paths.times) > 2:
-        kept, cut = filtered(paths, radius=_surroundings(paths), bounds=wanted.bounds)
+        kept, cut = filtered(
+            paths, radius=_surroundings(paths), bounds=wanted.bounds, neighbours=wanted.neighbours
+        )  # fmt: skip
     write_paths_csv(kept, wanted.out / "trajectories.csv")
     if motion is not None:
         write_returns_csv(tracker.returns(), motion.rate, wanted.out / "returns.csv")

@@ -48,13 +48,14 @@ Examples:
     "--bounds", type=(float, float), metavar="M/S M/S²",
     help="Of videos: speed and acceleration beyond which a path is cut off.",
 )  # fmt: skip
+@click.option("--neighbours", is_flag=True, help="Of videos: also cut off points whose neighbours were cut off.")
 @click.option("--field", type=click.Choice(["odd", "even"]), help="Of interlaced images, these lines alone.")
 @_screen.verbose_option
 def surface(
     calibration: Path, views: tuple[str, ...], out: Path, unit: str, window: str, step: int, mask: Path | None,
     seeds: Path | None, least: float | None, gauge: float | None, incremental: bool, still: int | None,
     smooth: float, flat: float | None, motion: Path | None, bounds: tuple[float, float] | None,
-    field: str | None,
+    neighbours: bool, field: str | None,
 ) -> None:  # fmt: skip
     """Measure a surface that two cameras or more see: points with standard deviations, a mesh, displacement, strain.
 
@@ -70,8 +71,9 @@ def surface(
     from kinefit.errors import ObservationError
 
     check_folder(out)
-    wanted = Wanted(out, window, step, mask, seeds, least, gauge, incremental, still, field, smooth, motion, bounds)
-    of_videos = [name for name, value in (("--motion", motion), ("--bounds", bounds)) if value is not None]
+    wanted = Wanted(out, window, step, mask, seeds, least, gauge, incremental, still, field, smooth, motion, bounds, neighbours)
+    of_videos = [name for name, value in (
+        ("--motion", motion), ("--bounds", bounds), ("--neighbours", neighbours or None)) if value is not None]  # fmt: skip
     if of_videos and flat is not None:
         raise ObservationError(f"{of_videos[0]} with --flat", remedy="It is for videos, which are followed in time.")
     if flat is not None:
