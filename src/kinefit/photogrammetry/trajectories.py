@@ -1,8 +1,8 @@
 """Paths of surface points: velocity and acceleration, and filters that truncate what is no motion of a surface.
 
 The filters are those of D'Apuzzo et al. (1999), section 2.4.2: bounds on velocity and acceleration, and uniformity of
-the velocity in a small region of space and time. `filtered` applies both, and where it is asked to the neighbourhood heuristics that
-the paper names as its next step: paths that were cut no longer judge their neighbours, and lone points go.
+the velocity in a small region of space and time. `filtered` applies both, and on demand the neighbourhood heuristics
+that the paper names as its next step: paths that were cut no longer judge their neighbours, and lone points go.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ def filtered(
     ObservationError
         A bound that is not positive.
     """
-    counts, kept = {"bounds": 0, "uniformity": 0, "neighbours": 0}, paths
+    counts, kept = {"short paths": 0, "bounds": 0, "uniformity": 0, "neighbours": 0}, paths
 
     def cut(name: str, good: NDArray[np.bool_]) -> bool:
         nonlocal kept
@@ -180,6 +180,7 @@ def filtered(
         counts[name] += before - int(kept.live.sum())
         return int(kept.live.sum()) < before
 
+    cut("short paths", kept.live)
     if bounds is not None:
         cut("bounds", within_bounds(kept, speed=bounds[0], acceleration=bounds[1]))
     limit = None

@@ -71,9 +71,11 @@ def surface(
     from kinefit.errors import ObservationError
 
     check_folder(out)
-    wanted = Wanted(out, window, step, mask, seeds, least, gauge, incremental, still, field, smooth, motion, bounds, neighbours)
-    of_videos = [name for name, value in (
-        ("--motion", motion), ("--bounds", bounds), ("--neighbours", neighbours or None)) if value is not None]  # fmt: skip
+    wanted = Wanted(
+        out, window, step, mask, seeds, least, gauge, incremental, still, field, smooth, motion, bounds, neighbours
+    )  # fmt: skip
+    videos_alone = {"--motion": motion, "--bounds": bounds, "--neighbours": neighbours or None}
+    of_videos = [name for name, value in videos_alone.items() if value is not None]
     if of_videos and flat is not None:
         raise ObservationError(f"{of_videos[0]} with --flat", remedy="It is for videos, which are followed in time.")
     if flat is not None:
