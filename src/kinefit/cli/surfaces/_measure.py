@@ -270,7 +270,8 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
     live, before = kept.live.sum(axis=1), int(paths.live.any(axis=0).sum())
     lengths = kept.live.sum(axis=0)
     lengths = lengths[lengths > 0] if lengths.any() else np.zeros(1, int)
-    about = f"{len(paths.times)} frames: {int(kept.live.any(axis=0).sum())} of {before} paths kept, {live.min()} to {live.max()} a frame"
+    count = int(kept.live.any(axis=0).sum())
+    about = f"{len(paths.times)} frames: {count} of {before} paths kept, {live.min()} to {live.max()} a frame"
     told.insert(0, f"{about}, {np.median(lengths):.0f} frames a path (median), speed {speed:.3f} m/s (99 %)")
     if cut:
         told.insert(1, "places cut off by the filters: " + ", ".join(f"{name} {count}" for name, count in cut.items()))
