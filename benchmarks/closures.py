@@ -10,6 +10,7 @@ PARTS = {
     "closures_mobility": "Gruebler's count, rank and mobility of the catalogue's bodies",
     "closures_people": "a cyclist and a snowboarder, simulated, with closures and without",
     "closures_gear": "dimensions of gear that are estimated",
+    "closures_sports": "a rower, a lifter and a golfer, with a dimension of their gear estimated",
     "closures_contacts": "feet that leave the ground and come back",
 }
 

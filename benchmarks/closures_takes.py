@@ -55,17 +55,17 @@ def cyclist(seed: int, *, seconds: float = 3.0, cameras: int = 4, leg: bool = Fa
     """Somebody who pedals on a bike that stands, seen by cameras about it."""
     random = np.random.default_rng(seed)
     generic = load_body("cyclist")
-    person = _person(generic, random)
+    person = another_person(generic, random)
     turn = random.uniform(-np.pi, np.pi)
     T = se3.transform(se3.exp_so3(np.array([0.0, turn, 0.0])), np.array([*random.uniform(-0.3, 0.3, 1), 0.28, 0.1]))
     person = _known_stand(person, T)
     cadence, start = random.uniform(70.0, 95.0) / 60.0 * 2.0 * np.pi, random.uniform(0.0, 2.0 * np.pi)
     names = person.tree.coordinates
-    wave = _waves(random, len(names))
-    usual = _posture(person, CYCLING)
+    wave = waves(random, len(names))
+    usual = posture_of(person, CYCLING)
 
     def drive(t: float) -> tuple[Body, ParameterRows, dict[int, float]]:
-        posture = usual + wave(t) * _give(person)
+        posture = usual + wave(t) * wandering(person)
         return person, towards(person, posture), {6 + names.index("crank_angle"): start + cadence * t}
 
     return from_drive(generic, drive, seconds, cameras, seed, leg, noise)
@@ -78,8 +78,8 @@ def snowboarder(
     """Somebody who carves and jumps on a board, which may have other dimensions [m, rad] than the catalogue's."""
     random = np.random.default_rng(seed)
     generic = load_body("snowboarder")
-    person = with_dimensions(_person(generic, random), gear or {})
-    wave, usual = _waves(random, len(person.tree.coordinates)), _posture(person, RIDING)
+    person = with_dimensions(another_person(generic, random), gear or {})
+    wave, usual = waves(random, len(person.tree.coordinates)), posture_of(person, RIDING)
     phase, speed, jump = random.uniform(0.0, 2.0 * np.pi), random.uniform(0.7, 1.1), random.uniform(1.2, 2.4)
 
     def drive(t: float) -> tuple[Body, ParameterRows, dict[int, float]]:
@@ -91,7 +91,7 @@ def snowboarder(
         held = Closure(PLACED, "rigid", "right_binding", place=tuple(place), turn=tuple(se3.log_so3(R)), hard=True)
         body = replace(person, closures=(*person.closures, held))
         crouch = 0.35 * np.sin(2.0 * np.pi * 0.6 * t + phase) - 0.9 * air
-        posture = usual + wave(t) * _give(person)
+        posture = usual + wave(t) * wandering(person)
         names = person.tree.coordinates
         for name, share in (("hip_flexion", 1.0), ("knee_angle", 1.2)):
             for side in "lr":
@@ -115,7 +115,7 @@ RIDING = {
 """[deg] postures about which people move."""
 
 
-def _person(generic: Body, random: np.random.Generator) -> Body:
+def another_person(generic: Body, random: np.random.Generator) -> Body:
     """Somebody of another size, each length by itself, whose points a detector sees where it was taught to."""
     size = random.normal(1.0, 0.04)
     body = generic.scaled(size * np.exp(random.normal(0.0, 0.03, len(generic.scale_groups))))
@@ -135,14 +135,14 @@ def _known_stand(body: Body, T: NDArray) -> Body:
     return replace(body, closures=closures)
 
 
-def _posture(body: Body, degrees: dict[str, float]) -> NDArray:
+def posture_of(body: Body, degrees: dict[str, float]) -> NDArray:
     out = np.array(body.tree.usual)
     for name, value in degrees.items():
         out[body.tree.coordinate(name)] = np.radians(value)
     return out
 
 
-def _give(body: Body) -> NDArray:
+def wandering(body: Body) -> NDArray:
     """(D,) [rad] how far each coordinate of the person wanders about its posture."""
     named = [c.rsplit("_", 1)[0] for c in body.tree.coordinates]
     return np.radians([{"neck_rotation": 15.0, "ankle_angle": 8.0, "arm_add": 6.0}.get(c, 3.0) for c in named])
@@ -154,7 +154,7 @@ def towards(body: Body, posture: NDArray) -> ParameterRows:
     return ParameterRows(6 + held, posture[held], np.full(len(held), np.radians(10.0) ** -2))
 
 
-def _waves(random: np.random.Generator, count: int):
+def waves(random: np.random.Generator, count: int):
     """Smooth functions of time, of about unit size."""
     speed, phase = random.uniform(0.2, 0.8, (3, count)), random.uniform(0.0, 2.0 * np.pi, (3, count))
     return lambda t: np.sin(2.0 * np.pi * speed * t + phase).sum(axis=0) / np.sqrt(1.5)

@@ -61,14 +61,15 @@ def packed_glb(tree: dict, binary: bytes) -> bytes:
 
 
 def _clicks(folder: Path) -> Seed:
-    from kinefit.readers.clicks import read_clicks
+    from kinefit.readers.clicks import clicks_text, read_clicks
 
     points = {camera: {name: [812.0, 401.5] for name in ("r_knee", "l_knee", "c7")} for camera in ("a", "b")}
     (folder / "clicks.json").write_text(json.dumps({"step": 0, "points": points}))
 
     def read() -> object:
-        clicks = read_clicks(folder / "clicks.json")
-        return clicks.text(), [finite(clicks.places(camera)) for camera in clicks.points if clicks.names]
+        steps = read_clicks(folder / "clicks.json")
+        places = [finite(of.places(camera)) for of in steps for camera in of.points if of.names]
+        return clicks_text(steps), places
 
     return Seed((folder / "clicks.json",), read)
 

@@ -43,6 +43,7 @@ class GearTake:
     scene : GearScene
     hidden : (F,) bool, frames in which the left leg is behind a cover
     seed : int
+    videos : int, of the cameras, whose colours are used; the others have the keypoints of the first frame alone
     """
 
     name: str
@@ -50,6 +51,7 @@ class GearTake:
     scene: GearScene
     hidden: NDArray
     seed: int
+    videos: int
 
     def write(self, folder: Path, *, closures: bool) -> Path:
         """The take file, with a body file that holds closures or does not; videos are written once."""
@@ -59,7 +61,7 @@ class GearTake:
         take = folder / f"take_{closures}.toml"
         take.write_text(_take(self, f"{self.name}_{closures}.toml"))
         if not (folder / "calibration.toml").exists():
-            for camera in rig:
+            for camera in rig.cameras[: self.videos]:
                 _video(self.scene, camera, folder / f"{camera.name}.mp4")
             seen = simulate_keypoints(
                 self.truth, rig, SET, noise_px=_NOISE, drift_px=_DRIFT, outliers=0.03, missing=0.05, seed=self.seed
@@ -84,8 +86,9 @@ def body_text(name: str, closures: bool) -> str:
 def _take(take: GearTake, body: str) -> str:
     text = f'[take]\nup = "y"\nrate = {RATE}\nbody = "{body}"\nheight = {take.truth.body.stature:.2f}\n'
     text += '[calibration]\nfile = "calibration.toml"\n'
-    for name in take.scene.rig.names:
-        text += f'[[camera]]\nname = "{name}"\nvideo = "{name}.mp4"\n[[region]]\ncamera = "{name}"\n'
+    for k, name in enumerate(take.scene.rig.names):
+        text += f'[[camera]]\nname = "{name}"\n'
+        text += f'video = "{name}.mp4"\n[[region]]\ncamera = "{name}"\n' if k < take.videos else ""
         text += f'[[keypoints]]\ncamera = "{name}"\nfile = "{name}"\nset = "{SET}"\nrate = {RATE}\nframes = [0, 1]\n'
     return text
 
@@ -108,8 +111,13 @@ def _keypoints(seen, folder: Path) -> None:
         (folder / f"{f:06d}_keypoints.json").write_text(json.dumps({"people": people}))
 
 
-def rendered_cyclist(seed: int, *, cover: bool = False, seconds: float = SECONDS) -> GearTake:
-    """In a lab, four cameras; the bike stands in view. The cover comes up before the left leg after a fifth."""
+def rendered_cyclist(
+    seed: int, *, cover: bool = False, seconds: float = SECONDS, videos: int = 4, shutter: float = 0.0
+) -> GearTake:
+    """In a lab, four cameras; the bike stands in view. The cover comes up before the left leg after a fifth.
+
+    The shutter is open for a part of the time between two images, which blurs what moves.
+    """
     truth = cyclist(seed, seconds=amount(seconds, 0.2)).truth
     random, count = np.random.default_rng((seed, 50)), len(truth)
     rig = studio_rig(truth, cameras=4, up="y", size=SIZE, focal=FOCAL)
@@ -127,7 +135,8 @@ def rendered_cyclist(seed: int, *, cover: bool = False, seconds: float = SECONDS
     light = Light(_unit(0.3, 1.0, 0.2), np.array([0.65, 0.63, 0.6]), np.array([0.42, 0.43, 0.45]), np.ones(count),
                   np.full((count, len(rig)), 0.95))  # fmt: skip
     ground = draw.lab_ground(centre, away + 1.2, seed)
-    return GearTake("cyclist", truth, _scene(moving, things, rig, light, ground, 0.0, seed, centre), hidden, seed)
+    scene = _scene(moving, things, rig, light, ground, shutter, seed, centre)
+    return GearTake("cyclist", truth, scene, hidden, seed, videos)
 
 
 def rendered_snowboarder(seed: int, *, cover: bool = False, seconds: float = SECONDS) -> GearTake:
@@ -148,7 +157,8 @@ def rendered_snowboarder(seed: int, *, cover: bool = False, seconds: float = SEC
                   np.array([0.27, 0.31, 0.38]), *clouds(count, RATE, len(rig), random))  # fmt: skip
     things = draw.scattered(random, centre, 2.6, 9.0, 30, seed)
     ground = draw.slope_ground(centre, 16.0, seed)
-    return GearTake("snowboarder", truth, _scene(moving, things, rig, light, ground, 0.5, seed, centre), hidden, seed)
+    scene = _scene(moving, things, rig, light, ground, 0.5, seed, centre)
+    return GearTake("snowboarder", truth, scene, hidden, seed, len(rig))
 
 
 def _scene(

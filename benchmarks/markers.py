@@ -9,6 +9,7 @@ PARTS = {
     "markers_sapm": "the paper's method on real takes, beside `identify`",
     "markers_real": "who is who in real takes, frame by frame and whole",
     "markers_unknown": "label sets that the catalogue does not know",
+    "markers_robot": "a robot's markers: a tree and a set of one's own",
     "markers_audit": "models of subjects, and labels that somebody else gave",
     "markers_fit": "bodies and angles beside Plug-in-Gait's and OpenSim's",
     "markers_roads": "`kinefit markers fit` and `kinefit track` on the same files",

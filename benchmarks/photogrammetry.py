@@ -15,6 +15,7 @@ PARTS = {
     "video_bodies": "drawn videos and a bar recording through the commands, with nothing but clicked joints",
     "metaballs": "an arm of metaballs fitted to points",
     "surface_arm": "a bare arm before two cameras, tracked",
+    "surface_clothes": "skin and clothes of real people: followed in one camera, measured between two",
     "clicked": "poses from joints clicked in three images",
     "retarget": "recorded motions on other characters, in the Khronos validator",
 }

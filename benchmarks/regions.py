@@ -10,6 +10,7 @@ PARTS = {
     "regions_rendered": "rendered objects in the manner of RBOT: moving light, noise, an occluder, larger steps",
     "regions_people": "the balancing trial by colours alone, beside keypoints, and by the paper's own recipe",
     "regions_gear": "a rendered cyclist in a lab and a snowboarder outdoors, with closures and without",
+    "regions_few": "the cyclist by one camera and two, blurred, with closures and without",
     "regions_speed": "time of a frame of a whole person",
 }
 

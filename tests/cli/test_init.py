@@ -159,6 +159,47 @@ def test_clicked_joints_give_body_and_start(folder, tmp_path):
     assert answer.exit_code == 2 and "[1] is no pixel" in answer.stderr
 
 
+def test_clicks_are_measurements_of_their_frames(folder, tmp_path):
+    """Clicks of two frames stay with the take: each frame of them alone gives the pose that was clicked there."""
+    from kinefit.observations import LineFrame
+    from kinefit.tracking.takes.take_recording import recording_of
+
+    motion = squat_and_wave()
+    assert run("init", folder).exit_code == 0
+    rng, looks = np.random.default_rng(0), [clicked(folder, motion, frame) for frame in (3, 20)]
+    for look in looks:
+        for points in look["points"].values():
+            for place in points.values():
+                place[:] = (np.array(place) + 2.0 * rng.normal(size=2)).tolist()
+    (tmp_path / "both.json").write_text(json.dumps(looks[::-1]))  # in any order
+    answer = run("init", folder, "--points", tmp_path / "both.json", "--force")
+    assert answer.exit_code == 0, answer.output
+    take = read_take(folder / "take.toml")
+    assert take.pose.step == 3 and take.pose.clicks == folder / "clicks.json"
+    seen = load_observations(take)
+    video = next(video for video in seen.lines if video.sensor == "cam02")
+    name, (u, v) = next(iter(looks[1]["points"]["cam02"].items()))
+    k = video.names.index(f"{name} u")
+    np.testing.assert_allclose(video.frame(1).ends[k, :, 0], u, atol=0.01)
+    np.testing.assert_allclose(video.frame(1).ends[k + 1, :, 1], v, atol=0.01)
+    assert video.landmarks[k] == video.landmarks[k + 1] == (name,)
+    body = load_body(take.body)
+    recording, body = recording_of(take, seen, body)
+    assert recording.sigma["lines cam02"] == 3.0
+    first, tracker = seen.frames[0], kinefit.Tracker(body, recording.rig, rate=30.0, up="z", sigma=recording.sigma)
+    tracker.start_at(recording.start[1])
+    frames = [[f for f in recording.steps(step - first) if isinstance(f, LineFrame)] for step in (3, 20)]
+    assert [len(of) for of in frames] == [3, 3]
+    for step, of in zip((3, 20), frames):
+        state = tracker.update(of).state
+        joints = body.tree.segment_poses(state.T_world_root[None], state.angles[None])[0, :, :3, 3]
+        limbs = [body.tree.segment(f"{part}_{side}") for part in ("forearm", "hand", "shank", "foot") for side in "rl"]
+        off = np.linalg.norm(joints - motion.joint_centres[step], axis=1)[limbs]
+        assert off.max() < 0.04, (step, off)
+    moved = np.linalg.norm(motion.joint_centres[3] - motion.joint_centres[20], axis=1)
+    assert moved.max() > 0.1  # the second frame is not the start
+
+
 def test_clicks_that_no_pose_has_are_told(folder, tmp_path):
     motion = squat_and_wave()
     assert run("init", folder).exit_code == 0
@@ -181,7 +222,7 @@ def test_clicks_that_no_pose_has_are_told(folder, tmp_path):
     answer = answered(lambda points: points["cam02"].update(knie=[10.0, 20.0]))
     assert answer.exit_code == 2 and "'knie'" in answer.stderr
     answer = answered(lambda points: points["cam02"].update(r_thigh_front=[10.0, 20.0]))
-    assert "Clicked in one image alone, and not used: r_thigh_front" in " ".join(answer.stdout.split())
+    assert "Clicked in one image alone, and no part of the start: r_thigh_front" in " ".join(answer.stdout.split())
 
 
 def test_joints_are_clicked_in_the_browser(folder, monkeypatch):

@@ -81,7 +81,7 @@ def test_what_faces_away_is_not_expected(images):
     assert same.maps == pytest.approx(np.tile(np.eye(2), (len(same.ids), len(RIG), 1, 1)))
     turned = vanished.expected(4)
     assert 0 < len(turned.ids) < len(same.ids)
-    vanished.found(turned.index)
+    vanished.found(4, turned.index)
     assert len(vanished) == len(there) - len(turned.ids)
     assert vanished.expected(len(MOTION)) is None  # the motion has ended
 
@@ -95,3 +95,17 @@ def test_points_off_the_body_are_not_remembered(images):
 def test_a_tracker_needs_a_frame_before_it_tells_paths():
     with pytest.raises(ObservationError, match="no frame"):
         SurfaceTracker(RIG, 30.0, motion=MOTION).trajectories()
+
+
+def test_the_motion_says_when_a_lost_point_comes_back(images):
+    """Turned away and back by one angle, a point is due as long before the end as it was lost after the beginning."""
+    tracker = SurfaceTracker(RIG, 30.0, SurfaceTracking(step=8), motion=MOTION)
+    for several in images:
+        tracker.update(several)
+    returns = tracker.returns()
+    assert len(returns) > 10
+    found = [of for of in returns if of.found is not None]
+    assert found and all(of.expected is not None and of.lost <= of.expected <= of.found for of in found)
+    late = [of.found - of.expected for of in found]
+    assert np.median(late) <= 1
+    assert not SurfaceTracker(RIG, 30.0).returns()

@@ -9,7 +9,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
-from kinefit.photogrammetry.trajectories import Trajectories, uniform, within_bounds
+from kinefit.photogrammetry.trajectories import Trajectories, accompanied, filtered, uniform, within_bounds
 
 TEXTURE = scenes.Texture(0.005, 3)
 
@@ -93,3 +93,38 @@ def test_a_surface_that_vanishes_and_images_that_change_are_refused():
     blank = [SplineImage.of(rng.normal(size=(150, 200))) for _ in rig]
     with pytest.raises(TrackingError, match="frame 1"):
         tracker.update(blank)
+
+
+def test_both_filters_and_the_neighbours_in_turn():
+    """A jump is cut by bounds, a drift by its neighbours, and a point that is alone by having none."""
+    rng = np.random.default_rng(0)
+    start = rng.uniform(-0.05, 0.05, (20, 3))
+    start[7] = [1.0, 0.0, 0.0]
+    x = start + 0.01 * np.arange(12)[:, None, None] * np.array([1.0, 0, 0]) + 1e-5 * rng.normal(size=(12, 20, 3))
+    x[6:, 4, 1] += 0.004 * np.arange(1, 7)
+    x[8:, 2, 2] += 0.5
+    paths = Trajectories(np.arange(12) / 30.0, x, np.full_like(x, 1e-4), np.zeros((12, 20, 2, 2)))
+    assert not accompanied(paths, radius=0.1)[:, 7].any() and accompanied(paths, radius=0.1)[:8, :4].all()
+    kept, cut = filtered(paths, radius=0.1, bounds=(2.0, 100.0), neighbours=True)
+    assert not kept.live[:, 7].any() and not kept.live[7:, 4].any() and not kept.live[8:, 2].any()
+    assert cut["bounds"] >= 4 and cut["uniformity"] >= 5 and cut["neighbours"] == 12
+    good = np.setdiff1d(np.arange(20), [2, 4, 7])
+    assert kept.live[:, good].all()
+    free, cut = filtered(paths, radius=0.1)
+    assert cut["bounds"] == 0 and not free.live[9:, 2].any()  # its neighbours do not jump
+
+
+def test_paths_that_were_cut_no_longer_judge_their_neighbours():
+    """A wrong point whose surroundings are wrong points passes the second filter alone, and not once those are cut."""
+    rng, along = np.random.default_rng(0), [*np.arange(-0.2, 0.001, 0.01), 0.02, 0.025, 0.105, 0.2]
+    wrong = slice(len(along) - 4, len(along) - 1)
+    x = np.array(along)[:, None] * np.array([1.0, 0, 0]) + 1e-5 * rng.normal(size=(12, len(along), 3))
+    x[:, wrong, 2] += 0.02 * np.arange(12)[:, None]
+    paths = Trajectories(np.arange(12) / 30.0, x, np.full_like(x, 1e-4), np.zeros((12, len(along), 2, 2)))
+    once = paths.kept(uniform(paths, radius=0.1))
+    assert once.live[:, -2].all() and not once.live[:, -4:-2].any()
+    kept, cut = filtered(paths, radius=0.1)
+    assert (kept.live == once.live).all() and cut["neighbours"] == 0
+    kept, cut = filtered(paths, radius=0.1, neighbours=True)
+    assert not kept.live[:, wrong].any() and cut["neighbours"] == 12  # the last one is alone
+    assert kept.live[:, :-4].all()

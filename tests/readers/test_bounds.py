@@ -166,6 +166,7 @@ def test_repeated_names_are_found_by_a_comparison_for_each():
     [("[" * 100_000, "is no JSON"), ('{"points": {"a": {"b": [1, %s]}}}' % ("9" * 400), "no pixel"),
      ('{"points": {"a": {"b": [NaN, 1]}}}', "no pixel"),
      ('{"step": %s, "points": {}}' % ("9" * 400), "no number of a frame"),
+     ("[]", "holds no points"), ('[{"points": {}}, {"points": {}}]', "step 0 is there twice"),
      ("\xff", "is no JSON")],
 )  # fmt: skip
 def test_clicks_that_are_none_are_told(tmp_path, text, told):

@@ -7,7 +7,8 @@ from scipy.optimize import minimize
 from kinefit.bodies import BodyState, load_body, parse_body
 from kinefit.correspondences import point_rows, prior_rows
 from kinefit.correspondences.closures import closed_at, hard_equations
-from kinefit.solvers.closed import CLOSED, closed_fit, null_space, on_null_space, onto
+from kinefit.errors import BodyError
+from kinefit.solvers.closed import CLOSED, closed_fit, closure_forces, load_of, null_space, on_null_space, onto
 from kinefit.solvers.equations import inverse
 
 LEG = """
@@ -104,3 +105,47 @@ def test_a_covariance_on_the_null_space_is_that_of_endless_weight():
     assert np.abs(A @ exact).max() < 1e-9 and np.all(np.diag(exact) <= np.diag(P) + 1e-12)
     Z = null_space(A, np.zeros(len(A)), np.zeros(A.shape[1], bool)).free
     np.testing.assert_allclose(exact, Z @ inverse(Z.T @ B.T @ B @ Z) @ Z.T, atol=1e-9)
+
+
+def test_a_pedal_under_a_known_load_is_pushed_along_the_line_through_the_hip(leg):
+    """A passive hip lets the leg push along the line from hip to foot alone: by the crank's torque over its lever."""
+    state, _ = onto(leg, at([0.3, -0.9, 1.2]), hard_equations(leg))
+    hip, torque = np.zeros(3), 25.0  # [N m] that brakes the crank
+    foot = leg.positions(state, leg.landmarks.select(("foot",)))[0]
+    axis, knee = np.array([0.0, 0.6, 0.0]), leg.positions(state, leg.landmarks.select(("joint",)))[0]
+    load = np.zeros(leg.tree.n_dofs)
+    load[6 + leg.tree.coordinate("axis")] = torque
+    found = closure_forces(leg, state, load, active=["knee"])
+    along = (foot - hip) / np.linalg.norm(foot - hip)
+    lever = np.cross(foot - axis, along)[2]  # the force on the crank is the opposite of that on the foot
+    crank = state.angles[2]
+    R = np.array([[np.cos(crank), -np.sin(crank)], [np.sin(crank), np.cos(crank)]])
+    on_foot = np.array([*(R @ found.force[:2]), found.force[2]])
+    np.testing.assert_allclose(on_foot, torque / lever * along, atol=1e-9)
+    assert found.names[:2] == ("foot along x", "foot along y") and found.determined[:2].all()
+    assert not found.determined[2]  # a plane's mechanism says nothing across it
+    needed = -np.cross(foot - knee, on_foot)[2]
+    assert found.torque[6 + leg.tree.coordinate("knee")] == pytest.approx(needed, abs=1e-9)
+    assert np.abs(found.unbalanced).max() < 1e-9
+    weight = load_of(leg, state, leg.landmarks.select(("joint",)), [[0.0, -80.0, 0.0]])
+    assert weight[6 + leg.tree.coordinate("hip")] == pytest.approx(-80.0 * knee[0], abs=1e-9)
+    assert not weight[[6 + leg.tree.coordinate("knee"), 6 + leg.tree.coordinate("axis")]].any()
+    pushed = closure_forces(leg, state, load, active=["hip", "knee"])  # then the crank alone says something
+    assert pushed.determined.tolist() == [True, False, False]
+    assert pushed.force[0] == pytest.approx(-torque / 0.15, abs=1e-9) and np.abs(pushed.unbalanced).max() < 1e-9
+
+
+def test_forces_of_closures_of_a_body_with_gear():
+    """Half of a bar's weight hangs in the left hand where the lifter's arms are alike, and the pelvis carries all."""
+    body = load_body("weight_lifter")
+    state, off = onto(body, body.usual_state(), hard_equations(body))
+    assert off <= CLOSED
+    load = load_of(body, state, body.landmarks.select(("bar_middle",)), [[0.0, -200.0, 0.0]])
+    found = closure_forces(body, state, load)
+    grip = body.tree.segment_poses(state.T_world_root[None], state.angles[None])[0, body.tree.segment("bar"), :3, :3]
+    assert np.linalg.norm(found.unbalanced[:3] - [0.0, -200.0, 0.0]) < 1e-6  # nothing holds the root
+    assert found.force.shape == (3,) and np.isfinite(grip @ found.force).all()
+    with pytest.raises(BodyError, match="no closures"):
+        closure_forces(load_body("humanoid"), load_body("humanoid").usual_state(), np.zeros(47))
+    with pytest.raises(BodyError, match="wing"):
+        closure_forces(body, state, load, active=["wing"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,16 +52,12 @@ def _ask(out: Path, take: Take, seen: Observations, body: Body, step: int, brows
     """Show the page until its clicks give a start."""
     import webbrowser
 
-    from kinefit.exporters.atomic import write_text
     from kinefit.initialization.from_clicks import clickable
     from kinefit.readers.clicks import clicks_of
     from kinefit.viewers.clicks import ClickPage
 
     def taken(told: Any) -> str:
-        clicks = clicks_of(told)
-        answer = _started(out, take, seen, body, clicks)
-        write_text(out.with_name(CLICKS), clicks.text())
-        return answer
+        return _started(out, take, seen, body, [clicks_of(told)])
 
     page = ClickPage(_pictures(take, seen, step), clickable(body), taken, step=step)
     try:
@@ -98,20 +95,23 @@ def _pictures(take: Take, seen: Observations, step: int) -> dict[str, bytes]:
     return out
 
 
-def _started(out: Path, take: Take, seen: Observations, body: Body, clicks: Clicks) -> str:
-    """Write body and start into the take file; what to tell."""
+def _started(out: Path, take: Take, seen: Observations, body: Body, steps: Sequence[Clicks]) -> str:
+    """Write body and start of the first step, and the clicks of all, to which the take file refers; what to tell."""
     import numpy as np
 
     from kinefit.bodies.serial import save_body
     from kinefit.exporters.atomic import write_text
     from kinefit.initialization.from_clicks import clickable, clicked_points, clicked_start
+    from kinefit.readers.clicks import clicks_text
 
     assert seen.rig is not None
-    unknown = [camera for camera in clicks.points if camera not in seen.rig.names]
+    clicks = steps[0]
+    unknown = [camera for of in steps for camera in of.points if camera not in seen.rig.names]
     if unknown:
         raise TrackingError(choices("camera of the take", unknown[0], seen.rig.names))
     every = [name for of in clicks.points.values() for name in of]
-    strange = [name for name in every if name not in body.landmarks.names]
+    named = [name for step in steps for of in step.points.values() for name in of]
+    strange = [name for name in named if name not in body.landmarks.names]
     if strange:
         raise TrackingError(choices(f"landmark of body '{body.name}'", strange[0], clickable(body)))
     once = [name for name in dict.fromkeys(every) if every.count(name) == 1]
@@ -133,12 +133,14 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, clicks: Clic
     lines = [f"{key} = [{', '.join(f'{v:.6f}' for v in vector)}]" for key, vector in vectors.items()]
     text = re.sub(r"\n\[start\]  # clicked\n.*?(?=\n\[|\Z)", "", out.read_text("utf-8"), flags=re.S)
     text = re.sub(r"(?m)^body = .*$", f'body = "{BODY}"  # {body.name} of the clicked lengths', text, count=1)
-    start = "\n".join(["[start]  # clicked", f"step = {clicks.step}", *lines, f"angles = {{ {written} }}"])
+    head = ["[start]  # clicked", f"step = {clicks.step}", f'clicks = "{CLICKS}"']
+    start = "\n".join([*head, *lines, f"angles = {{ {written} }}"])
+    write_text(out.with_name(CLICKS), clicks_text(steps))
     write_text(out, f"{text.rstrip()}\n\n{start}\n")
     known = np.isfinite(x_world).all(axis=1).sum()
     told = f"{known} points known in space, {100 * left:.1f} cm from the pose (median)."
     if once:
-        told += f" Clicked in one image alone, and not used: {', '.join(once)}."
+        told += f" Clicked in one image alone, and no part of the start: {', '.join(once)}."
     off = np.linalg.norm(fitted.positions(state, fitted.landmarks.select(names)) - x_world, axis=1)
     if np.nanmax(off) > _FAR:
         worst = np.argsort(-np.nan_to_num(off))[:_LISTED].tolist()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes, write_text
+from kinefit.photogrammetry.returning import PointReturn
 from kinefit.photogrammetry.strain import Strain
 from kinefit.photogrammetry.surface import MeasuredSurface
 from kinefit.photogrammetry.trajectories import Trajectories
@@ -124,6 +125,15 @@ def write_paths_csv(paths: Trajectories, path: str | PathLike[str]) -> None:
         table = np.hstack([paths.x_world[k, index], paths.std[k, index], velocity[k, index], acceleration[k, index]])
         for p, row in zip(index, table):
             lines.append(f"{time:.6f},{p}," + ",".join(f"{v:.6g}" if np.isfinite(v) else "" for v in row))
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def write_returns_csv(returns: Sequence[PointReturn], rate: float, path: str | PathLike[str]) -> None:
+    """Write a row for each point that vanished: when it was lost, is expected and was found [s]; empty for never."""
+    lines = ["point,lost_s,expected_s,found_s"]
+    for of in returns:
+        times = ["" if frame is None else f"{frame / rate:.6f}" for frame in (of.lost, of.expected, of.found)]
+        lines.append(",".join([str(of.point), *times]))
     write_text(path, "\n".join(lines) + "\n")
 
 

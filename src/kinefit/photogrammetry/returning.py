@@ -6,7 +6,7 @@ later frames the segment's pose says where it must be seen, and how its window i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +48,26 @@ class Expected:
     between: NDArray
 
 
+@dataclass(frozen=True)
+class PointReturn:
+    """When a vanished point comes back, in frames.
+
+    Parameters
+    ----------
+    point : its name
+    lost : first frame without it
+    expected : first frame from then on in which the motion brings it into view of all cameras; None: in none
+    found : frame in which it was found again; None: in none so far
+    """
+
+    point: int
+    lost: int
+    expected: int | None
+    found: int | None = None
+
+
 class Vanished:
-    """Remembers lost points of a body.
+    """Remembers lost points of a body; `returns` says when each comes back, in the order in which they were lost.
 
     Parameters
     ----------
@@ -66,6 +84,7 @@ class Vanished:
         self._rest, self._normal = np.zeros((0, 3)), np.zeros((0, 3))
         self._inside, self._axes = np.zeros((0, C, 2)), np.zeros((0, C, 2, 2))
         self._crops = np.zeros((0, C, self._side, self._side), np.float32)
+        self.returns: list[PointReturn] = []
 
     def __len__(self) -> int:
         return len(self._ids)
@@ -93,25 +112,41 @@ class Vanished:
         )  # fmt: skip
         for name, values in parts:
             setattr(self, name, np.concatenate([getattr(self, name), values]))
+        self._foretell(frame + 1, np.arange(len(self) - len(on), len(self)))
 
-    def expected(self, frame: int) -> Expected | None:
-        """Those that should be in view in every image of a frame; None where there are none."""
-        self._forget(frame - self._since > _SECONDS * self.motion.rate)
-        if not len(self) or not 0 <= frame < len(self.motion):
-            return None
-        frames = self._frames(frame)
-        uv, axes = self._seen(frames, self._segment, self._rest, self._normal)
-        R, t = self._of(frames, self._segment)
-        x = np.einsum("nij,nj->ni", R, self._rest) + t
-        out = np.einsum("nij,nj->ni", R, self._normal)
+    def _visible(self, frame: int, index: NDArray) -> tuple[NDArray[np.bool_], NDArray, NDArray]:
+        """(N,) which remembered points all cameras see by the motion, and their places and directions as of `_seen`."""
+        frames, segment, rest = self._frames(frame), self._segment[index], self._rest[index]
+        uv, axes = self._seen(frames, segment, rest, self._normal[index])
+        R, t = self._of(frames, segment)
+        x = np.einsum("nij,nj->ni", R, rest) + t
+        out = np.einsum("nij,nj->ni", R, self._normal[index])
         good = np.isfinite(uv).all(axis=(1, 2)) & np.isfinite(axes).all(axis=(1, 2, 3))
         half = 0.5 * self._side
         for c, camera in enumerate(self.rig):
             to = camera.centre_world - x
             good &= np.einsum("ni,ni->n", out, to) > _FACING * np.linalg.norm(to, axis=1)
             good &= ((uv[:, c] > half) & (uv[:, c] < np.array(camera.size) - half)).all(axis=1)
-        for seen in (self._axes, axes):
+        for seen in (self._axes[index], axes):
             good &= (np.abs(np.linalg.det(seen)) > _EDGE_ON).all(axis=1)
+        return good, uv, axes
+
+    def _foretell(self, lost: int, index: NDArray) -> None:
+        """Note when the motion brings points, lost in a frame, into view again."""
+        first = np.full(len(index), -1)
+        for frame in range(lost, min(len(self.motion), lost + int(_SECONDS * self.motion.rate) + 1)):
+            waiting = np.flatnonzero(first < 0)
+            if not len(waiting):
+                break
+            first[waiting[self._visible(frame, index[waiting])[0]]] = frame
+        self.returns += [PointReturn(int(self._ids[i]), lost, int(f) if f >= 0 else None) for i, f in zip(index, first)]
+
+    def expected(self, frame: int) -> Expected | None:
+        """Those that should be in view in every image of a frame; None where there are none."""
+        self._forget(frame - self._since > _SECONDS * self.motion.rate)
+        if not len(self) or not 0 <= frame < len(self.motion):
+            return None
+        good, uv, axes = self._visible(frame, np.arange(len(self)))
         index = np.flatnonzero(good)
         if not len(index):
             return None
@@ -122,8 +157,12 @@ class Vanished:
         at[..., 1] += (self._side * np.arange(len(index)))[:, None]
         return Expected(index, self._ids[index], mosaics, at, uv[index], maps, between)
 
-    def found(self, index: NDArray) -> None:
-        """Forget points that are back."""
+    def found(self, frame: int, index: NDArray) -> None:
+        """Forget points that are back in a frame."""
+        ids = set(map(int, self._ids[index]))
+        self.returns = [
+            replace(of, found=frame) if of.found is None and of.point in ids else of for of in self.returns
+        ]
         gone = np.zeros(len(self), bool)
         gone[index] = True
         self._forget(gone)

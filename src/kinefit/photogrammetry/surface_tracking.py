@@ -22,7 +22,7 @@ from kinefit.photogrammetry.intersection import intersect
 from kinefit.photogrammetry.least_squares_matching import WINDOW, match
 from kinefit.photogrammetry.matching.correlation import search_box
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds
-from kinefit.photogrammetry.returning import Vanished
+from kinefit.photogrammetry.returning import PointReturn, Vanished
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.surface import check_images, largest_parallax, measure
 from kinefit.photogrammetry.trajectories import Trajectories
@@ -158,6 +158,10 @@ class SurfaceTracker:
             std[k, points.ids] = np.sqrt(np.diagonal(points.covariance, axis1=1, axis2=2))
         return Trajectories(np.arange(len(self._frames)) / self.rate, x, std, uv)
 
+    def returns(self) -> list[PointReturn]:
+        """When points that vanished are expected and were found again; none without the motion."""
+        return [] if self._vanished is None else list(self._vanished.returns)
+
     def _started(self, images: Sequence[SplineImage]) -> SurfacePoints:
         settings = self.settings
         grid = Grid.of(images[0].size, settings.step, margin=settings.window // 2 + 2, mask=self.mask)
@@ -257,7 +261,7 @@ class SurfaceTracker:
         index = np.flatnonzero(good)
         meet = intersect(self.rig, uv[index], covariance[index])
         agree = meet.parallax <= largest_parallax(meet.parallax)
-        self._vanished.found(expected.index[index[agree]])
+        self._vanished.found(frame, expected.index[index[agree]])
         kept = (expected.ids[index], meet.x_world, meet.covariance, uv[index], maps[index])
         return SurfacePoints(*(value[agree] for value in kept))
 

@@ -1,9 +1,9 @@
-"""Joints that somebody clicked in the images of one time, as JSON."""
+"""Joints that somebody clicked in the images of one time or of several, as JSON."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -16,7 +16,7 @@ from kinefit._files import read_bytes, repeated
 from kinefit.errors import FileError
 
 _MAX_NUMBER = 1e9  # frames and pixels; no recording has as many
-_FORM = 'Write {"step": 0, "points": {"CAMERA": {"r_knee": [812.0, 401.5], ...}, ...}}.'
+_FORM = 'Write {"step": 0, "points": {"CAMERA": {"r_knee": [812.0, 401.5], ...}, ...}}, or a list of these.'
 
 
 @dataclass(frozen=True)
@@ -42,28 +42,33 @@ class Clicks:
         told = self.points.get(camera, {})
         return np.array([told.get(name, (np.nan, np.nan)) for name in self.names], float).reshape(-1, 2)
 
-    def text(self) -> str:
-        """As JSON."""
-        told = {"step": self.step, "points": {c: {n: list(p) for n, p in of.items()} for c, of in self.points.items()}}
-        return json.dumps(told, indent=1) + "\n"
+
+def clicks_text(steps: Sequence[Clicks]) -> str:
+    """Clicks of one step or of several as JSON, as `read_clicks` takes it."""
+    told = [{"step": of.step, "points": {c: {n: list(p) for n, p in points.items()} for c, points in of.points.items()}}
+            for of in steps]  # fmt: skip
+    return json.dumps(told if len(told) > 1 else told[0], indent=1) + "\n"
 
 
-def read_clicks(path: str | PathLike[str]) -> Clicks:
-    """Clicked points from a JSON file.
+def read_clicks(path: str | PathLike[str]) -> tuple[Clicks, ...]:
+    """Clicked points of every step in a JSON file, in the order of the steps; one at least.
 
     Raises
     ------
     FileError
-        Not readable, not JSON, or of another form.
+        Not readable, not JSON, of another form, or a step twice.
     """
     try:
         told = json.loads(read_bytes(Path(path)))
     except (ValueError, RecursionError) as error:
         raise FileError(f"is no JSON ({error})", file=path, remedy=_FORM) from error
     try:
-        return clicks_of(told)
+        steps = sorted(map(clicks_of, told if isinstance(told, list) and told else [told]), key=lambda of: of.step)
     except FileError as error:
         raise FileError(error.problem, file=path, place=error.place, remedy=error.remedy) from error
+    if twice := repeated(str(of.step) for of in steps):
+        raise FileError(f"step {', '.join(twice)} is there twice", file=path, remedy="Put its points together.")
+    return tuple(steps)
 
 
 def clicks_of(told: Any) -> Clicks:

@@ -6,18 +6,20 @@ With H the normal matrix, g the gradient, A the Jacobian of the equations c = 0,
 
 which solves the Karush-Kuhn-Tucker system without its multipliers, whatever equations follow from others. Every trial
 state is brought back onto c = 0 before its cost is compared, so that a fit never trades one for the other. Covariances
-are those on the null space of A.
+are those on the null space of A. The multipliers of c = 0 are forces where the gradient is one: `closure_forces`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from kinefit.bodies import Body, BodyState
+from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.correspondences.closures import closed_at
+from kinefit.errors import BodyError, choices
 from kinefit.rows import AnyRows
 from kinefit.solvers import _kernels_linear
 from kinefit.solvers.equations import lock, normal_equations
@@ -195,3 +197,78 @@ def on_null_space(covariance: NDArray, A: NDArray) -> NDArray:
     left = across * scale[:, None]
     out = covariance - left.T @ inner @ left
     return 0.5 * (out + out.T)
+
+
+@dataclass(frozen=True, eq=False)
+class ClosureForces:
+    """What closures of a body that stands still carry.
+
+    Parameters
+    ----------
+    names : (m,) of the equations: closure and direction
+    force : (m,) [N], of turns [N m]: on each closure's `point`, in the frame of its `to` (or of the world); the other
+        side gets the opposite
+    determined : (m,) bool, whether the equilibrium alone says it: false where gear is clamped against itself
+    torque : (n,) [N m, N] of the active coordinates that hold the pose; 0 for passive ones
+    unbalanced : (n,) [N, N m] of the root and the passive coordinates that no force of a closure balances; zero in
+        equilibrium
+    """
+
+    names: tuple[str, ...]
+    force: NDArray
+    determined: NDArray
+    torque: NDArray
+    unbalanced: NDArray
+
+
+def load_of(body: Body, state: BodyState, points: PointSet, forces: ArrayLike) -> NDArray:
+    """(n,) [N, N m] generalised forces Σ Jₖᵀ fₖ of forces (K, 3) [N] in the world on points (K,) of a body."""
+    screws = body.tree.forward(state.T_world_root, state.angles)[1]
+    x, f = body.positions(state, points) - state.T_world_root[:3, 3], np.asarray(forces, float)
+    out = np.zeros(body.tree.n_dofs)
+    for segment, arm, force in zip(points.segments, x, f):
+        out += body.tree.segment_jacobian(screws, int(segment)).T @ np.concatenate([force, np.cross(arm, force)])
+    return out
+
+
+def closure_forces(
+    body: Body, state: BodyState, load: NDArray, *, active: Collection[str] | None = None
+) -> ClosureForces:
+    """Forces in the closures of a body at rest: the multipliers λ of c = 0 in load + u + Aᵀ λ = 0.
+
+    A is the Jacobian of all closures, u the torques of coordinates that muscles or motors hold. It is statics: masses
+    that accelerate need their inertial forces in the load, which no part of kinefit computes. The paper (P3) has no
+    equation for forces.
+
+    Parameters
+    ----------
+    load : (n,) [N, N m] on the degrees of freedom, as of `load_of`; a torque of a joint by its own entry
+    active : coordinates whose torque is whatever the pose needs; default: all of the person's, none of the gear's
+
+    Raises
+    ------
+    BodyError
+        A body without closures; an active coordinate that it does not have.
+    """
+    if not body.closures:
+        raise BodyError(f"body '{body.name}' has no closures", remedy="Add [[closure]] to its file.")
+    tree = body.tree
+    if active is None:
+        gear = body.gear_scale[body.segment_scale]
+        active = [name for name, s in zip(tree.coordinates, tree.owners) if not gear[s]]
+    for name in active:
+        if name not in tree.coordinates:
+            raise BodyError(choices(f"angle of body '{body.name}'", name, tree.coordinates))
+    held = np.zeros(tree.n_dofs, bool)
+    held[[6 + tree.coordinate(name) for name in active]] = True
+    held[:6] = not tree.root_free
+    A = closed_at(body, state).jacobian
+    U, s, Vt = np.linalg.svd(A[:, ~held].T)
+    rank = int(np.sum(s > _RANK * max(float(s.max(initial=0.0)), 1e-12)))
+    force = -Vt[:rank].T @ ((U[:, :rank].T @ load[~held]) / s[:rank])
+    balance = load + A.T @ force
+    names = tuple(f"{c.name} {row}" for c in body.closures for row in c.row_names)
+    return ClosureForces(
+        names, force, np.abs(Vt[rank:]).max(axis=0, initial=0.0) < _RANK, np.where(held, -balance, 0.0),
+        np.where(held, 0.0, balance),
+    )  # fmt: skip

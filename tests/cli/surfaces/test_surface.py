@@ -187,6 +187,20 @@ def test_videos_are_tracked(folder, tmp_path):
     assert isinstance(told.exception, ObservationError) and "--gauge with videos" in str(told.exception)
 
 
+def test_bounds_and_neighbours_cut_paths_of_videos(folder, tmp_path):
+    """The plane moves by 0.11 m/s and accelerates little: bounds above that cut nothing, bounds below it everything."""
+    views = f"a={folder / 'a.avi'}", f"b={folder / 'b.avi'}"
+    wide = [*views, "-o", tmp_path / "wide", "--step", 20, "--bounds", 1, 500, "--neighbours"]
+    wide = call(folder / "calib.toml", *wide)
+    assert wide.exit_code == 0 and ", bounds 0," in wide.output, wide.output
+    none = call(folder / "calib.toml", *views, "-o", tmp_path / "none", "--step", 20, "--bounds", 0.02, 500)
+    assert none.exit_code == 0 and ": 0 of " in none.output, none.output
+    assert len((tmp_path / "wide" / "trajectories.csv").read_text().splitlines()) > 100
+    assert len((tmp_path / "none" / "trajectories.csv").read_text().splitlines()) == 1
+    told = call(folder / "calib.toml", f"a={folder / 'a'}", f"b={folder / 'b'}", "-o", tmp_path, "--bounds", 1, 50)
+    assert isinstance(told.exception, ObservationError) and "--bounds with photographs" in str(told.exception)
+
+
 def test_a_motion_must_be_of_the_same_videos(folder, tmp_path):
     from benchmarks.surface_body import moving_arm
 

@@ -20,6 +20,7 @@ from kinefit.exporters.surface_files import (
     write_paths_csv,
     write_point_picture,
     write_points_csv,
+    write_returns_csv,
     write_surface_vtk,
 )
 from kinefit.geometry.camera import Rig
@@ -32,7 +33,7 @@ from kinefit.photogrammetry.spline_image import SplineImage, grey
 from kinefit.photogrammetry.states import measure_states, rigid_motion, surface_strain
 from kinefit.photogrammetry.surface import MeasuredSurface
 from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
-from kinefit.photogrammetry.trajectories import Trajectories, uniform
+from kinefit.photogrammetry.trajectories import Trajectories, filtered
 from kinefit.readers.motion import read_motion
 from kinefit.readers.video import Video, check_rates
 
@@ -55,6 +56,8 @@ class Wanted:
     field: str | None
     smooth: float
     motion: Path | None = None
+    bounds: tuple[float, float] | None = None
+    neighbours: bool = False
 
     def side_of_all(self) -> int:
         """Side of the windows [px], of all."""
@@ -255,13 +258,22 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
             progress("frames", k + 1, count)
     paths = tracker.trajectories()
     speed = float(np.nanpercentile(np.linalg.norm(paths.velocity, axis=2), 99)) if len(paths.times) > 1 else 0.0
-    kept = paths.kept(uniform(paths, radius=_surroundings(paths))) if len(paths.times) > 2 else paths
+    kept, cut = paths, dict[str, int]()
+    if len(paths.times) > 2:
+        kept, cut = filtered(
+            paths, radius=_surroundings(paths), bounds=wanted.bounds, neighbours=wanted.neighbours
+        )  # fmt: skip
     write_paths_csv(kept, wanted.out / "trajectories.csv")
+    if motion is not None:
+        write_returns_csv(tracker.returns(), motion.rate, wanted.out / "returns.csv")
     live, before = kept.live.sum(axis=1), int(paths.live.any(axis=0).sum())
     lengths = kept.live.sum(axis=0)
-    lengths = lengths[lengths > 0]
-    about = f"{len(paths.times)} frames: {len(lengths)} of {before} paths kept, {live.min()} to {live.max()} a frame"
+    lengths = lengths[lengths > 0] if lengths.any() else np.zeros(1, int)
+    count = int(kept.live.any(axis=0).sum())
+    about = f"{len(paths.times)} frames: {count} of {before} paths kept, {live.min()} to {live.max()} a frame"
     told.insert(0, f"{about}, {np.median(lengths):.0f} frames a path (median), speed {speed:.3f} m/s (99 %)")
+    if cut:
+        told.insert(1, "places cut off by the filters: " + ", ".join(f"{name} {count}" for name, count in cut.items()))
     return told
 
 

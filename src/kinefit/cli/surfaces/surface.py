@@ -44,12 +44,18 @@ Examples:
     "--motion", type=click.Path(path_type=Path),
     help="Of videos: the motion.npz, or its folder, of the body that they show; lost points are sought where it says.",
 )  # fmt: skip
+@click.option(
+    "--bounds", type=(float, float), metavar="M/S M/S²",
+    help="Of videos: speed and acceleration beyond which a path is cut off.",
+)  # fmt: skip
+@click.option("--neighbours", is_flag=True, help="Of videos: also cut off points whose neighbours were cut off.")
 @click.option("--field", type=click.Choice(["odd", "even"]), help="Of interlaced images, these lines alone.")
 @_screen.verbose_option
 def surface(
     calibration: Path, views: tuple[str, ...], out: Path, unit: str, window: str, step: int, mask: Path | None,
     seeds: Path | None, least: float | None, gauge: float | None, incremental: bool, still: int | None,
-    smooth: float, flat: float | None, motion: Path | None, field: str | None,
+    smooth: float, flat: float | None, motion: Path | None, bounds: tuple[float, float] | None,
+    neighbours: bool, field: str | None,
 ) -> None:  # fmt: skip
     """Measure a surface that two cameras or more see: points with standard deviations, a mesh, displacement, strain.
 
@@ -65,15 +71,20 @@ def surface(
     from kinefit.errors import ObservationError
 
     check_folder(out)
-    wanted = Wanted(out, window, step, mask, seeds, least, gauge, incremental, still, field, smooth, motion)
-    if motion is not None and flat is not None:
-        raise ObservationError("--motion with --flat", remedy="It is for videos, which are followed in time.")
+    wanted = Wanted(
+        out, window, step, mask, seeds, least, gauge, incremental, still, field, smooth, motion, bounds, neighbours
+    )  # fmt: skip
+    videos_alone = {"--motion": motion, "--bounds": bounds, "--neighbours": neighbours or None}
+    of_videos = [name for name, value in videos_alone.items() if value is not None]
+    if of_videos and flat is not None:
+        raise ObservationError(f"{of_videos[0]} with --flat", remedy="It is for videos, which are followed in time.")
     if flat is not None:
         told = measure_one_camera([calibration, *map(Path, views)], flat, wanted)
     else:
         rig, paths = read_views(calibration, unit, views)
-        if motion is not None and not paths.videos:
-            raise ObservationError("--motion with photographs", remedy="It is for videos, which are followed in time.")
+        if of_videos and not paths.videos:
+            problem = f"{of_videos[0]} with photographs"
+            raise ObservationError(problem, remedy="It is for videos, which are followed in time.")
         with _screen.bars() as progress:
             told = (measure_videos if paths.videos else measure_photographs)(rig, paths, wanted, progress)
     for line in told:

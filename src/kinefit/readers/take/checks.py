@@ -194,6 +194,8 @@ def _pose(take: Take, pose: StartEntry, refuse: Callable[[str, str, str], None])
     if take.start is not None:
         refuse("[start] has no use with start = ... in [take]", "[start]", "Leave one of both out.")
     up = np.array(pose.upward or UP_AXES[take.up], float)
+    if not 0 < pose.click_sigma < 1e4:
+        refuse(f"click_sigma = {pose.click_sigma:g} px", "[start]", "Give a positive number.")
     numbers = np.concatenate([pose.at, pose.forward, up, list(pose.angles.values())])
     if not np.isfinite(numbers).all() or np.abs(numbers).max() > 1e6:
         refuse("numbers that are no place, direction or angle", "[start]", "Give metres, directions and degrees.")
@@ -334,6 +336,7 @@ def _files(take: Take) -> None:
     named += [(f"keypoints of camera {entry.camera}", entry.file) for entry in take.keypoints]
     named += [(f"silhouette of camera {entry.camera}", entry.file) for entry in take.silhouettes]
     named += [(f"lines of camera {entry.camera}", entry.file) for entry in take.lines]
+    named += [("[start] clicks", take.pose.clicks if take.pose else None)]
     named += [("[take] subject", take.subject), ("[take] start", take.start), ("[session] norms", take.session.norms)]
     named += [(kind, table.file) for kind, table in _of_places(take)]
     named += [(f"markers {entry.file.name}, model", entry.model) for entry in take.markers]

@@ -36,6 +36,8 @@ class StartEntry(_Entry, frozen=True, kw_only=True):
     angles: dict[str, float] = {}  # [deg] or, of joints that slide, [m]; others are the body's usual ones
     step: int | None = None  # of the common time; default: the first
     low_pass: bool = True  # whether silhouettes are also fitted with low-pass approximations of the surface first
+    clicks: Path | None = None  # joints clicked at this step and at others, which are measurements of their steps
+    click_sigma: float = 3.0  # [px] standard deviation of a click along each axis, in the calibration's image
 
 
 class SessionEntry(_Entry, frozen=True, kw_only=True):

@@ -1,4 +1,4 @@
-"""Image lines of known objects: `[[lines]]`, a table of two image points a line and frame (CSV or JSON)."""
+"""Image lines of known objects: `[[lines]]`, a table of two image points a line and frame; and clicked joints."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from numpy.typing import NDArray
 from kinefit.errors import FileError, KinefitError, ObservationError, TakeError, choices
 from kinefit.geometry.camera import ImageFrame
 from kinefit.observations import LineVideo
+from kinefit.readers.clicks import read_clicks
 from kinefit.readers.take.entries import LinesEntry
 from kinefit.readers.take.file import Take
 
 _COLUMNS = ("frame", "line", "u1", "v1", "u2", "v2")
 _REMEDY = f"Give a table with the columns {', '.join(_COLUMNS)} (.csv), or a list of objects with these keys (.json)."
+
+_CLICK_CROSS_PX = 20.0  # from a click to the ends of the two lines that cross there: short, that no lens bends them
 
 
 def read_lines(path: Path, names: Iterable[str]) -> tuple[NDArray, NDArray]:
@@ -73,7 +76,7 @@ def _rows(path: Path) -> Iterable[tuple[str, Mapping[str, Any]]]:
 def load_lines(
     take: Take, images: Mapping[str, ImageFrame], rates: Mapping[str, float]
 ) -> tuple[LineVideo, ...]:
-    """All `[[lines]]` of a take; `rates` [Hz] of its other streams.
+    """All `[[lines]]` of a take, then its clicked joints; `rates` [Hz] of its other streams.
 
     Raises
     ------
@@ -89,7 +92,32 @@ def load_lines(
         except KinefitError as error:
             place = ", ".join(part for part in (f"lines of camera {entry.camera}", error.place) if part)
             raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error
-    return tuple(out)
+    return (*out, *_clicks(take, images, rates))
+
+
+def _clicks(take: Take, images: Mapping[str, ImageFrame], rates: Mapping[str, float]) -> list[LineVideo]:
+    """Joints that were clicked: each is two image lines that cross in it, along u and v, with its landmark on both."""
+    if take.pose is None or take.pose.clicks is None:
+        return []
+    steps, out = read_clicks(take.pose.clicks), []
+    for camera in dict.fromkeys(camera for of in steps for camera in of.points):
+        if camera not in images or camera in {entry.camera for entry in take.lines}:
+            problem = choices("camera", camera, images) if camera not in images else f"{camera} has [[lines]] too"
+            raise TakeError(problem, file=take.pose.clicks, place="[start] clicks", remedy="Leave out its clicks.")
+        rate = rates.get(f"video {camera}") or take.rate
+        if rate is None:
+            raise TakeError("nothing states the rate", file=take.path, remedy="Write rate = ... into [take].")
+        mine = [of for of in steps if of.points.get(camera)]
+        names = tuple(dict.fromkeys(name for of in mine for name in of.points[camera]))
+        uv = np.array([[of.points[camera].get(name, (np.nan, np.nan)) for name in names] for of in mine])
+        cross = _CLICK_CROSS_PX * np.array([[[0, -1], [0, 1]], [[-1, 0], [1, 0]]])
+        ends = images[camera].to_calibration(uv[:, :, None, None] + cross).reshape(len(mine), -1, 2, 2)
+        offset = next(entry.time_offset for entry in take.cameras if entry.name == camera)
+        times = offset + np.array([round(of.step - offset * rate) for of in mine]) / rate
+        titles = tuple(f"{name} {axis}" for name in names for axis in "uv")
+        landmarks = tuple((name,) for name in names for _ in "uv")
+        out.append(LineVideo(camera, rate, times, titles, landmarks, ends, source=str(take.pose.clicks)))
+    return out
 
 
 def _lines(entry: LinesEntry, take: Take, image: ImageFrame, rates: Mapping[str, float]) -> LineVideo:

@@ -118,6 +118,8 @@ def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict
     out |= {entry.name: stereo_sigma(entry, video, seen) for entry, video in zip(take.stereo, stereo)}
     out |= {f"silhouette {entry.camera}": entry.sigma for entry in take.silhouettes}
     out |= {f"region {entry.camera}": entry.sigma for entry in take.regions if entry.sigma is not None}
+    if take.pose is not None and take.pose.clicks is not None:
+        out |= {f"lines {video.sensor}": take.pose.click_sigma for video in seen.lines}
     out |= {f"lines {entry.camera}": entry.sigma for entry in take.lines}
     out |= {entry.camera: entry.sigma for entry in (*take.skin, *take.keypoints)}
     return out | {sensor_name("markers", take.markers, k): entry.sigma for k, entry in enumerate(take.markers)}
