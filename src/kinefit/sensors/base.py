@@ -28,7 +28,6 @@ from kinefit.sensors.checks import check_rows, named, of_kind
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.surfaces.depth_view import DepthView
-from kinefit.solvers.pixels import PixelPoints
 
 if TYPE_CHECKING:
     from kinefit.sensors.points.keypoints import KeypointMatched
@@ -283,12 +282,6 @@ class RowsOf(Matched):
 def pixels_of(matched: Iterable[Matched]) -> list[KeypointMatched]:
     """The packed blocks of those matches that offer one."""
     return [block for m in matched if (block := m.pixels) is not None]
-
-
-def packed(matched: Sequence[Matched], scene: Scene) -> PixelPoints | None:
-    """The points of a scene's only match for a fit in one compiled piece; None where rows are needed."""
-    one = matched[0].pixels if len(matched) == 1 else None
-    return None if one is None or scene.at_time(one.time) is not scene else one.packed(scene)
 
 
 def matched_by(measurement: Measurement, scene: Scene, reach: float) -> Matched:

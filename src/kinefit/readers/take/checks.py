@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kinefit._files import repeated
 from kinefit.errors import FileError, ObservationError, TakeError, choices
 from kinefit.motion import UP_AXES
 from kinefit.observations.person import PersonChoice
@@ -122,15 +123,12 @@ def _values(take: Take) -> None:
             refuse(f"face = {list(source.face)}", place, "Give [left, top, width, height] in pixels of the video.")
         if source.frames is not None and not -_MOST < source.frames[0] < source.frames[1] < _MOST:
             refuse(f"frames {list(source.frames)}", place, "Give [first, one after the last].")
-    for region in take.regions:
-        if region.sigma is not None and not 0 < region.sigma < 1e4:
-            refuse(f"sigma {region.sigma} px", f"region of camera {region.camera}", "Give a positive number.")
-    keypoints: tuple[Any, ...] = (*take.keypoints, *take.skin)
-    for kind, entries in (("keypoints", keypoints), ("silhouette", take.silhouettes), ("lines", take.lines)):
+    pixels: dict[str, tuple[Any, ...]] = {"keypoints": (*take.keypoints, *take.skin), "lines": take.lines}
+    for kind, entries in (pixels | {"silhouette": take.silhouettes, "region": take.regions}).items():
         for e in entries:
-            if not 0 < e.sigma < 1e4 or (e.rate is not None and not 0 < e.rate < 1e6):
-                problem = f"sigma {e.sigma} px, rate {e.rate} Hz"
-                refuse(problem, f"{kind} of camera {e.camera}", "Give positive numbers.")
+            for key, unit, most in (("sigma", "px", 1e4), ("rate", "Hz", 1e6)):
+                if (value := getattr(e, key, None)) is not None and not 0 < value < most:
+                    refuse(f"{key} {value} {unit}", f"{kind} of camera {e.camera}", "Give a positive number.")
     for shape in take.silhouettes:
         place = f"silhouette of camera {shape.camera}"
         if shape.file is None and shape.format == "masks":
@@ -300,12 +298,11 @@ def _names(take: Take) -> None:
                 place=f"{kind} of camera {camera}", remedy="Give the [[camera]] its video.",
             )  # fmt: skip
     for kind, several in (("silhouettes", take.silhouettes), ("regions", take.regions)):
-        cameras = [s.camera for s in several]  # type: ignore[attr-defined]
-        for camera in cameras:
-            if cameras.count(camera) > 1:
-                raise TakeError(f"two {kind}", file=take.path, place=f"camera {camera}", remedy="Leave one out.")
-    told: list[tuple[object, ...]] = []
-    told += [(f"keypoints of camera {k.camera}", k.file, k.format, k.frames) for k in (*take.keypoints, *take.skin)]
+        for camera in repeated(s.camera for s in several):  # type: ignore[attr-defined]
+            raise TakeError(f"two {kind}", file=take.path, place=f"camera {camera}", remedy="Leave one out.")
+    told: list[tuple[object, ...]] = [
+        (f"keypoints of camera {k.camera}", k.file, k.format, k.frames) for k in (*take.keypoints, *take.skin)
+    ]
     told += [(f"markers {m.file.name}", m.file, m.set) for m in take.markers]
     told += [(f"surface points {p.file.name}", p.file) for p in take.surface_points]
     told += [(f"trackers {p.file.name}", p.file, sorted(p.points)) for p in take.trackers]

@@ -264,3 +264,9 @@ class KeypointMatched(Matched):
 def keypoint_sigma(keypoints: Sequence[Keypoints], sigma: Mapping[str, float], default: float) -> list[float]:
     """[px] of each record, where {camera: standard deviation} or {"CAMERA SET": standard deviation} are given."""
     return [sigma.get(f"{k.camera} {k.keypoint_set}", sigma.get(k.camera, default)) for k in keypoints]
+
+
+def packed(matched: Sequence[Matched], scene: Scene) -> PixelPoints | None:
+    """The points of a scene's only match for a fit in one compiled piece; None where rows are needed."""
+    one = matched[0].pixels if len(matched) == 1 else None
+    return None if one is None or scene.at_time(one.time) is not scene else one.packed(scene)
