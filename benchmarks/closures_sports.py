@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.closures_people import off
 from benchmarks.closures_takes import PLACED, Take, another_person, from_drive, posture_of, towards, wandering, waves
-from benchmarks.figures import amount, figure
+from benchmarks.figures import amount, figure, quick
 from kinefit.bodies import Body, load_body
 from kinefit.bodies.closures import Closure, with_dimensions
 from kinefit.rows import ParameterRows
@@ -64,6 +64,8 @@ SPORTS = {
 def run() -> None:
     """Print the figures."""
     for name, sport in SPORTS.items():
+        if quick() and name != "golfer":
+            continue
         errors, gear, bars, whole = list[float](), list[float](), list[float](), list[float]()
         for seed in amount(SEEDS, SEEDS[:1]):
             take, true = made(name, seed)
