@@ -27,7 +27,7 @@ from kinefit.recipes.contours import By, pose_of_contour
 from kinefit.tracking.takes.take import track_take
 
 GRID, EDGE = (9, 6), 0.025  # corners; [m] of a square
-OFF = amount((5.0, 15.0, 30.0, 45.0), (5.0, 30.0))  # [deg] about an axis in the plane of the image, with 2 mm of shift each
+OFF = amount((5.0, 15.0, 30.0, 45.0), (5.0, 30.0))  # [deg] about an axis in the plane of the image, 2 mm of shift each
 STARTS = amount(2, 1)
 SHEET = (0.6, 0.65, 0.7, 0.75, 0.8, 0.85)  # of the white of the sheet: darker is not the sheet
 BODY = (
