@@ -15,8 +15,9 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import FileError, KinefitError
+from kinefit.errors import FileError, KinefitError, ObservationError
 
+_MIN_STEP_S = 1e-6  # between frames of a table; shorter or longer than its inverse, times are in another unit
 _LARGEST = 4_000_000  # characters of a TOML file, which tomllib reads in about 2 s; kinefit's own have some thousands
 _DOTTED = re.compile(r"(?<![\w.-])(?:(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+\.[ \t]*+){50}")
 BACKSLASHES = "A backslash in double quotes begins a special character: use forward slashes, or single quotes."
@@ -72,6 +73,15 @@ def read_table(
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise FileError(f"cannot be read: {error}", file=path, remedy=remedy) from None
     return texts, np.array(rows).reshape(-1, len(columns) + len(optional))
+
+
+def rate_of(times: NDArray, path: Path, remedy: str) -> float:
+    """Rate [Hz] of the frames of a table, from their sorted times (F,) [s]; ObservationError where there is none."""
+    if len(times) < 2:
+        raise ObservationError(f"points of {len(times)} times", file=path, remedy=remedy)
+    if not _MIN_STEP_S < (step := float(np.median(np.diff(times)))) < 1 / _MIN_STEP_S:
+        raise ObservationError(f"times {step:g} s apart", file=path, remedy="Give time_s in seconds.")
+    return 1.0 / step
 
 
 def repeated(names: Iterable[str]) -> list[str]:

@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kinefit._files import read_table, repeated
+from kinefit._files import rate_of, read_table, repeated
 from kinefit.errors import FileError, ObservationError, choices
 from kinefit.geometry import se3
 from kinefit.observations import BodyTrackerVideo
-from kinefit.readers.units import rate_of
 
 _PLACE, _TURN = ("time_s", "x", "y", "z"), ("qw", "qx", "qy", "qz")
 _REMEDY = "Give a table with the columns time_s, tracker, x, y, z [s, m] and, for orientations, qw, qx, qy, qz."

@@ -1,16 +1,8 @@
-"""Units of length and time, as files and people spell them; the rate of a table."""
+"""Units of length and time, as files and people spell them."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-
-from kinefit.errors import ObservationError
-
-_MIN_STEP_S = 1e-6  # between frames of a table; shorter or longer than its inverse, times are in another unit
 
 LENGTHS = {
     "m": 1.0, "meters": 1.0, "metres": 1.0, "meter": 1.0, "metre": 1.0, "dm": 0.1, "cm": 0.01, "centimeters": 0.01,
@@ -26,12 +18,3 @@ TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 def worth(unit: Any, units: dict[str, float]) -> float | None:
     """What a unit is worth, whatever its case; None for one that is not among the `units`."""
     return units.get(unit.strip().lower()) if isinstance(unit, str) else None
-
-
-def rate_of(times: NDArray, path: Path, remedy: str) -> float:
-    """Rate [Hz] of the frames of a table, from their sorted times (F,) [s]; ObservationError where there is none."""
-    if len(times) < 2:
-        raise ObservationError(f"points of {len(times)} times", file=path, remedy=remedy)
-    if not _MIN_STEP_S < (step := float(np.median(np.diff(times)))) < 1 / _MIN_STEP_S:
-        raise ObservationError(f"times {step:g} s apart", file=path, remedy="Give time_s in seconds.")
-    return 1.0 / step

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from kinefit._files import read_table
+from kinefit._files import rate_of, read_table
 from kinefit.errors import FileError
 from kinefit.observations import SurfacePointVideo
 from kinefit.readers.take.file import Take
-from kinefit.readers.units import rate_of
 
 _COLUMNS = ("time_s", "point", "x", "y", "z", "std_x", "std_y", "std_z")
 _REMEDY = f"Give trajectories.csv of `kinefit surface`, or a table with the columns {', '.join(_COLUMNS)}."
