@@ -205,6 +205,18 @@ def test_errors_of_a_surface_last_over_a_segment():
     assert excess(points, 0.0)["depth"] < 2.0
 
 
+def test_each_segment_of_a_surface_counts_with_its_own_bias():
+    """A trunk of many rows that fits well does not have the bias of small parts that do not."""
+    random, count = np.random.default_rng(4), np.array([300] + 9 * [10])
+    segment, bias = np.repeat(np.arange(10), count), np.array([0.15] + 9 * [0.5])
+    frames = [[seen("depth", [rows(bias[segment] + 0.4 * random.normal(size=len(segment)), segment)], surface=True)]
+              for _ in range(10)]  # fmt: skip
+    expected = 0.4**2 + 10.0 * (bias**2 * count**2).sum() / count.sum()
+    assert excess(frames, 0.0)["depth"] == pytest.approx(expected, rel=0.3)
+    frames[3] = [seen("depth", [rows(np.where(segment == 0, 8.0, bias[segment]), segment)], surface=True)]
+    assert excess(frames, 0.0)["depth"] == pytest.approx(expected, rel=0.3)  # once behind something else
+
+
 def test_a_few_rows_tell_nothing_of_their_errors():
     frames = [[seen("rope", [ParameterRows(np.zeros(1, int), np.full(1, 5.0), np.ones(1))])] for _ in range(5)]
     assert excess(frames, 0.0) == {}

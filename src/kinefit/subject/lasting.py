@@ -41,8 +41,9 @@ def excess(frames: Sequence[Sequence[Seen]], followed: float) -> dict[str, float
     """{sensor: factor} by which the variance of what all frames measure together is larger than rows say.
 
     It is that of a channel's jitter, and n times that of its bias, where n rows of it were seen. Below 1 where rows
-    state more than is left over. Channels are points along each axis; of surfaces whole segments, because their errors
-    last over a patch.
+    state more than is left over. Channels are points along each axis, whose biases are alike; of surfaces whole
+    segments, because their errors last over a patch, and each counts with its own bias: one of many rows is seen well,
+    and the bias of a hand is not that of a thigh.
 
     Parameters
     ----------
@@ -66,5 +67,9 @@ def excess(frames: Sequence[Sequence[Seen]], followed: float) -> dict[str, float
         errors = variance_components(values, leverage=np.full(C, hidden * of_points[s]), group=np.arange(C))
         jitter, bias = (float(np.median(v)) ** 2 for v in (errors.jitter, errors.bias))
         rows = count.sum(axis=0)
-        out[s] = max(float(jitter * (count**2).sum() + bias * (rows**2).sum()) / float(rows.sum()), _MIN_EXCESS)
+        fresh, lasting = jitter * (count**2).sum(), bias * (rows**2).sum()
+        if not of_points[s]:
+            sums = np.nansum(np.where(errors.outlier[..., None], np.nan, values * count), axis=0)
+            lasting = max((sums**2).sum() - fresh, 0.0)
+        out[s] = max(float(fresh + lasting) / float(rows.sum()), _MIN_EXCESS)
     return out
