@@ -66,9 +66,7 @@ def live_session(
     threads = threads or cores()
     if streams_of(take):
         opened = opened_streams(take, body, threads, tell)
-    elif take.cameras and not (take.keypoints or take.skin or take.lines or take.depth or take.stereo
-                               or take.markers or take.silhouettes or take.regions or take.surface_points
-                               or take.trackers):  # fmt: skip
+    elif take.cameras and not (take.keypoints or take.other_sensors):
         opened = _videos(take, body, speed, threads, tell)
     else:
         opened = _recorded(take, body, speed)

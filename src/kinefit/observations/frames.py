@@ -124,7 +124,7 @@ class KeypointFrame:
 
     @classmethod
     def of_record(cls, record: Keypoints, frame: int, time: float) -> KeypointFrame:
-        """The person of a record of one, at a frame and a time [s]; what was checked with the record is so no more."""
+        """The person of a record of one, at a frame and a time [s]; not checked again, as the record was."""
         made = object.__new__(cls)
         uv, sure = (sealed(values[frame, 0].copy()) for values in (record.points, record.confidence))
         freeze(

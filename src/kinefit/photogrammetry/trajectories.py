@@ -104,8 +104,8 @@ def uniform(paths: Trajectories, *, radius: float, frames: int = 1, limit: float
 
 def _limit(off: NDArray) -> float:
     """[m/s] five robust deviations of differences."""
-    told = off[np.isfinite(off)]
-    return float(_OUTLYING * 1.4826 * np.median(told)) if len(told) else np.inf
+    known = off[np.isfinite(off)]
+    return float(_OUTLYING * 1.4826 * np.median(known)) if len(known) else np.inf
 
 
 def _differences(paths: Trajectories, radius: float, frames: int) -> NDArray:

@@ -38,11 +38,11 @@ def read_body_trackers(
         A name that the table does not have; a single time, of which no rate follows.
     """
     names, T = tuple(names), np.eye(4) if T_world_file is None else np.asarray(T_world_file, float)
-    told, values = read_table(path, _PLACE, _REMEDY, text="tracker", optional=_TURN)
+    labels, values = read_table(path, _PLACE, _REMEDY, text="tracker", optional=_TURN)
     for name in names:
-        if name not in told:
+        if name not in labels:
             remedy = "Correct the name in `points` of this [[tracker]]."
-            raise ObservationError(choices("tracker", name, list(dict.fromkeys(told))), file=path, remedy=remedy)
+            raise ObservationError(choices("tracker", name, list(dict.fromkeys(labels))), file=path, remedy=remedy)
     turned = np.isfinite(values[:, 4:]).all(axis=1)
     norm = np.linalg.norm(values[:, 4:], axis=1)
     odd = ~np.isnan(values[:, 4:]).all(axis=1) & ~(turned & (np.abs(norm - 1.0) < _MIN_QUATERNION_NORM))
@@ -53,13 +53,13 @@ def read_body_trackers(
         if bad.any():
             place = f"line {int(np.argmax(bad)) + 2}"
             raise FileError(problem, file=path, place=place, remedy="Leave the row out, or its quaternion empty.")
-    keys = [(t, name) for t, name in zip(values[:, 0].tolist(), told)]
+    keys = [(t, name) for t, name in zip(values[:, 0].tolist(), labels)]
     if twice := repeated(f"{name} at {t:g} s" for t, name in keys):
         raise FileError(f"{twice[0]} is there twice", file=path, remedy="Give each tracker one row at each time.")
     times, frame = np.unique(values[:, 0], return_inverse=True)
     x, R = np.full((len(times), len(names), 3), np.nan), np.full((len(times), len(names), 3, 3), np.nan)
     for k, name in enumerate(names):
-        own = np.array([other == name for other in told])
+        own = np.array([other == name for other in labels])
         x[frame[own], k] = se3.apply(T, values[own, 1:4])
         R[frame[own & turned], k] = T[:3, :3] @ se3.rotation_from_quaternion(values[own & turned, 4:])
     rate = rate_of(times, path, _REMEDY)

@@ -45,9 +45,8 @@ class Clicks:
 
 def clicks_text(steps: Sequence[Clicks]) -> str:
     """Clicks of one step or of several as JSON, as `read_clicks` takes it."""
-    told = [{"step": of.step, "points": {c: {n: list(p) for n, p in points.items()} for c, points in of.points.items()}}
-            for of in steps]  # fmt: skip
-    return json.dumps(told if len(told) > 1 else told[0], indent=1) + "\n"
+    content = [{"step": of.step, "points": {c: dict(points) for c, points in of.points.items()}} for of in steps]
+    return json.dumps(content if len(content) > 1 else content[0], indent=1) + "\n"
 
 
 def read_clicks(path: str | PathLike[str]) -> tuple[Clicks, ...]:

@@ -52,7 +52,7 @@ class TrackedSteps(TrackedFrames):
 class _Frames:
     """What is kept of all steps done, in the order in which they were done; in a file that stays, with a checkpoint."""
 
-    def __init__(self, checkpoint: Checkpoint | None) -> None:
+    def __init__(self, checkpoint: Checkpoint | None, recording: Recording) -> None:
         store = None if checkpoint is None else checkpoint.frames
         places = [()] * len(KINDS) if store is None else store.places
         self.results, self.measurements, self.leftovers = (
@@ -60,6 +60,7 @@ class _Frames:
         )
         self.place = {step: k for k, step in enumerate(() if store is None else store.steps)}
         self.written = 0  # rows of the table
+        self.streams = [(k.camera, k.keypoint_set, k.names) for k in recording.keypoints]
 
     def add(self, i: int, one: KeptFrame) -> None:
         count = len(self.place)
@@ -84,7 +85,7 @@ class _Frames:
     def name(self, checkpoint: Checkpoint, tracker: Tracker) -> None:
         """Names for what the records of all frames refer to."""
         keypoints, body = tracker.sensors.keypoints, tracker.body
-        checkpoint.frames.name(body=body)
+        checkpoint.frames.name(body=body, layout=keypoints.layout(body, self.streams)[0])
         checkpoint.frames.name_layouts(lambda streams: keypoints.layout(body, streams)[0])
         checkpoint.frames.name_sensors(tracker.sensors)
 
@@ -136,7 +137,7 @@ def run(
     if start is not None:
         begin, state = start
         tracker.start_at(state)
-    frames, at = _Frames(checkpoint), begin
+    frames, at = _Frames(checkpoint, recording), begin
     others = OtherPeople(recording.others, recording.rig, 0.5 / recording.rate + 1e-6)
     if checkpoint is not None:
         frames.name(checkpoint, tracker)

@@ -232,7 +232,7 @@ class Morphing:
         if not weight and not slope:
             return pose
         skin, f = self.skin, pose.frames
-        owner = np.take_along_axis(skin.owners, skin.weights.argmax(axis=1)[:, None], axis=1)[:, 0]
+        owner = skin.segment
         R, t = f[:, :9].reshape(-1, 3, 3), f[:, 9:]
         at = np.einsum("vij,vj->vi", R[owner], skin.vertices) + t[owner]
         y = (at - t[bone]) @ R[bone]

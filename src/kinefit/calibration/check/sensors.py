@@ -24,9 +24,9 @@ from kinefit.geometry.camera import Rig
 from kinefit.identification.take.named import with_names
 from kinefit.motion import Motion
 from kinefit.observations import sensor_of
+from kinefit.readers.take.entries import sensor_name
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
-from kinefit.readers.take.surface_points import sensor_name
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.displaced import AXES, Displaced, displacement
 from kinefit.sensors.scene import Scene

@@ -47,12 +47,10 @@ def check_enough(take: Take) -> None:
     TakeError
         With what to add.
     """
-    others = (take.depth, take.stereo, take.markers, take.skin, take.silhouettes, take.regions, take.lines,
-              take.surface_points, take.trackers)  # fmt: skip
     refuse_streams(take)
     seeing = {entry.camera for entry in take.keypoints} or {entry.name for entry in take.cameras if entry.video}
     lifted = not take.keypoints or any(entry.format == "detect" for entry in take.keypoints)
-    if len(seeing) == 1 and not (lifted or any(others) or take.start or take.pose):
+    if len(seeing) == 1 and not (lifted or take.other_sensors or take.start or take.pose):
         raise TakeError(
             ONE_CAMERA, file=take.path, place=f"camera {next(iter(seeing))}",
             remedy="Leave its [[keypoints]] out and give it its video: the built-in detector tells depth, too; or add "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -225,3 +226,8 @@ TABLES: dict[str, type[msgspec.Struct]] = {
     "surface_points": SurfacePointsEntry, "tracker": TrackerEntry,
 }  # fmt: skip
 """Every table of a take file, and its keys as the fields of a record."""
+
+
+def sensor_name(kind: str, entries: Sequence[object], k: int) -> str:
+    """Name of the sensor of the k-th entry of a kind in a take."""
+    return kind if len(entries) == 1 else f"{kind} {k + 1}"

@@ -140,6 +140,14 @@ class Take:
     trackers: tuple[TrackerEntry, ...] = ()
     session: SessionEntry = field(default_factory=SessionEntry)
 
+    @property
+    def other_sensors(self) -> tuple[object, ...]:
+        """Entries of all sensors but cameras and the keypoints of a detector."""
+        return (
+            *self.depth, *self.stereo, *self.markers, *self.skin, *self.silhouettes, *self.regions, *self.lines,
+            *self.surface_points, *self.trackers,
+        )  # fmt: skip
+
 
 @checked
 def read_take(path: str | PathLike[str]) -> Take:

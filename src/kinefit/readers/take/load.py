@@ -31,14 +31,14 @@ from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoints import read_keypoints
 from kinefit.readers.markers import read_markers
 from kinefit.readers.take.depth import load_depth
-from kinefit.readers.take.entries import MarkersEntry
+from kinefit.readers.take.entries import MarkersEntry, sensor_name
 from kinefit.readers.take.file import CameraEntry, KeypointsEntry, Take
 from kinefit.readers.take.lines import load_lines
 from kinefit.readers.take.one_camera import assumed_camera, is_alone, what_is_assumed
 from kinefit.readers.take.silhouettes import load_regions, load_silhouettes
 from kinefit.readers.take.skin import load_skin
 from kinefit.readers.take.streams import refuse_streams
-from kinefit.readers.take.surface_points import load_surface_points, sensor_name
+from kinefit.readers.take.surface_points import load_surface_points
 from kinefit.readers.video import Video, check_rates, common_frames
 
 _Timed = DepthVideo | CloudVideo | LineVideo | SurfacePointVideo | BodyTrackerVideo

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from kinefit._files import rate_of, read_table
 from kinefit.errors import FileError
 from kinefit.observations import SurfacePointVideo
+from kinefit.readers.take.entries import sensor_name
 from kinefit.readers.take.file import Take
 
 _COLUMNS = ("time_s", "point", "x", "y", "z", "std_x", "std_y", "std_z")
@@ -39,11 +39,6 @@ def read_surface_points(path: Path, sensor: str = "surface_points", *, time_offs
         sensor, rate, times + time_offset, first, values[:, 1].astype(np.int64), values[:, 2:5], values[:, 5:],
         source=str(path),
     )  # fmt: skip
-
-
-def sensor_name(kind: str, entries: Sequence[object], k: int) -> str:
-    """Name of the sensor of the k-th entry of a kind in a take."""
-    return kind if len(entries) == 1 else f"{kind} {k + 1}"
 
 
 def load_surface_points(take: Take) -> tuple[SurfacePointVideo, ...]:

@@ -118,7 +118,7 @@ class FrameFile(Store):
         self._known |= {f"sensor {sensor.name}": sensor for sensor in sensors}
 
     def name_layouts(self, layout_of: Callable[[Sequence[Stream]], Layout]) -> None:
-        """The same of the layouts of keypoints, by their streams: steps differ in which cameras saw something."""
+        """The same of all other layouts of keypoints, by their streams: steps differ in which cameras saw something."""
         self._layout_of = layout_of
 
     def close(self) -> None:

@@ -20,10 +20,10 @@ from kinefit.motion import UP_AXES
 from kinefit.multiview.people import PersonTrack
 from kinefit.observations import DepthFrame, DepthVideo, KeypointVideo, NamedMarkers, SilhouetteFrame, by_record
 from kinefit.readers.motion import read_motion
+from kinefit.readers.take.entries import sensor_name
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.take.stereo import load_stereo, stereo_sigma
-from kinefit.readers.take.surface_points import sensor_name
 from kinefit.sensors.base import Sensor
 from kinefit.sensors.points.body_trackers import BodyTrackerSensor
 from kinefit.sensors.settings import TrackSettings
