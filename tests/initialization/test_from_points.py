@@ -1,5 +1,7 @@
 """A start with no pose given: points in space, bone lengths, a pose."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.oracle import posture, rig_around
@@ -162,6 +164,16 @@ def test_a_wild_point_does_not_spoil_the_pose():
     found, _ = pose_from_points(BODY, POINTS, spoilt)
     off = np.linalg.norm(BODY.positions(found, POINTS) - x, axis=1)
     assert np.median(off) < 0.02
+
+
+def test_a_fixed_root_is_put_where_its_points_are():
+    truth = posture(BODY, 4, 0.3)
+    standing = replace(BODY, tree=replace(BODY.tree, root_free=False))
+    x = BODY.positions(truth, POINTS)
+    found, left = pose_from_points(standing, POINTS, x)
+    free, _ = pose_from_points(BODY, POINTS, x)
+    assert left < 0.02 and np.linalg.norm(truth.difference(found)[:3]) < 0.03
+    assert np.allclose(found.T_world_root, free.T_world_root) and np.allclose(found.angles, free.angles)
 
 
 def test_a_start_that_is_known():

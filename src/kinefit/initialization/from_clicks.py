@@ -20,7 +20,6 @@ _FEWEST = 3  # points that fix a pose
 _CLICK = 3.0  # [px] by which a person misses a joint
 _VAGUE = 0.5  # [m] of a point whose rays are all but parallel
 _SIGMA = 0.005  # [m] of a clicked joint: they agree already, and no posture prior is to move them
-_TURNS = 30  # of placing a fixed root and fitting the angles
 _LISTED = 4  # joints that a message names
 _ENDS = ("skull_vertex", "nose_tip", "digit_2", "heel", "metacarpal_phalanx_2", "metacarpal_phalanx_5")
 
@@ -140,13 +139,7 @@ def clicked_start(
     points = fitted.landmarks.select(tuple(names))
     known = np.isfinite(x_world).all(axis=1)
 
-    def posed(near: BodyState | None) -> tuple[BodyState, float]:
-        return pose_from_points(
-            fitted, points, x_world, sigma=_SIGMA, near=near, fewest=_FEWEST, robust=False, covariance=covariance
-        )  # fmt: skip
-
-    state, left = posed(None)
-    for _ in range(0 if body.tree.root_free else _TURNS):  # a root that stays where it is put is put better
-        T = se3.aligned(fitted.positions(state, points)[known], x_world[known]) @ state.T_world_root
-        state, left = posed(BodyState(T, state.angles))
+    state, left = pose_from_points(
+        fitted, points, x_world, sigma=_SIGMA, fewest=_FEWEST, robust=False, covariance=covariance
+    )
     return fitted, state, left

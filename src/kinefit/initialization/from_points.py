@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -98,12 +100,14 @@ def pose_from_points(
     `sigma` [m] along each axis, one or (K,), or else a `covariance` (K, 3, 3) [m²] of each.
     `robust`: single points may be wrong. With no pose given two starts are tried, the prior mean laid on the points and
     turned about its long axis; the cheaper end wins. `near` is a start that is known to be close, the only one then.
+    A root that stays where it is put is put here: it is found as a free one is.
 
     Raises
     ------
     TrackingError
         Fewer than six (`fewest`) points are known.
     """
+    body = replace(body, tree=replace(body.tree, root_free=True))
     known = np.isfinite(x_world).all(axis=1)
     if known.sum() < fewest:
         problem = f"fewer than {_NUMBERS.get(fewest, fewest)} points are known in space"
