@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import TrackingError, choices
-from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
 from kinefit.initialization.from_points import first_scales, pose_from_points
@@ -137,8 +136,6 @@ def clicked_start(
     points = body.landmarks.select(tuple(names))
     fitted = body.scaled(first_scales(body, points, x_world[None], covariance=covariance))
     points = fitted.landmarks.select(tuple(names))
-    known = np.isfinite(x_world).all(axis=1)
-
     state, left = pose_from_points(
         fitted, points, x_world, sigma=_SIGMA, fewest=_FEWEST, robust=False, covariance=covariance
     )
