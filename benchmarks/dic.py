@@ -149,6 +149,14 @@ def _strain(sample: Sample) -> None:
               f"linear fit of the truth alone {1e6 * alone:.0f}e-6")  # fmt: skip
         figure(f"dic_strain_L3_gauge_{gauge + 1}", 1e6 * error, "microstrain RMS", goal.replace("e-6", ""))
         print(f"#   95 % intervals about the mean over the gauge hold {100 * inside:.1f} %")
+    shares = []
+    for name in ("L1", "L3", "L5"):
+        _, flat = strained(sample, name, 21, 80)
+        z = [getattr(flat, n) / getattr(flat, f"std_{n}") for n in ("yy", "xy")]  # no strain in these directions
+        shares += [100 * float(np.mean(np.abs(one[np.isfinite(one)]) <= 1.96)) for one in z]
+    print("#   yy and xy of L1, L3, L5, window 21: " + ", ".join(f"{s:.1f}" for s in shares) + " % within 1.96 std")
+    figure("dic_strain_inside_least", min(shares), "% within 1.96 std, directions without strain", ">= 90")
+    figure("dic_strain_inside_most", max(shares), "% within 1.96 std, directions without strain", "<= 98")
     found = {name: strained(sample, name, 35, 250)[1].rms()["yy"] for name in ("L1", "L3")}
     print(f"# noise floor, the unstrained direction of L1 and L3, window 35, 251 px: {1e6 * found['L1']:.0f}e-6, "
           f"{1e6 * found['L3']:.0f}e-6")  # fmt: skip

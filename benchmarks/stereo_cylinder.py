@@ -22,12 +22,13 @@ from kinefit.geometry.se3 import log_so3
 from kinefit.photogrammetry.region_growing import Grid, grow
 from kinefit.photogrammetry.seeding.unaided import sift_seeds
 from kinefit.photogrammetry.spline_image import SplineImage
-from kinefit.photogrammetry.states import measure_states, rigid_motion
+from kinefit.photogrammetry.states import displacement_std, measure_states, rigid_motion, surface_strain
 from kinefit.photogrammetry.surface import MeasuredSurface, measure
 
 CAMERAS, SIZE = ("201", "202"), (2464, 3280)
 SPECKLE = slice(430, 2180), slice(720, 1620)  # of the first photograph
 WINDOW, STEP = 31, 8
+GAUGE = 0.005  # [m] of strain: five windows
 SQUARE = 0.01  # [m]
 NAMES = ("cylinder_points", "cylinder_radius_error", "cylinder_mad", "cylinder_points_a_second")
 
@@ -62,13 +63,17 @@ def run() -> None:
         figure(f"cylinder_points_{k}", surface.measured.sum(), "points", ">= 10000")
         figure(f"cylinder_radius_error_{k}", abs(1e3 * radius - 56.87), "mm", "<= 0.05")
         figure(f"cylinder_mad_{k}", mad, "mm", "<= 0.03")
+    shares = []
     for k, surface in enumerate(surfaces[1:], 2):
         T, residual = rigid_motion(surfaces[0].x_world, surface.x_world)
         lengths = 1e3 * np.linalg.norm(residual, axis=1)
         angle = np.rad2deg(np.arccos((np.trace(T[:3, :3]) - 1) / 2))
         rms = 1e3 * np.sqrt(np.nanmean(residual**2))
         print(f"# 1 to {k}: turned by {angle:.3f} degrees; a coordinate {rms:.4f} mm")
+        shares += inside(surfaces[0], surface, residual)
         figure(f"cylinder_rigid_motion_{k}", float(np.sqrt(np.nanmean(lengths**2))), "mm RMS in space", "<= 0.02")
+    figure("cylinder_inside_least", min(shares), "% within 1.96 std, worst of displacements and strains", ">= 90")
+    figure("cylinder_inside_most", max(shares), "% within 1.96 std, the widest", "<= 98")
     seeds, spent = sift_seeds(first, states[0][1], (rig.cameras[0], rig.cameras[1])), []
     for _ in range(amount(3, 1)):
         began = time.process_time()
@@ -76,6 +81,26 @@ def run() -> None:
         spent.append(time.process_time() - began)
     print(f"# 13x13: {matches.found.sum()} points, {matches.iterations[matches.found].mean():.1f} iterations")
     figure("cylinder_points_a_second", matches.found.sum() / min(spent), "found points/s a core, 13x13", ">= 10000")
+
+
+def inside(reference: MeasuredSurface, state: MeasuredSurface, residual: NDArray) -> list[float]:
+    """[%] within 1.96 standard deviations after a rigid motion: displacements x, y, z, strains xx, yy, xy.
+
+    Of displacements what neighbours 32 px apart, whose windows share no pixels, differ from each other (second
+    differences): the calibration's errors, which change slowly over the surface, are in no deviation.
+    """
+    std = displacement_std(reference, state, WINDOW)
+    apart = max(1, round(4 * STEP / reference.grid.step))
+    columns = reference.grid.columns
+    value, variance = (a.reshape(-1, columns, 3)[::apart, ::apart] for a in (residual, std**2))
+    second = value[1:-1] - 0.5 * (value[:-2] + value[2:])
+    spread = np.sqrt(variance[1:-1] + 0.25 * (variance[:-2] + variance[2:]))
+    z = (second / spread).reshape(-1, 3)
+    told = surface_strain(reference, state, GAUGE, WINDOW)
+    all_z = [*z.T, *(getattr(told, n) / getattr(told, f"std_{n}") for n in ("xx", "yy", "xy"))]
+    out = [100 * float(np.mean(np.abs(one[np.isfinite(one)]) <= 1.96)) for one in all_z]
+    print("#   within 1.96 std: " + ", ".join(f"{n} {s:.1f} %" for n, s in zip(("x", "y", "z", "xx", "yy", "xy"), out)))
+    return out
 
 
 def _photograph(file: Path) -> NDArray:

@@ -42,13 +42,15 @@ def surfaces():
 def test_a_table_has_a_row_for_each_measured_point(surfaces, tmp_path):
     first, second = surfaces
     told = strain(first.x_world, second.x_world - first.x_world, 8, gauge=0.04)
-    write_points_csv(second, tmp_path / "points.csv", point_columns(second, first, told))
+    write_points_csv(second, tmp_path / "points.csv", point_columns(second, first, told, window=13))
     with (tmp_path / "points.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 47 and (rows[9]["row"], rows[9]["column"]) == ("1", "2")  # the missing one is 1, 1
     assert float(rows[3]["dx_m"]) == pytest.approx(0.01 * 0.03) and float(rows[3]["std_x_m"]) == pytest.approx(1e-4)
     middle = next(row for row in rows if row["row"] == "3" and row["column"] == "4")
     assert float(middle["strain_xx"]) == pytest.approx(0.5 * (1.01**2 - 1))
+    assert float(middle["std_dx_m"]) < 1e-9  # neighbours agree; a corner has too few, and those of the matches
+    assert float(rows[0]["std_dx_m"]) == pytest.approx(np.sqrt(2) * 1e-4)
 
 
 def read_vtk(path):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes, write_text
 from kinefit.photogrammetry.returning import PointReturn
+from kinefit.photogrammetry.states import displacement_std
 from kinefit.photogrammetry.strain import Strain
 from kinefit.photogrammetry.surface import MeasuredSurface
 from kinefit.photogrammetry.trajectories import Trajectories
@@ -22,16 +23,21 @@ _BAR = 90  # [px] of the scale beside it
 
 
 def point_columns(
-    surface: MeasuredSurface, reference: MeasuredSurface | None = None, strain: Strain | None = None
+    surface: MeasuredSurface, reference: MeasuredSurface | None = None, strain: Strain | None = None, window: int = 0
 ) -> dict[str, NDArray]:
-    """Named columns (N,) of all points: places [m], standard deviations [m], quality, displacement [m] and strain."""
+    """Named columns (N,) of all points: places [m], standard deviations [m], quality, displacement [m] and strain.
+
+    `window`: [px] side of the matching windows, for the displacement's standard deviations.
+    """
     out = {}
     for axis, name in enumerate("xyz"):
         out[f"std_{name}_m"] = surface.std[:, axis]
     out["correlation"], out["parallax_px"] = surface.correlation, surface.parallax
     if reference is not None:
         moved = surface.x_world - reference.x_world
+        std = displacement_std(reference, surface, window)
         out |= {f"d{name}_m": moved[:, axis] for axis, name in enumerate("xyz")}
+        out |= {f"std_d{name}_m": std[:, axis] for axis, name in enumerate("xyz")}
     if strain is not None:
         out |= {f"strain_{name}": getattr(strain, name) for name in ("xx", "yy", "xy", "first", "second")}
         out |= {f"std_strain_{name}": getattr(strain, f"std_{name}") for name in ("xx", "yy", "xy")}

@@ -8,8 +8,9 @@ import numpy as np
 
 from kinefit._jit import jit
 
-# Row of results: E_xx, E_yy, E_xy, their variances, F - 1 (2x2, in the tangent plane), rotation [rad], points.
-COLUMNS = 12
+# Row of results: E_xx, E_yy, E_xy, their variances, F - 1 (2x2, in the tangent plane), rotation [rad], points,
+# variances of the displacements about their planes along the three axes.
+COLUMNS = 15
 
 
 @jit
@@ -19,12 +20,12 @@ def strains(x, d, columns, reach, overlap, filled, out):
     Positions and displacements within `reach` rows and columns are each fitted by a plane over the indices i, j; the
     change of the metric is the strain, in the tangent frame whose first axis runs along the row. Points with a NaN are
     left out.
-    overlap : factor of the variance for windows of neighbours that share pixels.
+    overlap : factor of the slopes' variance for windows of neighbours that share pixels.
     filled : least part of the (2 reach + 1)² points that must be there. NaN in out (N, 12) where fewer are.
     """
     count, height = x.shape[0], x.shape[0] // columns
     sums, right, a, b, c, e = np.empty(6), np.empty((6, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    second = np.empty(3)
+    second, one, two, scatter = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
     for k in range(count):
         for i in range(COLUMNS):
             out[k, i] = math.nan
@@ -33,7 +34,7 @@ def strains(x, d, columns, reach, overlap, filled, out):
         row, column = k // columns, k % columns
         sums[:] = 0.0
         right[:] = 0.0
-        square = 0.0
+        scatter[:] = 0.0
         for j in range(max(0, row - reach), min(height, row + reach + 1)):
             for i in range(max(0, column - reach), min(columns, column + reach + 1)):
                 n = j * columns + i
@@ -50,7 +51,8 @@ def strains(x, d, columns, reach, overlap, filled, out):
                     right[3, axis] += q
                     right[4, axis] += s * q
                     right[5, axis] += t * q
-                    square += q * q
+                    for other in range(3):
+                        scatter[axis, other] += q * (d[n, other] - d[k, other])
         total = sums[0]
         if total < filled * (2 * reach + 1) ** 2 or total < 6.0:
             continue
@@ -69,7 +71,11 @@ def strains(x, d, columns, reach, overlap, filled, out):
             p = right[4, axis] - sums[1] * right[3, axis] / total
             q = right[5, axis] - sums[2] * right[3, axis] / total
             c[axis], e[axis] = (tt * p - st * q) / det, (ss * q - st * p) / det
-            square -= right[3, axis] ** 2 / total + c[axis] * p + e[axis] * q
+            for other in range(3):  # what the planes explain: by the mean, by c and by e
+                mean = right[3, other] / total
+                scatter[axis, other] -= right[3, axis] * mean
+                p, q = right[4, other] - sums[1] * mean, right[5, other] - sums[2] * mean
+                scatter[other, axis] -= c[axis] * p + e[axis] * q
         aa = math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
         ab = (a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) / aa
         for axis in range(3):
@@ -81,20 +87,31 @@ def strains(x, d, columns, reach, overlap, filled, out):
         g11 = g22 = g12 = 0.0
         f11 = f12 = f21 = f22 = 0.0
         for axis in range(3):
-            one, two = a[axis] / aa, second[axis] / bb
+            one[axis], two[axis] = a[axis] / aa, second[axis] / bb
             p = c[axis] / aa
             q = (e[axis] - ab * p) / bb
-            g11 += (one + p) * (one + p)
-            g22 += (two + q) * (two + q)
-            g12 += (one + p) * (two + q)
-            f11, f12, f21, f22 = f11 + one * p, f12 + one * q, f21 + two * p, f22 + two * q
+            f11, f12 = f11 + one[axis] * p, f12 + one[axis] * q
+            f21, f22 = f21 + two[axis] * p, f22 + two[axis] * q
+            one[axis], two[axis] = one[axis] + p, two[axis] + q
+            g11 += one[axis] * one[axis]
+            g22 += two[axis] * two[axis]
+            g12 += one[axis] * two[axis]
         out[k, 0], out[k, 1], out[k, 2] = 0.5 * (g11 - 1.0), 0.5 * (g22 - 1.0), 0.5 * g12
-        noise = overlap * (square if square > 0.0 else 0.0) / (3.0 * (total - 3.0))
+        s11 = s22 = s12 = 0.0  # how the displacements scatter along the moved axes, squared
+        for axis in range(3):
+            for other in range(3):
+                s11 += one[axis] * scatter[axis, other] * one[other]
+                s22 += two[axis] * scatter[axis, other] * two[other]
+                s12 += one[axis] * scatter[axis, other] * two[other]
+        noise = overlap / (total - 3.0)
         v11 = noise * tt / det / (aa * aa)
         cross = noise * -st / det
         v22 = (noise * ss / det - 2.0 * ab / aa * cross + ab * ab * v11) / (bb * bb)
         v12 = (cross / aa - ab * v11) / bb
-        out[k, 3], out[k, 4], out[k, 5] = g11 * v11, g22 * v22, 0.25 * (g22 * v11 + g11 * v22 + 2.0 * g12 * v12)
+        out[k, 3], out[k, 4] = max(s11, 0.0) * v11, max(s22, 0.0) * v22
+        out[k, 5] = max(0.25 * (s22 * v11 + s11 * v22 + 2.0 * s12 * v12), 0.0)
         out[k, 6], out[k, 7], out[k, 8], out[k, 9] = f11, f12, f21, f22
         out[k, 10] = math.atan2(f21 - f12, 2.0 + f11 + f22)
         out[k, 11] = total
+        for axis in range(3):
+            out[k, 12 + axis] = max(scatter[axis, axis], 0.0) / (total - 3.0)

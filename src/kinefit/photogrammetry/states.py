@@ -15,7 +15,7 @@ from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches
 from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds
 from kinefit.photogrammetry.seeding.unaided import grow_between, grow_over_time, grow_through
 from kinefit.photogrammetry.spline_image import SplineImage
-from kinefit.photogrammetry.strain import Strain, grid_step, strain
+from kinefit.photogrammetry.strain import Strain, grid_step, scatter, strain
 from kinefit.photogrammetry.surface import MeasuredSurface, check_images, from_matches, measure
 
 Progress = Callable[[str, int, int], None]
@@ -83,10 +83,25 @@ def surface_strain(reference: MeasuredSurface, state: MeasuredSurface, gauge: fl
     gauge : [m] length over which it is taken
     window : [px] side of the matching windows
     """
-    step = grid_step(reference.x_world, reference.grid.columns)
-    side = window * step / reference.grid.step if np.isfinite(step) else 0.0
     moved = state.x_world - reference.x_world
-    return strain(reference.x_world, moved, reference.grid.columns, gauge=gauge, window=side)
+    return strain(reference.x_world, moved, reference.grid.columns, gauge=gauge, window=_side(reference, window))
+
+
+def displacement_std(reference: MeasuredSurface, state: MeasuredSurface, window: int) -> NDArray:
+    """(N, 3) [m] standard deviations of how far each point moved, by how displacements of neighbours differ.
+
+    By the matches of both states where too few neighbours are measured.
+    """
+    told = scatter(
+        reference.x_world, state.x_world - reference.x_world, reference.grid.columns, window=_side(reference, window)
+    )  # fmt: skip
+    return np.where(np.isfinite(told), told, np.hypot(reference.std, state.std))
+
+
+def _side(surface: MeasuredSurface, window: int) -> float:
+    """[m] of a matching window of so many pixels, about."""
+    step = grid_step(surface.x_world, surface.grid.columns)
+    return window * step / surface.grid.step if np.isfinite(step) else 0.0
 
 
 def rigid_motion(reference: NDArray, state: NDArray) -> tuple[NDArray, NDArray]:

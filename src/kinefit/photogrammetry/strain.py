@@ -83,7 +83,8 @@ def strain(
     out = np.empty((len(x), kernels.COLUMNS))
     missing = ~(np.isfinite(x).all(axis=1) & np.isfinite(d).all(axis=1))
     x, d = np.where(missing[:, None], np.nan, x), np.where(missing[:, None], np.nan, d)
-    kernels.strains(x, d, columns, reach, _overlap(window / step) ** 2, _FILLED, out)
+    slope, around = _overlap(window / step, 2 * reach + 1)
+    kernels.strains(x, d, columns, reach, slope / around, _FILLED, out)
     xx, yy, xy = out[:, 0], out[:, 1], out[:, 2]
     mean, radius = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
     std = np.sqrt(out[:, 3:6])
@@ -101,7 +102,32 @@ def grid_step(points: NDArray, columns: int) -> float:
     return float(np.median(gaps)) if len(gaps) else np.nan
 
 
-def _overlap(ratio: float) -> float:
-    """Factor of a mean's variance, along one axis, where windows are `ratio` times as long as their step."""
-    lags = np.arange(1, int(np.ceil(ratio)) + 1)
-    return float(1.0 + 2.0 * np.maximum(0.0, 1.0 - lags / ratio).sum()) if ratio > 1.0 else 1.0
+def scatter(reference: NDArray, displacement: NDArray, columns: int, *, window: float) -> NDArray:
+    """(N, 3) standard deviations of displacements by how they scatter about planes over two windows; NaN at few points.
+
+    Errors that repeat from state to state, such as those of the texture in a window, are not in a displacement.
+
+    Parameters
+    ----------
+    reference, displacement : (N, 3) [m], grids of `columns` points a row; NaN where a point is missing
+    window : [m] side of the matching windows
+    """
+    out, step = np.full((len(reference), kernels.COLUMNS), np.nan), grid_step(reference, columns)
+    if np.isfinite(step):
+        reach = max(2, int(np.ceil(window / step)))
+        kernels.strains(reference, displacement, columns, reach, 1.0, _FILLED, out)
+        out[:, 12:] /= _overlap(window / step, 2 * reach + 1)[1]
+    return np.sqrt(out[:, 12:])
+
+
+def _overlap(ratio: float, n: int) -> tuple[float, float]:
+    """Of planes over n x n points: factors of their slopes' variance, and of the points' mean square about them.
+
+    Windows are `ratio` times as long as their step: errors of neighbours correlate by the share of pixels in common.
+    """
+    line = np.arange(n)
+    together = np.maximum(0.0, 1.0 - np.abs(line[:, None] - line) / max(ratio, 1.0))
+    centred = line - (n - 1) / 2
+    mean, slope = together.sum() / n, centred @ together @ centred / (centred @ centred)
+    left = max(n * n - mean**2 - 2.0 * mean * slope, 1.0)  # n² - 3, were they independent
+    return float(mean * slope), float(left / (n * n - 3))

@@ -188,7 +188,7 @@ def _write(
                 f"   {kind} over {1e3 * strain.gauge:.2f} mm, RMS: xx {levels['xx']:.0f}e-6, yy {levels['yy']:.0f}e-6, "
                 f"xy {levels['xy']:.0f}e-6"
             )
-    columns = point_columns(surface, reference, strain)
+    columns = point_columns(surface, reference, strain, window)
     write_points_csv(surface, out / f"points_{k:03d}.csv", columns)
     write_surface_vtk(surface, out / f"surface_{k:03d}.vtk", columns)
     std = 1e3 * np.linalg.norm(surface.std, axis=1)
