@@ -16,6 +16,7 @@ from kinefit.errors import ObservationError
 from kinefit.findings import runs_of
 from kinefit.identification.audit.gaps import exchanges_in_gaps
 from kinefit.identification.audit.plausible import elsewhere, places_of_model, places_of_set, swapped_throughout
+from kinefit.identification.audit.resting import resting
 from kinefit.identification.audit.swaps import JOIN, best_run, crossings, glitches, pair_gain, swap_gains
 from kinefit.identification.model.learn import learn_model
 from kinefit.identification.model.model import MarkerModel
@@ -66,10 +67,11 @@ class AuditFinding:
     Parameters
     ----------
     kind : "swapped" (labels change places for a while), "throughout" (all the time), "stray" (off its segment for a
-        while), or "elsewhere" (not where another subject wears it: no wrong name)
+        while), "resting" (still in space while its neighbours move: fallen off, glued to a chair), or "elsewhere" (not
+        where another subject wears it: no wrong name)
     labels : one, or the two of a swap
     first, last : numbers of the frames, counted from 0, both included
-    size : [m] how far off, median over the frames
+    size : [m] how far off, median over the frames; of a resting marker how far its neighbours move
     text : the same as a sentence
     """
 
@@ -113,12 +115,13 @@ def audit_take(
         known = len(set(seen) & set(model.labels))
         remedy = f"It has: {', '.join(model.labels[:8])} ..."
         raise ObservationError(f"the model knows {known} of the labels", remedy=remedy)
+    still = [AuditFinding("resting", (label,), *span, size, text) for label, span, size, text in resting(markers)]
     other = model if model is not None and not _fits(markers, model) else None
     found: list[AuditFinding] = []
     if model is not None and other is None:
         names = _both(markers, model)
         swaps, positions = _swaps(markers.positions[:, [markers.names.index(n) for n in names]], model, names)
-        return _sorted(swaps + _strays(positions, model, names))
+        return _sorted(swaps + _strays(positions, model, names) + still)
     positions = markers.positions
     for _ in range(2):  # the second time with a model of the corrected take
         own = learn_model(Markers(markers.names, markers.rate, positions), template=marker_set if marker_set else "")
@@ -140,12 +143,12 @@ def audit_take(
         AuditFinding("throughout", pair, 0, len(markers) - 1, size, text)
         for pair, size, text in swapped_throughout(positions[:, index], own, places)
     ]
-    return _sorted(found + _strays(positions[:, index], own, own.labels))
+    return _sorted(found + _strays(positions[:, index], own, own.labels) + still)
 
 
 def _sorted(found: list[AuditFinding]) -> list[AuditFinding]:
-    """Throughout, swapped, stray, elsewhere; spans of one pair that are nearly next to each other as one."""
-    order = {"throughout": 0, "swapped": 1, "stray": 2, "elsewhere": 3}
+    """Throughout, swapped, stray, resting, elsewhere; spans of one pair that are nearly next to each other as one."""
+    order = {"throughout": 0, "swapped": 1, "stray": 2, "resting": 3, "elsewhere": 4}
     out: list[AuditFinding] = []
     for f in sorted(found, key=lambda f: (order[f.kind], f.labels, f.first)):
         last = out[-1] if out else None
