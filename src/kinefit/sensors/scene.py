@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -145,10 +145,16 @@ class Scene:
 
     def segment_jacobian(self, segment: int) -> NDArray:
         """(6, 6 + D) twist (v, ω) of a segment about the root's origin for each degree of freedom."""
+        return self.segment_jacobians([segment])[0]
+
+    def segment_jacobians(self, segments: Iterable[int]) -> list[NDArray]:
+        """Of each of several segments, as `segment_jacobian` of one."""
         if self.morphing is not None:
-            return self.morphing.pose(self.state).segment_jacobian(segment)
+            pose = self.morphing.pose(self.state)
+            return [pose.segment_jacobian(int(s)) for s in segments]
         tree = self.body.tree
-        return tree.segment_jacobian(tree.forward(self.state.T_world_root, self.state.angles)[1], segment)
+        screws = tree.forward(self.state.T_world_root, self.state.angles)[1]
+        return [tree.segment_jacobian(screws, int(s)) for s in segments]
 
     def position(self, name: str) -> NDArray:
         """(3,) [m] a landmark of the body in the world."""

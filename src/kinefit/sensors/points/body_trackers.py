@@ -100,10 +100,11 @@ class BodyTrackerSensor(Sensor):
                 raise BodyError(f"tracker '{name}': {problem}", remedy="Name a point that the body has.")
         return PointSet(tuple(names), np.array(segments, int), np.reshape(x, (-1, 3)))
 
-    def mount(self, name: str, scene: Scene) -> NDArray:
-        """(3, 3) rotation from a tracker's axes to those of its segment, as the scene has it."""
-        more = np.array([scene.value(self.name, f"{name} r{axis}", 0.0) for axis in "xyz"])
-        return se3.exp_so3(self.mounts.get(name, np.zeros(3))) @ se3.exp_so3(more)
+    def mounted(self, names: Sequence[str], scene: Scene) -> NDArray:
+        """(K, 3, 3) rotations from the axes of trackers to those of their segments, as the scene has them."""
+        known = np.array([self.mounts.get(name, (0.0, 0.0, 0.0)) for name in names], float)
+        more = np.array([[scene.value(self.name, f"{name} r{axis}", 0.0) for axis in "xyz"] for name in names])
+        return se3.exp_so3(known.reshape(-1, 3)) @ se3.exp_so3(more.reshape(-1, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +136,7 @@ class BodyTrackerMeasurement(Measurement):
     def hints(self, scene: Scene) -> Hints:
         """Where they are, and points ahead along their axes where their orientation is known."""
         points = self.of.places(scene.body, self.names)
-        axes = _LEVER * np.stack([self.of.mount(name, scene) for name in self.names]).swapaxes(1, 2)
+        axes = _LEVER * self.of.mounted(self.names, scene).swapaxes(1, 2)
         x = self.x_world[:, None] + _LEVER * self.Rs_world_tracker.swapaxes(1, 2)
         names = [*self.names, *(f"{name} {axis}" for name in self.names for axis in "xyz")]
         at = np.concatenate([points.points, (points.points[:, None] + axes).reshape(-1, 3)])
@@ -170,13 +171,11 @@ class BodyTrackerMatched(Matched):
         out = [scene.rows_of(_kernels.point_rows, 3, points, m.x_world, np.full(len(points), weight))]
         if len(turned):
             segments, phi = np.repeat(points.segments[turned], 3), self._turns(scene, points)
-            J = [
-                np.linalg.solve(se3.left_jacobian_so3(-p), scene.segment_jacobian(int(points.segments[k]))[3:])
-                for k, p in zip(turned, phi)
-            ]
+            moves = np.stack([J[3:] for J in scene.segment_jacobians(points.segments[turned])])
+            J = np.linalg.solve(se3.left_jacobian_so3(-phi), moves)
             groups, weights = len(points) + np.repeat(np.arange(len(turned)), 3), np.full(3 * len(turned), weight)
-            rows = DofRows(m.of.lever * np.concatenate(J), m.of.lever * phi.ravel(), weights, groups, segment=segments)
-            out.append(rows)
+            J, r = m.of.lever * J.reshape(len(segments), -1), m.of.lever * phi.ravel()
+            out.append(DofRows(J, r, weights, groups, segment=segments))
         return [replace(rows, loss=self.loss) for rows in out]
 
     def leftovers(self, scene: Scene) -> list[Leftover]:
@@ -191,5 +190,5 @@ class BodyTrackerMatched(Matched):
         """(T, 3) [rad] rotation vectors in the world that take the body's trackers to the measured ones."""
         m, turned = self.measurement, self.turned
         Rs_world_segment = scene.frames[points.segments[turned], :9].reshape(-1, 3, 3)
-        mounts = np.stack([m.of.mount(m.names[k], scene) for k in turned])
+        mounts = m.of.mounted([m.names[k] for k in turned], scene)
         return se3.log_so3(m.Rs_world_tracker[turned] @ (Rs_world_segment @ mounts).swapaxes(1, 2))
