@@ -10,6 +10,7 @@ PARTS = {
     "calibrate": "calibration refined with the body's motion, and found from people alone",
     "board": "calibration from boards",
     "detect": "the built-in detector",
+    "detect_quality": "its qualities: each camera predicted by the others",
     "smoothing": "whole takes at once",
     "error_bars": "truth within the error bars",
     "channels": "what is found of the errors of markers and of a range sensor",

@@ -1,15 +1,19 @@
 """Fetching of pinned packages, with a pip that hands out made-up wheels; and once the true one."""
 
 import hashlib
+import io
 import sys
+import tarfile
 import tomllib
 import zipfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from kinefit import assets
+from kinefit.assets import clients
 from kinefit.errors import AssetError, FileError
 from kinefit.geometry.triangulation import triangulate
 from kinefit.readers.take.file import read_take
@@ -52,7 +56,7 @@ def pip(tmp_path, monkeypatch, package):
         "dest = next(a.split('=', 1)[1] for a in sys.argv if a.startswith('--dest='))\n"
         "[shutil.copy(w, dest) for w in wheels] or sys.exit('ERROR: No matching distribution found for thing==1')\n"
     )
-    monkeypatch.setattr(assets, "_pip", lambda: [sys.executable, str(script)])
+    monkeypatch.setattr(clients, "pip", lambda: [sys.executable, str(script)])
     return calls
 
 
@@ -104,7 +108,7 @@ def test_says_why_pip_failed(cache, package, pip, tmp_path):
 
 
 def test_stops_pip_and_cleans_up_when_interrupted(cache, package, monkeypatch):
-    monkeypatch.setattr(assets, "_pip", lambda: [sys.executable, "-c", "import time; time.sleep(600)"])
+    monkeypatch.setattr(clients, "pip", lambda: [sys.executable, "-c", "import time; time.sleep(600)"])
 
     def interrupt(done, total):
         raise KeyboardInterrupt
@@ -115,7 +119,7 @@ def test_stops_pip_and_cleans_up_when_interrupted(cache, package, monkeypatch):
 
 
 def test_says_that_pip_is_absent(cache, package, monkeypatch):
-    monkeypatch.setattr(assets.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(clients.importlib.util, "find_spec", lambda name: None)
     monkeypatch.setenv("PATH", "")
     with pytest.raises(AssetError, match="pip.*not installed.*ensurepip"):
         assets.fetch(package)
@@ -212,3 +216,57 @@ def test_true_sample_take_agrees_with_its_calibration(tmp_path):
     names = seen.keypoints[0].names
     head, heel = (np.median(x_world[:, names.index(name), 2]) for name in ("nose", "left_heel"))
     assert 1.2 < head - heel < 1.6 and 0 < heel < 0.4  # [m], z is up
+
+
+@pytest.fixture
+def npm(tmp_path, monkeypatch):
+    """An npm that packs what it is asked for into the folder that it is told; the package that it packs."""
+    archive = tmp_path / "thing-1.tgz"
+    with tarfile.open(archive, "w:gz") as packed:
+        for name, content in FILES.items():
+            info = tarfile.TarInfo(f"package/{name}")
+            info.size = len(content)
+            packed.addfile(info, io.BytesIO(content))
+    script = tmp_path / "npm.py"
+    script.write_text(
+        "import shutil, sys\n"
+        "dest = next(a.split('=', 1)[1] for a in sys.argv if a.startswith('--pack-destination='))\n"
+        f"shutil.copy({str(archive)!r}, dest) if '@of/thing@1' in sys.argv else sys.exit('npm error 404 Not Found')\n"
+    )
+    monkeypatch.setattr(clients, "npm", lambda partial: [sys.executable, str(script)])
+    content = archive.read_bytes()
+    members = {f"package/{name}": (KEPT[name], hashlib.sha256(FILES[name]).hexdigest()) for name in FILES}
+    return assets.Package("@of/thing", "1", hashlib.sha256(content).hexdigest(), len(content), members, index="npm")
+
+
+def test_a_package_of_npm_is_unpacked_likewise(cache, npm):
+    folder = assets.fetch(npm)
+    assert folder.name == "of-thing-1" and (folder / "videos" / "cam01.mp4").read_bytes() == b"moving pictures"
+    assert leftovers(cache) == ["of-thing-1"]
+
+
+def test_says_why_npm_failed(cache, npm):
+    with pytest.raises(AssetError, match=r"npm could not fetch @of/thing 2: npm error 404.*registry"):
+        assets.fetch(replace(npm, version="2"))
+    with pytest.raises(AssetError, match=r"does not hold.*absent"):
+        assets.fetch(replace(npm, members={"package/absent": ("absent", "0" * 64)}))
+    assert leftovers(cache) == []
+
+
+def test_without_npm_pip_fetches_one_and_says_where_it_cannot(monkeypatch, tmp_path):
+    script = tmp_path / "pip.py"
+    script.write_text(
+        "import pathlib, sys\n"
+        "target = pathlib.Path(next(a.split('=', 1)[1] for a in sys.argv if a.startswith('--target=')))\n"
+        "for name in ('bin/node', 'lib/npm/bin/npm-cli.js'):\n"
+        "    (target / name).parent.mkdir(parents=True)\n"
+        "    (target / name).write_text('')\n"
+    )
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setattr(clients, "pip", lambda: [sys.executable, str(script)])
+    (tmp_path / "tmp").mkdir()
+    assert [Path(word).name for word in clients.npm(tmp_path / "tmp")] == ["node", "npm-cli.js"]
+    script.write_text("import sys; sys.exit('ERROR: No matching distribution found')")
+    (tmp_path / "more" / "tmp").mkdir(parents=True)
+    with pytest.raises(AssetError, match=r"npm.*not installed.*nodejs.*No matching distribution.*Install Node"):
+        clients.npm(tmp_path / "more" / "tmp")

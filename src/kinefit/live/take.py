@@ -202,9 +202,9 @@ def with_detector(
         if entry.name in sizes:
             images[entry.name] = image_frame(entry, rig, sizes[entry.name], take)
     people = 1 if take.person is None else 3
-    folder = networks(None, tell)
-    hush(folder)
-    detector = LiveDetector(folder, images, rate=rate, people=people, threads=threads)
+    files = networks(None, tell)
+    hush(files)
+    detector = LiveDetector(files, images, rate=rate, people=people, threads=threads)
     sigma = dict.fromkeys(images, KEYPOINT_SIGMA)
     own = Rig(tuple(rig[entry.name] for entry in take.cameras))
     recording = Recording(np.zeros(1), rate, own, sigma=sigma, up=take.up, name=take.name)

@@ -7,7 +7,7 @@ import os
 import shutil
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from kinefit._threads import cores
-from kinefit.errors import TakeError
+from kinefit.errors import AssetError, FileError, TakeError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 PEOPLE = 3
 """How many people are followed at most in one camera, unless told otherwise."""
+
+QUALITIES = ("balanced", "best")
+"""Of the landmarks, the last one unless another is asked for: see `images.detectors.models.OF_QUALITY`."""
 
 _METHOD = "3"  # raise it when the detector gives other numbers for the same video
 Step = Callable[[str, int, int], None]
@@ -61,6 +64,25 @@ class DetectionJob:
     seconds: tuple[float, float] | None = None
 
 
+@dataclass(frozen=True)
+class Networks:
+    """Files of the detector's networks.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the network that finds people.
+    landmarks : Path
+        The network that sees their landmarks.
+    name : str
+        Of its quality, or what tells a file of one's own from others.
+    """
+
+    folder: Path
+    landmarks: Path
+    name: str
+
+
 def jobs_of_take(take: Take) -> list[DetectionJob]:
     """Every camera of a take that has a video; TakeError where none has."""
     from kinefit.readers.detections import detections_file
@@ -92,23 +114,27 @@ def _seconds(take: Take, camera: CameraEntry) -> tuple[float, float] | None:
 
 
 def detect(
-    jobs: Sequence[DetectionJob], *, people: int | None = None, masks: bool | None = None, force: bool = False,
-    progress: Step | None = None, tell: Tell,
+    jobs: Sequence[DetectionJob], *, people: int | None = None, masks: bool | None = None,
+    quality: str | Path | None = None, force: bool = False, progress: Step | None = None, tell: Tell,
 ) -> list[DetectionJob]:
     """Look through the videos whose file is not there yet, or is of another video or other settings; returns these.
+
+    `quality` is one of `QUALITIES`, or the file of a landmark network of one's own. What is None is as it is where a
+    file is there, and else as is usual.
 
     Every file is written as soon as its video is done, so that what was interrupted goes on with the others.
     """
     from kinefit.readers.detections import detections_key
 
     keys = {job: _video_key(job) for job in jobs}
+    wanted = {"people": people, "masks": masks, "quality": None if quality is None else _name_of(quality)}
     if not force:
         for job in jobs:
-            _from_beside(job, keys[job], people, masks)
-    todo = [job for job in jobs if force or not _fits(detections_key(job.file), keys[job], people, masks, job.seconds)]
+            _from_beside(job, keys[job], wanted)
+    todo = [job for job in jobs if force or not _fits(detections_key(job.file), keys[job], wanted, job.seconds)]
     if not todo:
         return []
-    folder = networks(progress, tell)
+    files = networks(progress, tell, QUALITIES[-1] if quality is None else quality)
     number, outlines = people or PEOPLE, bool(masks)
     stop, lock = threading.Event(), threading.Lock()
 
@@ -122,10 +148,10 @@ def detect(
     threads = max(cores() // len(todo), 1)  # cameras run side by side; what cores are left help them
 
     def work(job: DetectionJob) -> None:
-        key = f"{keys[job]} {_settings(number, outlines, job.seconds)}"
-        _look_through(job, folder, number, outlines, key, step, threads)
+        key = f"{keys[job]} {_settings(number, outlines, job.seconds)} quality={files.name}"
+        _look_through(job, files, number, outlines, key, step, threads)
 
-    hush(folder)
+    hush(files)
     with _one_thread_each(), ThreadPoolExecutor(min(len(todo), cores())) as pool:
         futures = [pool.submit(work, job) for job in todo]
         try:
@@ -143,15 +169,15 @@ def detect(
     return todo
 
 
-def _from_beside(job: DetectionJob, key: str, people: int | None, masks: bool | None) -> None:
+def _from_beside(job: DetectionJob, key: str, wanted: Mapping[str, object]) -> None:
     """Copy what another take of the same folder found in the same video already."""
     from kinefit.exporters.atomic import writing
     from kinefit.readers.detections import detections_key
 
-    if _fits(detections_key(job.file), key, people, masks, job.seconds):
+    if _fits(detections_key(job.file), key, wanted, job.seconds):
         return
     for other in sorted(job.file.parent.parent.glob(f"*-detect/{escape(job.file.name)}")):
-        if _fits(detections_key(other), key, people, masks, job.seconds):
+        if _fits(detections_key(other), key, wanted, job.seconds):
             with writing(job.file) as temporary:
                 shutil.copyfile(other, temporary)
             return
@@ -163,7 +189,7 @@ class _Stopped(Exception):
 
 def _look_through(
     job: DetectionJob,
-    folder: Path,
+    files: Networks,
     people: int,
     masks: bool,
     key: str,
@@ -175,7 +201,7 @@ def _look_through(
     from kinefit.images.detectors.models import Models
     from kinefit.readers.video import Video
 
-    models = Models(folder, threads)
+    models = Models(files.folder, threads, files.landmarks)
     with Video(job.video, rate=job.rate) as video:
         first, last = 0, len(video)
         if job.seconds is not None:
@@ -195,10 +221,14 @@ def _look_through(
     write_detections(found, job.file, key=key)
 
 
-def networks(progress: Step | None, tell: Tell) -> Path:
-    """Folder with the networks; their licence is shown when they are fetched."""
-    from kinefit.assets import MODELS_CREDIT, detector_models
-    from kinefit.images.detectors.models import check_runtime
+def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced") -> Networks:
+    """The networks of a quality, or with a landmark network of one's own; their licence is shown as they are fetched.
+
+    Where the large one cannot be fetched, that of "balanced", which comes with the one that finds people, stands in for
+    it, and says so.
+    """
+    from kinefit.assets import MODELS_CREDIT, detector_models, landmark_models
+    from kinefit.images.detectors.models import LANDMARKS, OF_QUALITY, check_runtime
 
     check_runtime()
     fetched: list[int] = []
@@ -210,13 +240,31 @@ def networks(progress: Step | None, tell: Tell) -> Path:
         if progress:
             progress("fetching MB", done // 10**6, total // 10**6)
 
-    return detector_models(told)
+    folder = detector_models(told)
+    if isinstance(quality, Path):
+        return Networks(folder, quality, _name_of(quality))
+    if OF_QUALITY[quality] == LANDMARKS:
+        return Networks(folder, folder / LANDMARKS, quality)
+    try:
+        return Networks(folder, landmark_models(told) / OF_QUALITY[quality], quality)
+    except AssetError as error:
+        tell(f"{error} Until then people are seen by the network of quality 'balanced'.")
+        return Networks(folder, folder / LANDMARKS, "balanced")
+
+
+def _name_of(quality: str | Path) -> str:
+    """What tells results of a quality, or of a network's file, from those of another."""
+    if isinstance(quality, str):
+        return quality
+    try:
+        return hashlib.sha256(quality.read_bytes()).hexdigest()[:16]
+    except OSError as error:
+        raise FileError(f"cannot be read ({error.strerror})", file=quality, remedy="Check the path.") from error
 
 
 def _video_key(job: DetectionJob) -> str:
     """Text that another video, or another detector, does not have."""
     from kinefit.assets import MODELS_PACKAGE
-    from kinefit.errors import FileError
     from kinefit.readers.image_folders import images_in
 
     digest, size, path = hashlib.sha256(), 0, job.video
@@ -242,13 +290,12 @@ def _settings(people: int, masks: bool, seconds: tuple[float, float] | None) -> 
 
 
 def _fits(
-    found: str | None, key: str, people: int | None, masks: bool | None, seconds: tuple[float, float] | None
+    found: str | None, key: str, wanted: Mapping[str, object], seconds: tuple[float, float] | None
 ) -> bool:
-    """Whether what was found is of this video and of the settings that matter."""
+    """Whether what was found is of this video and of the settings that matter, those that are not None."""
     if found is None or not found.startswith(key + " "):
         return False
-    settings = dict(part.split("=") for part in found[len(key) + 1 :].split())
-    wanted = {"people": people, "masks": masks}
+    settings = {"quality": "balanced", **dict(part.split("=") for part in found[len(key) + 1 :].split())}
     first, last = (float(s) for s in settings.get("seconds", "-inf:inf").split(":"))
     start, stop = seconds or (-np.inf, np.inf)
     if not first <= start <= stop <= last:
@@ -256,7 +303,7 @@ def _fits(
     return all(value is None or settings.get(name) == str(value) for name, value in wanted.items())
 
 
-def hush(networks: Path) -> None:
+def hush(networks: Networks) -> None:
     """Let LiteRT say here, once and to nobody, how it runs: it writes that past Python on stderr, amid the progress."""
     from kinefit.images.detectors.models import Models
 
@@ -264,7 +311,7 @@ def hush(networks: Path) -> None:
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
-        Models(networks)
+        Models(networks.folder, landmarks=networks.landmarks)
     finally:
         os.dup2(kept, 2)
         os.close(kept)

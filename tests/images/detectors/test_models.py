@@ -19,3 +19,15 @@ def test_a_file_that_is_no_network_is_told(tmp_path, content):
 def test_a_missing_network_is_told(tmp_path):
     with pytest.raises(FileError, match="no such network"):
         Models(tmp_path)
+
+
+def test_a_network_of_other_inputs_and_outputs_is_told():
+    from kinefit import assets
+    from kinefit.errors import AssetError
+
+    try:
+        folder = assets.detector_models()
+    except AssetError as error:
+        pytest.skip(str(error))
+    with pytest.raises(FileError, match=r"without inputs or outputs of shape \(1, 256, 256, 3\).*outputs \(1, 195\)"):
+        Models(folder, landmarks=folder / DETECTOR)

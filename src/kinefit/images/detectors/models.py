@@ -17,7 +17,14 @@ from kinefit.images.detectors.person_detector import DetectedPerson, PersonDetec
 from kinefit.images.detectors.pose_model import MASK, PersonLandmarks, PoseModel
 
 DETECTOR, LANDMARKS = "pose_detection.tflite", "pose_landmark_full.tflite"
+OF_QUALITY = {"balanced": LANDMARKS, "best": "pose_landmark_heavy.tflite"}
+"""Landmark networks: the larger, the nearer to the joints, and the slower."""
+
 _REMEDY = "Delete its folder; it is then fetched again."
+_LAYOUT = (
+    "Name a landmark network of BlazePose: input (1, 256, 256, 3); outputs (1, 195), (1, 1), (1, 64, 64, 39), (1, 117) "
+    "and, for outlines, (1, 256, 256, 1)."
+)
 
 
 class Models:
@@ -29,23 +36,27 @@ class Models:
         With the two files.
     threads : int
         That each network runs on; the answers are the same.
+    landmarks : path
+        Of another landmark network than the folder's: one of `OF_QUALITY`, or one with the same inputs and outputs.
 
     Raises
     ------
     ObservationError
         The extra `detect` is not installed.
     FileError
-        A file is missing or not a network.
+        A file is missing, not a network, or a network of other inputs and outputs.
     """
 
-    def __init__(self, folder: str | PathLike[str], threads: int = 1) -> None:
-        self._landmarks, self._threads = Path(folder) / LANDMARKS, threads
-        self._points = PoseModel(_interpreter(self._landmarks, threads, without=MASK))
+    def __init__(
+        self, folder: str | PathLike[str], threads: int = 1, landmarks: str | PathLike[str] | None = None
+    ) -> None:
+        self._landmarks, self._threads = Path(folder) / LANDMARKS if landmarks is None else Path(landmarks), threads
+        self._points = _pose_model(self._landmarks, threads, without=MASK)
         self._detect = PersonDetector(_interpreter(Path(folder) / DETECTOR, threads))
 
     @cached_property
     def _outlines(self) -> PoseModel:
-        return PoseModel(_interpreter(self._landmarks, self._threads))
+        return _pose_model(self._landmarks, self._threads)
 
     def pose(self, crop: NDArray[np.uint8], *, mask: bool = True) -> PersonLandmarks:
         """Pose of the person in an RGB crop (256, 256, 3); its mask takes nearly as long as all the rest."""
@@ -93,6 +104,13 @@ def _runtime() -> Any:
             remedy="Run: pip install 'kinefit[detect]'.",
         ) from error
     return Interpreter
+
+
+def _pose_model(path: Path, threads: int, without: tuple[int, ...] = ()) -> PoseModel:
+    try:
+        return PoseModel(_interpreter(path, threads, without))
+    except KeyError as error:
+        raise FileError(f"a network without inputs or outputs of shape {error}", file=path, remedy=_LAYOUT) from error
 
 
 def _interpreter(path: Path, threads: int, without: tuple[int, ...] = ()) -> Any:

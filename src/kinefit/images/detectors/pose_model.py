@@ -54,12 +54,18 @@ class PoseModel:
     Parameters
     ----------
     interpreter
-        Of `pose_landmark_full.tflite`, with or without the output that is the mask.
+        Of `pose_landmark_full.tflite` or its like, with or without the output that is the mask.
+
+    Raises
+    ------
+    KeyError
+        No input or output of a shape.
     """
 
     def __init__(self, interpreter: Any) -> None:
         self._interpreter = interpreter
-        self._input = interpreter.get_input_details()[0]["index"]
+        inputs = {tuple(int(n) for n in o["shape"]): o["index"] for o in interpreter.get_input_details()}
+        self._input = inputs[1, SIZE, SIZE, 3]
         outputs = {tuple(int(n) for n in o["shape"]): o["index"] for o in interpreter.get_output_details()}
         self._landmarks, self._score = outputs[1, 195], outputs[1, 1]
         self._mask, self._heat = outputs.get(MASK), outputs[1, _HEAT, _HEAT, 39]
