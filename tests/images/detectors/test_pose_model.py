@@ -59,7 +59,7 @@ class Interpreter:
         self.tensors = {1: landmarks.reshape(1, 195), 2: np.array([[0.75]]), 3: mask, 4: flat, 5: np.zeros((1, 117))}
 
     def get_input_details(self):
-        return [{"index": 0}]
+        return [{"index": 0, "shape": np.array([1, 256, 256, 3])}]
 
     def get_output_details(self):
         return [{"shape": list(t.shape), "index": k} for k, t in self.tensors.items()]
