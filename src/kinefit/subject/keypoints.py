@@ -99,7 +99,7 @@ def fit_subject(
         progress("bone lengths", len(chosen) + 1, len(chosen) + 1)
     sets = tuple(name for name in channels.sets if name)
     scales = np.exp(found.mean[: len(scales)])
-    return Subject(found.body, scales, found, covariance, sets=sets, view_bias=bias)
+    return Subject(found.body, scales, found, covariance, sets=sets, view_bias=bias, frames=tuple(states))
 
 
 def _fitted(
@@ -115,17 +115,19 @@ def _fitted(
     of the round before.
     """
     spread, excess_of, start, gear, bias = _SHIFT, 1.0, None, Gear(body), ViewBias()
+    cameras: CameraExtrinsics | None = None
     bare = body if body.morphs else replace(body, surfaces=(), skin=None)  # surfaces would be stretched for nothing
     used = tuple(channels.rig.names[c] for c in np.unique(channels.camera))
+    if std is not None:
+        cameras = CameraExtrinsics(channels.rig, None, std, used, np.ones(len(used)))
     for k in range(_ROUNDS):
         parameters: list[Parameters] = [lengths, *(PointOffsets(body, name, spread) for name in channels.sets if name)]
         before = sum(len(one.names) for one in parameters)
         if k and gear.names:  # which poses of the first round have brought into place
             parameters.append(gear)
         of_body = sum(len(one.names) for one in parameters)
-        if std is not None:
-            held = np.array(std) / np.sqrt(excess_of)
-            parameters.append(CameraExtrinsics(channels.rig, None, (float(held[0]), float(held[1])), used))
+        if cameras is not None:
+            parameters.append(replace(cameras, factors=cameras.factors / np.sqrt(excess_of)))
         if start is None:
             start = np.concatenate([np.log(scales), *(one.mean for one in parameters[1:])])
         elif of_body > before:
@@ -144,6 +146,8 @@ def _fitted(
         moved, open_to = found.mean - found.prior.mean, np.isclose(np.diag(prior), spread**-2)
         open_to[of_body:] = False
         spread = place_spread(moved[open_to], np.diag(covariance)[open_to], spread, _SHIFT)
+        if cameras is not None:
+            cameras = cameras.with_errors_of(moved[of_body:], np.diag(covariance)[of_body:])
         excess_of = max(excess_of, 1.0)
     prior_world = World(body, channels.rig)
     found = replace(found, body=Worlds(prior_world, parameters).at(found.mean).body, prior_world=prior_world)

@@ -16,7 +16,10 @@ from kinefit.sensors.base import Sensor, Unknown
 from kinefit.sensors.checks import of_kind
 from kinefit.sensors.displaced import AXES, CLOCK
 from kinefit.solvers import _kernels_border
-from kinefit.subject.parameters import World
+from kinefit.subject.parameters import World, place_spread
+
+FAR_OFF = 3.0
+"""Standard deviations of its calibration: one of 24 numbers is so far off in 6 % of takes."""
 
 _STEP = 1e-4  # [m, rad] from which derivatives are taken
 
@@ -34,12 +37,14 @@ class CameraExtrinsics:
     held : name of the camera that stays; None where other sensors hold the world.
     std : (2,) standard deviations of v [m] and ω [rad].
     cameras : names of those that move, besides the one that is held; default: all.
+    factors : (C,) of each camera that moves, on its standard deviations; default 1, see `with_errors_of`.
     """
 
     rig: Rig
     held: str | None
     std: tuple[float, float] = (0.02, 0.01)
     cameras: tuple[str, ...] | None = None
+    factors: NDArray | None = None
 
     def __post_init__(self) -> None:
         for name in (*(self.cameras or ()), *(() if self.held is None else (self.held,))):
@@ -66,7 +71,35 @@ class CameraExtrinsics:
     @property
     def information(self) -> NDArray:
         """(6 C, 6 C)."""
-        return np.diag(np.tile(np.repeat(self.std, 3), len(self.free)) ** -2.0)
+        return np.diag(self.spreads.ravel() ** -2.0)
+
+    @property
+    def spreads(self) -> NDArray:
+        """(C, 6) [m, rad] prior standard deviation of each parameter."""
+        factors = np.ones(len(self.free)) if self.factors is None else np.asarray(self.factors, float)
+        return factors[:, None] * np.repeat(self.std, 3)
+
+    def with_errors_of(self, moved: NDArray, variance: NDArray) -> CameraExtrinsics:
+        """The same cameras with standard deviations as large as a take shows that their errors are.
+
+        A multiple of the stated ones is found for all cameras together, and one for each that is drawn towards it; a
+        camera that is off by far says nothing of the others. See `place_spread`.
+
+        Parameters
+        ----------
+        moved, variance : (6 C,) found with the present standard deviations, and how certain that is
+        """
+        stated = np.repeat(self.std, 3)
+        of = np.stack([moved.reshape(-1, 6) / stated, variance.reshape(-1, 6) / stated**2, self.spreads / stated])
+        alike = [place_spread(*of[:, c], 1.0) <= FAR_OFF for c in range(of.shape[1])]
+        common = place_spread(*of[:, alike], 1.0)
+        return replace(self, factors=np.array([place_spread(*of[:, c], common) for c in range(of.shape[1])]))
+
+    def far_off(self, moved: NDArray, variance: NDArray) -> dict[str, NDArray]:
+        """{camera: (6,)} twists of those that are surely farther off than their calibration may be."""
+        far = np.abs(moved.reshape(-1, 6)) - FAR_OFF * np.sqrt(variance.reshape(-1, 6))
+        which = np.any(far > FAR_OFF * np.repeat(self.std, 3), axis=1)
+        return {name: twist for name, twist, is_far in zip(self.free, moved.reshape(-1, 6), which) if is_far}
 
     @property
     def step(self) -> NDArray:
