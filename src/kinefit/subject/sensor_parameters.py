@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +22,7 @@ from kinefit.subject.parameters import World, place_spread
 FAR_OFF = 3.0
 """Standard deviations of its calibration: one of 24 numbers is so far off in 6 % of takes."""
 
+_FREED = 10.0  # standard deviations of its calibration: 30 mm and 1 degree, of what is left of a camera that was moved
 _STEP = 1e-4  # [m, rad] from which derivatives are taken
 
 
@@ -76,8 +78,19 @@ class CameraExtrinsics:
     @property
     def spreads(self) -> NDArray:
         """(C, 6) [m, rad] prior standard deviation of each parameter."""
-        factors = np.ones(len(self.free)) if self.factors is None else np.asarray(self.factors, float)
-        return factors[:, None] * np.repeat(self.std, 3)
+        return self._times[:, None] * np.repeat(self.std, 3)
+
+    @property
+    def _times(self) -> NDArray:
+        return np.ones(len(self.free)) if self.factors is None else np.asarray(self.factors, float)
+
+    def tighter(self, share: float) -> CameraExtrinsics:
+        """The same, held with so large a share of the standard deviations."""
+        return replace(self, factors=share * self._times)
+
+    def freed(self, far: Collection[str]) -> CameraExtrinsics:
+        """The same, with those that are known to be far off held ten times as loosely as is stated."""
+        return replace(self, factors=np.where(np.isin(self.free, list(far)), _FREED, self._times))
 
     def with_errors_of(self, moved: NDArray, variance: NDArray) -> CameraExtrinsics:
         """The same cameras with standard deviations as large as a take shows that their errors are.
@@ -91,15 +104,26 @@ class CameraExtrinsics:
         """
         stated = np.repeat(self.std, 3)
         of = np.stack([moved.reshape(-1, 6) / stated, variance.reshape(-1, 6) / stated**2, self.spreads / stated])
-        alike = [place_spread(*of[:, c], 1.0) <= FAR_OFF for c in range(of.shape[1])]
-        common = place_spread(*of[:, alike], 1.0)
-        return replace(self, factors=np.array([place_spread(*of[:, c], common) for c in range(of.shape[1])]))
 
-    def far_off(self, moved: NDArray, variance: NDArray) -> dict[str, NDArray]:
-        """{camera: (6,)} twists of those that are surely farther off than their calibration may be."""
-        far = np.abs(moved.reshape(-1, 6)) - FAR_OFF * np.sqrt(variance.reshape(-1, 6))
-        which = np.any(far > FAR_OFF * np.repeat(self.std, 3), axis=1)
-        return {name: twist for name, twist, is_far in zip(self.free, moved.reshape(-1, 6), which) if is_far}
+        def spread(which: Any, believed: float) -> float:
+            return place_spread(of[0, which], of[1, which], of[2, which], believed)
+
+        alike = [spread(c, 1.0) <= FAR_OFF for c in range(of.shape[1])]
+        common = spread(alike, 1.0)
+        return replace(self, factors=np.array([spread(c, common) for c in range(of.shape[1])]))
+
+    def far_off(self, moved: NDArray, variance: NDArray, known: Collection[str] = ()) -> dict[str, NDArray]:
+        """{camera: (6,)} twist of the one that is surely farther off than calibrations are; the rest of `known` ones.
+
+        A camera that is far off pulls others along, so they are found one after the other. Two cameras do not tell
+        which of them it is.
+        """
+        moved, stated = moved.reshape(-1, 6), np.repeat(self.std, 3)
+        beyond = np.max((np.abs(moved) - FAR_OFF * stated) / np.sqrt(variance.reshape(-1, 6)), axis=1)
+        before = np.isin(self.free, list(known))
+        beyond[before] = -np.inf
+        far = (len(before) > 2) & (beyond > 1.0) & (beyond == beyond.max()) | before & np.any(np.abs(moved) > stated, axis=1)
+        return {name: twist for name, twist, is_far in zip(self.free, moved, far) if is_far}
 
     @property
     def step(self) -> NDArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -138,13 +138,12 @@ class Subject:
         """A body that is the person's already."""
         return cls(body, np.ones(len(body.scale_groups)))
 
-    @property
-    def cameras_far_off(self) -> dict[str, NDArray]:
-        """{camera: (6,) [m, rad] twist} of cameras that the keypoints show to be farther off than they may be."""
+    def cameras_far_off(self, known: Collection[str]) -> dict[str, NDArray]:
+        """{camera: (6,) [m, rad] twist} of cameras farther off than they may be; of `known` ones what is left."""
         if self.fit is None or self.covariance is None or self.fit.cameras is None:
             return {}
         own = -len(self.fit.cameras.names)
-        return self.fit.cameras.far_off(self.fit.mean[own:], np.diag(self.covariance)[own:])
+        return self.fit.cameras.far_off(self.fit.mean[own:], np.diag(self.covariance)[own:], known)
 
     @property
     def length_std(self) -> dict[str, float]:

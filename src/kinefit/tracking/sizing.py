@@ -41,7 +41,7 @@ _POSES = 8  # and how many of them it is found from: twice as many change no hal
 _MANY = 16  # of markers alone, whose places are found by how they move; a frame of them costs little
 _MATCHES = 3  # rounds of matching and solving
 _PLACES = 2  # fits with a better spread of the markers' places; it changes by less than a tenth from then on
-_MOVES = 2  # times that cameras are moved that a subject fit has found far off
+_MOVES = 3  # times that cameras are moved that a subject fit has found far off
 _SEEN = 0.5  # quality of a frame that the shape may be found from
 
 Start = tuple[int, BodyState]
@@ -113,14 +113,16 @@ def fitted_to_person(
         person = _wearing(person, subject)
         return _by_all(person, body, settings, progress, size=False) if unknown else person
     if cameras >= 2:
+        moved: dict[str, NDArray] = {}
         for last in (False,) * _MOVES + (True,):
             by_keypoints = fit_subject(
                 body, channels_of(person.recording, body, settings), frames=frames or 25, height=height, trial=trial,
-                cameras=settings.camera_std, view_bias=settings.view_bias and not others, progress=progress,
+                cameras=settings.camera_std, far_off=tuple(moved), view_bias=settings.view_bias and not others,
+                progress=progress,
             )  # fmt: skip
-            if last or not (far := by_keypoints.cameras_far_off):
+            if last or not (far := by_keypoints.cameras_far_off(moved)):
                 break
-            person = _with_cameras(person, moved_rig(person.recording.rig, far))
+            person, moved = _with_cameras(person, moved_rig(person.recording.rig, far)), moved | far
         person = _with_depth_cameras(_wearing(person, by_keypoints, **_gear_of(body, by_keypoints)), settings)
     elif recording.markers and recording.markers[0].marker_set:
         person, found = _by_markers(person, height, progress)
