@@ -122,7 +122,8 @@ class CameraExtrinsics:
         beyond = np.max((np.abs(moved) - FAR_OFF * stated) / np.sqrt(variance.reshape(-1, 6)), axis=1)
         before = np.isin(self.free, list(known))
         beyond[before] = -np.inf
-        far = (len(before) > 2) & (beyond > 1.0) & (beyond == beyond.max()) | before & np.any(np.abs(moved) > stated, axis=1)
+        far = (beyond > 1.0) & (beyond == beyond.max()) & (len(before) > 2)
+        far |= before & np.any(np.abs(moved) > stated, axis=1)
         return {name: twist for name, twist, is_far in zip(self.free, moved, far) if is_far}
 
     @property
