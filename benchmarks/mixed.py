@@ -4,11 +4,11 @@
 
 Groups, each with its figures: "sensors" (each sensor helps), "intervals" (the truth lies inside the stated 95 %
 interval), "alone" (the same of markers and of silhouettes alone, smoothed, where it is asked for), "smoothing" (it
-helps every mix), "misfit" (sensors whose calibrations do not fit each other), "real" (a
-second sensor never harms the balancing trial), "memory" (what each frame of a long take needs). The first three are of
-simulated takes: see `benchmarks.mixed_takes` for the person, motion and sensors, `benchmarks.mixed_runs` for the mixes
-and conditions, `benchmarks.mixed_figures` for definitions. True surface: Anny; fitted body: the catalogue's humanoid of
-cylinders, its size found by `kinefit.track_take`.
+helps every mix), "cameras" (calibrations that are exact, off and wrong), "misfit" (sensors
+whose calibrations do not fit each other), "real" (a second sensor never harms the balancing trial), "memory" (what each
+frame of a long take needs). All but the last two are of simulated takes: see `benchmarks.mixed_takes` for the person,
+motion and sensors, `benchmarks.mixed_runs` for the mixes and conditions, `benchmarks.mixed_figures` for definitions.
+True surface: Anny; fitted body: the catalogue's humanoid of cylinders, its size found by `kinefit.track_take`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SIMULATED = {
     "sensors": mixed_figures.sensors, "intervals": mixed_figures.intervals, "alone": mixed_figures.alone,
     "smoothing": mixed_figures.smoothing,
 }  # fmt: skip
-GROUPS = (*SIMULATED, "misfit", "real", "memory")
+GROUPS = (*SIMULATED, "cameras", "misfit", "real", "memory")
 DRAWS, QUICK_DRAWS, QUICK_SECONDS = 30, 1, 0.4
 
 

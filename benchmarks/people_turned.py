@@ -1,4 +1,8 @@
-"""A camera whose calibration is turned by three degrees, on the real trial: named, of little harm, in the bars."""
+"""A camera whose calibration is turned by three degrees, on the real trial: named, of little harm, in the bars.
+
+Each camera in turn about its y axis, and 20 draws of a camera and an axis (draws 100 and on: what is
+set was chosen on simulated takes). Named is a camera in the notes that `kinefit track` prints.
+"""
 
 from __future__ import annotations
 
@@ -7,45 +11,72 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.figures import amount, data, figure
 from benchmarks.tracking import read_trial
-from kinefit import load_body
+from kinefit import Recording, load_body
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
+from kinefit.sensors.settings import TrackSettings
+from kinefit.tracking.agreement import sentences as contradicting
+from kinefit.tracking.cameras import sentences as moved
 from kinefit.tracking.video import track
 
 _GOALS = {
-    "people_turned_joints": ("mm from the fit with the right calibration, the worst camera", "<= 20"),
-    "people_turned_named": ("% of the cameras are named, and no other", ">= 100"),
-    "people_turned_inside": ("% of coordinates within 95 % intervals, the worst camera", ">= 90"),
-}  # fmt: skip
-DEGREES = 3.0
+    "joints": ("mm from the fit with the right calibration, the worst", "<= 15"),
+    "named": ("% of the cameras are named, and no other", ">= 100"),
+    "inside": ("% of coordinates within 95 % intervals, the worst", ">= 90"),
+}
+DEGREES, DRAWS, FIRST = 3.0, 20, 100
 
 
 def run() -> None:
     """Print every figure."""
     folder = data("video_balancing_4cam")
     if folder is None:
-        for name, (unit, goal) in _GOALS.items():
-            figure(name, None, unit, goal, "no recording")
+        for kind in ("turned", "turned_any_axis"):
+            for name, (unit, goal) in _GOALS.items():
+                figure(f"people_{kind}_{name}", None, unit, goal, "no recording")
         return
     with tempfile.TemporaryDirectory() as where:
-        trial = read_trial(folder, "openpose", Path(where))
-    body = load_body("humanoid")
-    x = track(trial.recording, body).segment_poses()[..., :3, 3]
+        recording = read_trial(folder, "openpose", Path(where)).recording
+    names = recording.rig.names
+    y = np.array([0.0, 1.0, 0.0])
+    _figures("turned", recording, [(name, y) for name in amount(names, names[:1])])
+    draws = [np.random.default_rng([32, FIRST + draw]) for draw in range(amount(DRAWS, 1))]
+    _figures("turned_any_axis", recording, [(names[r.integers(len(names))], _axis(r)) for r in draws])
+
+
+def _axis(random: np.random.Generator) -> NDArray:
+    """(3,) of length 1, all ways alike."""
+    axis = random.normal(size=3)
+    return np.asarray(axis / np.linalg.norm(axis))
+
+
+def _figures(kind: str, recording: Recording, turns: list[tuple[str, NDArray]]) -> None:
+    body, rig, std = load_body("humanoid"), recording.rig, TrackSettings().camera_std
+    motion = track(recording, body)
+    x, alone = motion.segment_poses()[..., :3, 3], _named(motion.provenance, std, rig)
+    print(f"# as calibrated: {', '.join(sorted(alone)) or 'none'} named")
     gaps, named, inside = [], [], []
-    for name in amount(trial.rig.names, trial.rig.names[:1]):
-        turn = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(DEGREES), 0.0]))
-        rig = Rig(tuple(c.with_pose(turn @ c.T_camera_world) if c.name == name else c for c in trial.rig))
-        motion = track(replace(trial.recording, rig=rig), body)
+    for name, axis in turns:
+        turn = se3.exp(np.concatenate([np.zeros(3), np.radians(DEGREES) * axis]))
+        wrong = Rig(tuple(c.with_pose(turn @ c.T_camera_world) if c.name == name else c for c in rig))
+        motion = track(replace(recording, rig=wrong), body)
         away = motion.segment_poses()[..., :3, 3] - x
         known = np.isfinite(motion.joint_std)
         gaps.append(1e3 * float(np.linalg.norm(away, axis=-1).mean()))
-        named.append(set(motion.provenance["contradictions"]) == {name})
+        named.append(_named(motion.provenance, std, rig) == {name})
         inside.append(100 * float(np.mean(np.abs(away[known]) < 1.96 * motion.joint_std[known])))
         sigma = 1e3 * float(np.median(motion.joint_std[known]))
-        print(f"# {name} turned: joints {gaps[-1]:.1f} mm, named {named[-1]}, inside {inside[-1]:.1f} %, standard "
-              f"deviation {sigma:.1f} mm (median)")  # fmt: skip
-    for name, value in zip(_GOALS, (max(gaps), 100 * float(np.mean(named)), min(inside))):
-        figure(name, value, *_GOALS[name])
+        print(f"# {name} turned about {axis.round(2)}: joints {gaps[-1]:.1f} mm, named {named[-1]}, inside "
+              f"{inside[-1]:.1f} %, standard deviation {sigma:.1f} mm (median)", flush=True)  # fmt: skip
+    for what, value in zip(_GOALS, (max(gaps), 100 * float(np.mean(named)), min(inside))):
+        figure(f"people_{kind}_{what}", value, *_GOALS[what])
+
+
+def _named(provenance: dict, std: tuple[float, float] | None, rig: Rig) -> set[str]:
+    """Cameras that the notes of `kinefit track` name."""
+    said = " ".join([*contradicting(provenance["contradictions"]), *moved(provenance, std)])
+    return {name for name in rig.names if name in said}

@@ -59,3 +59,22 @@ def test_cameras_that_are_turned_by_half_a_degree_come_back(kind):
     away = np.abs(found.mean - twists.ravel()).reshape(-1, 6)[:, 3:]
     assert np.degrees(away).max() < 0.1
     assert np.degrees(found.std.reshape(-1, 6)[:, 3:]).max() < 0.2
+
+
+def test_errors_of_cameras_are_as_large_as_a_take_shows():
+    cameras = CameraExtrinsics(ring(4), None, (0.003, 0.002))
+    stated, random = np.tile(np.repeat(cameras.std, 3), 4), np.random.default_rng(3)
+    exact, right, blind = (cameras.with_errors_of(moved * stated, share * stated**2).factors for moved, share in (
+        (np.zeros(24), np.full(24, 0.05)), (random.normal(size=24), np.full(24, 0.05)), (np.zeros(24), np.ones(24))
+    ))  # fmt: skip
+    assert np.all(exact < 0.5) and np.all((right > 0.6) & (right < 1.5)) and np.allclose(blind, 1.0)
+    moved = 0.3 * random.normal(size=24)
+    moved[6:12] += 20.0
+    far = cameras.with_errors_of(moved * stated, 0.05 * stated**2)
+    assert far.factors[1] > 8.0 and np.all(far.factors[[0, 2, 3]] < 1.0)
+    assert np.allclose(np.sqrt(np.diag(np.linalg.inv(far.information))), far.spreads.ravel())
+    assert list(cameras.far_off(moved * stated, 0.05 * stated**2)) == [cameras.free[1]]
+    assert not cameras.far_off(moved * stated, 1000.0 * stated**2)
+    two = CameraExtrinsics(ring(2), None, (0.003, 0.002))
+    assert not two.far_off((moved * stated)[:12], 0.05 * stated[:12] ** 2)
+    assert len(two.far_off((moved * stated)[:12], 0.05 * stated[:12] ** 2, [two.free[1]])) == 1

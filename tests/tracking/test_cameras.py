@@ -6,12 +6,13 @@ import pytest
 from kinefit import Recording, TrackSettings, read_take, track, track_take
 from kinefit.errors import TakeError
 from kinefit.geometry import se3
+from kinefit.geometry.camera import Rig
 from kinefit.observations import KeypointFrame, MarkerFrame
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.subject.parameters import World
 from kinefit.subject.sensor_parameters import CameraExtrinsics
-from kinefit.tracking.cameras import as_found, sentences
+from kinefit.tracking.cameras import as_found, between, composed, sentences
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +73,34 @@ def test_a_camera_that_is_farther_off_than_it_can_be_is_named():
     (sentence,) = sentences(told, (0.003, 0.00175))
     assert sentence.startswith("camera a was found 4 mm and 0.34 degrees from its calibration")
     assert not sentences(told, None) and not sentences({}, (0.003, 0.00175))
+
+
+def test_a_camera_turned_about_any_axis_is_moved_back_and_named():
+    motion = squat_and_wave(rate=10.0, duration=2.0)
+    rig, turn = studio_rig(motion), se3.exp(np.radians([0.0, 0.0, 0.0, 2.0, 1.0, -2.0]))
+    wrong = Rig(tuple(c.with_pose(turn @ c.T_camera_world) if c.name == "cam02" else c for c in rig))
+    seen = simulate_keypoints(motion, rig, noise_px=1.0, drift_px=0.5, outliers=0.05, missing=0.05)
+    told = {name: track(Recording.of_keypoints(r, seen), motion.body) for name, r in (("right", rig), ("wrong", wrong))}
+    assert "cameras" not in told["right"].provenance
+    assert list(told["wrong"].provenance["cameras"]) == ["cam02"]
+    assert sentences(told["wrong"].provenance, TrackSettings().camera_std)[0].startswith("camera cam02 was found")
+    found = as_found(wrong, told["wrong"].provenance)["cam02"].T_camera_world
+    left = se3.log(found @ se3.inverse(rig["cam02"].T_camera_world))
+    assert np.degrees(np.linalg.norm(left[3:])) < 1.0
+    away = {n: np.linalg.norm(m.positions() - motion.positions(), axis=-1).mean() for n, m in told.items()}
+    assert away["wrong"] < away["right"] + 0.005
+
+
+def test_two_moves_of_a_camera_amount_to_one():
+    twists = np.random.default_rng(1).normal(0.0, 0.1, (2, 6))
+    motion = squat_and_wave(rate=10.0, duration=0.5)
+    rig = studio_rig(motion)
+    steps = [{"cam01": {"moved": twist.tolist()}} for twist in twists]
+    once = as_found(as_found(rig, {"cameras": steps[0]}), {"cameras": steps[1]})
+    direct = as_found(rig, {"cameras": composed(*steps)})
+    assert np.allclose(direct["cam01"].T_camera_world, once["cam01"].T_camera_world)
+    assert np.allclose(between(rig, once)["cam01"]["moved"], composed(*steps)["cam01"]["moved"])
+    assert list(between(rig, once)) == ["cam01"]
 
 
 @pytest.mark.parametrize(

@@ -37,3 +37,11 @@ def test_between_frames_far_apart_limbs_are_sought_for_what_nothing_explains(mon
     result = tracker.update([sees(0)])
     assert not result.lost.any()
     assert len(sought) == times
+
+
+def test_a_limb_that_was_well_seen_at_this_very_time_may_move_as_far_as_in_a_frame():
+    tracker = Tracker(a_motion().body, a_rig(), rate=30.0, up="y")
+    tracker.start_at(a_motion().state(0))
+    result, one = tracker.update([depth_frame(0)]), np.arange(len(a_motion().body.tree.segments)) == 1
+    tracker._recovery._good[one] = result.time
+    assert tracker._recovery._leap(result.time, result, result, one) == 1.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -46,6 +46,7 @@ def fit_subject(
     height: float | None = None,
     trial: Subject | None = None,
     cameras: tuple[float, float] | None = None,
+    far_off: Collection[str] = (),
     view_bias: bool = False,
     progress: Progress | None = None,
 ) -> Subject:
@@ -59,6 +60,7 @@ def fit_subject(
     trial : what another trial of the same person gave: lengths start from there, and stay as near as it was sure.
     cameras : (2,) standard deviations of the cameras' positions [m] and directions [rad], which are then found along;
         default: the calibration is exact.
+    far_off : cameras that were moved from far off, whose directions are known to a degree alone.
     view_bias : whether the detectors' bias by direction of view is found along, of points that three cameras show.
 
     Raises
@@ -94,17 +96,20 @@ def fit_subject(
     if trial is not None and trial.covariance is not None:
         known = trial.covariance[: len(scales), : len(scales)]
         lengths = KnownLengths(body, scales=trial.scales, covariance=known)
-    found, covariance, bias = _fitted(body, channels, steps, list(states.values()), lengths, scales, cameras, view_bias)
+    found, covariance, bias = _fitted(
+        body, channels, steps, list(states.values()), lengths, scales, cameras, far_off, view_bias
+    )  # fmt: skip
     if progress:
         progress("bone lengths", len(chosen) + 1, len(chosen) + 1)
     sets = tuple(name for name in channels.sets if name)
     scales = np.exp(found.mean[: len(scales)])
-    return Subject(found.body, scales, found, covariance, sets=sets, view_bias=bias)
+    return Subject(found.body, scales, found, covariance, sets=sets, view_bias=bias, frames=tuple(states))
 
 
 def _fitted(
     body: Body, channels: Channels, steps: Sequence[Sequence[KeypointMeasurement]], states: Sequence[BodyState],
-    lengths: SegmentScales, scales: NDArray, std: tuple[float, float] | None, by_view: bool,
+    lengths: SegmentScales, scales: NDArray, std: tuple[float, float] | None,
+    far_off: Collection[str], by_view: bool,
 ) -> tuple[SubjectFit, NDArray, ViewBias]:  # fmt: skip
     """Lengths, points, gear and cameras, with as much freedom for points as this take asks for; and their covariance.
 
@@ -115,17 +120,19 @@ def _fitted(
     of the round before.
     """
     spread, excess_of, start, gear, bias = _SHIFT, 1.0, None, Gear(body), ViewBias()
+    cameras: CameraExtrinsics | None = None
     bare = body if body.morphs else replace(body, surfaces=(), skin=None)  # surfaces would be stretched for nothing
     used = tuple(channels.rig.names[c] for c in np.unique(channels.camera))
+    if std is not None:
+        cameras = CameraExtrinsics(channels.rig, None, std, used).freed(far_off)
     for k in range(_ROUNDS):
         parameters: list[Parameters] = [lengths, *(PointOffsets(body, name, spread) for name in channels.sets if name)]
         before = sum(len(one.names) for one in parameters)
         if k and gear.names:  # which poses of the first round have brought into place
             parameters.append(gear)
         of_body = sum(len(one.names) for one in parameters)
-        if std is not None:
-            held = np.array(std) / np.sqrt(excess_of)
-            parameters.append(CameraExtrinsics(channels.rig, None, (float(held[0]), float(held[1])), used))
+        if cameras is not None:
+            parameters.append(cameras.tighter(excess_of**-0.5))
         if start is None:
             start = np.concatenate([np.log(scales), *(one.mean for one in parameters[1:])])
         elif of_body > before:
@@ -144,6 +151,8 @@ def _fitted(
         moved, open_to = found.mean - found.prior.mean, np.isclose(np.diag(prior), spread**-2)
         open_to[of_body:] = False
         spread = place_spread(moved[open_to], np.diag(covariance)[open_to], spread, _SHIFT)
+        if cameras is not None:
+            cameras = cameras.with_errors_of(moved[of_body:], np.diag(covariance)[of_body:]).freed(far_off)
         excess_of = max(excess_of, 1.0)
     prior_world = World(body, channels.rig)
     found = replace(found, body=Worlds(prior_world, parameters).at(found.mean).body, prior_world=prior_world)

@@ -278,18 +278,18 @@ class PointOffsets:
         return replace(world, body=replace(body, marker_sets={**body.marker_sets, self.name: moved}))
 
 
-def place_spread(moved: NDArray, variance: NDArray, spread: float, believed: float) -> float:
+def place_spread(moved: NDArray, variance: NDArray, spread: ArrayLike, believed: float) -> float:
     """Standard deviation of how far points stand from their places on a body, as MacKay (1992) finds a prior's width.
 
     Parameters
     ----------
     moved, variance : (p,) [m], [m²] found with the prior standard deviation `spread`, and how certain that is
-    spread, believed : [m] standard deviations; `believed` before a take is seen, which counts as much as five
-        coordinates that a take measures
+    spread : scalar or (p,) [m] prior standard deviation
+    believed : [m] the same before a take is seen, which counts as much as five coordinates that a take measures
 
     All may be in any other unit, such as the standard deviation of each point.
     """
-    measured = float(np.sum(np.maximum(1.0 - variance / spread**2, 0.0)))
+    measured = float(np.sum(np.maximum(1.0 - variance / np.square(spread), 0.0)))
     return float(np.sqrt((np.sum(moved**2) + _BELIEF * believed**2) / (measured + _BELIEF)))
 
 

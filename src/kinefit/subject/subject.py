@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -121,7 +121,7 @@ class Subject:
     `fit` is the fit of keypoints that it came from, `covariance` (p, p) how sure each of its parameters is, logarithms
     of the scales first; both None for a body that was given. `length_share` (G,) is each scale's standard deviation
     over it, where other sensors gave it. `sets` are the detectors' keypoint sets that it was found from, `view_bias`
-    how far beside its points they see them from each side.
+    how far beside its points they see them from each side, `frames` the frames of whose poses are those of `fit`.
     """
 
     body: Body
@@ -131,11 +131,19 @@ class Subject:
     length_share: NDArray | None = None
     sets: tuple[str, ...] = ()
     view_bias: ViewBias | None = None
+    frames: tuple[int, ...] = ()
 
     @classmethod
     def as_is(cls, body: Body) -> Subject:
         """A body that is the person's already."""
         return cls(body, np.ones(len(body.scale_groups)))
+
+    def cameras_far_off(self, known: Collection[str]) -> dict[str, NDArray]:
+        """{camera: (6,) [m, rad] twist} of cameras farther off than they may be; of `known` ones what is left."""
+        if self.fit is None or self.covariance is None or self.fit.cameras is None:
+            return {}
+        own = -len(self.fit.cameras.names)
+        return self.fit.cameras.far_off(self.fit.mean[own:], np.diag(self.covariance)[own:], known)
 
     @property
     def length_std(self) -> dict[str, float]:

@@ -7,14 +7,18 @@ from typing import Any
 
 import numpy as np
 
+from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.subject.sensor_parameters import CameraExtrinsics, moved_rig
+from kinefit.subject.sensor_parameters import FAR_OFF, CameraExtrinsics, moved_rig
 from kinefit.subject.subject import SubjectFit
 
 CAMERAS = "cameras"
 """Key of `Motion.provenance`: {camera: {"moved": (6,), "std": (6,)}} [m, rad] as `CameraExtrinsics` has them."""
 
-_FAR = 3.0  # standard deviations of its calibration: one of 24 numbers is so far off in 6 % of takes
+LEFT_OUT = "cameras left out"
+"""Key of `Motion.provenance`: {depth camera: [m, rad] by which it would have to be moved and turned}."""
+
+_MOVED = 1e-9  # [m, rad] below which a camera stayed where it was
 
 
 def as_told(found: Sequence[SubjectFit]) -> dict[str, Any]:
@@ -32,6 +36,21 @@ def as_told(found: Sequence[SubjectFit]) -> dict[str, Any]:
     return {}
 
 
+def between(rig: Rig, other: Rig) -> dict[str, Any]:
+    """How the cameras of a rig that stand elsewhere in another one were moved there, as `as_told` has it."""
+    moved = {c.name: se3.log(other[c.name].T_camera_world @ se3.inverse(c.T_camera_world)) for c in rig}
+    return {name: {"moved": twist.tolist()} for name, twist in moved.items() if np.any(np.abs(twist) > _MOVED)}
+
+
+def composed(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[str, Any]:
+    """What two moves in turn amount to, each as `as_told` has it."""
+    out = {**first, **then}
+    for name in first.keys() & then.keys():
+        T = se3.exp(np.array(then[name]["moved"])) @ se3.exp(np.array(first[name]["moved"]))
+        out[name] = {**then[name], "moved": se3.log(T).tolist()}
+    return out
+
+
 def sentences(provenance: Mapping[str, Any], std: tuple[float, float] | None) -> list[str]:
     """What is worth saying of cameras that were found far from where their calibration has them.
 
@@ -42,12 +61,17 @@ def sentences(provenance: Mapping[str, Any], std: tuple[float, float] | None) ->
     out = []
     for name, one in provenance.get(CAMERAS, {}).items() if std is not None else ():
         moved = np.array(one["moved"])
-        if np.any(np.abs(moved) > _FAR * np.repeat(std, 3)):  # type: ignore[arg-type]
+        if np.any(np.abs(moved) > FAR_OFF * np.repeat(std, 3)):  # type: ignore[arg-type]
             shift, turn = 1e3 * np.linalg.norm(moved[:3]), np.degrees(np.linalg.norm(moved[3:]))
             out.append(
                 f"camera {name} was found {shift:.0f} mm and {turn:.2f} degrees from its calibration, more than it may "
                 "be off by: `kinefit check` looks closer"
             )
+    for name, (shift, turn) in provenance.get(LEFT_OUT, {}).items():
+        out.append(
+            f"depth camera {name} was left out: what it sees lies on the person only where the camera is turned by "
+            f"{np.degrees(turn):.0f} degrees and moved by {1e3 * shift:.0f} mm. Correct its pose in the calibration"
+        )
     return out
 
 

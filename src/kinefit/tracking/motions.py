@@ -30,7 +30,7 @@ from kinefit.smoothing.uncertainty import TIED, pixel_information, with_lasting_
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.tracking.agreement import LOOKS, cameras_apart, contradictions
-from kinefit.tracking.cameras import CAMERAS, as_told
+from kinefit.tracking.cameras import CAMERAS, as_told, composed
 from kinefit.tracking.recording import spread
 
 
@@ -119,7 +119,7 @@ def motion_of(
     scale = None if others is None else others.scale
     answers = [partial(shape_errors, one, settings, weighed, scale=scale) for one in found]
     if cameras := as_told(found):
-        provenance[CAMERAS] = cameras
+        provenance[CAMERAS] = composed(provenance.get(CAMERAS, {}), cameras)
     elsewhere = any(one.cameras is not None for one in found)
     last, detectors = with_lasting_errors(
         results, subject, take, weight, noise_of_others, answers,

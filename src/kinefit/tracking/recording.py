@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from numbers import Real
@@ -231,6 +231,11 @@ class Recording:
             steps=lambda i: [*others[i], *keypoint_frames(records, i, float(times[i]))],
             depth=_first_depth(by_source[DepthFrame], rate), **{"markers": worn, **more},
         )  # fmt: skip
+
+    def without(self, sensors: Collection[str]) -> Recording:
+        """The same without what some depth cameras saw."""
+        kept = {i: f for i, f in self.depth.items() if f.sensor not in sensors}
+        return replace(self, steps=lambda i: [f for f in self.steps(i) if sensor_of(f) not in sensors], depth=kept)
 
     def part(self, frames: slice) -> Recording:
         """A stretch of its steps."""

@@ -181,7 +181,7 @@ class Recovery:
 
     def _leap(self, time: float, old: FrameResult, new: FrameResult, seek: NDArray) -> float:
         """How much faster than a brisk wave a limb would have moved since it was last seen where it was, 1 at least."""
-        elapsed = float(np.abs(time - self._good[seek]).max())
+        elapsed = max(float(np.abs(time - self._good[seek]).max()), 1.0 / self.rate)
         points = self.body.landmarks
         gone = self.body.positions(new.state, points) - self.body.positions(old.state, points)
         return max(float(np.linalg.norm(gone, axis=1).max(initial=0.0)) / (_SPEED * elapsed), 1.0)

@@ -14,6 +14,7 @@ from kinefit.bodies.closures import has_unknown_gear
 from kinefit.bodies.marker_sets import MarkerPlacement
 from kinefit.errors import KinefitError, ObservationError, TrackingError
 from kinefit.frame.results import FrameResult
+from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.initialization.from_depth import sized_start
 from kinefit.markers.subject import fit_marker_subject
@@ -26,7 +27,10 @@ from kinefit.subject.gear import Gear
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.metaballs import ROUNDS, MetaballShape
 from kinefit.subject.parameters import SegmentScales
+from kinefit.subject.sensor_parameters import moved_rig
 from kinefit.subject.subject import Progress, Subject, SubjectFit
+from kinefit.tracking.cameras import CAMERAS, LEFT_OUT, between, composed
+from kinefit.tracking.placing import placed_cameras
 from kinefit.tracking.recording import Recording, spread
 from kinefit.tracking.run import run
 from kinefit.tracking.unknowns import Unknowns, of_all, of_points
@@ -37,6 +41,7 @@ _POSES = 8  # and how many of them it is found from: twice as many change no hal
 _MANY = 16  # of markers alone, whose places are found by how they move; a frame of them costs little
 _MATCHES = 3  # rounds of matching and solving
 _PLACES = 2  # fits with a better spread of the markers' places; it changes by less than a tenth from then on
+_MOVES = 3  # times that cameras are moved that a subject fit has found far off
 _SEEN = 0.5  # quality of a frame that the shape may be found from
 
 Start = tuple[int, BodyState]
@@ -108,11 +113,17 @@ def fitted_to_person(
         person = _wearing(person, subject)
         return _by_all(person, body, settings, progress, size=False) if unknown else person
     if cameras >= 2:
-        by_keypoints = fit_subject(
-            body, channels_of(recording, body, settings), frames=frames or 25, height=height, trial=trial,
-            cameras=settings.camera_std, view_bias=settings.view_bias and not others, progress=progress,
-        )  # fmt: skip
-        person = _wearing(person, by_keypoints, **_gear_of(body, by_keypoints))
+        moved: dict[str, NDArray] = {}
+        for last in (False,) * _MOVES + (True,):
+            by_keypoints = fit_subject(
+                body, channels_of(person.recording, body, settings), frames=frames or 25, height=height, trial=trial,
+                cameras=settings.camera_std, far_off=tuple(moved), view_bias=settings.view_bias and not others,
+                progress=progress,
+            )  # fmt: skip
+            if last or not (far := by_keypoints.cameras_far_off(moved)):
+                break
+            person, moved = _with_cameras(person, moved_rig(person.recording.rig, far)), moved | far
+        person = _with_depth_cameras(_wearing(person, by_keypoints, **_gear_of(body, by_keypoints)), settings)
     elif recording.markers and recording.markers[0].marker_set:
         person, found = _by_markers(person, height, progress)
         if recording.markers_alone and not unknown:
@@ -125,6 +136,30 @@ def fitted_to_person(
             person = _by_depth(person, progress)
     unknown = unknown and (bool(recording.sensors) or has_unknown_gear(person.subject.body))
     return _by_all(person, body, settings, progress, height=height, trial=trial) if others or unknown else person
+
+
+def _with_cameras(person: SizedPerson, rig: Rig) -> SizedPerson:
+    """With cameras where they belong in place of where their calibration has them."""
+    recording = replace(person.recording, rig=rig)
+    told = {**person.told, CAMERAS: composed(person.told.get(CAMERAS, {}), between(person.recording.rig, rig))}
+    return replace(person, recording=recording, calibrated=rig, told=told)
+
+
+def _with_depth_cameras(person: SizedPerson, settings: TrackSettings) -> SizedPerson:
+    """With depth cameras where they belong, and without those whose pose is of no use."""
+    rig, gone = person.recording.rig, dict[str, list[float]]()
+    for name, placed in placed_cameras(person.recording, person.subject, settings).items():
+        camera = rig[name]
+        if placed.usable and not placed.fits:
+            twist = se3.log(camera.T_camera_world @ se3.inverse(placed.T) @ se3.inverse(camera.T_camera_world))
+            rig = moved_rig(rig, {camera.name: twist})
+        elif not placed.fits:
+            gone[name] = [placed.shift, placed.turn]
+    if rig is not person.recording.rig:
+        person = _with_cameras(person, rig)
+    if gone:
+        person = replace(person, recording=person.recording.without(gone), told={**person.told, LEFT_OUT: gone})
+    return person
 
 
 def _wearing(person: SizedPerson, subject: Subject, **told: Any) -> SizedPerson:

@@ -36,7 +36,7 @@ class Unknowns:
     start: NDArray
 
     def with_places_of(self, found: SubjectFit, stated: Unknowns) -> Unknowns:
-        """The same from where a fit of them ended, with the spread of markers' places that it found.
+        """The same from where a fit of them ended, with the spread of places and cameras that it found.
 
         How far the markers of a set stand from their places on this person, as a multiple of what is stated, is one
         number of the take (`place_spread`); a multiple of 1 is believed beforehand.
@@ -54,6 +54,8 @@ class Unknowns:
                 ratio = float(np.median(factor / std))
                 wider = place_spread(found.mean[own] / std, variance[own] / std**2, ratio, 1.0)
                 parameters[k] = replace(one, std=wider * np.asarray(before.std))
+            elif isinstance(one, CameraExtrinsics):
+                parameters[k] = one.with_errors_of(found.mean[own], variance[own])
         return replace(self, parameters=tuple(parameters), start=found.mean)
 
 

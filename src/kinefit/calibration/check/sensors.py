@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.surfaces import TaperedCylinder
-from kinefit.calibration.check.registration import FAR, FINE, Ends, Registration, apart, starts, twist_of, values_of
 from kinefit.diagnostics.sensor_fit import PRIOR, SensorAlignment, doubts_of
 from kinefit.errors import ObservationError
 from kinefit.frame.routing import Sensors
@@ -31,6 +30,7 @@ from kinefit.sensors.base import Measurement
 from kinefit.sensors.displaced import AXES, Displaced, displacement
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.sensors.surfaces.registration import FAR, FINE, Ends, Registration, apart, starts, twist_of, values_of
 from kinefit.subject.fit import fit_subject
 from kinefit.subject.keypoints import fit_subject as fit_person
 from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets
