@@ -2,9 +2,9 @@
 
 Each person's points in space are carried to the next frame; in every camera people and detections are then paired at
 the least total cost, and views that do not fit the others are let go. Of two whose views are all of one person, one is
-nobody in that frame; so is who is seen by one camera alone, within a stride of another. Who is seen by enough cameras and is nobody yet
-is a new person, or one who was lost within reach a moment ago. Whom cameras saw before enough of them did is added
-backwards. Who was away for longer is known again by size, clothes and way, see `returns`.
+nobody in that frame; so is who is seen by one camera alone, within a stride of another. Who is seen by enough cameras
+and is nobody yet is a new person, or one who was lost within reach a moment ago. Whom cameras saw before enough of them
+did is added backwards. Who was away for longer is known again by size, clothes and way, see `returns`.
 """
 
 from __future__ import annotations
