@@ -146,6 +146,10 @@ def test_a_wide_error_bar_is_a_moment_or_told_of_the_whole_take():
     always = changed(motion, "joint_std", slice(None), toes, 0.1)
     assert doubtful_moments(always) == ()
     assert throughout_sentence(always).replace("\u00a0", " ") == "right foot (±35 cm) and right toes (±35 cm)"
+    (moment,) = doubtful_moments(changed(always, "joint_std", slice(5, 9), toes, 0.3))
+    assert (moment.start, moment.stop) == (5, 9)
+    everywhere = changed(motion, "joint_std", slice(None), slice(None), 0.1)
+    assert throughout_sentence(everywhere).startswith("the whole body (±35 to ")
     unbounded = changed(motion, "joint_std", slice(5, 9), toes, np.inf)
     assert not doubtful_moments(unbounded)  # the joint itself is as known as the one before it
     unbounded = changed(unbounded, "dof_std", slice(5, 9), 6 + motion.body.tree.coordinate("knee_angle_r"), np.inf)

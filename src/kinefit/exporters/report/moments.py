@@ -58,7 +58,8 @@ def doubtful_moments(motion: Motion) -> tuple[Moment, ...]:
     """All doubtful moments, the worst first.
 
     Doubtful is a frame without anybody, and a segment of which an end is rather more than 8 cm off than not (see
-    `doubt.doubtful`) while it is not so in most frames: see `throughout_sentence`.
+    `doubt.doubtful`). Where it is so in most frames, see `throughout_sentence`, those are left that views contradict,
+    and those that are twice as uncertain as in the median.
     """
     found = [*_nobody(motion), *_doubts(motion)]
     told = [replace(m, causes=causes(motion, m)) for m in _merged(found)]
@@ -78,6 +79,8 @@ def doubt_sentence(motion: Motion, moments: Sequence[Moment]) -> str:
 def throughout_sentence(motion: Motion) -> str:
     """Segments with an end that is uncertain by more than 8 cm in most frames, with 2 σ; empty where there is none."""
     told = uncertain_throughout(motion)
+    if len(told) == len(motion.body.tree.segments):
+        return f"the whole body (±{200 * min(told.values()):.0f} to {200 * max(told.values()):.0f}\u00a0cm)"
     return listed([f"{plain(name)} (±{200 * sigma:.0f}\u00a0cm)" for name, sigma in told.items()], 20)
 
 
@@ -161,7 +164,8 @@ def _doubts(motion: Motion) -> Iterable[_Doubt]:
         return
     sigma, against = end_sigmas(motion), contradicted(motion)
     unbounded = ~np.isfinite(motion.joint_std).all(axis=-1)
-    flags &= 2 * flags.sum(axis=0) <= len(motion)
+    often = 2 * flags.sum(axis=0) > len(motion)
+    flags &= ~often | against | (sigma > 2 * np.median(sigma, axis=0))
     for s, name in enumerate(motion.body.tree.segments):
         for start, stop in _runs(motion, flags[:, s]):
             part = np.where(flags[start:stop, s], sigma[start:stop, s], 0.0)
