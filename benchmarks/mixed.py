@@ -3,12 +3,13 @@
 `python -m benchmarks.mixed [--quick] [--draws N] [--first N] [--each K] [--mixes A,B] [--only GROUP] [--no-log]`.
 
 Groups, each with its figures: "sensors" (each sensor helps), "intervals" (the truth lies inside the stated 95 %
-interval), "alone" (the same of markers and of silhouettes alone, smoothed, where it is asked for), "smoothing" (it
-helps every mix), "cameras" (calibrations that are exact, off and wrong), "misfit" (sensors
-whose calibrations do not fit each other), "real" (a second sensor never harms the balancing trial), "memory" (what each
-frame of a long take needs). All but the last two are of simulated takes: see `benchmarks.mixed_takes` for the person,
-motion and sensors, `benchmarks.mixed_runs` for the mixes and conditions, `benchmarks.mixed_figures` for definitions.
-True surface: Anny; fitted body: the catalogue's humanoid of cylinders, its size found by `kinefit.track_take`.
+interval), "doubt" (what is called doubtful is wrong) and "alone" (the intervals of markers and of silhouettes alone,
+smoothed), both where they are asked for, "smoothing" (it helps every mix), "cameras" (calibrations that are exact, off
+and wrong), "misfit" (sensors whose calibrations do not fit each other), "real" (a second sensor never harms the
+balancing trial), "memory" (what each frame of a long take needs). All but the last two are of simulated takes: see
+`benchmarks.mixed_takes` for the person, motion and sensors, `benchmarks.mixed_runs` for the mixes and conditions,
+`benchmarks.mixed_figures` for definitions. True surface: Anny; fitted body: the catalogue's humanoid of cylinders, its
+size found by `kinefit.track_take`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import argparse
 import time
 from importlib import import_module
 
-from benchmarks import mixed_figures
+from benchmarks import mixed_doubt, mixed_figures
 from benchmarks.figures import figure
 from benchmarks.mixed_runs import MIXES, track_draws
 from benchmarks.mixed_takes import RATE, SECONDS
@@ -26,7 +27,7 @@ from kinefit.errors import AssetError
 
 SIMULATED = {
     "sensors": mixed_figures.sensors, "intervals": mixed_figures.intervals, "alone": mixed_figures.alone,
-    "smoothing": mixed_figures.smoothing,
+    "smoothing": mixed_figures.smoothing, "doubt": mixed_doubt.doubt,
 }  # fmt: skip
 GROUPS = (*SIMULATED, "cameras", "misfit", "real", "memory")
 DRAWS, QUICK_DRAWS, QUICK_SECONDS = 30, 1, 0.4
@@ -44,7 +45,7 @@ def main() -> None:
     parser.add_argument("--only", choices=GROUPS, help="one group of figures")
     parser.add_argument("--no-log", action="store_true", help="do not write the figures to the log")
     told = parser.parse_args()
-    groups = (told.only,) if told.only else tuple(group for group in GROUPS if group != "alone")
+    groups = (told.only,) if told.only else tuple(group for group in GROUPS if group not in ("alone", "doubt"))
     draws = told.draws or (QUICK_DRAWS if told.quick else DRAWS)
     simulated = [group for group in groups if group in SIMULATED]
     if simulated:
@@ -58,8 +59,8 @@ def main() -> None:
         if unknown := set(mixes) - set(MIXES):
             parser.error(f"no mix {', '.join(sorted(unknown))}; there are: {', '.join(MIXES)}")
         runs = [run for run in mixed_figures.runs_of(simulated, told.quick) if run[0] in mixes]
-        if told.each is not None and (simulated not in (["intervals"], ["alone"]) or told.each < 1):
-            parser.error("--each K, at least one, goes with --only intervals or alone: others compare takes of a draw")
+        if told.each is not None and (simulated not in (["intervals"], ["doubt"], ["alone"]) or told.each < 1):
+            parser.error("--each K, at least one, goes with --only intervals, doubt or alone: others compare takes")
         begin = time.perf_counter()
         frames = round(RATE * (QUICK_SECONDS if told.quick else SECONDS))
         which = range(told.first, told.first + draws)

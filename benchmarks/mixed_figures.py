@@ -231,8 +231,8 @@ def runs_of(groups: Sequence[str], quick: bool) -> list[Run]:
         out += [(mix, "smoothed") for mix in dict.fromkeys(name for pair in PAIRS for name in pair)]
     if "smoothing" in groups:
         out += [(mix, "lag") for mix in mixes]
-    if "smoothing" in groups or "intervals" in groups:
+    if {"smoothing", "intervals", "doubt"} & {*groups}:
         out += [(mix, condition) for mix in mixes for condition in CONDITIONS[:2]]
-    if "intervals" in groups:
+    if {"intervals", "doubt"} & {*groups}:
         out += [(m, c) for m in mixes for c in CONDITIONS[2:]]
     return list(dict.fromkeys(out))

@@ -28,7 +28,9 @@ from benchmarks.mixed_observable import observable
 from benchmarks.mixed_takes import CAMERAS, MASK_SCALE, Recording, detected, record, take_text, write
 from benchmarks.smoothing import acceleration_noise, peak_speeds
 from kinefit import Motion, track_take
+from kinefit.bodies import PointSet
 from kinefit.evaluation import angle_errors
+from kinefit.exporters.report.doubt import FAR, doubtful
 
 MIXES: dict[str, tuple[str, ...]] = {
     "cameras": ("keypoints",),
@@ -59,6 +61,7 @@ class Outcome:
     peak : float, speed of hands and feet that a fiftieth of the frames exceed, as a share of the truth
     seen, seen_turn : (S, 3), (D,) share of the frames in which joint centres and angles are observable
     seconds : float
+    doubt : (3, F, S) bool, segments of which an end is farther off than 8 cm; that are doubtful; that are lost
     """
 
     shift: NDArray
@@ -70,6 +73,7 @@ class Outcome:
     seen: NDArray
     seen_turn: NDArray
     seconds: float
+    doubt: NDArray
 
     @property
     def passing(self) -> float:
@@ -94,8 +98,25 @@ def compare(truth: Motion, motion: Motion, seen: tuple[NDArray, NDArray], second
     return Outcome(
         few(shift), few(motion.joint_std), few(turn), few(motion.dof_std[:, 6:]),
         acceleration_noise(shift, truth.rate), float(np.median(peak_speeds(motion) / peak_speeds(truth))), *seen,
-        seconds,
+        seconds, np.array([error_of_ends(truth, motion) > FAR, doubtful(motion), motion.lost]),
     )  # fmt: skip
+
+
+def error_of_ends(truth: Motion, motion: Motion) -> NDArray:
+    """(F, S) [m] of the end that is farther off: the joint centre, those of the children, or the surface's end."""
+    tree, joints = motion.body.tree, np.linalg.norm(motion.joint_centres - truth.joint_centres, axis=-1)
+    out = joints.copy()
+    for s in range(len(tree.segments)):
+        children = np.flatnonzero(tree.parents == s)
+        if len(children):
+            out[:, s] = np.maximum(joints[:, s], joints[:, children].max(axis=1))
+        else:
+            tips = [
+                m.positions(PointSet(("tip",), np.array([s]), m.body.segment_ends()[s][None]))[:, 0]
+                for m in (motion, truth)
+            ]
+            out[:, s] = np.maximum(joints[:, s], np.linalg.norm(tips[0] - tips[1], axis=-1))
+    return out
 
 
 def streams(mix: str) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from kinefit.simulation.movements import people as persons
 RATE = 30.0
 SET = "BODY_25B"
 KINDS = ("cross", "shake hands", "hide", "leave", "crowd")
+# Beside these: "throng", five people two thirds of a metre apart; "relieve", one leaves and another comes to the place.
 _THICK = 0.09  # [m] half the thickness of what hides a point
 _SEEN_THROUGH = 0.2  # share of hidden points that a detector gives all the same, from what it knows of people
 
@@ -47,7 +48,7 @@ class Crowd:
 def crowd(kind: str, seed: int, frames: int = 150, keypoint_set: str = SET, noise_px: float = 3.0) -> Crowd:
     """People of one kind of scene; 3 px of noise, 10 % outliers, 10 % missing, four or five cameras."""
     random = np.random.default_rng(seed)
-    count = {"crowd": 5, "leave": 3}.get(kind, 2 + seed % 2)
+    count = {"crowd": 5, "throng": 5, "leave": 3, "relieve": 3}.get(kind, 2 + seed % 2)
     bodies = [one.body for one in persons(load_body("humanoid"), count=count, seed=seed)]
     rest = random.permutation(["wave", "clap", "squat", "bow", "point"])
     paths = _paths(kind, count, frames, random)
@@ -58,6 +59,9 @@ def crowd(kind: str, seed: int, frames: int = 150, keypoint_set: str = SET, nois
     there = np.ones((frames, count), bool)
     if kind == "leave":
         there[frames // 3 : frames // 3 + 45, 1] = False
+    if kind == "relieve":  # a quarter of a second to a second apart
+        there[frames // 2 :, 1] = False
+        there[: frames // 2 + random.integers(round(0.25 * RATE), round(RATE)), 2] = False
     rig = studio_rig(_together(motions), cameras=4 + seed % 2)
     each = [
         simulate_keypoints(m, rig, keypoint_set, noise_px=noise_px, seed=100 * seed + k) for k, m in enumerate(motions)
@@ -99,6 +103,11 @@ def _paths(kind: str, count: int, frames: int, random: np.random.Generator) -> l
         elif kind == "hide" and k < 2:
             px = np.full(frames, 0.0) if k == 0 else 0.55 * np.cos(2 * np.pi * t)
             pz = np.full(frames, 0.0) if k == 0 else 0.55 * np.sin(2 * np.pi * t)
+        elif kind == "throng":
+            radius, turned = 0.55 + 0.1 * np.sin(2 * np.pi * t + k), angle + np.pi * t
+            px, pz = radius * np.cos(turned), radius * np.sin(turned)
+        elif kind == "relieve" and k == 2:
+            px, pz = out[1][:, 0] + random.uniform(-0.1, 0.1), out[1][:, 1] + random.uniform(-0.1, 0.1)
         elif kind == "crowd":
             px = x + 0.3 * np.sin(2 * np.pi * t + k)
             pz = z + 0.3 * np.cos(2 * np.pi * t + k)

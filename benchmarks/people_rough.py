@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
 from benchmarks.people_crowds import RATE, Crowd, crowd
-from benchmarks.people_simulated import errors_of, owners_of
+from benchmarks.people_simulated import errors_of, frames_on_one, motion_of, owners_of
 from kinefit.multiview.people import people_of
 
 KINDS = amount(("cross", "hide", "leave", "crowd"), ("leave",))
 SEEDS = amount((50, 51, 52), (51,))  # 21, 22 and 30 to 35 were looked at
+CLOSE_SEEDS = amount((50, 51, 52), (51,))  # 30 to 32 were looked at
+RELIEVED_SEEDS = amount(tuple(range(50, 60)), (50,))  # 30 to 37 were looked at
 _NOISE = 5.0  # [px]
 _MISSED = 0.15  # of all frames a person is missed by a camera, for a second each time
 _FURNITURE = 0.4  # of all pairs of person and camera: legs are hidden for half of the time
@@ -27,7 +29,7 @@ _LIMBS = ((5, 7, 9), (6, 8, 10), (11, 13, 15), (12, 14, 16), (7, 9), (0, 1, 2, 3
 
 def run() -> None:
     """Print every figure."""
-    given, taken, lost, invented, right = 0, 0, 0, 0, []
+    given, taken, lost, invented, on_one, right = 0, 0, 0, 0, 0, []
     for kind in KINDS:
         for seed in SEEDS:
             seen = rough(crowd(kind, seed, amount(200, 150), "COCO_17", _NOISE), seed)
@@ -39,17 +41,39 @@ def run() -> None:
             count = len(seen.motions)
             lost, invented = lost + count - len(set(owners)), invented + len(owners) - len(set(owners))
             best = [0.0] * count  # of somebody who is lost nothing is right
-            for k, owner in enumerate(owners):
-                best[owner] = max(best[owner], errors_of(seen, k, owner)[1])
+            motions = [motion_of(seen, people, k) for k in range(len(people))]
+            for motion, owner in zip(motions, owners):
+                best[owner] = max(best[owner], errors_of(seen, motion, owner)[1])
             right += best
+            two = frames_on_one(seen, motions)
+            on_one += two
             print(
-                f"# {kind} {seed}: {count} people, {len(seen.rig)} cameras: found {len(people)}, {mixed} views with "
-                f"another's detection; PCP {', '.join(f'{100 * one:.1f}' for one in best)} %", flush=True,
+                f"# {kind} {seed}: {count} people, {len(seen.rig)} cameras: found {len(people)}, {mixed} views "
+                f"with another's detection, {two} frames with two on one; "
+                f"PCP {', '.join(f'{100 * one:.1f}' for one in best)} %", flush=True,
             )  # fmt: skip
     figure("people_rough_mixed", 100 * taken / given, "% of the views", "<= 1")
     figure("people_rough_lost", float(lost), "people", "<= 0")
     figure("people_rough_invented", float(invented), "people", "<= 0")
     figure("people_rough_pcp", 100 * float(np.mean(right)), "%", ">= 98")
+    _close(on_one)
+
+
+def _close(on_one: int) -> None:
+    """Two bodies on one person, among people who stand closer, too; and those who leave as another comes."""
+    relieved = 0
+    for seed in CLOSE_SEEDS:
+        seen = rough(crowd("throng", seed, amount(200, 150), "COCO_17", _NOISE), seed)
+        people = people_of(seen.rig, seen.keypoints)
+        two = frames_on_one(seen, [motion_of(seen, people, k) for k in range(len(people))])
+        on_one += two
+        print(f"# throng {seed}: found {len(people)} of {len(seen.motions)}, {two} frames with two on one", flush=True)
+    for seed in RELIEVED_SEEDS:
+        seen = crowd("relieve", seed, amount(200, 150), "COCO_17", _NOISE)
+        owners = [owners_of(seen, one.chosen) for one in people_of(seen.rig, seen.keypoints)]
+        relieved += any((of == 1).any() and (of == 2).any() for of in owners)
+    figure("people_on_one", float(on_one), "frames in which two tracked bodies stand on one person", "== 0")
+    figure("people_relieved", float(relieved), f"of {len(RELIEVED_SEEDS)} who leave and who come taken for one", "== 0")
 
 
 def rough(seen: Crowd, seed: int) -> Crowd:

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 import numpy as np
 
 from benchmarks.figures import amount, figure, quick
 from benchmarks.people_crowds import KINDS, Crowd, crowd
-from kinefit import load_body
+from kinefit import Motion, load_body
 from kinefit.multiview.followed import PersonKeypoints, follow
-from kinefit.multiview.people import people_of
+from kinefit.multiview.people import PersonTrack, people_of
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.video import track
 
 SEEDS = amount(tuple(range(10, 14)), (10,))  # of each kind of scene: twenty sequences; 0 to 3 found two faults
 _LIMBS = ("upperarm", "forearm", "thigh", "shank")
+_ON = 0.3  # [m] median distance of a body's joints from those of the person on whom it stands
 
 
 def run() -> None:
@@ -33,12 +35,11 @@ def run() -> None:
         taken, given = taken + mixed, given + sum(int((w >= 0).sum()) for w in whose)
         lost += max(len(seen.motions) - len(people), 0)
         wrong += max(len(people) - len(seen.motions), 0)
-        told = []
-        for k in range(len(people)):
-            owner = int(np.bincount(whose[k][whose[k] >= 0]).argmax())
-            told.append(errors_of(seen, k, owner))
-            errors.append(told[-1][0])
-            right.append(told[-1][1])
+        motions = [motion_of(seen, people, k) for k in range(len(people))]
+        owners = [int(np.bincount(w[w >= 0]).argmax()) for w in whose]
+        told = [errors_of(seen, motion, owner) for motion, owner in zip(motions, owners)]
+        errors += [e for e, _ in told]
+        right += [r for _, r in told]
         print(
             f"# {kind} {seed}: {len(seen.motions)} people, {len(seen.rig)} cameras: found {len(people)}, "
             f"{mixed} views with another's detection; joints {', '.join(f'{e:.1f}' for e, _ in told)} mm, "
@@ -62,10 +63,14 @@ def owners_of(seen: Crowd, chosen: tuple) -> np.ndarray:
     return np.array(out)
 
 
-def errors_of(seen: Crowd, k: int, owner: int) -> tuple[float, float]:
-    """[mm] mean distance of joints and share of limbs found while the person is there; smoothed, as by the command."""
-    recording = Recording.of_keypoints(seen.rig, seen.keypoints, sigma=4.0, person=k + 1, up="y")
-    motion = track(recording, load_body("humanoid"))
+def motion_of(seen: Crowd, people: Sequence[PersonTrack], k: int) -> Motion:
+    """One of the people, smoothed, as by the command."""
+    recording = Recording.of_keypoints(seen.rig, seen.keypoints, sigma=4.0, person=k + 1, people=people, up="y")
+    return track(recording, load_body("humanoid"))
+
+
+def errors_of(seen: Crowd, motion: Motion, owner: int) -> tuple[float, float]:
+    """[mm] mean distance of joints and share of limbs found while the person is there."""
     truth, there = seen.motions[owner], seen.there[:, owner]
     a, b = (m.segment_poses()[there][..., :3, 3] for m in (motion, truth))
     tree = truth.body.tree
@@ -76,6 +81,16 @@ def errors_of(seen: Crowd, k: int, owner: int) -> tuple[float, float]:
             length = np.linalg.norm(b[:, child] - b[:, parent], axis=-1)
             good.append((far[:, child] + far[:, parent]) / 2 <= 0.5 * length)
     return 1e3 * float(far.mean()), float(np.mean(good))
+
+
+def frames_on_one(seen: Crowd, motions: Sequence[Motion]) -> int:
+    """Frames in which two tracked bodies stand on one true person: within 0.3 m (median joint), nobody else nearer."""
+    joints, truth = (np.array([m.joint_centres for m in several]) for several in (motions, seen.motions))
+    away = np.median(np.linalg.norm(joints[:, None] - truth, axis=-1), axis=-1)  # (bodies, people, F) [m]
+    nearest = np.where(seen.there.T, away, np.inf).argmin(axis=1)
+    on = (away.min(axis=1) < _ON) & (np.array([m.quality for m in motions]) > 0)
+    counts = [np.sum((nearest == person) & on, axis=0) for person in range(len(truth))]
+    return int(np.any(np.array(counts) > 1, axis=0).sum())
 
 
 def _speed() -> None:

@@ -7,6 +7,8 @@ import pytest
 from tests.oracle import posture, rig_around
 
 from kinefit.bodies import BodyState, load_body
+from kinefit.multiview import people
+from kinefit.multiview.association import some_points
 from kinefit.multiview.people import people_of, views_needed
 from kinefit.observations import Keypoints
 
@@ -92,6 +94,16 @@ def test_two_who_cross(seed):
 def _found(told, rig=RIG):
     keypoints, truth = told
     return people_of(rig, keypoints), truth
+
+
+@pytest.mark.parametrize("off", [0.05, 0.1, 0.14])  # [m] across the views of two cameras each
+def test_two_do_not_share_the_views_of_one(off):
+    keypoints, _ = records([along(line((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 2), 1)])
+    search = people._Search(RIG, keypoints)
+    x = along([(0.0, 0.0, 0.0)], 1)[0][some_points(len(NAMES))]
+    search.tracks = [people._OpenTrack(x + d, np.zeros_like(x), 0, 0, 0) for d in ((off, 0, 0), (0, 0, off))]
+    search._go_on(1, search.tracks)
+    assert [len(track.nodes.get(1, ())) for track in search.tracks] == [2, 0]
 
 
 def test_five_people_in_a_crowd():

@@ -98,6 +98,16 @@ def test_a_stranger_is_not_who_left():
     assert each_is_one(found, truth) and not any(one.returns or one.maybe for one in found)
 
 
+@pytest.mark.parametrize("brief", [6, 20])  # frames in which nobody is there, 0.24 and 0.8 s
+def test_who_comes_to_the_place_of_another_who_left_is_somebody_else(brief):
+    one, other = (stay([AT[0]] * 2, 7, sized(s)) for s in (0.9, 1.08))
+    gone = [(0, None, BEFORE, FRAMES), (1, None, 0, BEFORE + brief)]
+    keypoints, truth = records([one, other], unseen=gone)
+    assert each_is_one(people_of(RIG, keypoints), truth)
+    keypoints, truth = records([one], unseen=[(0, None, BEFORE, BEFORE + brief)])
+    assert len(people_of(RIG, keypoints)) == 1
+
+
 def test_nobody_walks_faster_than_people_do():
     for half, count in ((1.5, 1), (2.3, 2)):  # in 1.2 s they go 4.2 m at most
         one = stay([(-half, 0.0, 0.0), (half, 0.0, 0.0)], 7)

@@ -25,7 +25,7 @@ def print_summary(motion: Motion, *, points: bool = False) -> None:
     """Print it; with `points`, the residual of every point in every camera too."""
     from rich.table import Table
 
-    from kinefit.exporters.report.moments import doubt_sentence, doubtful_moments, when
+    from kinefit.exporters.report.moments import doubt_sentence, doubtful_moments, throughout_sentence, when
 
     seconds = len(motion) / motion.rate
     say(f"\n{motion.name}: {len(motion)} frames at {motion.rate:g} Hz ({seconds:.2f} s), body {motion.body.name}")
@@ -42,6 +42,8 @@ def print_summary(motion: Motion, *, points: bool = False) -> None:
         say(f"  {when(motion, moment)}: {' '.join(moment.what)}")
     if len(moments) > MOMENTS:
         say(f"  and {len(moments) - MOMENTS} more, less severe")
+    if throughout := throughout_sentence(motion):
+        say(f"uncertain in most frames, at the far end (2 σ): {throughout}")
     nobody = np.flatnonzero(motion.quality <= 0)
     if len(nobody):
         say(f"nobody seen: frames {frame_ranges(nobody)}")

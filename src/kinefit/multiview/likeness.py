@@ -68,9 +68,12 @@ class Looks:
         return bool(np.isfinite(self.bones).any() or np.isfinite(self.colours).any())
 
 
-def likeness(a: Looks, b: Looks) -> float:
-    """Logarithm of the likelihood that two are one person, over that of two people; 0 where nothing is known."""
-    return size_likeness(a, b) + colour_likeness(a, b)
+def likeness(a: Looks, b: Looks, *, wrong_size: float = _WRONG_SIZE) -> float:
+    """Logarithm of the likelihood that two are one person, over that of two people; 0 where nothing is known.
+
+    wrong_size : share of spans whose lengths are wrong as a whole, as detections of somebody else are among them
+    """
+    return size_likeness(a, b, wrong_size=wrong_size) + colour_likeness(a, b)
 
 
 def both_know(a: Looks, b: Looks) -> tuple[str, ...]:
@@ -79,7 +82,7 @@ def both_know(a: Looks, b: Looks) -> tuple[str, ...]:
     return ("size",) * size + ("clothes",) * clothes
 
 
-def size_likeness(a: Looks, b: Looks) -> float:
+def size_likeness(a: Looks, b: Looks, *, wrong_size: float = _WRONG_SIZE) -> float:
     """Of `likeness` what the lengths of bones say."""
     d = a.bones - b.bones
     known = np.isfinite(d)
@@ -88,7 +91,8 @@ def size_likeness(a: Looks, b: Looks) -> float:
     noise = np.diag((a.bones_std**2 + b.bones_std**2 + 2.0 * _WITHIN**2)[known])
     people = _STATURE**2 + _PROPORTION**2 * np.eye(int(known.sum()))
     one, two = _log_normal(d[known], noise), _log_normal(d[known], noise + 2.0 * people)
-    return float(np.logaddexp(np.log1p(-_WRONG_SIZE) + one - two, np.log(_WRONG_SIZE)))
+    wrong = np.log(wrong_size) if wrong_size > 0.0 else -np.inf
+    return float(np.logaddexp(np.log1p(-wrong_size) + one - two, wrong))
 
 
 def colour_likeness(a: Looks, b: Looks) -> float:

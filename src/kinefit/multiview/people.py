@@ -1,9 +1,10 @@
 """All people: who is who in all cameras and over time, among everybody whom detectors saw.
 
 Each person's points in space are carried to the next frame; in every camera people and detections are then paired at
-the least total cost, and views that do not fit the others are let go. Who is seen by enough cameras and is nobody yet
-is a new person, or one who was lost within reach a moment ago. Whom cameras saw before enough of them did is added
-backwards. Who was away for longer is known again by size, clothes and way, see `returns`.
+the least total cost, and views that do not fit the others are let go. Of two whose views are all of one person, one is
+nobody in that frame; so is who is seen by one camera alone, within a stride of another. Who is seen by enough cameras
+and is nobody yet is a new person, or one who was lost within reach a moment ago. Whom cameras saw before enough of them
+did is added backwards. Who was away for longer is known again by size, clothes and way, see `returns`.
 """
 
 from __future__ import annotations
@@ -258,18 +259,34 @@ class _Search:
                 views[t].append((q, mine[p]))
                 if turned[t, p] < as_is[t, p]:
                     sides.add((q, mine[p]))
-        places: list[NDArray] = []
-        unmet = [abs(frame - t.met) for t in tracks]
-        for k in sorted(range(len(tracks)), key=unmet.__getitem__):
-            if not views[k]:
-                continue
-            reach = _LEAP + SPEED * unmet[k] / self.rate
-            kept, found = self._agreeing(frame, views[k], expected[k], sides, reach)
-            if found is not None and unmet[k] > 1 and any(_apart(found, x) < _SAME for x in places):
-                continue  # other detections of somebody who is there
+        each: list[tuple[int, float, int, list[Node], NDArray | None]] = []
+        for k in (k for k in range(len(tracks)) if views[k]):
+            unmet = abs(frame - tracks[k].met)
+            kept, found = self._agreeing(frame, views[k], expected[k], sides, _LEAP + SPEED * unmet / self.rate)
+            each.append((unmet, np.inf if found is None else _apart(found, expected[k]), k, kept, found))
+        placed: list[tuple[list[Node], NDArray]] = []
+        for _, _, k, kept, found in sorted(each, key=lambda one: one[:3]):
+            lone = found is None and any(_apart(expected[k], place) < STRIDE for _, place in placed)
+            if lone or any(self._is_one(frame, kept, found, *other, sides) for other in placed):
+                continue  # other detections of somebody who is there: no two bodies stand in one place
             tracks[k].seen(frame, kept, found, SPEED / self.rate)
             if found is not None:
-                places.append(tracks[k].x)
+                placed.append((kept, found))
+
+    def _is_one(
+        self, frame: int, nodes: list[Node], x: NDArray | None, others: list[Node], place: NDArray,
+        sides: Collection[Node],
+    ) -> bool:  # fmt: skip
+        """Whether views of a track are of another one's person, who has points (k, 3) [m]: all agree together."""
+        if x is None:
+            q, p = nodes[0]
+            return self._off(place, nodes[0], (self.exchanged if nodes[0] in sides else self.uv)[q][frame, p]) <= _FITS
+        apart, cameras = _apart(x, place), {q for q, _ in others}
+        more = [node for node in nodes if node[0] not in cameras]
+        if apart < _SAME or apart > 2.0 * STRIDE or not more:
+            return apart < _SAME
+        both = [*others, *more]
+        return len(self._agreeing(frame, both, None, sides)[0]) == len(both)
 
     def _off(self, x: NDArray, node: Node, uv: NDArray) -> float:
         """How far a detection's points (k, 2) [px] are from points (k, 3), as a share of its height."""

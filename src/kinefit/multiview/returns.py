@@ -25,6 +25,7 @@ _SHORTEST = 0.3  # [s] of spans that are compared: in less, detectors err once a
 _BESIDE = 0.05  # share of the frames in which enough cameras see somebody that may be wrong, beside who follows
 _RETURNS = 2.0  # odds, before anything is known of them, that who comes after somebody left is that one
 _SURE = 10.0  # odds, from which on somebody is taken for another: one in ten such returns would be wrong
+_RELIEVED = 0.2  # [s] without anybody in which one may leave and another come to within a stride
 _WAY = 0.3, 0.7  # [m], [m/s] standard deviation of the way: a stride, and those who turn round out of view
 _ROOM = 25.0  # [m²] that cameras see in common, in which others come anywhere
 _ANYWHERE = 0.5  # share of those who come back elsewhere, by another door
@@ -98,8 +99,9 @@ def chains_of(
     needed : int, how many cameras must see somebody to count
     pictures : of the cameras, where there are any
     """
-    rate, n = keypoints[0].rate, len(spans)
-    spans = _parted(spans, needed, rate)
+    rate = keypoints[0].rate
+    spans = [part for span in spans for part in _relieved(rig, keypoints, span, needed, pictures)]
+    spans, n = _parted(spans, needed, rate), len(spans)
     ends = [s.ends for s in spans]
     seen = [sum(len(nodes) >= needed for nodes in s.nodes.values()) for s in spans]
     long = [k for k in range(n) if seen[k] >= _SHORTEST * rate]
@@ -138,6 +140,24 @@ def chains_of(
             chain = replace(chain, span=joined, members=(*chain.members, following), returns=(*chain.returns, back))
         out.append(chain)
     return out
+
+
+def _relieved(
+    rig: Rig, keypoints: Sequence[Keypoints], span: PresenceSpan, needed: int, pictures: Pictures | None
+) -> list[PresenceSpan]:
+    """A span, cut where somebody left and another came to the same place: size or clothes differ beyond doubt."""
+    rate = keypoints[0].rate
+    seen = np.sort([f for f, nodes in span.nodes.items() if len(nodes) > 1])
+    for k in np.flatnonzero(np.diff(seen) > max(_RELIEVED * rate, 1.0)):
+        parts = _within(span, -1, seen[k] + 1), _within(span, seen[k + 1], np.inf)
+        well = [sum(len(nodes) >= needed for nodes in part.nodes.values()) for part in parts]
+        if min(well) < BRIEF * rate:
+            continue
+        before, after = (_looks(rig, keypoints, part, pictures) for part in parts)
+        odds = np.log(_RETURNS) + likeness(before, after, wrong_size=0.0) + _way(*parts, rate)
+        if odds < -np.log(_SURE):
+            return [parts[0], *_relieved(rig, keypoints, parts[1], needed, pictures)]
+    return [span]
 
 
 def _parted(spans: Sequence[PresenceSpan], needed: int, rate: float) -> list[PresenceSpan]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT
 from kinefit.exporters.report.angles import thinned
-from kinefit.exporters.report.moments import DOUBTFUL, Moment, frame_residuals
+from kinefit.exporters.report.moments import POORLY_SUPPORTED, Moment, frame_residuals
 from kinefit.exporters.report.page import SERIES, Html, joined, moment, plot, shaded, table
 from kinefit.findings import runs_of
 from kinefit.motion import Motion, Residuals
@@ -130,7 +130,7 @@ def quality_plot(motion: Motion, moments: Sequence[Moment]) -> Html:
         "xaxis": {"title": "time [s]", "anchor": f"y{n}" if n > 1 else "y"},
         "legend": {"orientation": "h", "x": 0, "y": 1 + 8 / height, "yanchor": "bottom"},
         "margin": {"l": 56, "r": 12, "t": 46, "b": 42},
-        "shapes": [_shade(m, motion) for m in moments[:100]] + [_level(DOUBTFUL)],
+        "shapes": [_shade(m, motion) for m in moments[:100]] + [_level(POORLY_SUPPORTED)],
     }  # fmt: skip
     for k, unit in enumerate(units, 1):
         top = 1 - k * (tall + gap)

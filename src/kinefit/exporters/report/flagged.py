@@ -23,7 +23,7 @@ def flagged(motion: Motion, moments: Sequence[Moment], pictures: Pictures, width
     if not motion.residuals and not moments:
         return [p.callout("note", "This motion comes without measurements, so nothing shows where it is doubtful.")]
     if not moments:
-        return [p.callout("good", "None: every frame is supported by its measurements and fits like the others.")]
+        return [p.callout("good", "None: no end of a segment is probably farther off than 8 cm in some frames only.")]
     out = [time_line(motion, moments)]
     for m in moments[:MOMENTS]:
         shots = [

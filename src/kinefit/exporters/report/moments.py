@@ -9,13 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT
+from kinefit.exporters.report.doubt import contradicted, doubtful, end_sigmas, uncertain_throughout
 from kinefit.findings import runs_of
 from kinefit.motion import Motion, Residuals
 
-DOUBTFUL = 0.5  # quality below which the measurements support less than half of the body
-WIDE = 0.05  # [m] standard deviation of a joint centre: ±2 σ is as thick as a limb, which may then lie beside itself
-_OFF = 4.0  # robust standard deviations that a frame's residual lies above the take's: by chance once in 30,000
-_LEAST = 0.5  # [px, mm] of a residual that is told: less would be told as 0
+POORLY_SUPPORTED = 0.5  # quality below which the measurements support less than half of the body
 _GAP = 0.1  # [s] stretches nearer than this are one to somebody who looks at the video
 _MANY = 0.25  # share of outliers that is told as a cause; robust fits of good keypoints leave out less than a tenth
 
@@ -45,25 +43,25 @@ class Moment:
 
 @dataclass(frozen=True)
 class _Doubt:
-    """One doubt: of one kind, about one segment ("" for the whole body) or one sensor (name, unit, usual residual)."""
+    """One doubt: of one kind, about one segment ("" for the whole body)."""
 
-    kind: str  # "nobody", "weak", "unseen", "against", "wide" or "off"
+    kind: str  # "nobody", "against" or "wide"
     start: int
     stop: int
     worst: int
     score: float
     segment: str = ""
-    amount: float = 0.0  # [%], [cm], [px] or [mm]
-    sensor: tuple[str, str, float] = ("", "", 0.0)
+    amount: float = 0.0  # [cm]
 
 
 def doubtful_moments(motion: Motion) -> tuple[Moment, ...]:
     """All doubtful moments, the worst first.
 
-    Doubtful is a frame of low quality or without anybody, a segment that is lost, a joint centre with
-    a wide error bar that is usually narrower, and a frame that fits much worse than the others.
+    Doubtful is a frame without anybody, and a segment of which an end is rather more than 8 cm off than not (see
+    `doubt.doubtful`). Where it is so in most frames, see `throughout_sentence`, those are left that views contradict,
+    and those that are twice as uncertain as in the median.
     """
-    found = [*_whole_body(motion), *_lost(motion), *_wide(motion), *_off(motion)]
+    found = [*_nobody(motion), *_doubts(motion)]
     told = [replace(m, causes=causes(motion, m)) for m in _merged(found)]
     return tuple(sorted(told, key=lambda m: (-m.score, m.start)))
 
@@ -76,6 +74,14 @@ def doubt_sentence(motion: Motion, moments: Sequence[Moment]) -> str:
     for m in moments:
         frames[m.start : m.stop] = True
     return f"{len(moments)} ({100 * frames.mean():.0f}\u00a0% of the frames)"
+
+
+def throughout_sentence(motion: Motion) -> str:
+    """Segments with an end that is uncertain by more than 8 cm in most frames, with 2 σ; empty where there is none."""
+    told = uncertain_throughout(motion)
+    if len(told) == len(motion.body.tree.segments):
+        return f"the whole body (±{200 * min(told.values()):.0f} to {200 * max(told.values()):.0f}\u00a0cm)"
+    return listed([f"{plain(name)} (±{200 * sigma:.0f}\u00a0cm)" for name, sigma in told.items()], 20)
 
 
 def when(motion: Motion, m: Moment) -> str:
@@ -146,53 +152,26 @@ def _runs(motion: Motion, flags: NDArray) -> list[tuple[int, int]]:
     return runs_of(flags, round(_GAP * motion.rate))
 
 
-def _whole_body(motion: Motion) -> Iterable[_Doubt]:
-    nobody = motion.quality <= 0
-    for start, stop in runs_of(nobody):
+def _nobody(motion: Motion) -> Iterable[_Doubt]:
+    for start, stop in runs_of(motion.quality <= 0):
         yield _Doubt("nobody", start, stop, (start + stop) // 2, stop - start)
-    for start, stop in _runs(motion, (motion.quality < DOUBTFUL) & ~nobody):
-        q = np.where(nobody[start:stop], 1.0, motion.quality[start:stop])
-        yield _Doubt("weak", start, stop, start + int(np.argmin(q)), float(np.sum(1 - q)), amount=100 * float(q.min()))
 
 
-def _lost(motion: Motion) -> Iterable[_Doubt]:
+def _doubts(motion: Motion) -> Iterable[_Doubt]:
     share = 1 / len(motion.body.tree.segments)
-    gone = motion.lost & (motion.quality > 0)[:, None]
-    for kind, of in (("unseen", motion.segment_quality <= 0), ("against", motion.segment_quality > 0)):
-        for s, name in enumerate(motion.body.tree.segments):
-            for start, stop in _runs(motion, gone[:, s] & of[:, s]):
-                yield _Doubt(kind, start, stop, (start + stop) // 2, share * (stop - start), name)
-
-
-def _wide(motion: Motion) -> Iterable[_Doubt]:
-    share = 0.5 / len(motion.body.tree.segments)
-    std = np.linalg.norm(motion.joint_std, axis=-1)
-    usual = np.median(std, axis=0) if len(std) else np.zeros(std.shape[1])
-    doubtful = (std > WIDE) & (std > 2 * usual) & ~motion.lost & (motion.quality > 0)[:, None]
+    flags = doubtful(motion) & (motion.quality > 0)[:, None]
+    if not flags.any():
+        return
+    sigma, against = end_sigmas(motion), contradicted(motion)
+    unbounded = ~np.isfinite(motion.joint_std).all(axis=-1)
+    often = 2 * flags.sum(axis=0) > len(motion)
+    flags &= ~often | against | (sigma > 2 * np.median(sigma, axis=0))
     for s, name in enumerate(motion.body.tree.segments):
-        for start, stop in _runs(motion, doubtful[:, s]):
-            part = np.where(doubtful[start:stop, s], std[start:stop, s], 0.0)
-            worst = start + int(np.argmax(part))
-            yield _Doubt("wide", start, stop, worst, share * (stop - start), name, amount=200 * float(part.max()))
-
-
-def _off(motion: Motion) -> Iterable[_Doubt]:
-    share = 0.5 / max(len(motion.residuals), 1)
-    for name, r in motion.residuals.items():
-        level = frame_residuals(r) * (1 if r.unit == "px" else 1000)
-        seen = np.isfinite(level)
-        if not seen.any():
-            continue
-        usual = float(np.median(level[seen]))
-        spread = 1.4826 * float(np.median(np.abs(level[seen] - usual)))
-        bad = seen & (level > usual + _OFF * spread) & (level > max(1.5 * usual, _LEAST))
-        for start, stop in _runs(motion, bad):
-            part = np.where(bad[start:stop], level[start:stop], 0.0)
-            excess = np.minimum(part[part > 0] / max(usual, 1e-9) - 1, 3.0)
-            unit = "px" if r.unit == "px" else "mm"
-            worst, sensor = start + int(np.argmax(part)), (name, unit, usual)
-            score, most = share * float(excess.sum()), float(part.max())
-            yield _Doubt("off", start, stop, worst, score, amount=most, sensor=sensor)
+        for start, stop in _runs(motion, flags[:, s]):
+            part = np.where(flags[start:stop, s], sigma[start:stop, s], 0.0)
+            kind = "against" if 2 * against[start:stop, s].sum() > stop - start else "wide"
+            amount = np.inf if unbounded[start:stop, s].any() else 200 * float(part.max())
+            yield _Doubt(kind, start, stop, start + int(np.argmax(part)), share * (stop - start), name, amount)
 
 
 def _merged(found: Iterable[_Doubt]) -> list[Moment]:
@@ -229,19 +208,11 @@ def _sentences(group: Sequence[_Doubt]) -> Iterable[str]:
         most = max(g.amount for g in same)
         if kind == "nobody":
             yield "Nothing of the person was seen; the body stays where it was."
-        elif kind == "weak":
-            yield f"The measurements support only {min(g.amount for g in same):.0f} % of the body at worst."
-        elif kind == "unseen":
-            yield f"No measurement supports {names}: the pose follows from what is next to it and from earlier frames."
         elif kind == "against":
-            yield f"More of what was measured speaks against where {names} is than for it."
-        elif kind == "wide":
+            yield f"Most views show {names} more than 8 cm beside the body."
+        else:
             far = f"up to ±{most:.0f} cm (2 σ)" if np.isfinite(most) else "in some direction nothing bounds it"
             yield f"The place of {names} is uncertain: {far}."
-        else:
-            for sensor, unit, usual in dict.fromkeys(g.sensor for g in same):
-                most = max(g.amount for g in same if g.sensor[0] == sensor)
-                yield f"The body lies {most:.0f} {unit} beside what {sensor} saw (its median is {usual:.0f})."
 
 
 def causes(motion: Motion, moment: Moment) -> tuple[str, ...]:
@@ -262,6 +233,11 @@ def causes(motion: Motion, moment: Moment) -> tuple[str, ...]:
         most = max(left_out, key=lambda name: left_out[name])
         share = 100 * sum(left_out.values()) / seen_points
         out.append(f"{share:.0f} % of its keypoints were left out as outliers, most of them in {most}.")
+    quality = motion.segment_quality[frames]
+    for told, of in (("No measurement supports {}", quality <= 0), ("More speaks against {} than for it", quality > 0)):
+        gone = 2 * (of & motion.lost[frames]).sum(axis=0) > len(quality)
+        if names := [plain(n) for n in moment.segments if gone[motion.body.tree.segments.index(n)]]:
+            out.append(told.format(listed(names)) + ".")
     swapped = [name for name, r in pixels.items() if np.any(np.asarray(r.swapped)[frames])]
     if swapped:
         out.append(f"The detector took left for right in {listed(swapped)} (put right).")

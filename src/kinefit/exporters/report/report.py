@@ -29,13 +29,14 @@ from kinefit.exporters.report.fit import overall_median, point_table, quality_pl
 from kinefit.exporters.report.flagged import Pictures, flagged
 from kinefit.exporters.report.methods import lengths_table, methods
 from kinefit.exporters.report.moments import (
-    DOUBTFUL,
+    POORLY_SUPPORTED,
     Moment,
     doubt_sentence,
     doubtful_moments,
     listed,
     never_observed,
     shared_by_prior,
+    throughout_sentence,
 )
 from kinefit.exporters.report.names import spoken
 from kinefit.exporters.report.norms import Norms
@@ -146,8 +147,8 @@ def _summary(
     motion: Motion, moments: Sequence[Moment], findings: Sequence[tuple[str, str, str]], date: str
 ) -> p.Section:
     nobody = float(np.mean(motion.quality <= 0))
-    doubtful = float(np.mean(motion.quality < DOUBTFUL))
-    wrong = nobody > 0.1 or doubtful > 0.5 or of_provenance(motion.provenance)
+    poor = float(np.mean(motion.quality < POORLY_SUPPORTED))
+    wrong = nobody > 0.1 or poor > 0.5 or of_provenance(motion.provenance)
     severity = "bad" if wrong else "warning" if moments else "good"
     severity = severity if motion.residuals else "note"
     notes: list[str] = []
@@ -155,6 +156,8 @@ def _summary(
         notes.append(p.paragraph("See ", p.link("doubtful-moments", "where and why"), "."))
     if nobody:
         notes.append(f"In {100 * nobody:.0f} % of the frames nobody was seen.")
+    if throughout := throughout_sentence(motion):
+        notes.append(f"Uncertain in most frames, at the far end (2 σ): {throughout}.")
     parts = [p.callout(severity, trust_sentence(motion, moments), *notes)]
     parts += [p.callout(severity, title, text) for severity, title, text in findings]
     shifted = [f for f in sensor_fits(motion) if f.is_shifted]
@@ -271,7 +274,7 @@ def _mean(mean: float, spread: float) -> str:
 
 
 def _fit(motion: Motion, moments: Sequence[Moment]) -> list[p.Html]:
-    text = "Quality is the share of the body that its measurements support; below the dotted line a frame is doubtful."
+    text = "Quality is the share of the body that its measurements support; below the dotted line, less than half."
     parts = [p.paragraph(text), quality_plot(motion, moments)]
     if not motion.residuals:
         return [*parts, p.callout("note", "This motion comes without measurements, so there are no residuals.")]
