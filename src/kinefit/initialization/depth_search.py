@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies import Body, BodyState
 from kinefit.bodies.fingers import knuckles
 from kinefit.bodies.limbs import limbs
-from kinefit.correspondences import point_rows, prior_rows, surface_rows
+from kinefit.correspondences import prior_rows, surface_rows
+from kinefit.initialization._kernels_reach import reach
 from kinefit.initialization.depth_score import Score, spreads
 from kinefit.losses import geman_mcclure
 from kinefit.rows import AnyRows
 from kinefit.sensors.surfaces.depth_view import DepthView, geodesic_ends
-from kinefit.solvers.least_squares import bounds_of, gauss_newton, levenberg_marquardt
+from kinefit.solvers.least_squares import bounds_of, gauss_newton
 
 POINTS = 700  # measured points that take part in a fit: more do not distinguish postures better
 FACING = 0.02  # of the score: a person rather faces the sensor (twice that for one turned away) ...
@@ -174,8 +175,7 @@ class PostureSearch:
         usual = self.rng.normal(tree.usual[d], np.minimum(spreads(self.body)[d], 0.6), size=(count, len(d)))
         angles = np.repeat(state.angles[None], 1 + count, axis=0)
         angles[1:, d] = np.clip(np.where(self.rng.random((count, 1)) < 0.35, usual, anywhere), low, high)
-        reached = [self._reach(state, limb, end, tip) for tip in self._tips[limb[-1]] for end in ends]
-        angles = np.concatenate([angles, np.reshape(reached, (-1, angles.shape[1]))])
+        angles = np.concatenate([angles, self._reaching(state, limb, ends)])
         drawn = tuple(range(len(tree.segments))) if drawn is None else drawn
         others = tuple(s for s in drawn if s not in limb)
         held: dict[str, Any] = {"moving": limb, "base": self.score.depth(state, others)}
@@ -199,23 +199,20 @@ class PostureSearch:
             out[limb[-1]] = np.stack([tip, folded.get(limb[-1], tip)])
         return out
 
-    def _reach(self, state: BodyState, limb: tuple[int, ...], end: NDArray, tip: NDArray) -> NDArray:
-        """(D,) angles that bring a limb's tip to an end of the surface, from a random pose of the limb."""
-        body, d = self.body, self._dofs(limb, False) - 6
-        points = PointSet(("tip",), np.array(limb[-1:]), tip[None])
-        sight = (end - self.view.viewpoint) / np.linalg.norm(end - self.view.viewpoint)
-        target = (end + 0.03 * sight)[None]  # [m] the tip lies within, half a wrist behind what was seen
-        locked = np.ones(body.tree.n_dofs, bool)
-        locked[6 + d] = False
-        angles = np.array(state.angles)
-        angles[d] = np.clip(self.rng.normal(body.tree.usual[d], 0.5), body.tree.lower[d], body.tree.upper[d])
-
-        def rows(s: BodyState) -> list[AnyRows]:
-            return [point_rows(body, s, points, target, sigma=0.03), prior_rows(body, s, sigma=spreads(body))]
-
-        start = BodyState(state.T_world_root, angles)
-        fit = levenberg_marquardt(body, start, rows, locked=locked, max_iterations=10, tolerance=1e-2)
-        return fit.state.angles
+    def _reaching(self, state: BodyState, limb: tuple[int, ...], ends: NDArray) -> NDArray:
+        """(2 E, D) angles that bring a limb's tip, and its fist, to ends of the surface, from random poses of it."""
+        tree, d = self.body.tree, self._dofs(limb, False) - 6
+        sight = (ends - self.view.viewpoint) / np.linalg.norm(ends - self.view.viewpoint, axis=1, keepdims=True)
+        targets = np.tile(ends + 0.03 * sight, (2, 1))  # [m] the tip lies within, half a wrist behind what was seen
+        tips = np.repeat(self._tips[limb[-1]] + tree.rest[limb[-1]], len(ends), axis=0)
+        angles = np.repeat(state.angles[None], len(targets), axis=0)
+        some = self.rng.normal(tree.usual[d], 0.5, size=(len(targets), len(d)))
+        angles[:, d] = np.clip(some, tree.lower[d], tree.upper[d])
+        reach(
+            tree.parents, tree.dof_start, tree.prismatic, tree.axes, tree.rest, state.T_world_root, angles, d, limb[-1],
+            tips, targets, tree.usual, spreads(self.body), tree.lower, tree.upper, 0.03, 10,
+        )  # fmt: skip
+        return angles
 
     def ends(self, state: BodyState) -> NDArray:
         """(E, 3) [m] ends of the person's limbs, seen from the middle of the trunk."""
