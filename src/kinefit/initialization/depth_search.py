@@ -14,7 +14,7 @@ from kinefit.bodies.fingers import knuckles
 from kinefit.bodies.limbs import limbs
 from kinefit.correspondences import prior_rows, surface_rows
 from kinefit.initialization._kernels_reach import reach
-from kinefit.initialization.depth_score import Score, spreads
+from kinefit.initialization.depth_score import TOLERANCE, Score, spreads
 from kinefit.losses import geman_mcclure
 from kinefit.rows import AnyRows
 from kinefit.sensors.surfaces.depth_view import DepthView, geodesic_ends
@@ -25,7 +25,9 @@ FACING = 0.02  # of the score: a person rather faces the sensor (twice that for 
 UPRIGHT = 0.05  # ... and stands or sits upright (that for one who lies); for what is alike from both sides
 AS_BEFORE = 0.1  # instead, where it is known how a body faced a moment ago: twice that for one that has turned about
 YAWS, LEANS = np.arange(0.0, 2 * np.pi, np.pi / 6), ((0, 0), (20, 0), (45, 0), (-20, 0), (0, 20), (0, -20))  # [deg]
-TRIES = 200  # random poses of a limb
+TRIES, ROUGH_TRIES = 200, 100  # random poses of a limb: one that is to stay, and one for each place of the trunk
+_MIN_LIMB_PIXELS = 4  # of a view: fewer show nothing of a limb
+_MIN_UNEXPLAINED = 0.01  # share of a person's pixels that may be a limb's end: a hand has 2 %
 STEP = (0.04, 0.2, 0.35)  # [m, rad, rad] first random steps of the root's place and turn, and of angles
 
 
@@ -166,7 +168,10 @@ class PostureSearch:
     def limb(
         self, state: BodyState, limb: tuple[int, ...], drawn: tuple[int, ...] | None, ends: NDArray, count: int
     ) -> list[tuple[BodyState, float]]:
-        """The best poses of one limb, all else held, and their scores: random ones, its tip or its fist at each end."""
+        """The best poses of one limb, all else held, and their scores: random ones, its tip or its fist at each end.
+
+        A rough search, of fewer than `TRIES` random poses, leaves out closest points.
+        """
         tree = self.body.tree
         dofs = self._dofs(limb, False)
         d = dofs - 6
@@ -184,9 +189,26 @@ class PostureSearch:
         rough = sorted((self.polish(s, drawn, dofs, 3, 24, **held) for s in best), key=lambda b: -b[1])
         locked = np.ones(tree.n_dofs, bool)
         locked[dofs] = False
-        closer = [self.closest(s, 8, locked=locked) for s, _ in rough[:2]]
+        closer = [self.closest(s, 8, locked=locked) for s, _ in rough[:2]] if count >= TRIES else []
         out = [*rough, *(self.polish(s, drawn, dofs, 3, 24, 0.4, **held) for s in closer)]
         return sorted(out, key=lambda b: -b[1])
+
+    def _is_out_of_view(self, state: BodyState, limb: tuple[int, ...], drawn: tuple[int, ...]) -> bool:
+        """Whether the view shows nothing of a limb where it is, nor anything unexplained that it could reach."""
+        view = self.view
+        if ((self.score.depth(state, limb) < view.behind) & (view.trust > 0)).sum() > _MIN_LIMB_PIXELS:
+            return False
+        explained = np.abs(self.score.depth(state, drawn) - view.observed) < TOLERANCE
+        near = self.within_reach(state, limb, view.points[view.seen & ~explained])
+        return bool(near.sum() < _MIN_UNEXPLAINED * self.score.pixels)
+
+    def within_reach(self, state: BodyState, limb: tuple[int, ...], x_world: NDArray) -> NDArray:
+        """(N,) bool: points (N, 3) [m] that a limb could touch."""
+        tree, mesh = self.body.tree, self.score.mesh
+        frames, _ = tree.forward(state.T_world_root, state.angles)
+        root = tree.rest[limb[0]] @ frames[limb[0], :9].reshape(3, 3).T + frames[limb[0], 9:]
+        own = mesh.vertices[np.isin(mesh.segment, limb)] - tree.rest[limb[0]]
+        return np.asarray(np.linalg.norm(x_world - root, axis=1) < np.linalg.norm(own, axis=1).max(initial=0.0))
 
     @cached_property
     def _tips(self) -> dict[int, NDArray]:
@@ -242,7 +264,8 @@ class PostureSearch:
             ends, drawn = self.ends(state), self.score.core
             for limb in self.limbs:
                 drawn = (*drawn, *limb)
-                state = self.limb(state, limb, drawn, ends, TRIES)[0][0]
+                if not self._is_out_of_view(state, limb, drawn):
+                    state = self.limb(state, limb, drawn, ends, ROUGH_TRIES)[0][0]
             found.append((self.value(state), state, ends))
         found.sort(key=lambda f: -f[0])
         once = [(self.refined(state, ends, 1), ends) for _, state, ends in found[:4]]
@@ -252,11 +275,12 @@ class PostureSearch:
 
     def refined(self, state: BodyState, ends: NDArray, rounds: int = 2) -> BodyState:
         """A posture brought closer: points onto surfaces, each limb tried anew, random steps of everything."""
-        everything = np.arange(self.body.tree.n_dofs)
+        everything, everything_drawn = np.arange(self.body.tree.n_dofs), tuple(range(len(self.body.tree.segments)))
         for _ in range(rounds):
             state = max(state, self.closest(state), key=self.value)
             for limb in self.limbs:
-                state = self.limb(state, limb, None, ends, TRIES)[0][0]
+                if not self._is_out_of_view(state, limb, everything_drawn):
+                    state = self.limb(state, limb, None, ends, TRIES)[0][0]
             state, _ = self.polish(state, None, everything, 10, 40, 0.4)
         closer = self.closest(state, first=0.10)
         return closer if self.value(closer) > self.value(state) - 0.02 else state  # pixels are coarse, points are not

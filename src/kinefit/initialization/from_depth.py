@@ -95,6 +95,19 @@ def start_from_points(
     BodyError
         The body has no surfaces.
     """
+    *_, found = starts_by_attempt(
+        body, points, camera, depth, background=background, up=up, count=count, attempts=attempts, seed=seed,
+        forward=forward,
+    )  # fmt: skip
+    return found
+
+
+def starts_by_attempt(
+    body: Body, points: ArrayLike | None, camera: Camera, depth: NDArray | None = None, *,
+    background: NDArray | None = None, up: ArrayLike = (0.0, 1.0, 0.0), count: int = 5, attempts: int = 2,
+    seed: int = 0, forward: ArrayLike | None = None,
+) -> Iterator[list[Start]]:  # fmt: skip
+    """The best poses after each attempt, until one is good; arguments as of `start_from_points`."""
     found: list[tuple[PostureSearch, BodyState]] = []
     views: list[DepthView] = []
     more = _views(body, points, camera, depth, up, background)
@@ -102,10 +115,10 @@ def start_from_points(
         views += next(more, [])
         searches = _searches(body, views, up, seed + attempt, forward)
         found += [(search, state) for search in searches for state in search.best(count)]
-        if max(_meant(*f) for f in found) > _GOOD:
-            break
-    found.sort(key=lambda f: -_meant(*f))
-    return [Start(state, search.value(state), search.score.visible(state)) for search, state in found[:count]]
+        found.sort(key=lambda f: -_meant(*f))
+        yield [Start(state, search.value(state), search.score.visible(state)) for search, state in found[:count]]
+        if _meant(*found[0]) > _GOOD:
+            return
 
 
 def _meant(search: PostureSearch, state: BodyState) -> float:

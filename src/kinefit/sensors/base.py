@@ -213,6 +213,9 @@ class Measurement(ABC):
         """A depth image that other sensors may ask what is in front of something."""
         return None
 
+    def doubt(self, segments: NDArray) -> None:  # noqa: B027
+        """Know of segments (S,) bool that may be what no part of the body explains; see `Evidence.unplaced`."""
+
     def compact(self) -> Measurement:
         """What a smoother keeps of it: no whole images."""
         return self
