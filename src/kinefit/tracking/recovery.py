@@ -49,7 +49,10 @@ class Recovery:
         self.body, self.rig, self.up, self.settings, self.rate = body, rig, up, settings, rate
         self._good = np.full(len(body.tree.segments), -np.inf)  # [s] when each segment was last where it was thought
         self._root: NDArray | None = None  # (4, 4) where the root was then
-        self._of_limbs = np.isin(np.arange(len(self._good)), [s for b in limbs(body) if len(b) > 1 for s in b])
+        self._of_limbs, self._jointed = (
+            np.isin(np.arange(len(self._good)), [s for b in limbs(body) if len(b) > 1 for s in b[first:]])
+            for first in (0, 1)
+        )
         self.forget()
 
     def forget(self) -> None:
@@ -74,13 +77,14 @@ class Recovery:
     ) -> FrameResult | None:  # fmt: skip
         """The result of one time, or a better one that was found; `guess`: where the body may be, by an earlier fit.
 
-        Where images are rare, limbs that could be what nothing explains are said to be unplaced.
+        Where images are rare, limbs that could be what nothing explains are said to be unplaced, and so are segments of
+        limbs of which the one before is not seen: no earlier image holds them.
         """
         result = self._best(tracker, time, frames, measurements, result, guess)
         if result is None or not self.settings.search or not is_rare(self.rate):
             return result
         search = self._search(tracker, time, measurements, result)
-        doubtful = np.zeros(len(result.lost), bool)
+        doubtful = self._jointed & (result.lost | result.hidden)[self.body.tree.parents]
         if search is not None and search.score.missing(result.state) > LEAP:
             x = np.concatenate(search.score.unexplained(result.state))
             near = [s for limb in search.limbs for s in limb if search.within_reach(result.state, limb, x).mean() > 0.5]
