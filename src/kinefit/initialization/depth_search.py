@@ -260,7 +260,7 @@ class PostureSearch:
     def best(self, count: int) -> list[BodyState]:
         """The best postures, best first."""
         found = []
-        for state in self.trunks(8):
+        for state in self.trunks(6):
             ends, drawn = self.ends(state), self.score.core
             for limb in self.limbs:
                 drawn = (*drawn, *limb)
@@ -268,9 +268,9 @@ class PostureSearch:
                     state = self.limb(state, limb, drawn, ends, ROUGH_TRIES)[0][0]
             found.append((self.value(state), state, ends))
         found.sort(key=lambda f: -f[0])
-        once = [(self.refined(state, ends, 1), ends) for _, state, ends in found[:4]]
+        once = [(self.refined(state, ends, 1), ends) for _, state, ends in found[:3]]
         once.sort(key=lambda f: -self.value(f[0]))
-        out = [self.refined(state, ends, 1) if k < 2 else state for k, (state, ends) in enumerate(once)]
+        out = [self.refined(state, ends, 1) if k < 1 else state for k, (state, ends) in enumerate(once)]
         return sorted(out, key=lambda s: -self.value(s))[:count]
 
     def refined(self, state: BodyState, ends: NDArray, rounds: int = 2) -> BodyState:
