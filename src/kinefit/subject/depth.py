@@ -103,7 +103,7 @@ def fit_surfaces(
         )  # fmt: skip
 
     if start is not None:
-        return fitted(states, start, _ROUNDS, joint.REACH[-1:])
+        return fitted(states, start, _TRIED, joint.REACH[-1:])
     tried = [fitted(states, stature * groups, _TRIED, joint.REACH) for stature in _STATURES]
     best = min(tried, key=lambda found: _misfit(found, steps))
     return fitted(best.states, best.mean, _ROUNDS, joint.REACH[-1:])

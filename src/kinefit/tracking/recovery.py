@@ -84,7 +84,11 @@ class Recovery:
         if result is None or not self.settings.search or not is_rare(self.rate):
             return result
         search = self._search(tracker, time, measurements, result)
-        doubtful = self._jointed & (result.lost | result.hidden)[self.body.tree.parents]
+        unsupported = result.lost | result.hidden
+        for m in result.matched:
+            told = m.evidence(tracker.scene_of(result.state, m.time)).unplaced
+            unsupported = unsupported if told is None else unsupported & ~told
+        doubtful = self._jointed & unsupported[self.body.tree.parents]
         if search is not None and search.score.missing(result.state) > LEAP:
             x = np.concatenate(search.score.unexplained(result.state))
             near = [s for limb in search.limbs for s in limb if search.within_reach(result.state, limb, x).mean() > 0.5]
