@@ -77,7 +77,9 @@ class NearTake:
 
 def run() -> None:
     """Print the figures."""
-    gaps, lost, asked, spent = [], [], [], []
+    gaps: list[NDArray] = []
+    lost: list[NDArray] = []
+    asked, spent = [], []
     for seed in range(0, 2 * TAKES, 2):
         take = near_take(seed)
         begin = time.process_time()

@@ -248,9 +248,8 @@ class Sensor(ABC):
     def learn(self, measurement: Any, scene: Scene, sure: bool) -> None:  # noqa: B027
         """Learn from a step that was accepted; `sure` where no segment is lost.
 
-        Replace what was learnt by something new, rather than change it in place: where another sensor of the step
-        fails, the attributes of this one are set back. What a later match needs of it belongs into the measurement, so
-        that smoothing sees each time as it was.
+        Replace what was learnt, rather than change it in place: where another sensor of the step fails, the attributes
+        of this one are set back. What a later match needs belongs into the measurement: smoothing sees it as it was.
         """
 
 

@@ -85,8 +85,8 @@ class Recovery:
             return result
         search = self._search(tracker, time, measurements, result)
         unsupported = result.lost | result.hidden
-        for m in result.matched:
-            told = m.evidence(tracker.scene_of(result.state, m.time)).unplaced
+        for one in result.matched:
+            told = one.evidence(tracker.scene_of(result.state, one.time)).unplaced
             unsupported = unsupported if told is None else unsupported & ~told
         doubtful = self._jointed & unsupported[self.body.tree.parents]
         if search is not None and search.score.missing(result.state) > LEAP:
