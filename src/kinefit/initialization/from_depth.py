@@ -83,7 +83,7 @@ def start_from_points(
     up : (3,) upwards, in the world
     count : int, poses at most
     attempts : int
-        How often all is tried at most, until a good pose is found: about two and a half seconds of one core each.
+        How often all is tried at most, until a good pose is found: about 1.1 s of one core each.
     seed : int of the random tries; the same gives the same poses.
     forward : (3,) where the root faced a moment ago, optional; a person seldom turns about in a second.
 

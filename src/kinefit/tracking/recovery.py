@@ -170,11 +170,12 @@ class Recovery:
             scene, frames, self.up, own.measurements(frames, scene, points=True),
             backgrounds=own.stated, forward=None if known is None else known[:3, 0],
         ):  # fmt: skip
-            for state in states:
-                if known is not None and _gone(state.T_world_root, known) > _STRIDE + _SPEED * elapsed:
-                    continue  # somebody else
-                if here is not None and _gone(state.T_world_root, here) > _STRIDE:
-                    continue  # somebody else, too: but for a limb or two, the body is where it is thought to be
+            near = [s for s in states if known is None or _gone(s.T_world_root, known) <= _STRIDE + _SPEED * elapsed]
+            if here is not None:  # but for a limb or two, the body is where it is thought to be
+                near = [s for s in near if _gone(s.T_world_root, here) <= _STRIDE]
+            if not near:
+                break  # somebody else
+            for state in near:
                 found = tracker.fitted(time, frames, state).result
                 poor = _astray(found, self.settings.poor)
                 allowed = not poor if result is None else not poor or _astray(result, self.settings.poor)
