@@ -260,7 +260,7 @@ class PostureSearch:
     def best(self, count: int) -> list[BodyState]:
         """The best postures, best first."""
         found = []
-        for state in self.trunks(6):
+        for state in self.trunks(8):
             ends, drawn = self.ends(state), self.score.core
             for limb in self.limbs:
                 drawn = (*drawn, *limb)
