@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.limbs import limbs
 from kinefit.frame.prediction import forgetting
-from kinefit.frame.results import ANYWHERE, FrameResult
+from kinefit.frame.results import ANYWHERE, FrameResult, evidence_of, together
 from kinefit.geometry.camera import Rig
 from kinefit.initialization.candidates import LEAP, dofs_of_limbs, find_limbs, starts_from_points, starts_from_views
 from kinefit.initialization.depth_search import PostureSearch
@@ -49,10 +49,7 @@ class Recovery:
         self.body, self.rig, self.up, self.settings, self.rate = body, rig, up, settings, rate
         self._good = np.full(len(body.tree.segments), -np.inf)  # [s] when each segment was last where it was thought
         self._root: NDArray | None = None  # (4, 4) where the root was then
-        self._of_limbs, self._jointed = (
-            np.isin(np.arange(len(self._good)), [s for b in limbs(body) if len(b) > 1 for s in b[first:]])
-            for first in (0, 1)
-        )
+        self._of_limbs = np.isin(np.arange(len(self._good)), [s for b in limbs(body) if len(b) > 1 for s in b])
         self.forget()
 
     def forget(self) -> None:
@@ -84,18 +81,16 @@ class Recovery:
         if result is None or not self.settings.search or not is_rare(self.rate):
             return result
         search = self._search(tracker, time, measurements, result)
-        unsupported = result.lost | result.hidden
-        for one in result.matched:
-            told = one.evidence(tracker.scene_of(result.state, one.time)).unplaced
-            unsupported = unsupported if told is None else unsupported & ~told
-        doubtful = self._jointed & unsupported[self.body.tree.parents]
+        doubtful = np.zeros(len(result.lost), bool)
         if search is not None and search.score.missing(result.state) > LEAP:
             x = np.concatenate(search.score.unexplained(result.state))
             near = [s for limb in search.limbs for s in limb if search.within_reach(result.state, limb, x).mean() > 0.5]
             doubtful[near] = True
         for m in result.measurements:
             m.doubt(doubtful)
-        return replace(result, segment_quality=np.where(doubtful, 0.0, result.segment_quality))
+        scene = tracker.scene_of(result.state, time)
+        told = together(scene, evidence_of(scene, result.matched))
+        return replace(result, segment_quality=told.segment_quality(self.body.tree))
 
     def _best(
         self, tracker: Tracker, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],

@@ -26,7 +26,7 @@ from kinefit.bodies.surfaces import BodyMesh, body_mesh
 from kinefit.correspondences.targets import check_depth_image
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import Canvas, scaled
-from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.evidence import BELIEVED, SHOWN, Evidence
 from kinefit.sensors.visibility import _kernels_visibility as kernels
 
 COLUMNS = 160  # of the drawn image: a person's forearm at 3 m is then four pixels wide
@@ -68,6 +68,12 @@ class SegmentVerdict:
     def covered(self) -> NDArray:
         """(S,) share in 0..1 of a segment's foremost pixels that something else hides."""
         return self.counts[:, kernels.COVERED] / np.maximum(self.counts[:, 1:].sum(axis=1), 1)
+
+    @property
+    def holds(self) -> NDArray:
+        """(S,) bool: segments that are seen where they are, wherever their joint is."""
+        enough = self.supported >= SHOWN * np.maximum(self.counts[:, kernels.OWN], FEWEST)
+        return np.asarray(enough & (self.supported >= BELIEVED * self.seen))
 
     @property
     def evidence(self) -> Evidence:
