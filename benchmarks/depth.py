@@ -12,6 +12,7 @@ PARTS = {
     "depth_stereo": "stereo pair -> points; faces and hands by their colour",
     "skin_takes": "face and hands by their colour in fits of a real take",
     "depth_start": "pose and size from depth with no pose given",
+    "depth_near": "rendered people near a depth camera, cut by the image, hands at the camera",
     "depth_real": "real recordings of depth",
     "depth_scene": "the rendered body of ten parts, on M3T's frames",
     "depth_voodoo": "the paper's experiment, graded by the truth",

@@ -11,7 +11,7 @@ from kinefit.diagnostics.groups import group_findings
 from kinefit.diagnostics.keypoints import check_keypoints
 from kinefit.diagnostics.quick import input_findings, motion_findings, with_cause, with_findings
 from kinefit.errors import TrackingError
-from kinefit.findings import FINDINGS, Finding, faults_of, of_provenance
+from kinefit.findings import FINDINGS, INVERTED, Finding, faults_of, of_provenance
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
@@ -169,6 +169,19 @@ def test_a_person_who_hangs_head_down_or_walks_lying_has_a_wrong_vertical():
     assert [f.kind for f in inverted] == ["up"]
     lost = replace(walk, quality=np.full(len(walk), 0.2), up=other)
     assert motion_findings(lost, None) == ()  # it is not known how the person is placed
+
+
+def test_a_depth_camera_that_hangs_upside_down_is_named_with_the_line_to_write():
+    class Depth:
+        keypoints, markers, depth, clouds = (), (), (1,), ()
+
+    upright = with_findings(MOTION, (), Depth, None)
+    turned = with_findings(replace(MOTION, provenance={INVERTED: "front"}), (), Depth, None)
+    assert not of_provenance(upright.provenance)
+    (found,) = of_provenance(turned.provenance)
+    assert found.kind == "up" and found.cameras == ("front",) and "upside down" in found.text
+    opposite = MOTION.up[1:] if MOTION.up.startswith("-") else f"-{MOTION.up}"
+    assert f'up = "{opposite}"' in found.remedy
 
 
 def test_findings_are_kept_in_provenance_and_damaged_ones_are_none():

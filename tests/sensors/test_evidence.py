@@ -55,3 +55,17 @@ def test_a_segment_that_cameras_agree_on_elsewhere_is_lost():
     assert (none + none).elsewhere is None
     unseen = Evidence(np.zeros(2), np.zeros(2), np.array([True, False]))
     assert not unseen.lost.any()
+
+
+def test_an_unplaced_segment_has_no_quality_unless_another_sensor_supports_it():
+    tree = load_body("humanoid").tree
+    n, elbow, hand = len(tree.segments), tree.segment("forearm_r"), tree.segment("hand_r")
+    unplaced = np.arange(n) == elbow
+    hidden = np.where(unplaced, 0.0, 1.0)  # what is beside it agrees
+    depth, silent = Evidence(hidden, np.zeros(n), unplaced=unplaced), Evidence.none(n)
+    for told in (depth, silent + depth, depth + silent, depth + Evidence(np.zeros(n), np.ones(n) * SHOWN)):
+        assert told.segment_quality(tree)[elbow] == 0.0 < told.segment_quality(tree)[hand]
+    seen = Evidence(np.full(n, SHOWN), np.zeros(n))
+    for told in (depth + seen, seen + depth):
+        assert told.segment_quality(tree)[elbow] == 1.0
+    assert (depth + depth).segment_quality(tree)[elbow] == 0.0

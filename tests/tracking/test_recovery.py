@@ -45,3 +45,32 @@ def test_a_limb_that_was_well_seen_at_this_very_time_may_move_as_far_as_in_a_fra
     result, one = tracker.update([depth_frame(0)]), np.arange(len(a_motion().body.tree.segments)) == 1
     tracker._recovery._good[one] = result.time
     assert tracker._recovery._leap(result.time, result, result, one) == 1.0
+
+
+@pytest.mark.parametrize(("sees", "said"), [(with_a_thing, True), (depth_frame, False)])
+def test_limbs_that_could_be_what_nothing_explains_are_said_to_be_lost(monkeypatch, sees, said):
+    monkeypatch.setattr(recovery, "find_limbs", lambda *_: [])
+    monkeypatch.setattr(recovery, "starts_from_views", lambda *_, **__: [])
+    tracker = Tracker(a_motion().body, a_rig(), rate=1.0, on_body=("depth",), up="y")
+    tracker.start_at(a_motion().state(0))
+    result = tracker.update([sees(0)])
+    arms = [tracker.body.tree.segment(f"forearm_{side}") for side in "rl"]
+    assert (result.segment_quality[arms] == 0.0).any() == said
+    scene = tracker.scene_of(result.state, 0.0)
+    again = result.measurements[0].compact().evidence(scene).segment_quality(tracker.body.tree)
+    assert (again[arms] == 0.0).any() == said  # as smoothing judges it
+
+
+def test_a_guess_is_taken_where_more_speaks_for_it(monkeypatch):
+    monkeypatch.setattr(recovery, "find_limbs", lambda *_: [])
+    monkeypatch.setattr(recovery, "starts_from_views", lambda *_, **__: [])
+    away = a_motion().state(0)
+    root = np.array(away.T_world_root)
+    root[:3, 3] += 0.8
+    wrong = replace(away, T_world_root=root)
+    for guess, found in ((None, False), (away, True)):
+        tracker = Tracker(a_motion().body, a_rig(), rate=1.0, on_body=("depth",), up="y")
+        tracker.start_at(wrong)
+        result = tracker.update([depth_frame(0)], guess=guess)
+        off = np.linalg.norm(result.state.T_world_root[:3, 3] - away.T_world_root[:3, 3])
+        assert (off < 0.05) == found

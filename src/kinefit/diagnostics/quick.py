@@ -12,7 +12,7 @@ from kinefit.diagnostics.images import fit_image
 from kinefit.diagnostics.keypoints import Check, check_keypoints
 from kinefit.diagnostics.person import size_findings
 from kinefit.errors import KinefitError
-from kinefit.findings import FINDINGS, Finding, as_records, faults_of
+from kinefit.findings import FINDINGS, INVERTED, Finding, as_records, faults_of
 from kinefit.motion import UP_AXES, Motion
 from kinefit.observations import Keypoints
 from kinefit.readers.guess.views import nearest_axis
@@ -92,8 +92,17 @@ def motion_findings(motion: Motion, height: float | None) -> tuple[Finding, ...]
 def with_findings(motion: Motion, findings: Sequence[Finding], seen: Observations, height: float | None) -> Motion:
     """The motion with findings in its `provenance`, and with those of `motion_findings` where it has metric sensors."""
     if len({k.camera for k in seen.keypoints}) < 2 and (seen.markers or seen.depth or seen.clouds):
-        findings = [*findings, *motion_findings(motion, height)]
+        findings = [*findings, *motion_findings(motion, height), *_inverted_findings(motion)]
     return replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings)})
+
+
+def _inverted_findings(motion: Motion) -> list[Finding]:
+    if INVERTED not in motion.provenance:
+        return []
+    up, name = np.array(UP_AXES[motion.up]), motion.provenance[INVERTED]
+    text = f'up = "{motion.up}" is wrong, or {name} hangs upside down: people are explained better the other way round.'
+    remedy = f'Write up = "{nearest_axis(-up)[0]}" into [take], or turn the images by 180 degrees.'
+    return [Finding("fault", "up", text, (name,), "Likely, unless the person does a handstand.", remedy)]
 
 
 def with_cause(error: KinefitError, findings: Sequence[Finding]) -> KinefitError:

@@ -18,7 +18,7 @@ from kinefit.correspondences import prior_rows
 from kinefit.errors import KinefitError, TrackingError
 from kinefit.geometry.camera import Camera
 from kinefit.initialization.depth_search import PostureSearch
-from kinefit.initialization.from_depth import Start, start_from_points
+from kinefit.initialization.from_depth import starts_by_attempt
 from kinefit.initialization.from_points import pose_from_points
 from kinefit.observations import DepthFrame, PointCloud, by_record
 from kinefit.rows import AnyRows
@@ -60,27 +60,28 @@ def starts_from_points(
 def starts_from_views(
     scene: Scene, frames: Sequence[Any], up: NDArray, measurements: Sequence[Measurement], count: int = 3, *,
     backgrounds: Mapping[str, NDArray] | None = None, forward: NDArray | None = None,
-) -> list[BodyState]:  # fmt: skip
-    """States to begin with from one depth image or cloud; those that known points agree with come first.
+) -> Iterator[list[BodyState]]:  # fmt: skip
+    """States to begin with from one depth image or cloud, attempt by attempt; those that known points agree with first.
 
     `backgrounds`: {depth camera: (H, W) [m]} of the empty scene, where it is known; `forward`: (3,) where the body
     faced before.
     """
-    starts: list[Start] = []
-    for view in _views(scene, frames):
-        with suppress(KinefitError):
-            empty = (backgrounds or {}).get(view[1].name)
-            starts = start_from_points(scene.body, *view, background=empty, up=up, count=count, forward=forward)
-            break
     points, x, _ = known_points(measurements, scene)
     known = np.isfinite(x).all(axis=1)
-    if known.any():
-        starts.sort(
-            key=lambda start: float(
-                np.median(np.linalg.norm(scene.body.positions(start.state, points)[known] - x[known], axis=1))
-            )
-        )
-    return [start.state for start in starts]
+    for view in _views(scene, frames):
+        empty = (backgrounds or {}).get(view[1].name)
+        with suppress(KinefitError):
+            for starts in starts_by_attempt(scene.body, *view, background=empty, up=up, count=count, forward=forward):
+                if known.any():
+                    starts.sort(
+                        key=lambda start: float(
+                            np.median(
+                                np.linalg.norm(scene.body.positions(start.state, points)[known] - x[known], axis=1)
+                            )
+                        )
+                    )
+                yield [start.state for start in starts]
+            return
 
 
 def known_points(measurements: Sequence[Measurement], scene: Scene) -> tuple[PointSet, NDArray, NDArray]:

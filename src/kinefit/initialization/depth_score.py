@@ -168,7 +168,11 @@ class Score:
         return float(self(state.T_world_root[None], state.angles[None])[0])
 
     def missing(self, state: BodyState) -> float:
-        """Share of the person in pieces of a limb's size that nothing of the body is drawn at, nor near it.
+        """Share of the person in pieces of a limb's size that nothing of the body is drawn at, nor near it."""
+        return sum(map(len, self.unexplained(state))) / self.pixels
+
+    def unexplained(self, state: BodyState) -> list[NDArray]:
+        """Pieces (N, 3) [m] of the person that nothing of the body is drawn at, nor near it.
 
         What is longer than half of the person is a floor, a wall, furniture.
         """
@@ -179,12 +183,9 @@ class Score:
         nearest = cv2.erode(np.where(view.seen, view.observed, nothing), around)
         whole = cv2.dilate(view.observed, around) - nearest < TOLERANCE  # no step in depth parts it
         thick = cv2.morphologyEx((far & whole).astype(np.uint8), cv2.MORPH_OPEN, around)  # no sliver along an outline
-        _, piece, box, _ = cv2.connectedComponentsWithStats(thick)
-        total = 0
-        for k in range(1, len(box)):
-            x = view.points[piece == k]
-            total += len(x) if np.linalg.norm(np.ptp(x, axis=0)) < longest else 0
-        return total / self.pixels
+        count, piece = cv2.connectedComponents(thick)
+        pieces = [view.points[piece == k] for k in range(1, count)]
+        return [x for x in pieces if np.linalg.norm(np.ptp(x, axis=0)) < longest]
 
     def visible(self, state: BodyState) -> NDArray:
         """(S,) share of each segment's own outline that the sensor could see: within its image, behind nothing."""

@@ -9,22 +9,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies import Body, BodyState
 from kinefit.bodies.fingers import knuckles
 from kinefit.bodies.limbs import limbs
-from kinefit.correspondences import point_rows, prior_rows, surface_rows
-from kinefit.initialization.depth_score import Score, spreads
+from kinefit.correspondences import prior_rows, surface_rows
+from kinefit.initialization._kernels_reach import reach
+from kinefit.initialization.depth_score import TOLERANCE, Score, spreads
 from kinefit.losses import geman_mcclure
 from kinefit.rows import AnyRows
 from kinefit.sensors.surfaces.depth_view import DepthView, geodesic_ends
-from kinefit.solvers.least_squares import bounds_of, gauss_newton, levenberg_marquardt
+from kinefit.solvers.least_squares import bounds_of, gauss_newton
 
 POINTS = 700  # measured points that take part in a fit: more do not distinguish postures better
 FACING = 0.02  # of the score: a person rather faces the sensor (twice that for one turned away) ...
 UPRIGHT = 0.05  # ... and stands or sits upright (that for one who lies); for what is alike from both sides
 AS_BEFORE = 0.1  # instead, where it is known how a body faced a moment ago: twice that for one that has turned about
 YAWS, LEANS = np.arange(0.0, 2 * np.pi, np.pi / 6), ((0, 0), (20, 0), (45, 0), (-20, 0), (0, 20), (0, -20))  # [deg]
-TRIES = 200  # random poses of a limb
+TRIES, ROUGH_TRIES = 200, 100  # random poses of a limb: one that is to stay, and one for each place of the trunk
+_MIN_LIMB_PIXELS = 4  # of a view: fewer show nothing of a limb
+_MIN_UNEXPLAINED = 0.01  # share of a person's pixels that may be a limb's end: a hand has 2 %
 STEP = (0.04, 0.2, 0.35)  # [m, rad, rad] first random steps of the root's place and turn, and of angles
 
 
@@ -165,7 +168,10 @@ class PostureSearch:
     def limb(
         self, state: BodyState, limb: tuple[int, ...], drawn: tuple[int, ...] | None, ends: NDArray, count: int
     ) -> list[tuple[BodyState, float]]:
-        """The best poses of one limb, all else held, and their scores: random ones, its tip or its fist at each end."""
+        """The best poses of one limb, all else held, and their scores: random ones, its tip or its fist at each end.
+
+        A rough search, of fewer than `TRIES` random poses, leaves out closest points.
+        """
         tree = self.body.tree
         dofs = self._dofs(limb, False)
         d = dofs - 6
@@ -174,8 +180,7 @@ class PostureSearch:
         usual = self.rng.normal(tree.usual[d], np.minimum(spreads(self.body)[d], 0.6), size=(count, len(d)))
         angles = np.repeat(state.angles[None], 1 + count, axis=0)
         angles[1:, d] = np.clip(np.where(self.rng.random((count, 1)) < 0.35, usual, anywhere), low, high)
-        reached = [self._reach(state, limb, end, tip) for tip in self._tips[limb[-1]] for end in ends]
-        angles = np.concatenate([angles, np.reshape(reached, (-1, angles.shape[1]))])
+        angles = np.concatenate([angles, self._reaching(state, limb, ends)])
         drawn = tuple(range(len(tree.segments))) if drawn is None else drawn
         others = tuple(s for s in drawn if s not in limb)
         held: dict[str, Any] = {"moving": limb, "base": self.score.depth(state, others)}
@@ -184,9 +189,26 @@ class PostureSearch:
         rough = sorted((self.polish(s, drawn, dofs, 3, 24, **held) for s in best), key=lambda b: -b[1])
         locked = np.ones(tree.n_dofs, bool)
         locked[dofs] = False
-        closer = [self.closest(s, 8, locked=locked) for s, _ in rough[:2]]
+        closer = [self.closest(s, 8, locked=locked) for s, _ in rough[:2]] if count >= TRIES else []
         out = [*rough, *(self.polish(s, drawn, dofs, 3, 24, 0.4, **held) for s in closer)]
         return sorted(out, key=lambda b: -b[1])
+
+    def _is_out_of_view(self, state: BodyState, limb: tuple[int, ...], drawn: tuple[int, ...]) -> bool:
+        """Whether the view shows nothing of a limb where it is, nor anything unexplained that it could reach."""
+        view = self.view
+        if ((self.score.depth(state, limb) < view.behind) & (view.trust > 0)).sum() > _MIN_LIMB_PIXELS:
+            return False
+        explained = np.abs(self.score.depth(state, drawn) - view.observed) < TOLERANCE
+        near = self.within_reach(state, limb, view.points[view.seen & ~explained])
+        return bool(near.sum() < _MIN_UNEXPLAINED * self.score.pixels)
+
+    def within_reach(self, state: BodyState, limb: tuple[int, ...], x_world: NDArray) -> NDArray:
+        """(N,) bool: points (N, 3) [m] that a limb could touch."""
+        tree, mesh = self.body.tree, self.score.mesh
+        frames, _ = tree.forward(state.T_world_root, state.angles)
+        root = tree.rest[limb[0]] @ frames[limb[0], :9].reshape(3, 3).T + frames[limb[0], 9:]
+        own = mesh.vertices[np.isin(mesh.segment, limb)] - tree.rest[limb[0]]
+        return np.asarray(np.linalg.norm(x_world - root, axis=1) < np.linalg.norm(own, axis=1).max(initial=0.0))
 
     @cached_property
     def _tips(self) -> dict[int, NDArray]:
@@ -199,23 +221,20 @@ class PostureSearch:
             out[limb[-1]] = np.stack([tip, folded.get(limb[-1], tip)])
         return out
 
-    def _reach(self, state: BodyState, limb: tuple[int, ...], end: NDArray, tip: NDArray) -> NDArray:
-        """(D,) angles that bring a limb's tip to an end of the surface, from a random pose of the limb."""
-        body, d = self.body, self._dofs(limb, False) - 6
-        points = PointSet(("tip",), np.array(limb[-1:]), tip[None])
-        sight = (end - self.view.viewpoint) / np.linalg.norm(end - self.view.viewpoint)
-        target = (end + 0.03 * sight)[None]  # [m] the tip lies within, half a wrist behind what was seen
-        locked = np.ones(body.tree.n_dofs, bool)
-        locked[6 + d] = False
-        angles = np.array(state.angles)
-        angles[d] = np.clip(self.rng.normal(body.tree.usual[d], 0.5), body.tree.lower[d], body.tree.upper[d])
-
-        def rows(s: BodyState) -> list[AnyRows]:
-            return [point_rows(body, s, points, target, sigma=0.03), prior_rows(body, s, sigma=spreads(body))]
-
-        start = BodyState(state.T_world_root, angles)
-        fit = levenberg_marquardt(body, start, rows, locked=locked, max_iterations=10, tolerance=1e-2)
-        return fit.state.angles
+    def _reaching(self, state: BodyState, limb: tuple[int, ...], ends: NDArray) -> NDArray:
+        """(2 E, D) angles that bring a limb's tip, and its fist, to ends of the surface, from random poses of it."""
+        tree, d = self.body.tree, self._dofs(limb, False) - 6
+        sight = (ends - self.view.viewpoint) / np.linalg.norm(ends - self.view.viewpoint, axis=1, keepdims=True)
+        targets = np.tile(ends + 0.03 * sight, (2, 1))  # [m] the tip lies within, half a wrist behind what was seen
+        tips = np.repeat(self._tips[limb[-1]] + tree.rest[limb[-1]], len(ends), axis=0)
+        angles = np.repeat(state.angles[None], len(targets), axis=0)
+        some = self.rng.normal(tree.usual[d], 0.5, size=(len(targets), len(d)))
+        angles[:, d] = np.clip(some, tree.lower[d], tree.upper[d])
+        reach(
+            tree.parents, tree.dof_start, tree.prismatic, tree.axes, tree.rest, state.T_world_root, angles, d, limb[-1],
+            tips, targets, tree.usual, spreads(self.body), tree.lower, tree.upper, 0.03, 10,
+        )  # fmt: skip
+        return angles
 
     def ends(self, state: BodyState) -> NDArray:
         """(E, 3) [m] ends of the person's limbs, seen from the middle of the trunk."""
@@ -245,21 +264,23 @@ class PostureSearch:
             ends, drawn = self.ends(state), self.score.core
             for limb in self.limbs:
                 drawn = (*drawn, *limb)
-                state = self.limb(state, limb, drawn, ends, TRIES)[0][0]
+                if not self._is_out_of_view(state, limb, drawn):
+                    state = self.limb(state, limb, drawn, ends, ROUGH_TRIES)[0][0]
             found.append((self.value(state), state, ends))
         found.sort(key=lambda f: -f[0])
-        once = [(self.refined(state, ends, 1), ends) for _, state, ends in found[:4]]
+        once = [(self.refined(state, ends, 1), ends) for _, state, ends in found[:3]]
         once.sort(key=lambda f: -self.value(f[0]))
-        out = [self.refined(state, ends, 1) if k < 2 else state for k, (state, ends) in enumerate(once)]
+        out = [self.refined(state, ends, 1) if k < 1 else state for k, (state, ends) in enumerate(once)]
         return sorted(out, key=lambda s: -self.value(s))[:count]
 
     def refined(self, state: BodyState, ends: NDArray, rounds: int = 2) -> BodyState:
         """A posture brought closer: points onto surfaces, each limb tried anew, random steps of everything."""
-        everything = np.arange(self.body.tree.n_dofs)
+        everything, everything_drawn = np.arange(self.body.tree.n_dofs), tuple(range(len(self.body.tree.segments)))
         for _ in range(rounds):
             state = max(state, self.closest(state), key=self.value)
             for limb in self.limbs:
-                state = self.limb(state, limb, None, ends, TRIES)[0][0]
+                if not self._is_out_of_view(state, limb, everything_drawn):
+                    state = self.limb(state, limb, None, ends, TRIES)[0][0]
             state, _ = self.polish(state, None, everything, 10, 40, 0.4)
         closer = self.closest(state, first=0.10)
         return closer if self.value(closer) > self.value(state) - 0.02 else state  # pixels are coarse, points are not

@@ -29,6 +29,7 @@ _GAPS = (0.15, 0.075)  # [m] as `people` takes it: forearms towards the sensor a
 _SAME = 0.65  # overlap of two outlines of one person: an upper body without both arms keeps 0.7 (rule of nines)
 _FLAT = 0.015  # [m] deviation from a plane, of a wall; a person who faces the sensor, arms down, has 0.02 or more
 _GOOD = 0.7  # score of a pose that needs no second attempt: right ones of rendered bodies have 0.73 to 0.9
+_FAIR = 0.55  # score of a pose from which a size may be found, by a body of another size
 _MOST = 3  # largest things in view that are tried
 _FEWEST = 60  # measured points; a person 7.5 m from a camera of 160 x 124 pixels has several hundred
 
@@ -82,7 +83,7 @@ def start_from_points(
     up : (3,) upwards, in the world
     count : int, poses at most
     attempts : int
-        How often all is tried at most, until a good pose is found: about two and a half seconds of one core each.
+        How often all is tried at most, until a good pose is found: about 1.1 s of one core each.
     seed : int of the random tries; the same gives the same poses.
     forward : (3,) where the root faced a moment ago, optional; a person seldom turns about in a second.
 
@@ -95,6 +96,19 @@ def start_from_points(
     BodyError
         The body has no surfaces.
     """
+    *_, found = starts_by_attempt(
+        body, points, camera, depth, background=background, up=up, count=count, attempts=attempts, seed=seed,
+        forward=forward,
+    )  # fmt: skip
+    return found
+
+
+def starts_by_attempt(
+    body: Body, points: ArrayLike | None, camera: Camera, depth: NDArray | None = None, *,
+    background: NDArray | None = None, up: ArrayLike = (0.0, 1.0, 0.0), count: int = 5, attempts: int = 2,
+    seed: int = 0, forward: ArrayLike | None = None,
+) -> Iterator[list[Start]]:  # fmt: skip
+    """The best poses after each attempt, until one is good; arguments as of `start_from_points`."""
     found: list[tuple[PostureSearch, BodyState]] = []
     views: list[DepthView] = []
     more = _views(body, points, camera, depth, up, background)
@@ -102,10 +116,10 @@ def start_from_points(
         views += next(more, [])
         searches = _searches(body, views, up, seed + attempt, forward)
         found += [(search, state) for search in searches for state in search.best(count)]
-        if max(_meant(*f) for f in found) > _GOOD:
-            break
-    found.sort(key=lambda f: -_meant(*f))
-    return [Start(state, search.value(state), search.score.visible(state)) for search, state in found[:count]]
+        found.sort(key=lambda f: -_meant(*f))
+        yield [Start(state, search.value(state), search.score.visible(state)) for search, state in found[:count]]
+        if _meant(*found[0]) > _GOOD:
+            return
 
 
 def _meant(search: PostureSearch, state: BodyState) -> float:
@@ -145,16 +159,17 @@ def sized_start(
         tried: list[tuple[PostureSearch, BodyState]] = []
         for views in _views(body, None, camera, depth, up, background):
             tried += [(s, s.best(1)[0]) for s in _searches(body, views, up, seed)]
-            if max(_meant(*t) for t in tried) > _GOOD:
+            if max(_meant(*t) for t in tried) > _FAIR:
                 break
         search, state = max(tried, key=lambda t: _meant(*t))
         found.append((search.view, state))
     views = [view for view, _ in found]
     states = [state for _, state in found]
+    mean: NDArray | None = None
     for _ in range(rounds):
-        fit = fit_surfaces(body, [v.cloud for v in views], states, views=views)
-        searches = [PostureSearch(fit.body, v, _unit(up), np.random.default_rng(seed)) for v in views]
-        states = [s.refined(state, s.ends(state)) for s, state in zip(searches, fit.states)]
+        fit = fit_surfaces(body, [v.cloud for v in views], states, views=views, start=mean)
+        mean, searches = fit.mean, [PostureSearch(fit.body, v, _unit(up), np.random.default_rng(seed)) for v in views]
+        states = [s.refined(state, s.ends(state), 1) for s, state in zip(searches, fit.states)]
     starts = [Start(state, s.value(state), s.score.visible(state)) for s, state in zip(searches, states)]
     return fit, starts
 

@@ -213,6 +213,9 @@ class Measurement(ABC):
         """A depth image that other sensors may ask what is in front of something."""
         return None
 
+    def doubt(self, segments: NDArray) -> None:  # noqa: B027
+        """Know of segments (S,) bool that may be what no part of the body explains; see `Evidence.unplaced`."""
+
     def compact(self) -> Measurement:
         """What a smoother keeps of it: no whole images."""
         return self
@@ -245,9 +248,8 @@ class Sensor(ABC):
     def learn(self, measurement: Any, scene: Scene, sure: bool) -> None:  # noqa: B027
         """Learn from a step that was accepted; `sure` where no segment is lost.
 
-        Replace what was learnt by something new, rather than change it in place: where another sensor of the step
-        fails, the attributes of this one are set back. What a later match needs of it belongs into the measurement, so
-        that smoothing sees each time as it was.
+        Replace what was learnt, rather than change it in place: where another sensor of the step fails, the attributes
+        of this one are set back. What a later match needs belongs into the measurement: smoothing sees it as it was.
         """
 
 

@@ -27,16 +27,27 @@ class Evidence:
         is just enough to call a segment seen.
     elsewhere : (S,) bool, optional
         Segments that several cameras together show to be at another place, however much speaks for a part of them.
+    unplaced : (S,) bool, optional
+        Segments that may be centimetres away though what is seen of them agrees: they could be slid along themselves,
+        or something as large is seen elsewhere. Their quality is 0 where no other sensor supports them.
     """
 
     agreeing: NDArray
     contrary: NDArray
     elsewhere: NDArray | None = None
+    unplaced: NDArray | None = None
 
     def __add__(self, other: Evidence) -> Evidence:
         told = [e for e in (self.elsewhere, other.elsewhere) if e is not None]
         elsewhere = np.logical_or.reduce(told) if told else None
-        return Evidence(self.agreeing + other.agreeing, self.contrary + other.contrary, elsewhere)
+        doubts = [a.unplaced & ~b._supported for a, b in ((self, other), (other, self)) if a.unplaced is not None]
+        unplaced = np.logical_or.reduce(doubts) if doubts else None
+        return Evidence(self.agreeing + other.agreeing, self.contrary + other.contrary, elsewhere, unplaced)
+
+    @property
+    def _supported(self) -> NDArray:
+        supported = (self.agreeing >= SHOWN - 1e-9) & (self.agreeing > self.contrary)
+        return np.asarray(supported if self.unplaced is None else supported & ~self.unplaced)
 
     @classmethod
     def none(cls, segments: int) -> Evidence:
@@ -55,7 +66,10 @@ class Evidence:
         return self.agreeing / np.where(seen > 0.0, seen, 1.0)
 
     def segment_quality(self, tree: KinematicTree) -> NDArray:
-        """`quality`, (..., S); an unobserved segment has the lower one of its parent and its best child."""
+        """`quality`, (..., S); an unobserved segment has the lower one of its parent and its best child.
+
+        Of an unplaced one it is 0: what is beside it may agree as well where it is not.
+        """
         own, hidden = self.quality, self.hidden
         out = own.copy()
         for s in np.flatnonzero(hidden.reshape(-1, hidden.shape[-1]).any(axis=0)):
@@ -63,7 +77,7 @@ class Evidence:
             if len(below) and tree.parents[s] >= 0:
                 known = np.minimum(own[..., tree.parents[s]], own[..., below].max(axis=-1))
                 out[..., s] = np.where(hidden[..., s], known, own[..., s])
-        return out
+        return out if self.unplaced is None else np.where(self.unplaced, 0.0, out)
 
     @property
     def hidden(self) -> NDArray:

@@ -84,7 +84,7 @@ class TrackSettings:
     pause : float [s]
         A longer gap between frames leaves the velocity unknown; a clock that goes back further was set.
     search : bool
-        Whether what is lost is sought: a limb takes 50 ms of one core, a whole body 2 s. Without it every frame takes
+        Whether what is lost is sought: a limb takes 30 ms of one core, a whole body 1 s. Without it every frame takes
         as long as any other, and `start_at` is the only start.
     support : float in 0..1
         Share of the evidence that agrees below which a start from points that are known in space is tried.

@@ -48,6 +48,7 @@ def fit_surfaces(
     views: Sequence[DepthView] = (),
     sigma: float = 0.01,
     points: int = 500,
+    start: NDArray | None = None,
 ) -> SubjectFit:
     """Lengths and girths of a body from clouds of the person in poses that are about known.
 
@@ -61,6 +62,7 @@ def fit_surfaces(
     views : K, the same from whole depth images, instead of a camera
     sigma : float [m], of a point: noise, cloth
     points : int of each cloud that take part
+    start : (p,) parameters to start from, of an earlier fit; default: three statures are tried
 
     Returns
     -------
@@ -100,6 +102,8 @@ def fit_surfaces(
             posture=_POSTURE, coarse=_COARSE,
         )  # fmt: skip
 
+    if start is not None:
+        return fitted(states, start, _TRIED, joint.REACH[-1:])
     tried = [fitted(states, stature * groups, _TRIED, joint.REACH) for stature in _STATURES]
     best = min(tried, key=lambda found: _misfit(found, steps))
     return fitted(best.states, best.mean, _ROUNDS, joint.REACH[-1:])

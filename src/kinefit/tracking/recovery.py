@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.limbs import limbs
 from kinefit.frame.prediction import forgetting
-from kinefit.frame.results import ANYWHERE, FrameResult
+from kinefit.frame.results import ANYWHERE, FrameResult, evidence_of, together
 from kinefit.geometry.camera import Rig
 from kinefit.initialization.candidates import LEAP, dofs_of_limbs, find_limbs, starts_from_points, starts_from_views
 from kinefit.initialization.depth_search import PostureSearch
@@ -27,6 +28,11 @@ _ANEW = 0.3  # [s] between frames in which a pose becomes any other: what limbs 
 _TURN = 1.0  # [s] for which a person still faces about where it faced
 _STRIDE = 0.5  # [m] by which a root is found elsewhere without a step
 _GAIN = 0.1  # of the support, by which a start must be better than what was tracked
+
+
+def is_rare(rate: float) -> bool:
+    """Whether images are so far apart (rate [Hz]) that a pose becomes any other from one to the next."""
+    return rate < 1.0 / _ANEW
 
 
 class Recovery:
@@ -64,11 +70,39 @@ class Recovery:
 
     def run(
         self, tracker: Tracker, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],
-        result: FrameResult | None,
+        result: FrameResult | None, guess: BodyState | None = None,
     ) -> FrameResult | None:  # fmt: skip
-        """The result of one time, or a better one that was found."""
+        """The result of one time, or a better one that was found; `guess`: where the body may be, by an earlier fit.
+
+        Where images are rare, limbs that could be what nothing explains are said to be unplaced, and so are segments of
+        limbs of which the one before is not seen: no earlier image holds them.
+        """
+        result = self._best(tracker, time, frames, measurements, result, guess)
+        if result is None or not self.settings.search or not is_rare(self.rate):
+            return result
+        search = self._search(tracker, time, measurements, result)
+        doubtful = np.zeros(len(result.lost), bool)
+        if search is not None and search.score.missing(result.state) > LEAP:
+            x = np.concatenate(search.score.unexplained(result.state))
+            near = [s for limb in search.limbs for s in limb if search.within_reach(result.state, limb, x).mean() > 0.5]
+            doubtful[near] = True
+        for m in result.measurements:
+            m.doubt(doubtful)
+        scene = tracker.scene_of(result.state, time)
+        told = together(scene, evidence_of(scene, result.matched))
+        return replace(result, segment_quality=told.segment_quality(self.body.tree))
+
+    def _best(
+        self, tracker: Tracker, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],
+        result: FrameResult | None, guess: BodyState | None,
+    ) -> FrameResult | None:  # fmt: skip
         s, search = self.settings, None
-        rare = s.search and self.rate < 1.0 / _ANEW
+        rare = s.search and is_rare(self.rate)
+        if guess is not None:
+            found = tracker.fitted(time, frames, guess).result
+            if not _astray(found, s.poor) and (result is None or _better(found, result)):
+                result = found
+                tracker.restart(found)
         if np.isnan(self._good[0]):
             self._good[0] = time
         if result is None or result.support < s.support:
@@ -127,20 +161,25 @@ class Recovery:
         elapsed = abs(time - self._good[0])
         known = self._root if elapsed <= _TURN + 1e-6 else None
         here = None if result is None or _astray(result, self.settings.poor) else result.state.T_world_root
-        for state in starts_from_views(
+        for states in starts_from_views(
             scene, frames, self.up, own.measurements(frames, scene, points=True),
             backgrounds=own.stated, forward=None if known is None else known[:3, 0],
         ):  # fmt: skip
-            if known is not None and _gone(state.T_world_root, known) > _STRIDE + _SPEED * elapsed:
-                continue  # somebody else
-            if here is not None and _gone(state.T_world_root, here) > _STRIDE:
-                continue  # somebody else, too: but for a limb or two, the body is where it is thought to be
-            found = tracker.fitted(time, frames, state).result
-            poor = _astray(found, self.settings.poor)
-            allowed = not poor if result is None else not poor or _astray(result, self.settings.poor)
-            if allowed and (result is None or _better(found, result) or _explains(search, found, result)):
-                result, self._lost_since = found, time
-                tracker.restart(found)
+            near = [s for s in states if known is None or _gone(s.T_world_root, known) <= _STRIDE + _SPEED * elapsed]
+            if here is not None:  # but for a limb or two, the body is where it is thought to be
+                near = [s for s in near if _gone(s.T_world_root, here) <= _STRIDE]
+            if not near:
+                break  # somebody else
+            for state in near:
+                found = tracker.fitted(time, frames, state).result
+                poor = _astray(found, self.settings.poor)
+                allowed = not poor if result is None else not poor or _astray(result, self.settings.poor)
+                if allowed and (result is None or _better(found, result) or _explains(search, found, result)):
+                    result, self._lost_since = found, time
+                    tracker.restart(found)
+            if result is not None and not _astray(result, self.settings.poor):
+                if search is None or search.score.missing(result.state) <= LEAP:
+                    break  # another attempt costs as much
         return result
 
     def _limbs(

@@ -116,7 +116,8 @@ def tracker_of(
 
 def run(
     recording: Recording, body: Body, settings: TrackSettings, *, start: Any = None, values: Any = None,
-    view_bias: ViewBias | None = None, progress: Progress | None = None, checkpoint: Checkpoint | None = None,
+    view_bias: ViewBias | None = None, poses: Mapping[int, BodyState] | None = None, progress: Progress | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> TrackedSteps:  # fmt: skip
     """Track all steps of a recording, each from those before it.
 
@@ -125,6 +126,7 @@ def run(
     start : step and state to begin with; default: the first that the tracker finds by itself.
     values : {sensor: {name: value}} of the sensors' own unknowns
     view_bias : of the keypoints' detectors; default: none
+    poses : {step: state} where the body may be, by an earlier fit
     checkpoint : where it goes on from, and what is done is kept
 
     Raises
@@ -146,7 +148,8 @@ def run(
             tracker = frames.go_on(checkpoint, checkpoint.frames.state, anew())
 
     def step(tracker: Tracker, i: int, time: float) -> bool:
-        found = tracker.update(recording.steps(i), time, others=others.at(time))
+        guess = None if poses is None else poses.get(i)
+        found = tracker.update(recording.steps(i), time, others=others.at(time), guess=guess)
         if found is not None:
             moving = {"measurements": found.measurements, "velocity": tracker.speed}
             frames.add(i, KeptFrame.of(found, tracker.scene_of(found.state, time).at(found.state, **moving)))

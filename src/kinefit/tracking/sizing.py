@@ -13,10 +13,11 @@ from kinefit.bodies import Body, BodyState
 from kinefit.bodies.closures import has_unknown_gear
 from kinefit.bodies.marker_sets import MarkerPlacement
 from kinefit.errors import KinefitError, ObservationError, TrackingError
+from kinefit.findings import INVERTED
 from kinefit.frame.results import FrameResult
 from kinefit.geometry import se3
-from kinefit.geometry.camera import Rig
-from kinefit.initialization.from_depth import sized_start
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.initialization.from_depth import Start, sized_start, start_from_points
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import Channels, known_names, make_channels
@@ -32,7 +33,9 @@ from kinefit.subject.subject import Progress, Subject, SubjectFit
 from kinefit.tracking.cameras import CAMERAS, LEFT_OUT, between, composed
 from kinefit.tracking.placing import placed_cameras
 from kinefit.tracking.recording import Recording, spread
-from kinefit.tracking.run import run
+from kinefit.tracking.recovery import is_rare
+from kinefit.tracking.run import OtherPeople, TrackedSteps, run, tracker_of
+from kinefit.tracking.session import KeptFrame
 from kinefit.tracking.unknowns import Unknowns, of_all, of_points
 
 _TRIED = 100  # steps that are tracked to find the person's shape ...
@@ -44,7 +47,10 @@ _PLACES = 2  # fits with a better spread of the markers' places; it changes by l
 _MOVES = 3  # times that cameras are moved that a subject fit has found far off
 _SEEN = 0.5  # quality of a frame that the shape may be found from
 
-Start = tuple[int, BodyState]
+_MIN_UPRIGHT = 0.65  # mean score of starts of people who stand as the take says: 0.7 and more of drawn ones
+_MIN_INVERTED_GAIN = 0.04  # of the score: 0.06 to 0.07 of two drawn people upside down, -0.24 and -0.02 of upright ones
+
+KnownStart = tuple[int, BodyState]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,15 +64,17 @@ class SizedPerson:
     start : step and state to begin with
     values : {sensor: {name: value}} of the sensors' own unknowns
     told : what there is to report of it, for `Motion.provenance`
+    poses : {step: state} of steps that were fitted, where images are so far apart that none holds the next
     joint : what fits of several kinds of sensors together found, in their order
     calibrated : Rig as its calibration has it
     """
 
     recording: Recording
     subject: Subject
-    start: Start | None = None
+    start: KnownStart | None = None
     values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     told: Mapping[str, Any] = field(default_factory=dict)
+    poses: Mapping[int, BodyState] = field(default_factory=dict)
     joint: tuple[SubjectFit, ...] = ()
     calibrated: Rig = field(default_factory=lambda: Rig(()))
 
@@ -205,9 +213,27 @@ def _by_depth(person: SizedPerson, progress: Progress | None) -> SizedPerson:
         if progress:
             progress("size", 1, 1)
     step, best = max(zip(frames, starts), key=lambda found: found[1].score)
+    if _is_inverted(fit.body, [f.depth for f in frames.values()], camera, empty, r.up_axis, starts):
+        person = replace(person, told={**person.told, INVERTED: camera.name})
     told = {n: [round(float(m), 4), round(float(s), 4)] for n, m, s in zip(fit.names, fit.mean, fit.std)}
     person = replace(_by_joint(person, fit), told={**person.told, "size": told})
+    if is_rare(r.rate):
+        person = replace(person, poses={i: found.state for i, found in zip(frames, starts)})
     return person if person.start is not None else replace(person, start=(step, best.state))
+
+
+def _is_inverted(
+    body: Body, depths: Sequence[NDArray], camera: Camera, empty: NDArray | None, up: NDArray, starts: Sequence[Start]
+) -> bool:
+    """Whether people who are explained poorly are explained better with their heads where `up` has their feet."""
+    scores = [start.score for start in starts]
+    if np.mean(scores) > _MIN_UPRIGHT:
+        return False
+    try:
+        turned = [start_from_points(body, None, camera, d, background=empty, up=-up, attempts=1)[0] for d in depths]
+    except KinefitError:
+        return False
+    return bool(np.mean([start.score for start in turned]) > np.mean(scores) + _MIN_INVERTED_GAIN)
 
 
 def _by_all(
@@ -217,6 +243,7 @@ def _by_all(
     """Lengths, girths, places of markers, sensors' own unknowns, from all sensors of some frames together.
 
     The first steps are tracked with the body as it is; poses of some of them, spread over the time, are fitted along.
+    Where images are far apart, those are taken whose poses are known: no step helps to find the next.
     """
     r, body = person.recording, person.subject.body
     first = 0 if person.start is None else person.start[0]
@@ -227,9 +254,12 @@ def _by_all(
     if progress:
         counted = lambda what, done, total: progress("shape", done, total)
     try:
-        tracked = run(
-            r.part(stretch), body, settings, start=start, view_bias=person.subject.view_bias, progress=counted
-        )
+        if person.poses:
+            first, tracked = 0, _fitted_at(person.poses, r, body, settings)
+        else:
+            tracked = run(
+                r.part(stretch), body, settings, start=start, view_bias=person.subject.view_bias, progress=counted
+            )
     except TrackingError as error:
         return replace(person, told={**person.told, "shape": f"not found: {error.problem}"})
     shown = [bool(measured) or bool(r.keypoints) for measured in tracked.measurements]
@@ -273,7 +303,27 @@ def _by_all(
     if left is not None:
         found = fit(left, steps, states)
         person, states = _by_joint(person, found), found.states
-    return replace(person, start=(first + tracked.steps[chosen[0]], states[0]))
+    found_at = [first + tracked.steps[k] for k in chosen]
+    known = {**person.poses, **dict(zip(found_at, states))} if person.poses else {}
+    return replace(person, start=(found_at[0], states[0]), poses=known)
+
+
+def _fitted_at(
+    poses: Mapping[int, BodyState], recording: Recording, body: Body, settings: TrackSettings
+) -> TrackedSteps:
+    """Steps fitted from known poses, each by itself."""
+    tracker, times = tracker_of(recording, body, settings), recording.times
+    others = OtherPeople(recording.others, recording.rig, 0.5 / recording.rate + 1e-6)
+    frames = []
+    for step in sorted(poses):
+        tracker.others = tuple(others.at(float(times[step])))
+        found = tracker.fitted(float(times[step]), recording.steps(step), poses[step]).result
+        scene = tracker.scene_of(found.state, found.time).at(found.state, measurements=found.measurements)
+        frames.append(KeptFrame.of(found, scene))
+    return TrackedSteps(
+        [f.result for f in frames], [f.measurements for f in frames], [f.leftovers for f in frames],
+        times[sorted(poses)], recording.rate, tracker.scene_of, tracker.apart, sorted(poses), tracker, False,
+    )  # fmt: skip
 
 
 def _by_joint(person: SizedPerson, found: SubjectFit) -> SizedPerson:

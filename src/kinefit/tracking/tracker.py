@@ -201,7 +201,8 @@ class Tracker:
         return motion_of(frames, subject, self.settings, how, up=axis_of(self.up), name=name, told=told)
 
     def update(
-        self, frames: Sequence[Any], time: float | None = None, *, others: Sequence[Scene] = ()
+        self, frames: Sequence[Any], time: float | None = None, *, others: Sequence[Scene] = (),
+        guess: BodyState | None = None,
     ) -> FrameResult | None:  # fmt: skip
         """Track one step of time from what the sensors saw then.
 
@@ -210,6 +211,7 @@ class Tracker:
         frames : of any sensors, or measurements; none where `time` is given: the body is then where it was going.
         time : float [s], default the frames' mean.
         others : other bodies at this time, for sensors that must tell them apart; see `scene_of`.
+        guess : where the body may be at this time; taken where more speaks for it.
 
         Returns
         -------
@@ -230,7 +232,7 @@ class Tracker:
         before = self._time, self._recovery.clocks(), self.dropped, *kept
         learnt, self.others = self.sensors.learnt(), tuple(others)
         try:
-            return self._updated(frames, time)
+            return self._updated(frames, time, guess)
         except BaseException:  # as if they had never come
             self._time, clocks, self.dropped, self._prediction, self._last, self._seen = before
             self._recovery.set_clocks(clocks)
@@ -239,7 +241,7 @@ class Tracker:
         finally:
             self.others = ()
 
-    def _updated(self, frames: Sequence[Any], time: float) -> FrameResult | None:
+    def _updated(self, frames: Sequence[Any], time: float, guess: BodyState | None) -> FrameResult | None:
         steps = self._steps(time)
         if steps is None:
             return self._last
@@ -254,7 +256,7 @@ class Tracker:
             fitted = self._fit.run(scene, held, measurements, self._known(time))
             self._take(fitted, time)
             result, covariance = fitted.result, fitted.stated
-        result = self._recovery.run(self, time, frames, measurements, result)
+        result = self._recovery.run(self, time, frames, measurements, result, guess)
         self._last = result
         if result is not None:
             moving = {"velocity": self.speed, "measurements": tuple(measurements), "others": self.others}

@@ -95,7 +95,7 @@ def track(
     )
     tracked = run(
         person.recording, person.subject.body, settings, start=person.start, values=person.values,
-        view_bias=person.subject.view_bias, progress=progress, checkpoint=checkpoint,
+        view_bias=person.subject.view_bias, poses=person.poses, progress=progress, checkpoint=checkpoint,
     )  # fmt: skip
     tracker = tracked.tracker
     others = {} if recording.followed is None else recording.followed.as_told()

@@ -8,7 +8,7 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import render_body
 from kinefit.sensors.visibility import _kernels_visibility as kernels
-from kinefit.sensors.visibility.visibility import Layers, judge_segments
+from kinefit.sensors.visibility.visibility import Layers, SegmentVerdict, judge_segments
 
 CAMERA = Camera("depth", (320, 240), np.array([[275.0, 0, 159.5], [0, 275.0, 119.5], [0, 0, 1]]))
 WALL = 6.0  # [m]
@@ -150,3 +150,8 @@ def test_an_image_of_another_size_is_refused(scene):
     body, state, camera, layers = scene
     with pytest.raises(ObservationError, match=r"depth image .*\(120, 160\).*scaled"):
         judged(body, state, layers, np.zeros((120, 160), np.float32), camera)
+
+
+def test_a_segment_holds_the_next_one_where_enough_of_it_agrees():
+    counts = np.array([[100, 25, 0, 0, 0, 75], [100, 24, 0, 0, 0, 76], [100, 40, 10, 31, 0, 0], [8, 4, 0, 0, 0, 4]])
+    assert SegmentVerdict(counts, np.ones(4, bool)).holds.tolist() == [True, False, False, True]

@@ -122,6 +122,7 @@ class DepthImageMeasurement(Measurement):
         self._space = self._free(self._shown)
         self._matches, self.is_compact = 0, False
         self._judged: tuple[BodyState, NDArray] | None = None
+        self._doubtful: NDArray | None = None
         self._points, self._share = gathered(self._kept, camera, self.box, (first, last), self._shown, s)
         patches = surface.areas.sum() / (s.patch**2 * max(len(surface.samples), 1))
         self._sample_sigma = self.sigma / np.sqrt(min(patches, 1.0) / 2.0)  # halved: a patch is measured by both
@@ -197,7 +198,18 @@ class DepthImageMeasurement(Measurement):
         layers = scene.surface.layers(camera)
         told = judge_segments(vertices, layers, self.depth, camera, noise=(self.sigma / 2.0, 0.0))
         self._judged = None if self.is_compact else (scene.state, layers.front.copy())
-        return told.evidence
+        if self._doubtful is None:
+            return told.evidence
+        orphaned, of = np.zeros(len(told.unseen), bool), layers.limbs.jointed
+        orphaned[of] = ~told.holds[scene.body.tree.parents[of]]
+        return replace(told.evidence, unplaced=told.unseen | orphaned | self._doubtful)
+
+    def doubt(self, segments: NDArray) -> None:
+        """Know of segments (S,) bool that something in the image that nothing explains may be; no earlier image helps.
+
+        So what a limb's segment hangs on must be seen, too.
+        """
+        self._doubtful = segments
 
     def drawn_alone(self, scene: Scene) -> NDArray:
         """(h, w) [m] the body's own depth at a scene's state, small; what evidence has drawn is not drawn twice."""

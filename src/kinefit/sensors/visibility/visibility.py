@@ -7,8 +7,8 @@ slipped into the trunk agrees with the trunk's surface, but nothing that was mea
 Where limbs' segments begin: the joints between them, of which an image may show nothing.
 
 A tube that is slid along itself covers what it covered before, but for its ends. So a segment may agree with nearly all
-that was measured of it and have its joint at another place. Its first third tells: where less than half of it is seen,
-beside the image or where nothing was measured, the joint may be a sixth of the segment away: 4 cm of a forearm.
+that was measured of it and have its joint at another place. Its first third tells: where less than two thirds of it are
+seen, beside the image or where nothing was measured, the joint may be a ninth of the segment away: 3 cm of a forearm.
 """
 
 from __future__ import annotations
@@ -25,9 +25,8 @@ from kinefit.bodies.limbs import limbs
 from kinefit.bodies.surfaces import BodyMesh, body_mesh
 from kinefit.correspondences.targets import check_depth_image
 from kinefit.geometry.camera import Camera
-from kinefit.motion import BELIEVED
 from kinefit.rendering import Canvas, scaled
-from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.evidence import BELIEVED, SHOWN, Evidence
 from kinefit.sensors.visibility import _kernels_visibility as kernels
 
 COLUMNS = 160  # of the drawn image: a person's forearm at 3 m is then four pixels wide
@@ -71,11 +70,17 @@ class SegmentVerdict:
         return self.counts[:, kernels.COVERED] / np.maximum(self.counts[:, 1:].sum(axis=1), 1)
 
     @property
+    def holds(self) -> NDArray:
+        """(S,) bool: segments that are seen where they are, wherever their joint is."""
+        enough = self.supported >= SHOWN * np.maximum(self.counts[:, kernels.OWN], FEWEST)
+        return np.asarray(enough & (self.supported >= BELIEVED * self.seen))
+
+    @property
     def evidence(self) -> Evidence:
         """For and against each segment, in outlines of it; nothing of one that agrees and whose joint is not seen."""
         against, whole = self.seen - self.supported, np.maximum(self.counts[:, kernels.OWN], FEWEST)
         share = np.where(self.unseen & (self.supported >= against), 0.0, 1.0 / whole)
-        return Evidence(share * self.supported, share * against)
+        return Evidence(share * self.supported, share * against, unplaced=self.unseen)
 
 
 class Layers:
@@ -159,6 +164,7 @@ def judge_segments(
 
 
 END = 1.0 / 3.0  # of a segment's length from its joint on
+SEEN_END = 2.0 / 3.0  # of it that must be seen: with less a forearm may be slid along itself by 3 cm
 _STEPS = 16  # places along it
 _FEWEST = 16  # pixels of it: with fewer it is far away, or other parts of the body hide it
 
@@ -204,7 +210,7 @@ class LimbEnds:
         return out
 
     def unseen(self, axes: NDArray, counts: NDArray, camera: Camera) -> NDArray:
-        """(S,) bool: segments of which less than half of the end at their joint is seen, where a limb goes on from it.
+        """(S,) bool: segments of which too little of the end at their joint is seen, where a limb goes on from it.
 
         Parameters
         ----------
@@ -215,7 +221,7 @@ class LimbEnds:
         out, s = np.zeros(self._count, bool), self.jointed
         inside, (drawn, agreeing) = self._inside(axes[s], camera), counts[s].T
         whole = drawn / np.maximum(inside, 1.0 / _STEPS)  # with what lies beside the image
-        out[s] = (inside == 0.0) | ((whole >= _FEWEST) & (agreeing < BELIEVED * whole))
+        out[s] = (inside == 0.0) | ((whole >= _FEWEST) & (agreeing < SEEN_END * whole))
         return out
 
     def _inside(self, axes: NDArray, camera: Camera) -> NDArray:
