@@ -155,6 +155,7 @@ def sized_start(
         As `start_from_points` and `fit_surfaces`.
     """
     found: list[tuple[DepthView, BodyState]] = []
+    scores: list[float] = []
     for depth in depths:
         tried: list[tuple[PostureSearch, BodyState]] = []
         for views in _views(body, None, camera, depth, up, background):
@@ -163,13 +164,18 @@ def sized_start(
                 break
         search, state = max(tried, key=lambda t: _meant(*t))
         found.append((search.view, state))
+        scores.append(search.value(state))
+    used = [k for k, score in enumerate(scores) if score > min(_FAIR, max(scores) - 1e-9)]  # wrong poses tell no size
     views = [view for view, _ in found]
     states = [state for _, state in found]
     mean: NDArray | None = None
     for _ in range(rounds):
-        fit = fit_surfaces(body, [v.cloud for v in views], states, views=views, start=mean)
+        some = [views[k] for k in used]
+        fit = fit_surfaces(body, [v.cloud for v in some], [states[k] for k in used], views=some, start=mean)
+        for k, state in zip(used, fit.states):
+            states[k] = state
         mean, searches = fit.mean, [PostureSearch(fit.body, v, _unit(up), np.random.default_rng(seed)) for v in views]
-        states = [s.refined(state, s.ends(state), 1) for s, state in zip(searches, fit.states)]
+        states = [s.refined(state, s.ends(state), 1) for s, state in zip(searches, states)]
     starts = [Start(state, s.value(state), s.score.visible(state)) for s, state in zip(searches, states)]
     return fit, starts
 
