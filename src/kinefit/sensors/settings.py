@@ -69,8 +69,9 @@ class TrackSettings:
         without silhouettes, 0.01 1.07 times, 0.02 1.02 times, on a trunk that lay 1 to 1.5 cm further forward than the
         catalogue's; on the catalogue's 0.02 leaves 1.03 times. Turn: not swept. 0 takes surfaces for exact everywhere.
     camera_std : (2,) [m] and [rad], or None
-        Standard deviations of each camera's calibrated position and of its direction, for error bars; and how far
-        markers beside keypoints may move cameras. None takes calibrations for exact.
+        Standard deviations of each camera's calibrated position and of its direction, before a take shows how large
+        they are; of three cameras or more one that is surely three of them off is moved. None takes calibrations for
+        exact.
     view_bias : bool
         Whether it is found from the take how far beside its point a detector puts each keypoint, seen from each side,
         see `ViewBias`. It takes three cameras that show a point, and keypoints alone: beside other sensors cameras
