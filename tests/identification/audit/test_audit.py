@@ -3,14 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinefit.bodies.marker_sets import placement
 from kinefit.errors import ObservationError
 from kinefit.identification.audit.audit import audit_take
 from kinefit.identification.audit.swaps import crossings, pair_gain, swap_gains
 from kinefit.identification.model.learn import learn_model
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
-from kinefit.simulation import squat_and_wave
 
 
 @pytest.fixture(scope="module")
@@ -56,15 +54,6 @@ def test_an_exchange_of_one_frame_is_found_even_with_a_hidden_marker(walk, a, b,
     found = wrong(audit_take(take))
     assert len(found) == 1 and {n.partition(":")[2] for n in found[0].labels} == {a, b}
     assert (found[0].first, found[0].last) == (120, 120)
-
-
-@pytest.fixture(scope="module")
-def waving():
-    """A simulated person with 41 labelled markers and 1 mm of noise: arms wave, knees bend."""
-    truth = squat_and_wave(rate=60.0, duration=4.0)
-    points, rng = placement(truth.body, "CMU_41").points, np.random.default_rng(0)
-    x = truth.positions(points)
-    return Markers(points.names, truth.rate, x + rng.normal(0.0, 0.001, x.shape), up=truth.up)
 
 
 @pytest.mark.parametrize("way", ["islands", "one island", "the other hidden", "at its end", "leaps into a gap"])
