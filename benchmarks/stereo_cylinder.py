@@ -28,7 +28,7 @@ from kinefit.photogrammetry.surface import MeasuredSurface, measure
 CAMERAS, SIZE = ("201", "202"), (2464, 3280)
 SPECKLE = slice(430, 2180), slice(720, 1620)  # of the first photograph
 WINDOW, STEP = 31, 8
-GAUGE = 0.005  # [m] of strain: five windows
+GAUGE = amount(0.005, 0.01)  # [m] of strain: five windows
 SQUARE = 0.01  # [m]
 NAMES = ("cylinder_points", "cylinder_radius_error", "cylinder_mad", "cylinder_points_a_second")
 
