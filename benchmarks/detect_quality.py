@@ -37,10 +37,10 @@ def run() -> None:
         detecting.networks(None, print, "best")
     except (AssetError, ObservationError) as error:
         trial, reason = None, error.problem
-    told = None if trial is None else {quality: _measured(trial, quality) for quality in detecting.QUALITIES}
+    measured = None if trial is None else {quality: _measured(trial, quality) for quality in detecting.QUALITIES}
     for name, (unit, goal) in _GOALS.items():
-        figure(f"detect_best_{name}", None if told is None else told["best"][name], unit, goal, reason)
-    gain = None if told is None else told["best"]["mean"] / told["balanced"]["mean"]
+        figure(f"detect_best_{name}", None if measured is None else measured["best"][name], unit, goal, reason)
+    gain = None if measured is None else measured["best"]["mean"] / measured["balanced"]["mean"]
     figure("detect_best_of_balanced", gain, "of the mean of balanced", "<= 0.5", reason)
 
 

@@ -1,7 +1,7 @@
 """What is called doubtful, and what is wrong: of segments in frames of all simulated takes (for `benchmarks.mixed`).
 
 An error is a segment of which an end (its joint centre, a child's, or where its surface ends) is farther than 8 cm from
-the truth. It is said where the segment is doubtful in that frame (`kinefit.exporters.report.doubt`); "told" counts what
+the truth. It is said where the segment is doubtful in that frame (`kinefit.exporters.report.doubt`); "said" counts what
 is lost, too. All takes count together: precision is the share of what is said that is an error, recall the share of the
 errors that is said. The limit was chosen on draws 0 to 35, one take of each: figures are of draws 36 and on.
 """
@@ -30,7 +30,7 @@ def doubt(told: Told) -> None:
     share = 100 * float(np.concatenate(frames).mean()) if frames else 0.0
     print(f"# all: {_text(counts[0])}; with what is lost {_text(counts[1])}; {share:.0f} % of the frames")
     reason = f"{len(failed)} runs failed, first {failed[0]}" if failed else ""
-    for name, (hits, said, errors) in zip(("doubt", "told"), counts):
+    for name, (hits, said, errors) in zip(("doubt", "said"), counts):
         some = bool(errors) and bool(said) and not failed
         figure(f"mixed_{name}_precision", hits / said if some else None, "of what is said", ">= 0.6", reason)
         figure(f"mixed_{name}_recall", hits / errors if some else None, "of errors above 8 cm", ">= 0.9", reason)

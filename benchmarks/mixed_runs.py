@@ -30,7 +30,7 @@ from benchmarks.smoothing import acceleration_noise, peak_speeds
 from kinefit import Motion, track_take
 from kinefit.bodies import PointSet
 from kinefit.evaluation import angle_errors
-from kinefit.exporters.report.doubt import FAR, doubtful
+from kinefit.exporters.report.doubt import FAR, contradicted, doubtful, end_sigmas
 
 MIXES: dict[str, tuple[str, ...]] = {
     "cameras": ("keypoints",),
@@ -98,7 +98,7 @@ def compare(truth: Motion, motion: Motion, seen: tuple[NDArray, NDArray], second
     return Outcome(
         few(shift), few(motion.joint_std), few(turn), few(motion.dof_std[:, 6:]),
         acceleration_noise(shift, truth.rate), float(np.median(peak_speeds(motion) / peak_speeds(truth))), *seen,
-        seconds, np.array([error_of_ends(truth, motion) > FAR, doubtful(motion), motion.lost]),
+        seconds, np.array([error_of_ends(truth, motion) > FAR, doubtful(end_sigmas(motion), contradicted(motion)), motion.lost]),
     )  # fmt: skip
 
 

@@ -96,8 +96,8 @@ def inside(reference: MeasuredSurface, state: MeasuredSurface, residual: NDArray
     second = value[1:-1] - 0.5 * (value[:-2] + value[2:])
     spread = np.sqrt(variance[1:-1] + 0.25 * (variance[:-2] + variance[2:]))
     z = (second / spread).reshape(-1, 3)
-    told = surface_strain(reference, state, GAUGE, WINDOW)
-    all_z = [*z.T, *(getattr(told, n) / getattr(told, f"std_{n}") for n in ("xx", "yy", "xy"))]
+    strained = surface_strain(reference, state, GAUGE, WINDOW)
+    all_z = [*z.T, *(getattr(strained, n) / getattr(strained, f"std_{n}") for n in ("xx", "yy", "xy"))]
     out = [100 * float(np.mean(np.abs(one[np.isfinite(one)]) <= 1.96)) for one in all_z]
     print("#   within 1.96 std: " + ", ".join(f"{n} {s:.1f} %" for n, s in zip(("x", "y", "z", "xx", "yy", "xy"), out)))
     return out

@@ -18,7 +18,7 @@ from kinefit.correspondences import prior_rows
 from kinefit.errors import KinefitError, TrackingError
 from kinefit.geometry.camera import Camera
 from kinefit.initialization.depth_search import PostureSearch
-from kinefit.initialization.from_depth import starts_by_attempt
+from kinefit.initialization.from_depth import Start, starts_by_attempt
 from kinefit.initialization.from_points import pose_from_points
 from kinefit.observations import DepthFrame, PointCloud, by_record
 from kinefit.rows import AnyRows
@@ -68,18 +68,16 @@ def starts_from_views(
     """
     points, x, _ = known_points(measurements, scene)
     known = np.isfinite(x).all(axis=1)
+
+    def off(start: Start) -> float:
+        return float(np.median(np.linalg.norm(scene.body.positions(start.state, points)[known] - x[known], axis=1)))
+
     for view in _views(scene, frames):
         empty = (backgrounds or {}).get(view[1].name)
         with suppress(KinefitError):
             for starts in starts_by_attempt(scene.body, *view, background=empty, up=up, count=count, forward=forward):
                 if known.any():
-                    starts.sort(
-                        key=lambda start: float(
-                            np.median(
-                                np.linalg.norm(scene.body.positions(start.state, points)[known] - x[known], axis=1)
-                            )
-                        )
-                    )
+                    starts.sort(key=off)
                 yield [start.state for start in starts]
             return
 

@@ -92,10 +92,10 @@ def displacement_std(reference: MeasuredSurface, state: MeasuredSurface, window:
 
     By the matches of both states where too few neighbours are measured.
     """
-    told = scatter(
+    spread = scatter(
         reference.x_world, state.x_world - reference.x_world, reference.grid.columns, window=_side(reference, window)
     )  # fmt: skip
-    return np.where(np.isfinite(told), told, np.hypot(reference.std, state.std))
+    return np.where(np.isfinite(spread), spread, np.hypot(reference.std, state.std))
 
 
 def _side(surface: MeasuredSurface, window: int) -> float:

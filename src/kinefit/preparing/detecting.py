@@ -29,8 +29,11 @@ if TYPE_CHECKING:
 PEOPLE = 3
 """How many people are followed at most in one camera, unless told otherwise."""
 
-QUALITIES = ("balanced", "best")
-"""Of the landmarks, the last one unless another is asked for: see `images.detectors.models.OF_QUALITY`."""
+QUALITIES = {"balanced": "pose_landmark_full.tflite", "best": "pose_landmark_heavy.tflite"}
+"""Landmark networks: the larger, the nearer to the joints, and the slower."""
+
+QUALITY = "best"
+"""Of new detections, where none is asked for."""
 
 _METHOD = "3"  # raise it when the detector gives other numbers for the same video
 Step = Callable[[str, int, int], None]
@@ -134,7 +137,7 @@ def detect(
     todo = [job for job in jobs if force or not _fits(detections_key(job.file), keys[job], wanted, job.seconds)]
     if not todo:
         return []
-    files = networks(progress, tell, QUALITIES[-1] if quality is None else quality)
+    files = networks(progress, tell, QUALITY if quality is None else quality)
     number, outlines = people or PEOPLE, bool(masks)
     stop, lock = threading.Event(), threading.Lock()
 
@@ -228,7 +231,7 @@ def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced"
     it, and says so.
     """
     from kinefit.assets import MODELS_CREDIT, detector_models, landmark_models
-    from kinefit.images.detectors.models import LANDMARKS, OF_QUALITY, check_runtime
+    from kinefit.images.detectors.models import LANDMARKS, check_runtime
 
     check_runtime()
     fetched: list[int] = []
@@ -243,10 +246,10 @@ def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced"
     folder = detector_models(told)
     if isinstance(quality, Path):
         return Networks(folder, quality, _name_of(quality))
-    if OF_QUALITY[quality] == LANDMARKS:
+    if QUALITIES[quality] == LANDMARKS:
         return Networks(folder, folder / LANDMARKS, quality)
     try:
-        return Networks(folder, landmark_models(told) / OF_QUALITY[quality], quality)
+        return Networks(folder, landmark_models(told) / QUALITIES[quality], quality)
     except AssetError as error:
         tell(f"{error} Until then people are seen by the network of quality 'balanced'.")
         return Networks(folder, folder / LANDMARKS, "balanced")

@@ -16,7 +16,7 @@ from kinefit.observations import DepthFrame
 from kinefit.sensors.displaced import Displaced, displacement
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surfaces.registration import FAR, FINE, Registration, starts, values_of
+from kinefit.sensors.surfaces.registration import FAR, FINE, Ends, Registration, clearly_above, starts, values_of
 from kinefit.subject.subject import Subject
 from kinefit.tracking.recording import Recording, spread
 
@@ -28,7 +28,7 @@ _MAX_SHIFT, _MAX_TURN = 0.05, float(np.radians(3.0))  # [m], [rad] by which one 
 
 @dataclass(frozen=True, eq=False)
 class PlacedCamera:
-    """A depth camera, laid onto the person whom the keypoints show.
+    """A depth camera, laid onto the person of the keypoints.
 
     Parameters
     ----------
@@ -94,16 +94,14 @@ def _placed(T_camera_world: NDArray, looks: Sequence[tuple[DepthFrame, Scene]], 
     stated = seen_from(np.zeros(7))
     best = stated.settled(np.zeros(7), FINE)
     if _size(best)[0] > _MAX_TURN or _size(best)[1] > _MAX_SHIFT:
-        ends = [stated.settled(start, (*FAR, *FINE)) for start in starts(origin, centre, PRIOR)]
-        best = min(ends, key=lambda twist: float(stated.costs(twist).sum()))
+        best = Ends(stated, tuple(stated.settled(s, (*FAR, *FINE)) for s in starts(origin, centre, PRIOR))).best
     nearer = stated.above(np.zeros(7), best)
     axis = np.pi * T_camera_world[2, :3]
     way = centre - origin
     over = np.concatenate([se3.exp_so3(axis) @ way - way, axis, [0.0]])
     rolled = seen_from(over)
     over = rolled.settled(over, FINE)
-    more = stated.costs(best) - rolled.costs(over)
-    if more.mean() > SURE * more.std(ddof=1) / np.sqrt(len(more)):
+    if clearly_above(stated.costs(best), rolled.costs(over)):
         best, nearer = over, True
     turn, shift = _size(best)
     return PlacedCamera(_moved(best, centre), turn, shift, nearer)

@@ -19,14 +19,12 @@ _MAX_STD = 1e3  # [rad, m] of a coordinate without a prior
 _WINDOW = 0.05  # [s] to either side, in which most views must contradict: an outlier is alone
 
 
-def doubtful(motion: Motion) -> NDArray:
+def doubtful(sigmas: NDArray, against: NDArray) -> NDArray:
     """(F, S) bool: segments of which an end is rather more than 8 cm off than not, or is so in most views.
 
-    None of a motion that comes without measurements.
+    By `end_sigmas` and `contradicted`.
     """
-    if not motion.residuals:
-        return np.zeros(motion.segment_quality.shape, bool)
-    return np.asarray((end_sigmas(motion) > _DOUBTFUL) | contradicted(motion))
+    return np.asarray((sigmas > _DOUBTFUL) | against)
 
 
 def uncertain_throughout(motion: Motion) -> dict[str, float]:

@@ -78,10 +78,10 @@ def doubt_sentence(motion: Motion, moments: Sequence[Moment]) -> str:
 
 def throughout_sentence(motion: Motion) -> str:
     """Segments with an end that is uncertain by more than 8 cm in most frames, with 2 σ; empty where there is none."""
-    told = uncertain_throughout(motion)
-    if len(told) == len(motion.body.tree.segments):
-        return f"the whole body (±{200 * min(told.values()):.0f} to {200 * max(told.values()):.0f}\u00a0cm)"
-    return listed([f"{plain(name)} (±{200 * sigma:.0f}\u00a0cm)" for name, sigma in told.items()], 20)
+    sigmas = uncertain_throughout(motion)
+    if len(sigmas) == len(motion.body.tree.segments):
+        return f"the whole body (±{200 * min(sigmas.values()):.0f} to {200 * max(sigmas.values()):.0f}\u00a0cm)"
+    return listed([f"{plain(name)} (±{200 * sigma:.0f}\u00a0cm)" for name, sigma in sigmas.items()], 20)
 
 
 def when(motion: Motion, m: Moment) -> str:
@@ -158,11 +158,11 @@ def _nobody(motion: Motion) -> Iterable[_Doubt]:
 
 
 def _doubts(motion: Motion) -> Iterable[_Doubt]:
-    share = 1 / len(motion.body.tree.segments)
-    flags = doubtful(motion) & (motion.quality > 0)[:, None]
-    if not flags.any():
+    if not motion.residuals:
         return
+    share = 1 / len(motion.body.tree.segments)
     sigma, against = end_sigmas(motion), contradicted(motion)
+    flags = doubtful(sigma, against) & (motion.quality > 0)[:, None]
     unbounded = ~np.isfinite(motion.joint_std).all(axis=-1)
     often = 2 * flags.sum(axis=0) > len(motion)
     flags &= ~often | against | (sigma > 2 * np.median(sigma, axis=0))
@@ -234,10 +234,10 @@ def causes(motion: Motion, moment: Moment) -> tuple[str, ...]:
         share = 100 * sum(left_out.values()) / seen_points
         out.append(f"{share:.0f} % of its keypoints were left out as outliers, most of them in {most}.")
     quality = motion.segment_quality[frames]
-    for told, of in (("No measurement supports {}", quality <= 0), ("More speaks against {} than for it", quality > 0)):
+    for text, of in (("No measurement supports {}", quality <= 0), ("More speaks against {} than for it", quality > 0)):
         gone = 2 * (of & motion.lost[frames]).sum(axis=0) > len(quality)
         if names := [plain(n) for n in moment.segments if gone[motion.body.tree.segments.index(n)]]:
-            out.append(told.format(listed(names)) + ".")
+            out.append(text.format(listed(names)) + ".")
     swapped = [name for name, r in pixels.items() if np.any(np.asarray(r.swapped)[frames])]
     if swapped:
         out.append(f"The detector took left for right in {listed(swapped)} (put right).")

@@ -17,7 +17,7 @@ WINDOW = 1.0
 NEIGHBOURS = 3
 """That must all move: of a hand on a table or a foot on the floor others rest, too."""
 
-_TRIED = 50  # frames from which neighbours are told
+_TRIED = 50  # frames in which distances are compared
 
 
 def resting(markers: Markers) -> list[tuple[str, tuple[int, int], float, str]]:

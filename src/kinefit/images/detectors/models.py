@@ -17,9 +17,6 @@ from kinefit.images.detectors.person_detector import DetectedPerson, PersonDetec
 from kinefit.images.detectors.pose_model import MASK, PersonLandmarks, PoseModel
 
 DETECTOR, LANDMARKS = "pose_detection.tflite", "pose_landmark_full.tflite"
-OF_QUALITY = {"balanced": LANDMARKS, "best": "pose_landmark_heavy.tflite"}
-"""Landmark networks: the larger, the nearer to the joints, and the slower."""
-
 _REMEDY = "Delete its folder; it is then fetched again."
 _LAYOUT = (
     "Name a landmark network of BlazePose: input (1, 256, 256, 3); outputs (1, 195), (1, 1), (1, 64, 64, 39), (1, 117) "
@@ -37,7 +34,7 @@ class Models:
     threads : int
         That each network runs on; the answers are the same.
     landmarks : path
-        Of another landmark network than the folder's: one of `OF_QUALITY`, or one with the same inputs and outputs.
+        Of another landmark network than the folder's, with the same inputs and outputs.
 
     Raises
     ------

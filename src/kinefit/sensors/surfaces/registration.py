@@ -73,8 +73,7 @@ class Registration:
 
     def above(self, twist: NDArray, other: NDArray) -> bool:
         """Whether distances at a twist (7,) are clearly above those at another one."""
-        more = self.costs(twist) - self.costs(other)
-        return bool(more.mean() > CLEAR * more.std(ddof=1) / np.sqrt(len(more)))
+        return clearly_above(self.costs(twist), self.costs(other))
 
     def settled(self, twist: NDArray, reach: Sequence[float]) -> NDArray:
         """(7,) where the sensor comes to rest from a twist; the clock stays."""
@@ -128,6 +127,12 @@ class Ends:
     def rivals(self) -> tuple[NDArray, ...]:
         """Of (7,): what leads from the best one to each other whose distances are not clearly above."""
         return tuple(apart(t, self.best) for t in self.twists if not self.registration.above(t, self.best))
+
+
+def clearly_above(costs: NDArray, others: NDArray) -> bool:
+    """Whether costs (F,) of one place are above those of another one by more than chance; see `CLEAR`."""
+    more = costs - others
+    return bool(more.mean() > CLEAR * more.std(ddof=1) / np.sqrt(len(more)))
 
 
 def starts(origin: NDArray, centre: NDArray, std: tuple[float, float]) -> list[NDArray]:
