@@ -98,7 +98,10 @@ def compare(truth: Motion, motion: Motion, seen: tuple[NDArray, NDArray], second
     return Outcome(
         few(shift), few(motion.joint_std), few(turn), few(motion.dof_std[:, 6:]),
         acceleration_noise(shift, truth.rate), float(np.median(peak_speeds(motion) / peak_speeds(truth))), *seen,
-        seconds, np.array([error_of_ends(truth, motion) > FAR, doubtful(end_sigmas(motion), contradicted(motion)), motion.lost]),
+        seconds,
+        np.array([
+            error_of_ends(truth, motion) > FAR, doubtful(end_sigmas(motion), contradicted(motion)), motion.lost,
+        ]),
     )  # fmt: skip
 
 
