@@ -9,10 +9,13 @@ pytest.importorskip("ai_edge_litert", reason="needs the extra detect")
 
 
 @pytest.mark.parametrize("content", [b"", b"garbage" * 9, b"\0\0\0\0TFL3" + bytes(100), b"\x1c\0\0\0TFL3" + bytes(20)])
-def test_a_file_that_is_no_network_is_told(tmp_path, content):
+def test_a_file_that_is_no_network_is_told(tmp_path, monkeypatch, content):
     for name in (LANDMARKS, DETECTOR):
         (tmp_path / name).write_bytes(content)
-    with pytest.raises(FileError, match="not a network that LiteRT runs"):
+    with pytest.raises(FileError, match="not a network that LiteRT runs.*Name a landmark network"):
+        Models(tmp_path)
+    monkeypatch.setenv("KINEFIT_CACHE", str(tmp_path))
+    with pytest.raises(FileError, match="not a network that LiteRT runs.*Delete its folder"):
         Models(tmp_path)
 
 

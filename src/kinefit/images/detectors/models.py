@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._jit import cache_directory
 from kinefit.errors import FileError, ObservationError
 from kinefit.images.detectors.person_detector import DetectedPerson, PersonDetector
 from kinefit.images.detectors.pose_model import MASK, PersonLandmarks, PoseModel
@@ -112,15 +113,15 @@ def _pose_model(path: Path, threads: int, without: tuple[int, ...] = ()) -> Pose
 
 def _interpreter(path: Path, threads: int, without: tuple[int, ...] = ()) -> Any:
     """A network, ready to run; `without` the output of a shape, and what makes it alone."""
-    runtime = _runtime()
+    runtime, remedy = _runtime(), _REMEDY if path.is_relative_to(cache_directory()) else _LAYOUT
     if not path.is_file():
-        raise FileError("no such network", file=path, remedy=_REMEDY)
+        raise FileError("no such network", file=path, remedy=remedy)
     try:
         given = {"model_content": _reduced(path, without)} if without else {"model_path": str(path)}
         interpreter = runtime(**given, num_threads=threads)
         interpreter.allocate_tensors()
     except (ValueError, RuntimeError, TypeError, LookupError, AttributeError, struct.error) as error:
-        raise FileError(f"not a network that LiteRT runs ({error})", file=path, remedy=_REMEDY) from error
+        raise FileError(f"not a network that LiteRT runs ({error})", file=path, remedy=remedy) from error
     return interpreter
 
 
