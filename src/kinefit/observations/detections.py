@@ -22,6 +22,16 @@ MEDIAPIPE_33 = (
 )  # fmt: skip
 """Names of the landmarks of MediaPipe's pose network, in its order; kinefit's own detector gives the same."""
 
+_FINGERS = ("index", "middle", "ring", "pinky")
+MEDIAPIPE_HAND_21 = (
+    "hand_wrist", "thumb_cmc", "thumb_mcp", "thumb_ip", "thumb_tip",
+    *(f"{finger}_{joint}" for finger in _FINGERS for joint in ("mcp", "pip", "dip", "tip")),
+)  # fmt: skip
+"""Names of the landmarks of MediaPipe's hand network, in its order, without the side (`left_`, `right_`)."""
+
+MEDIAPIPE_75 = (*MEDIAPIPE_33, *(f"{side}_{name}" for side in ("left", "right") for name in MEDIAPIPE_HAND_21))
+"""Names of the landmarks of a person with both hands: of the pose network, then of the left and the right hand."""
+
 
 @dataclass(frozen=True, eq=False)
 class Detections:
