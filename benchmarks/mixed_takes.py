@@ -127,6 +127,12 @@ def _with_skin_of(anny: Body, off: NDArray) -> Body:
     return replace(body, skin=replace(skin, nodes=skin.nodes + shift[:, None]), stature=anny.stature)
 
 
+def name_of(draw: int) -> str:
+    """Of the motion of a draw."""
+    names = (EXERCISE, *(n for n, entry in MOTIONS.items() if data(entry[0]) is not None))
+    return names[draw % len(names)]
+
+
 def moved(name: str, body: Body, frames: int, random: np.random.Generator) -> Motion:
     """Some frames of a motion done by a body, world y up."""
     if name == EXERCISE:
@@ -155,13 +161,12 @@ def record(draw: int, frames: int = round(RATE * SECONDS), *, depth: bool = True
     Without depth images, which take nearly all of the time, where no take has any.
     """
     random = np.random.default_rng([13, draw])
-    names = (EXERCISE, *(n for n, entry in MOTIONS.items() if data(entry[0]) is not None))
-    truth = moved(names[draw % len(names)], person(random), frames, random)
+    truth = moved(name_of(draw), person(random), frames, random)
     assert truth.body.skin is not None
     rig = studio_rig(truth)
     front = in_front(truth, SENSOR.camera(), azimuth=float(random.uniform(-0.6, 0.6)), near=SENSOR.near, far=SENSOR.far)
     both = Rig((*rig, front))
-    told = Rig(tuple(camera.with_pose(_error(random) @ camera.T_camera_world) for camera in both))
+    told = Rig(tuple(camera.with_pose(camera_error(random) @ camera.T_camera_world) for camera in both))
     bare = SimulatedScene(truth, truth.body.skin)  # type: ignore[arg-type]
     masks = np.array([[_mask(bare, i, camera, random) for i in range(len(truth))] for camera in rig])
     if not depth:
@@ -232,9 +237,9 @@ def take_text(folder: Path, parts: Sequence[str]) -> str:
     return text
 
 
-def _error(random: np.random.Generator) -> NDArray:
-    """(4, 4) a small error of a camera's pose."""
-    turn, shift = CALIBRATION
+def camera_error(random: np.random.Generator, times: float = 1.0) -> NDArray:
+    """(4, 4) a small error of a camera's pose, so many times as large as calibrations usually have."""
+    turn, shift = times * np.array(CALIBRATION)
     return se3.transform(se3.exp_so3(random.normal(0.0, turn, 3)), random.normal(0.0, shift, 3))
 
 

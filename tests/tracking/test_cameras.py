@@ -82,8 +82,8 @@ def test_a_camera_turned_about_any_axis_is_moved_back_and_named():
     seen = simulate_keypoints(motion, rig, noise_px=1.0, drift_px=0.5, outliers=0.05, missing=0.05)
     told = {name: track(Recording.of_keypoints(r, seen), motion.body) for name, r in (("right", rig), ("wrong", wrong))}
     assert "cameras" not in told["right"].provenance
-    assert list(told["wrong"].provenance["cameras"]) == ["cam02"]
-    assert sentences(told["wrong"].provenance, TrackSettings().camera_std)[0].startswith("camera cam02 was found")
+    (named,) = sentences(told["wrong"].provenance, TrackSettings().camera_std)
+    assert named.startswith("camera cam02 was found")
     found = as_found(wrong, told["wrong"].provenance)["cam02"].T_camera_world
     left = se3.log(found @ se3.inverse(rig["cam02"].T_camera_world))
     assert np.degrees(np.linalg.norm(left[3:])) < 1.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -46,7 +46,7 @@ def fit_subject(
     height: float | None = None,
     trial: Subject | None = None,
     cameras: tuple[float, float] | None = None,
-    far_off: Collection[str] = (),
+    moved: CameraExtrinsics | None = None,
     view_bias: bool = False,
     progress: Progress | None = None,
 ) -> Subject:
@@ -60,7 +60,7 @@ def fit_subject(
     trial : what another trial of the same person gave: lengths start from there, and stay as near as it was sure.
     cameras : (2,) standard deviations of the cameras' positions [m] and directions [rad], which are then found along;
         default: the calibration is exact.
-    far_off : cameras that were moved from far off, whose directions are known to a degree alone.
+    moved : what an earlier fit found of these cameras, which stand now where it found them.
     view_bias : whether the detectors' bias by direction of view is found along, of points that three cameras show.
 
     Raises
@@ -97,7 +97,7 @@ def fit_subject(
         known = trial.covariance[: len(scales), : len(scales)]
         lengths = KnownLengths(body, scales=trial.scales, covariance=known)
     found, covariance, bias = _fitted(
-        body, channels, steps, list(states.values()), lengths, scales, cameras, far_off, view_bias
+        body, channels, steps, list(states.values()), lengths, scales, cameras, moved, view_bias
     )  # fmt: skip
     if progress:
         progress("bone lengths", len(chosen) + 1, len(chosen) + 1)
@@ -109,7 +109,7 @@ def fit_subject(
 def _fitted(
     body: Body, channels: Channels, steps: Sequence[Sequence[KeypointMeasurement]], states: Sequence[BodyState],
     lengths: SegmentScales, scales: NDArray, std: tuple[float, float] | None,
-    far_off: Collection[str], by_view: bool,
+    known: CameraExtrinsics | None, by_view: bool,
 ) -> tuple[SubjectFit, NDArray, ViewBias]:  # fmt: skip
     """Lengths, points, gear and cameras, with as much freedom for points as this take asks for; and their covariance.
 
@@ -124,7 +124,7 @@ def _fitted(
     bare = body if body.morphs else replace(body, surfaces=(), skin=None)  # surfaces would be stretched for nothing
     used = tuple(channels.rig.names[c] for c in np.unique(channels.camera))
     if std is not None:
-        cameras = CameraExtrinsics(channels.rig, None, std, used).freed(far_off)
+        cameras = replace(known or CameraExtrinsics(channels.rig, None, std, used), rig=channels.rig)
     for k in range(_ROUNDS):
         parameters: list[Parameters] = [lengths, *(PointOffsets(body, name, spread) for name in channels.sets if name)]
         before = sum(len(one.names) for one in parameters)
@@ -134,7 +134,8 @@ def _fitted(
         if cameras is not None:
             parameters.append(cameras.tighter(excess_of**-0.5))
         if start is None:
-            start = np.concatenate([np.log(scales), *(one.mean for one in parameters[1:])])
+            of_points = [one.mean for one in parameters[1:] if not isinstance(one, CameraExtrinsics)]
+            start = np.concatenate([np.log(scales), *of_points, np.zeros(0 if cameras is None else len(cameras.names))])
         elif of_body > before:
             start = np.concatenate([start[:before], gear.start(states), start[before:]])
         found = joint.fit_subject(
@@ -152,10 +153,15 @@ def _fitted(
         open_to[of_body:] = False
         spread = place_spread(moved[open_to], np.diag(covariance)[open_to], spread, _SHIFT)
         if cameras is not None:
-            cameras = cameras.with_errors_of(moved[of_body:], np.diag(covariance)[of_body:]).freed(far_off)
+            measured, own = found.information / excess_of, slice(of_body, len(moved))
+            cameras = cameras.with_errors_of(own, moved, measured, found.prior.information / excess_of)
+            prior[own, own] = cameras.information
+            covariance = inverse(prior + measured)
         excess_of = max(excess_of, 1.0)
     prior_world = World(body, channels.rig)
     found = replace(found, body=Worlds(prior_world, parameters).at(found.mean).body, prior_world=prior_world)
+    if cameras is not None:
+        found = replace(found, parameters=(*parameters[:-1], cameras))
     wider = np.sqrt(np.where(np.arange(len(covariance)) < of_body, _UNTOLD, 1.0))
     return found, wider[:, None] * covariance * wider, bias
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,12 +17,14 @@ from kinefit.sensors.base import Sensor, Unknown
 from kinefit.sensors.checks import of_kind
 from kinefit.sensors.displaced import AXES, CLOCK
 from kinefit.solvers import _kernels_border
+from kinefit.solvers.equations import inverse
 from kinefit.subject.parameters import World, place_spread
 
 FAR_OFF = 3.0
 """Standard deviations of its calibration: one of 24 numbers is so far off in 6 % of takes."""
 
-_FREED = 10.0  # standard deviations of its calibration: 30 mm and 1 degree, of what is left of a camera that was moved
+_WRONG = 2.0  # times its calibration's standard deviations, found of a camera, from which on it is moved
+_ROUNDS = 30  # of spreads and moves in turn; the slowest change by less than a hundredth from then on
 _STEP = 1e-4  # [m, rad] from which derivatives are taken
 
 
@@ -35,11 +37,12 @@ class CameraExtrinsics:
 
     Parameters
     ----------
-    rig : Rig, the prior mean.
+    rig : Rig, from which twists count.
     held : name of the camera that stays; None where other sensors hold the world.
     std : (2,) standard deviations of v [m] and ω [rad].
     cameras : names of those that move, besides the one that is held; default: all.
     factors : (C,) of each camera that moves, on its standard deviations; default 1, see `with_errors_of`.
+    calibrated : Rig, the prior mean; default: `rig`.
     """
 
     rig: Rig
@@ -47,6 +50,7 @@ class CameraExtrinsics:
     std: tuple[float, float] = (0.02, 0.01)
     cameras: tuple[str, ...] | None = None
     factors: NDArray | None = None
+    calibrated: Rig | None = None
 
     def __post_init__(self) -> None:
         for name in (*(self.cameras or ()), *(() if self.held is None else (self.held,))):
@@ -67,8 +71,8 @@ class CameraExtrinsics:
 
     @property
     def mean(self) -> NDArray:
-        """(6 C,) zero."""
-        return np.zeros(len(self.names))
+        """(6 C,) with which the cameras stand as their calibration has them."""
+        return np.zeros(len(self.names)) if self.calibrated is None else self.values_of(self.calibrated)
 
     @property
     def information(self) -> NDArray:
@@ -88,43 +92,41 @@ class CameraExtrinsics:
         """The same, held with so large a share of the standard deviations."""
         return replace(self, factors=share * self._times)
 
-    def freed(self, far: Collection[str]) -> CameraExtrinsics:
-        """The same, with those that are known to be far off held ten times as loosely as is stated."""
-        return replace(self, factors=np.where(np.isin(self.free, list(far)), _FREED, self._times))
-
-    def with_errors_of(self, moved: NDArray, variance: NDArray) -> CameraExtrinsics:
+    def with_errors_of(self, own: slice, moved: NDArray, information: NDArray, prior: NDArray) -> CameraExtrinsics:
         """The same cameras with standard deviations as large as a take shows that their errors are.
 
         A multiple of the stated ones is found for all cameras together, and one for each that is drawn towards it; a
-        camera that is off by far says nothing of the others. See `place_spread`.
+        camera that is off by far beside the others says nothing of these. See `place_spread`.
 
         Parameters
         ----------
-        moved, variance : (6 C,) found with the present standard deviations, and how certain that is
+        own : which of the p parameters of a fit are these cameras'
+        moved : (p,) found, from the prior means
+        information, prior : (p, p) of the sensors, and that with which it was found
         """
+        out, prior, pull = self, prior.copy(), (information + prior) @ moved
+        for _ in range(_ROUNDS):
+            prior[own, own] = out.information
+            covariance = inverse(prior + information)
+            out = out._with_spreads_of((covariance @ pull)[own], np.diag(covariance)[own])
+        return out
+
+    def _with_spreads_of(self, moved: NDArray, variance: NDArray) -> CameraExtrinsics:
+        """One round of it: from where cameras (6 C,) were found with the present standard deviations."""
         stated = np.repeat(self.std, 3)
         of = np.stack([moved.reshape(-1, 6) / stated, variance.reshape(-1, 6) / stated**2, self.spreads / stated])
 
         def spread(which: Any, believed: float) -> float:
             return place_spread(of[0, which], of[1, which], of[2, which], believed)
 
-        alike = [spread(c, 1.0) <= FAR_OFF for c in range(of.shape[1])]
-        common = spread(alike, 1.0)
+        each = np.array([spread(c, 1.0) for c in range(of.shape[1])])
+        common = spread(each <= FAR_OFF * max(float(np.median(each)), 1.0), 1.0)
         return replace(self, factors=np.array([spread(c, common) for c in range(of.shape[1])]))
 
-    def far_off(self, moved: NDArray, variance: NDArray, known: Collection[str] = ()) -> dict[str, NDArray]:
-        """{camera: (6,)} twist of the one that is surely farther off than calibrations are; the rest of `known` ones.
-
-        A camera that is far off pulls others along, so they are found one after the other. Two cameras do not tell
-        which of them it is.
-        """
-        moved, stated = moved.reshape(-1, 6), np.repeat(self.std, 3)
-        beyond = np.max((np.abs(moved) - FAR_OFF * stated) / np.sqrt(variance.reshape(-1, 6)), axis=1)
-        before = np.isin(self.free, list(known))
-        beyond[before] = -np.inf
-        far = (beyond > 1.0) & (beyond == beyond.max()) & (len(before) > 2)
-        far |= before & np.any(np.abs(moved) > stated, axis=1)
-        return {name: twist for name, twist, is_far in zip(self.free, moved, far) if is_far}
+    @property
+    def wrong(self) -> bool:
+        """Whether a camera is farther off than its calibration says; two cameras do not tell which of them it is."""
+        return len(self.free) > 2 and float(self._times.max()) > _WRONG
 
     @property
     def step(self) -> NDArray:

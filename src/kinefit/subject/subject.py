@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -138,12 +138,14 @@ class Subject:
         """A body that is the person's already."""
         return cls(body, np.ones(len(body.scale_groups)))
 
-    def cameras_far_off(self, known: Collection[str]) -> dict[str, NDArray]:
-        """{camera: (6,) [m, rad] twist} of cameras farther off than they may be; of `known` ones what is left."""
-        if self.fit is None or self.covariance is None or self.fit.cameras is None:
+    @property
+    def camera_errors(self) -> dict[str, NDArray]:
+        """{camera: (6,) [m, rad] twist} to where cameras were found that their calibration has wrongly; else none."""
+        cameras = None if self.fit is None else self.fit.cameras
+        if self.fit is None or cameras is None or not cameras.wrong:
             return {}
-        own = -len(self.fit.cameras.names)
-        return self.fit.cameras.far_off(self.fit.mean[own:], np.diag(self.covariance)[own:], known)
+        twists = self.fit.mean[-len(cameras.names) :].reshape(-1, 6)
+        return dict(zip(cameras.free, twists)) if np.any(np.abs(twists) > np.repeat(cameras.std, 3)) else {}
 
     @property
     def length_std(self) -> dict[str, float]:

@@ -28,7 +28,7 @@ from kinefit.subject.gear import Gear
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.metaballs import ROUNDS, MetaballShape
 from kinefit.subject.parameters import SegmentScales
-from kinefit.subject.sensor_parameters import moved_rig
+from kinefit.subject.sensor_parameters import CameraExtrinsics, moved_rig
 from kinefit.subject.subject import Progress, Subject, SubjectFit
 from kinefit.tracking.cameras import CAMERAS, LEFT_OUT, between, composed
 from kinefit.tracking.placing import placed_cameras
@@ -44,7 +44,7 @@ _POSES = 8  # and how many of them it is found from: twice as many change no hal
 _MANY = 16  # of markers alone, whose places are found by how they move; a frame of them costs little
 _MATCHES = 3  # rounds of matching and solving
 _PLACES = 2  # fits with a better spread of the markers' places; it changes by less than a tenth from then on
-_MOVES = 3  # times that cameras are moved that a subject fit has found far off
+_MOVES = 3  # times that cameras are moved to where a subject fit has found them
 _SEEN = 0.5  # quality of a frame that the shape may be found from
 
 _MIN_UPRIGHT = 0.65  # mean score of starts of people who stand as the take says: 0.7 and more of drawn ones
@@ -121,16 +121,18 @@ def fitted_to_person(
         person = _wearing(person, subject)
         return _by_all(person, body, settings, progress, size=False) if unknown else person
     if cameras >= 2:
-        moved: dict[str, NDArray] = {}
+        moved: CameraExtrinsics | None = None
         for last in (False,) * _MOVES + (True,):
             by_keypoints = fit_subject(
                 body, channels_of(person.recording, body, settings), frames=frames or 25, height=height, trial=trial,
-                cameras=settings.camera_std, far_off=tuple(moved), view_bias=settings.view_bias and not others,
+                cameras=settings.camera_std, moved=moved, view_bias=settings.view_bias and not others,
                 progress=progress,
             )  # fmt: skip
-            if last or not (far := by_keypoints.cameras_far_off(moved)):
+            if last or not (errors := by_keypoints.camera_errors):
                 break
-            person, moved = _with_cameras(person, moved_rig(person.recording.rig, far)), moved | far
+            assert by_keypoints.fit is not None and by_keypoints.fit.cameras is not None
+            moved = replace(by_keypoints.fit.cameras, calibrated=recording.rig)
+            person = _with_cameras(person, moved_rig(person.recording.rig, errors))
         person = _with_depth_cameras(_wearing(person, by_keypoints, **_gear_of(body, by_keypoints)), settings)
     elif recording.markers and recording.markers[0].marker_set:
         person, found = _by_markers(person, height, progress)
@@ -150,7 +152,7 @@ def _with_cameras(person: SizedPerson, rig: Rig) -> SizedPerson:
     """With cameras where they belong in place of where their calibration has them."""
     recording = replace(person.recording, rig=rig)
     told = {**person.told, CAMERAS: composed(person.told.get(CAMERAS, {}), between(person.recording.rig, rig))}
-    return replace(person, recording=recording, calibrated=rig, told=told)
+    return replace(person, recording=recording, told=told)
 
 
 def _with_depth_cameras(person: SizedPerson, settings: TrackSettings) -> SizedPerson:

@@ -47,6 +47,7 @@ class Unknowns:
         stated : with the spreads that are stated
         """
         parameters, first, variance = list(self.parameters), 0, np.diag(found.covariance)
+        moved = found.mean - found.prior.mean
         for k, (one, before) in enumerate(zip(self.parameters, stated.parameters)):
             own = slice(first, first := first + len(one.names))
             if isinstance(one, PointOffsets) and isinstance(before, PointOffsets) and one.name in one.body.marker_sets:
@@ -55,7 +56,7 @@ class Unknowns:
                 wider = place_spread(found.mean[own] / std, variance[own] / std**2, ratio, 1.0)
                 parameters[k] = replace(one, std=wider * np.asarray(before.std))
             elif isinstance(one, CameraExtrinsics):
-                parameters[k] = one.with_errors_of(found.mean[own], variance[own])
+                parameters[k] = one.with_errors_of(own, moved, found.information, found.prior.information)
         return replace(self, parameters=tuple(parameters), start=found.mean)
 
 
@@ -94,12 +95,12 @@ def of_points(
         offsets = PointOffsets(generic, name, stds[name])
         found.append((offsets, offsets.values_of(worn[name].points - scaled.markers(name).points)))
     used = tuple(dict.fromkeys(k.camera for k in recording.keypoints))
-    rig = recording.rig
     if cameras is not None and used:
-        poses = CameraExtrinsics(calibrated or rig, None, cameras, used)
-        found.append((poses, poses.values_of(rig)))
-        rig = poses.rig
-    return _together(World(generic, rig), found)
+        before = None if subject.fit is None else subject.fit.cameras
+        factors = before.factors if before is not None and before.free == used else None
+        poses = CameraExtrinsics(recording.rig, None, cameras, used, factors, calibrated)
+        found.append((poses, np.zeros(len(poses.names))))
+    return _together(World(generic, recording.rig), found)
 
 
 def _of(values: NDArray, whole: PointSet, part: PointSet) -> NDArray:
