@@ -112,7 +112,8 @@ def people_of(take: Take, out: Path, step: Step, tell: Tell) -> tuple[InView | N
     people = len(view.people) if view else 0
     if people < 2:
         return view, [(take, out)]
-    numbers = range(1, people + 1)
+    assert view is not None
+    numbers = [k for k, one in enumerate(view.people, start=1) if one.image_of is None]
     return view, [(replace(take, person=k, name=f"{take.name}-person-{k}"), out / f"person-{k}") for k in numbers]
 
 

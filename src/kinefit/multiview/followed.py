@@ -11,6 +11,7 @@ import numpy as np
 from kinefit.errors import TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.multiview.likeness import Pictures
+from kinefit.multiview.mirrors import with_images
 from kinefit.multiview.one_camera import lifted_alone, people_before
 from kinefit.multiview.people import PersonTrack, may_be_several, people_of
 from kinefit.observations import Keypoints
@@ -51,7 +52,7 @@ class PersonKeypoints:
                     "left_s": round(r.left / self.rate, 2), "came_s": round(r.came / self.rate, 2),
                     "odds": round(r.odds, 1), "by": list(r.by),
                 } for r in one.returns],
-                "maybe": [k + 1 for k in one.maybe],
+                "maybe": [k + 1 for k in one.maybe], "image_of": None if one.image_of is None else one.image_of + 1,
             } for one in self.people],
         }}  # fmt: skip
 
@@ -80,9 +81,12 @@ def follow(
     PersonChoice.of(person)
     if people is None:
         lifted = lifted_alone(keypoints)
-        people = () if not may_be_several(keypoints) else (
-            people_of(rig, keypoints, pictures) if lifted is None else people_before(rig, keypoints, lifted)
-        )
+        if not may_be_several(keypoints):
+            people = ()
+        elif lifted is not None:
+            people = people_before(rig, keypoints, lifted)
+        else:
+            people = with_images(rig, keypoints, people_of(rig, keypoints, pictures))
     people = tuple(people)
     number = choose(people, person)
     if len(people) < 2:
@@ -128,4 +132,6 @@ def sentences(provenance: Mapping[str, Any], *, asked: bool) -> list[str]:
         if one.get("maybe"):
             others = " or ".join(map(str, one["maybe"]))
             said.append(f"person {k} may be person {others}, who left before: what was seen leaves it open")
+        if one.get("image_of"):
+            said.append(f"person {k} is person {one['image_of']} in a mirror")
     return said

@@ -49,6 +49,7 @@ class PersonTrack:
     place : (3,) [m] median place of the body's middle
     returns : when the person was away, and how sure it is that it is the same
     maybe : numbers, in a list of people from 0, of others who left before this one came and may be the same
+    image_of : number, likewise, of who shows here in a mirror
     """
 
     chosen: tuple[NDArray, ...]
@@ -59,6 +60,7 @@ class PersonTrack:
     place: NDArray
     returns: tuple[Return, ...] = ()
     maybe: tuple[int, ...] = ()
+    image_of: int | None = None
 
 
 def views_needed(cameras: int) -> int:
