@@ -17,7 +17,7 @@ from kinefit.bodies.morphs.morph_files import morphs_of, with_images
 from kinefit.bodies.surfaces.files import surfaces_of
 from kinefit.bodies.surfaces.skins.skin_files import skin_of
 from kinefit.bodies.toml.closures import closed, with_closure_images
-from kinefit.bodies.toml.couplings import coupled, with_posture
+from kinefit.bodies.toml.couplings import coupled, with_coupling_images, with_posture
 from kinefit.bodies.toml.records import (
     FileRecord,
     JointRecord,
@@ -95,7 +95,8 @@ def parse_body(text: str, source: str = "body") -> Body:
     index = {s.name: i for i, s in enumerate(segments)}
     landmarks = _points(points, index, source)
     usual = {**({_left(n): v for n, v in record.usual.items()} if mirror else {}), **record.usual}
-    tree = with_posture(coupled(_tree(segments, index, source), record.coupling, source), usual, source)
+    couplings = with_coupling_images(record.coupling, _left) if mirror else record.coupling
+    tree = with_posture(coupled(_tree(segments, index, source), couplings, source), usual, source)
     body = Body(
         name=record.body.name,
         tree=tree,
