@@ -6,7 +6,7 @@ import pytest
 from kinefit.bodies import BodyState, catalogue, load_body
 from kinefit.bodies.surfaces import Metaballs
 from kinefit.geometry import se3
-from kinefit.readers.keypoints import keypoint_names
+from kinefit.readers.keypoint_sets import keypoint_names
 
 
 @pytest.fixture(params=catalogue())

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from kinefit.errors import FileError, ObservationError
 from kinefit.geometry.camera import ImageFrame
+from kinefit.readers.keypoint_sets import KEYPOINT_SETS, keypoint_names
 from kinefit.readers.keypoints import (
-    KEYPOINT_SETS,
-    keypoint_names,
     read_caliscope_csv,
     read_keypoints,
     read_mediapipe,
@@ -36,7 +35,10 @@ def read(folder, **options):
 
 def test_sets_have_the_detectors_sizes_and_unique_names():
     sizes = {name: len(names) for name, names in KEYPOINT_SETS.items()}
-    assert sizes == {"BODY_25B": 25, "BODY_25": 25, "COCO_17": 17, "HALPE_26": 26, "MEDIAPIPE_33": 33}
+    assert sizes == {
+        "BODY_25B": 25, "BODY_25": 25, "COCO_17": 17, "HALPE_26": 26, "MEDIAPIPE_33": 33,
+        "BODY_25_HANDS": 67, "COCO_WHOLEBODY_133": 133, "MEDIAPIPE_75": 75,
+    }
     assert all(len(set(names)) == len(names) for names in KEYPOINT_SETS.values())
     assert KEYPOINT_SETS["MEDIAPIPE_33"][23:26] == ("left_hip", "right_hip", "left_knee")
     assert KEYPOINT_SETS["MEDIAPIPE_33"][9:13] == ("mouth_left", "mouth_right", "left_shoulder", "right_shoulder")

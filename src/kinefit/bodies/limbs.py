@@ -6,7 +6,6 @@ import numpy as np
 
 from kinefit.bodies.body import Body
 
-
 _MAX_BRANCHES = 4  # of a trunk; what forks into more is a hand
 
 

@@ -14,7 +14,7 @@ from kinefit.geometry.camera import Camera, ImageFrame, Rig
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.guess.folder import guess_take
 from kinefit.readers.guess.names import trials
-from kinefit.readers.keypoints import KEYPOINT_SETS
+from kinefit.readers.keypoint_sets import KEYPOINT_SETS
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
@@ -336,7 +336,7 @@ def test_keypoints_of_which_none_can_be_used(folder, motion, rig):
     write_mediapipe(folder, motion, rig, [f"{name}.npy" for name in rig.names])
     take = read_guess(folder)
     assert {k.format for k in take.keypoints} == {"mediapipe"}
-    assert "18 points; there are sets of 17, 25, 26, 33" in notes(guess_take(folder))
+    assert "18 points; there are sets of 17, 25, 26, 33, 67, 75, 133" in notes(guess_take(folder))
 
 
 def test_keypoints_of_another_recording_are_left_out(folder, motion, rig):

@@ -24,6 +24,7 @@ from kinefit.bodies.toml.records import (
     MarkerSetRecord,
     SegmentRecord,
     Vector,
+    extended,
     merged,
     stature_of,
 )
@@ -94,6 +95,7 @@ def parse_body(text: str, source: str = "body") -> Body:
     groups = tuple(dict.fromkeys(s.scale or s.name for s in segments))
     index = {s.name: i for i, s in enumerate(segments)}
     landmarks = _points(points, index, source)
+    sets = extended(record.keypoints)
     usual = {**({_left(n): v for n, v in record.usual.items()} if mirror else {}), **record.usual}
     couplings = with_coupling_images(record.coupling, _left) if mirror else record.coupling
     tree = with_posture(coupled(_tree(segments, index, source), couplings, source), usual, source)
@@ -104,7 +106,7 @@ def parse_body(text: str, source: str = "body") -> Body:
         scale_groups=groups,
         segment_scale=np.array([groups.index(s.scale or s.name) for s in segments]),
         landmarks=landmarks,
-        keypoint_sets={n: _renamed(s, landmarks, f"keypoints.{n}", source) for n, s in record.keypoints.items()},
+        keypoint_sets={n: _renamed(s, landmarks, f"keypoints.{n}", source) for n, s in sets.items()},
         marker_sets={n: _markers(s, landmarks, index, f"markers.{n}", source) for n, s in record.markers.items()},
         surfaces=tuple(
             surface for s in segments
