@@ -126,7 +126,10 @@ def _fitted(
     if std is not None:
         cameras = CameraExtrinsics(channels.rig, None, std, used).freed(far_off)
     for k in range(_ROUNDS):
-        parameters: list[Parameters] = [lengths, *(PointOffsets(body, name, spread) for name in channels.sets if name)]
+        sets = [name for name in channels.sets if name]
+        shares = [body.offset_shares[body.keypoints(name).segments] for name in sets]
+        offsets = [PointOffsets(body, name, spread * own) for name, own in zip(sets, shares)]
+        parameters: list[Parameters] = [lengths, *offsets]
         before = sum(len(one.names) for one in parameters)
         if k and gear.names:  # which poses of the first round have brought into place
             parameters.append(gear)
@@ -148,9 +151,12 @@ def _fitted(
             steps = _by_detector(channels, found, steps)
         excess_of = _excess(found, steps)
         covariance = inverse(prior + found.information / excess_of)
-        moved, open_to = found.mean - found.prior.mean, np.isclose(np.diag(prior), spread**-2)
-        open_to[of_body:] = False
-        spread = place_spread(moved[open_to], np.diag(covariance)[open_to], spread, _SHIFT)
+        moved, share = found.mean - found.prior.mean, np.full(len(prior), np.nan)
+        of_points = [one.values_of(own[:, None].repeat(3, axis=1)) for one, own in zip(offsets, shares)]
+        share[len(lengths.names) : before] = np.concatenate(of_points)
+        open_to = np.isclose(np.diag(prior) * share**2, spread**-2)
+        share, variance = share[open_to], np.diag(covariance)[open_to]
+        spread = place_spread(moved[open_to] / share, variance / share**2, spread, _SHIFT)
         if cameras is not None:
             cameras = cameras.with_errors_of(moved[of_body:], np.diag(covariance)[of_body:]).freed(far_off)
         excess_of = max(excess_of, 1.0)
