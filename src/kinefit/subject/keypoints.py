@@ -116,19 +116,20 @@ def _fitted(
     And the detectors' bias by view, which the first round tells and the others do without.
 
     How far points stand from where the body has them is found from the take (`place_spread`), beginning with one
-    centimetre. What a detector errs by lasts, and would move cameras: their calibration counts for more by the excess
-    of the round before.
+    centimetre; on short segments (fingers) apart. What a detector errs by lasts, and would move cameras: their
+    calibration counts for more by the excess of the round before.
     """
-    spread, excess_of, start, gear, bias = _SHIFT, 1.0, None, Gear(body), ViewBias()
+    spread, excess_of, start, gear, bias = np.full(2, _SHIFT), 1.0, None, Gear(body), ViewBias()
+    sets = [name for name in channels.sets if name]
+    shares = [body.offset_shares[body.keypoints(name).segments] for name in sets]
     cameras: CameraExtrinsics | None = None
     bare = body if body.morphs else replace(body, surfaces=(), skin=None)  # surfaces would be stretched for nothing
     used = tuple(channels.rig.names[c] for c in np.unique(channels.camera))
     if std is not None:
         cameras = CameraExtrinsics(channels.rig, None, std, used).freed(far_off)
     for k in range(_ROUNDS):
-        sets = [name for name in channels.sets if name]
-        shares = [body.offset_shares[body.keypoints(name).segments] for name in sets]
-        offsets = [PointOffsets(body, name, spread * own) for name, own in zip(sets, shares)]
+        std = [spread[(own < 1.0).astype(int)] * own for own in shares]
+        offsets = [PointOffsets(body, name, own) for name, own in zip(sets, std)]
         parameters: list[Parameters] = [lengths, *offsets]
         before = sum(len(one.names) for one in parameters)
         if k and gear.names:  # which poses of the first round have brought into place
@@ -154,9 +155,10 @@ def _fitted(
         moved, share = found.mean - found.prior.mean, np.full(len(prior), np.nan)
         of_points = [one.values_of(own[:, None].repeat(3, axis=1)) for one, own in zip(offsets, shares)]
         share[len(lengths.names) : before] = np.concatenate(of_points)
-        open_to = np.isclose(np.diag(prior) * share**2, spread**-2)
-        share, variance = share[open_to], np.diag(covariance)[open_to]
-        spread = place_spread(moved[open_to] / share, variance / share**2, spread, _SHIFT)
+        for short, of in enumerate((share == 1.0, share < 1.0)):
+            open_to = np.flatnonzero(of & np.isclose(np.diag(prior) * share**2, spread[short] ** -2))
+            apart, variance = moved[open_to] / share[open_to], np.diag(covariance)[open_to] / share[open_to] ** 2
+            spread[short] = place_spread(apart, variance, spread[short], _SHIFT)
         if cameras is not None:
             cameras = cameras.with_errors_of(moved[of_body:], np.diag(covariance)[of_body:]).freed(far_off)
         excess_of = max(excess_of, 1.0)
