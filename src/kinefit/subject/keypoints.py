@@ -30,7 +30,7 @@ from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.subject.subject import Progress, Subject, SubjectFit
 from kinefit.subject.view_bias import SeenFrames, learn_view_bias
 
-_SHIFT = 0.01  # [m] how far a detector's points stand from the anatomical ones, before a take is seen
+_SHIFT = 0.01, 0.005  # [m] how far detectors' points are off on long and on short segments, before a take is seen
 _POSTURE = 0.1  # share of the posture prior: frames of a take are a few independent postures at the most
 _UNTOLD = 1.6  # variance of shapes found, over what they state: limits, weights and priors are taken for known there.
 # Measured on twenty known people with BODY_25B (`benchmarks.error_bars`); MEDIAPIPE_33 is the check.
@@ -115,11 +115,11 @@ def _fitted(
 
     And the detectors' bias by view, which the first round tells and the others do without.
 
-    How far points stand from where the body has them is found from the take (`place_spread`), beginning with one
-    centimetre; on short segments (fingers) apart. What a detector errs by lasts, and would move cameras: their
+    How far points stand from where the body has them is found from the take (`place_spread`), beginning with
+    `_SHIFT`; on short segments (fingers) apart. What a detector errs by lasts, and would move cameras: their
     calibration counts for more by the excess of the round before.
     """
-    spread, excess_of, start, gear, bias = np.full(2, _SHIFT), 1.0, None, Gear(body), ViewBias()
+    spread, excess_of, start, gear, bias = np.array(_SHIFT), 1.0, None, Gear(body), ViewBias()
     sets = [name for name in channels.sets if name]
     shares = [body.offset_shares[body.keypoints(name).segments] for name in sets]
     cameras: CameraExtrinsics | None = None
@@ -158,7 +158,7 @@ def _fitted(
         for short, of in enumerate((share == 1.0, share < 1.0)):
             open_to = np.flatnonzero(of & np.isclose(np.diag(prior) * share**2, spread[short] ** -2))
             apart, variance = moved[open_to] / share[open_to], np.diag(covariance)[open_to] / share[open_to] ** 2
-            spread[short] = place_spread(apart, variance, spread[short], _SHIFT)
+            spread[short] = place_spread(apart, variance, spread[short], _SHIFT[short])
         if cameras is not None:
             cameras = cameras.with_errors_of(moved[of_body:], np.diag(covariance)[of_body:]).freed(far_off)
         excess_of = max(excess_of, 1.0)
