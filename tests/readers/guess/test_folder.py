@@ -245,7 +245,7 @@ def test_where_hands_are_seen_the_body_has_fingers(folder, motion, rig, body_set
                 person["hand_left_keypoints_2d"] = [40.0, 50.0, 0.7 * seen_hands] * 21
                 person["hand_right_keypoints_2d"] = [0.0] * 63
             path.write_text(json.dumps(frame))
-    take = read_guess(folder)
+    take, _, _ = taken(folder)
     assert {k.set for k in take.keypoints} == {"BODY_25_HANDS" if body_set == "BODY_25" else "BODY_25B"}
     assert take.body == ("humanoid_hands" if body_set == "BODY_25" and seen_hands else "humanoid")
 
