@@ -53,8 +53,8 @@ def run() -> None:
         _lengths(triangulated(rig, list(seen.values())))
         for name in amount(rig.names, rig.names[:1]):
             errors.append(_held_out(rig, seen, name))
-            fit, alone = (float(np.median(e)) if len(e) else float("nan") for e in errors[-1])
-            print(f"# {name} held out: {fit:.1f} px, triangulated {alone:.1f} px, {len(errors[-1][0])} points")
+            px = [float(np.median(e)) if len(e) else float("nan") for e in errors[-1]]
+            print(f"# {name} held out: {px[0]:.1f} px, triangulated {px[1]:.1f} px, {len(errors[-1][0])} points")
     fit, alone = (np.concatenate(e) for e in zip(*errors)) if errors else (np.full(1, np.nan), np.full(1, np.nan))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # no recording

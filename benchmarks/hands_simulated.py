@@ -196,7 +196,7 @@ def run() -> None:
 def _speed(rig: Rig, seen: list[Keypoints], name: str) -> float:
     """Frames a second of processor time, size of the person and smoothing included: the better of two."""
     recording, spent = Recording.of_keypoints(rig, seen, up="y"), []
-    for _ in range(2):
+    for _ in range(amount(2, 1)):
         began = time.process_time()
         track(recording, load_body(name))
         spent.append(time.process_time() - began)

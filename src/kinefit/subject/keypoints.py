@@ -128,8 +128,9 @@ def _fitted(
     if std is not None:
         cameras = CameraExtrinsics(channels.rig, None, std, used).freed(far_off)
     for k in range(_ROUNDS):
-        std = [spread[(own < 1.0).astype(int)] * own for own in shares]
-        offsets = [PointOffsets(body, name, own) for name, own in zip(sets, std)]
+        offsets = [
+            PointOffsets(body, name, spread[(own < 1.0).astype(int)] * own) for name, own in zip(sets, shares)
+        ]
         parameters: list[Parameters] = [lengths, *offsets]
         before = sum(len(one.names) for one in parameters)
         if k and gear.names:  # which poses of the first round have brought into place
