@@ -499,4 +499,8 @@ def test_recordings_of_caliscope(data_dir, tmp_path):
     assert {k.format for k in take.keypoints} == {"caliscope"} and take.up == "x" and take.body == "humanoid_hands"
     assert all(c.video is None for c in take.cameras)  # its videos are of the calibration
     seen = load_observations(take)
+    assert {k.keypoint_set for k in seen.keypoints} == {"MEDIAPIPE_75"}
+    (tmp_path / "c.toml").write_text(guess.text.replace('"caliscope"', '"caliscope"\nset = "MEDIAPIPE_33"'))
+    plain = load_observations(read_take(tmp_path / "c.toml"))
+    assert {(k.keypoint_set, len(k.names)) for k in plain.keypoints} == {("MEDIAPIPE_33", 33)}
     assert seen.frames == (0, 267) and [k.camera for k in seen.keypoints] == [f"cam_{k}" for k in range(4)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 from kinefit.errors import KinefitError, ObservationError
 from kinefit.geometry.camera import ImageFrame, Rig
@@ -77,9 +76,8 @@ def _read(file: KeypointFile, camera: str) -> Keypoints:
         record = read_keypoints(file.path, format=file.format, camera=camera, rate=1.0, keypoint_set=_SETS[file.points])
         if file.points in _EITHER:
             name = guess_views.guess_body_25(record)
-            names = KEYPOINT_SETS[name := OPENPOSE_HANDS if file.points > 25 and name == "BODY_25" else name]
-            points, confidence = record.points[:, :, : len(names)], record.confidence[:, :, : len(names)]
-            record = replace(record, keypoint_set=name, names=names, points=points, confidence=confidence)
+            name = OPENPOSE_HANDS if file.points > 25 and name == "BODY_25" else name
+            record = record.first_points(name, KEYPOINT_SETS[name])
     else:
         rate = None if file.format == "caliscope" else 1.0
         record = read_keypoints(file.path, format=file.format, camera=camera, rate=rate)
