@@ -89,6 +89,7 @@ def recordings(where: Path) -> Iterator[Inputs]:
     if landmarks is not None and not amount(False, True):
         text = f'[take]\nrate = 30.0\nup = "x"\n[calibration]\nfile = "{landmarks}/config.toml"\n' + "".join(
             f'[[camera]]\nname = "cam_{c}"\n[[keypoints]]\ncamera = "cam_{c}"\nformat = "caliscope"\n'
+            'set = "MEDIAPIPE_33"\n'
             f'file = "{landmarks}/HOLISTIC/xy_HOLISTIC.csv"\n' for c in range(4)
         )  # fmt: skip
         yield _read(where, "landmarks", text, shifted=2, turn=10.0, late=20)  # its second camera is the origin

@@ -23,7 +23,7 @@ from kinefit.bodies import load_body
 from kinefit.exporters.report.report import write_report
 from kinefit.motion import Motion
 from kinefit.readers.calibration.read import write_calibration
-from kinefit.readers.keypoints import KEYPOINT_SETS
+from kinefit.readers.keypoint_sets import KEYPOINT_SETS
 from kinefit.readers.motion import read_motion
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 

@@ -29,6 +29,7 @@ from kinefit import (
     track,
 )
 from kinefit.errors import AssetError, ObservationError
+from kinefit.observations import MEDIAPIPE_33
 from kinefit.preparing import detecting
 from kinefit.preparing.take import prepared
 from kinefit.readers.keypoints import read_caliscope_csv
@@ -123,7 +124,8 @@ def _takes(where: Path) -> dict[str, Seen]:
     if cropped is not None:
         rig = read_calibration(cropped / "config.toml")
         ports = read_caliscope_csv(cropped / "HOLISTIC" / "xy_HOLISTIC.csv", rate=24.0)
-        keypoints = [replace(one, camera=name) for name, one in zip(rig.names, ports.values(), strict=True)]
+        poses = [one.first_points("MEDIAPIPE_33", MEDIAPIPE_33) for one in ports.values()]
+        keypoints = [replace(one, camera=name) for name, one in zip(rig.names, poses, strict=True)]
         out["cropped"] = Seen(rig, persons(rig, keypoints))
     return out
 

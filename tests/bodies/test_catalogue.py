@@ -6,7 +6,9 @@ import pytest
 from kinefit.bodies import BodyState, catalogue, load_body
 from kinefit.bodies.surfaces import Metaballs
 from kinefit.geometry import se3
-from kinefit.readers.keypoints import keypoint_names
+from kinefit.readers.keypoint_sets import HAND_POINTS, keypoint_names
+
+FINGERS = ("thumb", "index", "middle", "ring", "little")
 
 
 @pytest.fixture(params=catalogue())
@@ -68,12 +70,23 @@ def test_keypoints_are_those_of_their_detectors(body):
     assert len(body.keypoints("COCO_17")) == (3 if body.name.startswith("arm") else 17)
 
 
+def test_sets_with_hands_are_known_to_every_body_and_their_hands_to_one_with_fingers(body):
+    for name, of in (("MEDIAPIPE_75", "MEDIAPIPE_33"), ("BODY_25_HANDS", "BODY_25"), ("COCO_WHOLEBODY_133", "COCO_17")):
+        if of not in body.keypoint_sets:
+            assert name not in body.keypoint_sets
+            continue
+        plain, more = set(body.keypoints(of).names), set(body.keypoints(name).names)
+        hands = set(keypoint_names(name)[-2 * HAND_POINTS :])
+        assert plain <= more and more & hands == (hands if body.name == "humanoid_hands" else set())
+
+
 def test_surfaces_end_at_the_next_joint_or_within_the_body(body):
     ends = body.segment_ends()
     for limb in body.surfaces:
         gear = body.gear_scale[body.segment_scale[limb.segment]]
         end = ends[limb.segment] if isinstance(limb, Metaballs) else limb.end
-        assert np.min(limb.radii) > 0 and (gear or 0.03 < np.linalg.norm(end) < 0.7)
+        shortest = 0.015 if body.tree.segments[limb.segment].startswith(FINGERS) else 0.03
+        assert np.min(limb.radii) > 0 and (gear or shortest < np.linalg.norm(end) < 0.7)
 
 
 def test_screws_agree_with_central_differences(body):

@@ -12,7 +12,7 @@ from kinefit.bodies import catalogue, load_body
 from kinefit.bodies.toml import records
 from kinefit.bodies.toml.bodies import JOINT_TYPES
 from kinefit.exporters import tables
-from kinefit.readers.keypoints import KEYPOINT_SETS
+from kinefit.readers.keypoint_sets import KEYPOINT_SETS
 from kinefit.readers.take import file as takes
 from kinefit.simulation import cut, squat_and_wave
 

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from kinefit.errors import FileError, ObservationError
 from kinefit.geometry.camera import ImageFrame
+from kinefit.readers.keypoint_sets import KEYPOINT_SETS, keypoint_names
 from kinefit.readers.keypoints import (
-    KEYPOINT_SETS,
-    keypoint_names,
     read_caliscope_csv,
     read_keypoints,
     read_mediapipe,
@@ -36,7 +35,10 @@ def read(folder, **options):
 
 def test_sets_have_the_detectors_sizes_and_unique_names():
     sizes = {name: len(names) for name, names in KEYPOINT_SETS.items()}
-    assert sizes == {"BODY_25B": 25, "BODY_25": 25, "COCO_17": 17, "HALPE_26": 26, "MEDIAPIPE_33": 33}
+    assert sizes == {
+        "BODY_25B": 25, "BODY_25": 25, "COCO_17": 17, "HALPE_26": 26, "MEDIAPIPE_33": 33,
+        "BODY_25_HANDS": 67, "COCO_WHOLEBODY_133": 133, "MEDIAPIPE_75": 75,
+    }
     assert all(len(set(names)) == len(names) for names in KEYPOINT_SETS.values())
     assert KEYPOINT_SETS["MEDIAPIPE_33"][23:26] == ("left_hip", "right_hip", "left_knee")
     assert KEYPOINT_SETS["MEDIAPIPE_33"][9:13] == ("mouth_left", "mouth_right", "left_shoulder", "right_shoulder")
@@ -205,7 +207,7 @@ def test_caliscope_table(data_dir, tmp_path):
     path = data_dir("mv4_landmarks_caliscope") / "HOLISTIC" / "xy_HOLISTIC.csv"
     cameras = read_caliscope_csv(path)
     assert list(cameras) == ["cam_0", "cam_1", "cam_2", "cam_3"]
-    assert all(k.points.shape == (267, 1, 33, 2) for k in cameras.values())
+    assert all(k.points.shape == (267, 1, 75, 2) and k.keypoint_set == "MEDIAPIPE_75" for k in cameras.values())
     assert cameras["cam_0"].rate == pytest.approx(30.4, abs=0.1)
     assert cameras["cam_0"].points[0, 0, 0].tolist() == [520, 193]
     (tmp_path / "x.csv").write_text("sync_index,port\n0,1\n")
@@ -213,10 +215,55 @@ def test_caliscope_table(data_dir, tmp_path):
         read_caliscope_csv(tmp_path / "x.csv")
     with pytest.raises(FileError, match="no such file"):
         read_caliscope_csv(tmp_path / "y.csv")
+    apart = np.concatenate([_of_wrists(k) for k in cameras.values()])
+    assert np.all(np.nanmedian(apart, axis=0)[[0, 1], [0, 1]] < 35)  # each hand at its own side's wrist
+    assert np.all(np.nanmedian(apart, axis=0)[[0, 1], [1, 0]] > 35)
+    rows = path.read_text().splitlines()
+    alone = [rows[0], *(row for row in rows[1:] if int(row.split(",")[4]) < 33)]
+    (tmp_path / "x.csv").write_text("\n".join(alone))
+    without = read_caliscope_csv(tmp_path / "x.csv")["cam_0"]
+    assert without.keypoint_set == "MEDIAPIPE_33"
+    np.testing.assert_array_equal(without.points, cameras["cam_0"].points[:, :, :33])
     text = path.read_text().splitlines()[:9]
     (tmp_path / "x.csv").write_text("\n".join([*text, "0,0,0,1.0,3,abc,5,,"]))
     with pytest.raises(ObservationError, match="not a number"):
         read_caliscope_csv(tmp_path / "x.csv")
+
+
+def _of_wrists(record):
+    """(F, 2, 2) [px] from the left and right hand's wrist to the pose's left and right wrist."""
+    at = record.points[:, 0, [record.names.index(n) for n in ("left_hand_wrist", "right_hand_wrist")]]
+    pose = record.points[:, 0, [record.names.index(n) for n in ("left_wrist", "right_wrist")]]
+    return np.linalg.norm(at[:, :, None] - pose[:, None], axis=-1)
+
+
+def test_openpose_with_hands(tmp_path):
+    left = [v for k in range(21) for v in (10.0 + k, 20.0, 0.8)]
+    body = {"pose_keypoints_2d": [5.0, 6.0, 0.9] * 25}
+    frames = {0: [body | {"hand_left_keypoints_2d": left, "hand_right_keypoints_2d": []}], 1: [body]}
+    seen = read(write(tmp_path / "cam", frames), keypoint_set="BODY_25_HANDS")
+    assert len(seen.names) == 67 and seen.names[25] == "LHandWrist" and seen.names[-1] == "RHandLittle4"
+    assert seen.points[0, 0, seen.names.index("LHandIndex1")].tolist() == [15.0, 20.0]
+    assert np.isnan(seen.points[0, 0, 46:]).all() and not seen.confidence[1, 0, 25:].any()
+    assert read(tmp_path / "cam", keypoint_set="BODY_25").points.shape[2] == 25  # without them, too
+    short = [body | {"hand_left_keypoints_2d": left[:-3]}]
+    with pytest.raises(ObservationError, match="198 numbers where BODY_25_HANDS has 67 x 3"):
+        read(write(tmp_path / "cut", {0: short}), keypoint_set="BODY_25_HANDS")
+
+
+def test_mediapipe_with_hands(tmp_path):
+    data = np.ones((4, 75, 3))
+    data[2, 54:] = np.nan  # a hand that is not seen
+    data[3, 33:54] = 0.0
+    np.save(tmp_path / "m.npy", data)
+    seen = read_mediapipe(tmp_path / "m.npy", camera="c", rate=30)
+    assert seen.keypoint_set == "MEDIAPIPE_75" and seen.names[33] == "left_hand_wrist"
+    assert np.isnan(seen.points[2, 0, 54:]).all() and np.isfinite(seen.points[2, 0, :54]).all()
+    assert not seen.confidence[3, 0, 33:54].any() and seen.confidence[3, 0, 54:].all()
+    data[1, 40, 0] = np.nan
+    np.save(tmp_path / "m.npy", data)
+    with pytest.raises(ObservationError, match="frame 1.*left_index_dip"):
+        read_mediapipe(tmp_path / "m.npy", camera="c", rate=30)
 
 
 def test_any_format(data_dir, tmp_path):

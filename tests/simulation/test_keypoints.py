@@ -7,7 +7,7 @@ import pytest
 
 from kinefit.errors import ExportError, ObservationError
 from kinefit.motion import UP_AXES
-from kinefit.readers.keypoints import KEYPOINT_SETS
+from kinefit.readers.keypoint_sets import KEYPOINT_SETS
 from kinefit.readers.motion import ARRAYS
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations

@@ -11,10 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kinefit import Motion, Recording, load_body, track
+from kinefit.bodies import PointSet
 from kinefit.bodies.charts import twin
 from kinefit.evaluation import angle_errors, joint_errors
 from kinefit.geometry import se3
-from kinefit.sensors.observability import levers, near
+from kinefit.sensors.observability import levers, moves_points, near
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.smoothing.foot_contacts import find_contacts, soles
@@ -102,6 +103,22 @@ def test_a_joint_is_told_of_only_by_points_away_from_its_axis():
     told = np.zeros((9, 1), bool)
     told[4] = True
     np.testing.assert_array_equal(near(told, 2)[:, 0], [0, 0, 1, 1, 1, 1, 1, 0, 0])
+
+
+def test_a_short_segment_needs_a_short_lever():
+    """A finger's tip, 18 mm from its joint, tells that joint's angle; the same lever on a forearm tells nothing."""
+    body = load_body("humanoid_hands")
+    k, angles = body.keypoints("MEDIAPIPE_75"), body.tree.usual[None]
+    seen = np.ones((1, len(k)), bool)
+    told = moves_points(body, k, seen, np.eye(4)[None], angles)[0]
+    dip = body.tree.coordinate("index_dip_flex_r")
+    assert 0.01 < levers(body, k, seen, np.eye(4)[None], angles)[0, dip] < 0.02 and told[dip]
+    seen[0, k.index("right_index_tip")] = False
+    assert not moves_points(body, k, seen, np.eye(4)[None], angles)[0, dip]
+    points = PointSet(("near",), [TREE.segment("forearm_r")], [[0.015, 0.0, 0.0]])
+    one = np.ones((1, 1), bool)
+    near_joint = moves_points(BODY, points, one, np.eye(4)[None], TREE.usual[None])[0]
+    assert not near_joint[TREE.coordinate("elbow_flex_r")]
 
 
 @pytest.fixture(scope="module")

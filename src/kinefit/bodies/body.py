@@ -20,6 +20,8 @@ from kinefit.bodies.tree import ROOT_DOFS, KinematicTree
 from kinefit.errors import BodyError, choices
 from kinefit.geometry import se3
 
+_LONG = 0.05  # [m] from a joint to the next, from where on detectors err as they do on limbs; fingers are shorter
+
 
 @dataclass(frozen=True, eq=False)
 class PointSet:
@@ -216,6 +218,15 @@ class Body:
         """The body with the points (K, 3) [m] of one keypoint set replaced (learnt offsets)."""
         old = self.keypoints(name)
         return replace(self, keypoint_sets={**self.keypoint_sets, name: PointSet(old.names, old.segments, points)})
+
+    @cached_property
+    def offset_shares(self) -> NDArray:
+        """(S,) how far points of detectors stand from their places on each segment, as a share of that on long ones."""
+        tree, x = self.tree, self.landmarks
+        reach = np.zeros(len(tree.segments))
+        np.maximum.at(reach, x.segments, np.linalg.norm(x.points, axis=1))
+        np.maximum.at(reach, tree.parents[1:], np.linalg.norm(tree.offsets[1:], axis=1))
+        return np.where(reach > 0.0, np.minimum(reach / _LONG, 1.0), 1.0)
 
     @cached_property
     def surface_tables(self) -> SurfaceTables:

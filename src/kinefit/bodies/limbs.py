@@ -6,16 +6,20 @@ import numpy as np
 
 from kinefit.bodies.body import Body
 
+_MAX_BRANCHES = 4  # of a trunk; what forks into more is a hand
+
 
 def limbs(body: Body) -> tuple[tuple[int, ...], ...]:
-    """Segments from each leaf up to where the tree branches, the nearest to the trunk first."""
+    """Segments from each leaf up to where the tree branches, the nearest to the trunk first; fingers with their arm."""
     parents = body.tree.parents
     children = np.bincount(parents[parents >= 0], minlength=len(parents))
-    out = []
-    for leaf in np.flatnonzero(children == 0):
-        limb = [int(leaf)]
+    hand = (children > _MAX_BRANCHES) & (parents >= 0)
+    out: dict[int, list[int]] = {}
+    for end in np.flatnonzero((children == 0) | hand):
+        limb = [int(end)]
         while parents[limb[-1]] > 0 and children[parents[limb[-1]]] == 1:
             limb.append(int(parents[limb[-1]]))
-        if leaf > 0:
-            out.append(tuple(limb[::-1]))
-    return tuple(out)
+        if end > 0:
+            above = int(parents[limb[-1]])
+            out[above if hand[above] else int(end)] = [*(out[above] if hand[above] else []), *limb[::-1]]
+    return tuple(tuple(limb) for limb in out.values())

@@ -14,7 +14,7 @@ from kinefit.frame.results import ANYWHERE, BLIND
 from kinefit.rows import AnyRows, PairRows, ParameterRows, Rows
 from kinefit.sensors.base import Matched
 from kinefit.sensors.evidence import AGREES, Evidence
-from kinefit.sensors.observability import SHORTEST, levers, near
+from kinefit.sensors.observability import moves_points, near
 from kinefit.sensors.points.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import variances
@@ -39,7 +39,7 @@ def levered(scene: Scene, pixels: Iterable[KeypointMatched]) -> NDArray:
     for m in pixels:
         inside = (m.weight > 0) & (m.squares(scene.at_time(m.time)) < AGREES**2)
         points = m.measurement.layout.points_of(scene.body)
-        out |= levers(scene.body, points, inside[None], state.T_world_root[None], state.angles[None])[0] > SHORTEST
+        out |= moves_points(scene.body, points, inside[None], state.T_world_root[None], state.angles[None])[0]
     return out
 
 

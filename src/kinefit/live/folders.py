@@ -160,7 +160,7 @@ class KeypointFolderStream(FolderSource):
 
     Parameters
     ----------
-    keypoint_set : of `readers.keypoints.KEYPOINT_SETS`
+    keypoint_set : of `readers.keypoint_sets.KEYPOINT_SETS`
     rate : float [Hz], about
     image : ImageFrame of their coordinates, where it is not the calibration's
     """

@@ -68,6 +68,14 @@ class Keypoints:
         points, confidence = self.points[frames], self.confidence[frames]
         return replace(self, points=points, confidence=confidence, lifted=lifted, time_offset=time_offset)
 
+    def first_points(self, keypoint_set: str, names: tuple[str, ...]) -> Keypoints:
+        """Its first points alone, as those of another set with these names."""
+        lifted = None if self.lifted is None else self.lifted[:, :, : len(names)]
+        points, confidence = self.points[:, :, : len(names)], self.confidence[:, :, : len(names)]
+        return replace(
+            self, keypoint_set=keypoint_set, names=names, points=points, confidence=confidence, lifted=lifted
+        )
+
     def of_one(self, chosen: NDArray) -> Keypoints:
         """One person's; chosen (F,) is who it is in each frame, -1 for nobody."""
         if self.points.shape[1] == 0:

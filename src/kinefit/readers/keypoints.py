@@ -17,48 +17,32 @@ from kinefit._arguments import checked
 from kinefit._files import no_column, read_npy
 from kinefit._mapped import kept
 from kinefit.errors import FileError, ObservationError, choices
-from kinefit.observations import MEDIAPIPE_33, Keypoints
+from kinefit.observations import Keypoints
 from kinefit.observations.arrays import sealed
+from kinefit.readers.keypoint_sets import HAND_POINTS, KEYPOINT_SETS, MEDIAPIPE_SETS, OPENPOSE_HANDS, keypoint_names
 
 if TYPE_CHECKING:
     from kinefit.geometry.camera import ImageFrame
 
-_FACE_ARMS_LEGS = (
-    "Nose LEye REye LEar REar LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle RAnkle"
-)
-
-KEYPOINT_SETS: dict[str, tuple[str, ...]] = {
-    "BODY_25B": (
-        *_FACE_ARMS_LEGS.split(),
-        *"UpperNeck HeadTop LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel".split(),
-    ),
-    "BODY_25": tuple(
-        "Nose Neck RShoulder RElbow RWrist LShoulder LElbow LWrist MidHip RHip RKnee RAnkle LHip LKnee LAnkle "
-        "REye LEye REar LEar LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel".split()
-    ),
-    "COCO_17": tuple(_FACE_ARMS_LEGS.split()),
-    "HALPE_26": (
-        *_FACE_ARMS_LEGS.split(),
-        *"Head Neck Hip LBigToe RBigToe LSmallToe RSmallToe LHeel RHeel".split(),
-    ),
-    "MEDIAPIPE_33": MEDIAPIPE_33,
-}  # names in each detector's own order
+_NO_HAND = [0.0] * (3 * HAND_POINTS)
 _NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.IGNORECASE)
 
 
-def keypoint_names(keypoint_set: str) -> tuple[str, ...]:
-    """Names of a keypoint set in the detector's order; ObservationError lists the sets that exist."""
-    if keypoint_set not in KEYPOINT_SETS:
-        raise ObservationError(choices("keypoint set", keypoint_set, KEYPOINT_SETS))
-    return KEYPOINT_SETS[keypoint_set]
+class OpenPosePerson(msgspec.Struct):
+    """One person of a frame: x, y, confidence of point after point; hands where the detector was asked for them."""
 
-
-class _OpenPosePerson(msgspec.Struct):
     pose_keypoints_2d: list[float]
+    hand_left_keypoints_2d: list[float] = []
+    hand_right_keypoints_2d: list[float] = []
+
+    def with_hands(self) -> list[float]:
+        """The body, then the left and the right hand; zero where a hand was not looked for."""
+        left, right = (hand or _NO_HAND for hand in (self.hand_left_keypoints_2d, self.hand_right_keypoints_2d))
+        return [*self.pose_keypoints_2d, *left, *right]
 
 
 class _OpenPoseFrame(msgspec.Struct):
-    people: list[_OpenPosePerson]
+    people: list[OpenPosePerson]
 
 
 decode_openpose = msgspec.json.Decoder(_OpenPoseFrame).decode
@@ -118,12 +102,13 @@ def read_mediapipe(
     path: str | PathLike[str], *, camera: str, rate: float, frames: tuple[int, int] | None = None,
     time_offset: float = 0.0, image_frame: ImageFrame | None = None,
 ) -> Keypoints:  # fmt: skip
-    """Read MediaPipe pose landmarks from an array file (.npy).
+    """Read MediaPipe landmarks from an array file (.npy): of the pose alone, or of both hands too.
 
     Parameters
     ----------
     path : path
-        (F, 33, 3): x, y [px] in the video's image frame, visibility; frames with nobody are all NaN or all zero.
+        (F, 33, 3), or (F, 75, 3) with the left and the right hand after the pose: x, y [px] in the video's image
+        frame, visibility; frames with nobody are all NaN or all zero, as is a hand that is not seen.
     camera, rate, frames, time_offset
         As in `read_openpose`.
     image_frame : ImageFrame, optional
@@ -137,14 +122,17 @@ def read_mediapipe(
         Missing or not an array file.
     """
     path = Path(path)
-    names = KEYPOINT_SETS["MEDIAPIPE_33"]
     data = read_npy(path, remedy="Write it by numpy.save.")
-    if data.dtype.kind not in "fiu" or data.shape[1:] != (len(names), 3):
-        remedy = f"Give (frames, {len(names)}, 3) numbers: x, y [px], visibility."
+    sets = {(len(KEYPOINT_SETS[name]), 3): name for name in MEDIAPIPE_SETS}
+    if data.dtype.kind not in "fiu" or data.shape[1:] not in sets:
+        remedy = "Give (frames, 33, 3) numbers, or (frames, 75, 3) with hands: x, y [px], visibility."
         raise ObservationError(f"landmarks have shape {data.shape}", file=path, remedy=remedy)
     data, start = _cut(data, frames, path)
-    data = np.array(data, dtype=float)
-    data[np.isnan(data).all(axis=(1, 2))] = 0
+    data, keypoint_set = np.array(data, dtype=float), sets[data.shape[1:]]
+    names = KEYPOINT_SETS[keypoint_set]
+    pose = len(KEYPOINT_SETS["MEDIAPIPE_33"])
+    for part in np.split(data, range(pose, len(names), HAND_POINTS), axis=1):
+        part[np.isnan(part).all(axis=(1, 2))] = 0
     if not np.isfinite(data).all():
         frame, point, _ = np.argwhere(~np.isfinite(data))[0]
         raise ObservationError(
@@ -156,15 +144,19 @@ def read_mediapipe(
             f"nobody is seen in any of the {len(data)} frames of camera {camera}", file=path,
             remedy="Check that the detector ran on this camera's video; or leave this camera out.",
         )
-    return _keypoints(data[:, None], camera, "MEDIAPIPE_33", rate, time_offset, start, path, image_frame)
+    return _keypoints(data[:, None], camera, keypoint_set, rate, time_offset, start, path, image_frame)
 
 
+_CALISCOPE_HANDS = (100, 200)  # first indices of the right and of the left hand
 _GAPS, _PORTS = 20, 100  # indices for each that is there, and cameras, beyond which a table is damaged
 
 
 @checked
 def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) -> dict[str, Keypoints]:
-    """Read the body landmarks (MediaPipe's 33) of all cameras from a table of caliscope (pyxy3d): xy_*.csv.
+    """Read MediaPipe's landmarks of all cameras from a table of caliscope (pyxy3d): xy_*.csv.
+
+    Those of the pose are `MEDIAPIPE_33`; with hands, whose indices begin at 100 (right) and 200 (left), `MEDIAPIPE_75`.
+    Points of the face, from 500 on, are left out.
 
     Parameters
     ----------
@@ -183,7 +175,7 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
     FileError, ObservationError
         Missing file; missing columns, cells that are no numbers, no body landmark.
     """
-    path, names = Path(path), KEYPOINT_SETS["MEDIAPIPE_33"]
+    path, pose = Path(path), len(KEYPOINT_SETS["MEDIAPIPE_33"])
     columns = ("sync_index", "port", "frame_time", "point_id", "img_loc_x", "img_loc_y")
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -196,7 +188,8 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
         raise FileError("no such file", file=path, remedy="Check the path.") from error
     except (OSError, ValueError, TypeError, csv.Error) as error:
         raise ObservationError(f"a cell is not a number ({error})", file=path, remedy="Export it again.") from error
-    table = table[(table[:, 3] < len(names)) & np.isfinite(table).all(axis=1)]
+    right, left = (np.isin(table[:, 3], begin + np.arange(HAND_POINTS)) for begin in _CALISCOPE_HANDS)
+    table = table[((table[:, 3] < pose) | right | left) & np.isfinite(table).all(axis=1)]
     if not len(table):
         raise ObservationError("no landmark of the body in this table", file=path, remedy="Track the whole pose.")
     numbers = table[:, (0, 1, 3)]
@@ -205,6 +198,9 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
         problem = f"{('sync_index', 'port', 'point_id')[k]} = {numbers[row, k]:g}"
         raise ObservationError(problem, file=path, remedy="They are whole numbers from 0 on: export the table again.")
     frame, port, point = numbers.astype(int).T
+    keypoint_set = MEDIAPIPE_SETS[int(point.max() >= pose)]
+    for k, begin in enumerate(_CALISCOPE_HANDS):  # the left hand comes first in the set
+        point[(point >= begin) & (point < begin + HAND_POINTS)] += pose + (1 - k) * HAND_POINTS - begin
     frame = frame - frame.min()
     if frame.max() > _GAPS * len(np.unique(frame)) + 1000 or len(np.unique(port)) > _PORTS:
         problem = f"{len(np.unique(frame))} frames of {len(np.unique(port))} ports in {frame.max() + 1} of sync_index"
@@ -215,10 +211,10 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
         rate = float(1 / np.median(np.diff(table[first, 2][at]))) if len(at) > 1 else 1.0
     keypoints = {}
     for p in np.unique(port):
-        data = np.zeros((frame.max() + 1, 1, len(names), 3))
+        data = np.zeros((frame.max() + 1, 1, len(KEYPOINT_SETS[keypoint_set]), 3))
         rows = port == p
         data[frame[rows], 0, point[rows]] = np.column_stack([table[rows, 4:6], np.ones(rows.sum())])
-        keypoints[f"cam_{p}"] = _keypoints(data, f"cam_{p}", "MEDIAPIPE_33", rate, 0.0, 0, path, None)
+        keypoints[f"cam_{p}"] = _keypoints(data, f"cam_{p}", keypoint_set, rate, 0.0, 0, path, None)
     return keypoints
 
 
@@ -304,16 +300,17 @@ def _read_people(path: Path, count: int, keypoint_set: str) -> NDArray:
         infinite = re.search(rb"[\[,:]\s*-?(NaN|Inf)", raw, re.IGNORECASE)
         problem = "NaN or infinity among the keypoints" if infinite else f"broken json ({error})"
         raise ObservationError(problem, file=path, remedy="Run the detector again on this frame.") from error
-    for i, person in enumerate(people):
-        if len(person.pose_keypoints_2d) != 3 * count:
-            fitting = [name for name in KEYPOINT_SETS if 3 * len(KEYPOINT_SETS[name]) == len(person.pose_keypoints_2d)]
+    values = [p.with_hands() if keypoint_set == OPENPOSE_HANDS else p.pose_keypoints_2d for p in people]
+    for i, numbers in enumerate(values):
+        if len(numbers) != 3 * count:
+            fitting = [name for name in KEYPOINT_SETS if 3 * len(KEYPOINT_SETS[name]) == len(numbers)]
             remedy = (
                 f"This number fits: {', '.join(fitting)}; name it by set = ... of [[keypoints]]." if fitting
                 else f"No set has so many; there are: {', '.join(KEYPOINT_SETS)}. Run the detector with one of these."
             )  # fmt: skip
-            problem = f"{len(person.pose_keypoints_2d)} numbers where {keypoint_set} has {count} x 3"
+            problem = f"{len(numbers)} numbers where {keypoint_set} has {count} x 3"
             raise ObservationError(problem, file=path, place=f"person {i}", remedy=remedy)
-    data = np.array([person.pose_keypoints_2d for person in people], dtype=float).reshape(len(people), count, 3)
+    data = np.array(values, dtype=float).reshape(len(people), count, 3)
     if not np.isfinite(data).all():
         raise ObservationError("numbers too large", file=path, remedy="Run the detector again on this frame.")
     return data

@@ -30,6 +30,12 @@ def levers(body: Body, points: PointSet, seen: NDArray, Ts_world_root: NDArray, 
     return np.where(tree.prismatic, np.inf, out)
 
 
+def moves_points(body: Body, points: PointSet, seen: NDArray, Ts_world_root: NDArray, angles: NDArray) -> NDArray:
+    """(F, D) bool: coordinates that move some point seen by more than detectors err; arguments as of `levers`."""
+    shortest = SHORTEST * body.offset_shares[body.tree.owners]
+    return np.asarray(levers(body, points, seen, Ts_world_root, angles) > shortest)
+
+
 def near(told: NDArray, frames: int) -> NDArray:
     """(F, D) bool: coordinates that are observed, (F, D) bool, in this frame or at most so many frames away."""
     count = np.cumsum(np.concatenate([np.zeros((1, told.shape[1]), int), told]), axis=0)

@@ -9,7 +9,7 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import Motion, rotation_between_up
 from kinefit.observations import Keypoints
-from kinefit.readers.keypoints import keypoint_names
+from kinefit.readers.keypoint_sets import keypoint_names
 from kinefit.sensors.channels import mirror_name
 
 _MARGIN = 0.04  # of the image, that stays free around the person

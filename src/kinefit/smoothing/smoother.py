@@ -16,7 +16,7 @@ from kinefit.frame.results import BLIND, FrameResult, judged
 from kinefit.frame.trust import adrift
 from kinefit.sensors.base import Matched, pixels_of
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.observability import SHORTEST, levers, near
+from kinefit.sensors.observability import moves_points, near
 from kinefit.sensors.points.left_right import find_swaps, limb_groups
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.foot_contacts import find_contacts
@@ -173,7 +173,7 @@ def _take(take: SmoothTake, settings: TrackSettings) -> SmoothTake:
     body, channels, others, rate = take.body, take.channels, take.others, 1.0 / take.dt
     inliers = take.agreeing(channels.sigma) > INLIER
     alone, rows = _observed(take, channels, others)
-    far = levers(body, take.points, inliers, take.roots, take.angles) > SHORTEST
+    far = moves_points(body, take.points, inliers, take.roots, take.angles)
     told = alone[0] & (far | looped(body)) | alone[1]
     lost = inliers.sum(axis=1) + 0.5 * rows < _ENOUGH
     roots, angles = bridged(take.roots, unwrap(body.tree, take.angles), lost, settings.smooth_memory * rate)

@@ -30,7 +30,7 @@ from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.subject.subject import Progress, Subject, SubjectFit
 from kinefit.subject.view_bias import SeenFrames, learn_view_bias
 
-_SHIFT = 0.01  # [m] how far a detector's points stand from the anatomical ones, before a take is seen
+_SHIFT = 0.01, 0.005  # [m] how far detectors' points are off on long and on short segments, before a take is seen
 _POSTURE = 0.1  # share of the posture prior: frames of a take are a few independent postures at the most
 _UNTOLD = 1.2  # variance of shapes found, over what they state: limits, weights and priors are taken for known there.
 # With 1.0, 1.2 and 1.6 intervals of 95 % hold 95, 96 and 98 % of the joints of twenty known people with BODY_25B
@@ -116,18 +116,23 @@ def _fitted(
 
     And the detectors' bias by view, which the first round tells and the others do without.
 
-    How far points stand from where the body has them is found from the take (`place_spread`), beginning with one
-    centimetre. What a detector errs by lasts, and would move cameras: their calibration counts for more by the excess
-    of the round before.
+    How far points stand from where the body has them is found from the take (`place_spread`), beginning with
+    `_SHIFT`; on short segments (fingers) apart. What a detector errs by lasts, and would move cameras: their
+    calibration counts for more by the excess of the round before.
     """
-    spread, excess_of, start, gear, bias = _SHIFT, 1.0, None, Gear(body), ViewBias()
+    spread, excess_of, start, gear, bias = np.array(_SHIFT), 1.0, None, Gear(body), ViewBias()
+    sets = [name for name in channels.sets if name]
+    shares = [body.offset_shares[body.keypoints(name).segments] for name in sets]
     cameras: CameraExtrinsics | None = None
     bare = body if body.morphs else replace(body, surfaces=(), skin=None)  # surfaces would be stretched for nothing
     used = tuple(channels.rig.names[c] for c in np.unique(channels.camera))
     if std is not None:
         cameras = replace(known or CameraExtrinsics(channels.rig, None, std, used), rig=channels.rig)
     for k in range(_ROUNDS):
-        parameters: list[Parameters] = [lengths, *(PointOffsets(body, name, spread) for name in channels.sets if name)]
+        offsets = [
+            PointOffsets(body, name, spread[(own < 1.0).astype(int)] * own) for name, own in zip(sets, shares)
+        ]
+        parameters: list[Parameters] = [lengths, *offsets]
         before = sum(len(one.names) for one in parameters)
         if k and gear.names:  # which poses of the first round have brought into place
             parameters.append(gear)
@@ -150,9 +155,13 @@ def _fitted(
             steps = _by_detector(channels, found, steps)
         excess_of = _excess(found, steps)
         covariance = inverse(prior + found.information / excess_of)
-        moved, open_to = found.mean - found.prior.mean, np.isclose(np.diag(prior), spread**-2)
-        open_to[of_body:] = False
-        spread = place_spread(moved[open_to], np.diag(covariance)[open_to], spread, _SHIFT)
+        moved, share = found.mean - found.prior.mean, np.full(len(prior), np.nan)
+        of_points = [one.values_of(own[:, None].repeat(3, axis=1)) for one, own in zip(offsets, shares)]
+        share[len(lengths.names) : before] = np.concatenate(of_points)
+        for short, of in enumerate((share == 1.0, share < 1.0)):
+            open_to = np.flatnonzero(of & np.isclose(np.diag(prior) * share**2, spread[short] ** -2))
+            apart, variance = moved[open_to] / share[open_to], np.diag(covariance)[open_to] / share[open_to] ** 2
+            spread[short] = place_spread(apart, variance, spread[short], _SHIFT[short])
         if cameras is not None:
             measured, own = found.information / excess_of, slice(of_body, len(moved))
             cameras = cameras.with_errors_of(own, moved, measured, found.prior.information / excess_of)

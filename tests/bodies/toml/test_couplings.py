@@ -57,6 +57,30 @@ def test_a_coupling_makes_the_posture_prior_a_gaussian_with_covariance():
     assert tree.posture_precision[tree.coordinate("s3")].max() == 0.0  # no prior
 
 
+def test_a_coupling_of_one_side_has_its_image():
+    text = """
+    [body]
+    name = "two arms"
+    mirror = true
+    [[segment]]
+    name = "trunk"
+    joint = { name = "root", type = "free" }
+    [[segment]]
+    name = "arm_r"
+    parent = "trunk"
+    joint = { name = "j_r", type = "universal", axes = ["z", "x"], coordinates = ["a_r", "b_r"], spread = [9, 9] }
+    [[coupling]]
+    name = "together_r"
+    of = { a_r = 1.0, b_r = -0.5 }
+    spread = 4
+    """
+    tree = parse_body(text).tree
+    lines = np.zeros((2, 4))
+    for line, side in zip(lines, "rl"):
+        line[[tree.coordinate(f"a_{side}"), tree.coordinate(f"b_{side}")]] = 1.0, -0.5
+    np.testing.assert_allclose(tree.couplings, lines / np.radians(4.0))
+
+
 def test_without_couplings_the_prior_is_what_usual_and_spread_say():
     tree = load_body("humanoid10").tree
     assert not tree.coupled

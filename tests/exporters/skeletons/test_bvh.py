@@ -25,6 +25,17 @@ def test_joint_centres_come_back(tmp_path, unit, metres, up):
     assert back.rate == pytest.approx(motion.rate, rel=1e-6)
 
 
+def test_fingers_come_back(tmp_path):
+    motion = smooth_motion(10, body=load_body("humanoid_hands"))
+    write_bvh(motion, tmp_path / "a.bvh", unit="m")
+    back = read_bvh(tmp_path / "a.bvh", unit=1.0)
+    body = motion.body
+    columns = [back.names.index(body.alias("bvh", s)) for s in body.tree.segments]
+    fingers = ("Thumb", "Index", "Middle", "Ring", "Pinky")
+    assert {f"RightHand{finger}{k}" for finger in fingers for k in (1, 2, 3)} <= set(back.names)
+    assert np.abs(back.positions[:, columns] - motion.segment_poses()[..., :3, 3]).max() < 1e-6
+
+
 def test_limbs_end_where_their_surfaces_end(tmp_path):
     motion = smooth_motion(3)
     write_bvh(motion, tmp_path / "a.bvh")

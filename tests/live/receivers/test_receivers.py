@@ -196,6 +196,15 @@ def test_avatars_get_the_same_pose_by_osc(scene, played):
             assert np.allclose(world[BONES[n]][:3, 3], expected, atol=1e-5)
 
 
+def test_fingers_are_those_of_the_avatar():
+    from kinefit.bodies import load_body
+
+    tree = load_body("humanoid_hands").tree
+    named = {BONES[s] for s in tree.segments if s.endswith("_l") and s not in load_body("humanoid").tree.segments}
+    assert named == {f"Left{f}{k}" for f in ("Thumb", "Index", "Middle", "Ring", "Little")
+                     for k in ("Proximal", "Intermediate", "Distal")}  # fmt: skip
+
+
 def test_an_avatar_at_rest_stands_as_a_t():
     """A body in T pose that faces z has no turn in any bone: Unity's humanoid at rest."""
     from kinefit.bodies import load_body

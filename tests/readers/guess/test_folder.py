@@ -14,7 +14,7 @@ from kinefit.geometry.camera import Camera, ImageFrame, Rig
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.guess.folder import guess_take
 from kinefit.readers.guess.names import trials
-from kinefit.readers.keypoints import KEYPOINT_SETS
+from kinefit.readers.keypoint_sets import KEYPOINT_SETS
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
@@ -231,6 +231,25 @@ def test_the_set_follows_from_the_points(folder, motion, rig, keypoint_set):
     assert seen.keypoints[0].names == KEYPOINT_SETS[keypoint_set]
 
 
+@pytest.mark.parametrize("body_set", ["BODY_25", "BODY_25B"])
+@pytest.mark.parametrize("seen_hands", [True, False])
+def test_where_hands_are_seen_the_body_has_fingers(folder, motion, rig, body_set, seen_hands):
+    """OpenPose with hands of BODY_25; beside those of BODY_25B, which have no set, the body's points are taken."""
+    write_calibration(rig, folder / "calibration.toml")
+    write_videos(folder, [f"{name}.mp4" for name in rig.names])
+    for record in simulate_keypoints(motion, rig, body_set, noise_px=1.5):
+        write_openpose(folder / "pose" / f"{record.camera}_json", record)
+        for path in (folder / "pose" / f"{record.camera}_json").iterdir():
+            frame = json.loads(path.read_text())
+            for person in frame["people"]:
+                person["hand_left_keypoints_2d"] = [40.0, 50.0, 0.7 * seen_hands] * 21
+                person["hand_right_keypoints_2d"] = [0.0] * 63
+            path.write_text(json.dumps(frame))
+    take, _, _ = taken(folder)
+    assert {k.set for k in take.keypoints} == {"BODY_25_HANDS" if body_set == "BODY_25" else "BODY_25B"}
+    assert take.body == ("humanoid_hands" if body_set == "BODY_25" and seen_hands else "humanoid")
+
+
 def test_of_two_detectors_one_is_left_as_comments(folder, motion, rig):
     write_calibration(rig, folder / "calibration.toml")
     write_mediapipe(folder, motion, rig, [f"mediapipe_{name}.npy" for name in rig.names])
@@ -336,7 +355,7 @@ def test_keypoints_of_which_none_can_be_used(folder, motion, rig):
     write_mediapipe(folder, motion, rig, [f"{name}.npy" for name in rig.names])
     take = read_guess(folder)
     assert {k.format for k in take.keypoints} == {"mediapipe"}
-    assert "18 points; there are sets of 17, 25, 26, 33" in notes(guess_take(folder))
+    assert "18 points; there are sets of 17, 25, 26, 33, 67, 75, 133" in notes(guess_take(folder))
 
 
 def test_keypoints_of_another_recording_are_left_out(folder, motion, rig):
@@ -477,7 +496,11 @@ def test_recordings_of_caliscope(data_dir, tmp_path):
     guess = guess_take(data_dir("mv4_landmarks_caliscope"), beside=tmp_path)
     (tmp_path / "b.toml").write_text(guess.text, encoding="utf-8")
     take = read_take(tmp_path / "b.toml")
-    assert {k.format for k in take.keypoints} == {"caliscope"} and take.up == "x"
+    assert {k.format for k in take.keypoints} == {"caliscope"} and take.up == "x" and take.body == "humanoid_hands"
     assert all(c.video is None for c in take.cameras)  # its videos are of the calibration
     seen = load_observations(take)
+    assert {k.keypoint_set for k in seen.keypoints} == {"MEDIAPIPE_75"}
+    (tmp_path / "c.toml").write_text(guess.text.replace('"caliscope"', '"caliscope"\nset = "MEDIAPIPE_33"'))
+    plain = load_observations(read_take(tmp_path / "c.toml"))
+    assert {(k.keypoint_set, len(k.names)) for k in plain.keypoints} == {("MEDIAPIPE_33", 33)}
     assert seen.frames == (0, 267) and [k.camera for k in seen.keypoints] == [f"cam_{k}" for k in range(4)]

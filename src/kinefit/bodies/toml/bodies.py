@@ -17,13 +17,14 @@ from kinefit.bodies.morphs.morph_files import morphs_of, with_images
 from kinefit.bodies.surfaces.files import surfaces_of
 from kinefit.bodies.surfaces.skins.skin_files import skin_of
 from kinefit.bodies.toml.closures import closed, with_closure_images
-from kinefit.bodies.toml.couplings import coupled, with_posture
+from kinefit.bodies.toml.couplings import coupled, with_coupling_images, with_posture
 from kinefit.bodies.toml.records import (
     FileRecord,
     JointRecord,
     MarkerSetRecord,
     SegmentRecord,
     Vector,
+    extended,
     merged,
     stature_of,
 )
@@ -94,8 +95,10 @@ def parse_body(text: str, source: str = "body") -> Body:
     groups = tuple(dict.fromkeys(s.scale or s.name for s in segments))
     index = {s.name: i for i, s in enumerate(segments)}
     landmarks = _points(points, index, source)
+    sets = extended(record.keypoints)
     usual = {**({_left(n): v for n, v in record.usual.items()} if mirror else {}), **record.usual}
-    tree = with_posture(coupled(_tree(segments, index, source), record.coupling, source), usual, source)
+    couplings = with_coupling_images(record.coupling, _left) if mirror else record.coupling
+    tree = with_posture(coupled(_tree(segments, index, source), couplings, source), usual, source)
     body = Body(
         name=record.body.name,
         tree=tree,
@@ -103,7 +106,7 @@ def parse_body(text: str, source: str = "body") -> Body:
         scale_groups=groups,
         segment_scale=np.array([groups.index(s.scale or s.name) for s in segments]),
         landmarks=landmarks,
-        keypoint_sets={n: _renamed(s, landmarks, f"keypoints.{n}", source) for n, s in record.keypoints.items()},
+        keypoint_sets={n: _renamed(s, landmarks, f"keypoints.{n}", source) for n, s in sets.items()},
         marker_sets={n: _markers(s, landmarks, index, f"markers.{n}", source) for n, s in record.markers.items()},
         surfaces=tuple(
             surface for s in segments

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 
 from kinefit.bodies.toml.records import CouplingRecord
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError, choices
+
+
+def with_coupling_images(records: Sequence[CouplingRecord], left: Callable[[str], str]) -> list[CouplingRecord]:
+    """Couplings whose names end in `_r`, with their images."""
+    images = [
+        msgspec.structs.replace(r, name=left(r.name), of={left(c): weight for c, weight in r.of.items()})
+        for r in records if left(r.name) not in {other.name for other in records}
+    ]  # fmt: skip
+    return [*records, *images]
 
 
 def coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord], source: str) -> KinematicTree:

@@ -128,3 +128,12 @@ def merged(base: FileRecord, own: FileRecord) -> FileRecord:
         keypoints=base.keypoints | own.keypoints,
         markers=base.markers | own.markers,
     )
+
+
+_EXTENDS = {"MEDIAPIPE_75": "MEDIAPIPE_33", "BODY_25_HANDS": "BODY_25", "COCO_WHOLEBODY_133": "COCO_17"}
+"""Keypoint sets with hands, and those whose points they begin with."""
+
+
+def extended(sets: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
+    """Keypoint sets of a file, and those that extend them; a body without fingers knows all but the hands."""
+    return sets | {name: sets[of] | sets.get(name, {}) for name, of in _EXTENDS.items() if of in sets}

@@ -30,6 +30,11 @@ _TRUNK = {"pelvis": "Hips", "abdomen": "Spine", "thorax": "Chest", "neck": "Neck
 _SIDES = {
     "clavicle": "Shoulder", "upperarm": "UpperArm", "forearm": "LowerArm", "hand": "Hand", "thigh": "UpperLeg",
     "shank": "LowerLeg", "foot": "Foot", "toes": "Toes",
+    "thumb_metacarpal": "ThumbProximal", "thumb_proximal": "ThumbIntermediate", "thumb_distal": "ThumbDistal",
+    **{
+        f"{finger}_{phalanx}": finger.capitalize() + bone for finger in ("index", "middle", "ring", "little")
+        for phalanx, bone in (("proximal", "Proximal"), ("middle", "Intermediate"), ("distal", "Distal"))
+    },
 }  # fmt: skip
 BONES = _TRUNK | {f"{k}_{s}": words["Side"] + v for k, v in _SIDES.items() for s, words in SIDES.items()}
 """Segment -> bone of Unity's humanoid."""

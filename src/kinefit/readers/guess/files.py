@@ -240,10 +240,11 @@ def find_keypoints(files: list[Path]) -> tuple[list[KeypointFile], list[str]]:
     for path in files:
         suffix = path.suffix.lower()
         shape = _array_shape(path) if suffix == ".npy" else None
-        if shape is not None and len(shape) == 3 and shape[1:] == (33, 3):
-            found.append(KeypointFile(path, "mediapipe", shape[0], 33))
+        if shape is not None and len(shape) == 3 and shape[1:] in ((33, 3), (75, 3)):
+            found.append(KeypointFile(path, "mediapipe", shape[0], shape[1]))
         elif shape is not None and len(shape) >= 3 and shape[-1] in (2, 3):
-            remarks.append(f"{path.name}: an array of shape {shape}; landmarks are read as (frames, 33, 3)")
+            told = "landmarks are read as (frames, 33, 3), or (frames, 75, 3) with hands"
+            remarks.append(f"{path.name}: an array of shape {shape}; {told}")
         if suffix == ".csv" and (frames := _caliscope_frames(path)):
             found.append(KeypointFile(path, "caliscope", frames, 33))
     return found, remarks
@@ -261,7 +262,9 @@ def _openpose_points(numbered: list[Path]) -> int | None:
             continue
         there = True
         if people:
-            return len(people[0].pose_keypoints_2d) // 3
+            person = people[0]
+            hands = person.hand_left_keypoints_2d or person.hand_right_keypoints_2d
+            return len(person.with_hands() if hands else person.pose_keypoints_2d) // 3
     return 0 if there else None
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 from kinefit.errors import KinefitError, ObservationError
 from kinefit.geometry.camera import ImageFrame, Rig
@@ -12,11 +11,13 @@ from kinefit.readers.guess import views as guess_views
 from kinefit.readers.guess.draft import Draft, Told
 from kinefit.readers.guess.files import STATIC, KeypointFile
 from kinefit.readers.guess.names import Trial, camera_number, common_words, trials
-from kinefit.readers.keypoints import KEYPOINT_SETS, read_keypoints
+from kinefit.readers.keypoint_sets import HAND_POINTS, KEYPOINT_SETS, OPENPOSE_HANDS, SETS_WITH_HANDS
+from kinefit.readers.keypoints import read_keypoints
 
 Source = dict[str, KeypointFile]  # camera -> its file, of one detector
 
-_SETS = {17: "COCO_17", 25: "BODY_25B", 26: "HALPE_26", 33: "MEDIAPIPE_33"}
+_SETS = {len(KEYPOINT_SETS[name]): name for name in sorted(KEYPOINT_SETS)}  # of 25 points BODY_25B
+_EITHER = (25, 25 + 2 * HAND_POINTS)  # points of BODY_25 and BODY_25B, without hands and with them
 _FORMATS = ("openpose", "mediapipe", "caliscope")  # of several detectors the first: its confidence tells the most
 _SAME_LENGTH = 0.1  # keypoints whose number of frames is farther from the video's are of another recording
 
@@ -71,10 +72,12 @@ def _read(file: KeypointFile, camera: str) -> Keypoints:
     """Keypoints of a camera; where no rate is told, at 1 Hz."""
     if file.format == "openpose":
         if file.points not in _SETS:
-            raise ObservationError(f"{file.points} points; there are sets of {', '.join(map(str, _SETS))}")
+            raise ObservationError(f"{file.points} points; there are sets of {', '.join(map(str, sorted(_SETS)))}")
         record = read_keypoints(file.path, format=file.format, camera=camera, rate=1.0, keypoint_set=_SETS[file.points])
-        if file.points == 25 and (name := guess_views.guess_body_25(record)) != record.keypoint_set:
-            record = replace(record, keypoint_set=name, names=KEYPOINT_SETS[name])
+        if file.points in _EITHER:
+            name = guess_views.guess_body_25(record)
+            name = OPENPOSE_HANDS if file.points > 25 and name == "BODY_25" else name
+            record = record.first_points(name, KEYPOINT_SETS[name])
     else:
         rate = None if file.format == "caliscope" else 1.0
         record = read_keypoints(file.path, format=file.format, camera=camera, rate=rate)
@@ -99,14 +102,22 @@ def keypoint_entries(
     what = f"{format}, {', '.join(sorted({r.keypoint_set for r in records.values()}))}, {len(records)} cameras"
     told = f"{what}: taken" if active else f"{what}: left as comments, as one detector is enough to begin with"
     draft.note("keypoints", "sure" if active else "guess", told)
+    if active and any(_hands_seen(record) for record in records.values()):
+        body = Told("humanoid_hands", "likely", "the humanoid with fingers, as the keypoints have hands")
+        draft.head["body"] = draft.tell("body", body, "body")
     if frame is not None:
         draft.tell(f"keypoints, {format}", frame, "frame")
     for name, record in records.items():
         entry = {"camera": Told(name), "file": Told(source[name].path), "format": Told(format)}
         if format == "openpose":
-            of_two = source[name].points == 25  # BODY_25 and BODY_25B
+            of_two = source[name].points in _EITHER
             why = f"{source[name].points} points" + ", told by where neck and hips lie" * of_two
             entry["set"] = Told(record.keypoint_set, "likely" if of_two else "sure", why)
         if frame is not None and name in images:
             entry["frame"] = frame
         draft.keypoints.append((active, entry))
+
+
+def _hands_seen(record: Keypoints) -> bool:
+    """Whether a detector gives points of hands, and saw some."""
+    return record.keypoint_set in SETS_WITH_HANDS and bool(record.confidence[..., -2 * HAND_POINTS :].any())

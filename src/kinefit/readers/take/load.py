@@ -14,6 +14,7 @@ from kinefit.errors import CalibrationError, ObservationError, TakeError, choice
 from kinefit.geometry import se3
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.observations import (
+    MEDIAPIPE_33,
     BodyTrackerVideo,
     CloudVideo,
     ColourVideo,
@@ -279,11 +280,13 @@ def _read_keypoints(
         raise TakeError("nothing states the rate", file=take.path, place=place, remedy="Write rate = ... into [take].")
     assert source.file is not None
     options: dict[str, Any] = {"keypoint_set": source.set} if source.format == "openpose" and source.set else {}
-    return read_keypoints(
+    record = read_keypoints(
         source.file, format=source.format, camera=source.camera, rate=rate,
         image_frame=image if source.frame == "video" and not same else None,
         time_offset=offset, **options,
     )
+    hands_unwanted = source.set == "MEDIAPIPE_33" and record.keypoint_set == "MEDIAPIPE_75"
+    return record.first_points(source.set, MEDIAPIPE_33) if source.set and hands_unwanted else record
 
 
 def _read_markers(entry: MarkersEntry) -> Markers:

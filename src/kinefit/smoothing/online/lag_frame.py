@@ -15,7 +15,7 @@ from kinefit.frame.fit import rows_of, rows_of_points
 from kinefit.frame.results import BLIND, FrameResult
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched, Measurement, matched_by, pixels_of
-from kinefit.sensors.observability import SHORTEST, levers
+from kinefit.sensors.observability import moves_points
 from kinefit.sensors.points.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
@@ -126,7 +126,7 @@ class FrameCosts:
         for m in pixels:
             inside = (m.weight > 0) & (m.loss.factor(m.squares(scene)) > INLIER)
             points, state = m.measurement.layout.points_of(self.body), scene.state
-            out |= levers(self.body, points, inside[None], state.T_world_root[None], state.angles[None])[0] > SHORTEST
+            out |= moves_points(self.body, points, inside[None], state.T_world_root[None], state.angles[None])[0]
         return out
 
     def scene(self, frames: Sequence[LagFrame], f: int) -> Scene:

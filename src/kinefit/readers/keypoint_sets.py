@@ -1,0 +1,59 @@
+"""Names of the points of detectors, in each detector's own order."""
+
+from __future__ import annotations
+
+from kinefit.errors import ObservationError, choices
+from kinefit.observations import MEDIAPIPE_33, MEDIAPIPE_75
+
+_FACE_ARMS_LEGS = (
+    "Nose LEye REye LEar REar LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle RAnkle"
+)
+
+_FEET = "LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel"
+_FINGERS = "Thumb Index Middle Ring Little"
+_HANDS = tuple(
+    f"{side}Hand{point}" for side in "LR"
+    for point in ("Wrist", *(f"{finger}{k}" for finger in _FINGERS.split() for k in range(1, 5)))
+)  # fmt: skip
+_BODY_25 = tuple(
+    "Nose Neck RShoulder RElbow RWrist LShoulder LElbow LWrist MidHip RHip RKnee RAnkle LHip LKnee LAnkle "
+    "REye LEye REar LEar LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel".split()
+)
+
+KEYPOINT_SETS: dict[str, tuple[str, ...]] = {
+    "BODY_25B": (
+        *_FACE_ARMS_LEGS.split(),
+        "UpperNeck", "HeadTop", *_FEET.split(),
+    ),
+    "BODY_25": _BODY_25,
+    "BODY_25_HANDS": (*_BODY_25, *_HANDS),
+    "COCO_17": tuple(_FACE_ARMS_LEGS.split()),
+    "COCO_WHOLEBODY_133": (
+        *_FACE_ARMS_LEGS.split(), *_FEET.split(), *(f"Face{k}" for k in range(68)), *_HANDS,
+    ),
+    "HALPE_26": (
+        *_FACE_ARMS_LEGS.split(),
+        *"Head Neck Hip LBigToe RBigToe LSmallToe RSmallToe LHeel RHeel".split(),
+    ),
+    "MEDIAPIPE_33": MEDIAPIPE_33,
+    "MEDIAPIPE_75": MEDIAPIPE_75,
+}  # names in each detector's own order; of OpenPose both hands come after the body, left first
+
+HAND_POINTS = 21
+"""Points of one hand of every detector."""
+
+OPENPOSE_HANDS = "BODY_25_HANDS"
+"""The set whose hands OpenPose's files have apart from the body."""
+
+MEDIAPIPE_SETS = ("MEDIAPIPE_33", "MEDIAPIPE_75")
+"""Sets of MediaPipe, without and with hands."""
+
+SETS_WITH_HANDS = (OPENPOSE_HANDS, "COCO_WHOLEBODY_133", "MEDIAPIPE_75")
+"""Keypoint sets that have the points of both hands."""
+
+
+def keypoint_names(keypoint_set: str) -> tuple[str, ...]:
+    """Names of a keypoint set in the detector's order; ObservationError lists the sets that exist."""
+    if keypoint_set not in KEYPOINT_SETS:
+        raise ObservationError(choices("keypoint set", keypoint_set, KEYPOINT_SETS))
+    return KEYPOINT_SETS[keypoint_set]
