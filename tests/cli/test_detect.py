@@ -16,7 +16,7 @@ from kinefit.exporters.pictures.detections import write_detections
 from kinefit.images.detectors.person_detector import DetectedPerson
 from kinefit.images.detectors.pose_model import SIZE, PersonLandmarks
 from kinefit.observations import Detections
-from kinefit.preparing import detecting
+from kinefit.preparing import detecting, each_video
 from kinefit.preparing.take import ensure_detections, with_detections
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.motion import read_motion
@@ -145,7 +145,7 @@ def test_another_video_or_setting_is_done_anew_and_only_that(take, networks):
 
 
 def test_what_was_interrupted_goes_on_with_the_others(take, networks, monkeypatch):
-    monkeypatch.setattr(detecting, "cores", lambda: 1)
+    monkeypatch.setattr(each_video, "cores", lambda: 1)
 
     def stop(camera, done, total):
         if camera == "cam02" and done == 6:
@@ -163,8 +163,8 @@ def test_ctrl_c_says_how_much_is_kept(take, monkeypatch):
         futures[0].result()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(detecting, "cores", lambda: 1)
-    monkeypatch.setattr(detecting, "wait", interrupted)
+    monkeypatch.setattr(each_video, "cores", lambda: 1)
+    monkeypatch.setattr(each_video, "wait", interrupted)
     with pytest.raises(KeyboardInterrupt, match=r"[1-4] of 4 videos are done and kept"):
         ensure_detections(read_take(take))
     assert detections_file(take, "cam01").is_file()
