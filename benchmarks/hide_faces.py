@@ -110,7 +110,7 @@ def write_sheets(folder: Path) -> None:
             heads = {name: find_faces(DetectionJob(name, path, Path()))}
         with HiddenVideo(path, heads[name]) as video:
             image = video.read(frame)
-        top = slice(image.shape[0] // 20, image.shape[0] * 11 // 20) if image.shape[0] > image.shape[1] else slice(None)
+        top = slice(image.shape[0] // 10, image.shape[0] * 13 // 20) if image.shape[0] > image.shape[1] else slice(None)
         sheet[f"{number}"] = cv2.putText(
             np.array(image[top]), f"{number} {Path(name).stem} {frame}", (5, 40), 0, 1.2, (255, 255, 0), 3
         )

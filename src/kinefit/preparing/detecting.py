@@ -110,7 +110,7 @@ def _seconds(take: Take, camera: CameraEntry) -> tuple[float, float] | None:
 
 
 def detect(
-    jobs: Sequence[DetectionJob], *, people: int | None = None, masks: bool | None = None,
+    jobs: Sequence[DetectionJob], *, people: int | None = None, masks: bool | None = None, hands: bool | None = None,
     quality: str | Path | None = None, force: bool = False, progress: Step | None = None, tell: Tell,
 ) -> list[DetectionJob]:
     """Look through the videos whose file is not there yet, or is of another video or other settings; returns these.
@@ -125,7 +125,7 @@ def detect(
     from kinefit.readers.detections import detections_key
 
     keys = {job: video_key(job.video, job.rate, f"{MODELS_PACKAGE} {_METHOD}") for job in jobs}
-    wanted = {"people": people, "masks": masks, "quality": None if quality is None else _name_of(quality)}
+    wanted = {"people": people, "masks": masks, "hands": hands, "quality": quality and _name_of(quality)}
     if not force:
         for job in jobs:
             _from_beside(job, keys[job], wanted)
@@ -133,12 +133,12 @@ def detect(
     if not todo:
         return []
     files = networks(progress, tell, QUALITY if quality is None else quality)
-    number, outlines = people or PEOPLE, bool(masks)
+    number, outlines = PEOPLE if people is None else people, bool(masks)
     threads = max(cores() // len(todo), 1)  # cameras run side by side; what cores are left help them
 
     def work(job: DetectionJob, step: Step) -> None:
-        key = f"{keys[job]} {_settings(number, outlines, job.seconds)} quality={files.name}"
-        _look_through(job, files, number, outlines, key, step, threads)
+        key = f"{keys[job]} {_settings(number, outlines, bool(hands), job.seconds)} quality={files.name}"
+        _look_through(job, files, number, outlines, key, step, threads, bool(hands))
 
     with hushed():
         Models(files.folder, landmarks=files.landmarks)
@@ -176,9 +176,11 @@ def _look_through(
     key: str,
     tell: Step,
     threads: int,
+    hands: bool,
 ) -> None:
     from kinefit.exporters.pictures.detections import write_detections
     from kinefit.images.detectors.detection import detect_people
+    from kinefit.images.detectors.hands import HandFollower, HandModels
     from kinefit.images.detectors.models import Models
     from kinefit.readers.video import Video
 
@@ -194,7 +196,7 @@ def _look_through(
 
         found = detect_people(
             counted(video.frames(first, last)), models, camera=job.camera, rate=video.rate, people=people, masks=masks,
-            source=str(job.video),
+            source=str(job.video), with_hands=HandFollower(HandModels(files.folder, threads)) if hands else None,
         )
         found = found.within(first, len(video))
     write_detections(found, job.file, key=key)
@@ -241,9 +243,9 @@ def _name_of(quality: str | Path) -> str:
         raise FileError(f"cannot be read ({error.strerror})", file=quality, remedy="Check the path.") from error
 
 
-def _settings(people: int, masks: bool, seconds: tuple[float, float] | None) -> str:
+def _settings(people: int, masks: bool, hands: bool, seconds: tuple[float, float] | None) -> str:
     part = "" if seconds is None else " seconds={}:{}".format(*seconds)
-    return f"people={people} masks={masks}{part}"
+    return f"people={people} masks={masks}{' hands=True' * hands}{part}"
 
 
 def _fits(
@@ -252,7 +254,8 @@ def _fits(
     """Whether what was found is of this video and of the settings that matter, those that are not None."""
     if found is None or not found.startswith(key + " "):
         return False
-    settings = {"quality": "balanced", **dict(part.split("=") for part in found[len(key) + 1 :].split())}
+    told = dict(part.split("=") for part in found[len(key) + 1 :].split())
+    settings = {"quality": "balanced", "hands": "False", **told}
     first, last = (float(s) for s in settings.get("seconds", "-inf:inf").split(":"))
     start, stop = seconds or (-np.inf, np.inf)
     if not first <= start <= stop <= last:

@@ -27,6 +27,7 @@ _MIN_UNCONFIRMED_SCORE = 0.8  # of a person of whom no landmarks are found: the 
 _PART_STEP = 0.65  # of a part's side from one to the next: each face lies whole in one of them
 _MIN_PART_PX = 250  # side of the smallest parts: faces of 15 px are found in them
 _MAX_SHARE = 0.2  # of a part's side: larger faces are found in larger parts
+_MAX_RATIO, _MIN_LARGE_SCORE = 1.5, 0.85  # a face on somebody's body is no larger than the head there, or scores high
 _FACE_REACH = 0.9  # radius of what is hidden, in sides of the box of a face
 _PERSON_REACH = 0.25  # the same, in radii of the circle around a person
 _POINTS_REACH, _MIN_RADIUS_PX = 2.2, 12.0  # the same, in distances of the outermost of nose, eyes, ears; and at least
@@ -62,25 +63,27 @@ class FaceDetector:
         The image is looked at as a whole and in squares of its shorter side; with `small`, in the parts, too, that
         heads of a hundredth of its height need, which takes several times as long.
         """
-        found, bodies, shorter = [np.zeros((0, 4))], list[NDArray](), min(image.shape[:2])
+        found, shorter = [np.zeros((0, 4))], min(image.shape[:2])
+        bodies = list[tuple[NDArray, float]]()  # landmarks (33, 2) [px], radius of the head [px]
         for left, top, side in parts(image.shape[1], image.shape[0], small=small):
-            part = np.ascontiguousarray(image[top : top + side, left : left + side])
-            whole, in_part = side >= max(image.shape[:2]), side < shorter
+            part, corner = np.ascontiguousarray(image[top : top + side, left : left + side]), np.array([left, top])
+            whole, in_part, circles = side >= max(image.shape[:2]), side < shorter, list[list[float]]()
+            for person in self._people.find_people(part) if side >= shorter // 2 else ():  # whole in no smaller part
+                if in_part and any(_is_inside(person.points[0] + corner, body) for body, _ in bodies):
+                    continue
+                circle, points = self._head(part, person)
+                circles += circle
+                bodies += [(points + corner, head[2]) for head in circle if len(points) and not in_part]
             near, far = (_MIN_FACE_SCORE if whole else _MIN_NEAR_SCORE), _MIN_FACE_SCORE
             if side < shorter // 2:
                 near = far = _MIN_SMALL_SCORE
-            boxes = self._near(part, near) + self._far(part, far)
-            sides = [float(np.ptp(box.corners, axis=0).max()) for box in boxes]
-            circles = [
-                [*box.corners.mean(axis=0), _FACE_REACH * size] for box, size in zip(boxes, sides)
-                if whole or size < _MAX_SHARE * side
-            ]  # fmt: skip
-            for person in self._people.find_people(part) if side >= shorter // 2 else ():  # whole in no smaller part
-                if in_part and any(_is_inside(person.points[0] + [left, top], body) for body in bodies):
-                    continue
-                circle, body = self._head(part, person)
-                circles += circle
-                bodies += [body + [left, top]] * (len(body) > 0 and not in_part)
+            for box in self._near(part, near) + self._far(part, far):
+                middle, size = box.corners.mean(axis=0), float(np.ptp(box.corners, axis=0).max())
+                radius = _FACE_REACH * size
+                if (whole or size < _MAX_SHARE * side) and (box.score > _MIN_LARGE_SCORE or not any(
+                    _is_inside(middle + corner, body) and radius > _MAX_RATIO * head for body, head in bodies
+                )):  # fmt: skip
+                    circles.append([*middle, radius])
             found += [np.array([[u + left, v + top, radius, in_part]]) for u, v, radius in circles]
         return np.concatenate(found)
 
