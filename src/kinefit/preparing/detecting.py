@@ -120,11 +120,10 @@ def detect(
 
     Every file is written as soon as its video is done, so that what was interrupted goes on with the others.
     """
-    from kinefit.assets import MODELS_PACKAGE
     from kinefit.images.detectors.models import Models
     from kinefit.readers.detections import detections_key
 
-    keys = {job: video_key(job.video, job.rate, f"{MODELS_PACKAGE} {_METHOD}") for job in jobs}
+    keys = {job: detection_key(job) for job in jobs}
     wanted = {"people": people, "masks": masks, "hands": hands, "quality": quality and _name_of(quality)}
     if not force:
         for job in jobs:
@@ -241,6 +240,13 @@ def _name_of(quality: str | Path) -> str:
         return hashlib.sha256(quality.read_bytes()).hexdigest()[:16]
     except OSError as error:
         raise FileError(f"cannot be read ({error.strerror})", file=quality, remedy="Check the path.") from error
+
+
+def detection_key(job: DetectionJob) -> str:
+    """Begin of the key of a video's detections: text that another video, or another detector, does not have."""
+    from kinefit.assets import MODELS_PACKAGE
+
+    return video_key(job.video, job.rate, f"{MODELS_PACKAGE} {_METHOD}")
 
 
 def _settings(people: int, masks: bool, hands: bool, seconds: tuple[float, float] | None) -> str:

@@ -129,7 +129,7 @@ class HandFollower:
                 found = self._of_wrist(image, person, side)
                 other = now.get((person.column, 0))
                 if found and other and side and _is_same(found, other):
-                    if found.left < other.left:  # it is the right one, to which both wrists led
+                    if found.left < 0.5:  # it is the right one, to which both wrists led
                         del now[person.column, 0]
                     else:
                         continue
