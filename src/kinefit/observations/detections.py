@@ -109,14 +109,14 @@ class Detections:
         """The same as frames from `first` on of a video of so many; nobody is seen in the others."""
         after, people = frames - first - len(self), self.points.shape[1]
 
-        def padded(array: NDArray | None, value: float = np.nan) -> NDArray | None:
-            if array is None:
-                return None
+        def padded(array: NDArray, value: float = np.nan) -> NDArray:
             return np.pad(array, ((first, after), *[(0, 0)] * (array.ndim - 1)), constant_values=value)
 
         return replace(
-            self, points=padded(self.points), confidence=padded(self.confidence, 0.0), lifted=padded(self.lifted),
-            hands=padded(self.hands), hand_confidence=padded(self.hand_confidence, 0.0),
+            self, points=padded(self.points), confidence=padded(self.confidence, 0.0),
+            lifted=None if self.lifted is None else padded(self.lifted),
+            hands=None if self.hands is None else padded(self.hands),
+            hand_confidence=None if self.hand_confidence is None else padded(self.hand_confidence, 0.0),
             mask_starts=np.pad(self.mask_starts, (first * people, after * people), mode="edge"),
         )  # fmt: skip
 

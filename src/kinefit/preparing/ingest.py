@@ -16,6 +16,7 @@ from kinefit.preparing.each_video import Step, Tell
 from kinefit.preparing.faces import HiddenVideo, ensure_faces
 from kinefit.preparing.take import with_detections
 from kinefit.readers.take.file import Take, read_take
+from kinefit.readers.video import Video
 
 _VIDEO = re.compile(r'^video = "[^"\n]*"', re.M)
 FOLDER = "hidden-faces"
@@ -54,7 +55,7 @@ def hide_in_copies(path: Path, progress: Step | None, tell: Tell) -> list[Path]:
 
             return np.zeros((0, 3)) if points is None else head_circles(points[frame, :, :11])
 
-        def shown(video: HiddenVideo, camera: str = job.camera) -> Iterator[NDArray[np.uint8]]:
+        def shown(video: Video, camera: str = job.camera) -> Iterator[NDArray[np.uint8]]:
             for frame, image in enumerate(video.frames()):
                 if progress:
                     progress(f"hiding {camera}", frame + 1, len(video))
@@ -72,8 +73,6 @@ def hide_in_copies(path: Path, progress: Step | None, tell: Tell) -> list[Path]:
 
 def _check(take: Take) -> None:
     """Refuse videos that cannot be copied as they are."""
-    from kinefit.readers.video import Video
-
     for camera in take.cameras:
         if camera.video is not None and not camera.video.is_file():
             problem = "copies without faces are made of video files, not of images in folders or recordings"
