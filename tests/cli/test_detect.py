@@ -2,6 +2,7 @@
 
 import shutil
 import threading
+from types import SimpleNamespace
 
 import av
 import click
@@ -323,6 +324,30 @@ def test_another_quality_is_looked_through_anew_and_none_keeps_what_is_there(tak
         assert run(take, "--network", own).exit_code == 0 and networks.pictures == times * first
     own.write_bytes(b"another network")
     assert run(take, "--network", own).exit_code == 0 and networks.pictures == 4 * first
+
+
+def test_hands_are_looked_for_where_they_are_asked_for_and_kept(take, networks, monkeypatch):
+    class NoHands:
+        def __init__(self, folder, threads=1):
+            pass
+
+        def find_palms(self, image):
+            return []
+
+        def landmarks(self, image, roi):
+            return SimpleNamespace(presence=0.1)
+
+    monkeypatch.setattr("kinefit.images.detectors.hands.HandModels", NoHands)
+    file = detections_file(take, "cam01")
+    assert run(take).exit_code == 0 and read_detections(file).hands is None
+    first = networks.pictures
+    told = run(take, "--hands")
+    assert told.exit_code == 0 and "a left hand in 0, a right one in 0" in told.output
+    found = read_detections(file)
+    assert networks.pictures == 2 * first and found.hands.shape[2:] == (2, 21, 2) and (found.hand_confidence == 0).all()
+    assert run(take).exit_code == 0 and run(take, "--hands").exit_code == 0 and networks.pictures == 2 * first
+    assert run(take, "--no-hands").exit_code == 0 and read_detections(file).hands is None
+    assert run(take, "--people", "0").exit_code == 2
 
 
 def test_a_network_that_is_not_there_and_two_wishes_at_once_are_told(take, tmp_path):

@@ -140,6 +140,15 @@ def test_overlays_and_report_of_a_track_show_no_face(how, copy_take, found, tmp_
     assert path.with_name("take-detect").is_dir()
 
 
+def test_a_scene_shows_no_face(copy_take, found, tmp_path):
+    from kinefit.cli.view import gather
+
+    path = copy_take(tmp_path / "take")
+    shown = [gather((path,), None, hide_faces=hide).pictures.read("cam01", 0.5, 200) for hide in (False, True)]
+    changed = (shown[0] != shown[1]).any(axis=2)
+    assert changed.any() and changed.mean() < 0.2
+
+
 def run(path, out, *more):
     """Overlay's frame 2 of the first camera, and the report's text."""
     told = CliRunner().invoke(main, ["track", str(path), "-o", str(out), "--formats", "motion", "--no-report", *more])

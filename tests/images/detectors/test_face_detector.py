@@ -29,6 +29,12 @@ def test_a_head_s_circle_is_wider_than_its_points_and_nobody_has_none():
     assert head_circles(np.full((2, 3, 2), np.nan)).shape == (0, 3)
 
 
+def test_a_point_that_is_not_on_the_head_does_not_widen_the_circle():
+    profile = np.array([[0.0, 0], [3, -4], [4, -4], [5, -4], [4, -3], [20, 2], [21, 2], [2, 6]])  # ears far away
+    near, far = head_circles(profile[None])[0], head_circles(np.concatenate([profile, [[-170.0, 55.0]]])[None])[0]
+    assert near[2] > 2 * np.linalg.norm(profile[5] - near[:2]) and np.allclose(far, near)
+
+
 @pytest.fixture(scope="module")
 def detector():
     pytest.importorskip("ai_edge_litert", reason="needs the extra detect")

@@ -31,6 +31,7 @@ _MAX_RATIO, _MIN_LARGE_SCORE = 1.5, 0.85  # a face on somebody's body is no larg
 _FACE_REACH = 0.9  # radius of what is hidden, in sides of the box of a face
 _PERSON_REACH = 0.25  # the same, in radii of the circle around a person
 _POINTS_REACH, _MIN_RADIUS_PX = 2.2, 12.0  # the same, in distances of the outermost of nose, eyes, ears; and at least
+_OUTLIER_SHARE = 8.0  # of the median distance from the median: a point further away is not on the head; ears are nearer
 _HEAD = slice(0, 11)  # landmarks of MEDIAPIPE_33 on the face
 
 
@@ -124,6 +125,8 @@ def head_circles(points: NDArray) -> NDArray:
     points = points[np.isfinite(points).all(axis=2).any(axis=1)]
     if not points.size:
         return np.zeros((0, 3))
+    off = np.linalg.norm(points - np.nanmedian(points, axis=1, keepdims=True), axis=2, keepdims=True)
+    points = np.where(off > _OUTLIER_SHARE * np.nanmedian(off, axis=1, keepdims=True), np.nan, points)
     middle = np.nanmean(points, axis=1)
     spread = np.nanmax(np.linalg.norm(points - middle[:, None], axis=2), axis=1)
     return np.column_stack([middle, np.maximum(_POINTS_REACH * spread, _MIN_RADIUS_PX)])
