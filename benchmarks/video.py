@@ -11,6 +11,8 @@ PARTS = {
     "board": "calibration from boards",
     "detect": "the built-in detector",
     "detect_quality": "its qualities: each camera predicted by the others",
+    "hands_detect": "hands found, and seen alike by two cameras",
+    "hide_faces": "faces left open in images that leave the program",
     "smoothing": "whole takes at once",
     "error_bars": "truth within the error bars",
     "channels": "what is found of the errors of markers and of a range sensor",

@@ -2,6 +2,7 @@
 
 import shutil
 import threading
+from types import SimpleNamespace
 
 import av
 import click
@@ -16,7 +17,7 @@ from kinefit.exporters.pictures.detections import write_detections
 from kinefit.images.detectors.person_detector import DetectedPerson
 from kinefit.images.detectors.pose_model import SIZE, PersonLandmarks
 from kinefit.observations import Detections
-from kinefit.preparing import detecting
+from kinefit.preparing import detecting, each_video
 from kinefit.preparing.take import ensure_detections, with_detections
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.motion import read_motion
@@ -145,7 +146,7 @@ def test_another_video_or_setting_is_done_anew_and_only_that(take, networks):
 
 
 def test_what_was_interrupted_goes_on_with_the_others(take, networks, monkeypatch):
-    monkeypatch.setattr(detecting, "cores", lambda: 1)
+    monkeypatch.setattr(each_video, "cores", lambda: 1)
 
     def stop(camera, done, total):
         if camera == "cam02" and done == 6:
@@ -163,8 +164,8 @@ def test_ctrl_c_says_how_much_is_kept(take, monkeypatch):
         futures[0].result()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(detecting, "cores", lambda: 1)
-    monkeypatch.setattr(detecting, "wait", interrupted)
+    monkeypatch.setattr(each_video, "cores", lambda: 1)
+    monkeypatch.setattr(each_video, "wait", interrupted)
     with pytest.raises(KeyboardInterrupt, match=r"[1-4] of 4 videos are done and kept"):
         ensure_detections(read_take(take))
     assert detections_file(take, "cam01").is_file()
@@ -325,6 +326,30 @@ def test_another_quality_is_looked_through_anew_and_none_keeps_what_is_there(tak
     assert run(take, "--network", own).exit_code == 0 and networks.pictures == 4 * first
 
 
+def test_hands_are_looked_for_where_they_are_asked_for_and_kept(take, networks, monkeypatch):
+    class NoHands:
+        def __init__(self, folder, threads=1):
+            pass
+
+        def find_palms(self, image):
+            return []
+
+        def landmarks(self, image, roi):
+            return SimpleNamespace(presence=0.1)
+
+    monkeypatch.setattr("kinefit.images.detectors.hands.HandModels", NoHands)
+    file = detections_file(take, "cam01")
+    assert run(take).exit_code == 0 and read_detections(file).hands is None
+    first = networks.pictures
+    told = run(take, "--hands")
+    assert told.exit_code == 0 and "a left hand in 0, a right one in 0" in told.output
+    found = read_detections(file)
+    assert networks.pictures == 2 * first and found.hands.shape[2:] == (2, 21, 2) and (found.hand_confidence == 0).all()
+    assert run(take).exit_code == 0 and run(take, "--hands").exit_code == 0 and networks.pictures == 2 * first
+    assert run(take, "--no-hands").exit_code == 0 and read_detections(file).hands is None
+    assert run(take, "--people", "0").exit_code == 2
+
+
 def test_a_network_that_is_not_there_and_two_wishes_at_once_are_told(take, tmp_path):
     told = run(take, "--network", tmp_path / "none.tflite")
     assert isinstance(told.exception, FileError) and "none.tflite" in str(told.exception)
@@ -352,7 +377,7 @@ def drawn(drawn_take, tmp_path):
     return take
 
 
-def look(job, networks, people, masks, key, tell, threads):
+def look(job, networks, people, masks, key, tell, threads, hands):
     landmarks = np.load(job.video.with_name(f"mediapipe_{job.camera}.npy"))[:, None]
     points = np.where(landmarks[..., 2:] > 0, landmarks[..., :2], 0.5)
     nothing = np.zeros(0, np.uint32), np.zeros(len(points) + 1, int)

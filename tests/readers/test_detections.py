@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinefit.errors import ExportError, FileError
+from kinefit.errors import ExportError, FileError, ObservationError
 from kinefit.exporters.pictures.detections import write_detections
 from kinefit.observations import Detections
 from kinefit.readers.detections import detections_file, detections_key, read_detections
@@ -40,6 +40,21 @@ def test_what_is_written_is_read(found, tmp_path):
             assert np.array_equal(read.mask(f, p), found.mask(f, p))
     assert detections_key(path) == "the key"
     assert list(path.parent.iterdir()) == [path]
+
+
+def test_hands_are_written_and_read(found, tmp_path):
+    rng = np.random.default_rng(1)
+    hands, confidence = rng.uniform(0, 4, (3, 2, 2, 21, 2)), rng.uniform(size=(3, 2, 2, 21))
+    hands[0, 0, 1], confidence[0, 0, 1] = np.nan, 0
+    write_detections(replace(found, hands=hands, hand_confidence=confidence), tmp_path / "left.npz")
+    read = read_detections(tmp_path / "left.npz")
+    assert np.allclose(read.hands, hands, equal_nan=True, atol=1e-5)
+    keypoints = read.keypoints()
+    assert keypoints.points.shape == (3, 2, 75, 2) and keypoints.lifted.shape == (3, 2, 75, 3)
+    at = keypoints.names.index("right_pinky_tip")
+    assert at == 74 and np.allclose(keypoints.confidence[..., at], confidence[:, :, 1, 20], atol=1e-6)
+    with pytest.raises(ObservationError, match="hands"):
+        replace(found, hands=hands)
 
 
 def test_masks_run_down_the_columns(found):

@@ -87,6 +87,15 @@ MODELS_PACKAGE = Package(
             "pose_detection.tflite", "9ba9dd3d42efaaba86b4ff0122b06f29c4122e756b329d89dca1e297fd8f866c"),
         "mediapipe/modules/pose_landmark/pose_landmark_full.tflite": (
             "pose_landmark_full.tflite", "e9a5c5cb17f736fafd4c2ec1da3b3d331d6edbe8a0d32395855aeb2cdfd64b9f"),
+        "mediapipe/modules/face_detection/face_detection_short_range.tflite": (
+            "face_detection_short_range.tflite", "bbff11cebd1eb27a1e004cae0b0e63ec8c551cbf34a4451148b4908b8db3eca8"),
+        "mediapipe/modules/face_detection/face_detection_full_range_sparse.tflite": (
+            "face_detection_full_range_sparse.tflite",
+            "2c3728e6da56f21e21a320433396fb06d40d9088f2247c05e5635a688d45dfe1"),
+        "mediapipe/modules/palm_detection/palm_detection_full.tflite": (
+            "palm_detection_full.tflite", "1b14e9422c6ad006cde6581a46c8b90dd573c07ab7f3934b5589e7cea3f89a54"),
+        "mediapipe/modules/hand_landmark/hand_landmark_full.tflite": (
+            "hand_landmark_full.tflite", "11c272b891e1a99ab034208e23937a8008388cf11ed2a9d776ed3d01d0ba00e3"),
         "mediapipe-0.10.21.dist-info/LICENSE": (
             "LICENSE", "8707eef0533987efc5b155d64761eeb6e20793f50b9bd1a68dad1cf4719d0ed8"),
     }),
@@ -110,8 +119,8 @@ LANDMARKS_PACKAGE = Package(
 """The landmark network's larger sister; the package states its licence in package.json."""
 
 MODELS_CREDIT = (
-    "BlazePose networks out of mediapipe 0.10.21 and @mediapipe/pose 0.5.1675469404 by the MediaPipe authors, Google; "
-    "Apache-2.0"
+    "Networks of people, faces and hands out of mediapipe 0.10.21 and @mediapipe/pose 0.5.1675469404 by the MediaPipe "
+    "authors, Google; Apache-2.0"
 )
 """What to show to whoever fetches the networks."""
 

@@ -12,7 +12,7 @@ from kinefit.errors import KinefitError, TakeError
 
 if TYPE_CHECKING:
     from kinefit.motion import Motion
-    from kinefit.preparing.detecting import Tell
+    from kinefit.preparing.each_video import Tell
     from kinefit.readers.take.file import Take
     from kinefit.tracking.takes.in_view import InView
 
@@ -32,6 +32,7 @@ class Choices:
     lag : float [s], see `track`
     person : who is followed; None: whom the take names, else everybody in view
     restart : bool, whether what an earlier run left is forgotten
+    hide_faces : bool, whether everybody's face is hidden in what is shown of the videos, as the take may say, too
     """
 
     formats: tuple[str, ...] = USUAL
@@ -43,6 +44,7 @@ class Choices:
     lag: float | None = None
     person: str | None = None
     restart: bool = False
+    hide_faces: bool = False
 
     @property
     def draws(self) -> bool:
@@ -78,6 +80,7 @@ def asked_take(path: Path, choices: Choices) -> Take:
     from kinefit.readers.take.file import read_take
 
     take = read_take(path)
+    take = replace(take, hide_faces=take.hide_faces or choices.hide_faces)
     if choices.person is not None:
         take = replace(take, person=choices.person)
         try:

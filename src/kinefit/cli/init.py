@@ -26,16 +26,21 @@ _COLOURS = {"sure": "green", "likely": "cyan", "guess": "yellow", "open": "bold 
 @click.option("--points", type=click.Path(path_type=Path), metavar="JSON", help="Joints that were clicked before.")
 @click.option("--step", type=click.IntRange(min=0), help="With --click: frame of the images.  [default: the first]")
 @click.option("--body", metavar="BODY", help="Body that is clicked: of the catalogue, or a file.  [default: humanoid]")
+@click.option(
+    "--hide-faces", is_flag=True,
+    help="Write copies of the videos with everybody's face hidden, as far as it is found; the take names these.",
+)
 @click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page of --click.")
 @_screen.verbose_option
 def init(
     folder: Path, out: Path | None, force: bool, clicked: bool, points: Path | None, step: int | None,
-    body: str | None, browser: bool,
+    body: str | None, browser: bool, hide_faces: bool,
 ) -> None:
     """Write a first take file from what lies in FOLDER: calibration, videos, keypoints, markers.
 
     Everything is guessed from names and contents, and reported with how sure it is, here and as comments in the file.
-    Nothing else is changed. Look at what is a guess or open, then run kinefit check.
+    Nothing else is changed; with --hide-faces, copies of the videos are written beside the file. Look at what is a
+    guess or open, then run kinefit check.
     """
     if clicked and points is not None:
         raise click.UsageError("--click asks for joints, --points has them: name one.")
@@ -57,6 +62,12 @@ def init(
     guess = guess_take(folder, beside=out.absolute().parent)
     write_text(out, guess.text)
     _show(guess.notes)
+    if hide_faces:
+        from kinefit.preparing.ingest import hide_in_copies
+
+        with _screen.bars() as progress:
+            copies = hide_in_copies(out, progress, _screen.note)
+        _screen.say(f"{len(copies)} videos with faces hidden: {copies[0].parent}. The originals are as they were.")
     if clicked or points is not None:
         from kinefit.cli._clicks import start_from_clicks
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,11 +36,12 @@ Examples:
 @click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 lets other computers look in, too.")
 @_screen.token_option
 @click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page.")
+@_screen.hide_faces_option
 @click.option("--html", type=click.Path(path_type=Path), help="Write one self-contained page instead.")
 @_screen.verbose_option
 def view(
     sources: tuple[Path, ...], take: Path | None, port: int, host: str, token: str | None, browser: bool,
-    html: Path | None,
+    html: Path | None, hide_faces: bool,
 ) -> None:
     """Show a motion, a take or a folder of results as a 3D scene in the browser.
 
@@ -51,17 +53,18 @@ def view(
 
     if html is not None:
         check_file(html, "--html")
-    recording = gather(sources, take)
+    recording = gather(sources, take, hide_faces=hide_faces)
     if html is not None:
         _write(recording, html)
     else:
         _serve(recording, port, Access(host, token), browser)
 
 
-def gather(sources: tuple[Path, ...], take_file: Path | None) -> ViewerContent:
+def gather(sources: tuple[Path, ...], take_file: Path | None, *, hide_faces: bool = False) -> ViewerContent:
     """Read everything that is to be shown."""
     import numpy as np
 
+    from kinefit.preparing.faces import ensure_faces, shown_video
     from kinefit.readers.motion import read_motion
     from kinefit.readers.take.file import read_take
     from kinefit.readers.take.find import takes_in
@@ -91,15 +94,20 @@ def gather(sources: tuple[Path, ...], take_file: Path | None) -> ViewerContent:
         take, seen = found
     else:
         return ViewerContent(tuple(motions), name=motions[0].name)
+    take = replace(take, hide_faces=take.hide_faces or hide_faces)
     cameras = {camera.name: camera for camera in seen.rig or ()}
     offsets = {entry.name: entry.time_offset for entry in take.cameras}
     for motion in motions:
         if motion.up != take.up:
             _screen.note(f"{motion.name} has {motion.up} up, the take {take.up}: it is turned to the take's world.")
+    with _screen.bars() as step:
+        if take.hide_faces and seen.videos:
+            ensure_faces(take, step, _screen.note)
+    videos = {name: shown_video(take, seen, name) for name in seen.videos}
     return ViewerContent(
         tuple(motions), rig=seen.rig, up=take.up, name=take.name, steps=np.arange(*seen.frames) / seen.rate,
         points=None if motions else _triangulated(take, seen),
-        pictures=CameraImages(cameras, seen.videos, seen.images, offsets, rate=seen.rate) if seen.videos else None,
+        pictures=CameraImages(cameras, videos, seen.images, offsets, rate=seen.rate) if videos else None,
         markers=seen.markers, marker_offsets=tuple(entry.time_offset for entry in take.markers),
     )  # fmt: skip
 

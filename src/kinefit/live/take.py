@@ -14,6 +14,7 @@ from kinefit.errors import CalibrationError, TakeError
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
 from kinefit.identification.take.named import with_names
 from kinefit.images.depth_scene import background_model
+from kinefit.images.detectors.models import Models
 from kinefit.live.cameras import CameraStream, SessionClock, VideoReplay
 from kinefit.live.detecting import LiveDetector
 from kinefit.live.folders import DepthFolderStream, ImageFolderStream, KeypointFolderStream
@@ -23,7 +24,8 @@ from kinefit.live.seen import SeenRecord
 from kinefit.live.session import LiveSession, Receiver, Source
 from kinefit.live.sizing import LiveSize
 from kinefit.observations import KEYPOINT_SIGMA
-from kinefit.preparing.detecting import Tell, hush, networks
+from kinefit.preparing.detecting import hushed, networks
+from kinefit.preparing.each_video import Tell
 from kinefit.preparing.take import warn
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.motion import read_motion
@@ -203,7 +205,8 @@ def with_detector(
             images[entry.name] = image_frame(entry, rig, sizes[entry.name], take)
     people = 1 if take.person is None else 3
     files = networks(None, tell)
-    hush(files)
+    with hushed():
+        Models(files.folder, landmarks=files.landmarks)
     detector = LiveDetector(files, images, rate=rate, people=people, threads=threads)
     sigma = dict.fromkeys(images, KEYPOINT_SIGMA)
     own = Rig(tuple(rig[entry.name] for entry in take.cameras))

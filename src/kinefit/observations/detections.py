@@ -55,6 +55,11 @@ class Detections:
     lifted : (F, P, 33, 3) [m], optional
         The landmarks in space from the middle of the hips, along the image's u and v and away from the camera, of a
         person of the network's idea of size; NaN where a person is not seen.
+    hands : (F, P, 2, 21, 2) [px], optional
+        Landmarks of MEDIAPIPE_HAND_21 of the left and the right hand; NaN where a hand is not seen. Of hands in an
+        image that shows nobody, the person is not seen.
+    hand_confidence : (F, P, 2, 21), with `hands`
+        Probability that a landmark is of this hand and in the image; 0 where a hand is not seen.
     """
 
     camera: str
@@ -66,6 +71,8 @@ class Detections:
     mask_starts: NDArray
     source: str = ""
     lifted: NDArray | None = None
+    hands: NDArray | None = None
+    hand_confidence: NDArray | None = None
 
     def __post_init__(self) -> None:
         points, confidence = frozen(self.points), frozen(self.confidence)
@@ -83,6 +90,11 @@ class Detections:
         if lifted is not None:
             what = f"lifted landmarks of camera {self.camera}"
             lifted = frozen(lifted, float, what, (*points.shape[:3], 3), self.source)
+        hands, hand_confidence = self.hands, self.hand_confidence
+        if hands is not None or hand_confidence is not None:
+            what, shape = f"hands of camera {self.camera}", (*points.shape[:2], 2, 21)
+            hands = frozen(hands, float, what, (*shape, 2), self.source)
+            hand_confidence = frozen(hand_confidence, float, f"the confidence of {what}", shape, self.source)
         ends = np.concatenate([[0], np.cumsum(runs, dtype=np.int64)])[starts]
         sizes, pixels = np.diff(ends)[np.diff(starts) > 0], math.prod(self.size)
         if min(self.size) < 1 or pixels > MAX_IMAGE_PIXELS or np.any(sizes != pixels):
@@ -91,15 +103,20 @@ class Detections:
                 file=self.source or None, remedy="Give runs that sum up to the image's pixels.",
             )  # fmt: skip
         freeze(self, points=points, confidence=confidence, mask_runs=runs, mask_starts=starts, lifted=lifted)
+        freeze(self, hands=hands, hand_confidence=hand_confidence)
 
     def within(self, first: int, frames: int) -> Detections:
         """The same as frames from `first` on of a video of so many; nobody is seen in the others."""
         after, people = frames - first - len(self), self.points.shape[1]
-        around = ((first, after), (0, 0), (0, 0))
+
+        def padded(array: NDArray, value: float = np.nan) -> NDArray:
+            return np.pad(array, ((first, after), *[(0, 0)] * (array.ndim - 1)), constant_values=value)
+
         return replace(
-            self, points=np.pad(self.points, (*around, (0, 0)), constant_values=np.nan),
-            confidence=np.pad(self.confidence, around),
-            lifted=None if self.lifted is None else np.pad(self.lifted, (*around, (0, 0)), constant_values=np.nan),
+            self, points=padded(self.points), confidence=padded(self.confidence, 0.0),
+            lifted=None if self.lifted is None else padded(self.lifted),
+            hands=None if self.hands is None else padded(self.hands),
+            hand_confidence=None if self.hand_confidence is None else padded(self.hand_confidence, 0.0),
             mask_starts=np.pad(self.mask_starts, (first * people, after * people), mode="edge"),
         )  # fmt: skip
 
@@ -108,8 +125,9 @@ class Detections:
 
     @property
     def seen(self) -> NDArray:
-        """(F, P) bool, whether a person is seen in a frame."""
-        return np.isfinite(self.points).all(axis=(2, 3))
+        """(F, P) bool, whether a person, or a hand alone, is seen in a frame."""
+        seen = np.isfinite(self.points).all(axis=(2, 3))
+        return seen if self.hands is None else seen | np.isfinite(self.hands).all(axis=(3, 4)).any(axis=2)
 
     def mask(self, frame: int, person: int) -> NDArray | None:
         """(height, width) bool, the pixels of a person; None where there is no mask."""
@@ -123,7 +141,7 @@ class Detections:
     def keypoints(
         self, camera: str | None = None, *, image_frame: ImageFrame | None = None, time_offset: float = 0.0
     ) -> Keypoints:
-        """The landmarks of all people as a detector's keypoints.
+        """The landmarks of all people as a detector's keypoints: MEDIAPIPE_33, with hands MEDIAPIPE_75.
 
         Parameters
         ----------
@@ -144,11 +162,17 @@ class Detections:
                 file=self.source or None,
                 remedy="The detector wants a person of a tenth of the image's height or more; leave this camera out.",
             )
-        points, lifted = self.points, self.lifted
+        points, confidence, lifted, names = self.points, self.confidence, self.lifted, MEDIAPIPE_33
+        if self.hands is not None and self.hand_confidence is not None:
+            people, names = self.seen.shape, MEDIAPIPE_75
+            points = np.concatenate([points, self.hands.reshape(*people, 42, 2)], axis=2)
+            confidence = np.concatenate([confidence, self.hand_confidence.reshape(*people, 42)], axis=2)
+            if lifted is not None:  # hands are not lifted
+                lifted = np.concatenate([lifted, np.full((*people, 42, 3), np.nan)], axis=2)
         if image_frame is not None:
             points, lifted = in_calibration(points, lifted, image_frame)
         return Keypoints(
-            camera or self.camera, "MEDIAPIPE_33", MEDIAPIPE_33, self.rate, points, self.confidence,
+            camera or self.camera, f"MEDIAPIPE_{len(names)}", names, self.rate, points, confidence,
             time_offset=time_offset, source=self.source, lifted=lifted,
         )
 

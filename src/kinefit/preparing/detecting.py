@@ -6,9 +6,7 @@ import hashlib
 import os
 import shutil
 import sys
-import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from glob import escape
@@ -19,12 +17,14 @@ import numpy as np
 
 from kinefit._threads import cores
 from kinefit.errors import AssetError, FileError, TakeError
+from kinefit.preparing.each_video import Step, Tell, each_video, video_key
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from kinefit.readers.take.entries import CameraEntry
     from kinefit.readers.take.file import Take
+    from kinefit.readers.video import Video
 
 PEOPLE = 3
 """How many people are followed at most in one camera, unless told otherwise."""
@@ -36,13 +36,6 @@ QUALITY = "best"
 """Of new detections, where none is asked for."""
 
 _METHOD = "3"  # raise it when the detector gives other numbers for the same video
-Step = Callable[[str, int, int], None]
-"""Called with what is done, how much of it is done, and how much there is (0: unknown)."""
-
-Tell = Callable[[str], None]
-"""Called with what is worth saying."""
-
-_ENDS = 2**20  # [bytes] of a video's begin and end by which it is recognised
 
 
 @dataclass(frozen=True)
@@ -117,7 +110,7 @@ def _seconds(take: Take, camera: CameraEntry) -> tuple[float, float] | None:
 
 
 def detect(
-    jobs: Sequence[DetectionJob], *, people: int | None = None, masks: bool | None = None,
+    jobs: Sequence[DetectionJob], *, people: int | None = None, masks: bool | None = None, hands: bool | None = None,
     quality: str | Path | None = None, force: bool = False, progress: Step | None = None, tell: Tell,
 ) -> list[DetectionJob]:
     """Look through the videos whose file is not there yet, or is of another video or other settings; returns these.
@@ -127,10 +120,11 @@ def detect(
 
     Every file is written as soon as its video is done, so that what was interrupted goes on with the others.
     """
+    from kinefit.images.detectors.models import Models
     from kinefit.readers.detections import detections_key
 
-    keys = {job: _video_key(job) for job in jobs}
-    wanted = {"people": people, "masks": masks, "quality": None if quality is None else _name_of(quality)}
+    keys = {job: detection_key(job) for job in jobs}
+    wanted = {"people": people, "masks": masks, "hands": hands, "quality": quality and _name_of(quality)}
     if not force:
         for job in jobs:
             _from_beside(job, keys[job], wanted)
@@ -138,37 +132,16 @@ def detect(
     if not todo:
         return []
     files = networks(progress, tell, QUALITY if quality is None else quality)
-    number, outlines = people or PEOPLE, bool(masks)
-    stop, lock = threading.Event(), threading.Lock()
-
-    def step(camera: str, done: int, total: int) -> None:
-        if stop.is_set():
-            raise _Stopped
-        if progress:
-            with lock:
-                progress(camera, done, total)
-
+    number, outlines = PEOPLE if people is None else people, bool(masks)
     threads = max(cores() // len(todo), 1)  # cameras run side by side; what cores are left help them
 
-    def work(job: DetectionJob) -> None:
-        key = f"{keys[job]} {_settings(number, outlines, job.seconds)} quality={files.name}"
-        _look_through(job, files, number, outlines, key, step, threads)
+    def work(job: DetectionJob, step: Step) -> None:
+        key = f"{keys[job]} {_settings(number, outlines, bool(hands), job.seconds)} quality={files.name}"
+        _look_through(job, files, number, outlines, key, step, threads, bool(hands))
 
-    hush(files)
-    with _one_thread_each(), ThreadPoolExecutor(min(len(todo), cores())) as pool:
-        futures = [pool.submit(work, job) for job in todo]
-        try:
-            done, _ = wait(futures, return_when=FIRST_EXCEPTION)
-        except KeyboardInterrupt as stopped:
-            kept = len(jobs) - len(todo) + sum(future.done() for future in futures)
-            told = f"{kept} of {len(jobs)} videos are done and kept; the same command goes on with the others."
-            raise KeyboardInterrupt(told) from stopped
-        finally:  # after an error, or Ctrl-C: those that run end at their next picture
-            stop.set()
-            for future in futures:
-                future.cancel()
-    for future in done:
-        future.result()
+    with hushed():
+        Models(files.folder, landmarks=files.landmarks)
+    each_video(todo, work, progress, of=len(jobs))
     return todo
 
 
@@ -186,8 +159,12 @@ def _from_beside(job: DetectionJob, key: str, wanted: Mapping[str, object]) -> N
             return
 
 
-class _Stopped(Exception):
-    """Another camera failed, or Ctrl-C came."""
+def seconds_of(job: DetectionJob, video: Video) -> tuple[int, int]:
+    """Frames (first, stop) of a video that are looked through."""
+    if job.seconds is None:
+        return 0, len(video)
+    first, stop = (int(np.clip(np.ceil(s * video.rate), 0, len(video))) for s in job.seconds)
+    return first, stop
 
 
 def _look_through(
@@ -196,19 +173,19 @@ def _look_through(
     people: int,
     masks: bool,
     key: str,
-    tell: Callable[[str, int, int], None],
+    tell: Step,
     threads: int,
+    hands: bool,
 ) -> None:
     from kinefit.exporters.pictures.detections import write_detections
     from kinefit.images.detectors.detection import detect_people
+    from kinefit.images.detectors.hands import HandFollower, HandModels
     from kinefit.images.detectors.models import Models
     from kinefit.readers.video import Video
 
     models = Models(files.folder, threads, files.landmarks)
     with Video(job.video, rate=job.rate) as video:
-        first, last = 0, len(video)
-        if job.seconds is not None:
-            first, last = (int(np.clip(np.ceil(s * video.rate), 0, len(video))) for s in job.seconds)
+        first, last = seconds_of(job, video)
 
         def counted(images: Iterable[NDArray]) -> Iterator[NDArray]:
             for number, image in enumerate(images):
@@ -218,7 +195,7 @@ def _look_through(
 
         found = detect_people(
             counted(video.frames(first, last)), models, camera=job.camera, rate=video.rate, people=people, masks=masks,
-            source=str(job.video),
+            source=str(job.video), with_hands=HandFollower(HandModels(files.folder, threads)) if hands else None,
         )
         found = found.within(first, len(video))
     write_detections(found, job.file, key=key)
@@ -265,31 +242,16 @@ def _name_of(quality: str | Path) -> str:
         raise FileError(f"cannot be read ({error.strerror})", file=quality, remedy="Check the path.") from error
 
 
-def _video_key(job: DetectionJob) -> str:
-    """Text that another video, or another detector, does not have."""
+def detection_key(job: DetectionJob) -> str:
+    """Begin of the key of a video's detections: text that another video, or another detector, does not have."""
     from kinefit.assets import MODELS_PACKAGE
-    from kinefit.readers.image_folders import images_in
 
-    digest, size, path = hashlib.sha256(), 0, job.video
-    images = images_in(path) if path.is_dir() or "*" in path.name else []
-    try:
-        for part in images or [path]:
-            with part.open("rb") as file:
-                length = file.seek(0, os.SEEK_END)
-                for start in (0, max(0, length - _ENDS // max(1, len(images)))):
-                    file.seek(start)
-                    digest.update(file.read(_ENDS // max(1, len(images))))
-            size += length
-    except OSError as error:
-        raise FileError(f"cannot be read ({error.strerror})", file=path, remedy="Check the path.") from error
-    if images:
-        digest.update(f"{len(images)} {job.rate}".encode())
-    return f"{digest.hexdigest()[:32]} {size} {MODELS_PACKAGE} {_METHOD}"
+    return video_key(job.video, job.rate, f"{MODELS_PACKAGE} {_METHOD}")
 
 
-def _settings(people: int, masks: bool, seconds: tuple[float, float] | None) -> str:
+def _settings(people: int, masks: bool, hands: bool, seconds: tuple[float, float] | None) -> str:
     part = "" if seconds is None else " seconds={}:{}".format(*seconds)
-    return f"people={people} masks={masks}{part}"
+    return f"people={people} masks={masks}{' hands=True' * hands}{part}"
 
 
 def _fits(
@@ -298,7 +260,8 @@ def _fits(
     """Whether what was found is of this video and of the settings that matter, those that are not None."""
     if found is None or not found.startswith(key + " "):
         return False
-    settings = {"quality": "balanced", **dict(part.split("=") for part in found[len(key) + 1 :].split())}
+    told = dict(part.split("=") for part in found[len(key) + 1 :].split())
+    settings = {"quality": "balanced", "hands": "False", **told}
     first, last = (float(s) for s in settings.get("seconds", "-inf:inf").split(":"))
     start, stop = seconds or (-np.inf, np.inf)
     if not first <= start <= stop <= last:
@@ -306,29 +269,15 @@ def _fits(
     return all(value is None or settings.get(name) == str(value) for name, value in wanted.items())
 
 
-def hush(networks: Networks) -> None:
+@contextmanager
+def hushed() -> Iterator[None]:
     """Let LiteRT say here, once and to nobody, how it runs: it writes that past Python on stderr, amid the progress."""
-    from kinefit.images.detectors.models import Models
-
     sys.stderr.flush()
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
-        Models(networks.folder, landmarks=networks.landmarks)
+        yield
     finally:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(nowhere)
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """OpenCV without threads of its own: the cameras run side by side."""
-    import cv2
-
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)

@@ -10,7 +10,9 @@ from pathlib import Path
 import msgspec
 
 from kinefit.errors import ObservationError
-from kinefit.preparing.detecting import DetectionJob, Step, Tell, detect, jobs_of_take
+from kinefit.preparing.detecting import DetectionJob, detect, jobs_of_take
+from kinefit.preparing.each_video import Step, Tell
+from kinefit.preparing.faces import ensure_faces
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.take.entries import KeypointsEntry
 from kinefit.readers.take.file import Take
@@ -26,7 +28,7 @@ def prepared(take: Take, progress: Step | None = None, tell: Tell = warn) -> Tak
 
     Its body is fetched, where it is one that has to be. The built-in detector looks through the videos of a take that
     names no keypoints, nor another sensor that shows a body, or that asks for it; what it finds is kept beside the take
-    and not looked for again.
+    and not looked for again. So are faces, where the take hides them.
 
     Parameters
     ----------
@@ -39,6 +41,8 @@ def prepared(take: Take, progress: Step | None = None, tell: Tell = warn) -> Tak
         As `ensure_detections`; what cannot be fetched.
     """
     take = with_detections(take, progress, tell)
+    if take.hide_faces and any(camera.video for camera in take.cameras):
+        ensure_faces(take, progress, tell)
     if take.body == "anny":
         from kinefit.assets import anny_files
 

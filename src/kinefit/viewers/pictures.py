@@ -95,7 +95,7 @@ class CameraImages:
     Parameters
     ----------
     cameras : {name: Camera}
-    videos : {name: path}
+    videos : {name: path or Video}
         Of some or all of the cameras.
     images : {name: ImageFrame}, optional
         From the calibration to the video; by default they are the same.
@@ -113,7 +113,7 @@ class CameraImages:
     def __init__(
         self,
         cameras: Mapping[str, Camera],
-        videos: Mapping[str, Path],
+        videos: Mapping[str, Path | Video],
         images: Mapping[str, ImageFrame] | None = None,
         time_offsets: Mapping[str, float] | None = None,
         *,
@@ -125,7 +125,7 @@ class CameraImages:
         self._kept: OrderedDict[tuple[str, int, int], NDArray[np.uint8]] = OrderedDict()
         try:
             for name, path in videos.items():
-                self._videos[name] = Video(path, rate=rate)
+                self._videos[name] = path if isinstance(path, Video) else Video(path, rate=rate)
         except BaseException:
             self.close()
             raise

@@ -12,7 +12,7 @@ from kinefit.diagnostics.views import from_others
 from kinefit.errors import KinefitError
 from kinefit.exporters.report import page as p
 from kinefit.geometry.camera import Camera, ImageFrame
-from kinefit.readers.video import Video
+from kinefit.preparing.faces import shown_video
 
 _SEEN, _TOLD, _DARK, _ARROW = (255, 240, 60), (90, 200, 255), (15, 15, 15), (255, 90, 60)  # RGB
 _MAGNIFIED = 10  # times: bias arrows
@@ -67,10 +67,10 @@ def _ground(check: Check, camera: Camera, frame: int) -> tuple[NDArray, ImageFra
     """A frame of the camera's video (grey where there is none), and how it relates to the calibration's picture."""
     seen = check.observations
     entry = next((e for e in check.take.cameras if e.name == camera.name), None) if check.take else None
-    if seen is not None and entry is not None and camera.name in seen.videos:
+    if check.take and seen is not None and entry is not None and camera.name in seen.videos:
         at = frame + seen.frames[0] - round(entry.time_offset * seen.rate) - check.frames_late.get(camera.name, 0)
         try:
-            with Video(seen.videos[camera.name], rate=seen.rate) as video:
+            with shown_video(check.take, seen, camera.name) as video:
                 return np.array(video.read(min(max(at, 0), len(video) - 1))), seen.images[camera.name]
         except KinefitError:
             pass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,11 +33,12 @@ _PRINTED = ("camera", "bias u, v [px]", "±", "spread", "late [frames]", "l/r ex
     "--points", type=click.Path(path_type=Path),
     help="With --refine: TOML of static points, [name] and camera = [u, v] px in the calibration's image.",
 )
+@_screen.hide_faces_option
 @click.option("--strict", is_flag=True, help="Exit code 2 where there is a fault.")
 @_screen.verbose_option
 def check(
     take: Path, out: Path | None, refine: bool, focal: bool, distortion: bool, time_offsets: bool,
-    points: Path | None, strict: bool,
+    points: Path | None, strict: bool, hide_faces: bool,
 ) -> None:  # fmt: skip
     """Find out what is wrong with a recording, how sure that is, and what would fix it.
 
@@ -54,6 +56,7 @@ def check(
     from kinefit.cli.checks._refine import refined_of, write_refined
     from kinefit.errors import KinefitError
     from kinefit.exporters.atomic import write_text
+    from kinefit.preparing.faces import ensure_faces
     from kinefit.preparing.take import with_detections
     from kinefit.readers.take.file import read_take
     from kinefit.readers.take.find import find_take
@@ -62,6 +65,7 @@ def check(
     out = out or take.with_name(f"{take.stem}-check.html")
     check_file(out)
     entry = read_take(take)
+    entry = replace(entry, hide_faces=entry.hide_faces or hide_faces)
     refined: Refined | None = None
     failed: KinefitError | None = None
     with _screen.bars() as step:
@@ -69,6 +73,8 @@ def check(
             entry = with_detections(entry, step, _screen.note)
         except KinefitError as error:  # the rest can be checked without
             _screen.note(f"note: no keypoints: {error}")
+        if entry.hide_faces and any(camera.video for camera in entry.cameras):
+            ensure_faces(entry, step, _screen.note)
         found = check_take(entry, progress=step)
         if refine:
             try:

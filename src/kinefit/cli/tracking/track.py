@@ -56,6 +56,7 @@ def choices_options(command: Callable) -> Callable:
             "--pictures", type=click.Choice(PICTURES), default="full", show_default=True,
             help="What report and overlays show of the videos: all, all but the person's face, nothing.",
         ),
+        _screen.hide_faces_option,
         click.option("--contacts", is_flag=True, help="Hold soles still where they rest on a level floor."),
         click.option("--realtime", is_flag=True, help="Do not smooth over the whole take."),
         click.option(
@@ -90,7 +91,9 @@ def choices_options(command: Callable) -> Callable:
     return called
 
 
-_CHOICES = ("overlays", "formats", "report", "pictures", "contacts", "realtime", "lag", "person", "restart")
+_CHOICES = (
+    "overlays", "formats", "report", "pictures", "contacts", "realtime", "lag", "person", "restart", "hide_faces",
+)  # fmt: skip
 
 
 def _check(choices: Choices, wanted: bool) -> None:

@@ -24,7 +24,10 @@ def write_detections(detections: Detections, path: str | PathLike[str], *, key: 
     """
     if Path(path).suffix != ".npz":
         raise ExportError("a file of detections ends in .npz", file=path, remedy=f"Call it {Path(path).stem}.npz.")
-    extra: dict[str, Any] = {} if detections.lifted is None else {"lifted": detections.lifted.astype(np.float32)}
+    extra: dict[str, Any] = {
+        name: array.astype(np.float32) for name in ("lifted", "hands", "hand_confidence")
+        if (array := getattr(detections, name)) is not None
+    }  # fmt: skip
     with writing(path) as temporary:
         np.savez_compressed(
             temporary, format=np.array(FORMAT), version=np.array(VERSION), key=np.array(key),

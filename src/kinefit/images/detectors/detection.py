@@ -7,7 +7,7 @@ is followed by the region that the last landmarks tell.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -49,13 +49,17 @@ class _DetectionTrack:
 
 @dataclass(frozen=True, eq=False)
 class PersonDetection:
-    """One person in one picture: column, landmarks (33, 2) [px], confidence, runs of the mask, lifted (33, 3) [m]."""
+    """One person in one picture: column, landmarks (33, 2) [px], confidence, runs of the mask, lifted (33, 3) [m].
+
+    And points (2, 21, 2) [px] and confidence (2, 21) of the left and the right hand, where they were looked for.
+    """
 
     column: int
     points: NDArray
     confidence: NDArray
     runs: NDArray
     lifted: NDArray
+    hands: tuple[NDArray, NDArray] | None = None
 
 
 @dataclass
@@ -282,6 +286,7 @@ def cover(image: NDArray[np.uint8], shapes: Iterable[tuple[Roi, NDArray]]) -> ND
 def detect_people(
     images: Iterable[NDArray[np.uint8]], models: Models, *, camera: str, rate: float, people: int = 3,
     masks: bool = True, source: str = "",
+    with_hands: Callable[[NDArray[np.uint8], list[PersonDetection]], list[PersonDetection]] | None = None,
 ) -> Detections:
     """Keypoints and masks of the people in a video.
 
@@ -295,6 +300,8 @@ def detect_people(
         How many are followed at most at a time.
     masks : bool
         Whether outlines are wanted.
+    with_hands : callable, optional
+        Adds their hands to the people in an image, such as a `HandFollower`.
 
     Returns
     -------
@@ -307,7 +314,8 @@ def detect_people(
     size = (0, 0)
     for image in images:
         size = (image.shape[1], image.shape[0])
-        frames.append(follower.update(image))
+        seen = follower.update(image)
+        frames.append(with_hands(image, seen) if with_hands else seen)
     times = Counter(s.column for frame in frames for s in frame)
     least = min(max(_FEW, round(_BRIEF * rate)), len(frames) // 2)
     column = {c: k for k, c in enumerate(sorted(c for c in times if times[c] >= least))}
@@ -316,12 +324,15 @@ def detect_people(
     counts = np.zeros((len(frames), len(column)), int)
     lifted = np.full((len(frames), len(column), 33, 3), np.nan)
     runs = [np.zeros(0, np.uint32)]
+    hands = np.full((*counts.shape, 2, 21, 2), np.nan), np.zeros((*counts.shape, 2, 21))
     for f, frame in enumerate(frames):
         for s in sorted((s for s in frame if s.column in column), key=lambda s: s.column):
             at = f, column[s.column]
             points[at], confidence[at], counts[at], lifted[at] = s.points, s.confidence, len(s.runs), s.lifted
             runs.append(s.runs)
+            if s.hands:
+                hands[0][at], hands[1][at] = s.hands
     return Detections(
         camera, rate, size, points, confidence, np.concatenate(runs), np.concatenate([[0], np.cumsum(counts)]), source,
-        lifted,
+        lifted, *(hands if with_hands else ()),
     )

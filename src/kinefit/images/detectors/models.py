@@ -50,7 +50,7 @@ class Models:
     ) -> None:
         self._landmarks, self._threads = Path(folder) / LANDMARKS if landmarks is None else Path(landmarks), threads
         self._points = _pose_model(self._landmarks, threads, without=MASK)
-        self._detect = PersonDetector(_interpreter(Path(folder) / DETECTOR, threads))
+        self._detect = PersonDetector(interpreter(Path(folder) / DETECTOR, threads))
 
     @cached_property
     def _outlines(self) -> PoseModel:
@@ -106,23 +106,23 @@ def _runtime() -> Any:
 
 def _pose_model(path: Path, threads: int, without: tuple[int, ...] = ()) -> PoseModel:
     try:
-        return PoseModel(_interpreter(path, threads, without))
+        return PoseModel(interpreter(path, threads, without))
     except KeyError as error:
         raise FileError(f"a network without inputs or outputs of shape {error}", file=path, remedy=_LAYOUT) from error
 
 
-def _interpreter(path: Path, threads: int, without: tuple[int, ...] = ()) -> Any:
+def interpreter(path: Path, threads: int, without: tuple[int, ...] = ()) -> Any:
     """A network, ready to run; `without` the output of a shape, and what makes it alone."""
     runtime, remedy = _runtime(), _REMEDY if path.is_relative_to(cache_directory()) else _LAYOUT
     if not path.is_file():
         raise FileError("no such network", file=path, remedy=remedy)
     try:
         given = {"model_content": _reduced(path, without)} if without else {"model_path": str(path)}
-        interpreter = runtime(**given, num_threads=threads)
-        interpreter.allocate_tensors()
+        network = runtime(**given, num_threads=threads)
+        network.allocate_tensors()
     except (ValueError, RuntimeError, TypeError, LookupError, AttributeError, struct.error) as error:
         raise FileError(f"not a network that LiteRT runs ({error})", file=path, remedy=remedy) from error
-    return interpreter
+    return network
 
 
 @lru_cache(maxsize=2)

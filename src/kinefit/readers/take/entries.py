@@ -217,6 +217,7 @@ class _Head(_Entry, frozen=True, kw_only=True):
     start: Path | None = None
     size: bool | None = None
     frames: tuple[int, int] | None = None
+    hide_faces: bool = False  # in all images and videos that show what the cameras saw
 
 
 TABLES: dict[str, type[msgspec.Struct]] = {

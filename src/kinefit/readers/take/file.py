@@ -110,6 +110,8 @@ class Take:
         Steps of the common time, t = step / rate.
     calibration : CalibrationEntry or None
     session : SessionEntry, whom and what the recording shows
+    hide_faces : bool
+        Whether images and videos that are made from the take's show no faces.
     cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines, surface_points, trackers : tuples
         Of entries; `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
     """
@@ -139,6 +141,7 @@ class Take:
     surface_points: tuple[SurfacePointsEntry, ...] = ()
     trackers: tuple[TrackerEntry, ...] = ()
     session: SessionEntry = field(default_factory=SessionEntry)
+    hide_faces: bool = False
 
     @property
     def other_sensors(self) -> tuple[object, ...]:
@@ -189,7 +192,7 @@ def read_take(path: str | PathLike[str]) -> Take:
         silhouettes=content.silhouette, regions=content.region,
         skin=tuple(k for k in content.keypoints if k.format == "skin"), lines=content.lines, start=head.start,
         pose=content.start, size=head.size, person=head.person, session=content.session,
-        surface_points=content.surface_points, trackers=content.tracker,
+        surface_points=content.surface_points, trackers=content.tracker, hide_faces=head.hide_faces,
     )  # fmt: skip
     check_take(take)
     return take

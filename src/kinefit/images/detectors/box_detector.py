@@ -1,0 +1,115 @@
+"""Single-shot detectors of BlazeFace's family: people, faces and palms in a whole image, by anchors of one size.
+
+Source: Bazarevsky et al., BlazeFace, 2019 (anchors, weighted suppression); BlazePose, 2020.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+_MAX_OVERLAP = 0.3  # boxes whose intersection is a larger share of their union show the same thing
+_MAX_LOGIT = 100.0  # beyond it the exponential overflows
+
+
+@dataclass(frozen=True, eq=False)
+class DetectedBox:
+    """One detection: corners (2, 2) [px] upper left and lower right, points (K, 2) [px], score 0..1."""
+
+    corners: NDArray
+    points: NDArray
+    score: float
+
+
+class BoxDetector:
+    """Boxes with points in a whole image.
+
+    Parameters
+    ----------
+    interpreter
+        Of a network with an input (1, S, S, 3) and outputs (1, N, 4 + 2 K), the boxes and points in pixels from their
+        anchors, and (1, N, 1), the logits.
+    cells : ((stride [px], anchors in a cell), ...)
+        Feature maps in the order of the network's anchors.
+    low : float
+        Value of black at the input; white is 1.
+    """
+
+    def __init__(self, interpreter: Any, cells: Sequence[tuple[int, int]], low: float = -1.0) -> None:
+        self._interpreter, self._low = interpreter, low
+        details = interpreter.get_input_details()[0]
+        self._input, self.size = details["index"], int(details["shape"][1])
+        outputs = sorted(interpreter.get_output_details(), key=lambda o: int(o["shape"][-1]))
+        self._scores, self._boxes = (o["index"] for o in outputs)
+        self._anchors = anchors(self.size, cells)
+
+    def __call__(self, image: NDArray[np.uint8], min_score: float = 0.5) -> list[DetectedBox]:
+        """Detections in an RGB image (H, W, 3), in order of decreasing score."""
+        square, side, offset = letterboxed(image, self.size)
+        values = square * np.float32((1 - self._low) / 255) + np.float32(self._low)
+        self._interpreter.set_tensor(self._input, values[None])
+        self._interpreter.invoke()
+        raw = self._interpreter.get_tensor(self._boxes)[0]
+        logits = self._interpreter.get_tensor(self._scores)[0, :, 0]
+        found = decode(raw, logits, self._anchors, self.size, min_score)
+        return [DetectedBox(v[:2] * side - offset, v[2:] * side - offset, score) for v, score in found]
+
+
+def anchors(size: int, cells: Sequence[tuple[int, int]]) -> NDArray:
+    """(N, 2) centres of the anchors, in sides of the network's image of `size` px; see `BoxDetector`."""
+    maps = []
+    for stride, count in cells:
+        at = (np.arange(size // stride) + 0.5) * stride / size
+        u, v = np.meshgrid(at, at)
+        maps.append(np.repeat(np.column_stack([u.ravel(), v.ravel()]), count, axis=0))
+    return np.concatenate(maps)
+
+
+def decode(
+    raw: NDArray, logits: NDArray, centres: NDArray, size: int, min_score: float = 0.5
+) -> list[tuple[NDArray, float]]:
+    """Detections from the network's numbers: corners and points (2 + K, 2) in sides of its image, and their scores.
+
+    Parameters
+    ----------
+    raw : (N, 4 + 2 K)
+        Centre, width and height of the box, then its points; in pixels from the anchor.
+    logits : (N,)
+    centres : (N, 2) of the anchors
+    size : int [px] side of the network's image
+    """
+    kept = np.flatnonzero(logits > np.log(min_score / (1 - min_score)))
+    kept = kept[np.argsort(-logits[kept], kind="stable")]
+    scores = 1 / (1 + np.exp(-np.clip(logits[kept], -_MAX_LOGIT, _MAX_LOGIT)))
+    values = raw[kept].reshape(len(kept), raw.shape[1] // 2, 2).astype(float) / size
+    half = values[:, 1] / 2
+    values[:, 1] = values[:, 0]
+    values += centres[kept][:, None]
+    values[:, 0] -= half
+    values[:, 1] += half
+    found = []
+    while len(scores):
+        low, high = values[:, 0], values[:, 1]
+        inner = np.prod(np.clip(np.minimum(high, high[0]) - np.maximum(low, low[0]), 0, None), axis=1)
+        areas = np.prod(high - low, axis=1)
+        same = inner > _MAX_OVERLAP * (areas + areas[0] - inner)
+        same[0] = True
+        found.append((np.average(values[same], axis=0, weights=scores[same]), float(scores[0])))
+        values, scores = values[~same], scores[~same]
+    return found
+
+
+def letterboxed(image: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], float, NDArray]:
+    """The whole image in the middle of a black square of `size` px; the square's side and offset in the image [px]."""
+    height, width = image.shape[:2]
+    side = max(height, width)
+    offset = np.array([side - width, side - height]) / 2
+    scale = side / size
+    A = np.array([[scale, 0, -offset[0]], [0, scale, -offset[1]]])
+    square = cv2.warpAffine(image, A, (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    return np.asarray(square, np.uint8), float(side), offset
