@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
-from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies import Body, BodyState
 from kinefit.bodies.marker_sets import find_placement
 from kinefit.errors import TrackingError
 from kinefit.findings import runs_of
 from kinefit.losses import Loss
 from kinefit.markers.poses import columns, sequence_both_ways
+from kinefit.markers.valleys import PointTake, settled_by_motion, widened
 from kinefit.motion import UP_AXES, Motion, Residuals
 from kinefit.observations import Markers
 from kinefit.sensors.points.markers import of_points
@@ -78,19 +79,14 @@ def fit_markers(
     roots, angles = _tried_anew(data, *data.poses(slice(None)))
     sure = certainty(body, roots, angles, points, x, sigma=sigma, loss=loss, posture=1.0)
     roots, angles = _bridged(data, roots, unwrap(body.tree, angles), sure, markers.rate)
+    sure, flat = widened(data, roots, angles, sure, markers.rate)
+    roots, angles = settled_by_motion(data, roots, angles, flat, markers.rate)
     return _motion(data, roots, angles, sure, markers, up)
 
 
 @dataclass(frozen=True, eq=False)
-class _MarkerData:
-    """Markers on a body, measured at x (F, K, 3) [m], NaN for none, sigma (K,) [m]; loss, whether limits hold."""
-
-    body: Body
-    points: PointSet
-    x: NDArray
-    sigma: NDArray
-    loss: Loss
-    limits: bool
+class _MarkerData(PointTake):
+    """Markers on a body."""
 
     def poses(self, frames: slice) -> tuple[NDArray, NDArray]:
         """Roots and angles of some frames, with no pose given."""
