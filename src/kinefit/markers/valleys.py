@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
 from kinefit.findings import runs_of
+from kinefit.frame.results import BLIND
 from kinefit.losses import Loss
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.unwrap import boxes
-from kinefit.solvers.sequence import Certainty, fit_sequence, point_equations
+from kinefit.solvers.sequence import Certainty, certainty, fit_sequence, point_equations
 from kinefit.solvers.trajectory.motion_prior import MotionPrior
 from kinefit.solvers.trajectory.smoothing import smooth
 
@@ -26,6 +27,7 @@ FINE_INTERVAL_S = 0.03  # likewise near one that is flat along a coordinate
 MIN_STD = np.radians(1.5)  # [rad] a coordinate that is better determined is not looked at
 FLAT_RISE = 2.0  # a cost that rises by less at two standard deviations, where a parabola rises by 4, is flat
 FULL_RISE = 4.0  # of the cost at two standard deviations, 95 % of a Gaussian
+MIN_FALL = 1.0  # of the cost by which another minimum is better
 MAX_STEPS = 5  # outwards along a valley, each twice as far at most
 FREE_ACCELERATION = 1e5  # [m/s², rad/s²] of coordinates that motion does not hold
 
@@ -42,39 +44,46 @@ class PointTake:
     limits: bool
 
 
-def widened(
-    take: PointTake, roots: NDArray, angles: NDArray, sure: Certainty, rate: float
-) -> tuple[Certainty, NDArray]:
-    """Deviations that reach as far as a frame's cost is flat, and in which frames and coordinates it is, (F, D) bool.
+def profiled(
+    take: PointTake, roots: NDArray, angles: NDArray, rate: float
+) -> tuple[NDArray, NDArray, Certainty, Certainty, NDArray]:
+    """Frames at the best minima that profiles find, and deviations that reach as far as a frame's cost is flat.
 
     The profile of a coordinate: it is set off by two standard deviations to either side and all others are fitted
-    anew. Where the cost rises by less than half of what its curvature says, the step is lengthened until it does rise;
-    all coordinates and joint centres are as unsure as they move on the way.
+    anew. Where the cost falls, the frame was in another minimum than the best. Where it rises by less than half of
+    what its curvature says, the step is lengthened until it does rise; all coordinates and joint centres are as unsure
+    as they move on the way.
 
     Parameters
     ----------
-    roots, angles : (F, 4, 4) [m], (F, D) [rad or m], the fitted frames
+    roots, angles : (F, 4, 4) [m], (F, D) [rad or m], the fitted frames, within their limits
     rate : [Hz]
+
+    Returns
+    -------
+    roots, angles, deviations by the curvature, deviations by the profiles, (F, D) bool: where a coordinate is flat
     """
     tree, F = take.body.tree, len(angles)
     coarse, fine = (max(round(rate * interval), 1) for interval in (SAMPLE_INTERVAL_S, FINE_INTERVAL_S))
-    profiles = _Profiles(take, roots, angles, np.array(sure.dof_std), np.array(sure.joint_std), boxes(tree, angles))
-    std = sure.dof_std[:, 6:]
-    asked = (std > MIN_STD) & (std < 0.95 * tree.spread) & ~tree.prismatic
-    flat, frames, grid = np.zeros(angles.shape, bool), np.arange(0, F, coarse), np.arange(0, F, fine)
-    for d in np.flatnonzero(asked[frames].any(axis=0)).tolist():
-        own = frames[asked[frames, d]]
-        own = own[profiles.flat(own, d)]
+    frames, grid = np.arange(0, F, coarse), np.arange(0, F, fine)
+    profiles = _Profiles(take, roots.copy(), angles.copy())
+    asked = profiles.asked()
+    near = {d: frames[asked[frames, d]] for d in np.flatnonzero(asked[frames].any(axis=0)).tolist()}
+    near = {d: own[profiles.is_flat(own, d)] for d, own in near.items()}
+    profiles.spread()
+    asked, flat = profiles.asked(), np.zeros(angles.shape, bool)
+    for d, own in near.items():
         close = np.abs(grid[:, None] - own).min(axis=1, initial=F) <= coarse
-        own = grid[close & asked[grid, d]]
-        if len(own):
-            flat[own, d] = profiles.widen(own, d)
+        flat[grid, d] = profiles.widen(grid, d, close & asked[grid, d])
+    sure = profiles.sure
     dof_std, joint_std = (
         old * _between(new[grid] / np.maximum(old[grid], 1e-12), grid, F)
         for old, new in ((sure.dof_std, profiles.dof_std), (sure.joint_std, profiles.joint_std))
     )
     nearest = np.minimum(np.round(np.arange(F) / fine).astype(int), len(grid) - 1)
-    return replace(sure, dof_std=dof_std, joint_std=joint_std), flat[grid[nearest]]
+    dof_std[:, 6:] = np.minimum(dof_std[:, 6:], np.maximum(sure.dof_std[:, 6:], BLIND * tree.spread))
+    wide = replace(sure, dof_std=dof_std, joint_std=joint_std)
+    return profiles.roots, profiles.angles, sure, wide, flat[grid[nearest]]
 
 
 def _between(values: NDArray, grid: NDArray, count: int) -> NDArray:
@@ -86,78 +95,98 @@ def _between(values: NDArray, grid: NDArray, count: int) -> NDArray:
     return np.asarray((1.0 - share) * known[low] + share * known[np.minimum(low + 1, len(grid) - 1)])
 
 
-@dataclass(eq=False)
 class _Profiles:
-    """Costs of frames with one coordinate set off, all others fitted; deviations (F, n), (F, S, 3) that grow with it.
+    """Costs of frames with one coordinate set off, all others fitted anew; deviations that grow with them."""
 
-    bounds : lower and upper ends and prior mean (F, D) in the charts of the angles
-    """
+    def __init__(self, take: PointTake, roots: NDArray, angles: NDArray) -> None:
+        self.take, self.roots, self.angles = take, roots, angles
+        self._free = np.zeros(take.body.tree.n_dofs, bool)
+        self._better: set[int] = set()
+        self._judge()
+        self._costs = self._fit(np.arange(len(angles)), roots, angles, ~self._free, 0)[2]
 
-    take: PointTake
-    roots: NDArray
-    angles: NDArray
-    dof_std: NDArray
-    joint_std: NDArray
-    bounds: tuple[NDArray, NDArray, NDArray]
+    def _judge(self) -> None:
+        t = self.take
+        self.sure = certainty(
+            t.body, self.roots, self.angles, t.points, t.x, sigma=t.sigma, loss=t.loss, posture=1.0
+        )
+        self.dof_std, self.joint_std = np.array(self.sure.dof_std), np.array(self.sure.joint_std)
+        self._centres = t.body.tree.segment_poses(self.roots, self.angles)[..., :3, 3]
 
-    def __post_init__(self) -> None:
-        self._curvature_std = self.dof_std.copy()
-        tree = self.take.body.tree
-        within = (self.angles >= tree.lower) & (self.angles <= tree.upper)
-        self._inside = np.asarray(within.all(axis=1) & self.take.limits)
-        everything = np.arange(len(self.angles))
-        self._costs = self._fit(everything, self.angles, np.ones(tree.n_dofs, bool), 0)[2]
-        self._centres = tree.segment_poses(self.roots, self.angles)[..., :3, 3]
+    def asked(self) -> NDArray:
+        """(F, D) bool: angles that a frame observes, but not well."""
+        tree, std = self.take.body.tree, self.sure.dof_std[:, 6:]
+        return np.asarray((std > MIN_STD) & (std < BLIND * tree.spread) & ~tree.prismatic)
 
     def _fit(
-        self, frames: NDArray, angles: NDArray, locked: NDArray, iterations: int = 40
+        self, frames: NDArray, roots: NDArray, angles: NDArray, locked: NDArray, iterations: int = 40
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Roots, angles and costs of frames fitted from such angles, coordinates `locked` (n,) as they are."""
+        """Roots, angles and costs of frames (N,) fitted from such poses, coordinates `locked` (n,) as they are."""
         t = self.take
-        roots, fitted, costs = self.roots[frames].copy(), np.array(angles), np.empty(len(frames))
-        for limits in (True, False):
-            own = self._inside[frames] == limits
-            if own.any():
-                fit = fit_sequence(
-                    t.body, (roots[own], angles[own]), t.points, t.x[frames[own]], sigma=t.sigma, loss=t.loss,
-                    limits=limits, locked=locked, posture=1.0, usual=self.bounds[2][frames[own]], tolerance=1e-3,
-                    max_iterations=iterations,
-                )  # fmt: skip
-                roots[own], fitted[own], costs[own] = fit.Ts_world_root, fit.angles, fit.costs
-        return roots, fitted, costs
+        fit = fit_sequence(
+            t.body, (roots, angles), t.points, t.x[frames], sigma=t.sigma, loss=t.loss, limits=t.limits, locked=locked,
+            posture=1.0, tolerance=1e-3, max_iterations=iterations,
+        )  # fmt: skip
+        return fit.Ts_world_root, fit.angles, fit.costs
 
     def _set_off(self, frames: NDArray, d: int, step: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """Roots and angles with coordinate d moved by step (N,), and by how much the cost rises; inf beyond limits."""
-        angles, locked = self.angles[frames].copy(), np.zeros(self.dof_std.shape[1], bool)
+        tree, angles, locked = self.take.body.tree, self.angles[frames].copy(), self._free.copy()
         angles[:, d] += step
         locked[6 + d] = True
-        roots, fitted, costs = self._fit(frames, angles, locked)
-        beyond = (angles[:, d] < self.bounds[0][frames, d]) | (angles[:, d] > self.bounds[1][frames, d])
+        roots, fitted, costs = self._fit(frames, self.roots[frames], angles, locked)
+        beyond = (angles[:, d] < tree.lower[d]) | (angles[:, d] > tree.upper[d])
         return roots, fitted, np.where(beyond & self.take.limits, np.inf, costs - self._costs[frames])
 
-    def flat(self, frames: NDArray, d: int) -> NDArray:
-        """Of some frames (N,) whether the cost is flat along coordinate d, (N,) bool."""
-        step = 2.0 * self._curvature_std[frames, 6 + d]
-        return np.min([self._set_off(frames, d, side * step)[2] for side in (-1.0, 1.0)], axis=0) < FLAT_RISE
-
-    def widen(self, frames: NDArray, d: int) -> NDArray:
-        """Widen the deviations of frames (N,) that are flat along coordinate d; which are, (N,) bool."""
+    def is_flat(self, frames: NDArray, d: int) -> NDArray:
+        """(N,) bool: whether the costs of some frames (N,) are flat along coordinate d; better minima are taken."""
         flat = np.zeros(len(frames), bool)
         for side in (-1.0, 1.0):
-            step, going = 2.0 * self._curvature_std[frames, 6 + d], np.ones(len(frames), bool)
-            for first in [True] + [False] * (MAX_STEPS - 1):
-                some = frames[going]
-                roots, angles, rise = self._set_off(some, d, side * step[going])
-                if first:
-                    flat |= rise < FLAT_RISE
-                low = rise < FLAT_RISE if first else rise < 0.9 * FULL_RISE
-                reached = np.isfinite(rise) & (flat[going] if first else True)
-                self._reach(some[reached], roots[reached], angles[reached], rise[reached])
-                longer = np.minimum(np.sqrt(FULL_RISE / np.maximum(rise[low], 1.0)), 2.0)
-                going[np.flatnonzero(going)] = low
-                step[going] *= longer
-                if not going.any():
+            roots, angles, rise = self._set_off(frames, d, side * 2.0 * self.sure.dof_std[frames, 6 + d])
+            flat |= rise < FLAT_RISE
+            some = rise < -MIN_FALL
+            self._take(frames[some], roots[some], angles[some])
+        return flat
+
+    def _take(self, frames: NDArray, roots: NDArray, angles: NDArray) -> NDArray:
+        """Fit frames (N,) from such poses, and take what costs clearly less than what they have; (N,) bool: which."""
+        if not len(frames):
+            return np.zeros(0, bool)
+        roots, angles, costs = self._fit(frames, roots, angles, self._free)
+        better = costs < self._costs[frames] - MIN_FALL
+        own = frames[better]
+        self.roots[own], self.angles[own], self._costs[own] = roots[better], angles[better], costs[better]
+        self._better |= set(own.tolist())
+        return np.asarray(better)
+
+    def spread(self) -> None:
+        """Frames next to those that found a better minimum try it, too."""
+        for way in (1, -1):
+            for f in sorted(self._better, reverse=way < 0):
+                g = f + way
+                while 0 <= g < len(self.angles) and self._take(np.array([g]), *self._state(g - way))[0]:
+                    g += way
+        self._judge()
+
+    def _state(self, f: int) -> tuple[NDArray, NDArray]:
+        return self.roots[f : f + 1], self.angles[f : f + 1]
+
+    def widen(self, grid: NDArray, d: int, asked: NDArray) -> NDArray:
+        """Widen the deviations of frames grid[asked] that are flat along coordinate d; (G,) bool: which are."""
+        flat = np.zeros(len(grid), bool)
+        for side in (-1.0, 1.0):
+            going, step = np.flatnonzero(asked), 2.0 * self.sure.dof_std[grid, 6 + d]
+            for turn in range(MAX_STEPS):
+                if not len(going):
                     break
+                roots, angles, rise = self._set_off(grid[going], d, side * step[going])
+                if turn == 0:
+                    flat[going] |= rise < FLAT_RISE
+                reached = np.isfinite(rise) & flat[going]
+                self._reach(grid[going[reached]], roots[reached], angles[reached], rise[reached])
+                low = rise < (0.9 * FULL_RISE if turn else FLAT_RISE)
+                step[going] *= np.minimum(np.sqrt(FULL_RISE / np.maximum(rise, 1.0)), 2.0)
+                going = going[low]
         return flat
 
     def _reach(self, frames: NDArray, roots: NDArray, angles: NDArray, rise: NDArray) -> None:
@@ -178,7 +207,7 @@ def settled_by_motion(
 
     Parameters
     ----------
-    flat : (F, D) bool, frames and coordinates of `widened`
+    flat : (F, D) bool, frames and coordinates of `profiled`
     """
     tree, settings, margin = take.body.tree, TrackSettings(), max(round(SAMPLE_INTERVAL_S * rate), 2)
     roots, angles = roots.copy(), angles.copy()
