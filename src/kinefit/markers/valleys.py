@@ -29,6 +29,8 @@ FLAT_RISE = 2.0  # a cost that rises by less at two standard deviations, where a
 FULL_RISE = 4.0  # of the cost at two standard deviations, 95 % of a Gaussian
 MIN_FALL = 1.0  # of the cost by which another minimum is better
 MAX_STEPS = 5  # outwards along a valley, each twice as far at most
+MAX_RISE = 9.0  # of the cost of any frame that motion may ask for; else the motion is livelier than was thought:
+LIVELINESS = 1.0, 3.0, 10.0  # factors on its acceleration
 FREE_ACCELERATION = 1e5  # [m/s², rad/s²] of coordinates that motion does not hold
 
 
@@ -210,20 +212,27 @@ def settled_by_motion(
     flat : (F, D) bool, frames and coordinates of `profiled`
     """
     tree, settings, margin = take.body.tree, TrackSettings(), max(round(SAMPLE_INTERVAL_S * rate), 2)
-    roots, angles = roots.copy(), angles.copy()
+    roots, angles, memory = roots.copy(), angles.copy(), (settings.acceleration_memory, settings.smooth_memory)
     for a, b in runs_of(np.asarray(flat.any(axis=1)), 2 * margin):
         span = slice(max(a - margin, 0), b + margin)
-        acceleration = np.full(tree.n_dofs, FREE_ACCELERATION)
-        acceleration[6:][flat[span].any(axis=0)] = settings.angle_acceleration
         lower, upper, usual = boxes(tree, angles[span])
-        prior = MotionPrior(
-            acceleration, (settings.acceleration_memory, settings.smooth_memory), 1.0 / rate, usual, tree.spread,
-            couplings=tree.couplings,
-        )  # fmt: skip
+        bounds = (lower, upper) if take.limits else None
         equations = point_equations(take.body, take.points, take.x[span], sigma=take.sigma, loss=take.loss)
-        found = smooth(
-            take.body, roots[span], angles[span], equations, prior, bounds=(lower, upper) if take.limits else None,
-            tolerance=1e-3,
-        )  # fmt: skip
-        roots[span], angles[span] = found.roots, found.angles
+        acceleration = np.where(flat[span].any(axis=0), settings.angle_acceleration, FREE_ACCELERATION)
+        for livelier in LIVELINESS:
+            prior = MotionPrior(
+                np.concatenate([np.full(6, FREE_ACCELERATION), livelier * acceleration]), memory, 1.0 / rate, usual,
+                tree.spread, couplings=tree.couplings,
+            )  # fmt: skip
+            found = smooth(
+                take.body, roots[span], angles[span], equations, prior, bounds=bounds, tolerance=1e-3
+            )
+            costs = [
+                equations(*poses)[2] + np.einsum("fi,ij,fj->f", away, prior.precision, away)
+                for poses in ((roots[span], angles[span]), (found.roots, found.angles))
+                for away in (poses[1] - usual,)
+            ]
+            if (costs[1] - costs[0]).max() < MAX_RISE:
+                roots[span], angles[span] = found.roots, found.angles
+                break
     return roots, angles
