@@ -34,7 +34,6 @@ TAKES = (
 TRUNK = "lumbar_extension", "thorax_extension"
 JUMP = np.radians(10.0)
 OFFSET, NOISE = 0.005, 0.002  # [m] of simulated markers: constant, and anew in every frame
-KIND = "angles whose step departs by over 10° and two stated sigma"
 
 
 def jumps(motion: Motion) -> tuple[NDArray, NDArray]:
@@ -101,8 +100,9 @@ def run() -> None:
             value = rise(motion, markers, subject.marker_set, subject.sigma, SQUATS[1], TRUNK[0])
             figure("jumps_squats_rise", value, "of the cost at two stated sigma", ">= 3")
     why = "" if takes else "no recordings: set KINEFIT_DATA"
-    figure("jumps_trunk_outside", trunk_outside if takes else None, f"of lumbar and thorax in {takes} takes", "== 0", why)
-    figure("jumps_outside", outside if takes else None, f"of all {count} {KIND.partition(' ')[0]} that jump", "== 0", why)
+    trunk_told, told = (trunk_outside, outside) if takes else (None, None)
+    figure("jumps_trunk_outside", trunk_told, f"of lumbar and thorax in {takes} takes, not covered", "== 0", why)
+    figure("jumps_outside", told, f"of all {count} jumps of angles, not covered", "== 0", why)
     figure("jumps_ms_frame", 1e3 * seconds / frames if frames else None, "ms a frame", "<= 2", why)
     inside: dict[str, list[NDArray]] = {"trunk": [], "angles": []}
     for truth, motion in simulated() if takes else ():
@@ -113,8 +113,8 @@ def run() -> None:
         inside["trunk"].append(within[:, trunk].ravel())
         inside["angles"].append(within.ravel())
     for key, parts in inside.items():
-        value = 100 * float(np.nanmean(np.concatenate(parts))) if parts else None
-        figure(f"jumps_simulated_{key}_inside", value, "% of the truth within two stated sigma", ">= 90", why)
+        share = 100 * float(np.nanmean(np.concatenate(parts))) if parts else None
+        figure(f"jumps_simulated_{key}_inside", share, "% of the truth within two stated sigma", ">= 90", why)
 
 
 if __name__ == "__main__":

@@ -67,11 +67,12 @@ def profiled(
     """
     tree, F = take.body.tree, len(angles)
     coarse, fine = (max(round(rate * interval), 1) for interval in (SAMPLE_INTERVAL_S, FINE_INTERVAL_S))
-    frames, grid = np.arange(0, F, coarse), np.arange(0, F, fine)
     profiles = _Profiles(take, roots.copy(), angles.copy())
-    asked = profiles.asked()
+    asked, grid = profiles.asked(), np.arange(0, F, fine)
+    leaps = np.abs(np.diff(angles, 2, axis=0)) > profiles.sure.dof_std[1:-1, 6:]
+    frames = np.arange(0, F, coarse)
     near = {d: frames[asked[frames, d]] for d in np.flatnonzero(asked[frames].any(axis=0)).tolist()}
-    near = {d: own[profiles.is_flat(own, d)] for d, own in near.items()}
+    near = {d: np.union1d(own[profiles.is_flat(own, d)], 1 + np.flatnonzero(leaps[:, d])) for d, own in near.items()}
     profiles.spread()
     asked, flat = profiles.asked(), np.zeros(angles.shape, bool)
     for d, own in near.items():
@@ -79,7 +80,7 @@ def profiled(
         flat[grid, d] = profiles.widen(grid, d, close & asked[grid, d])
     sure = profiles.sure
     dof_std, joint_std = (
-        old * _between(new[grid] / np.maximum(old[grid], 1e-12), grid, F)
+        old * _growth(old[grid], new[grid], grid, F)
         for old, new in ((sure.dof_std, profiles.dof_std), (sure.joint_std, profiles.joint_std))
     )
     nearest = np.minimum(np.round(np.arange(F) / fine).astype(int), len(grid) - 1)
@@ -88,13 +89,14 @@ def profiled(
     return profiles.roots, profiles.angles, sure, wide, flat[grid[nearest]]
 
 
-def _between(values: NDArray, grid: NDArray, count: int) -> NDArray:
-    """Values (G, ...) of some frames (G,) at all `count` frames, linearly interpolated; 1 where they are not finite."""
+def _growth(old: NDArray, new: NDArray, grid: NDArray, count: int) -> NDArray:
+    """Factor between deviations (G, ...) of some frames (G,), linearly interpolated at all `count` frames."""
+    factor = np.ones(old.shape)
+    np.divide(new, old, out=factor, where=np.isfinite(old) & (old > 0.0))
     place = np.interp(np.arange(count), grid, np.arange(len(grid)))
     low = place.astype(int)
-    share = (place - low).reshape(-1, *[1] * (values.ndim - 1))
-    known = np.nan_to_num(values, nan=1.0, posinf=1.0)
-    return np.asarray((1.0 - share) * known[low] + share * known[np.minimum(low + 1, len(grid) - 1)])
+    share = (place - low).reshape(-1, *[1] * (old.ndim - 1))
+    return np.asarray((1.0 - share) * factor[low] + share * factor[np.minimum(low + 1, len(grid) - 1)])
 
 
 class _Profiles:
