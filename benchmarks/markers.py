@@ -13,6 +13,7 @@ PARTS = {
     "markers_audit": "models of subjects, and labels that somebody else gave",
     "markers_fit": "bodies and angles beside Plug-in-Gait's and OpenSim's",
     "markers_roads": "`kinefit markers fit` and `kinefit track` on the same files",
+    "markers_jumps": "angles that jump from frame to frame, and whether their error bars say so",
     "markers_left_out": "error bars of real takes against markers that are left out",
     "body_trackers": "trackers on the body, made of real marker plates, against the fit to all markers",
     "markers_speed": "time of large sets, and of a whole take from points to angles",

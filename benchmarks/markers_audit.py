@@ -136,6 +136,7 @@ def run() -> None:
         figure(title, value if markers else None, "found", "== 1", why)
     one_frame()
     in_gaps()
+    gappy()
     flip, subject4 = take(FLIP), take(SUBJECT4)
     found = audit_take(flip, model=learn_model(subject4)) if flip and subject4 else []
     for f in found:
@@ -217,6 +218,27 @@ def in_gaps() -> None:
     why = "" if tried else "no recordings: set KINEFIT_DATA"
     share = 100 * float(hits.sum()) / (len(ways) * tried) if tried else None
     figure("audit_one_frame_exchanges_in_gaps", share, "% found", ">= 98", why)
+
+
+def gappy() -> None:
+    """Time of the longest take with forty gaps of 1 to 30 frames a marker and fifteen exchanges of 5 to 200 frames."""
+    markers, rng = clean(CLEAN[0]), np.random.default_rng(0)
+    if markers is None:
+        figure("audit_seconds_gaps_and_swaps", None, "s CPU", "<= 5", "no recordings: set KINEFIT_DATA")
+        return
+    x = np.array(markers.positions)
+    for k in range(x.shape[1]):
+        for _ in range(40):
+            f = int(rng.integers(len(x)))
+            x[f : f + rng.integers(1, 30), k] = np.nan
+    for _ in range(15):
+        (a, b), f = rng.choice(x.shape[1], 2, replace=False), int(rng.integers(len(x) - 200))
+        n = int(rng.integers(5, 200))
+        x[f : f + n, [a, b]] = x[f : f + n, [b, a]]
+    start = time.process_time()
+    found = audit_take(replace(markers, positions=x, residual=None))
+    figure("audit_seconds_gaps_and_swaps", time.process_time() - start, "s CPU", "<= 5")
+    print(f"# {sum(f.kind == 'swapped' for f in found)} exchanges reported of 15 injected into gaps")
 
 
 def calibration() -> None:

@@ -1,7 +1,7 @@
 """`kinefit markers fit` and `kinefit track` on one file of labelled markers: the same body, poses, quality, lost limbs.
 
 Both through the commands' own functions, with defaults, on whole recordings. `markers fit` judges each frame on its
-own, `track` smooths them all together, so poses may differ by what smoothing takes away.
+own but for flat valleys, `track` smooths them all together, so poses may differ by what smoothing takes away.
 """
 
 from __future__ import annotations

@@ -10,23 +10,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
-from kinefit.bodies import Body, BodyState, PointSet
+from kinefit.bodies import Body, BodyState
 from kinefit.bodies.marker_sets import find_placement
 from kinefit.errors import TrackingError
 from kinefit.findings import runs_of
+from kinefit.frame.results import BLIND
 from kinefit.losses import Loss
 from kinefit.markers.poses import columns, sequence_both_ways
+from kinefit.markers.valleys import PointTake, profiled, settled_by_motion
 from kinefit.motion import UP_AXES, Motion, Residuals
 from kinefit.observations import Markers
 from kinefit.sensors.points.markers import of_points
 from kinefit.sensors.settings import MARKER_LOSS
 from kinefit.smoothing.gaps import bridged
 from kinefit.smoothing.unwrap import unwrap
-from kinefit.solvers.sequence import Certainty, certainty, fit_sequence
+from kinefit.solvers.sequence import Certainty, fit_sequence
 
 _TOLD = 0.35  # [rad] an angle less sure than that is not observed by its frame, but by those before and after
 _HELD = 0.1  # [m] likewise for the root
-_PRIOR = 0.95  # share of the prior standard deviation from which an angle is known by that alone
 _MEMORY = 0.3  # [s] in which the velocity of a body that is not seen forgets itself
 _WORSE = 0.3  # standard deviations that a frame's markers may fit worse for following its neighbours
 _OFF = 4.0  # times the take's median misfit from which a frame is tried anew, from nowhere
@@ -76,21 +77,14 @@ def fit_markers(
     sigma = np.broadcast_to(np.asarray(sigma, float), len(points))
     data = _MarkerData(body, points, x, sigma, loss, limits)
     roots, angles = _tried_anew(data, *data.poses(slice(None)))
-    sure = certainty(body, roots, angles, points, x, sigma=sigma, loss=loss, posture=1.0)
-    roots, angles = _bridged(data, roots, unwrap(body.tree, angles), sure, markers.rate)
-    return _motion(data, roots, angles, sure, markers, up)
-
+    roots, angles, sure, wide, flat = profiled(data, roots, angles, markers.rate)
+    roots, angles = settled_by_motion(data, roots, unwrap(body.tree, angles), flat, markers.rate)
+    roots, angles = _bridged(data, roots, angles, sure, markers.rate)
+    return _motion(data, roots, angles, wide, markers, up)
 
 @dataclass(frozen=True, eq=False)
-class _MarkerData:
-    """Markers on a body, measured at x (F, K, 3) [m], NaN for none, sigma (K,) [m]; loss, whether limits hold."""
-
-    body: Body
-    points: PointSet
-    x: NDArray
-    sigma: NDArray
-    loss: Loss
-    limits: bool
+class _MarkerData(PointTake):
+    """Markers on a body."""
 
     def poses(self, frames: slice) -> tuple[NDArray, NDArray]:
         """Roots and angles of some frames, with no pose given."""
@@ -127,7 +121,7 @@ def _bridged(
     """Poses whose untold angles follow from the frames around them; the others stay as measured."""
     tree, x = data.body.tree, data.x
     lost = ~((sure.dof_std[:, :3].max(axis=1) < _HELD) & (sure.dof_std[:, 3:6].max(axis=1) < _TOLD))
-    enough = np.minimum(np.where(tree.prismatic, _HELD, _TOLD), _PRIOR * tree.spread)
+    enough = np.minimum(np.where(tree.prismatic, _HELD, _TOLD), BLIND * tree.spread)
     told = (sure.dof_std[:, 6:] < enough) & ~lost[:, None]
     some = told.any(axis=0)
     if lost.all() or (told[:, some].all() and not lost.any()):
@@ -158,7 +152,7 @@ def _motion(
     """Quality as of every other track: the share of what shows a segment that agrees with it."""
     body, points, x = data.body, data.points, data.x
     dof_std = np.array(sure.dof_std)
-    dof_std[:, 6:][dof_std[:, 6:] > _PRIOR * body.tree.spread] = np.inf
+    dof_std[:, 6:][dof_std[:, 6:] > BLIND * body.tree.spread] = np.inf
     values = x - body.trajectories(roots, angles, points)
     squares = np.square(values / data.sigma[:, None]).sum(axis=2)
     quality = of_points(body, points, squares).segment_quality(body.tree)

@@ -62,9 +62,11 @@ def fit_sequence(
     parents, dof_start, chain, depth, prismatic, axes, rest_joints, lower, upper, locked,
     owner, rest, target, weight, plane_owner, plane_rest, plane_order, plane_x, plane_n, plane_w,
     usual, posture, prior_pairs, prior, wide, wide_depth, place, kind, scale, max_iterations, tolerance, damping_share,
-    roots, angles, costs, iterations,
+    each, roots, angles, costs, iterations,
 ):  # fmt: skip
     """Fit all frames, each from the last one's solution; roots[0], angles[0] hold the start and are overwritten.
+
+    With `each`, all roots and angles hold starts, and every frame begins at its own.
 
     owner (K,), rest (K, 3), target (F, K, 3) [m], weight (F, K) [1/m²]; planes sorted by segment: plane_owner (P,),
     plane_rest (3, P); not sorted, NaN where not measured: plane_x, plane_n (F, P, 3); plane_order (P,) sorts them.
@@ -89,6 +91,8 @@ def fit_sequence(
     damping, growth = -1.0, 2.0
     for f in range(roots.shape[0]):
         delta[:] = 0.0
+        if each:
+            root, q, damping = roots[f].copy(), angles[f].copy(), -1.0
         retract(root, q, delta, lower, upper, root, q)
         cost, predicted, count, least = 0.0, 0.0, 0, 0.0
         used = 0
@@ -147,6 +151,28 @@ def fit_sequence(
         for i in range(n_angles):
             angles[f, i] = q[i]
         costs[f], iterations[f] = cost, used
+
+
+@jit
+def point_equations(
+    parents, dof_start, chain, depth, prismatic, axes, rest_joints, owner, rest, target, weight, kind, scale,
+    roots, angles, C, g, costs,
+):  # fmt: skip
+    """Normal equations of frames at roots (F, 4, 4), angles (F, D): C (F, n, m) packed, g (F, n), costs (F,).
+
+    Points as in `fit_sequence`.
+    """
+    size = 3 * owner.size
+    data, segment, group = np.empty((8, size)), np.empty(size, np.int64), np.empty(size, np.int64)
+    factor, blocks = np.empty(size), np.empty((parents.size, 27))
+    frames, screws = np.empty((parents.size, 12)), np.empty((axes.shape[0], 6))
+    for f in range(roots.shape[0]):
+        forward(parents, dof_start, prismatic, axes, rest_joints, roots[f], angles[f], frames, screws)
+        count = point_rows(frames, owner, rest, target[f], weight[f], data, segment, group, 0)
+        costs[f] = assemble(
+            data, segment, group, count, kind, scale, roots[f, :3, 3], parents, dof_start, chain, depth, screws,
+            factor, blocks, C[f], g[f],
+        )  # fmt: skip
 
 
 @jit

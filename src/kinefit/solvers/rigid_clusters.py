@@ -23,8 +23,9 @@ def rigid_frames(
 ) -> tuple[NDArray, NDArray]:
     """Rotations (F, 3, 3), translations (F, 3) that lay x (k, 3) onto y (F, k, 3); NaN in y is not seen.
 
-    Points count by `weight` (k,), by default alike. What they leave open (two of them, or one) follows `prior`
-    (F, 3, 3), by default the identity. NaN where nothing is seen.
+    Points count by `weight` (k,), by default alike; x and weight may differ from frame to frame, (F, k, 3) and (F, k).
+    What they leave open (two of them, or one) follows `prior` (F, 3, 3), by default the identity. NaN where nothing is
+    seen.
     """
     prior = np.broadcast_to(np.eye(3), (len(y), 3, 3)) if prior is None else prior
     seen = np.isfinite(y[..., 0])

@@ -13,8 +13,10 @@ from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, Loss
 from kinefit.solvers._kernels_sequence import certainties as _certainties
 from kinefit.solvers._kernels_sequence import fit_sequence as _fit_sequence
+from kinefit.solvers._kernels_sequence import point_equations as _point_equations
 from kinefit.solvers.equations import lock
 from kinefit.solvers.least_squares import bounds_of
+from kinefit.solvers.trajectory.smoothing import Equations, MakeEquations
 
 _NO_POINTS = PointSet((), np.empty(0, np.int64), np.empty((0, 3)))
 
@@ -49,7 +51,7 @@ class SequenceFit:
 
 def fit_sequence(
     body: Body,
-    start: BodyState,
+    start: BodyState | tuple[NDArray, NDArray],
     points: PointSet = _NO_POINTS,
     x_world: ArrayLike | None = None,
     *,
@@ -65,6 +67,8 @@ def fit_sequence(
     tolerance: float = 1e-6,
 ) -> SequenceFit:
     """Minimise Σ ρ(w r²) in every frame, each from the solution of the one before (the first from `start`).
+
+    With roots (F, 4, 4) and angles (F, D) as `start`, each frame begins at its own.
 
     The same minimum as `levenberg_marquardt` with `point_rows` and `plane_rows`, without its calls from Python.
 
@@ -100,8 +104,10 @@ def fit_sequence(
     p_order = np.argsort(p.points.segments, kind="stable")
     lower, upper = bounds_of(body, limits)
     roots, angles = np.empty((count, 4, 4)), np.empty((count, len(tree.coordinates)))
+    each = not isinstance(start, BodyState)
     if count:
-        roots[0], angles[0] = start.T_world_root, start.angles
+        first = slice(None) if each else 0
+        roots[first], angles[first] = start if isinstance(start, tuple) else (start.T_world_root, start.angles)
     costs, iterations = np.empty(count), np.empty(count, np.int64)
     _fit_sequence(
         tree.parents, tree.dof_start, tree.chain, tree.depth, tree.prismatic, tree.axes, tree.rest, lower, upper,
@@ -112,7 +118,7 @@ def fit_sequence(
         p_order, np.ascontiguousarray(p.x_world), np.ascontiguousarray(p.normal), 1.0 / p.sigma**2,
         np.ascontiguousarray(np.broadcast_to(tree.usual if usual is None else usual, angles.shape), float),
         posture, *tree.posture_entries, *tree.coupled_pattern, loss.kind, loss.scale, max_iterations, tolerance,
-        damping, roots, angles, costs, iterations,
+        damping, each, roots, angles, costs, iterations,
     )  # fmt: skip
     return SequenceFit(roots, angles, costs, iterations)
 
@@ -161,3 +167,23 @@ def certainty(
         np.ascontiguousarray(angles, float), dof_std, joint_std, factors,
     )  # fmt: skip
     return Certainty(dof_std, joint_std, factors)
+
+
+def point_equations(
+    body: Body, points: PointSet, x_world: NDArray, *, sigma: NDArray, loss: Loss = SQUARED
+) -> MakeEquations:
+    """What `trajectory.smoothing.smooth` asks for, of points measured at x_world (F, K, 3) [m], NaN for none."""
+    tree, seen = body.tree, np.isfinite(x_world).all(axis=2)
+    weight = np.where(seen, 1.0 / np.square(sigma), 0.0)
+    x, rest = np.nan_to_num(x_world), body.points_rest(points)
+
+    def make(roots: NDArray, angles: NDArray) -> Equations:
+        F = len(roots)
+        C, g, costs = np.empty((F, *tree.chain.shape)), np.empty((F, tree.n_dofs)), np.empty(F)
+        _point_equations(
+            tree.parents, tree.dof_start, tree.chain, tree.depth, tree.prismatic, tree.axes, tree.rest,
+            points.segments, rest, x, weight, loss.kind, loss.scale, roots, angles, C, g, costs,
+        )  # fmt: skip
+        return C, g, costs
+
+    return make

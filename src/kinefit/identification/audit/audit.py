@@ -207,8 +207,9 @@ def _swaps(
     refused: set[tuple[int, int, int, int]] = set()
     told = len(found)
     gains = swap_gains(positions[::step], mean, deviation)
+    met_gains = {(a, b): pair_gain(positions, a, b, mean, deviation) for a, b in {_pair(c) for c in met}}
     while len(found) - told < MOST_SWAPS:
-        spans = _candidates(gains, positions, mean, deviation, met, broken, step)
+        spans = _candidates(gains, met_gains, positions, mean, deviation, met, broken, step)
         spans = [c for c in spans if c[1:] not in refused]
         if not spans:
             break
@@ -226,8 +227,10 @@ def _swaps(
         positions[first : last + 1] = here
         rows = slice(-(-first // step), last // step + 1)
         gains[rows] = swap_gains(positions[::step][rows], mean, deviation)
+        for pair, gain in met_gains.items():
+            gain[first : last + 1] = pair_gain(here, *pair, mean, deviation)
         refused = {c for c in refused if c[3] < first or c[2] > last}
-        met = [c for c in met if not ({c[1], c[2]} == {a, b} and c[0] in (first, last + 1))]
+        met = [c for c in met if _pair(c) != (a, b) or c[0] not in (first, last + 1)]
     return found, positions
 
 
@@ -263,8 +266,8 @@ def _better(before: NDArray, after: NDArray, jumps: int) -> bool:
 
 
 def _candidates(
-    gains: NDArray, positions: NDArray, mean: NDArray, deviation: NDArray, met: list[tuple[int, int, int]],
-    broken: NDArray, step: int,
+    gains: NDArray, met_gains: dict[tuple[int, int], NDArray], positions: NDArray, mean: NDArray, deviation: NDArray,
+    met: list[tuple[int, int, int]], broken: NDArray, step: int,
 ) -> list[tuple[float, int, int, int, int]]:
     """(worth, a, b, first, last) of exchanges that distances ask for, or jumps and not against the distances."""
     out = []
@@ -283,16 +286,17 @@ def _candidates(
             last, last_met = _snapped(last + 1, [*ends, total])
             if _breaks(broken, (a, b), first) and _breaks(broken, (a, b), last):
                 out.append((worth * (1 + first_met + last_met), a, b, first, last - 1))
-    pairs = {tuple(sorted(c[1:])) for c in met}
-    for a, b in pairs:
-        ends = sorted({0, total, *(c[0] for c in met if {c[1], c[2]} == {a, b})})
-        gain = pair_gain(positions, a, b, mean, deviation)
+    for a, b in {_pair(c) for c in met}:
+        ends, gain = sorted({0, total, *(c[0] for c in met if _pair(c) == (a, b))}), met_gains[a, b]
         for first, end in pairwise(ends):
             if (first, end) != (0, total) and np.median(gain[first:end]) > 0:
-                worth = float(np.clip(gain[first:end] - 0.0, -10 * GAIN, 10 * GAIN).sum())
-                if worth > 0:
+                if (worth := float(np.clip(gain[first:end], -10 * GAIN, 10 * GAIN).sum())) > 0:
                     out.append((worth * 3, a, b, first, end - 1))
     return out
+
+
+def _pair(crossing: tuple[int, int, int]) -> tuple[int, int]:
+    return min(crossing[1:]), max(crossing[1:])
 
 
 def _breaks(broken: NDArray, pair: tuple[int, int], frame: int) -> bool:
@@ -332,8 +336,8 @@ def _swap(
     points: NDArray, pair: tuple[int, int], labels: Sequence[str], first: int, last: int, total: int
 ) -> AuditFinding:
     """A finding of labels that change places; with one of them seldom seen, only the other's name is wrong."""
-    pair = (min(pair), max(pair))
-    names = (labels[pair[0]], labels[pair[1]])
+    pair = min(pair), max(pair)
+    names = labels[pair[0]], labels[pair[1]]
     apart = np.linalg.norm(points[:, pair[0]] - points[:, pair[1]], axis=-1)
     seen = np.isfinite(points[:, pair, 0]).mean(0)
     size = float(np.nanmedian(apart)) if np.isfinite(apart).any() else float("nan")
