@@ -26,7 +26,7 @@ class Choices:
     formats : of `results.NAMES`
     overlays : bool, whether the fit is drawn on every video
     report : bool, whether report.html is written
-    pictures : what report and overlays show of the videos: "full", "blurred" (no faces) or "none"
+    pictures : what report and overlays show of the videos: "full" or "none"
     smooth : bool, whether each frame knows the whole take
     contacts : bool, whether soles that rest on a level floor are held still
     lag : float [s], see `track`
@@ -165,7 +165,7 @@ def track_person(
         motion = replace(motion, provenance=provenance(take, **motion.provenance))
         write_results(motion, out, choices.formats, step, files)
         if choices.draws and not total:
-            write_overlays(motion, take, seen, out, step, files, blur=choices.pictures == "blurred")
+            write_overlays(motion, take, seen, out, step, files)
         if choices.report and not total:
             write_track_report(motion, take, seen, out, step, files, choices.pictures, notes)
         if not total:

@@ -28,14 +28,14 @@ def write_track_report(
 ) -> None:  # fmt: skip
     """Write report.html into a folder of results, with links to what lies there already; enter it into `files`.
 
-    `pictures` are "full", "blurred" or "none"; `notes` are what the command says, too.
+    `pictures` are "full" or "none"; `notes` are what the command says, too.
     """
     from kinefit.batch.results import ABOUT
     from kinefit.exporters.report.norms import read_norms
     from kinefit.exporters.report.report import write_report
 
     norms = read_norms(take.session.norms) if take.session.norms else None
-    shown = {} if pictures == "none" else take_pictures(motion, take, seen, step, blur=pictures == "blurred")
+    shown = {} if pictures == "none" else take_pictures(motion, take, seen, step)
     step("report", 0, 1)
     links = {path.relative_to(folder).as_posix(): ABOUT.get(name, name) for name, path in files.items()}
     files["report"] = write_report(
@@ -46,7 +46,7 @@ def write_track_report(
 
 
 def take_pictures(
-    motion: Motion, take: Take, seen: Observations, step: Step, *, blur: bool = False
+    motion: Motion, take: Take, seen: Observations, step: Step
 ) -> dict[str, dict[int, NDArray[np.uint8]]]:
     """{camera: {frame: picture of the person with the fit drawn on it}} of the frames that a report shows.
 
@@ -63,7 +63,7 @@ def take_pictures(
     for number, name in enumerate(seen.videos):
         step("pictures", number, len(seen.videos))
         offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
-        given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name), "blur": blur}
+        given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name)}
         with shown_video(take, seen, name) as video:
             for frame in frames:
                 shown = round((motion.times[frame] - offset) * video.rate)

@@ -77,13 +77,9 @@ def write_results(motion: Motion, folder: Path, formats: Iterable[str], step: St
 
 
 def write_overlays(
-    motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path], *,
-    blur: bool = False,
+    motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path]
 ) -> None:  # fmt: skip
-    """Write overlay videos of all cameras and depth sensors, and one picture; enter what is there into `files`.
-
-    With `blur` faces are made unrecognisable.
-    """
+    """Write overlay videos of all cameras and depth sensors, and one picture; enter what is there into `files`."""
     import numpy as np
 
     from kinefit.exporters import depth_picture, draw_overlay, write_depth_overlay, write_montage, write_overlay
@@ -95,7 +91,7 @@ def write_overlays(
     pictures, middle = {}, motion.times[len(motion) // 2]
     for name in seen.videos:
         offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
-        given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name), "blur": blur}
+        given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name)}
         with shown_video(take, seen, name) as colour:
             shown = min(max(round((middle - offset) * colour.rate), 0), len(colour) - 1)
             at = nearest_frame(motion, shown / colour.rate + offset)

@@ -17,8 +17,10 @@ import kinefit
 from kinefit.batch.results import NAMES, USUAL
 from kinefit.cli import main
 from kinefit.cli._summary import bone_lengths
+from kinefit.errors import ObservationError
 from kinefit.exporters.report.moments import doubt_sentence, doubtful_moments, when
 from kinefit.findings import frame_ranges
+from kinefit.preparing import faces
 from kinefit.readers.video import Video
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.tracking.checkpoints.interrupted import TrackingInterrupted
@@ -382,13 +384,17 @@ def test_bone_lengths_tell_left_and_right_once():
     assert len(lengths) == 11
 
 
-def test_pictures_without_faces_or_none_at_all(take, tmp_path):
-    for pictures in ("blurred", "none"):
-        told = run("track", take, "--out", tmp_path / pictures, "--formats", "bvh", "--pictures", pictures)
-        assert told.exit_code == 0, told.stderr
-    assert (tmp_path / "blurred" / "montage.png").is_file()
+def test_pictures_without_faces_or_none_at_all(take, tmp_path, monkeypatch):
+    def absent(*_):
+        raise ObservationError("no networks here", remedy="Fetch them.")
+
+    told = run("track", take, "--out", tmp_path / "none", "--formats", "bvh", "--pictures", "none")
+    assert told.exit_code == 0, told.stderr
+    monkeypatch.setattr(faces, "networks", absent)
+    told = run("track", take, "--out", tmp_path / "blurred", "--formats", "bvh", "--pictures", "blurred")
+    assert told.exit_code == 2 and "is now --hide-faces" in told.stderr and "no networks here" in told.stderr
+    assert not (tmp_path / "blurred" / "montage.png").exists()
     assert not (tmp_path / "none" / "montage.png").exists() and not (tmp_path / "none" / "overlays").exists()
-    assert "<img" in (tmp_path / "blurred" / "report.html").read_text()
     assert "<img" not in (tmp_path / "none" / "report.html").read_text()
     told = run("track", take, "--out", tmp_path / "c", "--pictures", "none", "--overlays")
     assert told.exit_code == 2 and "choose one" in told.stderr

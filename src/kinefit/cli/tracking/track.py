@@ -54,7 +54,7 @@ def choices_options(command: Callable) -> Callable:
         click.option("--report/--no-report", default=True, show_default=True, help="Write report.html."),
         click.option(
             "--pictures", type=click.Choice(PICTURES), default="full", show_default=True,
-            help="What report and overlays show of the videos: all, all but the person's face, nothing.",
+            help="What report and overlays show of the videos: all, or nothing; faces are hidden by --hide-faces.",
         ),
         _screen.hide_faces_option,
         click.option("--contacts", is_flag=True, help="Hold soles still where they rest on a level floor."),
@@ -81,6 +81,9 @@ def choices_options(command: Callable) -> Callable:
         told = {parameter: given.pop(parameter) for parameter in _CHOICES}
         source = click.get_current_context().get_parameter_source("overlays")
         wanted = told["overlays"] and source == click.core.ParameterSource.COMMANDLINE
+        if told["pictures"] == "blurred":
+            _screen.note("--pictures blurred is now --hide-faces, which hides everybody's face.")
+            told |= {"pictures": "full", "hide_faces": True}
         told["smooth"] = not told.pop("realtime")
         choices = Choices(**told)
         _check(choices, wanted)

@@ -17,7 +17,6 @@ from kinefit._threads import ahead
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes, writing
 from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT, WHITE, draw_body, draw_residuals, write_lines
-from kinefit.exporters.pictures.privacy import without_face
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
 from kinefit.readers.video import Video
@@ -35,7 +34,6 @@ def write_overlay(
     image_frame: ImageFrame | None = None,
     residuals: Residuals | None = None,
     time_offset: float = 0.0,
-    blur: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> None:
     """Write a video (H.264 where the codec is there, else MPEG-4) of a motion's pictures with the fit drawn on them.
@@ -56,8 +54,6 @@ def write_overlay(
         By default those that the motion holds under the camera's name.
     time_offset : float [s]
         Added to frame / rate to get the time of the take.
-    blur : bool
-        Whether the person's face is made unrecognisable; see `without_face`.
     progress : callable, optional
         Called with the number of pictures done.
 
@@ -74,7 +70,7 @@ def write_overlay(
             frame = nearest_frame(motion, i / video.rate + time_offset)
             label = f"frame {i}"
             yield draw_overlay(
-                image, motion, frame, camera, image_frame=image_frame, residuals=residuals, label=label, blur=blur
+                image, motion, frame, camera, image_frame=image_frame, residuals=residuals, label=label
             )[:height, :width]
 
     write_pictures(drawn(), path, video.rate, (width, height), progress)
@@ -127,14 +123,13 @@ def draw_overlay(
     image_frame: ImageFrame | None = None,
     residuals: Residuals | None = None,
     label: str | None = None,
-    blur: bool = False,
 ) -> NDArray[np.uint8]:
     """One picture with the fit drawn on it.
 
     Parameters
     ----------
     image : (H, W, 3) uint8 RGB; left as it is.
-    motion, camera, image_frame, residuals, blur : see `write_overlay`.
+    motion, camera, image_frame, residuals : see `write_overlay`.
     frame : frame of the motion, None for a picture outside of it.
     label : str, optional
         By default the number of the frame.
@@ -144,7 +139,7 @@ def draw_overlay(
     (H, W, 3) uint8 RGB
     """
     image_frame = image_frame or ImageFrame.identity()
-    out = without_face(image, motion, frame, camera, image_frame) if blur else np.array(image, order="C")
+    out = np.array(image, order="C")
     residuals = motion.residuals.get(camera.name) if residuals is None else residuals
     if residuals is not None and (residuals.unit != "px" or not residuals.of_points):
         residuals = None

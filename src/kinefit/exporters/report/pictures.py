@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.exporters.pictures.drawing import draw_body, draw_residuals, drawn_points
-from kinefit.exporters.pictures.privacy import without_face
 from kinefit.exporters.report.moments import doubtful_moments
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
@@ -34,14 +33,10 @@ def close_up(
     *,
     image_frame: ImageFrame | None = None,
     residuals: Residuals | None = None,
-    blur: bool = False,
 ) -> NDArray[np.uint8]:
-    """The part of a picture (H, W, 3) uint8 RGB that shows the person, with the fit and the keypoints drawn on it.
-
-    With `blur` the face is made unrecognisable; see `without_face`.
-    """
+    """The part of a picture (H, W, 3) uint8 RGB that shows the person, with the fit and the keypoints drawn on it."""
     image_frame = image_frame or ImageFrame.identity()
-    out = without_face(image, motion, frame, camera, image_frame) if blur else np.array(image, order="C")
+    out = np.array(image, order="C")
     draw_body(out, motion, frame, camera, image_frame)
     if residuals is not None and residuals.unit == "px":
         draw_residuals(out, residuals, frame, image_frame)
