@@ -52,9 +52,12 @@ def print_summary(motion: Motion, *, points: bool = False) -> None:
         never = [name for name, frames in gone.items() if len(frames) == len(motion) - len(nobody)]
         if never:
             say(f"{'nothing supports' if told == 'lost' else told + ' on'}: {', '.join(never)} (no frame)")
+        together: dict[str, list[str]] = {}
         for name, frames in gone.items():
             if name not in never:
-                say(f"{told}: {name} in frames {frame_ranges(frames)}")
+                together.setdefault(frame_ranges(frames), []).append(name)
+        for ranges, names in together.items():
+            say(f"{told}: {', '.join(names)} in frames {ranges}")
     lengths = [f"{name} {told}" for name, told in bone_lengths(motion).items()]
     if lengths:
         say("bone lengths [cm]: " + ", ".join(lengths))

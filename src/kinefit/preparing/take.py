@@ -9,6 +9,7 @@ from pathlib import Path
 
 import msgspec
 
+from kinefit.bodies import load_body
 from kinefit.errors import ObservationError
 from kinefit.preparing.detecting import DetectionJob, detect, jobs_of_take
 from kinefit.preparing.each_video import Step, Tell
@@ -56,6 +57,8 @@ def ensure_detections(
 ) -> dict[str, Path]:
     """Files of detections of all cameras of a take in which somebody is seen; made where they are not there yet.
 
+    With points of hands where the take's body has fingers.
+
     Parameters
     ----------
     people : int, optional
@@ -79,8 +82,15 @@ def ensure_detections(
         What fetching the networks, reading a video and writing the file raise.
     """
     jobs = jobs_of_take(take)
-    detect(jobs, people=people, masks=masks, force=force, progress=progress, tell=tell)
+    hands = has_fingers(take.body) or None
+    detect(jobs, people=people, masks=masks, hands=hands, force=force, progress=progress, tell=tell)
     return somebody(jobs, tell)
+
+
+def has_fingers(name_or_file: str) -> bool:
+    """Whether a body has points of hands beyond those of the pose; no for one that has neither set."""
+    sets = {} if name_or_file == "anny" else load_body(name_or_file).keypoint_sets
+    return "MEDIAPIPE_75" in sets and len(sets["MEDIAPIPE_75"]) > len(sets["MEDIAPIPE_33"])
 
 
 def with_detections(take: Take, progress: Step | None = None, tell: Tell = warn) -> Take:
