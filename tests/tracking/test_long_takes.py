@@ -94,7 +94,7 @@ def test_a_frame_needs_little_memory(depth, monkeypatch):
     """Twice the 15 kB that keypoints of two cameras need on this body; what depth images add goes to the file."""
     monkeypatch.setattr(spool, "IN_MEMORY", 2**18)
     monkeypatch.setattr(motions, "smooth_results", partial(smooth_results, window=12, overlap=6))
-    peaks, counts = [], (14, 14, 30)  # the first makes what is made once
+    peaks, counts = [], (16, 16, 40)  # the first makes what is made once
     for count in counts:
         whole = recording(count, depth)
         gc.collect()

@@ -99,14 +99,14 @@ def test_no_start_is_needed():
 def test_mounts_are_estimated():
     truth, rng = a_motion(), np.random.default_rng(2)
     slip = np.array([0.0, 0.2, 0.0])  # every tracker is 11 degrees turned about the limb's axis
-    steps = [[frame(truth.state(i), i / RATE, rng, slipped=slip)] for i in range(0, 30, 5)]
+    steps = [[frame(truth.state(i), i / RATE, rng, slipped=slip)] for i in range(0, 30, 2)]
     errors = []
     for sigma in (0.0, 0.3):
-        recording = Recording.of_frames(steps, Rig(()), rate=RATE / 5, up="y", sensors=[sensor(mount_sigma=sigma)])
+        recording = Recording.of_frames(steps, Rig(()), rate=RATE / 2, up="y", sensors=[sensor(mount_sigma=sigma)])
         found = track(recording, BODY, size=True, smooth=False)
         elbows = [b.landmarks.select(("r_elbow", "l_elbow")) for b in (found.body, BODY)]
-        x = [found.body.positions(found.state(k), elbows[0]) for k in range(6)]
-        y = [BODY.positions(truth.state(5 * k), elbows[1]) for k in range(6)]
+        x = [found.body.positions(found.state(k), elbows[0]) for k in range(15)]
+        y = [BODY.positions(truth.state(2 * k), elbows[1]) for k in range(15)]
         errors.append(float(np.mean(np.linalg.norm(np.subtract(x, y), axis=2))))
     assert errors[1] < 0.5 * errors[0]
 
