@@ -33,7 +33,7 @@ MOTIONS = ["wash 02_10", "jumping jacks 13_30", "reach 14_20", "twists and squat
 SHORT = "walk 02_01"  # three seconds: told, but no recording to calibrate from
 LATE = (0.0, 0.4, -1.7, 5.0)  # frames that each camera's clock is late
 FOCAL = (1.02, 0.98, 1.02, 0.98)
-_LONGEST, _DISTANCE, _SURE = amount(600, 50), 5.0, 0.3  # frames; [m]; confidence
+_LONGEST, _DISTANCE, _SURE = amount(600, 30), 5.0, 0.3  # frames; [m]; confidence
 
 
 def agreement(rig: Rig, motion: Motion, keypoints: tuple[Keypoints, ...]) -> float:

@@ -26,6 +26,7 @@ from kinefit.recipes.voodoo import Settings
 from kinefit.simulation.rendering.sensors import KINECT, TOF
 
 KINECT_COUNT = amount(20, 1)  # each movement and each person twice: images of 640 x 480 take long to simulate
+RATE = amount(10.0, 5.0)  # [Hz]
 TUNED, HELD_OUT = 2, 1  # seeds of people and errors
 FLOOR = (0.0, 1.0, 0.0, 0.0)
 _WAS = Settings(overlap="exclusive", maximum=100)
@@ -68,7 +69,7 @@ def _variant(name: str) -> Summary:
     def method(run: TruthSequence, inputs: Inputs, start: BodyState) -> Motion:
         return voodoo_method(run, inputs, start, VARIANTS[name], one_cylinder(run.truth.body) if thin else None)
 
-    runs = sequences(amount(30, 1), seed=TUNED, sensor=_NEAR if near else TOF)
+    runs = sequences(amount(30, 1), seed=TUNED, sensor=_NEAR if near else TOF, rate=RATE)
     return evaluate(runs, method, inputs=("fusion",))["fusion"]
 
 
@@ -77,7 +78,7 @@ def run() -> None:
     for name in list(VARIANTS)[: 1 if quick() else None]:
         found = _variant(name)
         print(f"#   {name}: {found.counts}, mean {found.mean_grade:.2f}, joints {1e3 * found.error:.0f} mm", flush=True)
-    runs = list(sequences(amount(100, 1), seed=HELD_OUT))
+    runs = list(sequences(amount(100, 1), seed=HELD_OUT, rate=RATE))
     for name, method in METHODS.items():
         began = time.process_time()
         summaries = evaluate(runs, method)
@@ -99,7 +100,7 @@ def run() -> None:
         figure(f"{name}_minutes", spent, "min CPU for all three choices of sensors", "<= 10")
         if not published:
             figure(f"{name}_tof_mm", 1e3 * both.error, "mm, mean of all joints", "<= 25")
-    kinect = sequences(KINECT_COUNT, sensor=KINECT, seed=HELD_OUT)
+    kinect = sequences(KINECT_COUNT, sensor=KINECT, seed=HELD_OUT, rate=RATE)
     near = evaluate(kinect, METHODS["fusion"], inputs=("fusion",))["fusion"]
     figure("fusion_kinect_mm", 1e3 * near.error, "mm, mean of all joints", "<= 12")
 

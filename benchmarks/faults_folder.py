@@ -27,7 +27,7 @@ from kinefit.tracking.checkpoints.frame_file import FORMAT, KINDS
 from kinefit.tracking.takes.take import track_take
 
 LONG, KILLS = 20_000, 20
-_FRAMES, _BYTES = amount(700, 320), 10_000  # frames of the take that is killed; of a frame, about
+_FRAMES, _BYTES = amount(700, 160), 10_000  # frames of the take that is killed; of a frame, about
 _OPTIONS = "--no-report", "--no-overlays", "--formats", "motion,csv"
 _UNPICKLING = {"pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib"}
 MACHINE_CODE = {"_jit.py"}
@@ -140,8 +140,9 @@ def run() -> None:
         work, rng = Path(name), random.Random(0)
         (work / "crafted").mkdir()
         ran, wrong = _ran_and_wrong(read_take(write_long_take(work / "crafted" / "take", 40)), work / "crafted")
-        print(f"  modules that could unpickle: {', '.join(unpickling_modules()) or 'none'}")
-        figure("faults_folder_classes", ran + len(unpickling_modules()), "", "== 0")
+        modules = unpickling_modules()
+        print(f"  modules that could unpickle: {', '.join(modules) or 'none'}")
+        figure("faults_folder_classes", ran + len(modules), "", "== 0")
         figure("faults_folder_crafted_wrong", wrong, f"of {len(WAYS)}", "== 0")
         take, whole, began = write_long_take(work / "take", _FRAMES), work / "whole", time.monotonic()
         tracked(take, whole, *_OPTIONS)

@@ -28,6 +28,7 @@ from kinefit.simulation.retarget import known_motion
 
 SIZE, FOCAL = (640, 480), 600.0
 SECONDS = 1.0
+VIDEOS = amount(4, 2)
 _NOISE, _DRIFT = 1.5, 1.0  # [px] of the keypoints of the first frame
 _CASE = np.array([[-0.40, -0.30, -0.42], [0.42, 0.70, -0.015]])  # [m] in the bike's frame: around the left leg
 
@@ -112,13 +113,13 @@ def _keypoints(seen, folder: Path) -> None:
 
 
 def rendered_cyclist(
-    seed: int, *, cover: bool = False, seconds: float = SECONDS, videos: int = 4, shutter: float = 0.0
+    seed: int, *, cover: bool = False, seconds: float = SECONDS, videos: int = VIDEOS, shutter: float = 0.0
 ) -> GearTake:
     """In a lab, four cameras; the bike stands in view. The cover comes up before the left leg after a fifth.
 
     The shutter is open for a part of the time between two images, which blurs what moves.
     """
-    truth = cyclist(seed, seconds=amount(seconds, 0.2)).truth
+    truth = cyclist(seed, seconds=amount(seconds, 0.12)).truth
     random, count = np.random.default_rng((seed, 50)), len(truth)
     rig = studio_rig(truth, cameras=4, up="y", size=SIZE, focal=FOCAL)
     moving, hidden = draw.dressed(truth, random), np.zeros(count, bool)

@@ -58,7 +58,7 @@ def run() -> None:
     if folder is not None:
         rig = read_calibration(folder / "config.toml")
         table = read_caliscope_csv(folder / "HOLISTIC" / "xy_HOLISTIC.csv")
-        seen = {name: one.rows(slice(40, amount(220, 80)), 0.0) for name, one in table.items()}
+        seen = {name: one.rows(slice(40, amount(220, 60)), 0.0) for name, one in table.items()}
     _figures("real", rig, seen, "x", missing)
     rig, seen = Rig(()), {}
     if videos is not None:

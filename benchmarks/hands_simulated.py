@@ -174,7 +174,7 @@ def run() -> None:
     """Print every figure."""
     found = []
     for seed in amount(SEEDS, SEEDS[:1]):
-        truth = somebody(hands_moving(seed, seconds=amount(_SECONDS, 1.5)), seed)
+        truth = somebody(hands_moving(seed, seconds=amount(_SECONDS, 1.0)), seed)
         rig = near_rig(truth)
         seen = seen_by(truth, rig, seed)
         with tempfile.TemporaryDirectory() as folder:

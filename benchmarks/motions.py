@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from benchmarks.figures import amount, data, quick
 from kinefit import Motion, read_amc, read_bvh
 from kinefit.simulation import cut, resampled, retarget
@@ -40,13 +42,17 @@ def library(names: list[str] | None = None) -> dict[str, Motion]:
     """The motions at 60 Hz (or their own rate where lower); those whose recording is absent are left out."""
     whole: dict[tuple[str, str], Motion] = {}
     out = {}
-    for name in names or (QUICK if quick() else MOTIONS):
+    chosen = names or (QUICK if quick() else MOTIONS)
+    for name in chosen:
         folder, file, asf, start, stop = MOTIONS[name]
         root = data(folder)
         if root is None or not (root / file).exists():
             continue
         if (folder, file) not in whole:
             skeleton = read_amc(root / asf, root / file) if asf else read_bvh(root / file)
+            if LONGEST is not None:
+                until = max(MOTIONS[n][3] for n in chosen if MOTIONS[n][:2] == (folder, file)) + (LONGEST + 2) / RATE
+                skeleton = replace(skeleton, Ts_world_joint=skeleton.Ts_world_joint[: round(until * skeleton.rate)])
             motion = retarget(skeleton)
             whole[folder, file] = resampled(motion, RATE) if motion.rate > RATE else motion
         motion = whole[folder, file]

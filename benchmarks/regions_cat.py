@@ -16,7 +16,7 @@ import numpy as np
 from click.testing import CliRunner
 from numpy.typing import NDArray
 
-from benchmarks.figures import data, figure
+from benchmarks.figures import amount, data, figure
 from benchmarks.regions_scene import away, rigid, state_of
 from kinefit.bodies import Body
 from kinefit.bodies.surfaces.obj import read_obj
@@ -27,6 +27,7 @@ from kinefit.readers.motion import read_motion
 from kinefit.tracking.tracker import Tracker
 
 RATE = 30.0  # [Hz] that the images are taken to have; the recording does not state it
+IMAGES = amount(None, 13)
 RIGHT = 50.0, 5.0  # [mm], [deg], the field's rule
 GOALS = {1: ">= 30", 2: ">= 15", 3: ">= 9", 4: ">= 5"}
 SMOOTHED = "cat, smoothed: images right"
@@ -35,7 +36,8 @@ SRT3D = {1: "29 of 30", 2: "1 of 15", 3: "0 of 10", 4: "0 of 7"}
 
 def images(folder: Path) -> list[NDArray]:
     """All images (H, W, 3) uint8 RGB."""
-    return [cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB) for file in sorted((folder / "img").glob("*.png"))]
+    files = sorted((folder / "img").glob("*.png"))[:IMAGES]
+    return [cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB) for file in files]
 
 
 def truth(folder: Path, count: int) -> NDArray:
@@ -97,7 +99,7 @@ def run() -> None:
     vertices, faces = read_obj(folder / "Cat.obj")
     body, rig = rigid("cat", 1e-3 * vertices, faces), Rig((camera(folder),))
     loaded = time.process_time() - began
-    times = [timed(body, rig, seen, true[0]) for _ in range(5)]
+    times = [timed(body, rig, seen, true[0]) for _ in range(amount(5, 1))]
     spent = np.min([t for t, _ in times], axis=0)
     name = "cat, every image: CPU time a frame, median of each frame's best of 5"
     figure(name, float(np.median(spent)), "ms", "<= 2")
@@ -121,7 +123,7 @@ def tracked(folder: Path, true: NDArray, every: int, *options: str) -> tuple[Mot
 def take_of(folder: Path, work: Path, first: NDArray, every: int = 1) -> Path:
     """A take file of every so many images of the recording, its first pose stated."""
     (work / "img").mkdir()
-    for file in sorted((folder / "img").glob("*.png"))[::every]:
+    for file in sorted((folder / "img").glob("*.png"))[:IMAGES:every]:
         (work / "img" / file.name).symlink_to(file)
     K = np.loadtxt(folder / "K.txt").reshape(3, 3)
     (work / "cat.toml").write_text(

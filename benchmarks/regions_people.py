@@ -32,6 +32,7 @@ from kinefit.rendering import render_body, scaled
 from kinefit.smoothing.foot_contacts import find_contacts
 
 FRAMES = amount(100, 3)
+TRACKED = amount(CAMERAS, CAMERAS[:2])
 GOOD = 0.8  # overlap of a frame from which it counts as tracked, as of silhouettes
 SMALL = 0.35  # at which the paper's recipe sees the images
 GOALS = {
@@ -68,7 +69,7 @@ def run() -> None:
     masks = seen_of(masks_text(folder, "masks"))
     rig = masks.rig
     assert rig is not None
-    motion = tracked(take_text(folder))
+    motion = tracked(take_text(folder, TRACKED))
     alone = overlaps(motion, rig, masks.silhouettes)
     figure(names[0], alone.mean(), "", GOALS[names[0]])
     print(f"  camera by camera {np.round(alone.mean(axis=0), 3)}, worst image {alone.min():.3f}; "
@@ -91,7 +92,7 @@ def run() -> None:
 
 def _with_contacts(folder: Path, motion: Motion, rig: Rig, masks: Sequence[SilhouetteVideo]) -> None:
     """What changes where soles are held while they rest, on the beam or on the ground."""
-    held = tracked(take_text(folder), contacts=True)
+    held = tracked(take_text(folder, TRACKED), contacts=True)
     found = find_contacts(held.body, held.Ts_world_root, held.angles, held.rate, held.up)
     resting = found.weight > 0
     if not resting.any():

@@ -25,7 +25,7 @@ from kinefit.observations import ColourFrame, DepthFrame, KeypointFrame, MarkerF
 from kinefit.rendering import render_body
 from kinefit.tracking.tracker import Tracker
 
-FRAMES, WARM, ROUNDS, RATE = amount(40, 10), 5, amount(4, 1), 30.0
+FRAMES, WARM, ROUNDS, RATE = amount(40, 6), amount(5, 2), amount(4, 1), 30.0
 CAMERAS = amount((1, 2, 4, 8), (1, 2))
 WALL = 4.5  # [m] from each camera
 GOALS = {"keypoints": ">= 100", "masks": ">= 30", "colours": ">= 30", "depth": ">= 30", "markers": ">= 300"}

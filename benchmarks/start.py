@@ -20,7 +20,9 @@ import sys
 from pathlib import Path
 from kinefit import assets
 assets.sample_recording = lambda progress=None: Path(sys.argv[1])
-assets.write_sample_take(Path(sys.argv[2]))
+take = assets.write_sample_take(Path(sys.argv[2]))
+if len(sys.argv) > 3:
+    take.write_text(take.read_text().replace("[[keypoints]]", f"[[keypoints]]\\nframes = [0, {sys.argv[3]}]"))
 """
 
 _FIRST = """
@@ -44,7 +46,7 @@ def run() -> None:
         return
     with tempfile.TemporaryDirectory() as work:
         take = Path(work) / "take"
-        subprocess.run([sys.executable, "-c", _TAKE, str(folder), str(take)], check=True)
+        subprocess.run([sys.executable, "-c", _TAKE, str(folder), str(take), *amount([], ["25"])], check=True)
         kernels = os.environ | ({} if quick() else {"KINEFIT_CACHE": str(Path(work) / "kernels")})
         first = None if quick() else _first(take, kernels)
         figure("start_first", first, "s", names["start_first"], LEFT_OUT)

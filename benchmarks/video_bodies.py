@@ -89,7 +89,7 @@ def run() -> None:
         found: dict[str, list[float]] = {}
         for seed in (42, 43, 44)[: amount(3, 1)]:
             with tempfile.TemporaryDirectory() as place:
-                for name, value in errors(Path(place), kind, seed, frames=amount(24, 5), looks=looks).items():
+                for name, value in errors(Path(place), kind, seed, frames=amount(24, 3), looks=looks).items():
                     found.setdefault(name, []).append(value)
         for name, values in found.items():
             unit, goal = GOALS[name.partition("_")[0]]
@@ -120,7 +120,7 @@ def errors(folder: Path, kind: str, seed: int, *, frames: int, looks: int = 1) -
     setup = SETUPS[kind]
     rig, motion = cameras(setup), another(setup.body, seed, frames)
     take, views = folder / "take", [f"{c.name}={folder / 'take' / c.name}.avi" for c in rig]
-    record_bar(folder / "bar", rig, setup, amount(150, 60), seed)
+    record_bar(folder / "bar", rig, setup, amount(150, 40), seed)
     record(take, motion, rig, seed)
     (take / "clicks.json").write_text(clicks(motion, rig, seed, [frames * k // looks for k in range(looks)]))
     write_character_glb(take / "character.glb", arms=0.8, longer=0.8, seed=2)
