@@ -33,7 +33,7 @@ from kinefit.subject.view_bias import SeenFrames, learn_view_bias
 _SHIFT = 0.01, 0.005  # [m] how far detectors' points are off on long and on short segments, before a take is seen
 _POSTURE = 0.1  # share of the posture prior: frames of a take are a few independent postures at the most
 _UNTOLD = 1.2  # variance of shapes found, over what they state: limits, weights and priors are taken for known there.
-# With 1.0, 1.2 and 1.6 intervals of 95 % hold 95, 96 and 98 % of the joints of twenty known people with BODY_25B
+# With 1.0, 1.2 and 1.6 intervals of 95 % hold 95.5, 96.5 and 97.7 % of the joints of twenty known people with BODY_25B
 # (`benchmarks.error_bars`); the worst group of angles 88, 89 and 91 %. MEDIAPIPE_33 is the check.
 _ROUNDS = 2  # of fits with a better prior standard deviation; it changes by less than a tenth from then on
 _PLAUSIBLE = 0.15  # [m] median distance from triangulated points beyond which a pose is not one

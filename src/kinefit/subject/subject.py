@@ -139,9 +139,14 @@ class Subject:
         return cls(body, np.ones(len(body.scale_groups)))
 
     @property
+    def cameras(self) -> CameraExtrinsics | None:
+        """The parameters of cameras, where the fit sought them."""
+        return None if self.fit is None else self.fit.cameras
+
+    @property
     def camera_errors(self) -> dict[str, NDArray]:
         """{camera: (6,) [m, rad] twist} to where cameras were found that their calibration has wrongly; else none."""
-        cameras = None if self.fit is None else self.fit.cameras
+        cameras = self.cameras
         if self.fit is None or cameras is None or not cameras.wrong:
             return {}
         twists = self.fit.mean[-len(cameras.names) :].reshape(-1, 6)

@@ -130,8 +130,7 @@ def fitted_to_person(
             )  # fmt: skip
             if last or not (errors := by_keypoints.camera_errors):
                 break
-            assert by_keypoints.fit is not None and by_keypoints.fit.cameras is not None
-            moved = replace(by_keypoints.fit.cameras, calibrated=recording.rig)
+            moved = by_keypoints.cameras and replace(by_keypoints.cameras, calibrated=recording.rig)
             person = _with_cameras(person, moved_rig(person.recording.rig, errors))
         person = _with_depth_cameras(_wearing(person, by_keypoints, **_gear_of(body, by_keypoints)), settings)
     elif recording.markers and recording.markers[0].marker_set:

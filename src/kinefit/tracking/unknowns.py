@@ -101,7 +101,7 @@ def of_points(
         found.append((offsets, offsets.values_of(worn[name].points - scaled.markers(name).points)))
     used = tuple(dict.fromkeys(k.camera for k in recording.keypoints))
     if cameras is not None and used:
-        before = None if subject.fit is None else subject.fit.cameras
+        before = subject.cameras
         factors = before.factors if before is not None and before.free == used else None
         poses = CameraExtrinsics(recording.rig, None, cameras, used, factors, calibrated)
         found.append((poses, np.zeros(len(poses.names))))
