@@ -9,6 +9,7 @@ from pathlib import Path
 
 import msgspec
 
+from kinefit.bodies import load_body
 from kinefit.errors import ObservationError
 from kinefit.preparing.detecting import DetectionJob, detect, jobs_of_take
 from kinefit.preparing.each_video import Step, Tell
@@ -51,8 +52,8 @@ def prepared(take: Take, progress: Step | None = None, tell: Tell = warn) -> Tak
 
 
 def ensure_detections(
-    take: Take, *, people: int | None = None, masks: bool | None = None, force: bool = False,
-    progress: Step | None = None, tell: Tell = warn,
+    take: Take, *, people: int | None = None, masks: bool | None = None, hands: bool | None = None,
+    force: bool = False, progress: Step | None = None, tell: Tell = warn,
 ) -> dict[str, Path]:
     """Files of detections of all cameras of a take in which somebody is seen; made where they are not there yet.
 
@@ -62,6 +63,8 @@ def ensure_detections(
         How many are followed at most; default: as it was done, or `PEOPLE`.
     masks : bool, optional
         Whether outlines are wanted; default: as it was done, or no, as they nearly double the time.
+    hands : bool, optional
+        Whether points of hands are wanted; default: as it was done, or yes where the take's body has fingers.
     force : bool
         Make them anew.
     progress : called with (camera, pictures done, pictures in all).
@@ -79,8 +82,15 @@ def ensure_detections(
         What fetching the networks, reading a video and writing the file raise.
     """
     jobs = jobs_of_take(take)
-    detect(jobs, people=people, masks=masks, force=force, progress=progress, tell=tell)
+    hands = has_fingers(take.body) or None if hands is None else hands
+    detect(jobs, people=people, masks=masks, hands=hands, force=force, progress=progress, tell=tell)
     return somebody(jobs, tell)
+
+
+def has_fingers(name_or_file: str) -> bool:
+    """Whether a body has points of hands beyond those of the pose; no for one that has neither set."""
+    sets = {} if name_or_file == "anny" else load_body(name_or_file).keypoint_sets
+    return "MEDIAPIPE_75" in sets and len(sets["MEDIAPIPE_75"]) > len(sets["MEDIAPIPE_33"])
 
 
 def with_detections(take: Take, progress: Step | None = None, tell: Tell = warn) -> Take:

@@ -93,7 +93,7 @@ class Draft:
     def text(self) -> str:
         """The take file."""
         head = {"name": Told(self.folder.name or "take"), **self.head}
-        head.setdefault("body", Told("humanoid", "sure", 'a whole person; there are "humanoid10" and "arm" too'))
+        head.setdefault("body", Told("humanoid", "sure", 'a whole person; "humanoid_hands" has fingers, too'))
         first = _table("[take]", head, self) + "".join(f"# {comment}\n" for comment in self.comments)
         parts = [_HEAD, first]
         if self.calibration:
