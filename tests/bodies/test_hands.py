@@ -5,7 +5,8 @@ import pytest
 
 from kinefit.bodies import BodyState, load_body
 from kinefit.bodies.fingers import knuckles
-from kinefit.bodies.limbs import limbs
+from kinefit.bodies.limbs import finger_groups, limbs
+from kinefit.exporters.report.moments import spoken_segments
 
 BODY = load_body("humanoid_hands")
 TREE = BODY.tree
@@ -77,3 +78,11 @@ def test_points_on_fingers_stand_nearer_to_their_places():
     share = dict(zip(TREE.segments, BODY.offset_shares))
     assert share["index_proximal_r"] > share["index_middle_r"] > share["index_distal_r"] > 0.3
     assert np.all(load_body("humanoid").offset_shares == 1.0)
+
+
+def test_fingers_of_a_hand_are_one_group():
+    groups = finger_groups(BODY)
+    assert set(groups) == {"hand_l", "hand_r"} and finger_groups(load_body("humanoid")) == {}
+    assert all(len(own) == 15 and all(s.startswith(FINGERS) for s in own) for own in groups.values())
+    words = spoken_segments(BODY, ["ring_distal_l", "hand_l", "little_distal_l", "index_distal_r"])
+    assert words == ["fingers of the left hand", "left hand", "right index distal"]

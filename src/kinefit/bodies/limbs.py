@@ -23,3 +23,17 @@ def limbs(body: Body) -> tuple[tuple[int, ...], ...]:
             above = int(parents[limb[-1]])
             out[above if hand[above] else int(end)] = [*(out[above] if hand[above] else []), *limb[::-1]]
     return tuple(tuple(limb) for limb in out.values())
+
+
+def finger_groups(body: Body) -> dict[str, tuple[str, ...]]:
+    """Name of a hand -> names of all segments below it, of hands that fork into fingers."""
+    tree = body.tree
+    children = np.bincount(tree.parents[tree.parents >= 0], minlength=len(tree.parents))
+    of = np.where((children > _MAX_BRANCHES) & (tree.parents >= 0), np.arange(len(children)), -1)
+    for s, parent in enumerate(tree.parents):  # parents come first
+        if parent >= 0 and of[parent] >= 0:
+            of[s] = of[parent]
+    return {
+        tree.segments[hand]: tuple(tree.segments[s] for s in np.flatnonzero(of == hand) if s != hand)
+        for hand in np.unique(of[of >= 0])
+    }

@@ -51,13 +51,10 @@ def print_summary(motion: Motion, *, points: bool = False) -> None:
     for told, gone in (("no markers", bare), ("lost", lost_segments(motion))):
         never = [name for name, frames in gone.items() if len(frames) == len(motion) - len(nobody)]
         if never:
-            say(f"{'nothing supports' if told == 'lost' else told + ' on'}: {', '.join(never)} (no frame)")
-        together: dict[str, list[str]] = {}
-        for name, frames in gone.items():
-            if name not in never:
-                together.setdefault(frame_ranges(frames), []).append(name)
-        for ranges, names in together.items():
-            say(f"{told}: {', '.join(names)} in frames {ranges}")
+            names = ", ".join(_hands_together(motion, {n: gone[n] for n in never}))
+            say(f"{'nothing supports' if told == 'lost' else told + ' on'}: {names} (no frame)")
+        for name, frames in _hands_together(motion, {n: f for n, f in gone.items() if n not in never}).items():
+            say(f"{told}: {name} in frames {frame_ranges(frames)}")
     lengths = [f"{name} {told}" for name, told in bone_lengths(motion).items()]
     if lengths:
         say("bone lengths [cm]: " + ", ".join(lengths))
@@ -80,6 +77,17 @@ def lost_segments(motion: Motion) -> dict[str, NDArray]:
         gone[frames, motion.body.tree.segment(name)] = False
     lost = {name: np.flatnonzero(gone[:, s]) for s, name in enumerate(motion.body.tree.segments)}
     return {name: frames for name, frames in lost.items() if len(frames)}
+
+
+def _hands_together(motion: Motion, gone: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    """Segments -> frames; of each hand all its fingers as one, in frames in which any of them is gone."""
+    from kinefit.bodies.limbs import finger_groups
+
+    out = dict(gone)
+    for hand, segments in finger_groups(motion.body).items():
+        if frames := [out.pop(s) for s in segments if s in out]:
+            out[f"fingers of {hand}"] = np.unique(np.concatenate(frames))
+    return out
 
 
 def without_markers(motion: Motion) -> dict[str, NDArray]:

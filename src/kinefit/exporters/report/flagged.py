@@ -73,4 +73,4 @@ def _who(m: Moment) -> str:
 
 
 def _when(motion: Motion, m: Moment) -> p.Html:
-    return p.joined(p.moment(motion.times[m.worst], span(motion, m)), f" {place(m)}")
+    return p.joined(p.moment(motion.times[m.worst], span(motion, m)), f" {place(motion, m)}")

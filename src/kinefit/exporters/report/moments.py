@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies import Body
+from kinefit.bodies.limbs import finger_groups
 from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT
 from kinefit.exporters.report.doubt import contradicted, doubtful, end_sigmas, uncertain_throughout
 from kinefit.findings import runs_of
@@ -62,7 +64,7 @@ def doubtful_moments(motion: Motion) -> tuple[Moment, ...]:
     and those that are twice as uncertain as in the median.
     """
     found = [*_nobody(motion), *_doubts(motion)]
-    told = [replace(m, causes=causes(motion, m)) for m in _merged(found)]
+    told = [replace(m, causes=causes(motion, m)) for m in _merged(motion.body, found)]
     return tuple(sorted(told, key=lambda m: (-m.score, m.start)))
 
 
@@ -86,7 +88,7 @@ def throughout_sentence(motion: Motion) -> str:
 
 def when(motion: Motion, m: Moment) -> str:
     """Times, frames and segments of a moment: "1.20–1.43 s (frames 36–43): head"."""
-    return f"{span(motion, m)} {place(m)}"
+    return f"{span(motion, m)} {place(motion, m)}"
 
 
 def span(motion: Motion, m: Moment) -> str:
@@ -95,10 +97,10 @@ def span(motion: Motion, m: Moment) -> str:
     return f"{start:.2f} s" if m.stop - m.start == 1 else f"{start:.2f}–{stop:.2f} s"
 
 
-def place(m: Moment) -> str:
+def place(motion: Motion, m: Moment) -> str:
     """Frames and segments of a moment: "(frames 36–43): head"."""
     frames = f"frame {m.start}" if m.stop - m.start == 1 else f"frames {m.start}–{m.stop - 1}"
-    return f"({frames}): {listed([plain(s) for s in m.segments]) or 'whole body'}"
+    return f"({frames}): {listed(spoken_segments(motion.body, m.segments)) or 'whole body'}"
 
 
 def never_observed(motion: Motion) -> tuple[str, ...]:
@@ -129,6 +131,13 @@ def plain(segment: str) -> str:
     """A segment's name in words: hand_l becomes "left hand"."""
     side = {"_l": "left ", "_r": "right "}.get(segment[-2:], "")
     return (side + (segment[:-2] if side else segment)).replace("_", " ").replace("upperarm", "upper arm")
+
+
+def spoken_segments(body: Body, segments: Sequence[str]) -> list[str]:
+    """Segments in words, each once; several fingers of a hand together: "fingers of the left hand"."""
+    groups = finger_groups(body)
+    hand = {s: name for name, own in groups.items() if len(set(own) & set(segments)) > 1 for s in own}
+    return list(dict.fromkeys(f"fingers of the {plain(hand[s])}" if s in hand else plain(s) for s in segments))
 
 
 def listed(names: Sequence[str], most: int = 4) -> str:
@@ -174,7 +183,7 @@ def _doubts(motion: Motion) -> Iterable[_Doubt]:
             yield _Doubt(kind, start, stop, start + int(np.argmax(part)), share * (stop - start), name, amount)
 
 
-def _merged(found: Iterable[_Doubt]) -> list[Moment]:
+def _merged(body: Body, found: Iterable[_Doubt]) -> list[Moment]:
     """What shares more than half of its time becomes one moment; of the same segment, half of the shorter's time."""
     groups: list[list[_Doubt]] = []
     spans: list[tuple[int, int]] = []
@@ -194,17 +203,17 @@ def _merged(found: Iterable[_Doubt]) -> list[Moment]:
     return [
         Moment(
             *span, group[0].worst, tuple(dict.fromkeys(g.segment for g in group if g.segment)),
-            tuple(_sentences(group)), (), sum(g.score for g in group),
+            tuple(_sentences(body, group)), (), sum(g.score for g in group),
         )
         for group, span in zip(groups, spans)
     ]  # fmt: skip
 
 
-def _sentences(group: Sequence[_Doubt]) -> Iterable[str]:
+def _sentences(body: Body, group: Sequence[_Doubt]) -> Iterable[str]:
     """What a moment's findings say; what is the same of several segments is said once, of all."""
     for kind in dict.fromkeys(g.kind for g in group):
         same = [g for g in group if g.kind == kind]
-        names = listed(list(dict.fromkeys(plain(g.segment) for g in same)))
+        names = listed(spoken_segments(body, [g.segment for g in same]))
         most = max(g.amount for g in same)
         if kind == "nobody":
             yield "Nothing of the person was seen; the body stays where it was."
@@ -236,8 +245,8 @@ def causes(motion: Motion, moment: Moment) -> tuple[str, ...]:
     quality = motion.segment_quality[frames]
     for text, of in (("No measurement supports {}", quality <= 0), ("More speaks against {} than for it", quality > 0)):
         gone = 2 * (of & motion.lost[frames]).sum(axis=0) > len(quality)
-        if names := [plain(n) for n in moment.segments if gone[motion.body.tree.segments.index(n)]]:
-            out.append(text.format(listed(names)) + ".")
+        if names := [n for n in moment.segments if gone[motion.body.tree.segments.index(n)]]:
+            out.append(text.format(listed(spoken_segments(motion.body, names))) + ".")
     swapped = [name for name, r in pixels.items() if np.any(np.asarray(r.swapped)[frames])]
     if swapped:
         out.append(f"The detector took left for right in {listed(swapped)} (put right).")
