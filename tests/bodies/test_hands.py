@@ -1,5 +1,7 @@
 """The humanoid with fingers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -68,6 +70,23 @@ def test_fingers_belong_to_the_limb_of_their_arm():
     expected = {tuple(plain.tree.segments[s] for s in limb) for limb in limbs(plain)}
     assert {tuple(s for s in limb if not s.startswith(FINGERS)) for limb in found} == expected
     assert sorted(map(len, found)) == [1, 4, 4, 19, 19]
+
+
+def test_a_trunk_on_which_much_hangs_is_no_hand():
+    plain = load_body("humanoid")
+    tree, thorax = plain.tree, plain.tree.segment("thorax")
+    places = np.array([thorax] * 6 + [tree.segment("head")] * 6 + [thorax])
+    names = tuple(f"plate {k}" for k in range(len(places)))
+    worn = replace(
+        tree, segments=(*tree.segments, *names), parents=np.concatenate([tree.parents, places]),
+        offsets=np.concatenate([tree.offsets, np.full((len(places), 3), 0.05)]),
+    )  # fmt: skip
+    scale = np.concatenate([plain.segment_scale, plain.segment_scale[places]])
+    body = replace(plain, tree=worn, joints=(*plain.joints, *names), segment_scale=scale)
+    found = [tuple(worn.segments[s] for s in limb) for limb in limbs(body)]
+    arm = ("clavicle_r", "upperarm_r", "forearm_r", "hand_r")
+    assert arm in found and list(finger_groups(body)) == ["head"]
+    assert sorted(s for limb in found for s in limb) == sorted({*worn.segments} - {"pelvis", "abdomen", "thorax"})
 
 
 def test_a_hand_with_fingers_ends_in_no_folded_ones():

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kinefit.bodies.body import Body
 
-_MAX_BRANCHES = 4  # of a trunk; what forks into more is a hand
+_MAX_BRANCHES = 4  # of a trunk; what forks into more, none of which forks again, is a hand
 
 
 def limbs(body: Body) -> tuple[tuple[int, ...], ...]:
     """Segments from each leaf up to where the tree branches, the nearest to the trunk first; fingers with their arm."""
     parents = body.tree.parents
-    children = np.bincount(parents[parents >= 0], minlength=len(parents))
-    hand = (children > _MAX_BRANCHES) & (parents >= 0)
+    children, hand = _children(parents), _is_hand(parents)
     out: dict[int, list[int]] = {}
     for end in np.flatnonzero((children == 0) | hand):
         limb = [int(end)]
@@ -28,8 +28,7 @@ def limbs(body: Body) -> tuple[tuple[int, ...], ...]:
 def finger_groups(body: Body) -> dict[str, tuple[str, ...]]:
     """Name of a hand -> names of all segments below it, of hands that fork into fingers."""
     tree = body.tree
-    children = np.bincount(tree.parents[tree.parents >= 0], minlength=len(tree.parents))
-    of = np.where((children > _MAX_BRANCHES) & (tree.parents >= 0), np.arange(len(children)), -1)
+    of = np.where(_is_hand(tree.parents), np.arange(len(tree.parents)), -1)
     for s, parent in enumerate(tree.parents):  # parents come first
         if parent >= 0 and of[parent] >= 0:
             of[s] = of[parent]
@@ -37,3 +36,19 @@ def finger_groups(body: Body) -> dict[str, tuple[str, ...]]:
         tree.segments[hand]: tuple(tree.segments[s] for s in np.flatnonzero(of == hand) if s != hand)
         for hand in np.unique(of[of >= 0])
     }
+
+
+def _children(parents: NDArray) -> NDArray:
+    """(S,) how many segments hang on each."""
+    return np.bincount(parents[parents >= 0], minlength=len(parents))
+
+
+def _is_hand(parents: NDArray) -> NDArray:
+    """(S,) bool."""
+    children = _children(parents)
+    forks = children > 1
+    below = np.zeros(len(parents), bool)  # whether anything below forks; parents come first
+    for s in range(len(parents) - 1, 0, -1):
+        if parents[s] >= 0:
+            below[parents[s]] |= forks[s] | below[s]
+    return (children > _MAX_BRANCHES) & (parents >= 0) & ~below
