@@ -1,8 +1,8 @@
 """A seated person with both hands before four cameras (caliscope's recordings), each camera held out of the whole fit.
 
 Landmarks of MediaPipe Holistic as caliscope wrote them ("real"), and those of kinefit's own detector in the videos of
-another recording, as a take with the body "humanoid_hands" has them looked for ("video"). Nobody knows where the
-fingers were. What is told: how far, in the camera that the fit did not have, points of hands lie from where it puts
+another recording, as a take with the body "humanoid_hands" has them looked for ("video"). There is no truth of
+fingers. What is measured: how far, in the camera that the fit did not have, points of hands lie from where it puts
 them. Beside it the same of points that the other cameras triangulate, each by itself, over the same frames and points.
 Holistic often puts both hands onto one; frames of the camera in which its two hands are nearer to each other than 0.4
 of a hand's size do not judge. The cameras' pictures of the videos are up to half a frame apart, at 6 a second.

@@ -62,7 +62,7 @@ def test_cameras_that_are_turned_by_half_a_degree_come_back(kind):
 
 
 def with_errors(cameras, moved, share):
-    """The same where a fit with what is stated found twists so many stated deviations away, told so far by its data."""
+    """The same after a fit that found such twists [stated deviations], with so large a share of variance left."""
     prior = cameras.information
     information = prior * (1.0 / share - 1.0)
     found = np.repeat(cameras.std, 3) * np.reshape(moved, (-1, 6))

@@ -1,7 +1,7 @@
 """People who are another one's image in a mirror.
 
 Cameras see the image of a person in a mirror as one more person, who stands behind the glass and does the same with the
-other side. It is told by the one plane about which it mirrors somebody in all frames.
+other side. The one plane about which it mirrors somebody in all frames gives it away.
 """
 
 from __future__ import annotations

@@ -260,8 +260,8 @@ def _fits(
     """Whether what was found is of this video and of the settings that matter, those that are not None."""
     if found is None or not found.startswith(key + " "):
         return False
-    told = dict(part.split("=") for part in found[len(key) + 1 :].split())
-    settings = {"quality": "balanced", "hands": "False", **told}
+    stated = dict(part.split("=") for part in found[len(key) + 1 :].split())
+    settings = {"quality": "balanced", "hands": "False", **stated}
     first, last = (float(s) for s in settings.get("seconds", "-inf:inf").split(":"))
     start, stop = seconds or (-np.inf, np.inf)
     if not first <= start <= stop <= last:

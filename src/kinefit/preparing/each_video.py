@@ -52,8 +52,8 @@ def each_video(jobs: Sequence[J], work: Callable[[J, Step], None], progress: Ste
             done, _ = wait(futures, return_when=FIRST_EXCEPTION)
         except KeyboardInterrupt as stopped:
             kept = of - len(jobs) + sum(future.done() for future in futures)
-            told = f"{kept} of {of} videos are done and kept; the same command goes on with the others."
-            raise KeyboardInterrupt(told) from stopped
+            message = f"{kept} of {of} videos are done and kept; the same command goes on with the others."
+            raise KeyboardInterrupt(message) from stopped
         finally:  # after an error, or Ctrl-C: those that run end at their next picture
             stop.set()
             for future in futures:

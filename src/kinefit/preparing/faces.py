@@ -8,7 +8,7 @@ those of the search for small ones; `key`, which another video does not have.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -49,7 +49,7 @@ class Heads:
     found: NDArray
 
     def at(self, frame: int) -> NDArray | None:
-        """(N, 3) [px] circles of a frame, those of the two searched before it and after it; None: nobody looked."""
+        """(N, 3) [px] circles of a frame, those of the two searched before it and after it; None: not searched."""
         reach = np.diff(self.searched).max(initial=1)
         if not len(self.searched) or not -reach <= frame - self.searched[0] <= np.ptp(self.searched) + reach:
             return None
@@ -93,7 +93,7 @@ class HiddenVideo(Video):
         self._heads, self._more = heads, more
 
     def read(self, i: int) -> NDArray[np.uint8]:
-        """Frame `i` as (H, W, 3) uint8 RGB, upright, with all faces hidden; all of it where nobody looked for them."""
+        """Frame `i` as (H, W, 3) uint8 RGB, upright, with all faces hidden; all of it where it was not searched."""
         from kinefit.exporters.pictures.privacy import hide_all, hide_circles
 
         image, circles = super().read(i), self._heads.at(i)
@@ -111,7 +111,7 @@ def shown_video(take: Take, seen: Observations, camera: str) -> Video:
     path = seen.videos[camera]
     if not take.hide_faces:
         return Video(path, rate=seen.rate)
-    heads = ensure_faces(take)[camera]
+    heads = ensure_faces(take, cameras=(camera,))[camera]
     offset = next(entry.time_offset for entry in take.cameras if entry.name == camera)
     rate = seen.rate
 
@@ -133,8 +133,11 @@ def shown_video(take: Take, seen: Observations, camera: str) -> Video:
     return video
 
 
-def ensure_faces(take: Take, progress: Step | None = None, tell: Tell = lambda text: None) -> dict[str, Heads]:
-    """{camera: Heads} of all videos of a take; looked for where that was not done yet.
+def ensure_faces(
+    take: Take, progress: Step | None = None, tell: Tell = lambda text: None, *,
+    cameras: Collection[str] | None = None,
+) -> dict[str, Heads]:  # fmt: skip
+    """{camera: Heads} of the videos of a take, or of some of its cameras; looked for where that was not done yet.
 
     Raises
     ------
@@ -145,7 +148,8 @@ def ensure_faces(take: Take, progress: Step | None = None, tell: Tell = lambda t
     """
     from kinefit.assets import MODELS_PACKAGE
 
-    jobs = {job: _seconds_key(job, f"{MODELS_PACKAGE} {_METHOD}") for job in jobs_of_take(take)}
+    chosen = [job for job in jobs_of_take(take) if cameras is None or job.camera in cameras]
+    jobs = {job: _seconds_key(job, f"{MODELS_PACKAGE} {_METHOD}") for job in chosen}
     todo = [job for job, key in jobs.items() if _read(_file(job), key) is None]
     if todo:
         from kinefit.images.detectors.face_detector import FaceDetector

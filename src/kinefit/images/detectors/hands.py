@@ -157,7 +157,7 @@ class HandFollower:
         for before in [hand for (column, _), hand in self._before.items() if column == ALONE]:
             if found := self._look(image, before.roi):
                 now.setdefault((ALONE, int(found.left < 0.5)), found)
-        for roi in self.models.find_palms(image) if len(now) < 1 else ():
+        for roi in self.models.find_palms(image) if not now else ():
             found = self._look(image, roi, twice=True)
             if found and not any(_is_same(found, hand) for hand in now.values()):
                 now.setdefault((ALONE, int(found.left < 0.5)), found)
