@@ -112,7 +112,7 @@ def record(draw: int, shape: str, seconds: float = SECONDS) -> Walk:
         truth, SENSOR.camera(), azimuth=float(random.uniform(-np.pi, np.pi)), near=SENSOR.near, far=SENSOR.far
     )
     rig = Rig((*(c for c in studio_rig(truth) if c.name in CAMERAS[:2]), front))
-    told = Rig(tuple(c.with_pose(takes._error(random) @ c.T_camera_world) for c in rig.cameras[:2]) + (front,))
+    told = Rig(tuple(c.with_pose(takes.camera_error(random) @ c.T_camera_world) for c in rig.cameras[:2]) + (front,))
     bare = SimulatedScene(truth, body_mesh(body) if body.skin is None else body.skin)  # type: ignore[arg-type]
     around = replace(bare, room=room(truth, front))
     depth = takes._counts(simulate_depth(truth, front, SENSOR, seed=draw, scene=around), len(truth))
