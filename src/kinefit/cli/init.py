@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import click
@@ -61,7 +62,7 @@ def init(
         check_file(out)
     guess = guess_take(folder, beside=out.absolute().parent)
     write_text(out, guess.text)
-    _show(guess.notes)
+    show(guess.notes)
     if hide_faces:
         from kinefit.preparing.ingest import hide_in_copies
 
@@ -79,7 +80,24 @@ def init(
     _screen.say(f"\n{out}: written. {first}:\n  {command('check', out)}\n  {command('track', out)}")
 
 
-def _show(notes: tuple) -> None:
+def write_first_take(folder: Path) -> Path:
+    """The take file of a folder that has none: guessed, shown, with the person's height where somebody answers."""
+    from kinefit.exporters.atomic import write_text
+    from kinefit.readers.guess.folder import guess_take
+
+    guess, out = guess_take(folder), folder / "take.toml"
+    text = guess.text
+    if sys.stdin.isatty() and "[calibration]" not in text:  # lengths then hang on the height alone
+        given = click.prompt("Height of the person in metres, Enter where you do not know it", default="", show_default=False)
+        text = text.replace("# height = 1.75  # open: the stature in metres, where you know it", f"height = {float(given)}") if given else text
+    write_text(out, text)
+    show(guess.notes)
+    _screen.say(f"{out}: written, and used from now on.")
+    return out
+
+
+def show(notes: tuple) -> None:
+    """Print what was guessed, a line each."""
     from rich.text import Text
 
     console = _screen.console()

@@ -13,22 +13,30 @@ from kinefit.bodies import Body, PointSet
 from kinefit.bodies.rigid_pairs import rigid_pairs
 from kinefit.calibration.people.first_rig import first_rig
 from kinefit.calibration.people.floor import centre_of_mass, settled
+from kinefit.calibration.people.skeletons import first_cameras, in_step
+from kinefit.calibration.people.steady import steady_person
 from kinefit.calibration.refine.bundle import bundle_adjust
 from kinefit.calibration.refine.gauge import resized
 from kinefit.calibration.refine.refine import Length, check_input, length_of, prior_sigma, refine_from
 from kinefit.calibration.refine.result import Refinement
 from kinefit.calibration.refine.sightings import PersonSighting, PersonTrial, Progress
 from kinefit.errors import CalibrationError
+from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.geometry.triangulation import triangulate, triangulate_robust
 from kinefit.multiview.association import person_records
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.sensors.channels import Channels, make_channels
-from kinefit.solvers.bundle.cameras import CameraPrior, PointPixels
+from kinefit.solvers.bundle.cameras import FOCAL, TIME, CameraPrior, PointPixels
 
 _SURE = 0.3  # confidence of a keypoint that takes part in the start
 _MOST = 2500  # points in space of the start
 _ANYWHERE = 20.0, 3.0  # [m], [rad] no prior to speak of
+_GUESSED = 0.25  # of a focal length's logarithm: 64 degrees stand for 52 to 78 (one standard deviation)
+_CLOCKS, _NEAR_CLOCKS = 2.0, 0.05  # [s] clocks of cameras that were started by hand; what the first look leaves
+_COARSE = 8.0, 4.0, 2.0, 1.0  # standard deviations of a keypoint at which the robust loss begins, and ends
+_TOGETHER = 20.0  # pixels of a detector that tell as much of a lens as one: their errors come together
+_BEFORE = 0.05  # of the rig's size: points nearer to a camera are triangulated badly
 _AGREE = 5.0  # standard deviations within which the cameras' rays meet, before they are adjusted
 
 
@@ -49,8 +57,10 @@ def calibrate_people(
 ) -> Refinement:
     """Poses of cameras whose intrinsics are known, from a person who moves in front of them.
 
-    Essential matrices choose the pair to start from; the other cameras are laid on its points (see `first_rig`); free
-    points, then the body with its constant bone lengths, are adjusted together with all cameras.
+    Where a network lifted the person to space in each camera, these skeletons are laid on each other: turns, clocks and
+    distances come from them (`first_cameras`). Else essential matrices choose the pair to start from, and the other
+    cameras are laid on its points (`first_rig`). Free points, then the body with its constant bone lengths, are adjusted
+    together with all cameras.
 
     Parameters
     ----------
@@ -59,7 +69,8 @@ def calibrate_people(
     body : Body, generic.
     height : float [m] stature of the person: sets the scale; default: the generic body's bones.
     known_length : (point, point, [m]) of the body: sets the scale instead.
-    focal, time_offsets : bool, estimate focal lengths, and time offsets, too.
+    focal : bool, the cameras' lenses are guesses: estimate focal lengths, too.
+    time_offsets : bool, estimate time offsets, too: up to 2 s with `lifted` keypoints, else a few frames.
     up : str, vertical axis that the world shall have.
 
     Raises
@@ -73,53 +84,38 @@ def calibrate_people(
     given = Rig(tuple(camera.with_pose(np.eye(4)) for camera in cameras))
     check_input(given, keypoints, height, known_length)
     step("first cameras", 0, 2)
-    alone = [steady_person(record) for record in keypoints]
-    in_step = person_records(alone, [np.zeros(len(k), int) for k in alone])
-    channels = make_channels(body, given, in_step, [sigma] * len(alone))
+    late = np.zeros(len(given), int)
+    rate, frames = keypoints[0].rate, len(keypoints[0])
+    first: Rig | None = None
+    if all(record.lifted is not None for record in keypoints):
+        start = first_cameras(cameras, keypoints, within=_CLOCKS if time_offsets else 0.0)
+        first, alone, late = start.rig, list(start.people), start.frames_late
+    else:
+        alone = [steady_person(record) for record in keypoints]
+    keypoints = [in_step(record, n, frames) for record, n in zip(keypoints, late, strict=True)]
+    alone = [in_step(record, n, frames) for record, n in zip(alone, late, strict=True)]
+    together = person_records(alone, [np.zeros(frames, int) for _ in alone])
+    channels = make_channels(body, given, together, [sigma] * len(alone))
     uv = common_pixels(channels)
-    rig = first_rig(given, uv.reshape(-1, len(given), 2), sigma)
+    rig = first or first_rig(given, uv.reshape(-1, len(given), 2), sigma)
     step("first cameras", 1, 2)
-    rig, x = _adjusted(rig, uv, sigma, focal=focal)
+    spread = _GUESSED if focal else 0.0
+    rig, x = _adjusted(rig, given, uv, sigma, focal=spread, clock=_NEAR_CLOCKS if time_offsets else 0.0, rate=rate)
     factor = _whole_scale(body, channels.points, x, height)
     rig = settled(resized(rig, factor), factor * x, _above_soles(body, channels.points), up=up)
     step("first cameras", 2, 2)
     prior_std = prior_sigma(len(rig), focal=focal, distortion=False, time_offsets=time_offsets)
-    prior_std[:, :3], prior_std[:, 3:6] = _ANYWHERE
+    prior_std[:, :3], prior_std[:, 3:6], prior_std[:, FOCAL] = *_ANYWHERE, spread
     prior = CameraPrior(Rig(tuple(replace(a, matrix=b.matrix) for a, b in zip(rig, given, strict=True))), prior_std)
 
     def stand(rig: Rig, seen: PersonSighting) -> tuple[Rig, str]:
         return _on_the_floor(rig, seen, body, height, known_length, up)
 
-    return refine_from(rig, PersonTrial(keypoints, body, up, sigma), prior, stand, progress=progress, from_scratch=True)
-
-
-def steady_person(record: Keypoints) -> Keypoints:
-    """The same person of one camera in all frames: the one seen best, and whoever is nearest to where that one was."""
-    frames, people = record.points.shape[:2]
-    seen = np.isfinite(record.points).all(axis=-1) & (record.confidence > 0.1)
-    sure = np.where(seen, record.confidence, 0.0).sum(axis=-1)
-    x = np.where(seen[..., None], record.points, np.nan)
-    with np.errstate(all="ignore"):
-        count = np.maximum(seen.sum(axis=2), 1)[..., None]
-        centre = np.nansum(x, axis=2) / count
-        size = np.sqrt(np.nansum((x - centre[:, :, None]) ** 2, axis=(2, 3)) / count[..., 0])
-    size = np.where(sure > 0, size, 0.0)
-    best = int(np.argmax((sure * size).max(axis=1))) if people else 0
-    chosen = np.full(frames, -1)
-    for order in (range(best, frames), range(best, -1, -1)):
-        last: NDArray | None = None
-        for f in order:
-            near = 1.0 if last is None else np.exp(-np.linalg.norm(centre[f] - last, axis=1) / np.maximum(size[f], 1.0))
-            score = sure[f] * size[f] * near if people else np.zeros(1)
-            if score.max() > 0:
-                chosen[f] = int(np.argmax(score))
-                last = centre[f, chosen[f]]
-    if not (chosen >= 0).any():
-        raise CalibrationError(
-            "nobody is seen in any frame", file=record.source or None, place=f"camera {record.camera}",
-            remedy="Leave this camera out, or find the keypoints anew.",
-        )
-    return record.of_one(chosen)
+    trial = PersonTrial(keypoints, body, up, sigma)
+    found = refine_from(rig, trial, prior, stand, progress=progress, from_scratch=True)
+    offsets = {name: found.time_offsets[name] + float(n) / rate for name, n in zip(rig.names, late, strict=True)}
+    clocks = {name: replace(found.cameras[name], time=offsets[name]) for name in rig.names}
+    return replace(found, time_offsets=offsets, cameras=clocks)
 
 
 def common_pixels(channels: Channels) -> NDArray:
@@ -130,18 +126,35 @@ def common_pixels(channels: Channels) -> NDArray:
     return out
 
 
-def _adjusted(rig: Rig, uv: NDArray, sigma: float, *, focal: bool) -> tuple[Rig, NDArray]:
-    """The rig adjusted with free points, and the points (F, K, 3) in its units."""
+def _adjusted(
+    rig: Rig, given: Rig, uv: NDArray, sigma: float, *, focal: float, clock: float, rate: float
+) -> tuple[Rig, NDArray]:
+    """The rig adjusted with free points, from coarse to fine, and the points (F, K, 3) in its units.
+
+    focal: standard deviation of the logarithm of the lenses' focal lengths about the given ones, clock [s] of what is
+    left of the cameras' offsets; 0 holds them.
+    """
     flat = uv.reshape(-1, len(rig), 2)
-    x, agree, _ = triangulate_robust(rig, flat, max_residual_px=_AGREE * sigma)
-    good = np.flatnonzero(agree.sum(axis=1) >= 2)
-    good = good[np.unique(np.linspace(0, len(good) - 1, min(_MOST, len(good))).astype(int))]
-    point, camera = np.nonzero(np.isfinite(flat[good]).all(axis=-1))
-    pixels = PointPixels(camera, point, flat[good][point, camera], np.full(len(point), sigma**-2))
-    prior_std = prior_sigma(len(rig), focal=focal, distortion=False, time_offsets=False)
-    size = np.linalg.norm(np.ptp([c.centre_world for c in rig], axis=0))
-    prior_std[:, :3], prior_std[:, 3:6] = 10.0 * size, _ANYWHERE[1]
-    rig = bundle_adjust(rig, pixels, x[good], CameraPrior(rig, prior_std)).rig
+    speed = np.nan_to_num(np.gradient(uv, axis=0) * rate).reshape(flat.shape)
+    many = np.flatnonzero(np.isfinite(flat).all(axis=-1).sum(axis=1) >= 2)
+    many = many[np.unique(np.linspace(0, len(many) - 1, min(_MOST, len(many))).astype(int))]
+    offsets = np.zeros(len(rig))
+    for coarse in _COARSE:
+        size = float(np.linalg.norm(np.ptp([c.centre_world for c in rig], axis=0)))
+        x = triangulate(rig, flat[many])
+        seen = np.isfinite(flat[many]).all(axis=-1)
+        ahead = np.stack([se3.apply(c.T_camera_world, x)[:, 2] for c in rig], axis=1) > _BEFORE * size
+        good = np.isfinite(x).all(axis=1) & (ahead | ~seen).all(axis=1)
+        point, camera = np.nonzero(seen[good])
+        chosen = many[good][point], camera
+        weight = np.full(len(point), (coarse * sigma) ** -2)
+        pixels = PointPixels(camera, point, flat[chosen], weight, speed[chosen] if clock else None)
+        prior_std = prior_sigma(len(rig), focal=False, distortion=False, time_offsets=False)
+        prior_std[:, :3], prior_std[:, 3:6], prior_std[:, FOCAL] = 10.0 * size, _ANYWHERE[1], focal / np.sqrt(_TOGETHER)
+        prior_std[1:, TIME] = clock
+        mean = Rig(tuple(replace(a, matrix=b.matrix) for a, b in zip(rig, given, strict=True)))
+        bundle = bundle_adjust(rig, pixels, x[good], CameraPrior(mean, prior_std), offsets=offsets)
+        rig, offsets = bundle.rig, bundle.offsets
     x = triangulate_robust(rig, flat, max_residual_px=_AGREE * sigma)[0]
     return rig, x.reshape(*uv.shape[:2], 3)
 

@@ -41,6 +41,7 @@ _ROUNDS, _CLOCK_ROUNDS = 3, 6  # clocks come nearer by steps: how fast a point m
 _SETTLED, _SETTLED_FRAMES = 2e-4, 0.02  # [m, rad] 0.3 px; [frames]: tracking anew would find the same
 _LIMIT_PX = 10.0  # a calibration known no better than this is no better than the ones that need refining
 _LIMIT_POINT = 0.05  # [m] the same: a tripod that was knocked
+_FAR_OFF = 3.0  # times these limits where nothing was known before: said, and held by the error bars
 _IMPLAUSIBLE = 0.02  # of the image's diagonal: a camera left with more is another one, or elsewhere
 
 
@@ -145,7 +146,7 @@ def refine_from(
     assert first is not None
     changes, distance = changes_of(prior.rig, rig, first, last, covariance, offsets)
     step("refining", rounds + 1, rounds + 1)
-    _check_result(rig, changes, distance)
+    _check_result(rig, changes, distance, _FAR_OFF if from_scratch else 1.0)
     left = _static_residuals(rig, static, names)
     return Refinement(
         rig, dict(zip(rig.names, offsets.tolist(), strict=True)), changes, rule, chosen,
@@ -246,7 +247,7 @@ def _check_frames(seen: PersonSighting, frames: NDArray) -> None:
         )
 
 
-def _check_result(rig: Rig, changes: Mapping[str, CameraChange], distance: float) -> None:
+def _check_result(rig: Rig, changes: Mapping[str, CameraChange], distance: float, times: float) -> None:
     """Refuse cameras that still fit nothing, and those that the recording does not tell."""
     wrong = [
         name for name, c in changes.items()
@@ -259,8 +260,8 @@ def _check_result(rig: Rig, changes: Mapping[str, CameraChange], distance: float
             remedy="Look whether two cameras are exchanged, the calibration is of another session or the cameras are "
             "out of step; `kinefit calibrate people` starts from no poses at all.",
         )
-    unknown = [name for name, c in changes.items() if not c.uncertainty <= _LIMIT_PX]
-    if unknown or not distance <= _LIMIT_POINT:
+    unknown = [name for name, c in changes.items() if not c.uncertainty <= times * _LIMIT_PX]
+    if unknown or not distance <= times * _LIMIT_POINT:
         told = ", ".join(f"{name} to {changes[name].uncertainty:.0f} px" for name in unknown)
         told = told or f"space to {1e3 * distance:.0f} mm"
         raise CalibrationError(

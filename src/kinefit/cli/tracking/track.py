@@ -32,6 +32,7 @@ PICTURES = ("full", "blurred", "none")
 _EXAMPLES = """\b
 Examples:
   kinefit track my_take/take.toml
+  kinefit track my_videos               a folder with the videos of one to eight cameras, and nothing else
   kinefit track take.toml --out results --no-overlays --formats bvh,csv
   kinefit track take.toml --realtime    each frame from those before it, as a live camera would give
   kinefit track take.toml --lag 0.1     the same a tenth of a second later, which is far smoother
@@ -121,9 +122,9 @@ def track(
 ) -> None:
     """Track the people of a take file and write all results.
 
-    TAKE is one TOML file that names calibration, cameras, videos and keypoints: `kinefit init` writes a first one,
-    `kinefit demo` leaves one to copy, docs/take-file.md explains it. Where it names no keypoints they are detected in
-    the videos first (extra `detect`). Ctrl-C stops the tracking and writes the frames that are done; the same command
+    TAKE is one TOML file that names calibration, cameras, videos and keypoints, or a folder of videos, in which a first
+    one is written as by `kinefit init`; docs/take-file.md explains it. Where it names no keypoints they are detected in
+    the videos first (extra `detect`); where it has no calibration the cameras are found from the people in view. Ctrl-C stops the tracking and writes the frames that are done; the same command
     then goes on from there, as it does after a crash. Meanwhile OUT/unfinished/so-far.csv grows.
 
     Faults of the inputs (a camera that moved, a wrong unit, vertical, focal length or clock, exchanged names, mirrored
@@ -131,9 +132,10 @@ def track(
 
     Where keypoints show several people, each has the same results in OUT/person-1, OUT/person-2 and so on.
     """
-    from kinefit.readers.take.find import find_take
+    from kinefit.cli.init import write_first_take
+    from kinefit.readers.take.find import find_take, takes_in
 
-    take = find_take(take)
+    take = write_first_take(take) if take.is_dir() and not takes_in(take) else find_take(take)
     out = out or take.with_name(f"{take.stem}-kinefit")
     ctx.exit(run(take, out, choices, wanted=wanted))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from os import PathLike
 from pathlib import Path
@@ -116,8 +117,14 @@ def read_opencv_stereo(
 
 
 @checked
-def write_calibration(rig: Rig, path: str | PathLike[str]) -> None:
+def write_calibration(
+    rig: Rig, path: str | PathLike[str], *, metadata: Mapping[str, float | str | Sequence[float] | Sequence[str]] = {},
+) -> None:  # fmt: skip
     """Write a rig as Pose2Sim TOML, in metres; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    metadata : more that is to stand under [metadata].
 
     Raises
     ------
@@ -127,8 +134,8 @@ def write_calibration(rig: Rig, path: str | PathLike[str]) -> None:
         Where a camera has what the format lacks.
     """
     path = Path(path)
-    metadata = '[metadata]\nadjusted = false\nerror = 0.0\nunit = "m"\n'
-    text = "\n".join([*(_toml(camera, path) for camera in rig), metadata])
+    more = "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in metadata.items())
+    text = "\n".join([*(_toml(camera, path) for camera in rig), f'[metadata]\nadjusted = false\nerror = 0.0\nunit = "m"\n{more}'])
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         temporary.write_text(text, encoding="utf-8", newline="\n")

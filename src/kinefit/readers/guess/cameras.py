@@ -68,13 +68,39 @@ def describe_cameras(
         draft.note("keypoints", "sure", "none here: kinefit track runs the built-in detector on the videos")
 
 
-def describe_one(draft: Draft, video: Path) -> None:
-    """Enter the only camera of a folder without calibration."""
-    with Video(video, rate=UNSTATED) as opened:
-        draft.head["rate"] = draft.tell("rate", _rate({video.stem: opened}, {}), "rate")
-    why = f"degrees across the longer side; {USUAL:g} is usual for telephones; a tenth more, a tenth nearer"
-    draft.cameras[video.stem] = {"video": Told(video), "field_of_view": Told(USUAL, "guess", why)}
-    draft.note("camera", "likely", f"{draft.name(video)} alone: a network tells how far limbs are; state height")
+def describe_uncalibrated(draft: Draft, videos: Sequence[Path]) -> None:
+    """Enter the cameras of a folder with videos and no calibration.
+
+    Raises
+    ------
+    TakeError
+        Videos of one name.
+    """
+    opened: dict[str, Video] = {}
+    with ExitStack() as stack:
+        for path in videos:
+            if path.stem in opened:
+                first = draft.name(opened[path.stem].path)
+                raise TakeError(
+                    f"two videos are called {path.stem}: {first} and {draft.name(path)}", file=draft.folder,
+                    remedy="Name the folder of one recording, with one video of each camera.",
+                )  # fmt: skip
+            opened[path.stem] = stack.enter_context(Video(path, rate=UNSTATED))
+        draft.head["rate"] = draft.tell("rate", _rate(opened, {}), "rate")
+        if len(opened) > 1:
+            _cut(draft, list(opened.values()))
+        counts = {name: f"{len(video)} frames" for name, video in opened.items()}
+    more = "a tenth more, a tenth nearer" if len(opened) == 1 else "it is found with where the cameras stand"
+    why = f"degrees across the longer side; {USUAL:g} is usual for telephones; {more}"
+    for path in videos:
+        video = Told(path, "likely", counts[path.stem]) if len(videos) > 1 else Told(path)
+        draft.cameras[path.stem] = {"video": video, "field_of_view": Told(USUAL, "guess", why)}
+    if len(videos) == 1:
+        draft.note("camera", "likely", f"{draft.name(videos[0])} alone: a network tells how far limbs are; state height")
+        return
+    draft.head["up"] = Told("z", "sure", "found with the floor, from the people in view")
+    draft.note("cameras", "likely", f"{len(videos)} videos of one moment: {', '.join(map(draft.name, videos))}")
+    draft.note("calibration", "guess", "none here: kinefit track finds lenses, places and clocks from the people in view")
 
 
 def _nothing_fits(draft: Draft, calibration: CalibrationFile, *, found: bool) -> TakeError:

@@ -12,9 +12,9 @@ import numpy as np
 from kinefit.errors import CalibrationError, KinefitError, TakeError, command
 from kinefit.geometry.camera import Rig
 from kinefit.readers.guess import files as guess_files
-from kinefit.readers.guess.cameras import describe_cameras, describe_one
+from kinefit.readers.guess.cameras import describe_cameras, describe_uncalibrated
 from kinefit.readers.guess.draft import Draft, Entry, Note, Told
-from kinefit.readers.guess.files import STATIC, CalibrationFile
+from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile
 from kinefit.readers.guess.names import trials
 from kinefit.readers.markers import read_markers
 from kinefit.readers.ros.contents import Shown, shown
@@ -103,8 +103,9 @@ def _choose_calibration(
             remedy=f"{fault.remedy or ''} {_CALIBRATE}".strip(),
         )
     if not found:
-        if len(seen) == 1 and seen[0] in guess_files.find_videos(files, draft.folder):
-            describe_one(draft, seen[0])
+        videos = guess_files.find_videos(files, draft.folder)
+        if videos and len(seen) == len(videos):
+            describe_uncalibrated(draft, _of_one_moment(draft, videos))
             return None
         alone = f" ({draft.name(singles[0])} is of one camera alone)" if singles else ""
         raise CalibrationError(f"no calibration of the cameras{alone}", file=draft.folder, remedy=_CALIBRATE)
@@ -129,6 +130,14 @@ def _choose_calibration(
     draft.note("calibration", told.sure, f"{draft.name(best.path)}: {why}")
     draft.calibration = best, {"file": told}
     return best
+
+
+def _of_one_moment(draft: Draft, videos: Sequence[Path]) -> list[Path]:
+    """The videos that lie nearest to the folder, without static trials and what a detector drew."""
+    usual = [v for v in videos if not any(p.search(draft.name(v)) for p in (STATIC, DRAWN_ON, OF_CALIBRATION))]
+    usual = usual or list(videos)
+    depth = min(draft.name(path).count("/") for path in usual)
+    return [path for path in usual if draft.name(path).count("/") == depth]
 
 
 def _above(folder: Path) -> list[Path]:

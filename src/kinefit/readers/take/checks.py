@@ -266,8 +266,8 @@ def _names(take: Take) -> None:
                 remedy=f'Add [[camera]] with name = "{camera}", or correct the name.',
             )
     beside = (places, take.depth, take.stereo)  # of a world in which its place is not known
-    if take.cameras and take.calibration is None and (len(take.cameras) > 1 or any(beside)):
-        remedy = 'Add [calibration] with file = "...". One camera alone needs none.'
+    if take.cameras and take.calibration is None and any(beside):
+        remedy = 'Add [calibration] with file = "...". Cameras that see people, and nothing beside, need none.'
         raise TakeError("cameras without calibration", file=take.path, remedy=remedy)
     for entry in take.cameras:
         angle, place = entry.field_of_view, f"camera {entry.name}"

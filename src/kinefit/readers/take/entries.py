@@ -79,7 +79,7 @@ class CameraEntry(_Entry, frozen=True, kw_only=True):
     image: Literal["as calibrated", "scaled", "letterboxed"] = "as calibrated"  # what became of the image
     rotation: Literal[0, 90, 180, 270] = 0  # [deg] the image is the calibration's, turned clockwise
     time_offset: float = 0.0  # [s] added to frame / rate
-    field_of_view: float | None = None  # [deg] across the longer side, of the only camera of a take without calibration
+    field_of_view: float | None = None  # [deg] across the longer side, of a camera of a take without calibration
 
 
 class KeypointsEntry(_Entry, frozen=True, kw_only=True):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from kinefit._arguments import checked
-from kinefit.errors import CalibrationError, ObservationError, TakeError, choices
+from kinefit.errors import CalibrationError, ObservationError, TakeError, choices, command
 from kinefit.geometry import se3
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.observations import (
@@ -27,6 +27,7 @@ from kinefit.observations import (
     SurfacePointVideo,
 )
 from kinefit.readers.body_trackers import read_body_trackers
+from kinefit.readers.calibration.found import read_found
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoints import read_keypoints
@@ -35,7 +36,7 @@ from kinefit.readers.take.depth import load_depth
 from kinefit.readers.take.entries import MarkersEntry, sensor_name
 from kinefit.readers.take.file import CameraEntry, KeypointsEntry, Take
 from kinefit.readers.take.lines import load_lines
-from kinefit.readers.take.one_camera import assumed_camera, is_alone, what_is_assumed
+from kinefit.readers.take.one_camera import assumed_camera, is_alone, is_uncalibrated, what_is_assumed
 from kinefit.readers.take.silhouettes import load_regions, load_silhouettes
 from kinefit.readers.take.skin import load_skin
 from kinefit.readers.take.streams import refuse_streams
@@ -145,9 +146,11 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
                 stream = f"video {entry.name}"
                 rates[stream], lengths[stream], offsets[stream] = video.rate, len(video), entry.time_offset
                 sizes[entry.name] = video.size
-    if is_alone(take):
-        entry = take.cameras[0]
-        rig = Rig((assumed_camera(entry, sizes.get(entry.name, entry.size), take),))
+    if is_alone(take) or is_uncalibrated(take) and not exteriors:
+        rig = Rig(tuple(assumed_camera(e, sizes.get(e.name, e.size), take) for e in take.cameras))
+    elif is_uncalibrated(take):
+        remedy = f"They are found from the people in view: {command('track', take.path)}"
+        raise TakeError("cameras that are not calibrated yet", file=take.path, remedy=remedy)
     images = {entry.name: image_frame(entry, rig, sizes.get(entry.name), take) for entry in take.cameras}
     keypoints, markers = [], tuple(_read_markers(entry) for entry in take.markers)
     for number, source in enumerate(take.keypoints):
@@ -189,8 +192,14 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         videos={entry.name: entry.video for entry in take.cameras if entry.video is not None}, images=images,
         depth=sensors.depth, clouds=sensors.clouds, silhouettes=silhouettes,
         regions=load_regions(take, rig, images), skin=skin, lines=lines, surface_points=surfaces, trackers=trackers,
-        notes=(*sensors.notes(rate), *(what_is_assumed(take) if is_alone(take) else ())),
+        notes=(*sensors.notes(rate), *(what_is_assumed(take) if is_alone(take) else calibration_notes(take))),
     )
+
+
+def calibration_notes(take: Take) -> tuple[str, ...]:
+    """What is worth saying of a calibration that was found from people; nothing of any other."""
+    found = read_found(take.calibration.file) if take.calibration is not None else None
+    return found.notes if found is not None else ()
 
 
 def _span(recordings: Sequence[_Timed], rate: float) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""The camera of a take that has one and no calibration: level, at the world's origin, of the usual field of view."""
+"""Cameras of a take without calibration: level, at the world's origin, of the usual field of view."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ USUAL = 64.0
 def is_alone(take: Take) -> bool:
     """Whether a take has one camera, and no calibration; `check_take` lets no sensor of another world beside it."""
     return take.calibration is None and len(take.cameras) == 1
+
+
+def is_uncalibrated(take: Take) -> bool:
+    """Whether a take has several cameras and nothing that tells where they stand but the people in view."""
+    return take.calibration is None and len(take.cameras) > 1
 
 
 def assumed_camera(entry: CameraEntry, size: tuple[int, int] | None, take: Take) -> Camera:

@@ -1,0 +1,296 @@
+"""A first rig from what a network lifted to space in each camera alone: no lens, clock or place need be known well."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.calibration.people.steady import steadiest
+from kinefit.errors import CalibrationError
+from kinefit.geometry import se3
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.observations import Keypoints
+
+_JOINTS = tuple(
+    f"{side}_{joint}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in ("left", "right")
+)
+_SURE = 0.6  # confidence of a landmark that takes part
+_PEOPLE = 4  # of one camera that are tried
+_LEAST, _SHARE = 10, 0.4  # frames in common, and share of the shorter record, without which clocks are not compared
+_SCALE = 0.05  # [m] of the loss: landmarks of two cameras that are farther apart count less (Geman-McClure)
+_STRANGERS = 0.9  # of 1 less the correlation of their movements: another person, or another day
+_SAME = 1.5  # [px] two cameras whose every landmark is nearer show one video twice
+
+
+@dataclass(frozen=True, eq=False)
+class FirstCameras:
+    """Where cameras stand roughly, whom they saw, and how late their clocks are.
+
+    Parameters
+    ----------
+    rig : Rig, in the first camera's axes [m], of a person of the network's idea of size.
+    people : for each camera the record of the one person alone.
+    frames_late : (C,) int [frames] to add to each camera's own, the first camera's being 0.
+    """
+
+    rig: Rig
+    people: tuple[Keypoints, ...]
+    frames_late: NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Skeleton:
+    """One person of one camera: x (F, J, 3) [m] in its axes, about the hips; weight (F, J); where the hips are."""
+
+    record: Keypoints
+    x: NDArray
+    weight: NDArray
+    hips: NDArray  # (F, 3) [m] from the camera, by the size in the image
+
+
+@dataclass(frozen=True, eq=False)
+class _Match:
+    """Two skeletons laid on each other: b ≈ R a, frame f of a being frame f + lag of b.
+
+    unlike: (2 · most + 1,) for lags from −most to most, 1 less the correlation of the movements about their means, inf
+    where too little is in common; lag is where it is least.
+    """
+
+    R: NDArray
+    lag: int
+    unlike: NDArray
+
+    @property
+    def cost(self) -> float:
+        return float(self.unlike.min())
+
+
+def first_cameras(cameras: Sequence[Camera], keypoints: Sequence[Keypoints], *, within: float) -> FirstCameras:
+    """Turns, clocks and places of cameras from landmarks that a network lifted to space in each of them.
+
+    A network that lifts a person tells the turn of each camera against the person to 5 to 25 degrees, from any side;
+    two cameras are turned against each other, and their clocks set, so that their skeletons lie on each other in all
+    frames (W. Kabsch, 1976, robustly), and move alike. The distance comes from the person's size in the image. Cameras are taken in
+    along the pairs that agree best.
+
+    Parameters
+    ----------
+    cameras : with guessed or known lenses; poses are not used.
+    keypoints : one record for each camera, with `lifted`, of equal rate.
+    within : float [s] clocks differ by at most this much; 0: they agree.
+
+    Raises
+    ------
+    CalibrationError
+        A camera that saw nobody, the same video twice, cameras that never show the same person.
+    """
+    seen = [_skeletons(c, k) for c, k in zip(cameras, keypoints, strict=True)]
+    _refuse_doubles(seen)
+    most = round(within * keypoints[0].rate)
+    pairs: dict[tuple[int, int, int, int], _Match] = {}
+    for i, j in combinations(range(len(seen)), 2):
+        for p, q in product(range(len(seen[i])), range(len(seen[j]))):
+            if (match := _matched(seen[i][p], seen[j][q], most)) is not None:
+                pairs[i, p, j, q] = match
+                pairs[j, q, i, p] = _Match(match.R.T, -match.lag, match.unlike[::-1])
+    trees = [t for p in range(len(seen[0])) if (t := _tree(p, len(seen), pairs)) is not None]
+    if not trees:
+        raise _strangers(cameras, pairs)
+    _, person, parent = min(trees, key=lambda tree: tree[0])
+    late = _clocks(person, pairs, most)
+    Ts = {0: np.eye(4)}
+    for j, i in parent.items():  # in the order in which they were taken in
+        Ts[j] = _laid(seen[i][person[i]], seen[j][person[j]], int(late[i] - late[j])) @ Ts[i]
+    rig = Rig(tuple(camera.with_pose(Ts[c]) for c, camera in enumerate(cameras)))
+    return FirstCameras(rig, tuple(seen[c][person[c]].record for c in range(len(cameras))), late)
+
+
+def in_step(record: Keypoints, late: int, length: int) -> Keypoints:
+    """A record moved by whole frames, so that frame f is what was seen at f − late; of `length` frames."""
+    at = np.arange(length) - late
+    inside = (at >= 0) & (at < len(record))
+    at = np.clip(at, 0, len(record) - 1)
+    points = np.where(inside[:, None, None, None], record.points[at], np.nan)
+    confidence = np.where(inside[:, None, None], record.confidence[at], 0.0)
+    lifted = None
+    if record.lifted is not None:
+        lifted = np.where(inside[:, None, None, None], record.lifted[at], np.nan)
+    return replace(record, points=points, confidence=confidence, lifted=lifted)
+
+
+def _skeletons(camera: Camera, record: Keypoints) -> list[_Skeleton]:
+    """Everybody whom a camera followed, the one seen best first."""
+    assert record.lifted is not None
+    out, left = [], record
+    columns = [record.names.index(name) for name in _JOINTS]
+    for _ in range(min(record.points.shape[1], _PEOPLE)):
+        try:
+            chosen = steadiest(left)
+        except CalibrationError:
+            if out:
+                break
+            raise
+        one = left.of_one(chosen)
+        assert one.lifted is not None
+        x, uv = one.lifted[:, 0][:, columns], one.points[:, 0][:, columns]
+        confidence = one.confidence[:, 0][:, columns]
+        known = np.isfinite(x).all(axis=-1) & np.isfinite(uv).all(axis=-1) & (confidence > _SURE)
+        out.append(_placed(camera, one, np.where(known[..., None], x, np.nan), uv, np.where(known, confidence, 0.0)))
+        taken = np.zeros(left.confidence.shape[:2], bool)
+        taken[np.flatnonzero(chosen >= 0), chosen[chosen >= 0]] = True
+        left = replace(
+            left, points=np.where(taken[..., None, None], np.nan, left.points),
+            confidence=np.where(taken[..., None], 0.0, left.confidence),
+        )  # fmt: skip
+    return out
+
+
+def _placed(camera: Camera, record: Keypoints, x: NDArray, uv: NDArray, weight: NDArray) -> _Skeleton:
+    """With the axes of the crop turned to the camera's, and the distance at which it has its size in the image."""
+    ray = camera.with_pose(np.eye(4)).ray(uv.reshape(-1, 2)).reshape(*uv.shape[:2], 3)
+    ray = ray / np.where(ray[..., 2:] > 1e-6, ray[..., 2:], np.nan)
+    w = np.where(np.isfinite(ray).all(axis=-1), weight, 0.0)
+    total = np.maximum(w.sum(axis=1), 1e-9)
+    ahead = np.einsum("fk,fkd->fd", w, np.nan_to_num(ray)) / total[:, None]
+    x = np.einsum("fij,fkj->fki", _towards(ahead), x)  # a crop is seen as if the camera looked at its middle
+    A = np.zeros((*uv.shape, 3))
+    A[..., 0, 0] = A[..., 1, 1] = 1.0
+    A[..., 2] = -np.nan_to_num(ray[..., :2])
+    b = np.nan_to_num(ray[..., :2] * x[..., 2:] - x[..., :2])
+    normal = np.einsum("fk,fkdi,fkdj->fij", w, A, A) + 1e-9 * np.eye(3)
+    hips = np.linalg.solve(normal, np.einsum("fk,fkdi,fkd->fi", w, A, b)[..., None])[..., 0]
+    far = (w > 0).sum(axis=1) >= len(_JOINTS) // 2
+    return _Skeleton(record, x, w * far[:, None], np.where((far & (hips[:, 2] > 0))[:, None], hips, np.nan))
+
+
+def _towards(ahead: NDArray) -> NDArray:
+    """(F, 3, 3) smallest rotations that take z to directions (F, 3)."""
+    u = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+    axis = np.stack([-u[:, 1], u[:, 0], np.zeros(len(u))], axis=1)
+    sine = np.linalg.norm(axis, axis=1, keepdims=True)
+    return se3.exp_so3(axis / np.maximum(sine, 1e-12) * np.arctan2(sine, u[:, 2:]))
+
+
+def _refuse_doubles(seen: Sequence[Sequence[_Skeleton]]) -> None:
+    """Refuse one video under two names, which shows nothing from a second side."""
+    for a, b in combinations([people[0].record for people in seen], 2):
+        frames = min(len(a), len(b))
+        away = np.linalg.norm(a.points[:frames, 0] - b.points[:frames, 0], axis=-1)
+        if np.isfinite(away).sum() > _LEAST and np.nanpercentile(away, 95) < _SAME:
+            raise CalibrationError(
+                f"{a.camera} and {b.camera} show the same pictures", place=f"camera {b.camera}",
+                remedy="It is one video twice: leave one out.",
+            )
+
+
+def _common(a: _Skeleton, b: _Skeleton, lag: int) -> tuple[slice, slice] | None:
+    """Frames of both that belong together with a lag; None for too few."""
+    first, last = max(0, -lag), min(len(a.x), len(b.x) - lag)
+    if last - first < max(_LEAST, _SHARE * min(len(a.x), len(b.x))):
+        return None
+    return slice(first, last), slice(first + lag, last + lag)
+
+
+def _turned(a: _Skeleton, b: _Skeleton, lag: int) -> NDArray | None:
+    """(3, 3) turn that lays one skeleton on the other, robustly."""
+    if (frames := _common(a, b, lag)) is None:
+        return None
+    x, y, w = a.x[frames[0]], b.x[frames[1]], np.minimum(a.weight[frames[0]], b.weight[frames[1]])
+    x, y, w = (v[w > 0] for v in (x, y, w))
+    if len(w) < _LEAST * len(_JOINTS) // 4:
+        return None
+    share = w
+    for _ in range(5):
+        R = se3.nearest_rotation((share[:, None] * y).T @ x)
+        share = w / (1.0 + np.sum((y - x @ R.T) ** 2, axis=1) / _SCALE**2) ** 2
+    return R
+
+
+def _matched(a: _Skeleton, b: _Skeleton, most: int) -> _Match | None:
+    """The turn and the lag, within so many frames, with which two skeletons move alike; None for no frames."""
+    unlike = np.full(2 * most + 1, np.inf)
+    for lag in range(-most, most + 1):
+        R, frames = _turned(a, b, lag), _common(a, b, lag)
+        if R is not None and frames is not None:
+            x, y, w = a.x[frames[0]], b.x[frames[1]], np.minimum(a.weight[frames[0]], b.weight[frames[1]])
+            known, total = w > 0, np.maximum(w.sum(axis=0), 1e-9)[:, None]
+            x, y = np.where(known[..., None], x, 0.0), np.where(known[..., None], y, 0.0)
+            x = (x - np.einsum("fk,fkd->kd", w, x) / total) @ R.T
+            y = y - np.einsum("fk,fkd->kd", w, y) / total
+            power = np.sum(w[..., None] * x * x) * np.sum(w[..., None] * y * y)
+            unlike[lag + most] = 1.0 - np.sum(w[..., None] * x * y) / max(float(np.sqrt(power)), 1e-12)
+    if not np.isfinite(unlike).any():
+        return None
+    lag = int(np.argmin(unlike)) - most
+    R = _turned(a, b, lag)
+    assert R is not None
+    return _Match(R, lag, unlike)
+
+
+def _tree(
+    root: int, count: int, pairs: dict[tuple[int, int, int, int], _Match]
+) -> tuple[float, dict[int, int], dict[int, int]] | None:
+    """From a person of the first camera, all others taken in by what moves most alike: cost, people, parents."""
+    person: dict[int, int] = {0: root}
+    parent: dict[int, int] = {}
+    cost = 0.0
+    while len(person) < count:
+        near = [key for key in pairs if person.get(key[0]) == key[1] and key[2] not in person]
+        key = min(near, key=lambda k: pairs[k].cost, default=None)
+        if key is None or pairs[key].cost > _STRANGERS:
+            return None
+        person[key[2]], parent[key[2]], cost = key[3], key[0], cost + pairs[key].cost
+    return cost, person, parent
+
+
+def _clocks(person: dict[int, int], pairs: dict[tuple[int, int, int, int], _Match], most: int) -> NDArray:
+    """(C,) int [frames] to add to each camera's: with which all pairs together move most alike."""
+    count = len(person)
+    curves = {
+        (i, j): np.minimum(pairs[key].unlike, 1.0)
+        for i in range(count) for j in range(count)
+        if i != j and (key := (i, person[i], j, person[j])) in pairs
+    }
+    late = np.zeros(count, int)
+    for turn in range(2 * count):
+        before = late.copy()
+        for j in range(1, count):
+            others = [i for i in range(count) if (i, j) in curves and (i < j or turn)]
+            at = np.arange(-most, most + 1)
+            total = np.zeros(len(at))
+            for i in others:
+                lag = late[i] - at  # of j's frames behind i's
+                curve = curves[i, j]
+                total += np.where(np.abs(lag) <= most, curve[np.clip(lag + most, 0, 2 * most)], 1.0)
+            late[j] = at[np.argmin(total)]
+        if turn and np.array_equal(before, late):
+            break
+    return late
+
+
+def _laid(a: _Skeleton, b: _Skeleton, lag: int) -> NDArray:
+    """T_b_a (4, 4) [m] of two cameras from one person's skeletons and places in both."""
+    frames, R = _common(a, b, lag), _turned(a, b, lag)
+    if frames is None or R is None:
+        raise CalibrationError(
+            f"{a.record.camera} and {b.record.camera} hardly saw the person at the same time",
+            place=f"camera {b.record.camera}", remedy="Trim the videos to what all cameras recorded.",
+        )  # fmt: skip
+    moved = b.hips[frames[1]] - a.hips[frames[0]] @ R.T
+    moved = moved[np.isfinite(moved).all(axis=1)]
+    return se3.transform(R, np.median(moved, axis=0) if len(moved) else np.zeros(3))
+
+
+def _strangers(cameras: Sequence[Camera], pairs: dict[tuple[int, int, int, int], _Match]) -> CalibrationError:
+    """The error that names the camera which agrees least with any other."""
+    best = {c: min((m.cost for k, m in pairs.items() if k[0] == c), default=np.inf) for c in range(len(cameras))}
+    worst = max(best, key=lambda c: best[c])
+    return CalibrationError(
+        f"what {cameras[worst].name} saw agrees with no other camera", place=f"camera {cameras[worst].name}",
+        remedy="Check that it is of the same recording, shows the same person at the same time, and was started within "
+        "two seconds of the others; or leave it out.",
+    )

@@ -1,0 +1,92 @@
+"""Cameras of a take without calibration, found from the people in view, once, and kept beside the take."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+
+import msgspec
+import numpy as np
+
+from kinefit.bodies import load_body
+from kinefit.preparing.each_video import Step, Tell
+from kinefit.readers.calibration.found import FoundCameras, read_found, write_found
+from kinefit.readers.take.entries import CalibrationEntry
+from kinefit.readers.take.file import Take
+from kinefit.readers.take.load import load_observations
+from kinefit.readers.take.one_camera import USUAL, is_uncalibrated
+
+
+def with_cameras(take: Take, progress: Step | None, tell: Tell) -> Take:
+    """The take with cameras where the people in view put them; as it is where it has a calibration, or one camera.
+
+    Lenses, places and clocks are found together (`calibrate_people`) and written beside the take, TAKE-cameras.toml;
+    they are found anew where keypoints, height or fields of view changed.
+
+    Raises
+    ------
+    CalibrationError
+        The people do not tell where the cameras stand.
+    ExportError
+        The file cannot be written.
+    """
+    if not is_uncalibrated(take):
+        return take
+    file = take.path.with_name(f"{take.path.stem}-cameras.toml")
+    made_from = _made_from(take)
+    found = read_found(file)
+    if found is None or found.made_from != made_from:
+        found = _find(take, made_from, progress)
+        write_found(found, file)
+        for note in found.notes:
+            tell(note)
+    offsets = dict(zip(found.rig.names, found.time_offsets, strict=True))
+    cameras = tuple(
+        msgspec.structs.replace(e, field_of_view=None, time_offset=e.time_offset + offsets[e.name])
+        for e in take.cameras
+    )
+    entry = CalibrationEntry(
+        file=file, position_sigma=found.position_sigma, rotation_sigma=found.rotation_sigma
+    )
+    return replace(take, cameras=cameras, calibration=entry)
+
+
+def _find(take: Take, made_from: str, progress: Step | None) -> FoundCameras:
+    """Cameras from a take's keypoints."""
+    from kinefit.calibration.people.calibrate import calibrate_people
+
+    seen = load_observations(take, exteriors=False)
+    assert seen.rig is not None
+    found = calibrate_people(
+        tuple(seen.rig), seen.keypoints, load_body(take.body), height=take.height, focal=True, time_offsets=True,
+        up=take.up, sigma=median(entry.sigma for entry in take.keypoints), progress=progress,
+    )
+    changes = found.cameras.values()
+    notes = [f"Nothing tells where the cameras stand: found from the people in view. {line}" if k == 0 else line
+             for k, line in enumerate(found.told())]
+    if take.height is None:
+        notes.append("No height is stated: all lengths are as unsure as the person's size, about 5 %. Write height.")
+    return FoundCameras(
+        found.rig, tuple(found.time_offsets[name] for name in found.rig.names),
+        float(median(c.shift_std for c in changes)), float(np.degrees(median(c.turn_std for c in changes))),
+        tuple(notes), made_from,
+    )  # fmt: skip
+
+
+def _made_from(take: Take) -> str:
+    """A hash of everything that the cameras are found from."""
+    told = hashlib.sha256(repr((take.height, take.up, take.rate, take.frames, take.body)).encode())
+    for camera in take.cameras:
+        told.update(repr((camera.name, camera.field_of_view or USUAL, camera.size, camera.time_offset)).encode())
+    for entry in take.keypoints:
+        files = [] if entry.file is None else sorted(entry.file.rglob("*")) if entry.file.is_dir() else [entry.file]
+        for file in files:
+            told.update(f"{file.name} {_content(file)}".encode())
+    return told.hexdigest()[:32]
+
+
+def _content(file: Path) -> str:
+    """What tells one file from another: its bytes, or for one of thousands its size."""
+    return hashlib.sha256(file.read_bytes()).hexdigest() if file.suffix == ".npz" else str(file.stat().st_size)

@@ -1,0 +1,70 @@
+"""Cameras that were found from the people in view: Pose2Sim TOML, with clocks and how sure they are in [metadata]."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+from kinefit._files import parse_toml
+from kinefit.errors import FileError
+from kinefit.geometry.camera import Rig
+from kinefit.readers.calibration.read import read_calibration, write_calibration
+
+_KEY = "kinefit_found_from"
+
+
+@dataclass(frozen=True, eq=False)
+class FoundCameras:
+    """A rig that was found from people.
+
+    Parameters
+    ----------
+    rig : Rig [m]
+    time_offsets : (C,) [s] to add to each camera's times, in the rig's order.
+    position_sigma, rotation_sigma : float [m], [deg] how far a camera may be off, one standard deviation.
+    notes : what was found and how sure it is, in sentences.
+    made_from : text that tells the keypoints and settings: another text, another result.
+    """
+
+    rig: Rig
+    time_offsets: tuple[float, ...]
+    position_sigma: float
+    rotation_sigma: float
+    notes: tuple[str, ...]
+    made_from: str
+
+
+def write_found(found: FoundCameras, path: str | PathLike[str]) -> None:
+    """Write it; raises as `write_calibration`."""
+    write_calibration(
+        found.rig, path,
+        metadata={
+            "time_offsets": list(found.time_offsets), "position_sigma": found.position_sigma,
+            "rotation_sigma": found.rotation_sigma, "notes": list(found.notes), _KEY: found.made_from,
+        },
+    )  # fmt: skip
+
+
+def read_found(path: str | PathLike[str]) -> FoundCameras | None:
+    """What `write_found` wrote; None for a calibration of any other source, or no file.
+
+    Raises
+    ------
+    FileError
+        One of `write_found` that was changed so that it cannot be read.
+    """
+    path = Path(path)
+    if path.suffix != ".toml" or not path.is_file():
+        return None
+    metadata = parse_toml(path.read_text("utf-8"), path).get("metadata")
+    if not isinstance(metadata, dict) or _KEY not in metadata:
+        return None
+    try:
+        return FoundCameras(
+            read_calibration(path), tuple(float(t) for t in metadata["time_offsets"]),
+            float(metadata["position_sigma"]), float(metadata["rotation_sigma"]), tuple(map(str, metadata["notes"])),
+            str(metadata[_KEY]),
+        )  # fmt: skip
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileError(f"its [metadata] lacks {error}", file=path, remedy="Delete it: it is found anew.") from error
