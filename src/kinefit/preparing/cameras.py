@@ -19,6 +19,11 @@ from kinefit.readers.take.load import load_observations
 from kinefit.readers.take.one_camera import USUAL, is_uncalibrated
 
 
+def cameras_file(take: Path) -> Path:
+    """Where the cameras that were found for a take file are kept: TAKE-cameras.toml beside it."""
+    return take.with_name(f"{take.stem}-cameras.toml")
+
+
 def with_cameras(take: Take, progress: Step | None, tell: Tell) -> Take:
     """The take with cameras where the people in view put them; as it is where it has a calibration, or one camera.
 
@@ -34,7 +39,7 @@ def with_cameras(take: Take, progress: Step | None, tell: Tell) -> Take:
     """
     if not is_uncalibrated(take):
         return take
-    file = take.path.with_name(f"{take.path.stem}-cameras.toml")
+    file = cameras_file(take.path)
     made_from = _made_from(take)
     found = read_found(file)
     if found is None or found.made_from != made_from:

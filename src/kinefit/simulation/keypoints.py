@@ -163,7 +163,7 @@ def simulate_keypoints(
             frames = min(len(motion), len(person))
             uv = _project(person, camera, keypoint_set, names)[:frames]
             if drift_px:
-                uv = uv + drift_px * _drift(uv.shape, keep, random)
+                uv = uv + drift_px * drift(uv.shape, keep, random)
             found = _detect(uv, camera, names, random, noise_px, outliers, missing, swaps)
             points[:frames, p], confidence[:frames, p] = found
         if len(people) > 1:  # the order of people means nothing
@@ -185,7 +185,7 @@ def _project(motion: Motion, camera: Camera, keypoint_set: str, names: tuple[str
     return uv
 
 
-def _drift(shape: tuple[int, ...], keep: float, random: np.random.Generator) -> NDArray:
+def drift(shape: tuple[int, ...], keep: float, random: np.random.Generator) -> NDArray:
     """Values (F, ...) of unit variance, each the share `keep` of the last frame's and something new."""
     out = random.standard_normal(shape)
     for f in range(1, len(out)):
