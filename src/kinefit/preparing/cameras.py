@@ -39,6 +39,11 @@ def with_cameras(take: Take, progress: Step | None, tell: Tell) -> Take:
     """
     if not is_uncalibrated(take):
         return take
+    seen = {entry.camera for entry in take.keypoints}
+    if not (take.silhouettes or take.regions or take.skin or take.lines):
+        take = replace(take, cameras=tuple(camera for camera in take.cameras if camera.name in seen))
+    if len(take.cameras) < 2:  # the others see nobody, as was said
+        return take
     file = cameras_file(take.path)
     made_from = _made_from(take)
     found = read_found(file)

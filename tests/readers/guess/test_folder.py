@@ -504,3 +504,23 @@ def test_recordings_of_caliscope(data_dir, tmp_path):
     plain = load_observations(read_take(tmp_path / "c.toml"))
     assert {(k.keypoint_set, len(k.names)) for k in plain.keypoints} == {("MEDIAPIPE_33", 33)}
     assert seen.frames == (0, 267) and [k.camera for k in seen.keypoints] == [f"cam_{k}" for k in range(4)]
+
+
+def test_videos_alone_become_cameras_that_are_found(folder):
+    for name, size in (("left", SIZE), ("right", SIZE[::-1])):
+        write_video(folder / f"{name}.mp4", size)
+    (folder / "static").mkdir()
+    write_video(folder / "static" / "left.mp4")
+    guess = guess_take(folder)
+    (folder / "take.toml").write_text(guess.text)
+    take = read_take(folder / "take.toml")
+    assert take.calibration is None and [c.name for c in take.cameras] == ["left", "right"]
+    assert all(camera.field_of_view == 64.0 for camera in take.cameras) and take.up == "z"
+    assert any(note.about == "calibration" and "people in view" in note.told for note in guess.notes)
+
+
+def test_videos_of_one_name_are_not_mixed(folder):
+    for place in ("one", "two"):
+        write_video(folder / place / "cam.mp4")
+    with pytest.raises(TakeError, match="two videos are called cam.*Name the folder of one recording"):
+        guess_take(folder)

@@ -208,7 +208,6 @@ WRONG = {
     "camera twice": (take_text(more='[[camera]]\nname = "a"'), "camera a: there are two"),
     "empty": ("", "an empty take"),
     "empty with head": ('[take]\nname = "x"', "an empty take"),
-    "no calibration": ('[[camera]]\nname = "a"\n[[camera]]\nname = "b"', "cameras without calibration"),
     "one camera of no known place beside a sensor of the world": (
         '[[camera]]\nname = "a"\nsize = [640, 480]\n[[depth]]\nname = "tof"\nfile = "seen"\n'
         "intrinsics = [500.0, 500.0, 320.0, 240.0]", "cameras without calibration",

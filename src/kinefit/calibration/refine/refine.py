@@ -41,7 +41,8 @@ _ROUNDS, _CLOCK_ROUNDS = 3, 6  # clocks come nearer by steps: how fast a point m
 _SETTLED, _SETTLED_FRAMES = 2e-4, 0.02  # [m, rad] 0.3 px; [frames]: tracking anew would find the same
 _LIMIT_PX = 10.0  # a calibration known no better than this is no better than the ones that need refining
 _LIMIT_POINT = 0.05  # [m] the same: a tripod that was knocked
-_FAR_OFF = 100.0  # times these limits where nothing was known before: said, and held by the error bars
+_FAR_OFF = 10.0  # times these limits where nothing was known before: half a metre; said, and held by the error bars
+_LENS = 0.2  # of a focal length: one that is known no better puts people a fifth nearer, as a guess does
 _IMPLAUSIBLE = 0.02  # of the image's diagonal: a camera left with more is another one, or elsewhere
 
 
@@ -260,6 +261,14 @@ def _check_result(rig: Rig, changes: Mapping[str, CameraChange], distance: float
             remedy="Look whether two cameras are exchanged, the calibration is of another session or the cameras are "
             "out of step; `kinefit calibrate people` starts from no poses at all.",
         )
+    loose = [name for name, c in changes.items() if not c.focal_std <= _LENS]
+    if loose:
+        told = ", ".join(f"{name} to {100 * changes[name].focal_std:.0f} %" for name in loose)
+        raise CalibrationError(
+            f"the motion does not tell the lenses: focal lengths would be known in {told}", place=f"camera {loose[0]}",
+            remedy="Record someone who walks towards the cameras and away, raises the arms and is seen whole; or state "
+            "field_of_view, or calibrate the lenses with a board.",
+        )  # fmt: skip
     unknown = [name for name, c in changes.items() if not c.uncertainty <= times * _LIMIT_PX]
     if unknown or not distance <= times * _LIMIT_POINT:
         told = ", ".join(f"{name} to {changes[name].uncertainty:.0f} px" for name in unknown)

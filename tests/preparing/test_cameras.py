@@ -1,0 +1,78 @@
+"""A take with several cameras and no calibration: these are found once, kept, and used by everything."""
+
+import numpy as np
+import pytest
+from tests.calibration.people.test_skeletons import FRAMES, LATE, seen, turn_errors
+from tests.calibration.people_data import BODY, room, walker
+
+from kinefit import read_take, track_take
+from kinefit.errors import TakeError
+from kinefit.exporters.pictures.detections import write_detections
+from kinefit.observations import Detections
+from kinefit.preparing.cameras import cameras_file, with_cameras
+from kinefit.readers.calibration.found import read_found
+from kinefit.readers.take.load import load_observations
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Four detections and a take of cameras with guessed lenses."""
+    where = tmp_path_factory.mktemp("phones")
+    for camera, record in zip(room(), seen(LATE), strict=True):
+        masks = np.zeros(0, np.uint32), np.zeros(FRAMES + 1, int)
+        write_detections(
+            Detections(camera.name, 30.0, camera.size, record.points, record.confidence, *masks, "", record.lifted),
+            where / f"{camera.name}.npz",
+        )  # fmt: skip
+    (where / "take.toml").write_text(take_text(f"height = {BODY.stature}"))
+    return where
+
+
+def take_text(head):
+    text = f'[take]\nrate = 30.0\nup = "z"\n{head}\n'
+    for camera in room():
+        text += f'[[camera]]\nname = "{camera.name}"\nsize = [{camera.size[0]}, {camera.size[1]}]\n'
+        text += f'[[keypoints]]\ncamera = "{camera.name}"\nformat = "detect"\nfile = "{camera.name}.npz"\nsigma = 2.0\n'
+    return text
+
+
+def test_a_take_without_calibration_is_tracked(folder):
+    with pytest.warns(UserWarning, match="found from the people in view"):
+        motion, observations = track_take(folder / "take.toml")
+    found = read_found(cameras_file(folder / "take.toml"))
+    assert turn_errors(found.rig).max() < 0.6
+    np.testing.assert_allclose(np.array(found.time_offsets) * 30.0, LATE, atol=0.2)
+    assert any("clock" in note for note in observations.notes)
+    truth = walker(FRAMES)
+    at = np.round(motion.times * 30.0).astype(int)
+    x, y = motion.joint_centres, truth.joint_centres[at]
+    apart = lambda p: np.linalg.norm(p[:, :, None] - p[:, None], axis=-1)
+    assert np.abs(apart(x) - apart(y)).mean() < 0.01
+
+
+def test_what_was_found_is_used_again_until_something_changes(folder, monkeypatch):
+    from kinefit.calibration.people import calibrate
+
+    def never(*args, **options):
+        raise AssertionError("found anew")
+
+    monkeypatch.setattr(calibrate, "calibrate_people", never)
+    take = with_cameras(read_take(folder / "take.toml"), None, lambda text: None)
+    assert take.calibration.file.name == "take-cameras.toml" and take.calibration.position_sigma > 0
+    (folder / "take.toml").write_text(take_text("height = 1.6"))
+    with pytest.raises(AssertionError, match="found anew"):
+        with_cameras(read_take(folder / "take.toml"), None, lambda text: None)
+
+
+def test_reading_alone_says_what_finds_them(folder):
+    with pytest.raises(TakeError, match="not calibrated yet.*kinefit track"):
+        load_observations(read_take(folder / "take.toml"))
+
+
+def test_a_camera_that_sees_nobody_is_left_out(folder):
+    text = take_text(f"height = {BODY.stature}")
+    name = room().names[3]
+    text = text.replace(f'[[keypoints]]\ncamera = "{name}"\nformat = "detect"\nfile = "{name}.npz"\nsigma = 2.0\n', "")
+    (folder / "three.toml").write_text(text)
+    take = with_cameras(read_take(folder / "three.toml"), None, lambda text: None)
+    assert [camera.name for camera in take.cameras] == list(room().names[:3])

@@ -1,0 +1,38 @@
+"""Cameras that were found from people, written and read back."""
+
+import numpy as np
+import pytest
+
+from kinefit.errors import FileError
+from kinefit.readers.calibration.found import FoundCameras, read_found, write_found
+from kinefit.readers.calibration.read import read_calibration, write_calibration
+from kinefit.simulation import studio_rig
+
+
+@pytest.fixture
+def found():
+    rig = studio_rig(cameras=3)
+    return FoundCameras(rig, (0.0, -0.25, 1.5), 0.08, 0.7, ('a "note"', "another"), "abc")
+
+
+def test_what_is_written_is_read(found, tmp_path):
+    write_found(found, tmp_path / "cameras.toml")
+    back = read_found(tmp_path / "cameras.toml")
+    assert back.time_offsets == found.time_offsets and back.notes == found.notes and back.made_from == "abc"
+    assert (back.position_sigma, back.rotation_sigma) == (0.08, 0.7)
+    for a, b in zip(read_calibration(tmp_path / "cameras.toml"), found.rig, strict=True):
+        np.testing.assert_allclose(a.T_camera_world, b.T_camera_world, atol=1e-9)
+
+
+def test_other_calibrations_are_none(found, tmp_path):
+    write_calibration(found.rig, tmp_path / "rig.toml")
+    assert read_found(tmp_path / "rig.toml") is None
+    assert read_found(tmp_path / "nothing.toml") is None and read_found(tmp_path) is None
+
+
+def test_one_that_was_changed_is_told(found, tmp_path):
+    file = tmp_path / "cameras.toml"
+    write_found(found, file)
+    file.write_text(file.read_text().replace("position_sigma", "place_sigma"))
+    with pytest.raises(FileError, match="position_sigma.*found anew"):
+        read_found(file)
