@@ -1,7 +1,7 @@
 """Whether the views of a hand agree: its fingers are tracked together, or lost together.
 
-One view can be fitted by fingers of any depth, so each of two views that contradict each other supports its own
-points, and half of all points seem to agree. Views are counted here in place of points.
+Fingers can be fitted to any single view. Where two views contradict each other, the points of one of them agree, and
+half of all points seem enough. So views are counted here, in place of points.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def join_fingers(
     ----------
     hands : HandViews
     agreeing, contrary : (S,) as `Evidence` has them
-    offset : (N,) [m] of each channel's point beside the body at its depth, NaN where unseen
-    sigma : (N,) [m] standard deviation of the same
+    offset : (N,) [m] distance of each channel's point from the body's at its depth, NaN where unseen
+    sigma : (N,) [m] its standard deviation
     """
     for hand in hands:
         votes = []
