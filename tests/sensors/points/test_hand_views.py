@@ -1,7 +1,5 @@
 """Fingers of a hand are tracked together, or lost together."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from benchmarks.hands_simulated import fingers, hands_moving, near_rig

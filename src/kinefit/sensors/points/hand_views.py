@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
 from kinefit.bodies.limbs import finger_groups
-from kinefit.motion import BELIEVED
 from kinefit.sensors.channels import Channels
 
 _MAX_OFFSET_M = 0.02  # median of a hand's points, beyond which a view shows it elsewhere; a finger is 0.016 wide
@@ -55,8 +54,8 @@ def join_fingers(
 ) -> None:
     """Let the fingers of each hand agree or be contradicted together, in place.
 
-    They are contradicted where at least as many views show them elsewhere as where they are, where most of them are
-    lost, or where the palm is. They count as unseen where no view shows half of their points.
+    They are contradicted where at least as many views show them elsewhere as where they are, or where the palm is lost.
+    They count as unseen where no view shows half of their points.
 
     Parameters
     ----------
@@ -72,11 +71,8 @@ def join_fingers(
             if len(seen) >= _MIN_SHARE * len(view):
                 limit = max(_MAX_OFFSET_M, _MIN_OFFSET_SIGMAS * float(np.median(sigma[seen])))
                 votes.append(bool(np.median(offset[seen]) <= limit))
-        some = [hand.palm, *hand.fingers]
-        lost = agreeing[some] <= BELIEVED * (agreeing[some] + contrary[some])  # or unseen
-        palm_lost = lost[0] and contrary[hand.palm] > 0.0
         if not votes:
             agreeing[hand.fingers] = contrary[hand.fingers] = 0.0
-        elif 2 * sum(votes) <= len(votes) or palm_lost or np.mean(lost[1:]) > 0.5:
+        elif 2 * sum(votes) <= len(votes) or contrary[hand.palm] > agreeing[hand.palm]:
             contrary[hand.fingers] += agreeing[hand.fingers]
             agreeing[hand.fingers] = 0.0

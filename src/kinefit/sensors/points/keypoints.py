@@ -246,7 +246,7 @@ class KeypointMatched(Matched):
         return Evidence(agreeing, contrary, self._elsewhere(right, wrong))
 
     def _metres(self, scene: Scene) -> tuple[NDArray, NDArray]:
-        """(N,) [m] distance of each point from the body's at its depth, NaN where unseen, and its standard deviation."""
+        """(N,) [m] distance of each point from the body's at its depth, NaN where unseen; its standard deviation."""
         layout = self.measurement.layout
         channels, x = layout.channels, scene.positions(layout.points_of(scene.body))
         to_camera = np.stack([c.T_camera_world[2] for c in channels.rig])[channels.camera]
