@@ -199,10 +199,7 @@ def _by_markers(
 
 
 def sized_by_depth(person: SizedPerson, progress: Progress | None = None) -> SizedPerson:
-    """The body in the size of the person in some depth images; as it is where nobody is found in them.
-
-    `told` has `findings.INVERTED` where people hang head down in them.
-    """
+    """The body in the size of the person in some depth images, if found; INVERTED is `told` of people head down."""
     r, body = person.recording, person.subject.body
     frames = r.depth
     camera = r.rig[next(iter(frames.values())).sensor]
