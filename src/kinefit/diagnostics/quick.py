@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -106,17 +107,25 @@ def with_findings(motion: Motion, findings: Sequence[Finding], seen: Observation
     late = [f"{found.text} {found.remedy}" for found in findings if found.severity == "doubt"]
     findings = faults_of(findings)
     if len({k.camera for k in seen.keypoints}) < 2 and (seen.markers or seen.depth or seen.clouds):
-        findings = [*findings, *motion_findings(motion, height), *_inverted_findings(motion)]
+        inverted = inverted_findings(motion.provenance, motion.up)
+        findings = [*findings, *motion_findings(motion, height), *inverted]
     clocks = {CLOCKS: late} if late else {}
     return replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings), **clocks})
 
 
-def _inverted_findings(motion: Motion) -> list[Finding]:
-    if INVERTED not in motion.provenance:
+def inverted_findings(provenance: Mapping[str, Any], up: str) -> list[Finding]:
+    """A fault where the fit of a person's size found that people hang head down in a depth camera.
+
+    Parameters
+    ----------
+    provenance : of a motion, or what `tracking.sizing.sized_by_depth` reports
+    up : vertical axis of the world, as the take states it
+    """
+    if INVERTED not in provenance:
         return []
-    up, name = np.array(UP_AXES[motion.up]), motion.provenance[INVERTED]
-    text = f'up = "{motion.up}" is wrong, or {name} hangs upside down: people are explained better the other way round.'
-    remedy = f'Write up = "{nearest_axis(-up)[0]}" into [take], or turn the images by 180 degrees.'
+    name, other = provenance[INVERTED], nearest_axis(-np.array(UP_AXES[up]))[0]
+    text = f'up = "{up}" is wrong, or {name} hangs upside down: people are explained better the other way round.'
+    remedy = f'Write up = "{other}" into [take], or turn the images by 180 degrees.'
     return [Finding("fault", "up", text, (name,), "Likely, unless the person does a handstand.", remedy)]
 
 
