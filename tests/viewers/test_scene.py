@@ -37,6 +37,13 @@ def test_bones_reach_from_joint_to_joint(motion):
                 assert np.linalg.norm(bone - joint, axis=1).min() < 0.015
 
 
+def test_balls_at_joints_are_thinner_than_fingers():
+    body = load_body("humanoid_hands")
+    radii = dict(zip(body.tree.segments, scene.joint_radii(body)))
+    assert radii["index_distal_l"] < 0.006 and radii["thumb_proximal_r"] < 0.0105
+    assert radii["shank_l"] == radii["upperarm_r"] == radii["hand_l"] == 0.016
+
+
 def test_every_surface_is_there():
     body = load_body("humanoid")
     meshes = scene.surface_meshes(body)

@@ -21,6 +21,7 @@ OUTLIER_WEIGHT = 0.05  # robust weight below which a measurement had no say
 OUTLIER = (255, 30, 30)
 LARGEST_ELLIPSOID = 0.5  # [m] half axis beyond which "somewhere there" says nothing more, and hides the rest
 _RAMP = np.array([(40, 170, 80), (240, 200, 40), (240, 120, 30)], float)  # good, middling, bad
+_JOINT = 0.016  # [m] radius of the ball at a joint, of one on thin segments less
 _AROUND, _CAP = 14, 4  # vertices around a capsule, rings of a rounded end
 
 
@@ -83,6 +84,16 @@ def bone_meshes(body: Body) -> list[Mesh | None]:
         lengths = [float(np.linalg.norm(tip)) for tip in tips]
         bones = [(tip, min(0.013, 0.1 * n)) for tip, n in zip(tips, lengths) if n > 1e-6]
         out.append(joined([capsule(np.zeros(3), tip, (radius, 0.6 * radius)) for tip, radius in bones]))
+    return out
+
+
+def joint_radii(body: Body) -> NDArray:
+    """(S,) [m] of the balls at the segments' joints, inside the tapered surfaces that begin there."""
+    out = np.full(len(body.tree.segments), _JOINT)
+    for c in body.surfaces:
+        if isinstance(c, TaperedCylinder):
+            first = np.reshape(np.asarray(c.radii, float), (2, -1))[0]
+            out[c.segment] = min(out[c.segment], 0.7 * float(np.prod(first) ** (1 / len(first))))
     return out
 
 
