@@ -106,7 +106,7 @@ class Figure:
                 self._looks[s] = (*colour, opacity)
                 for node, usual in self._bones[s]:
                     node.color, node.opacity = tuple(colour), None if opacity * usual == 1.0 else opacity * usual
-        axes = np.zeros((len(x), 3)) if joint_std is None else content.ellipsoids(joint_std)
+        axes = np.zeros((len(x), 3)) if joint_std is None else content.ellipsoids(self.body, joint_std)
         steps = 1.1 ** np.rint(np.log(np.maximum(axes, 1e-5)) / np.log(1.1))  # sizes cost a browser more than moves
         for centre, t in zip(self._centres, x, strict=True):
             centre.position = t

@@ -131,9 +131,20 @@ def segment_looks(quality: NDArray, usual: NDArray, *, by_quality: bool) -> tupl
     return np.where(lost[:, None], np.array(LOST, np.uint8), colours), np.where(lost, 0.3, 1.0)
 
 
-def ellipsoids(joint_std: NDArray, *, sigmas: float = 2.0) -> NDArray:
-    """Half axes (..., 3) [m] along the world's axes of `sigmas` standard deviations, at most `LARGEST_ELLIPSOID`."""
-    return np.minimum(sigmas * np.nan_to_num(joint_std, nan=np.inf, posinf=np.inf), LARGEST_ELLIPSOID)
+def ellipsoids(body: Body, joint_std: NDArray, *, sigmas: float = 2.0) -> NDArray:
+    """Half axes (S, 3) [m] along the world's axes of `sigmas` standard deviations (S, 3), at most `LARGEST_ELLIPSOID`.
+
+    A joint that does not slide is on a sphere about the one above it, so it is no farther off than that one and the
+    sphere's diameter: lost fingers stay near their hand.
+    """
+    tree = body.tree
+    out = np.minimum(sigmas * np.nan_to_num(joint_std, nan=np.inf, posinf=np.inf), LARGEST_ELLIPSOID)
+    reach = 2.0 * np.linalg.norm(tree.offsets, axis=1)
+    reach[tree.owners[tree.prismatic]] = LARGEST_ELLIPSOID
+    for s, parent in enumerate(tree.parents):
+        if parent >= 0:
+            out[s] = np.minimum(out[s], out[parent] + reach[s])
+    return out
 
 
 def fitted_points(body: Body, residuals: Residuals) -> PointSet | None:
