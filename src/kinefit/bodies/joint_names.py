@@ -218,6 +218,7 @@ class _ExplicitNaming(NamingConvention):
         return {role: self.trunk[segment] for role, segment in out.items()}
 
 
+@cache  # characters have up to 20,000 nodes, each compared with some 800 names
 def plain(name: str) -> str:
     """A name without namespace, program's prefix, capitals and separators: "mixamorig1:LeftArm" is "leftarm"."""
     last = re.split(r"[:|]", name)[-1]
