@@ -5,7 +5,7 @@ another recording, as a take with the body "humanoid_hands" has them looked for 
 fingers. What is measured: how far, in the camera that the fit did not have, points of hands lie from where it puts
 them. Beside it the same of points that the other cameras triangulate, each by itself, over the same frames and points.
 Holistic often puts both hands onto one; frames of the camera in which its two hands are nearer to each other than 0.4
-of a hand's size do not judge. The cameras' pictures of the videos are up to half a frame apart, at 6 a second.
+of a hand's size do not judge. One camera of the videos is 0.65 of a frame out of step, at 6 a second (`kinefit check`).
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ class NamesError(Exception):
 
 def plain(name):
     """A name without namespace, program's prefix, capitals and separators."""
-    last = re.sub(r"(?i)^(mixamorig\d*|bip0*1)[ _]", "", re.split(r"[:|]", name)[-1])
+    last = re.sub(r"(?i)^(mixamorig\d*|bip0*1|def)[ _\-]", "", re.split(r"[:|]", name)[-1])
     return re.sub(r"[\s_.\-]+", "", last).lower()
 
 

@@ -17,6 +17,9 @@ SEVERITIES: tuple[Severity, ...] = ("fault", "doubt", "note", "good")
 FINDINGS = "findings"
 """Key of `Motion.provenance`: the faults that `track` found in its inputs, as mappings of a `Finding`'s parts."""
 
+CLOCKS = "clocks"
+"""Key of `Motion.provenance`: sentences about cameras whose clocks are off, with what to write."""
+
 INVERTED = "upside down"
 """Key of `Motion.provenance`: the depth camera in which people are explained better upside down."""
 

@@ -3,7 +3,7 @@
 import pytest
 
 from kinefit.bodies import load_body
-from kinefit.bodies.joint_names import LIMBS, SIDES, conventions, find, joint_map, recorded_joints
+from kinefit.bodies.joint_names import FINGERS, LIMBS, SIDES, conventions, find, joint_map, recorded_joints
 from kinefit.errors import BodyError, ObservationError
 
 BY_NAME = {family.name: family for family in conventions()}
@@ -32,6 +32,33 @@ def test_a_recorded_skeleton_of_every_family_is_recognised(family):
         role: names[find(names, name)] for role, name in BY_NAME[found.family].recorded.items()
     }
     assert found.family == family.name
+
+
+@pytest.mark.parametrize(
+    ("thumb", "little"),
+    [
+        (["mixamorig:LeftHandThumb1", "mixamorig:LeftHandThumb2"], "mixamorig:RightHandPinky3"),
+        (["leftThumbMetacarpal", "leftThumbProximal", "leftThumbDistal"], "rightLittleDistal"),
+        (["leftThumbProximal", "leftThumbIntermediate", "leftThumbDistal"], "rightLittleDistal"),
+        (["LeftThumbProximal", "LeftThumbIntermediate", "LeftThumbDistal"], "RightLittleDistal"),
+        (["thumb_01_l", "thumb_02_l", "thumb_03_l"], "pinky_03_r"),
+        (["thumb.01.L", "thumb.02.L", "thumb.03.L"], "f_pinky.03.R"),
+        (["DEF-thumb.01.L", "DEF-thumb.02.L", "DEF-thumb.03.L"], "DEF-f_pinky.03.R"),
+        (["CC_Base_L_Thumb1", "CC_Base_L_Thumb2", "CC_Base_L_Thumb3"], "CC_Base_R_Pinky3"),
+        (["Bip01 L Finger0", "Bip01 L Finger01", "Bip01 L Finger02"], "Bip01 R Finger42"),
+        (["left_thumb1", "left_thumb2", "left_thumb3"], "right_pinky3"),
+        (["l_carpometacarpal_1", "l_metacarpophalangeal_1"], "r_carpal_distal_interphalangeal_5"),
+        (["thumb_metacarpal_l", "thumb_proximal_l", "thumb_distal_l"], "little_distal_r"),
+    ],
+)
+def test_fingers_are_known_whatever_names_the_limbs_bear(thumb, little):
+    names = [*thumb, little, *BY_NAME["SMPL"].joints.values()]
+    found = joint_map(names)
+    of_thumb = [f"thumb_{bone}_l" for bone in ("metacarpal", "proximal", "distal")[: len(thumb)]]
+    fingers = {segment: names[index] for segment, index in found.items() if segment in FINGERS}
+    assert fingers == dict(zip((*of_thumb, "little_distal_r"), (*thumb, little)))
+    told = joint_map([*names, "spare"], {"ring_middle_r": "spare"})
+    assert told["ring_middle_r"] == len(names) and len(told) == len(found) + 1
 
 
 def test_a_table_goes_before_the_names_and_is_checked():

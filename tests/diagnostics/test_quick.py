@@ -11,7 +11,7 @@ from kinefit.diagnostics.groups import group_findings
 from kinefit.diagnostics.keypoints import check_keypoints
 from kinefit.diagnostics.quick import input_findings, motion_findings, with_cause, with_findings
 from kinefit.errors import TrackingError
-from kinefit.findings import FINDINGS, INVERTED, Finding, faults_of, of_provenance
+from kinefit.findings import CLOCKS, FINDINGS, INVERTED, Finding, faults_of, of_provenance
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
@@ -220,6 +220,32 @@ def test_a_camera_that_sees_other_people_alone_is_no_fault(tmp_path, copy_take):
     assert input_findings(entry, seen, gone, body) == ()
     nobody = input_findings(entry, replace(seen, keypoints=tuple(gone)), gone, body)
     assert [(f.kind, f.cameras) for f in nobody] == [("coverage", ("cam03",))]
+
+
+def test_a_camera_that_is_late_by_part_of_a_slow_frame_is_named_with_the_line_to_write(tmp_path, copy_take):
+    """Six frames a second: half a frame is 83 ms. At 30 a second it is no matter for `track`."""
+    entry = kinefit.read_take(copy_take(tmp_path))
+    motion = squat_and_wave(duration=12.0)
+    rig = studio_rig(motion)
+    views = simulate_keypoints(motion, rig, noise_px=3.0, seed=1)
+
+    def found(step, late):
+        slow = [replace(k.rows(slice(late if k.camera == "cam02" else 0, 355, step), 0.0), rate=30.0 / step)
+                for k in views]  # fmt: skip
+        length = min(len(k) for k in slow)
+        slow = [k.rows(slice(0, length), 0.0) for k in slow]
+        seen = replace(kinefit.load_observations(entry), rig=rig, keypoints=tuple(slow))
+        return input_findings(entry, seen, slow, load_body("humanoid"))
+
+    (late,) = found(5, 3)
+    assert late.severity == "doubt" and late.cameras == ("cam02",) and faults_of([late]) == ()
+    assert found(5, 0) == found(1, 1) == ()
+    provenance = with_findings(MOTION, (late,), Nothing, None).provenance
+    (sentence,) = provenance[CLOCKS]
+    assert "time_offset = 0." in sentence and "cam02" in sentence and provenance[FINDINGS] == []
+    assert CLOCKS not in with_findings(MOTION, (), Nothing, None).provenance
+    error = TrackingError("lost")
+    assert with_cause(error, (late,)) is error
 
 
 def test_track_take_keeps_what_it_found(tmp_path, copy_take):

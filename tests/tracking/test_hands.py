@@ -1,11 +1,14 @@
 """Hands with fingers, tracked in keypoints of hands."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from benchmarks.hands_simulated import fingers, hands_moving, near_rig, seen_by, somebody
 
 from kinefit import Recording, load_body, track
 from kinefit.evaluation import angle_errors, joint_errors
+from kinefit.simulation import simulate_keypoints
 
 TRUTH = somebody(hands_moving(0, seconds=1.5), 0)
 RIG = near_rig(TRUTH)
@@ -33,6 +36,24 @@ def test_a_wrong_finger_is_called_lost_or_uncertain(motion):
     said = motion.lost | (error <= 3.0 * np.linalg.norm(motion.joint_std, axis=-1))
     assert np.all(said[:, segments] | (error[:, segments] < 0.02))
     assert motion.lost[-1, segments & left & ~shown].all() and not motion.lost[:, segments & ~left].any()
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_hand_that_half_of_the_views_show_elsewhere_is_lost(smooth):
+    """As where cameras' clocks are off and the hand is fast; frame by frame the error bars widen, too."""
+    apart, short = slice(6, 12), next(TRUTH.parts(15))
+    seen = simulate_keypoints(short, RIG, "MEDIAPIPE_75", noise_px=2.0, outliers=0.0, missing=0.0, seed=0)
+    for c, shift in ((0, -60.0), (2, 60.0)):
+        points = np.array(seen[c].points)
+        points[apart, :, 33:54] += (0.0, shift)
+        seen[c] = replace(seen[c], points=points)
+    found = track(Recording.of_keypoints(RIG, seen, up="y"), TRUTH.body, smooth=smooth)
+    segments, _ = fingers(TRUTH.body)
+    left = segments & np.array([s.endswith("_l") for s in TRUTH.body.tree.segments])
+    assert found.lost[apart][:, left].all() and not found.lost[: apart.start, segments].any()
+    assert not found.lost[:, segments & ~left].any()
+    std = np.median(np.linalg.norm(found.joint_std[:, left], axis=-1), axis=1)
+    assert smooth or np.all(std[apart] > 1.5 * std[: apart.start].max())
 
 
 def test_a_body_without_fingers_takes_the_same_keypoints():

@@ -37,6 +37,13 @@ def test_bones_reach_from_joint_to_joint(motion):
                 assert np.linalg.norm(bone - joint, axis=1).min() < 0.015
 
 
+def test_balls_at_joints_are_thinner_than_fingers():
+    body = load_body("humanoid_hands")
+    radii = dict(zip(body.tree.segments, scene.joint_radii(body)))
+    assert radii["index_distal_l"] < 0.006 and radii["thumb_proximal_r"] < 0.0105
+    assert radii["shank_l"] == radii["upperarm_r"] == radii["hand_l"] == 0.016
+
+
 def test_every_surface_is_there():
     body = load_body("humanoid")
     meshes = scene.surface_meshes(body)
@@ -63,8 +70,17 @@ def test_the_ramp_goes_from_green_to_orange():
 
 
 def test_ellipsoids_are_two_sigmas_and_end_somewhere():
-    axes = scene.ellipsoids(np.array([[0.01, 0.02, np.inf], [np.nan, 3.0, 0.0]]))
-    assert np.allclose(axes, [[0.02, 0.04, scene.LARGEST_ELLIPSOID], [scene.LARGEST_ELLIPSOID] * 2 + [0]])
+    body = load_body("humanoid_hands")
+    std = np.full((len(body.tree.segments), 3), 0.01)
+    names = ["pelvis", "shank_l", "index_proximal_l", "index_distal_l", "thumb_distal_r"]
+    pelvis, shank, index, tip, thumb = (body.tree.segment(name) for name in names)
+    std[pelvis], std[shank], std[thumb, 2] = [0.01, 0.02, np.inf], [np.nan, 3.0, 0.0], 0.02
+    std[index : tip + 1] = np.inf
+    axes = scene.ellipsoids(body, std)
+    most = scene.LARGEST_ELLIPSOID
+    assert np.allclose(axes[[pelvis, shank, thumb]], [[0.02, 0.04, most], [most, most, 0], [0.02, 0.02, 0.04]])
+    finger = 2 * np.linalg.norm(body.tree.offsets[index : tip + 1], axis=1)  # one joint turns about the one above
+    assert np.allclose(axes[index : tip + 1].T, 0.02 + np.cumsum(finger))
 
 
 def test_rays_pass_through_what_was_measured_and_end_at_what_was_fitted(motion):

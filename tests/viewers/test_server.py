@@ -291,6 +291,23 @@ def test_a_page_is_one_file_with_all_in_it(motion, rig):
     assert re.search(r'<head><meta http-equiv="Content-Security-Policy" content="connect-src', text)
 
 
+def test_a_page_that_plays_again_shows_the_first_frame_as_it_was(server, motion):
+    """What only changes are sent of is all sent at the start: colours, and sizes of error bars."""
+    show = Show(server, ViewerContent((motion,)))
+    body = show.figures[0]
+    show.frame(0)
+
+    def looks():
+        bones = [(node.color, node.opacity) for nodes in body._bones for node, _ in nodes]
+        return [*bones, *(node.scale for node in body._parts["uncertainty"])]
+
+    first = looks()
+    body.blank()
+    assert not any(a == b for a, b in zip(first, looks()))
+    show.frame(0)
+    assert looks() == first
+
+
 @pytest.mark.parametrize(
     ("count", "most"), [(5, 10), (10, 10), (11, 10), (1000, 7), (1, 1), (MOST_FRAMES * 3 + 1, MOST_FRAMES)]
 )

@@ -133,6 +133,7 @@ def track_person(
         What tracking and writing raise.
     """
     from kinefit.batch.report import provenance, write_track_report
+    from kinefit.findings import CLOCKS
     from kinefit.multiview import followed
     from kinefit.tracking import cameras
     from kinefit.tracking.agreement import sentences
@@ -160,6 +161,7 @@ def track_person(
             notes += [*seen.notes, *sentences(motion.provenance["contradictions"])]
             notes += followed.sentences(motion.provenance, asked=take.person is not None)
             notes += cameras.sentences(motion.provenance, settings_of(take).camera_std)
+            notes += motion.provenance.get(CLOCKS, ())
         except TrackingInterrupted as stopped:
             motion, total = stopped.motion, stopped.total
         motion = replace(motion, provenance=provenance(take, **motion.provenance))

@@ -24,6 +24,15 @@ SEGMENTS = ("pelvis", "abdomen", "thorax", "neck", "head") + tuple(
 )
 """Segments of the humanoid, and the neck, that a joint may move."""
 
+DIGITS = {
+    "thumb": ("metacarpal", "proximal", "distal"),
+    **dict.fromkeys(("index", "middle", "ring", "little"), ("proximal", "middle", "distal")),
+}
+"""Digits of a hand -> its bones, from the palm to the tip."""
+
+FINGERS = tuple(f"{digit}_{bone}_{side}" for side in SIDES for digit, bones in DIGITS.items() for bone in bones)
+"""Segments of the fingers of `humanoid_hands`, each before the next on its digit; a character may lack any of them."""
+
 MORE = ("head_top",) + tuple(f"{name}_{side}" for name in ("toe_end", "knuckle") for side in SIDES)
 """Ends of bones that a table of names may name, too."""
 
@@ -144,15 +153,48 @@ FAMILIES = (
         ("{S}_Hip", "{S}_Knee", "{S}_Ankle", "{S}_Foot", "{S}_Shoulder", "{S}_Elbow", "{S}_Wrist"),
         knuckle="{S}_Hand",
     ),
+    NamingConvention(
+        "Rigify", _trunk("spine", "spine.001", "spine.003", "spine.004", "spine.006", "shoulder.{S}"),
+        ("thigh.{S}", "shin.{S}", "foot.{S}", "toe.{S}", "upper_arm.{S}", "forearm.{S}", "hand.{S}"),
+        knuckle="f_middle.01.{S}",
+    ),
 )  # fmt: skip
 """Known families; those of `conventions`, which the body files name, come beside them."""
+
+
+def _fingers(pattern: str, digits: str, bones: str = "1 2 3", thumb: str = "") -> dict[str, str]:
+    """Segment of `FINGERS` -> name, of a pattern in which * stands for the digit and # for its bone."""
+    out = dict[str, str]()
+    for (digit, segments), word in zip(DIGITS.items(), digits.split()):
+        for segment, number in zip(segments, (thumb if thumb and digit == "thumb" else bones).split(" ")):
+            name = pattern.replace("*", word).replace("#", number)
+            out |= {f"{digit}_{segment}_{side}": name.format(**words) for side, words in SIDES.items()}
+    return out
+
+
+_UNITY = "Proximal Intermediate Distal"
+VRM0_FINGERS = _fingers("{side}*#", "Thumb Index Middle Ring Little", _UNITY)
+"""Names of VRM 0 and of Unity's humanoid, which call the thumb's metacarpal its proximal bone."""
+VRM1_FINGERS = _fingers("{side}*#", "Thumb Index Middle Ring Little", _UNITY, "Metacarpal Proximal Distal")
+"""Names of VRM 1."""
+
+_FINGER_NAMES = (
+    _fingers("{Side}Hand*#", "Thumb Index Middle Ring Pinky"),  # Mixamo, MotionBuilder
+    VRM1_FINGERS,
+    VRM0_FINGERS,
+    _fingers("*_0#_{s}", "thumb index middle ring pinky"),  # Unreal
+    _fingers("*.0#.{S}", "thumb f_index f_middle f_ring f_pinky"),  # Rigify
+    _fingers("CC_Base_{S}_*#", "Thumb Index Mid Ring Pinky"),  # iClone
+    _fingers("{S} Finger*#", "0 1 2 3 4", " 1 2"),  # Biped
+    _fingers("{side}_*#", "thumb index middle ring pinky"),  # SMPL-H, SMPL-X
+)
 
 
 @cache
 def conventions() -> tuple[NamingConvention, ...]:
     """`FAMILIES`, and the conventions under which motions are exported ("mixamo", "hanim", ...)."""
     out = list(FAMILIES)
-    body = read_toml_body("humanoid")
+    body = read_toml_body("humanoid_hands")
     for name, names in {**body.aliases, "kinefit": {s: s for s in body.tree.segments}}.items():
         out.append(_ExplicitNaming(name, names))
     return tuple(out)
@@ -176,10 +218,11 @@ class _ExplicitNaming(NamingConvention):
         return {role: self.trunk[segment] for role, segment in out.items()}
 
 
+@cache  # characters have up to 20,000 nodes, each compared with some 800 names
 def plain(name: str) -> str:
     """A name without namespace, program's prefix, capitals and separators: "mixamorig1:LeftArm" is "leftarm"."""
     last = re.split(r"[:|]", name)[-1]
-    last = re.sub(r"(?i)^(mixamorig\d*|bip0*1)[ _]", "", last)
+    last = re.sub(r"(?i)^(mixamorig\d*|bip0*1|def)[ _\-]", "", last)
     return re.sub(r"[\s_.\-]+", "", last).lower()
 
 
@@ -197,7 +240,7 @@ def joint_map(names: Sequence[str], table: Mapping[str, str] | None = None, *, s
     Parameters
     ----------
     names : (J,) of the joints.
-    table : segment of `SEGMENTS` -> name of a joint, optional
+    table : segment of `SEGMENTS` or `FINGERS` -> name of a joint, optional
         Goes before what the names tell.
     source : str
         File of the character, for messages.
@@ -205,6 +248,7 @@ def joint_map(names: Sequence[str], table: Mapping[str, str] | None = None, *, s
     Returns
     -------
     segment -> index of the joint
+        Of `FINGERS` those that one convention names most of, whichever the other joints follow.
 
     Raises
     ------
@@ -216,7 +260,7 @@ def joint_map(names: Sequence[str], table: Mapping[str, str] | None = None, *, s
         index = find(names, name)
         if index is None:
             raise BodyError(choices("joint", name, names), file=source or None, place=f"table of names, {segment}")
-        if segment in SEGMENTS:
+        if segment in SEGMENTS or segment in FINGERS:
             told[segment] = index
     found = [
         (family, {s: i for s, n in family.joints.items() if (i := find(names, n)) is not None} | told)
@@ -232,7 +276,12 @@ def joint_map(names: Sequence[str], table: Mapping[str, str] | None = None, *, s
     twice = [names[i] for i in set(best.values()) if list(best.values()).count(i) > 1]
     if twice:
         raise BodyError(f"the joint '{twice[0]}' is named for two segments", file=source or None)
-    return best
+    explicit = ({s: n for s, n in f.trunk.items() if s in FINGERS} for f in conventions() if f not in FAMILIES)
+    fingers = [
+        {s: i for s, n in table.items() if (i := find(names, n)) is not None and i not in best.values()}
+        for table in (*_FINGER_NAMES, *explicit)
+    ]
+    return max(fingers, key=len) | best
 
 
 def lacking(segments: Iterable[str]) -> list[str]:

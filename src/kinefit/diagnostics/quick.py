@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from kinefit.diagnostics.images import fit_image
 from kinefit.diagnostics.keypoints import Check, check_keypoints
 from kinefit.diagnostics.person import size_findings
 from kinefit.errors import KinefitError
-from kinefit.findings import FINDINGS, INVERTED, Finding, as_records, faults_of
+from kinefit.findings import CLOCKS, FINDINGS, INVERTED, Finding, as_records, faults_of
 from kinefit.motion import UP_AXES, Motion
 from kinefit.observations import Keypoints
 from kinefit.readers.guess.views import nearest_axis
@@ -24,11 +25,15 @@ _MIN_FRAMES = 10
 _MIN_INVERTED = 135.0  # [deg] median angle between trunk and vertical
 _MIN_LYING = 60.0  # [deg] the same: who bends comes back
 _MIN_WALK = 0.5  # [m] across the trunk: nobody goes so far lying
+_MIN_LATE_S = 0.05  # of a camera's clock: a hand that gestures at 0.5 m/s is 2.5 cm off by that
+_LATE_STDS = 8.0  # standard errors of the same
 _STATED = ("scaled", "letterboxed")  # what the take may say of an image, and one image of the video can contradict
 
 
 def input_findings(take: Take, seen: Observations, keypoints: Sequence[Keypoints], body: Body) -> tuple[Finding, ...]:
-    """The faults of a take's images, cameras and keypoints; doubts are for `kinefit check`.
+    """The faults of a take's images, cameras and keypoints, and doubts about clocks that displace a moving hand.
+
+    Other doubts are for `kinefit check`.
 
     Parameters
     ----------
@@ -37,7 +42,7 @@ def input_findings(take: Take, seen: Observations, keypoints: Sequence[Keypoints
     keypoints : of the person who is tracked.
     body : of the person, generic.
     """
-    rig, findings = seen.rig, list[Finding]()
+    rig, findings, late = seen.rig, list[Finding](), list[Finding]()
     if rig is None or take.calibration is None:
         return ()
     for entry in take.cameras:
@@ -48,10 +53,15 @@ def input_findings(take: Take, seen: Observations, keypoints: Sequence[Keypoints
     cameras = tuple(name for name in rig.names if any(k.camera == name for k in shown))
     if len(cameras) > 1:
         begun = Check(take.name, take=take, observations=seen)
-        findings += check_keypoints(
+        check = check_keypoints(
             rig.select(cameras), shown, body=body, up=take.up, height=take.height, begun=begun, quick=True
-        ).findings
-    return faults_of(findings)
+        )
+        findings += check.findings
+        if (t := check.times) is not None:
+            clear = np.abs(t.offsets) >= np.maximum(_MIN_LATE_S, _LATE_STDS * t.std)
+            names = {name for name, is_late in zip(t.cameras, clear) if is_late}
+            late = [f for f in check.findings if f.kind == "time" and f.severity == "doubt" and names & {*f.cameras}]
+    return *faults_of(findings), *late
 
 
 def _with_somebody(keypoints: Sequence[Keypoints]) -> set[str]:
@@ -90,24 +100,38 @@ def motion_findings(motion: Motion, height: float | None) -> tuple[Finding, ...]
 
 
 def with_findings(motion: Motion, findings: Sequence[Finding], seen: Observations, height: float | None) -> Motion:
-    """The motion with findings in its `provenance`, and with those of `motion_findings` where it has metric sensors."""
+    """The motion with faults and late clocks in its `provenance`.
+
+    The faults of `motion_findings` are among them where it has metric sensors.
+    """
+    late = [f"{found.text} {found.remedy}" for found in findings if found.severity == "doubt"]
+    findings = faults_of(findings)
     if len({k.camera for k in seen.keypoints}) < 2 and (seen.markers or seen.depth or seen.clouds):
-        findings = [*findings, *motion_findings(motion, height), *_inverted_findings(motion)]
-    return replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings)})
+        inverted = inverted_findings(motion.provenance, motion.up)
+        findings = [*findings, *motion_findings(motion, height), *inverted]
+    clocks = {CLOCKS: late} if late else {}
+    return replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings), **clocks})
 
 
-def _inverted_findings(motion: Motion) -> list[Finding]:
-    if INVERTED not in motion.provenance:
+def inverted_findings(provenance: Mapping[str, Any], up: str) -> list[Finding]:
+    """A fault where the fit of a person's size found that people hang head down in a depth camera.
+
+    Parameters
+    ----------
+    provenance : of a motion, or what `tracking.sizing.sized_by_depth` reports
+    up : vertical axis of the world, as the take states it
+    """
+    if INVERTED not in provenance:
         return []
-    up, name = np.array(UP_AXES[motion.up]), motion.provenance[INVERTED]
-    text = f'up = "{motion.up}" is wrong, or {name} hangs upside down: people are explained better the other way round.'
-    remedy = f'Write up = "{nearest_axis(-up)[0]}" into [take], or turn the images by 180 degrees.'
+    name, other = provenance[INVERTED], nearest_axis(-np.array(UP_AXES[up]))[0]
+    text = f'up = "{up}" is wrong, or {name} hangs upside down: people are explained better the other way round.'
+    remedy = f'Write up = "{other}" into [take], or turn the images by 180 degrees.'
     return [Finding("fault", "up", text, (name,), "Likely, unless the person does a handstand.", remedy)]
 
 
 def with_cause(error: KinefitError, findings: Sequence[Finding]) -> KinefitError:
     """An error of tracking, with the worst fault of the inputs as its cause."""
-    if not findings:
+    if not (findings := faults_of(findings)):
         return error
     first = findings[0]
     problem = f"{error.problem.rstrip('.')}; the inputs have a fault: {first.text.rstrip('.')}"

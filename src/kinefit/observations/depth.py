@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,6 +152,11 @@ class DepthVideo(_Recording):
             )  # fmt: skip
         depth[~((depth >= self.near) & (depth <= self.far))] = 0.0
         return DepthFrame(self.sensor, float(self.times[i]), depth)
+
+    def without(self, frames: NDArray) -> DepthVideo:
+        """The same without some frames (N,), but not without all."""
+        kept = np.setdiff1d(np.arange(len(self)), frames)
+        return replace(self, times=self.times[kept], image=lambda i: self.image(int(kept[i])))
 
 
 @dataclass(frozen=True, eq=False)

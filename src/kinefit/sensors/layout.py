@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
 from kinefit.sensors.channels import Channels
+from kinefit.sensors.points.hand_views import HandViews
 from kinefit.sensors.points.left_right import limb_groups
 from kinefit.sensors.points.view_bias import beside, trunks
 from kinefit.sensors.scene import Scene
@@ -48,6 +49,11 @@ class Layout:
     def informs(self) -> NDArray:
         """(S, N) 0 or 1: channels that show where a segment is."""
         return informing(self.body, self.channels)
+
+    @cached_property
+    def hands(self) -> tuple[HandViews, ...]:
+        """The hands with fingers, and which channels are on them."""
+        return HandViews.of(self.body, self.channels, self.points)
 
     @cached_property
     def parts(self) -> list[tuple[str, NDArray, tuple[str, ...], NDArray]]:

@@ -142,7 +142,7 @@ def fitted_to_person(
             scales = np.full(len(body.scale_groups), height / body.stature)
             person = _wearing(person, Subject(body.scaled(scales), scales), size="as stated")
         if recording.depth:
-            person = _by_depth(person, progress)
+            person = sized_by_depth(person, progress)
     unknown = unknown and (bool(recording.sensors) or has_unknown_gear(person.subject.body))
     return _by_all(person, body, settings, progress, height=height, trial=trial) if others or unknown else person
 
@@ -198,8 +198,8 @@ def _by_markers(
     return _wearing(person, subject, markers={"rms_m": round(found.rms, 4), "frames": found.frames}), found.fit
 
 
-def _by_depth(person: SizedPerson, progress: Progress | None) -> SizedPerson:
-    """The body in the size of the person in some depth images; as it is where nobody is found in them."""
+def sized_by_depth(person: SizedPerson, progress: Progress | None = None) -> SizedPerson:
+    """The body in the size of the person in some depth images, if found; INVERTED is `told` of people head down."""
     r, body = person.recording, person.subject.body
     frames = r.depth
     camera = r.rig[next(iter(frames.values())).sensor]

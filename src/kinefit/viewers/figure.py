@@ -39,14 +39,14 @@ class Figure:
         self._parts: dict[str, list[Any]] = {part: [] for part in PARTS}
         self._looks: list[tuple[Any, ...]] = [()] * S
         self._bones: list[list[Any]] = [[] for _ in range(S)]
-        ball = _ball(0.016)
+        balls = [_ball(radius) for radius in content.joint_radii(body)]
         bones, surfaces = content.bone_meshes(body), content.surface_meshes(body)
         for s, segment in enumerate(body.tree.segments):
             at, shade = f"/world/{name}/{segment}", tuple(int(v) for v in self.usual[s])
             for part, mesh, more in (
                 ("bones", bones[s], {}),
                 ("surface", surfaces[s], {"opacity": _SURFACE_OPACITY, "cast_shadow": False, "receive_shadow": False}),
-                ("joints", ball, {}),
+                ("joints", balls[s], {}),
             ):
                 if mesh is None:
                     continue
@@ -78,6 +78,14 @@ class Figure:
         """Show or hide the whole figure."""
         self._root.visible = visible
 
+    def blank(self) -> None:
+        """Leave nothing that the next pose would not set: a recording that plays in a loop has to set all of it."""
+        self._looks = [()] * len(self._looks)
+        for node, _ in (bone for bones in self._bones for bone in bones):
+            node.color, node.opacity = (0, 0, 0), 0.0
+        for node in self._parts["uncertainty"]:
+            node.scale = (1e-6,) * 3
+
     def pose(
         self,
         Ts_world_segment: NDArray,
@@ -98,7 +106,7 @@ class Figure:
                 self._looks[s] = (*colour, opacity)
                 for node, usual in self._bones[s]:
                     node.color, node.opacity = tuple(colour), None if opacity * usual == 1.0 else opacity * usual
-        axes = np.zeros((len(x), 3)) if joint_std is None else content.ellipsoids(joint_std)
+        axes = np.zeros((len(x), 3)) if joint_std is None else content.ellipsoids(self.body, joint_std)
         steps = 1.1 ** np.rint(np.log(np.maximum(axes, 1e-5)) / np.log(1.1))  # sizes cost a browser more than moves
         for centre, t in zip(self._centres, x, strict=True):
             centre.position = t

@@ -32,6 +32,8 @@ def page(recording: ViewerContent, *, choice: Choice = Choice()) -> tuple[str, i
         show = Show(server, recording)
         choice = replace(choice, follow=choice.follow or show.stage.goes_far)
         show.frame(0, choice)
+        for figure in show.figures:
+            figure.blank()
         serializer = server.get_scene_serializer()
         for k, i in enumerate(frames):
             show.frame(int(i), choice, pictures=k in with_pictures)

@@ -21,6 +21,7 @@ OUTLIER_WEIGHT = 0.05  # robust weight below which a measurement had no say
 OUTLIER = (255, 30, 30)
 LARGEST_ELLIPSOID = 0.5  # [m] half axis beyond which "somewhere there" says nothing more, and hides the rest
 _RAMP = np.array([(40, 170, 80), (240, 200, 40), (240, 120, 30)], float)  # good, middling, bad
+_JOINT = 0.016  # [m] radius of the ball at a joint, of one on thin segments less
 _AROUND, _CAP = 14, 4  # vertices around a capsule, rings of a rounded end
 
 
@@ -86,6 +87,16 @@ def bone_meshes(body: Body) -> list[Mesh | None]:
     return out
 
 
+def joint_radii(body: Body) -> NDArray:
+    """(S,) [m] of the balls at the segments' joints, inside the tapered surfaces that begin there."""
+    out = np.full(len(body.tree.segments), _JOINT)
+    for c in body.surfaces:
+        if isinstance(c, TaperedCylinder):
+            first = np.reshape(np.asarray(c.radii, float), (2, -1))[0]
+            out[c.segment] = min(out[c.segment], 0.7 * float(np.prod(first) ** (1 / len(first))))
+    return out
+
+
 def surface_meshes(body: Body) -> list[Mesh | None]:
     """One mesh a segment, in its frame: its tapered surfaces with rounded ends, and its meshes."""
     found: list[list[Mesh]] = [[] for _ in body.tree.segments]
@@ -120,9 +131,20 @@ def segment_looks(quality: NDArray, usual: NDArray, *, by_quality: bool) -> tupl
     return np.where(lost[:, None], np.array(LOST, np.uint8), colours), np.where(lost, 0.3, 1.0)
 
 
-def ellipsoids(joint_std: NDArray, *, sigmas: float = 2.0) -> NDArray:
-    """Half axes (..., 3) [m] along the world's axes of `sigmas` standard deviations, at most `LARGEST_ELLIPSOID`."""
-    return np.minimum(sigmas * np.nan_to_num(joint_std, nan=np.inf, posinf=np.inf), LARGEST_ELLIPSOID)
+def ellipsoids(body: Body, joint_std: NDArray, *, sigmas: float = 2.0) -> NDArray:
+    """Half axes (S, 3) [m] along the world's axes of `sigmas` standard deviations (S, 3), at most `LARGEST_ELLIPSOID`.
+
+    A joint that does not slide is on a sphere about the one above it, so it is no farther off than that one and the
+    sphere's diameter: lost fingers stay near their hand.
+    """
+    tree = body.tree
+    out = np.minimum(sigmas * np.nan_to_num(joint_std, nan=np.inf, posinf=np.inf), LARGEST_ELLIPSOID)
+    reach = 2.0 * np.linalg.norm(tree.offsets, axis=1)
+    reach[tree.owners[tree.prismatic]] = LARGEST_ELLIPSOID
+    for s, parent in enumerate(tree.parents):
+        if parent >= 0:
+            out[s] = np.minimum(out[s], out[parent] + reach[s])
+    return out
 
 
 def fitted_points(body: Body, residuals: Residuals) -> PointSet | None:

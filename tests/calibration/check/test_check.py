@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,7 +16,15 @@ from kinefit.findings import Finding, listed, ranked
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
 from kinefit.sensors.channels import mirror_name
-from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
+from kinefit.simulation import (
+    DepthSensor,
+    cut,
+    in_front,
+    simulate_depth,
+    simulate_keypoints,
+    squat_and_wave,
+    studio_rig,
+)
 
 MOTION = cut(squat_and_wave(duration=2.0), 0, 60)
 RIG = studio_rig(MOTION)
@@ -273,3 +282,23 @@ def test_the_real_trial_as_it_was_shipped(data_dir, tmp_path):
     assert 26 <= swapped[1] <= 31
     assert swapped.sum() == swapped[1]
     assert not [f for f in check.findings if f.kind in ("up", "scale", "coverage") and f.severity != "good"]
+
+
+@pytest.mark.parametrize("over", [False, True])
+def test_a_depth_camera_alone_that_hangs_upside_down_is_named(tmp_path, over):
+    sensor = DepthSensor("depth", (128, 96), 110.0, 0.5, 5.5, (0.004, 0.0008, 0.0), holes=0.01)
+    motion = squat_and_wave(rate=1.0, duration=2.0, up="y")
+    front = in_front(motion, sensor.camera(), azimuth=0.3, near=sensor.near, far=sensor.far)
+    video = simulate_depth(motion, front, sensor, room=False, seed=1)
+    for i in range(len(video)):
+        image = np.round(1e3 * video.frame(i).depth).astype(np.uint16)
+        cv2.imwrite(str(tmp_path / f"{i:02d}.png"), image[::-1, ::-1] if over else image)
+    K = front.matrix
+    (tmp_path / "take.toml").write_text(
+        f'[take]\nrate = 1.0\nup = "-y"\n[[depth]]\nname = "front"\nfile = "*.png"\nunit = 0.001\n'
+        f"intrinsics = [{K[0, 0]}, {K[1, 1]}, {K[0, 2]}, {K[1, 2]}]\n"
+    )
+    check = check_take(tmp_path / "take.toml")
+    assert [(f.kind, f.cameras) for f in check.faults] == ([("up", ("front",))] if over else [])
+    for found in check.faults:
+        assert "front hangs upside down" in found.text and 'up = "y"' in found.remedy

@@ -78,6 +78,16 @@ def test_faults_of_the_inputs_stand_on_top_of_summary_and_report(take, tmp_path,
     assert kinefit.read_motion(out / "motion.npz").provenance["findings"][0]["kind"] == "scale"
 
 
+def test_a_camera_that_is_out_of_step_is_noted_with_the_line_to_write(take, tmp_path, change):
+    change(take, 'name = "cam03"\n', 'name = "cam03"\ntime_offset = 0.06\n')
+    told = run("track", take, "--no-overlays", "--no-report", "--formats", "motion", "--realtime", "--out", tmp_path)
+    assert told.exit_code == 0, told.output
+    printed = " ".join((told.stdout + told.stderr).split())
+    note = r"note: cam03 runs 1\.\d+ ± 0\.\d+ frames \(\d+ ms\) earlier .* Write time_offset = (\S+) into"
+    found = re.search(note, printed)
+    assert found and abs(float(found[1])) < 0.01
+
+
 def test_only_what_is_asked_for_is_written(take, tmp_path):
     told = run("track", take, "--no-overlays", "--no-report", "--formats", "bvh, trc", "--out", tmp_path / "there")
     assert told.exit_code == 0

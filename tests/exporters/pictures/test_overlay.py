@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from tests.exporters.synthetic import a_camera, smooth_motion
 
+from kinefit.bodies import load_body
+from kinefit.bodies.limbs import finger_groups
 from kinefit.errors import ExportError
 from kinefit.exporters import draw_overlay, write_montage, write_overlay
 from kinefit.exporters.pictures.drawing import bones
@@ -55,11 +57,20 @@ def test_bones_lie_where_the_camera_sees_them_in_the_colour_of_their_side(motion
 
 
 def test_bones_reach_from_joint_to_joint_and_to_the_ends(motion):
-    points, owners, colours = bones(motion.body)
-    assert len(points) == 2 * len(owners) == 2 * len(colours)
+    points, owners, colours, widths = bones(motion.body)
+    assert len(points) == 2 * len(owners) == 2 * len(colours) == 2 * len(widths)
     leaves = [s for s in range(20) if not np.any(motion.body.tree.parents == s)]
     assert len(owners) == 19 + len(leaves)
     assert list(owners) == sorted(owners)
+    assert set(widths) == {0.022}
+
+
+def test_bones_of_fingers_are_thinner_than_those_of_arms():
+    body = load_body("humanoid_hands")
+    _, owners, _, widths = bones(body)
+    thin = [body.tree.segments[s] for s, width in zip(owners, widths) if width < 0.01]
+    assert set(thin) == {"hand_l", "hand_r", *(s for own in finger_groups(body).values() for s in own)}
+    assert len(thin) == 2 * 5 * 4  # of each hand and digit, to the knuckle and its three bones
 
 
 def test_a_lens_bends_bones_and_other_pictures_are_met(motion):

@@ -38,10 +38,44 @@ def rest(arms=0.0, longer=1.0):
     return {name: np.asarray(x[name], float) for name in PARENTS}
 
 
-def write_character_glb(path, *, arms=0.0, longer=1.0, prefix="mixamorig:", seed=0, leave_out=(), unit=0.01):
-    """Write it; its frames are turned at random, below a node of scale `unit` that is turned, as by Blender."""
-    rng, places = np.random.default_rng(seed), rest(arms, longer)
-    names = [name for name in PARENTS if name not in leave_out]
+DIGITS = {"Thumb": 0.03, "Index": 0.025, "Middle": 0.008, "Ring": -0.01, "Pinky": -0.027}
+"""Mixamo's digits, and how far [m] towards the thumb they begin."""
+
+
+def fingers(bend=0.0, spread=0.0, thumb=0.6, bones=3, digits=tuple(DIGITS), tips=True, arms=0.0, longer=1.0):
+    """Name -> (parent, place) of fingers of hands whose palms face down; turns [rad] of each bone, of the outer digits.
+
+    `thumb` is the angle of the thumb from the hand's direction; it points down, too, where it is large.
+    """
+    out, places = {}, rest(arms, longer)
+    for side, s in (("Left", 1.0), ("Right", -1.0)):
+        hand, along = places[f"{side}Hand"], np.array([s * np.cos(arms), -np.sin(arms), 0.0])
+        front = np.array([0.0, 0.0, 1.0])
+        palm = np.cross(along, front) * s
+        for digit in digits:
+            begin = 0.03 if digit == "Thumb" else 0.09
+            across = spread * DIGITS[digit] / 0.025 if digit != "Thumb" else thumb
+            parent, place = f"{side}Hand", hand + begin * along + DIGITS[digit] * front
+            for bone in range(1, bones + 1 + tips):
+                name = f"{side}Hand{digit}{bone if bone <= bones or bones == 3 else '_End'}"
+                out[name] = (parent, place)
+                parent, turn = name, bend * bone
+                ahead = np.cos(across) * along + np.sin(across) * front
+                place = place + 0.03 * (np.cos(turn) * ahead + np.sin(turn) * palm)
+    return out
+
+
+def write_character_glb(
+    path, *, arms=0.0, longer=1.0, prefix="mixamorig:", seed=0, leave_out=(), unit=0.01, more=None
+):
+    """Write it; its frames are turned at random, below a node of scale `unit` that is turned, as by Blender.
+
+    `more` joints, as of `fingers`, may replace others.
+    """
+    rng, more = np.random.default_rng(seed), more or {}
+    parents = PARENTS | {name: parent for name, (parent, _) in more.items()}
+    places = rest(arms, longer) | {name: place for name, (_, place) in more.items()}
+    names = [name for name in parents if name not in leave_out]
     top = np.eye(4)
     top[:3, :3] = unit * se3.exp_so3(np.array([-np.pi / 2, 0, 0]))
     world = {name: se3.transform(se3.exp_so3(rng.normal(0, 1, 3)), places[name]) for name in names}
@@ -52,8 +86,8 @@ def write_character_glb(path, *, arms=0.0, longer=1.0, prefix="mixamorig:", seed
     nodes.append({"name": "Armature", "rotation": quaternion.tolist(), "scale": [unit] * 3})
     nodes[0]["children"] = [1, len(names) + 1]
     for name in names:
-        local = np.linalg.inv(world[PARENTS[name]] if PARENTS[name] else top) @ world[name]
-        node = {"name": prefix + name, "children": [number[c] for c in names if PARENTS[c] == name]}
+        local = np.linalg.inv(world[parents[name]] if parents[name] else top) @ world[name]
+        node = {"name": prefix + name, "children": [number[c] for c in names if parents[c] == name]}
         if name == "Spine":
             node["matrix"] = local.T.ravel().tolist()
         else:
@@ -63,9 +97,10 @@ def write_character_glb(path, *, arms=0.0, longer=1.0, prefix="mixamorig:", seed
     nodes.append({"name": "body", "mesh": 0, "skin": 0})
     vertices, owners, faces = [], [], []
     for name in names:
-        ends = [c for c in names if PARENTS[c] == name] or [name]
-        low = np.min([places[name], *(places[e] for e in ends[:1])], axis=0) - SOLE
-        high = np.max([places[name], *(places[e] for e in ends[:1])], axis=0) + SOLE
+        ends = [c for c in names if parents[c] == name] or [name]
+        thick = 0.2 * SOLE if name in more else SOLE
+        low = np.min([places[name], *(places[e] for e in ends[:1])], axis=0) - thick
+        high = np.max([places[name], *(places[e] for e in ends[:1])], axis=0) + thick
         corners = np.stack(np.meshgrid(*zip(low, high), indexing="ij"), axis=-1).reshape(8, 3)
         box = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6), (0, 2, 6),
                (0, 6, 4), (1, 5, 7), (1, 7, 3)]  # fmt: skip

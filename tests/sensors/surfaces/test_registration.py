@@ -97,3 +97,12 @@ def test_one_that_would_move_farther_than_is_usual_is_not_written(walk, tmp_path
     found = SimpleNamespace(take=take, observations=seen)
     write_refined(found, refined, tmp_path / "take.toml")
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_one_that_is_upside_down_is_named_and_is_not_written(walk, tmp_path):
+    over = se3.transform(se3.exp_so3(np.array([0.0, 0.0, np.pi])), np.zeros(3))
+    take, _, fit = fitted(walk, tmp_path, over, frames=4)
+    (found,) = sensor_findings([fit], take)
+    assert (found.severity, found.cameras) == ("fault", ("depth",))
+    assert found.text.startswith("depth hangs upside down, or is so stated") and "the person turned by 1" in found.text
+    assert Refined(None, misfits([fit])).moved == ()

@@ -11,10 +11,12 @@ from pathlib import Path
 import msgspec
 
 from kinefit._arguments import checked
+from kinefit.bodies import load_body
 from kinefit.calibration.check.sensor_verdicts import sensor_findings
 from kinefit.calibration.check.sensors import fit_sensors
-from kinefit.diagnostics.images import finding_of, fit_image
+from kinefit.diagnostics.images import finding_of, fit_image, noise_findings, without_covered
 from kinefit.diagnostics.keypoints import Check, Progress, check_keypoints
+from kinefit.diagnostics.quick import inverted_findings
 from kinefit.diagnostics.scene import lens_findings
 from kinefit.diagnostics.sensor_fit import SensorAlignment
 from kinefit.errors import KinefitError, command
@@ -27,6 +29,9 @@ from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.readers.take.one_camera import is_alone
 from kinefit.readers.take.pictures import TakePictures
+from kinefit.subject.subject import Subject
+from kinefit.tracking.sizing import SizedPerson, sized_by_depth
+from kinefit.tracking.takes.take_recording import recording_of
 
 _SHOWS_MOST = "moving"  # of several people: who stands still shows cameras little of the volume, and clocks nothing
 
@@ -50,9 +55,15 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
         return Check(take.name, (note,), take, None)
     loaded = load_leniently(take)
     seen = loaded.observations
+    if seen is not None:
+        seen, covered = without_covered(loaded.take, seen)
+        found = (*loaded.findings, *covered, *noise_findings(loaded.take, seen.depth))
+        loaded = replace(loaded, observations=seen, findings=found)
     if seen is None or seen.rig is None or len({k.camera for k in seen.keypoints}) < 2:
         missing = list(loaded.findings)
-        if seen is not None:
+        if seen is not None and seen.depth and not (take.cameras or take.markers):
+            missing += _of_depth_alone(loaded.take, seen)
+        elif seen is not None:
             text = (
                 f"Keypoints of {len({k.camera for k in seen.keypoints})} camera(s): a check needs those of two or more."
             )
@@ -81,6 +92,18 @@ def _others(one: PersonKeypoints, asked: bool) -> list[Finding]:
     why = "" if asked else ", who moves most and so tells most of the cameras"
     text = f"{len(one.people)} people are in view; the check is by person {one.number}{why}."
     return [Finding("note", "people", text, remedy="Another: write person = 2 to [take], or whichever it is.")]
+
+
+def _of_depth_alone(take: Take, seen: Observations) -> list[Finding]:
+    """Whether the person in the first images of a depth camera hangs upside down."""
+    text = "Depth alone: where its cameras stand is not checked."
+    found = [Finding("note", "load", text, remedy="Add videos of two cameras, whose keypoints show the person.")]
+    try:
+        recording, body = recording_of(take, seen, load_body(take.body))
+        person = sized_by_depth(SizedPerson(recording, Subject.as_is(body)))
+    except KinefitError as error:
+        return [*found, finding_of(error)]
+    return [*found, *inverted_findings(person.told, take.up)]
 
 
 def _with_sensors(check: Check, progress: Progress | None) -> Check:
@@ -125,14 +148,15 @@ class Loaded:
 
 def load_leniently(take: Take) -> Loaded:
     """Read a take; what cannot be read is left out or guessed, and told."""
-    if take.calibration is None:
+    if take.calibration is None and not take.depth:
         return Loaded(
             take,
             None,
             (Finding("fault", "load", "The take names no cameras.", remedy="Add [[camera]] and [calibration]."),),
         )
     try:
-        rig = read_calibration(take.calibration.file, unit=take.calibration.unit)
+        stated = take.calibration
+        rig = Rig(()) if stated is None else read_calibration(stated.file, unit=stated.unit)
     except KinefitError as error:
         return Loaded(take, None, (finding_of(error),))
     findings: list[Finding] = []

@@ -15,6 +15,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.readers.take.entries import MarkersEntry
 from kinefit.readers.take.file import Take
 
+_INVERTED = np.radians(150.0)  # [rad] turn of a camera that is upside down
 _LATE = 0.01  # [s] by which a clock must be off: 1 cm of somebody who walks
 
 
@@ -29,7 +30,12 @@ def sensor_findings(fits: Sequence[SensorAlignment], take: Take) -> list[Finding
     for fit in fits:
         told = f"{np.degrees(fit.turn):.2f} ± {np.degrees(fit.bars[1]):.2f}° and {amount(fit)}"
         sure = f"{fit.deviations:.0f} standard deviations; ± holds 95 % of errors, the surface's own among them."
-        if fit in wrong and fit.doubts:
+        if fit.kind == "depth" and fit.turn > _INVERTED:
+            turn = f"{np.degrees(fit.turn):.0f} degrees"
+            text = f"{fit.sensor} hangs upside down, or is so stated: what it sees fits the person turned by {turn}."
+            remedy = "Correct its pose in the calibration, or turn its images by 180 degrees; `track` leaves it out."
+            out.append(Finding("fault", "sensor", text, (fit.sensor,), remedy=remedy))
+        elif fit in wrong and fit.doubts:
             may = "does not fit the videos" if fit.falls else "may not fit the videos"
             text = f"{fit.sensor} {may}: it seems off by {told} at the person."
             unsure = f"Where it belongs is not sure, because {'; '.join(fit.doubts)}."

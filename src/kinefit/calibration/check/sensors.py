@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.surfaces import TaperedCylinder
-from kinefit.diagnostics.sensor_fit import PRIOR, SensorAlignment, doubts_of
+from kinefit.diagnostics.sensor_fit import PRIOR, SURE, SensorAlignment, doubts_of
 from kinefit.errors import ObservationError
 from kinefit.frame.routing import Sensors
 from kinefit.geometry import se3
@@ -37,6 +37,7 @@ from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets
 from kinefit.subject.sensor_parameters import SensorFrames
 from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.subject.surfaces import CylinderShape
+from kinefit.tracking.placing import PlacedCamera, placed_cameras
 from kinefit.tracking.recording import Recording, spread
 from kinefit.tracking.sizing import channels_of
 from kinefit.tracking.takes.take_recording import recording_of
@@ -94,12 +95,24 @@ def fit_sensors(
     )  # fmt: skip
     person = fit_person(body, channels_of(recording, body, TrackSettings()), height=take.height, progress=progress)
     motion = track(alone, body, subject=person, progress=progress)
+    placed = placed_cameras(recording, person, TrackSettings())
+    away = [_elsewhere(name, one, motion) for name, one in placed.items() if not (one.usable or one.fits)]
+    recording, depth = recording.without(names := {fit.sensor for fit in away}), depth - names
     origins = {name: recording.rig[name].centre_world for name in depth}
     for k, entry in enumerate(take.markers):
         origins[sensor_name("markers", take.markers, k)] = entry.T_world_file[:3, 3]
     problem = _PlacementProblem(recording, motion, person, frozenset(depth), origins)
     chosen = problem.chosen(frames)
-    return problem.fits(chosen) if len(chosen) >= _FEWEST else ()
+    return (*away, *(problem.fits(chosen) if len(chosen) >= _FEWEST else ()))
+
+
+def _elsewhere(sensor: str, placed: PlacedCamera, motion: Motion) -> SensorAlignment:
+    """A depth camera that belongs too far from where it is stated to be moved there, such as upside down."""
+    T, centre = placed.T, motion.positions().mean(axis=(0, 1))
+    twist = np.array([*(se3.apply(T, centre) - centre), *se3.log_so3(T[:3, :3]), 0.0])
+    std = np.array([*np.repeat(PRIOR, 3), _CLOCK])
+    doubts = (f"it would turn by {np.degrees(placed.turn):.0f}°: more than {np.degrees(SURE * PRIOR[1]):.0f}°",)
+    return SensorAlignment(sensor, "depth", twist, np.diag(std**2), centre, True, doubts)
 
 
 @dataclass(frozen=True, eq=False)

@@ -145,6 +145,7 @@ def _retarget(motion: Path, character: Path, table: Path | None, out: Path | Non
     if others:
         raise click.UsageError(f"--{others[0]} has no place beside --retarget: all is as in the character's file.")
     from kinefit.exporters import write_character
+    from kinefit.exporters.skeletons.finger_bones import in_words
     from kinefit.readers.motion import find_motion, read_motion
     from kinefit.readers.skeletons.characters import KINDS, read_names
 
@@ -155,6 +156,8 @@ def _retarget(motion: Path, character: Path, table: Path | None, out: Path | Non
     recorded = read_motion(motion)
     found = write_character(recorded, character, out, names=read_names(table) if table else None)
     _screen.say(f"{out}: {len(recorded)} frames on {len(found.segments)} joints of {character.name}")
+    if found.lacking:
+        _screen.note(f"{character.name} has no bones for fingers that the motion moves. {in_words(found.lacking)}.")
 
 
 def _choice(format: str, key: str, value: str) -> str:

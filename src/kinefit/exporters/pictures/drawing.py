@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
+from kinefit.bodies.limbs import finger_groups
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.exporters.skeletons.tubes import side_colour
@@ -21,17 +22,19 @@ LOST, DARK, WHITE = (150, 150, 150), (15, 15, 15), (255, 255, 255)
 MEASURED, OUTLIER, WAY = (255, 240, 60), (255, 40, 40), (255, 90, 220)
 OUTLIER_WEIGHT = 0.05
 _SAMPLES = np.linspace(0.0, 1.0, 6)[:, None]  # along a bone, which a lens may bend
+_LIMB_WIDTH, _FINGER_WIDTH = 0.022, 0.007  # [m] of a bone as drawn
 _SHIFT, _FAR = 4, 20000.0  # OpenCV's sub-pixel bits; [px] beyond which nothing is drawn
 
 
 @lru_cache(maxsize=8)
-def bones(body: Body) -> tuple[PointSet, tuple[int, ...], tuple[tuple[int, int, int], ...]]:
-    """Bones of a body: end points as a PointSet of (2 B) points (from, to, from, to ...), owners (B,), colours (B,).
+def bones(body: Body) -> tuple[PointSet, tuple[int, ...], tuple[tuple[int, int, int], ...], NDArray]:
+    """Bones of a body: points (2 B) (from, to, from, to ...), owners (B,), colours (B,), widths (B,) [m] as drawn.
 
     From every joint to the joints of its children; from the last joint of a limb to the end of its surface.
     """
     tree, ends = body.tree, body.segment_ends()
-    owners, points, colours = [], [], []
+    owners, points, colours, widths = [], [], [], []
+    fingers = {name for own in finger_groups(body).values() for name in own}
     for s, name in enumerate(tree.segments):
         children = np.flatnonzero(tree.parents == s)
         tips = [(tree.offsets[c], tree.segments[c]) for c in children]
@@ -41,19 +44,20 @@ def bones(body: Body) -> tuple[PointSet, tuple[int, ...], tuple[tuple[int, int, 
             owners.append(s)
             points += [np.zeros(3), tip]
             colours.append(side_colour(side))
+            widths.append(_FINGER_WIDTH if side in fingers else _LIMB_WIDTH)
     names = tuple(f"{tree.segments[s]}_{k}" for s in owners for k in (0, 1))
-    return PointSet(names, np.repeat(owners, 2), np.array(points)), tuple(owners), tuple(colours)
+    return PointSet(names, np.repeat(owners, 2), np.array(points)), tuple(owners), tuple(colours), np.array(widths)
 
 
 def draw_bones(image: NDArray, motion: Motion, frame: int, camera: Camera, image_frame: ImageFrame) -> None:
     """Draw the fitted skeleton into an image (H, W, 3) uint8 RGB, far bones first; thicker the nearer."""
-    points, owners, colours = bones(motion.body)
+    points, owners, colours, widths = bones(motion.body)
     ends = motion.body.positions(motion.state(frame), points).reshape(-1, 2, 3)
     lines = ends[:, :1] * (1 - _SAMPLES) + ends[:, 1:] * _SAMPLES  # (B, samples, 3)
     uv = image_frame.from_calibration(camera.project(lines))
     depth = ends.mean(1) @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
     px_per_metre = camera.matrix[0, 0] * float(np.mean(image_frame.scale)) / np.maximum(depth, 1e-3)
-    thick = np.clip(np.rint(0.022 * px_per_metre), 2, 24).astype(int)
+    thick = np.clip(np.rint(widths * px_per_metre), 2, 24).astype(int)
     edge = max(1, round(image.shape[0] / 900))
     for b in np.argsort(-depth):
         lost = motion.lost[frame, owners[b]]

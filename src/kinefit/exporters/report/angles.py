@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kinefit.exporters.curves import Curve, curves
 from kinefit.exporters.report.cycles import PERCENT, Cycles, normalised
-from kinefit.exporters.report.names import NAMES
+from kinefit.exporters.report.names import DIGITS, FINGER_JOINTS, NAMES
 from kinefit.exporters.report.norms import Norms
 from kinefit.exporters.report.page import CENTRE, LEFT, RIGHT, Html, plot
 from kinefit.motion import Motion
@@ -23,6 +23,7 @@ _JOINTS = {
     "hip": "Hip", "knee": "Knee", "ankle": "Ankle", "mtp": "Toes", "pelvis": "Pelvis", "back": "Lower back",
     "thoracic": "Upper back", "neck": "Neck", "sternoclavicular": "Collarbone", "shoulder": "Shoulder",
     "elbow": "Elbow and forearm", "wrist": "Wrist",
+    **{f"{digit}_{joint}": word for digit, word in DIGITS.items() for joint in FINGER_JOINTS},
 }  # fmt: skip
 
 _POSITIVE = {
@@ -34,6 +35,8 @@ _POSITIVE = {
     "clav_prot": "shoulder forward", "clav_elev": "shoulder up", "arm_flex": "forward", "arm_add": "towards the middle",
     "arm_rot": "inwards", "elbow_flex": "flexion", "pro_sup": "pronation", "wrist_flex": "flexion",
     "wrist_dev": "towards the little finger", "pelvis_tilt": "backward", "pelvis_list": "right side down",
+    **{f"{digit}_mcp_dev": "towards the little finger" for digit in DIGITS},
+    **{f"thumb_{joint}_abd": "away from the palm" for joint in FINGER_JOINTS},
 }  # fmt: skip
 
 
@@ -90,15 +93,10 @@ def thinned(values: NDArray, most: int = MOST) -> NDArray:
 
 def by_joint(found: list[Curve]) -> dict[str, dict[str, list[Curve]]]:
     """{joint: {name without the side: curves}}, in the order of interest, with the joints' names in words."""
-    order = list(_JOINTS)
-    joints = dict.fromkeys(sorted({c.joint for c in found}, key=lambda j: order.index(j) if j in order else len(order)))
+    order = {joint: number for number, joint in enumerate(_JOINTS)}
     out: dict[str, dict[str, list[Curve]]] = {}
-    for joint in joints:
-        rows: dict[str, list[Curve]] = {}
-        for curve in found:
-            if curve.joint == joint:
-                rows.setdefault(curve.stem, []).append(curve)
-        out[_JOINTS.get(joint, joint)] = rows
+    for curve in sorted(found, key=lambda c: order.get(c.joint, len(order))):
+        out.setdefault(_JOINTS.get(curve.joint, curve.joint), {}).setdefault(curve.stem, []).append(curve)
     return out
 
 

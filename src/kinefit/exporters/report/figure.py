@@ -106,7 +106,7 @@ def _capsules(body: Body) -> Capsules:
         radii = np.array([r for _, _, r in limbs])
         points = PointSet(tuple(f"{k}" for k in range(len(tips))), segments, tips)
     else:
-        points, _, _ = bones(body)
+        points = bones(body)[0]
         radii = np.full((len(points) // 2, 2), _BONE)
     colours = ["#%02x%02x%02x" % side_colour(tree.segments[s]) for s in points.segments[::2]]  # noqa: UP031
     return Capsules(points, radii, colours)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.moments import Moment, listed, place, plain, span
+from kinefit.exporters.report.moments import Moment, listed, place, span, spoken_segments
 from kinefit.exporters.report.pictures import MOMENTS
 from kinefit.motion import Motion
 
@@ -45,7 +45,7 @@ def time_line(motion: Motion, moments: Sequence[Moment]) -> p.Html:
     """When what is doubtful: one row for each part of the body, the worst first; a click moves the 3D figure there."""
     rows: dict[str, list[Moment]] = {}
     for m in moments:
-        rows.setdefault(_who(m), []).append(m)
+        rows.setdefault(listed(spoken_segments(motion.body, m.segments)) or "whole body", []).append(m)
     shown = list(rows)[:_LINES]
     traces = []
     for name in reversed(shown):  # plots grow upwards
@@ -61,15 +61,11 @@ def time_line(motion: Motion, moments: Sequence[Moment]) -> p.Html:
                     "hovertemplate": f"{name} %{{x:.2f}} s<extra></extra>", "showlegend": False,
                 })  # fmt: skip
     layout = {
-        "margin": {"l": 10, "r": 12, "t": 8, "b": 40}, "yaxis": {"type": "category", "automargin": True},
+        "margin": {"l": 10, "r": 12, "t": 30, "b": 40}, "yaxis": {"type": "category", "automargin": True},
         "xaxis": {"title": "time [s]", "range": [float(motion.times[0]), float(motion.times[-1])]},
     }  # fmt: skip
-    height = _ROW * len(shown) + 64
+    height = _ROW * len(shown) + 86
     return p.plot(traces, layout, height=height, label="when which part of the body is doubtful", seeks=True)
-
-
-def _who(m: Moment) -> str:
-    return listed([plain(s) for s in m.segments]) or "whole body"
 
 
 def _when(motion: Motion, m: Moment) -> p.Html:

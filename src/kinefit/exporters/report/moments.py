@@ -12,6 +12,7 @@ from kinefit.bodies import Body
 from kinefit.bodies.limbs import finger_groups
 from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT
 from kinefit.exporters.report.doubt import contradicted, doubtful, end_sigmas, uncertain_throughout
+from kinefit.exporters.report.names import DIGITS
 from kinefit.findings import runs_of
 from kinefit.motion import Motion, Residuals
 
@@ -83,7 +84,10 @@ def throughout_sentence(motion: Motion) -> str:
     sigmas = uncertain_throughout(motion)
     if len(sigmas) == len(motion.body.tree.segments):
         return f"the whole body (±{200 * min(sigmas.values()):.0f} to {200 * max(sigmas.values()):.0f}\u00a0cm)"
-    return listed([f"{plain(name)} (±{200 * sigma:.0f}\u00a0cm)" for name, sigma in sigmas.items()], 20)
+    widest: dict[str, float] = {}
+    for name, told in _spoken(motion.body, list(sigmas)).items():
+        widest[told] = max(sigmas[name], widest.get(told, 0.0))
+    return listed([f"{name} (±{200 * sigma:.0f}\u00a0cm)" for name, sigma in widest.items()], 20)
 
 
 def when(motion: Motion, m: Moment) -> str:
@@ -128,16 +132,22 @@ def shared_by_prior(motion: Motion) -> dict[str, float]:
 
 
 def plain(segment: str) -> str:
-    """A segment's name in words: hand_l becomes "left hand"."""
+    """A segment's name in words: hand_l becomes "left hand", index_distal_l "left index finger (distal)"."""
     side = {"_l": "left ", "_r": "right "}.get(segment[-2:], "")
-    return (side + (segment[:-2] if side else segment)).replace("_", " ").replace("upperarm", "upper arm")
+    name = (segment[:-2] if side else segment).replace("_", " ").replace("upperarm", "upper arm")
+    digit, _, bone = name.partition(" ")
+    return side + (f"{DIGITS[digit].lower()} ({bone})" if bone and digit in DIGITS else name)
 
 
 def spoken_segments(body: Body, segments: Sequence[str]) -> list[str]:
     """Segments in words, each once; several fingers of a hand together: "fingers of the left hand"."""
+    return list(dict.fromkeys(_spoken(body, segments).values()))
+
+
+def _spoken(body: Body, segments: Sequence[str]) -> dict[str, str]:
     groups = finger_groups(body)
     hand = {s: name for name, own in groups.items() if len(set(own) & set(segments)) > 1 for s in own}
-    return list(dict.fromkeys(f"fingers of the {plain(hand[s])}" if s in hand else plain(s) for s in segments))
+    return {s: f"fingers of the {plain(hand[s])}" if s in hand else plain(s) for s in segments}
 
 
 def listed(names: Sequence[str], most: int = 4) -> str:
@@ -184,14 +194,15 @@ def _doubts(motion: Motion) -> Iterable[_Doubt]:
 
 
 def _merged(body: Body, found: Iterable[_Doubt]) -> list[Moment]:
-    """What shares more than half of its time becomes one moment; of the same segment, half of the shorter's time."""
+    """What shares more than half of its time becomes one moment; of a segment or a hand, half of the shorter's time."""
+    hand = {s: name for name, own in finger_groups(body).items() for s in own}
     groups: list[list[_Doubt]] = []
     spans: list[tuple[int, int]] = []
     for f in sorted(found, key=lambda f: -f.score):
         for k, (start, stop) in enumerate(spans):
             if f.start < stop and start < f.stop:
                 first, last = min(f.start, start), max(f.stop, stop)
-                same = any(g.segment == f.segment for g in groups[k])
+                same = any(hand.get(g.segment, g.segment) == hand.get(f.segment, f.segment) for g in groups[k])
                 whole = min(f.stop - f.start, stop - start) if same else last - first
                 if min(f.stop, stop) - max(f.start, start) > 0.5 * whole:
                     groups[k].append(f)

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+DIGITS = {"thumb": "Thumb"} | {digit: f"{digit.capitalize()} finger" for digit in ("index", "middle", "ring", "little")}
+"""Digits of a hand, as coordinates and segments begin, in words."""
+
+FINGER_JOINTS = ("cmc", "mcp", "pip", "dip", "ip")
+_FINGER_MOVES = {"flex": "flexion", "abd": "abduction", "dev": "ulnar deviation"}
+
 NAMES = {
     "hip_flexion": "Hip flexion", "hip_adduction": "Hip adduction", "hip_rotation": "Hip inward rotation",
     "knee_angle": "Knee flexion", "ankle_angle": "Ankle dorsiflexion", "subtalar_angle": "Subtalar inversion",
@@ -15,6 +21,8 @@ NAMES = {
     "thorax_bending": "Thoracic bending (to the right)", "thorax_rotation": "Thoracic rotation (to the left)",
     "neck_extension": "Neck extension", "neck_bending": "Neck bending (to the right)",
     "neck_rotation": "Neck rotation (to the left)",
+    **{f"{digit}_{joint}_{move}": f"{digit.capitalize()} {joint.upper()} {of}"
+       for digit in DIGITS for joint in FINGER_JOINTS for move, of in _FINGER_MOVES.items()},
 }  # fmt: skip
 """Clinical names of OpenSim's coordinates, in the direction that counts as positive."""
 
@@ -23,4 +31,5 @@ def spoken(coordinate: str) -> str:
     """Clinical name of a coordinate, with its side in words: hip_flexion_l becomes "left hip flexion"."""
     side = {"_l": "left ", "_r": "right "}.get(coordinate[-2:], "")
     stem = coordinate[:-2] if side else coordinate
-    return side + NAMES.get(stem, stem.replace("_", " ")).lower()
+    name = NAMES.get(stem, stem.replace("_", " "))
+    return side + name[0].lower() + name[1:]

@@ -86,7 +86,8 @@ def ranges_table(motion: Motion) -> p.Html:
     paired: list[tuple[str, ...]] = []
     single: list[tuple[str, ...]] = []
     for stem, of in ranges_of(motion).items():
-        name = spoken(stem).capitalize()
+        name = spoken(stem)
+        name = name[0].upper() + name[1:]
         if "" in of:
             single.append((name, *_cells(of[""])))
         else:

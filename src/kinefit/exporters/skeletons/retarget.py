@@ -1,7 +1,8 @@
 """A motion on the skeleton of another character: its bones point where the body's do, its feet keep to the ground.
 
 Where both stand upright their trunks, heads and feet agree; of arms and legs the bones' directions agree, however the
-character rests (T, A, arms hanging). Every joint turns by D = R_segment Cᵀ from its rest, C the segment's axes at rest.
+character rests (T, A, arms hanging), and so do those of fingers. Every joint turns by D = R_segment Cᵀ from its rest, C
+the segment's axes at rest.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.bodies.joint_names import conventions, joint_map
+from kinefit.bodies.joint_names import FINGERS, conventions, joint_map
 from kinefit.errors import BodyError, ExportError, FileError
+from kinefit.exporters.skeletons.finger_bones import add_finger_axes, common_knuckles
 from kinefit.geometry import se3
 from kinefit.motion import Motion
 from kinefit.readers.skeletons.characters import Character
@@ -24,6 +26,7 @@ _FAR = {"thigh": "shank", "shank": "foot", "upperarm": "forearm", "forearm": "ha
 _BODY_NEEDED = tuple(f"{name}_{side}" for name in ("thigh", "shank", "upperarm", "forearm") for side in "lr")
 _UP = np.array([0.0, 1.0, 0.0])
 _ALONG = 0.9  # cosine above which a bone that points forward tells nothing of what is in front of it
+_LIKE_KNUCKLES = (("index",), ("pinky", "little"))  # in names of bones that no convention knows
 _STANCE = 0.01  # [m] a foot so much lower than the other carries most of the weight; a swinging one clears some cm
 _LOWEST = 5.0  # percentile of the lowest point's height that counts as the ground
 
@@ -41,6 +44,7 @@ class Retargeted:
     places : (F, 3) of the mover in its parent, in the file's unit.
     positions : (F, J, 3) [m] of all nodes, y up.
     segments : node -> segment of the body whose turn it does.
+    lacking : segments of the body's fingers for which the character has no bone.
     """
 
     character: Character
@@ -50,6 +54,7 @@ class Retargeted:
     places: NDArray
     positions: NDArray
     segments: Mapping[int, str]
+    lacking: tuple[str, ...] = ()
 
 
 def retargeted(motion: Motion, character: Character, names: Mapping[str, str] | None = None) -> Retargeted:
@@ -76,10 +81,9 @@ def retargeted(motion: Motion, character: Character, names: Mapping[str, str] | 
     segments = _segments(motion.body)
     used = {segment: node for segment, node in nodes.items() if segment in segments}
     poses = motion.segment_poses()
-    turns = {
-        node: poses[:, segments[name], :3, :3] @ C.T
-        for (name, node), C in zip(used.items(), _axes(character, nodes, motion.body, segments, used).values())
-    }
+    axes = _axes(character, nodes, motion.body, segments, used)
+    add_finger_axes(axes, character, used, motion.body)
+    turns = {used[name]: poses[:, segments[name], :3, :3] @ C.T for name, C in axes.items()}
     mover = _common(character, list(nodes.values()))
     turns[mover] = turns[nodes["pelvis"]]
     _between(character, nodes, used, turns)
@@ -101,7 +105,7 @@ def retargeted(motion: Motion, character: Character, names: Mapping[str, str] | 
     moving[list(turns)] = True
     return Retargeted(
         character, above.swapaxes(-1, -2) @ frames, moving, mover, character.in_parent(mover, places[:, mover]), places,
-        {node: segment for segment, node in used.items()},
+        {used[segment]: segment for segment in axes}, tuple(s for s in FINGERS if s in segments and s not in axes),
     )
 
 
@@ -111,6 +115,8 @@ def _nodes(character: Character, names: Mapping[str, str] | None) -> dict[str, i
     told = {segment: character.names[node] for segment, node in character.told.items()}
     found = joint_map([character.names[n] for n in there], {**told, **(names or {})}, source=str(character.path))
     nodes = {segment: int(there[i]) for segment, i in found.items()}
+    hands = {side: _below(character, nodes[f"hand_{side}"]) for side in "lr"}
+    nodes = {segment: node for segment, node in nodes.items() if segment not in FINGERS or node in hands[segment[-1]]}
     carrier = _common(character, [nodes["upperarm_l"], nodes["upperarm_r"], nodes["head"]])
     if carrier != nodes["pelvis"] and "thorax" not in (names or {}):
         nodes = {segment: node for segment, node in nodes.items() if node != carrier} | {"thorax": carrier}
@@ -154,6 +160,8 @@ def _axes(
     forward, out = stand[:, 0], {}
     for segment in used:
         bone, _, side = segment.rpartition("_")
+        if segment in FINGERS:
+            continue
         if bone == "foot" and f"toes_{side}" in nodes and f"toes_{side}" in segments:
             mine = (x[nodes[f"toes_{side}"]] - x[nodes[segment]]) * (1.0, 0.0, 1.0)
             own = body.tree.offsets[segments[f"toes_{side}"]] * (1.0, 0.0, 1.0)
@@ -162,12 +170,16 @@ def _axes(
             out[segment] = out[f"foot_{side}"]
         elif bone in _FAR or bone == "hand":
             far = _FAR.get(bone)
+            knuckles = common_knuckles(used, side)
             mine = x[nodes[f"{far}_{side}"]] - x[nodes[segment]] if far else _hand(character, nodes, side)
-            number = segments.get(f"{far}_{side}")
-            own = np.array([0.0, -1.0, 0.0]) if number is None else body.tree.offsets[number]
+            ends = [segments[name] for name in ([f"{far}_{side}"] if far else knuckles) if name in segments]
+            own = body.tree.offsets[ends].mean(axis=0) if ends else np.array([0.0, -1.0, 0.0])
             front, own_front = forward if abs(_unit(mine) @ forward) < _ALONG else _UP, np.array([1.0, 0.0, 0.0])
             if bone in ("forearm", "hand"):  # thumbs are in front in T and A, outside where palms face forward
                 front, own_front = _thumb(character, nodes, side, front), np.array([0, 0, 1.0 if side == "r" else -1.0])
+                if len(knuckles) > 1:
+                    first, last = (body.tree.offsets[segments[name]] for name in (knuckles[0], knuckles[-1]))
+                    own_front = first - last
             out[segment] = _frame(mine, front) @ _frame(own, own_front).T
         else:
             out[segment] = stand
@@ -175,22 +187,22 @@ def _axes(
 
 
 def _hand(character: Character, nodes: Mapping[str, int], side: str) -> NDArray:
-    """Direction of a hand at rest: to its fingers, or as the forearm where it has none."""
+    """Direction of a hand at rest: to its knuckles, or as the forearm where it has none."""
     x, hand = character.positions, nodes[f"hand_{side}"]
-    fingers = np.flatnonzero(character.parents == hand)
+    knuckles = [nodes[name] for name in common_knuckles(nodes, side)] or np.flatnonzero(character.parents == hand)
     along = x[hand] - x[nodes[f"forearm_{side}"]]
-    to = x[fingers].mean(axis=0) - x[hand] if len(fingers) else along
+    to = x[knuckles].mean(axis=0) - x[hand] if len(knuckles) else along
     return to if _unit(to) @ _unit(along) > 0.5 else along
 
 
 def _thumb(character: Character, nodes: Mapping[str, int], side: str, front: NDArray) -> NDArray:
-    """Direction towards the thumb at rest: from the little to the index finger where they are named, else the front."""
+    """Direction towards the thumb at rest: from the last to the first knuckle where they are named, else the front."""
     x, below = character.positions, _below(character, nodes[f"hand_{side}"])
-    ends = []
-    for word in ("index", "pinky|little"):
-        found = [n for n in below if any(w in character.names[n].lower() for w in word.split("|"))]
-        ends += [x[found[0]]] if found else []
-    return ends[0] - ends[1] if len(ends) == 2 and np.linalg.norm(ends[0] - ends[1]) > 1e-4 else front
+    ends = [x[nodes[name]] for name in common_knuckles(nodes, side)]
+    if len(ends) < 2:
+        words = [[n for n in below if any(w in character.names[n].lower() for w in ws)] for ws in _LIKE_KNUCKLES]
+        ends = [x[found[0]] for found in words if found]
+    return ends[0] - ends[-1] if len(ends) > 1 and np.linalg.norm(ends[0] - ends[-1]) > 1e-4 else front
 
 
 def _between(

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.bodies.joint_names import SIDES
+from kinefit.bodies.joint_names import SIDES, VRM0_FINGERS
 from kinefit.errors import BodyError, ExportError
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
 from kinefit.geometry import se3
@@ -30,13 +30,9 @@ _TRUNK = {"pelvis": "Hips", "abdomen": "Spine", "thorax": "Chest", "neck": "Neck
 _SIDES = {
     "clavicle": "Shoulder", "upperarm": "UpperArm", "forearm": "LowerArm", "hand": "Hand", "thigh": "UpperLeg",
     "shank": "LowerLeg", "foot": "Foot", "toes": "Toes",
-    "thumb_metacarpal": "ThumbProximal", "thumb_proximal": "ThumbIntermediate", "thumb_distal": "ThumbDistal",
-    **{
-        f"{finger}_{phalanx}": finger.capitalize() + bone for finger in ("index", "middle", "ring", "little")
-        for phalanx, bone in (("proximal", "Proximal"), ("middle", "Intermediate"), ("distal", "Distal"))
-    },
 }  # fmt: skip
 BONES = _TRUNK | {f"{k}_{s}": words["Side"] + v for k, v in _SIDES.items() for s, words in SIDES.items()}
+BONES |= {segment: name[0].upper() + name[1:] for segment, name in VRM0_FINGERS.items()}
 """Segment -> bone of Unity's humanoid."""
 
 

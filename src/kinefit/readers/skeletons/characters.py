@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import parse_toml
-from kinefit.bodies.joint_names import FAMILIES, MORE, SEGMENTS
+from kinefit.bodies.joint_names import FAMILIES, FINGERS, MORE, SEGMENTS, VRM0_FINGERS, VRM1_FINGERS
 from kinefit.errors import FileError, choices
 from kinefit.motion import rotation_between_up
 from kinefit.readers.skeletons.bvh import read_bvh
@@ -96,7 +96,7 @@ def read_names(path: str | PathLike[str]) -> dict[str, str]:
 
     Returns
     -------
-    segment (of `SEGMENTS`, or of `MORE`) -> name of a joint
+    segment (of `SEGMENTS`, `FINGERS` or `MORE`) -> name of a joint
 
     Raises
     ------
@@ -108,9 +108,9 @@ def read_names(path: str | PathLike[str]) -> dict[str, str]:
     except (OSError, UnicodeDecodeError) as error:
         raise FileError(f"cannot be read ({error})", file=path, remedy="Give a TOML file.") from error
     for segment, name in table.items():
-        if segment not in SEGMENTS and segment not in MORE:
+        if segment not in (known := (*SEGMENTS, *FINGERS, *MORE)):
             remedy = 'A line is: thigh_l = "LeftUpLeg".'
-            raise FileError(choices("segment", segment, SEGMENTS), file=path, remedy=remedy)
+            raise FileError(choices("segment", segment, known), file=path, remedy=remedy)
         if not isinstance(name, str):
             raise FileError("is no name of a joint", file=path, place=segment, remedy="Write it in quotes.")
     return dict(table)
@@ -206,6 +206,7 @@ def _told(file: Mapping[str, Any]) -> dict[str, int]:
     old = more.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
     bones = {name: bone["node"] for name, bone in new.items()} | {bone["bone"]: bone["node"] for bone in old}
     joints = next(family for family in FAMILIES if family.name == "VRM, Unity").joints
+    joints |= VRM1_FINGERS if new else VRM0_FINGERS
     out = {segment: int(bones[name]) for segment, name in joints.items() if name in bones}
     if wrong := [name for name, node in out.items() if not 0 <= node < len(file["nodes"])]:
         raise ValueError(f"humanBones names a node for {wrong[0]} that the file does not have")

@@ -20,6 +20,7 @@ from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.channels import Channels, known_points, make_channels
 from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
 from kinefit.sensors.layout import Layout, Stream, projected
+from kinefit.sensors.points.hand_views import join_fingers
 from kinefit.sensors.points.left_right import find_swaps
 from kinefit.sensors.points.triangulation import rays, triangulated_frame
 from kinefit.sensors.points.view_bias import ViewBias
@@ -232,11 +233,27 @@ class KeypointMatched(Matched):
         ]
 
     def evidence(self, scene: Scene) -> Evidence:
-        """A keypoint speaks for the segments that it informs of within three standard deviations, else against."""
+        """A keypoint speaks for the segments that it informs of within three standard deviations, else against.
+
+        Fingers of a hand are judged together, see `hand_views`.
+        """
         agrees = self.squares(scene) < AGREES**2
         seen, informs = self.weight > 0, self.measurement.layout.informs
         right, wrong = seen & agrees, seen & ~agrees
-        return Evidence(SHOWN * (informs @ right), SHOWN * (informs @ wrong), self._elsewhere(right, wrong))
+        agreeing, contrary = SHOWN * (informs @ right), SHOWN * (informs @ wrong)
+        if hands := self.measurement.layout.hands:
+            join_fingers(hands, agreeing, contrary, *self._metres(scene))
+        return Evidence(agreeing, contrary, self._elsewhere(right, wrong))
+
+    def _metres(self, scene: Scene) -> tuple[NDArray, NDArray]:
+        """(N,) [m] distance of each point from the body's at its depth, NaN where unseen; its standard deviation."""
+        layout = self.measurement.layout
+        channels, x = layout.channels, scene.positions(layout.points_of(scene.body))
+        to_camera = np.stack([c.T_camera_world[2] for c in channels.rig])[channels.camera]
+        depth = np.einsum("ni,ni->n", to_camera[:, :3], x) + to_camera[:, 3]
+        size = depth / np.array([c.matrix[0, 0] for c in channels.rig])[channels.camera]  # [m] of a pixel
+        gap = np.where(self.weight > 0, np.linalg.norm(self.uv - projected(scene, layout), axis=1), np.nan)
+        return size * gap, size * channels.sigma
 
     def _elsewhere(self, right: NDArray, wrong: NDArray) -> NDArray | None:
         """(S,) bool: segments whose own points most views show beside where they should be, two of them in one place.

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, load_body
+from kinefit.diagnostics.images import load_uncovered
 from kinefit.errors import KinefitError, TrackingError
 from kinefit.images.depth import to_points
 from kinefit.images.depth_noise import denoised, without_speckles
@@ -19,7 +20,7 @@ from kinefit.multiview.followed import PersonKeypoints, choose, follow
 from kinefit.multiview.people import PersonTrack
 from kinefit.observations import DepthFrame
 from kinefit.readers.take.file import Take
-from kinefit.readers.take.load import Observations, load_observations
+from kinefit.readers.take.load import Observations
 from kinefit.readers.take.pictures import TakePictures
 from kinefit.sensors.settings import TrackSettings
 from kinefit.tracking.recording import Recording
@@ -117,7 +118,7 @@ def people_in_view(take: Take) -> InView | None:
     points = take.markers or take.lines or take.skin or take.surface_points or take.trackers
     if points or not (take.keypoints or ((take.depth or take.stereo) and not (take.start or take.pose))):
         return None
-    seen = load_observations(take)
+    seen = load_uncovered(take)
     if take.keypoints:
         if seen.rig is None:
             return None

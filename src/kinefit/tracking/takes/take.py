@@ -9,6 +9,7 @@ import numpy as np
 
 from kinefit._arguments import checked
 from kinefit.bodies import load_body
+from kinefit.diagnostics.images import load_uncovered
 from kinefit.diagnostics.quick import input_findings, with_cause, with_findings
 from kinefit.errors import KinefitError, TakeError, command
 from kinefit.identification.take.named import with_names
@@ -59,7 +60,7 @@ def track_take(
     check_enough(take)
     take = prepared(take, progress)
     view = view or people_in_view(take)
-    seen = with_names(take, view.seen if view else load_observations(take), progress=progress)
+    seen = with_names(take, view.seen if view else load_uncovered(take), progress=progress)
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
     sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin, take.trackers)
     alone = take.start or take.pose or any(sensors)
