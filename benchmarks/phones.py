@@ -1,0 +1,10 @@
+"""Every figure of takes of telephones: `python -m benchmarks.phones`; some parts: `... phones phones_time`."""
+
+from __future__ import annotations
+
+from benchmarks.figures import run_parts
+
+PARTS = {"phones_time": "videos that dropped frames, and cameras of unequal rates"}
+
+if __name__ == "__main__":
+    run_parts(PARTS)
