@@ -86,5 +86,6 @@ def _apart(whole: Motion, motion: Motion) -> float:
     _, mine, theirs = np.intersect1d(at, other, return_indices=True)
     x, y = whole.joint_centres[mine], motion.joint_centres[theirs]
     each = 1e3 * np.linalg.norm(x - y, axis=2).mean(axis=1)
-    print(f"  {len(mine)} of {len(whole)} frames, the worst {each.max():.1f} mm at {whole.times[mine[each.argmax()]]:.2f} s")
+    worst = whole.times[mine[each.argmax()]]
+    print(f"  {len(mine)} of {len(whole)} frames, the worst {each.max():.1f} mm at {worst:.2f} s")
     return float(each.mean())

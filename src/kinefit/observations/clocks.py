@@ -11,6 +11,7 @@ from kinefit.observations.recordings import Keypoints
 
 _MAX_JITTER = 0.15  # of a step: milliseconds, to which some containers round, are 0.12 steps of 240 Hz
 _MAX_SAME = 0.02  # of a step, by which a frame may be off and still counts at it as it is
+_MAX_OFF, _MAX_STEPS = 0.4, 3  # medians, that a distance is off a whole number, up to this one; 5 ms are 1.25 of 4
 _MAX_GAP = 2.1  # usual distances of frames over which is interpolated: one frame is lacking
 _MAX_MOVE = 0.5  # of a person's extent, mean distance of its points in two frames next to each other
 
@@ -22,10 +23,12 @@ def is_even(times: NDArray, rate: float) -> bool:
 
 
 def nominal_rate(times: NDArray) -> float:
-    """Rate [Hz] of two or more frames at `times` (N,) [s]: of the usual distances of frames, those about the median."""
+    """Rate [Hz] of two or more frames at `times` (N,) [s]: by distances near to one to three times their median."""
     distances = np.diff(times)
-    usual = float(np.median(distances))
-    return 1.0 / float(np.mean(distances[np.abs(distances - usual) < 0.5 * usual]))
+    ratios = distances / np.median(distances)
+    steps = np.rint(ratios)
+    near = (np.abs(ratios - steps) < _MAX_OFF) & (steps >= 1) & (steps <= _MAX_STEPS)
+    return float(steps[near].sum() / distances[near].sum())
 
 
 def frame_times(count: int, rate: float, clock: NDArray | None = None) -> NDArray:

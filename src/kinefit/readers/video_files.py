@@ -145,8 +145,8 @@ def _presentation_times(path: Path) -> list[int]:
     with _open(path) as container:
         stream = container.streams.video[0]
         stated, rate, base = stream.frames, float(stream.average_rate or 0), float(stream.time_base or 0)
-        if not stated and len(container.streams) == 1 and container.duration and container.size > 0:
-            stated = int(container.duration / av.time_base * rate * 0.98) - 2  # of the duration, which is rounded
+        alone = len(container.streams) == 1 and container.duration and container.size > 0
+        duration = container.duration / av.time_base if alone else 0.0
         try:
             for packet in container.demux(stream):
                 if packet.size and packet.is_corrupt:
@@ -158,6 +158,9 @@ def _presentation_times(path: Path) -> list[int]:
         except (av.FFmpegError, ValueError) as error:
             problem = str(error)
         hidden = stream.codec_context.name in _HIDDEN
+    last = base * max((time for time in pts if time is not None), default=0)
+    if not stated and last < 0.98 * duration - 3.0 / (rate or np.inf):  # the duration is rounded
+        stated = int(duration * rate * 0.98) - 2
     if problem or packets < stated:
         told = f" of {stated}" if stated > packets else ""
         raise FileError(
