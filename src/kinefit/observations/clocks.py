@@ -14,6 +14,7 @@ _MAX_SAME = 0.02  # of a step, by which a frame may be off and still counts at i
 _MAX_OFF, _MAX_STEPS = 0.4, 3  # medians, that a distance is off a whole number, up to this one; 5 ms are 1.25 of 4
 _MAX_GAP = 2.1  # usual distances of frames over which is interpolated: one frame is lacking
 _MAX_MOVE = 0.5  # of a person's extent, mean distance of its points in two frames next to each other
+_MIN_MOVE_PX = 20.0  # that distance is always allowed: of some persons a point or two are seen
 
 
 def is_even(times: NDArray, rate: float) -> bool:
@@ -102,5 +103,6 @@ def _next_people(points: NDArray, next_points: NDArray) -> NDArray:
     seen = np.isfinite(points)
     extent = np.where(seen, points, -np.inf).max(axis=1) - np.where(seen, points, np.inf).min(axis=1)
     best, back = mean.argmin(axis=1), mean.argmin(axis=0)
-    near = mean[np.arange(len(mean)), best] <= _MAX_MOVE * np.linalg.norm(extent, axis=-1)
+    limit = np.maximum(_MAX_MOVE * np.linalg.norm(extent, axis=-1), _MIN_MOVE_PX)
+    near = mean[np.arange(len(mean)), best] <= limit
     return np.where(near & (back[best] == np.arange(len(mean))), best, -1)
