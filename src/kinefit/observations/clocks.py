@@ -26,7 +26,7 @@ def is_even(times: NDArray, rate: float) -> bool:
 def nominal_rate(times: NDArray) -> float:
     """Rate [Hz] of two or more frames at `times` (N,) [s]: by distances near to one to three times their median."""
     distances = np.diff(times)
-    ratios = distances / np.median(distances)
+    ratios = distances / np.sort(distances)[len(distances) // 2]  # the median, or the distance above it
     steps = np.rint(ratios)
     near = (np.abs(ratios - steps) < _MAX_OFF) & (steps >= 1) & (steps <= _MAX_STEPS)
     return float(steps[near].sum() / distances[near].sum())
