@@ -89,6 +89,7 @@ def test_rates_and_what_is_said_of_them():
     milliseconds = np.round(np.arange(500) / 240, 3)
     assert nominal_rate(milliseconds) == pytest.approx(240, rel=1e-3) and is_even(milliseconds, 240.0)
     assert nominal_rate(DROPPED) == pytest.approx(60)
+    assert nominal_rate(np.array([0.0, 0.1, 0.4])) == pytest.approx(1 / 0.3)  # two distances with nothing between
     assert unevenness(DROPPED, RATE) == "variable frame rate, 60 Hz nominal, 20 frames lacking between 0.667 and 1.33 s"
     assert steps_of(ALL[::2] + 0.1, RATE) == (6, 125) and steps_of(ALL + 0.1, RATE) == (6, 126)
     assert steps_of(np.array([0.5]), RATE) == (30, 31)

@@ -2,7 +2,6 @@
 
 import json
 
-import av
 import numpy as np
 import pytest
 
@@ -158,10 +157,10 @@ def test_streams_of_different_rate(small):
         load(small, take_text(keys='set = "COCO_17"\nrate = 30'))
 
 
-def test_keypoints_take_the_times_of_the_video_beside_them(small):
+def test_keypoints_take_the_times_of_the_video_beside_them(small, write_frames):
     kept = [0, 1, 2, 4, 6, 8, 9, 10, 11, 13]  # steps of 50 Hz
-    write_video(small / "a.mp4", pts=kept)
-    write_video(small / "b.mp4", pts=range(0, 20, 2))
+    write_frames(small / "a.mp4", kept)
+    write_frames(small / "b.mp4", range(0, 20, 2))
     text = take_text(head="", a='video = "a.mp4"', b='video = "b.mp4"\ntime_offset = 0.02')
     seen = load(small, text)
     assert seen.rate == pytest.approx(50) and seen.frames == (1, 14)
@@ -170,17 +169,6 @@ def test_keypoints_take_the_times_of_the_video_beside_them(small):
     assert "video a: variable frame rate, 50 Hz nominal, 4 frames lacking between 0.04 and 0.26 s" in seen.notes
     with pytest.raises(ObservationError, match="the keypoints have 30 Hz, and the video of as many frames 50 Hz"):
         load(small, text.replace('set = "COCO_17"', 'set = "COCO_17"\nrate = 30', 1))
-
-
-def write_video(path, pts, rate=50, size=(640, 480)):
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=rate)
-        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
-        for time in pts:
-            frame = av.VideoFrame.from_ndarray(np.full((size[1], size[0], 3), 90, np.uint8), format="rgb24")
-            frame.pts = time
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
 
 
 def test_nothing_tells_the_rate(small):
