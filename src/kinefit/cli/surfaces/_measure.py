@@ -237,8 +237,8 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
     with ExitStack() as opened:
         videos = [opened.enter_context(Video(path)) for path in views.videos]
         if not all(is_even(video.times, videos[0].rate) for video in videos):
-            told = (video.unevenness or f"{video.rate:.6g} Hz" for video in videos)
-            listed = ", ".join(f"{name} {rate}" for name, rate in zip(views.names, told))
+            rates = [video.unevenness or f"{video.rate:.6g} Hz" for video in videos]
+            listed = ", ".join(f"{name} {rate}" for name, rate in zip(views.names, rates))
             remedy = "A surface is matched between images taken at once: record with cameras in step."
             raise ObservationError(f"videos of different or varying rate: {listed}", remedy=remedy)
         if motion is not None:

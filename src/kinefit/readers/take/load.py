@@ -283,12 +283,12 @@ def _read_keypoints(
             file=take.path, place=place, remedy='Write frame = "calibration" or frame = "video".',
         )
     offset = next(entry.time_offset for entry in take.cameras if entry.name == source.camera)
+    clock = clocks.get(source.camera)
     if source.format == "detect":
         file = source.file or detections_file(take.path, source.camera)
         found = read_detections(file)
         seen = found.keypoints(source.camera, image_frame=None if same else image, time_offset=offset)
-        own = frame_times(len(found), found.rate, found.times)
-        return seen, frame_times(len(found), found.rate, clocks.get(source.camera)) if found.times is None else own
+        return seen, frame_times(len(found), found.rate, clock if found.times is None else found.times)
     rate = source.rate or rates.get(f"video {source.camera}") or take.rate
     if rate is None:
         raise TakeError("nothing states the rate", file=take.path, place=place, remedy="Write rate = ... into [take].")
@@ -299,7 +299,7 @@ def _read_keypoints(
         image_frame=image if source.frame == "video" and not same else None,
         time_offset=offset, **options,
     )
-    times = frame_times(len(record), rate, clock := clocks.get(source.camera))
+    times = frame_times(len(record), rate, clock)
     if times is clock and source.rate and not is_even(times, source.rate):
         own = rates[f"video {source.camera}"]
         raise ObservationError(

@@ -122,7 +122,7 @@ def _silhouettes(
     if found.seen.any() and not len(found.mask_runs):
         remedy = "Run `kinefit detect` on this take, which keeps outlines."
         raise TakeError("the detector's file has no outlines", file=file, remedy=remedy)
-    times = offset + (frame_times(len(found), found.rate, clock) if found.times is None else found.times)
+    times = offset + frame_times(len(found), found.rate, clock if found.times is None else found.times)
     return SilhouetteVideo(
         entry.camera, found.rate, times, size, lambda i: in_calibration(_everybody(found, i), size, frame), found.source
     )
