@@ -210,7 +210,8 @@ def _turn(entry: dict[str, Told]) -> int:
 
 def _rate(draft: Draft, opened: Mapping[str, Video], records: Sequence[Mapping[str, Keypoints]]) -> Told:
     files = {name: video for name, video in opened.items() if video.path.is_file()}
-    tables = [k.rate for record in records[:1] for k in record.values() if k.rate != UNSTATED]
+    first = next((record for record in records if record), {})
+    tables = [k.rate for k in first.values() if k.rate != UNSTATED]
     for name, video in files.items():
         if video.unevenness:
             draft.note(f"camera {name}", "likely", video.unevenness)

@@ -181,7 +181,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     if not (streams or lines or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
         raise TakeError("cameras, but nothing that they saw", file=take.path, remedy=remedy)
-    own = [*(m.rate for m in markers[:1]), *(recording.rate for recording in (*recordings, *lines))]
+    own = [*(recording.rate for recording in (*recordings, *lines)), *(m.rate for m in markers)]
     rate = fastest or own[0]
     if streams:
         frames = common_frames(streams, rate, take.frames, file=take.path)
