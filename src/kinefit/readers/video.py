@@ -201,7 +201,7 @@ def common_frames(
     if start >= stop:
         raise ObservationError(f"no time that all streams saw: {listed}", file=file, remedy="Check the time offsets.")
     if frames is None:
-        slack = np.ceil(2.0 * rate * max(uneven.values(), default=0.0))
+        slack = np.ceil(2.0 * rate * max(uneven.values(), default=0.0) - 1e-6)
         if np.ptp([end - begin for begin, end in spans.values()]) > slack:
             raise ObservationError(
                 f"streams of different length: {listed}", file=file,

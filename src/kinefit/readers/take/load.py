@@ -132,7 +132,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         A camera without calibration; an image of another size than the calibration's where the take does not state how.
     ObservationError
         Streams of different length, with each stream's; keypoints of as many frames as the video, and another rate;
-        and what the readers of the files raise.
+        a rate of the take above its videos'; and what the readers of the files raise.
     FileError
         A file that is damaged.
     """
@@ -151,6 +151,13 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
                 rates[stream], clocks[entry.name], sizes[entry.name] = video.rate, video.times, video.size
                 streams[stream] = video.times + entry.time_offset
                 notes += [f"{stream}: {video.unevenness}"] * bool(video.unevenness)
+    listed = ", ".join(f"{stream} {rate:.6g} Hz" for stream, rate in rates.items())
+    if take.rate and rates and take.rate > 1.001 * max(rates.values()):
+        problem = f"a rate above that of every video: take {take.rate:.6g} Hz, {listed}"
+        raise ObservationError(problem, file=take.path, remedy="Leave rate out of [take]: the videos state theirs.")
+    rate = take.rate or max(rates.values(), default=0.0)
+    if not all(is_even(times, rate) for times in clocks.values()):
+        notes.append(f"take {rate:.6g} Hz, {listed}: points are interpolated between frames")
     if is_alone(take):
         entry = take.cameras[0]
         rig = Rig((assumed_camera(entry, sizes.get(entry.name, entry.size), take),))
