@@ -2,7 +2,7 @@
 
 Recorded motions before two to eight telephones: anywhere around at 2.5 to 6 m, at 0.6 to 2.2 m of height, lying or
 standing, fields of view of 64 degrees with a deviation of 8, started up to two seconds apart, 25 to 60 frames a second,
-2 to 20 s; in three rooms of ten a second person. What the detector saw is drawn: keypoints with noise that comes and goes, and
+2 to 20 s; in three rooms of ten a second person. What the detector saw is drawn: keypoints with noise that lasts, and
 landmarks lifted to space, turned by some 8 degrees in each camera, of another size, with 3 cm of noise, 6 cm along the
 view. They are written as the detector writes them; all else is `track_take` with its defaults, as `kinefit track` calls
 it, on a take with videos' sizes and the person's height. Settings were chosen on draws 0 to 9.
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
@@ -80,8 +80,8 @@ def room(draw: int) -> Room:
     records = simulate_keypoints(
         truths[0], rig, "MEDIAPIPE_33", bystander=truths[1] if count > 1 else None, seed=draw, **NOISE
     )  # fmt: skip
-    at = [np.round((reach + late[c] + np.arange(round(seconds * rate)) / rate) * FINE).astype(int) for c in range(len(rig))]
-    at = [np.minimum(frames, len(truths[0]) - 1) for frames in at]
+    steps = np.arange(round(seconds * rate)) / rate
+    at = [np.minimum(np.round((reach + t + steps) * FINE).astype(int), len(truths[0]) - 1) for t in late]
     seen = tuple(
         _as_detected(truths, camera, record, frames, rate, random)
         for camera, record, frames in zip(rig, records, at, strict=True)
@@ -100,7 +100,8 @@ def _moved(motions: Sequence[Motion], seconds: float, aside: float, random: np.r
         motion = known_motion(body, FINE, moved, motion.angles, up="z", name="moved")
         if parts:
             ends = [(m.Ts_world_root[f], m.angles[f]) for m, f in ((parts[-1], -1), (motion, 0))]
-            step = known_motion(body, 1.0, np.stack([e[0] for e in ends]), np.stack([e[1] for e in ends]), up="z", name="step")
+            Ts, angles = (np.stack(both) for both in zip(*ends))
+            step = known_motion(body, 1.0, Ts, angles, up="z", name="step")
             parts.append(resampled(step, FINE))
         parts.append(motion)
     Ts, angles = (np.concatenate([getattr(part, what) for part in parts]) for what in ("Ts_world_root", "angles"))
@@ -139,15 +140,14 @@ def _as_detected(
 ) -> Detections:  # fmt: skip
     """What the detector would have left of one telephone's video."""
     points, confidence = record.points[frames], record.confidence[frames]
-    people = np.argsort(np.arange(points.shape[1]))
     lifted = np.full((*points.shape[:3], 3), np.nan)
     keep, size = float(np.exp(-1.0 / (rate * LASTS))), random.uniform(0.9, 1.1)
     bias = se3.exp_so3(np.radians(random.normal(0.0, TURNED / np.sqrt(3.0), 3)))
-    for p in people:
-        for f, truth in enumerate(truths):
+    for p in range(points.shape[1]):
+        for truth in truths:
             lifted_one = _lifted(truth, camera, frames, size, bias, keep, random)
             near = _is_of(truth, camera, frames, points[:, p])
-            lifted[near, p] = lifted_one[near] if f < len(truths) else np.nan
+            lifted[near, p] = lifted_one[near]
     confidence = np.where(np.isfinite(points).all(axis=-1), confidence, 0.0)
     runs = np.zeros(0, np.uint32), np.zeros(points.shape[0] * points.shape[1] + 1, int)
     return Detections(camera.name, rate, camera.size, points, confidence, *runs, "simulation", lifted)
@@ -185,7 +185,8 @@ def _is_of(truth: Motion, camera: Camera, frames: NDArray, uv: NDArray) -> NDArr
 
 def write_take(draw: Room, folder: Path, *, known: bool) -> Path:
     """The take of a room, as kinefit init writes it, or with the true calibration and clocks."""
-    lines = ["[take]", 'name = "room"', f"rate = {draw.seen[0].rate:g}", 'up = "z"', f"height = {draw.truths[0].body.stature:.4f}"]
+    lines = ["[take]", 'name = "room"', f"rate = {draw.seen[0].rate:g}", 'up = "z"']
+    lines += [f"height = {draw.truths[0].body.stature:.4f}"]
     if known:
         write_calibration(draw.rig, folder / "true.toml")
         lines += ["", "[calibration]", 'file = "true.toml"', "position_sigma = 0.0", "rotation_sigma = 0.0"]
@@ -213,18 +214,23 @@ def score(draw: Room) -> Score:
     both = min(len(motion) + min(first, 0), len(known) - max(first, 0))
     one, other = cut(motion, max(-first, 0), max(-first, 0) + both), cut(known, max(first, 0), max(first, 0) + both)
     angles = float(np.nanmean(np.abs(angle_errors(one, other))))
-    return Score(*camera_errors(found, draw), scale, clock_error(found, draw), joints,
+    return Score(*camera_errors(found.rig.select(draw.rig.names), draw.rig), scale, clock_error(found, draw), joints,
                  joint_errors(truth, draw.start, known)[1], angles, inside)  # fmt: skip
 
 
-def camera_errors(found: FoundCameras, draw: Room) -> tuple[float, float]:
-    """Median turn between two cameras [deg] and median focal length [%] off the truth."""
+def turns_between(found: Rig, truth: Rig) -> list[float]:
+    """[deg] by which the turn from one camera to another is off, for all pairs."""
     turns = []
-    for a, b in combinations(draw.rig.names, 2):
-        R, Q = (rig[b].T_camera_world[:3, :3] @ rig[a].T_camera_world[:3, :3].T for rig in (found.rig, draw.rig))
+    for a, b in combinations(range(len(truth)), 2):
+        R, Q = (r.cameras[b].T_camera_world[:3, :3] @ r.cameras[a].T_camera_world[:3, :3].T for r in (found, truth))
         turns.append(float(np.degrees(np.linalg.norm(se3.log_so3(R.T @ Q)))))
-    lens = [100 * abs(found.rig[name].matrix[0, 0] / draw.rig[name].matrix[0, 0] - 1) for name in draw.rig.names]
-    return float(np.median(turns)), float(np.median(lens))
+    return turns
+
+
+def camera_errors(found: Rig, truth: Rig) -> tuple[float, float]:
+    """Median turn between two cameras [deg] and median focal length [%] off the truth."""
+    lens = [100 * abs(a.matrix[0, 0] / b.matrix[0, 0] - 1) for a, b in zip(found, truth, strict=True)]
+    return float(np.median(turns_between(found, truth))), float(np.median(lens))
 
 
 def clock_error(found: FoundCameras, draw: Room) -> float:
@@ -251,29 +257,28 @@ def joint_errors(truth: Motion, start: float, motion: Motion) -> tuple[float, fl
 
 def run() -> None:
     """Print every figure of rooms with telephones."""
-    scores, refused = [], 0
+    scores: list[Score] = []
     for k in range(FIRST, FIRST + ROOMS):
         draw = room(k)
         what = f"# room {k}: {len(draw.rig)} telephones, {len(draw.truths)} people, {len(draw.seen[0].points)} frames"
         try:
-            one = score(draw)
+            scores.append(one := score(draw))
         except KinefitError as error:
-            refused += 1
             print(f"{what}: refused: {error}", flush=True)
             continue
-        scores.append(one)
         print(f"{what}: turn {one.rotation:.2f} deg, focal {one.focal:.1f} %, scale {one.scale:.1f} %, clock "
-              f"{one.clock:.2f} frames, joints {one.joints:.1f} mm of {one.known:.1f} known, angles {one.angles:.2f} deg, "
-              f"{one.inside:.1f} % inside", flush=True)  # fmt: skip
+              f"{one.clock:.2f} frames, joints {one.joints:.1f} mm of {one.known:.1f} known, angles {one.angles:.2f} "
+              f"deg, {one.inside:.1f} % inside", flush=True)  # fmt: skip
     figure("phones_rooms_ended", 100 * len(scores) / ROOMS, "% of rooms", ">= 95", "no room")
-    median = {name: float(np.median([getattr(s, name) for s in scores])) if scores else None for name in Score.__annotations__}
-    figure("phones_rooms_rotation", median["rotation"], "deg between two cameras, median", "<= 0.5", "no room ended")
-    figure("phones_rooms_focal", median["focal"], "%, median", "<= 2", "no room ended")
-    figure("phones_rooms_scale", median["scale"], "%, median", "<= 1.5", "no room ended")
-    figure("phones_rooms_clock", median["clock"], "frames, median", "<= 0.2", "no room ended")
-    ratio = float(np.median([s.joints / s.known for s in scores])) if scores else None
-    figure("phones_rooms_joints", ratio, "x the error with the true calibration, median", "<= 1.25", "no room ended")
-    figure("phones_rooms_angles", median["angles"], "deg from those with the true calibration, median", "<= 0.5", "no room ended")
-    inside = float(np.mean([s.inside for s in scores])) if scores else None
-    figure("phones_rooms_inside_least", inside, "% within 95 % bars", ">= 90", "no room ended")
-    figure("phones_rooms_inside_most", inside, "% within 95 % bars", "<= 98", "no room ended")
+
+    def said(name: str, values: list[float], unit: str, goal: str) -> None:
+        figure(f"phones_rooms_{name}", float(np.median(values)) if values else None, unit, goal, "no room ended")
+
+    said("rotation", [s.rotation for s in scores], "deg between two cameras, median", "<= 0.5")
+    said("focal", [s.focal for s in scores], "%, median", "<= 2")
+    said("scale", [s.scale for s in scores], "%, median", "<= 1.5")
+    said("clock", [s.clock for s in scores], "frames, median", "<= 0.2")
+    said("joints", [s.joints / s.known for s in scores], "x the error with the true calibration, median", "<= 1.25")
+    said("angles", [s.angles for s in scores], "deg from those with the true calibration, median", "<= 0.5")
+    said("inside_least", [s.inside for s in scores], "% within 95 % bars, median", ">= 90")
+    said("inside_most", [s.inside for s in scores], "% within 95 % bars, median", "<= 98")

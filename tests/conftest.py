@@ -62,3 +62,24 @@ def copy_take(drawn_take) -> Callable[[Path], Path]:
         return folder / "take.toml"
 
     return copy
+
+
+@pytest.fixture
+def write_frames():
+    """Function that writes a video with a frame at each of some steps of a rate [Hz], as grey as its step is late."""
+    import av
+    import numpy as np
+
+    def write(path, steps, rate=50, size=(640, 480)):
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream("mpeg4", rate=rate)
+            stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+            for step in steps:
+                grey = np.full((size[1], size[0], 3), 20 + 5 * step, np.uint8)
+                frame = av.VideoFrame.from_ndarray(grey, format="rgb24")
+                frame.pts = step
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+        return path
+
+    return write

@@ -225,7 +225,7 @@ def test_formats_may_stand_apart():
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [("up = ", 'unit = "mm"\nup = ', "'unit' belongs to [calibration], [[markers]], [[depth]]"),
-     ("rate = 30.0", "rate = 25.0", "Leave rate out of [take]: the videos state theirs"),
+     ("rate = 30.0", "rate = 35.0", "Leave rate out of [take]: the videos state theirs"),
      ("[[camera]]", "[camera]", "write [[camera]], the first one too"),
      ('format = "mediapipe"', 'format = "openpose"', '.npy files are of format = "mediapipe"'),
      ("mediapipe_cam02.npy", "mediapipe_cam01.npy", "mediapipe_cam01.npy is of camera cam02, too"),

@@ -31,6 +31,13 @@ def test_what_is_written_is_read(found, tmp_path):
     assert np.allclose(read.points, found.points, equal_nan=True, atol=1e-5)
     assert np.allclose(read.confidence, found.confidence, atol=1e-6)
     assert np.allclose(read.lifted, found.lifted, equal_nan=True, atol=1e-6)
+    assert read.times is None  # as in all files before there were times
+    uneven = [0.0, 0.02, 0.06]
+    write_detections(replace(found, times=uneven), path)
+    assert read_detections(path).times.tolist() == uneven
+    for wrong, problem in (([0.0, 0.1], "times of camera left"), ([0.0, 0.1, 0.1], "do not increase")):
+        with pytest.raises(ObservationError, match=problem):
+            replace(found, times=wrong)
     bare = replace(found, lifted=None)
     write_detections(bare, path, key="the key")
     assert read_detections(path).lifted is None

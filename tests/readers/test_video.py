@@ -36,10 +36,11 @@ def write(path, count=COUNT, rate=30, codec="mpeg4", **options):
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         stream.codec_context.gop_size = 12
         stream.codec_context.max_b_frames = options.get("b_frames", 2)
-        stream.codec_context.time_base = Fraction(1, rate)
-        for i in range(count):
+        pts = options.get("pts", range(count))
+        stream.codec_context.time_base = Fraction(1, options.get("ticks", rate))
+        for i, shown in enumerate(pts):
             frame = av.VideoFrame.from_ndarray(picture(options.get("first", 0) + i), format="rgb24")
-            frame.pts = i
+            frame.pts = shown
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
     return path
@@ -136,6 +137,53 @@ def test_cameras_in_step_with_time_offsets(tmp_path):
     assert steps == [(k + 3, k) for k in range(COUNT - 3)]
 
 
+DROPPED = [i for i in range(40) if not (12 <= i < 26 and i % 2)]  # frames that a telephone kept
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
+@pytest.mark.parametrize("first", [0, 7])
+def test_times_of_a_video_that_dropped_frames(tmp_path, suffix, first):
+    with Video(write(tmp_path / f"v{suffix}", pts=[first + i for i in DROPPED], b_frames=0)) as video:
+        np.testing.assert_allclose(video.times, np.array(DROPPED) / 30, atol=1e-3)  # mkv has milliseconds
+        assert video.rate == pytest.approx(30, rel=2e-3)
+        assert video.unevenness == "variable frame rate, 30 Hz nominal, 7 frames lacking between 0.4 and 0.867 s"
+        assert number(video.read(20)) == 20
+        assert [video.frame_at(i / 30) for i in DROPPED] == list(range(len(DROPPED)))
+        assert video.frame_at(13.4 / 30) == DROPPED.index(14)  # the nearest where one is lacking
+        assert (video.frame_at(-0.4 / 30), video.frame_at(-0.6 / 30)) == (0, None)
+        assert (video.frame_at(39.4 / 30), video.frame_at(39.6 / 30)) == (len(DROPPED) - 1, None)
+
+
+def test_times_of_a_rate_that_varies(tmp_path):
+    pts = np.cumsum(np.r_[0, np.random.default_rng(0).integers(28, 39, 39)])
+    with Video(write(tmp_path / "v.mp4", pts=pts.tolist(), ticks=1000, b_frames=0)) as video:
+        np.testing.assert_allclose(video.times, pts / 1000, atol=1e-4)
+        assert video.rate == pytest.approx(39 / (pts[-1] / 1000), rel=0.01)
+        assert video.unevenness.startswith("variable frame rate, ") and "lacking" not in video.unevenness
+
+
+def test_a_rate_of_the_header_that_the_times_contradict(tmp_path):
+    path = write(tmp_path / "v.mp4", rate=25, pts=[i * 40 for i in range(39)] + [39 * 40], ticks=1000)
+    with Video(path) as video:
+        assert video.rate == pytest.approx(25, rel=1e-3) and not video.unevenness
+
+
+def test_of_two_frames_at_one_time_the_first_is_shown(tmp_path):
+    path = tmp_path / "v.mkv"
+    with av.open(str(write(tmp_path / "one.mkv", b_frames=0))) as source, av.open(str(path), "w") as target:
+        given = source.streams.video[0]
+        stream = target.add_stream_from_template(given)
+        for packet in source.demux(given):
+            if packet.size:
+                if packet.pts >= 333:
+                    packet.pts = packet.dts = max(packet.pts - 33, 300)
+                packet.stream = stream
+                target.mux(packet)
+    with Video(path) as video:
+        assert len(video) == COUNT - 1 and np.all(np.diff(video.times) > 0.0)
+        assert [number(video.read(i)) for i in (8, 9, 10, 38)] == [8, 9, 11, 39]
+
+
 def test_streams_of_different_length_or_rate(tmp_path):
     long, short = write(tmp_path / "long.mp4"), write(tmp_path / "short.mp4", count=25)
     with pytest.raises(ObservationError, match="a 40 frames, b 25 frames") as caught:
@@ -145,8 +193,12 @@ def test_streams_of_different_length_or_rate(tmp_path):
         assert [number(images["b"]) for images in videos] == list(range(5, 25))
     with pytest.raises(ObservationError, match=r"\[0, 30\]"):
         VideoSet({"a": long, "b": short}, frames=(0, 30))
-    with pytest.raises(ObservationError, match="different rate: a 30 Hz, c 25 Hz"):
-        VideoSet({"a": long, "c": write(tmp_path / "c.mp4", rate=25)})
+    slow = write(tmp_path / "c.mp4", rate=15, count=20)
+    with VideoSet({"a": long, "c": slow}) as videos:
+        assert videos.rate == 30 and len(videos) == 39  # to the slow one's last frame
+        assert [number(videos.read(i)["c"]) for i in (0, 2, 10, 38)] == [0, 1, 5, 19]
+    with pytest.raises(ObservationError, match="a 40 frames, c 79 frames of 30 Hz"):
+        VideoSet({"a": long, "c": write(tmp_path / "c.mp4", rate=15)})
     with pytest.raises(ObservationError, match="no camera 'z'"):
         VideoSet({"a": long}, {"z": 1.0})
     with pytest.raises(ObservationError, match="no videos"):
@@ -155,7 +207,7 @@ def test_streams_of_different_length_or_rate(tmp_path):
 
 def test_common_frames_without_overlap():
     with pytest.raises(ObservationError, match="no time that all streams saw"):
-        common_frames({"a": 10, "b": 10}, {"b": 5.0}, 30.0)
+        common_frames({"a": np.arange(10) / 30, "b": np.arange(10) / 30 + 5.0}, 30.0)
 
 
 class SideData(Mapping):

@@ -66,8 +66,8 @@ def take_pictures(
         given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name)}
         with shown_video(take, seen, name) as video:
             for frame in frames:
-                shown = round((motion.times[frame] - offset) * video.rate)
-                if 0 <= shown < len(video):
+                shown = video.frame_at(motion.times[frame] - offset)
+                if shown is not None:
                     picture = close_up(video.read(shown), motion, frame, seen.rig[name], **given)
                     out.setdefault(name, {})[frame] = picture
     step("pictures", len(seen.videos), len(seen.videos))

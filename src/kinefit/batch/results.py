@@ -93,10 +93,10 @@ def write_overlays(
         offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
         given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name)}
         with shown_video(take, seen, name) as colour:
-            shown = min(max(round((middle - offset) * colour.rate), 0), len(colour) - 1)
-            at = nearest_frame(motion, shown / colour.rate + offset)
+            shown = colour.frame_at(float(np.clip(middle - offset, 0.0, colour.times[-1]))) or 0
+            at = nearest_frame(motion, colour.times[shown] + offset)
             pictures[name] = draw_overlay(colour.read(shown), motion, at, seen.rig[name], **given)
-            bar, count = f"overlay {name}", len(frames_of(motion, np.arange(len(colour)) / colour.rate + offset))
+            bar, count = f"overlay {name}", len(frames_of(motion, colour.times + offset))
             step(bar, 0, count)
             write_overlay(
                 motion, seen.rig[name], colour, folder / "overlays" / f"{name}.mp4", time_offset=offset,

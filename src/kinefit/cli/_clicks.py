@@ -84,8 +84,8 @@ def _pictures(take: Take, seen: Observations, step: int) -> dict[str, bytes]:
     for entry in take.cameras:
         if entry.name in seen.videos:
             with shown_video(take, seen, entry.name) as video:
-                frame = round(step - entry.time_offset * seen.rate)
-                if not 0 <= frame < len(video):  # its first or last image would be of another time
+                frame = video.frame_at(step / seen.rate - entry.time_offset)
+                if frame is None:  # its first or last image would be of another time
                     continue
                 picture = cv2.cvtColor(video.read(frame), cv2.COLOR_RGB2BGR)
             out[entry.name] = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes()

@@ -83,13 +83,14 @@ def init(
 def write_first_take(folder: Path) -> Path:
     """The take file of a folder that has none: guessed, shown, with the person's height where somebody answers."""
     from kinefit.exporters.atomic import write_text
-    from kinefit.readers.guess.folder import guess_take
+    from kinefit.readers.guess.folder import OPEN_HEIGHT, guess_take
 
     guess, out = guess_take(folder), folder / "take.toml"
     text = guess.text
     if sys.stdin.isatty() and "[calibration]" not in text:  # lengths then hang on the height alone
-        given = click.prompt("Height of the person in metres, Enter where you do not know it", default="", show_default=False)
-        text = text.replace("# height = 1.75  # open: the stature in metres, where you know it", f"height = {float(given)}") if given else text
+        asked = "Height of the person in metres; 0 where you do not know it"
+        height = click.prompt(asked, type=click.FloatRange(0.0, 2.8))
+        text = text.replace(f"# {OPEN_HEIGHT}", f"height = {height:g}") if height else text
     write_text(out, text)
     show(guess.notes)
     _screen.say(f"{out}: written, and used from now on.")

@@ -163,8 +163,9 @@ class VideoReplay(CameraSource):
         start, stop = self.frames
         with self._video as video:
             for k, image in enumerate(video.frames(start, stop)):
-                when = self.offset + (start + k) / video.rate
-                due = (k / video.rate + max(self.offset, 0.0)) / self.speed if self.speed else 0.0
+                time, first = float(video.times[start + k]), float(video.times[start])
+                when = self.offset + time
+                due = (time - first + max(self.offset, 0.0)) / self.speed if self.speed else 0.0
                 if self._stop.wait(max(due - self.clock.now(), 0.0)):
                     return
                 if not self._bring(inbox, image, when, wait=not self.speed):

@@ -12,6 +12,7 @@ from kinefit._image_headers import MAX_IMAGE_PIXELS
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.observations.arrays import freeze, frozen
+from kinefit.observations.depth import checked_times
 from kinefit.observations.recordings import Keypoints
 
 _FACE = "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer left_ear right_ear"
@@ -60,6 +61,8 @@ class Detections:
         image that shows nobody, the person is not seen.
     hand_confidence : (F, P, 2, 21), with `hands`
         Probability that a landmark is of this hand and in the image; 0 where a hand is not seen.
+    times : (F,) [s], optional
+        When each frame is shown, from the first frame on, increasing; None: at the rate.
     """
 
     camera: str
@@ -73,6 +76,7 @@ class Detections:
     lifted: NDArray | None = None
     hands: NDArray | None = None
     hand_confidence: NDArray | None = None
+    times: NDArray | None = None
 
     def __post_init__(self) -> None:
         points, confidence = frozen(self.points), frozen(self.confidence)
@@ -103,17 +107,21 @@ class Detections:
                 file=self.source or None, remedy="Give runs that sum up to the image's pixels.",
             )  # fmt: skip
         freeze(self, points=points, confidence=confidence, mask_runs=runs, mask_starts=starts, lifted=lifted)
-        freeze(self, hands=hands, hand_confidence=hand_confidence)
+        times = self.times
+        if times is not None:
+            times = checked_times(times, f"camera {self.camera}", self.source)
+            times = frozen(times, float, f"times of camera {self.camera}", points.shape[:1], self.source)
+        freeze(self, hands=hands, hand_confidence=hand_confidence, times=times)
 
     def within(self, first: int, frames: int) -> Detections:
-        """The same as frames from `first` on of a video of so many; nobody is seen in the others."""
+        """The same as frames from `first` on of a video of so many, without times; nobody is seen in the others."""
         after, people = frames - first - len(self), self.points.shape[1]
 
         def padded(array: NDArray, value: float = np.nan) -> NDArray:
             return np.pad(array, ((first, after), *[(0, 0)] * (array.ndim - 1)), constant_values=value)
 
         return replace(
-            self, points=padded(self.points), confidence=padded(self.confidence, 0.0),
+            self, points=padded(self.points), confidence=padded(self.confidence, 0.0), times=None,
             lifted=None if self.lifted is None else padded(self.lifted),
             hands=None if self.hands is None else padded(self.hands),
             hand_confidence=None if self.hand_confidence is None else padded(self.hand_confidence, 0.0),

@@ -50,8 +50,7 @@ def with_cameras(take: Take, progress: Step | None, tell: Tell) -> Take:
     if found is None or found.made_from != made_from:
         found = _find(take, made_from, progress)
         write_found(found, file)
-        for note in found.notes:
-            tell(note)
+        tell("\n".join(found.notes))
     offsets = dict(zip(found.rig.names, found.time_offsets, strict=True))
     cameras = tuple(
         msgspec.structs.replace(e, field_of_view=None, time_offset=e.time_offset + offsets[e.name])
@@ -74,8 +73,8 @@ def _find(take: Take, made_from: str, progress: Step | None) -> FoundCameras:
         up=take.up, sigma=median(entry.sigma for entry in take.keypoints), progress=progress,
     )
     changes = found.cameras.values()
-    notes = [f"Nothing tells where the cameras stand: found from the people in view. {line}" if k == 0 else line
-             for k, line in enumerate(found.told())]
+    first, *lines = found.told()
+    notes = [f"Nothing tells where the cameras stand: found from the people in view. {first}", "; ".join(lines)]
     if take.height is None:
         notes.append("No height is stated: all lengths are as unsure as the person's size, about 5 %. Write height.")
     return FoundCameras(

@@ -8,7 +8,7 @@ import shutil
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -83,8 +83,9 @@ def jobs_of_take(take: Take) -> list[DetectionJob]:
     """Every camera of a take that has a video; TakeError where none has."""
     from kinefit.readers.detections import detections_file
 
+    rate = _rate(take) if take.frames else 0.0
     found = [
-        DetectionJob(c.name, c.video, detections_file(take.path, c.name), take.rate, _seconds(take, c))
+        DetectionJob(c.name, c.video, detections_file(take.path, c.name), take.rate, _seconds(take, c, rate))
         for c in take.cameras if c.video is not None
     ]  # fmt: skip
     if not found:
@@ -94,17 +95,22 @@ def jobs_of_take(take: Take) -> list[DetectionJob]:
     return found
 
 
-def _seconds(take: Take, camera: CameraEntry) -> tuple[float, float] | None:
-    """Of a camera's video that lie in the take's frames, a frame more at both ends."""
-    if take.frames is None:
-        return None
+def _rate(take: Take) -> float:
+    """Rate [Hz] of a take's steps: its own, or the highest of its videos'."""
     from kinefit.readers.video import Video
 
-    rate = take.rate
-    if rate is None and camera.video is not None:
-        with Video(camera.video) as video:
-            rate = video.rate
-    assert rate is not None
+    rates = [take.rate or 0.0]
+    for camera in take.cameras if take.rate is None else ():
+        if camera.video is not None:
+            with Video(camera.video) as video:
+                rates.append(video.rate)
+    return max(rates)
+
+
+def _seconds(take: Take, camera: CameraEntry, rate: float) -> tuple[float, float] | None:
+    """Of a camera's video that lie in the take's frames, a step more at both ends."""
+    if take.frames is None:
+        return None
     start, stop = take.frames
     return (start - 1) / rate - camera.time_offset, (stop + 1) / rate - camera.time_offset
 
@@ -163,7 +169,7 @@ def seconds_of(job: DetectionJob, video: Video) -> tuple[int, int]:
     """Frames (first, stop) of a video that are looked through."""
     if job.seconds is None:
         return 0, len(video)
-    first, stop = (int(np.clip(np.ceil(s * video.rate), 0, len(video))) for s in job.seconds)
+    first, stop = (int(k) for k in np.searchsorted(video.times, np.array(job.seconds) - 1e-6))
     return first, stop
 
 
@@ -197,7 +203,7 @@ def _look_through(
             counted(video.frames(first, last)), models, camera=job.camera, rate=video.rate, people=people, masks=masks,
             source=str(job.video), with_hands=HandFollower(HandModels(files.folder, threads)) if hands else None,
         )
-        found = found.within(first, len(video))
+        found = replace(found.within(first, len(video)), times=video.times if video.unevenness else None)
     write_detections(found, job.file, key=key)
 
 

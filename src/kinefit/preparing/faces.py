@@ -113,7 +113,6 @@ def shown_video(take: Take, seen: Observations, camera: str) -> Video:
         return Video(path, rate=seen.rate)
     heads = ensure_faces(take, cameras=(camera,))[camera]
     offset = next(entry.time_offset for entry in take.cameras if entry.name == camera)
-    rate = seen.rate
 
     def of_keypoints(frame: int) -> NDArray:
         from kinefit.images.detectors.face_detector import head_circles
@@ -122,14 +121,13 @@ def shown_video(take: Take, seen: Observations, camera: str) -> Video:
         for keypoints in seen.keypoints:
             if keypoints.camera == camera:
                 named = [k for k, name in enumerate(keypoints.names) if _HEAD_POINTS.search(name.lower())]
-                at = round((frame / rate + offset - keypoints.time_offset) * keypoints.rate)
+                at = round((video.times[frame] + offset - keypoints.time_offset) * keypoints.rate)
                 near = keypoints.points[max(at - 1, 0) : max(at + 2, 0), :, named]
                 uv = seen.images[camera].from_calibration(near)
                 circles += [head_circles(uv.reshape(-1, len(named), 2))] if named else []
         return np.concatenate(circles)
 
-    video = HiddenVideo(path, heads, rate=rate, more=of_keypoints)
-    rate = video.rate
+    video = HiddenVideo(path, heads, rate=seen.rate, more=of_keypoints)
     return video
 
 

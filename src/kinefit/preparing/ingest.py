@@ -62,7 +62,7 @@ def hide_in_copies(path: Path, progress: Step | None, tell: Tell) -> list[Path]:
                 yield image
 
         with HiddenVideo(job.video, heads[job.camera], rate=job.rate, more=of_people) as video:
-            write_pictures(shown(video), copies[job.camera], video.rate, video.size)
+            write_pictures(shown(video), copies[job.camera], video.rate, video.size, times=video.times)
         if found is not None and key is not None:
             own, of_copy = detection_key(job), detection_key(replace(job, video=copies[job.camera]))
             write_detections(found, job.file, key=key.replace(own, of_copy, 1))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import FileError, ObservationError, choices
+from kinefit.observations.clocks import frame_times, is_even, steps_of, unevenness
 from kinefit.readers.image_folders import ImageFolder
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.ros.video import McapVideo
@@ -21,7 +22,9 @@ class Video:
     """One video, read by frame number in order of presentation: a file, or images in a folder.
 
     The frames of a file are counted by walking through it, not taken from its header; the display rotation that phones
-    write beside the picture is applied. Images are taken in the order of the numbers in their names.
+    write beside the picture is applied. Images are taken in the order of the numbers in their names. `times` (N,) [s]
+    are when each frame is shown, from the first frame on; uneven where the rate varies or frames were dropped, and
+    `rate` [Hz] is then the nominal one.
 
     Parameters
     ----------
@@ -52,6 +55,8 @@ class Video:
             self._source = ImageFolder(self.path, rate) if images else VideoFile(self.path)
         self.size: tuple[int, int] = self._source.size
         self.rate: float = self._source.rate
+        times = self._source.times
+        self.times: NDArray = frame_times(len(times), self.rate) if is_even(times, self.rate) else times
 
     def __len__(self) -> int:
         return len(self._source)
@@ -70,9 +75,15 @@ class Video:
         self._source.close()
 
     @property
-    def times(self) -> NDArray:
-        """(N,) [s] when each frame is shown, from the first frame; uneven where the rate varies."""
-        return self._source.times
+    def unevenness(self) -> str:
+        """How its frame rate varies, such as "variable frame rate, 60 Hz nominal, ..."; "" where it does not."""
+        return unevenness(self.times, self.rate)
+
+    def frame_at(self, time: float) -> int | None:
+        """Frame nearest to a time [s] from the first frame; None where that is half a frame or more outside."""
+        if not -0.5 <= time * self.rate <= self.times[-1] * self.rate + 0.5:
+            return None
+        return int(np.searchsorted((self.times[1:] + self.times[:-1]) / 2.0, time))
 
     def read(self, i: int) -> NDArray[np.uint8]:
         """Frame `i` as (H, W, 3) uint8 RGB, upright."""
@@ -87,22 +98,23 @@ class Video:
 
 
 class VideoSet:
-    """Several cameras in step: for every common time one image per camera.
+    """Several cameras at common times: for each the image that every camera showed then.
 
     Parameters
     ----------
     paths : {camera: path}
     time_offsets : {camera: float [s]}, optional
-        Added to frame / rate to get the common time; 0 where not given. Each time takes the nearest frame.
+        Added to the times of a video's frames to get the common time; 0 where not given. Each time takes the nearest
+        frame.
     rate : float [Hz], optional
         Of folders of images, which state none.
     frames : (start, stop), optional
-        Steps of the common time to use, t = step / rate; default is all that every camera saw.
+        Steps of the common time to use, t = step / rate, of the highest rate; default is all that every camera saw.
 
     Raises
     ------
     ObservationError
-        Streams of different rate or (without `frames`) of different length; the message tells each camera's.
+        Streams of different length without `frames`; the message tells each camera's.
     """
 
     def __init__(
@@ -122,16 +134,15 @@ class VideoSet:
         try:
             for camera, path in paths.items():
                 self.videos[camera] = Video(path, rate=rate)
-            self.rate: float = next(iter(self.videos.values())).rate
+            self.rate: float = max(video.rate for video in self.videos.values())
             offsets = {c: (time_offsets or {}).get(c, 0.0) for c in paths}
-            lengths = {c: len(video) for c, video in self.videos.items()}
-            check_rates({c: video.rate for c, video in self.videos.items()})
-            start, stop = common_frames(lengths, offsets, self.rate, frames)
+            clocks = {c: video.times + offsets[c] for c, video in self.videos.items()}
+            start, stop = common_frames(clocks, self.rate, frames)
         except BaseException:
             self.close()
             raise
         self.times: NDArray = np.arange(start, stop) / self.rate  # (N,) [s] of the take
-        self._frames = {c: np.rint((self.times - offsets[c]) * self.rate).astype(int) for c in paths}
+        self._frames = {c: [v.frame_at(t - offsets[c]) or 0 for t in self.times] for c, v in self.videos.items()}
 
     def __len__(self) -> int:
         return len(self.times)
@@ -154,41 +165,44 @@ class VideoSet:
         """{camera: (H, W, 3) uint8 RGB} at `times[i]`."""
         if not 0 <= i < len(self):
             raise ObservationError(f"no step {i}; there are 0 to {len(self) - 1}", place="videos")
-        return {camera: video.read(int(self._frames[camera][i])) for camera, video in self.videos.items()}
-
-
-def check_rates(rates: Mapping[str, float], *, file: str | PathLike[str] | None = None) -> None:
-    """Refuse streams whose rates [Hz] differ by more than 0.1 %."""
-    if max(rates.values()) > 1.001 * min(rates.values()):
-        listed = ", ".join(f"{name} {rate:.6g} Hz" for name, rate in rates.items())
-        videos = [rate for name, rate in rates.items() if name.startswith("video ")]
-        remedy = "Correct rate = ... of [[keypoints]], or resample the videos: ffmpeg -i IN -r RATE OUT."
-        alike = bool(videos) and max(videos) <= 1.001 * min(videos)
-        if alike and abs(rates.get("take", videos[0]) / videos[0] - 1.0) > 0.001:
-            remedy = "Leave rate out of [take]: the videos state theirs."
-        raise ObservationError(f"streams of different rate: {listed}", file=file, remedy=remedy)
+        return {camera: video.read(self._frames[camera][i]) for camera, video in self.videos.items()}
 
 
 def common_frames(
-    lengths: Mapping[str, int],
-    time_offsets: Mapping[str, float],
+    clocks: Mapping[str, NDArray],
     rate: float,
     frames: tuple[int, int] | None = None,
     *,
     file: str | PathLike[str] | None = None,
 ) -> tuple[int, int]:
-    """Steps (start, stop) of the common time t = step / rate at which every stream has a frame.
+    """Steps (start, stop) of the common time t = step / rate that the frames of every stream reach.
 
-    Raises ObservationError where streams of different length come without `frames`, or `frames` exceeds what all saw.
+    Streams whose own rate is another one, or varies, may end at times that differ by up to two of their frames.
+
+    Parameters
+    ----------
+    clocks : {stream: (N,) [s]} times of its frames in the take
+    rate : float [Hz] of the take
+    frames : (start, stop), optional, steps that are asked for
+    file : path, optional, of the take, for messages
+
+    Raises
+    ------
+    ObservationError
+        Streams of different length come without `frames`, or `frames` exceeds what all saw.
     """
-    begins = {name: round(time_offsets.get(name, 0.0) * rate) for name in lengths}
-    start, stop = max(begins.values()), min(begins[name] + n for name, n in lengths.items())
-    shifts = {name: f" from step {begin}" if begin else "" for name, begin in begins.items()}
-    listed = ", ".join(f"{name} {n} frames{shifts[name]}" for name, n in lengths.items())
+    spans = {name: steps_of(times, rate) for name, times in clocks.items()}
+    start, stop = max(begin for begin, _ in spans.values()), min(end for _, end in spans.values())
+    uneven = {name: np.median(np.diff(times)) for name, times in clocks.items() if not is_even(times, rate)}
+    listed = ", ".join(
+        f"{n} {end - begin} frames{f' of {rate:.4g} Hz' * (n in uneven)}{f' from step {begin}' * bool(begin)}"
+        for n, (begin, end) in spans.items()
+    )
     if start >= stop:
         raise ObservationError(f"no time that all streams saw: {listed}", file=file, remedy="Check the time offsets.")
     if frames is None:
-        if len(set(lengths.values())) > 1:
+        slack = np.ceil(2.0 * rate * max(uneven.values(), default=0.0) - 1e-6)
+        if np.ptp([end - begin for begin, end in spans.values()]) > slack:
             raise ObservationError(
                 f"streams of different length: {listed}", file=file,
                 remedy=f"If they start together, take what all saw: frames = [{start}, {stop}].",

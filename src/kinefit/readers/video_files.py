@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from kinefit._image_headers import MAX_IMAGE_PIXELS
 from kinefit._pictures import check_image_size
 from kinefit.errors import FileError
+from kinefit.observations.clocks import is_even, nominal_rate
 
 _FORWARD = 64  # frames that are decoded and dropped rather than sought over
 _HIDDEN = ("vp8",)  # codecs with packets that show nothing, so that packets cannot be counted
@@ -36,6 +37,7 @@ class VideoFile:
             raise
         height, width = (first.height, first.width) if self._quarter_turns % 2 == 0 else (first.width, first.height)
         self.size: tuple[int, int] = (width, height)
+        self.times: NDArray = (np.array(self._pts) - self._pts[0]) * float(self._stream.time_base or 0)
         self.rate: float = self._measure_rate()
         self._restart()
 
@@ -45,11 +47,6 @@ class VideoFile:
     def close(self) -> None:
         """Close the file."""
         self._container.close()
-
-    @property
-    def times(self) -> NDArray:
-        """(N,) [s] when each frame is shown, from the first frame; uneven where the rate varies."""
-        return (np.array(self._pts) - self._pts[0]) * float(self._stream.time_base or 0)
 
     def image(self, i: int) -> NDArray[np.uint8]:
         """Frame `i` as (H, W, 3) uint8 RGB, upright."""
@@ -93,7 +90,8 @@ class VideoFile:
         measured = (len(self) - 1) / span if span > 0 else 0.0
         if not (stated or measured):
             raise FileError("the video tells no frame rate", file=self.path, remedy="Give it: ffmpeg -r RATE -i ...")
-        return stated if stated and (not measured or abs(measured / stated - 1) < 0.02) else measured
+        even = (rate for rate in (stated, measured) if rate and is_even(self.times, rate))
+        return next(even, 0.0) or nominal_rate(self.times)
 
 
 def open_container(path: Path) -> Any:
@@ -147,8 +145,8 @@ def _presentation_times(path: Path) -> list[int]:
     with _open(path) as container:
         stream = container.streams.video[0]
         stated, rate, base = stream.frames, float(stream.average_rate or 0), float(stream.time_base or 0)
-        if not stated and len(container.streams) == 1 and container.duration and container.size > 0:
-            stated = int(container.duration / av.time_base * rate * 0.98) - 2  # of the duration, which is rounded
+        alone = len(container.streams) == 1 and container.duration and container.size > 0
+        duration = container.duration / av.time_base if alone else 0.0
         try:
             for packet in container.demux(stream):
                 if packet.size and packet.is_corrupt:
@@ -160,17 +158,20 @@ def _presentation_times(path: Path) -> list[int]:
         except (av.FFmpegError, ValueError) as error:
             problem = str(error)
         hidden = stream.codec_context.name in _HIDDEN
+    last = base * max((time for time in pts if time is not None), default=0)
+    if not stated and last < 0.98 * duration - 3.0 / (rate or np.inf):  # the duration is rounded
+        stated = int(duration * rate * 0.98) - 2
     if problem or packets < stated:
         told = f" of {stated}" if stated > packets else ""
         raise FileError(
             f"the video is truncated: {packets}{told} frames can be read" + (f" ({problem})" if problem else ""),
             file=path, remedy="Copy the file again, or keep its readable part: ffmpeg -i IN -c copy OUT.",
         )
-    if hidden or None in pts or len(set(pts)) < len(pts) or not base:
+    if hidden or None in pts or not base:
         pts = _decoded_times(path)
     if not pts:
         raise FileError("no frame of this video can be decoded", file=path, remedy=_REMEDY)
-    return sorted(pts)  # type: ignore[type-var,arg-type]
+    return sorted(set(pts))  # type: ignore[type-var,arg-type]  # of two frames at one time the first is shown
 
 
 def _decoded_times(path: Path) -> list[int | None]:
@@ -179,7 +180,7 @@ def _decoded_times(path: Path) -> list[int | None]:
             pts = [frame.pts for frame in container.decode(video=0)]
         except (av.FFmpegError, ValueError) as error:
             raise FileError(f"the video cannot be decoded ({error})", file=path, remedy=_REMEDY) from error
-    if None in pts or len(set(pts)) < len(pts):
+    if None in pts:
         raise FileError("frames without times", file=path, remedy="Repack it: ffmpeg -i IN -c copy OUT.mp4.")
     return pts
 

@@ -140,9 +140,7 @@ class CameraImages:
 
     def frame(self, name: str, time: float) -> int | None:
         """Frame of a camera's video nearest to a time [s] of the take; None outside of the video."""
-        video = self._videos[name]
-        i = round((time - self._offsets.get(name, 0.0)) * video.rate)
-        return i if 0 <= i < len(video) else None
+        return self._videos[name].frame_at(time - self._offsets.get(name, 0.0))
 
     def read(self, name: str, time: float, longest: int) -> NDArray[np.uint8] | None:
         """(h, w, 3) uint8 RGB flat picture of a camera at a time [s]; None without video, or outside of it."""

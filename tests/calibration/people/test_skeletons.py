@@ -9,9 +9,10 @@ from tests.calibration.people_data import BODY, room, walker
 
 from kinefit.calibration.people.calibrate import calibrate_people
 from kinefit.calibration.people.skeletons import first_cameras, in_step
+from kinefit.calibration.refine.refine import check_result
+from kinefit.calibration.refine.result import CameraChange
 from kinefit.errors import CalibrationError
 from kinefit.geometry import se3
-from kinefit.geometry.camera import Rig
 from kinefit.simulation import simulate_keypoints
 
 FRAMES = 90
@@ -104,20 +105,26 @@ def test_one_video_twice_is_refused():
 
 
 def test_a_camera_of_another_day_is_named():
+    """One that shows the same person backwards."""
     one = list(seen())
-    random = np.random.default_rng(0)
-    steps = np.cumsum(random.normal(0.0, 0.05, one[3].lifted.shape), axis=0)
-    one[3] = replace(one[3], lifted=steps - steps[:, :, 23:25].mean(axis=2, keepdims=True))
+    turned = {what: getattr(one[3], what)[::-1] for what in ("points", "confidence", "lifted")}
+    one[3] = replace(one[3], **turned)
     with pytest.raises(CalibrationError, match="cam04"):
-        first_cameras(guessed(), one, within=0.5)
+        calibrate_people(guessed(), one, BODY, sigma=2.0, focal=True, time_offsets=True, up="z")
 
 
 def test_a_motion_that_tells_no_lens_is_refused():
-    """Half a second of somebody who stands."""
-    short = [record.rows(slice(0, 12), 0.0) for record in seen()]
-    with pytest.raises(CalibrationError) as caught:
-        calibrate_people(guessed(), short, BODY, sigma=8.0, focal=True, time_offsets=True, up="z")
-    assert caught.value.remedy
+    still = CameraChange(5.0, 5.0, np.zeros(2), 0.1, 0.1, 0.2, 0.0, 0.02, 0.1, 0.3, 0.0, 20.0)
+    changes = {name: still for name in room().names}
+    with pytest.raises(CalibrationError, match="does not tell the lenses.*cam01 to 30 %.*walks"):
+        check_result(room(), changes, 0.2, times=10.0)
+
+
+def test_somebody_who_stands_still_tells_nothing_of_clocks():
+    still = [replace(r, **{w: np.repeat(getattr(r, w)[:1], 30, axis=0) for w in ("points", "confidence", "lifted")})
+             for r in seen()]
+    with pytest.raises(CalibrationError, match="moves like nobody.*somebody who moves"):
+        first_cameras(guessed(), still, within=1.0)
 
 
 def test_frames_are_moved_whole():

@@ -165,7 +165,7 @@ BAD = {
     "image size": (
         lambda t: swap(t, "calibration.toml", "^size = .*", "size = [1280.0, 720.0]"), "camera cam01", "544x960",
     ),
-    "rates": (lambda t: swap(t, "take.toml", "^rate = .*", "rate = 25.0"), "take.toml", "take 25 Hz, video cam01 30"),
+    "rates": (lambda t: swap(t, "take.toml", "^rate = .*", "rate = 35.0"), "take.toml", "take 35 Hz, video cam01 30"),
     "lengths": (lambda t: landmarks(t, lambda a: a[:-7]), "take.toml", "keypoints cam02 53 frames"),
     "nan": (lambda t: landmarks(t, with_nan), "frame 3", "right_eye_inner"),
     "nobody": (lambda t: landmarks(t, np.zeros_like), "mediapipe_cam02.npy", "nobody"),

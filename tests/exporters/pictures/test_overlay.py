@@ -137,6 +137,18 @@ def test_every_picture_is_in_the_video(tmp_path, motion, size):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["in.mkv", "out.mp4"]
 
 
+def test_an_overlay_has_the_times_of_its_video(tmp_path, motion):
+    times = (2.0 + np.array([0, 1, 2, 4, 6, 8, 9])) / 60
+    with Video(a_video(tmp_path / "in.mkv", (320, 480), 7)) as video:
+        video.times = times - times[0]
+        write_overlay(motion, CAMERA, video, tmp_path / "out.mp4", time_offset=2.0)
+    with Video(tmp_path / "out.mp4") as out:
+        np.testing.assert_allclose(out.times, times - times[0], atol=1e-4)
+        a, b = CAMERA.project(motion.positions(motion.body.landmarks.select(("r_hip", "r_knee")))[8])
+        patch = at(out.read(5).astype(int), 0.5 * (a + b))  # shown at step 8
+        assert patch[0] > patch[2] + 40
+
+
 def test_only_the_motion_s_pictures_are_drawn(tmp_path, motion):
     path, done = a_video(tmp_path / "in.mkv", (320, 480), 20), []
     part = cut(motion, 0, 4)

@@ -148,8 +148,33 @@ def test_streams_of_different_length(small):
 
 
 def test_streams_of_different_rate(small):
-    with pytest.raises(ObservationError, match="different rate: take 50 Hz, keypoints a 60 Hz"):
-        load(small, take_text(keys='set = "COCO_17"\nrate = 60'))
+    seen = load(small, take_text(keys='set = "COCO_17"\nrate = 60'))
+    assert (seen.rate, seen.frames) == (50.0, (0, 8))  # of a the last point is at 0.15 s
+    x = seen.keypoints[0].points[:, 0, 0, 0]
+    np.testing.assert_allclose(x, 10 + np.arange(8) * 60 / 50)
+    assert seen.keypoints[1].points[7, 0, 0, 0] == 17
+    with pytest.raises(ObservationError, match="keypoints a 16 frames of 50 Hz, keypoints b 10 frames"):
+        load(small, take_text(keys='set = "COCO_17"\nrate = 30'))
+
+
+def test_keypoints_take_the_times_of_the_video_beside_them(small, write_frames):
+    kept = [0, 1, 2, 4, 6, 8, 9, 10, 11, 13]  # steps of 50 Hz
+    write_frames(small / "a.mp4", kept)
+    write_frames(small / "b.mp4", range(7), rate=25)
+    for i in (7, 8, 9):
+        (small / "b" / f"b_{i:04d}.json").unlink()
+    text = take_text(head="", a='video = "a.mp4"', b='video = "b.mp4"\ntime_offset = 0.02')
+    seen = load(small, text)
+    assert seen.rate == pytest.approx(50) and seen.frames == (1, 14)
+    np.testing.assert_allclose(seen.keypoints[0].points[:, 0, 0, 0], 10 + np.interp(np.arange(1, 14), kept, range(10)))
+    np.testing.assert_allclose(seen.keypoints[1].points[:, 0, 0, 0], 10 + np.arange(13) / 2, atol=1e-6)
+    assert "video a: variable frame rate, 50 Hz nominal, 4 frames lacking between 0.04 and 0.26 s" in seen.notes
+    assert seen.notes[-1] == "take 50 Hz, video a 50 Hz, video b 25 Hz: points are interpolated between frames"
+    assert load(small, text.replace("[take]", "[take]\nrate = 25", 1)).frames == (0, 7)
+    with pytest.raises(ObservationError, match="above that of every video: take 60 Hz, video a 50 Hz, video b 25 Hz"):
+        load(small, text.replace("[take]", "[take]\nrate = 60", 1))
+    with pytest.raises(ObservationError, match="the keypoints have 30 Hz, and the video of as many frames 50 Hz"):
+        load(small, text.replace('set = "COCO_17"', 'set = "COCO_17"\nrate = 30', 1))
 
 
 def test_nothing_tells_the_rate(small):

@@ -61,12 +61,20 @@ class NumberedImages:
 
 
 class Frames(Video):
-    """A video of one camera by frame number."""
+    """A video of one camera by frame number, or by steps of a rate [Hz] (`put_on`): those nearest to its frames."""
+
+    def put_on(self, rate: float) -> None:
+        """Count frames by steps of this rate [Hz], of which some may be without."""
+        self._frames = {round(float(time) * rate): i for i, time in enumerate(self.times)}
 
     @property
     def numbers(self) -> tuple[int, ...]:
         """Of the frames that there are."""
-        return tuple(range(len(self)))
+        return tuple(self._frames)
+
+    def read(self, i: int) -> NDArray[np.uint8]:
+        """The frame of step `i` as (H, W, 3) uint8 RGB, upright."""
+        return super().read(self._frames[i])
 
 
 def camera_sources(paths: Iterable[str | PathLike[str]]) -> dict[str, Path | dict[int, Path]]:
@@ -197,7 +205,10 @@ def opened(sources: Mapping[str, Path | dict[int, Path]]) -> Iterator[dict[str, 
     try:
         for name, source in sources.items():
             cameras[name] = NumberedImages(source) if isinstance(source, dict) else Frames(source)
-        _check_lengths({name: len(o) for name, o in cameras.items() if isinstance(o, Frames)})
+        videos = {name: camera for name, camera in cameras.items() if isinstance(camera, Frames)}
+        for video in videos.values():
+            video.put_on(max(other.rate for other in videos.values()))
+        _check_lengths({name: video.numbers[-1] + 1 for name, video in videos.items()})
         yield cameras
     finally:
         for camera in cameras.values():

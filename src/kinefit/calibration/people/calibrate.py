@@ -31,6 +31,7 @@ from kinefit.solvers.bundle.cameras import FOCAL, TIME, CameraPrior, PointPixels
 
 _SURE = 0.3  # confidence of a keypoint that takes part in the start
 _MOST = 2500  # points in space of the start
+_FREE = 1000  # of more people, beside the one whose body is fitted
 _ANYWHERE = 20.0, 3.0  # [m], [rad] no prior to speak of
 _GUESSED = 0.25  # of a focal length's logarithm: 64 degrees stand for 52 to 78 (one standard deviation)
 _CLOCKS, _NEAR_CLOCKS = 2.0, 0.05  # [s] clocks of cameras that were started by hand; what the first look leaves
@@ -57,10 +58,10 @@ def calibrate_people(
 ) -> Refinement:
     """Poses of cameras whose intrinsics are known, from a person who moves in front of them.
 
-    Where a network lifted the person to space in each camera, these skeletons are laid on each other: turns, clocks and
+    Where a network lifted people to space in each camera, these skeletons are laid on each other: turns, clocks and
     distances come from them (`first_cameras`). Else essential matrices choose the pair to start from, and the other
-    cameras are laid on its points (`first_rig`). Free points, then the body with its constant bone lengths, are adjusted
-    together with all cameras.
+    cameras are laid on its points (`first_rig`). Free points, then the body of one person with its constant bone
+    lengths beside the free points of the others, are adjusted together with all cameras.
 
     Parameters
     ----------
@@ -87,22 +88,22 @@ def calibrate_people(
     late = np.zeros(len(given), int)
     rate, frames = keypoints[0].rate, len(keypoints[0])
     first: Rig | None = None
+    others: Sequence[Sequence[Keypoints]] = ()
     if all(record.lifted is not None for record in keypoints):
         start = first_cameras(cameras, keypoints, within=_CLOCKS if time_offsets else 0.0)
-        first, alone, late = start.rig, list(start.people), start.frames_late
+        first, alone, others, late = start.rig, list(start.people), start.others, start.frames_late
     else:
         alone = [steady_person(record) for record in keypoints]
     keypoints = [in_step(record, n, frames) for record, n in zip(keypoints, late, strict=True)]
-    alone = [in_step(record, n, frames) for record, n in zip(alone, late, strict=True)]
-    together = person_records(alone, [np.zeros(frames, int) for _ in alone])
-    channels = make_channels(body, given, together, [sigma] * len(alone))
-    uv = common_pixels(channels)
+    seen = [_common(body, given, one, late, frames, sigma) for one in (alone, *others)]
+    (points, uv), *beside = seen
     rig = first or first_rig(given, uv.reshape(-1, len(given), 2), sigma)
     step("first cameras", 1, 2)
     spread = _GUESSED if focal else 0.0
-    rig, x = _adjusted(rig, given, uv, sigma, focal=spread, clock=_NEAR_CLOCKS if time_offsets else 0.0, rate=rate)
-    factor = _whole_scale(body, channels.points, x, height)
-    rig = settled(resized(rig, factor), factor * x, _above_soles(body, channels.points), up=up)
+    clock = _NEAR_CLOCKS if time_offsets else 0.0
+    rig, x = _adjusted(rig, given, [u for _, u in seen], sigma, focal=spread, clock=clock, rate=rate)
+    factor = _whole_scale(body, points, x, height)
+    rig = settled(resized(rig, factor), factor * x, _above_soles(body, points), up=up)
     step("first cameras", 2, 2)
     prior_std = prior_sigma(len(rig), focal=focal, distortion=False, time_offsets=time_offsets)
     prior_std[:, :3], prior_std[:, 3:6], prior_std[:, FOCAL] = *_ANYWHERE, spread
@@ -112,10 +113,34 @@ def calibrate_people(
         return _on_the_floor(rig, seen, body, height, known_length, up)
 
     trial = PersonTrial(keypoints, body, up, sigma)
-    found = refine_from(rig, trial, prior, stand, progress=progress, from_scratch=True)
+    free = free_points(rig, [u for _, u in beside], sigma)
+    found = refine_from(rig, trial, prior, stand, free=free, progress=progress, from_scratch=True)
     offsets = {name: found.time_offsets[name] + float(n) / rate for name, n in zip(rig.names, late, strict=True)}
     clocks = {name: replace(found.cameras[name], time=offsets[name]) for name in rig.names}
     return replace(found, time_offsets=offsets, cameras=clocks)
+
+
+def _common(
+    body: Body, rig: Rig, one: Sequence[Keypoints], late: NDArray, frames: int, sigma: float
+) -> tuple[PointSet, NDArray]:
+    """Points of one person, and (F, K, C, 2) [px] where each camera saw them, by whole frames in step."""
+    moved = [in_step(record, int(n), frames) for record, n in zip(one, late, strict=True)]
+    records = person_records(moved, [np.zeros(frames, int) for _ in moved])
+    channels = make_channels(body, rig, records, [sigma] * len(moved))
+    return channels.points, common_pixels(channels)
+
+
+def free_points(rig: Rig, people: Sequence[NDArray], sigma: float) -> PointPixels:
+    """Points of more people (F, K, C, 2) [px] each, free in every frame: those that cameras agree on.
+
+    They tell of the cameras wherever these people were, and nothing of bodies.
+    """
+    flat = np.concatenate([np.zeros((0, len(rig), 2)), *(uv.reshape(-1, len(rig), 2) for uv in people)])
+    agree = triangulate_robust(rig, flat, max_residual_px=2.0 * _AGREE * sigma)[1]
+    good = np.flatnonzero(agree.sum(axis=1) >= 2)
+    good = good[np.unique(np.linspace(0, len(good) - 1, min(_FREE, len(good))).astype(int))] if len(good) else good
+    point, camera = np.nonzero(agree[good] & np.isfinite(flat[good]).all(axis=-1))
+    return PointPixels(camera, point, flat[good][point, camera], np.full(len(point), sigma**-2))
 
 
 def common_pixels(channels: Channels) -> NDArray:
@@ -127,15 +152,16 @@ def common_pixels(channels: Channels) -> NDArray:
 
 
 def _adjusted(
-    rig: Rig, given: Rig, uv: NDArray, sigma: float, *, focal: float, clock: float, rate: float
+    rig: Rig, given: Rig, people: Sequence[NDArray], sigma: float, *, focal: float, clock: float, rate: float
 ) -> tuple[Rig, NDArray]:
-    """The rig adjusted with free points, from coarse to fine, and the points (F, K, 3) in its units.
+    """The rig adjusted with free points, from coarse to fine, and the first person's points (F, K, 3) in its units.
 
     focal: standard deviation of the logarithm of the lenses' focal lengths about the given ones, clock [s] of what is
     left of the cameras' offsets; 0 holds them.
     """
-    flat = uv.reshape(-1, len(rig), 2)
-    speed = np.nan_to_num(np.gradient(uv, axis=0) * rate).reshape(flat.shape)
+    flat = np.concatenate([uv.reshape(-1, len(rig), 2) for uv in people])
+    speed = np.concatenate([np.gradient(uv, axis=0).reshape(-1, len(rig), 2) for uv in people])
+    speed = np.nan_to_num(speed * rate)
     many = np.flatnonzero(np.isfinite(flat).all(axis=-1).sum(axis=1) >= 2)
     many = many[np.unique(np.linspace(0, len(many) - 1, min(_MOST, len(many))).astype(int))]
     offsets = np.zeros(len(rig))
@@ -155,8 +181,9 @@ def _adjusted(
         mean = Rig(tuple(replace(a, matrix=b.matrix) for a, b in zip(rig, given, strict=True)))
         bundle = bundle_adjust(rig, pixels, x[good], CameraPrior(mean, prior_std), offsets=offsets)
         rig, offsets = bundle.rig, bundle.offsets
-    x = triangulate_robust(rig, flat, max_residual_px=_AGREE * sigma)[0]
-    return rig, x.reshape(*uv.shape[:2], 3)
+    first = people[0].reshape(-1, len(rig), 2)
+    x = triangulate_robust(rig, first, max_residual_px=_AGREE * sigma)[0]
+    return rig, x.reshape(*people[0].shape[:2], 3)
 
 
 def _whole_scale(body: Body, points: PointSet, x: NDArray, height: float | None) -> float:

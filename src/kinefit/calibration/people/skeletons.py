@@ -23,7 +23,11 @@ _PEOPLE = 4  # of one camera that are tried
 _LEAST, _SHARE = 10, 0.4  # frames in common, and share of the shorter record, without which clocks are not compared
 _SCALE = 0.05  # [m] of the loss: landmarks of two cameras that are farther apart count less (Geman-McClure)
 _STRANGERS = 0.9  # of 1 less the correlation of their movements: another person, or another day
+_ALIKE = 0.5  # the same, of one among several people of a camera, with the clocks set
 _SAME = 1.5  # [px] two cameras whose every landmark is nearer show one video twice
+
+
+_Pair = tuple[int, int, int, int]  # camera, person of it, camera, person of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +37,14 @@ class FirstCameras:
     Parameters
     ----------
     rig : Rig, in the first camera's axes [m], of a person of the network's idea of size.
-    people : for each camera the record of the one person alone.
+    people : for each camera the record of the one person alone, whom most cameras show.
+    others : the same of others; of a camera that does not show them, a record of nobody.
     frames_late : (C,) int [frames] to add to each camera's own, the first camera's being 0.
     """
 
     rig: Rig
     people: tuple[Keypoints, ...]
+    others: tuple[tuple[Keypoints, ...], ...]
     frames_late: NDArray
 
 
@@ -74,8 +80,8 @@ def first_cameras(cameras: Sequence[Camera], keypoints: Sequence[Keypoints], *, 
 
     A network that lifts a person tells the turn of each camera against the person to 5 to 25 degrees, from any side;
     two cameras are turned against each other, and their clocks set, so that their skeletons lie on each other in all
-    frames (W. Kabsch, 1976, robustly), and move alike. The distance comes from the person's size in the image. Cameras are taken in
-    along the pairs that agree best.
+    frames (W. Kabsch, 1976, robustly), and move alike. The distance comes from the person's size in the image. Cameras
+    are taken in along the pairs that agree best, whichever person it is.
 
     Parameters
     ----------
@@ -91,22 +97,24 @@ def first_cameras(cameras: Sequence[Camera], keypoints: Sequence[Keypoints], *, 
     seen = [_skeletons(c, k) for c, k in zip(cameras, keypoints, strict=True)]
     _refuse_doubles(seen)
     most = round(within * keypoints[0].rate)
-    pairs: dict[tuple[int, int, int, int], _Match] = {}
+    pairs: dict[_Pair, _Match] = {}
     for i, j in combinations(range(len(seen)), 2):
         for p, q in product(range(len(seen[i])), range(len(seen[j]))):
             if (match := _matched(seen[i][p], seen[j][q], most)) is not None:
                 pairs[i, p, j, q] = match
                 pairs[j, q, i, p] = _Match(match.R.T, -match.lag, match.unlike[::-1])
-    trees = [t for p in range(len(seen[0])) if (t := _tree(p, len(seen), pairs)) is not None]
-    if not trees:
-        raise _strangers(cameras, pairs)
-    _, person, parent = min(trees, key=lambda tree: tree[0])
-    late = _clocks(person, pairs, most)
+    tree = _tree(cameras, pairs)
+    late = _clocks(len(seen), pairs, most)
     Ts = {0: np.eye(4)}
-    for j, i in parent.items():  # in the order in which they were taken in
-        Ts[j] = _laid(seen[i][person[i]], seen[j][person[j]], int(late[i] - late[j])) @ Ts[i]
+    for i, p, j, q in tree:  # in the order in which they were taken in
+        Ts[j] = _laid(seen[i][p], seen[j][q], int(late[i] - late[j])) @ Ts[i]
     rig = Rig(tuple(camera.with_pose(Ts[c]) for c, camera in enumerate(cameras)))
-    return FirstCameras(rig, tuple(seen[c][person[c]].record for c in range(len(cameras))), late)
+    people = [
+        tuple(seen[c][one[c]].record if c in one else record.of_one(np.full(len(record), -1))
+              for c, record in enumerate(keypoints))
+        for one in _people([len(them) for them in seen], pairs, late, most)
+    ]  # fmt: skip
+    return FirstCameras(rig, people[0], tuple(people[1:]), late)
 
 
 def in_step(record: Keypoints, late: int, length: int) -> Keypoints:
@@ -231,45 +239,73 @@ def _matched(a: _Skeleton, b: _Skeleton, most: int) -> _Match | None:
     return _Match(R, lag, unlike)
 
 
-def _tree(
-    root: int, count: int, pairs: dict[tuple[int, int, int, int], _Match]
-) -> tuple[float, dict[int, int], dict[int, int]] | None:
-    """From a person of the first camera, all others taken in by what moves most alike: cost, people, parents."""
-    person: dict[int, int] = {0: root}
-    parent: dict[int, int] = {}
-    cost = 0.0
-    while len(person) < count:
-        near = [key for key in pairs if person.get(key[0]) == key[1] and key[2] not in person]
-        key = min(near, key=lambda k: pairs[k].cost, default=None)
-        if key is None or pairs[key].cost > _STRANGERS:
-            return None
-        person[key[2]], parent[key[2]], cost = key[3], key[0], cost + pairs[key].cost
-    return cost, person, parent
+def _tree(cameras: Sequence[Camera], pairs: dict[_Pair, _Match]) -> list[_Pair]:
+    """Pairs along which all cameras are taken in, those first whose people move most alike."""
+    tree: list[_Pair] = []
+    there = {0}
+    while len(there) < len(cameras):
+        near = [key for key in pairs if key[0] in there and key[2] not in there]
+        best = min(near, key=lambda k: pairs[k].cost, default=None)
+        if best is None or pairs[best].cost > _STRANGERS:
+            alone = next(c for c in range(len(cameras)) if c not in there)
+            raise CalibrationError(
+                f"whom {cameras[alone].name} saw moves like nobody before the other cameras",
+                place=f"camera {cameras[alone].name}",
+                remedy="Record somebody who moves. Check that it is of the same recording, shows the same person at "
+                "the same time, and was started within two seconds of the others; or leave it out.",
+            )  # fmt: skip
+        tree.append(best)
+        there.add(best[2])
+    return tree
 
 
-def _clocks(person: dict[int, int], pairs: dict[tuple[int, int, int, int], _Match], most: int) -> NDArray:
+def _clocks(count: int, pairs: dict[_Pair, _Match], most: int) -> NDArray:
     """(C,) int [frames] to add to each camera's: with which all pairs together move most alike."""
-    count = len(person)
-    curves = {
-        (i, j): np.minimum(pairs[key].unlike, 1.0)
-        for i in range(count) for j in range(count)
-        if i != j and (key := (i, person[i], j, person[j])) in pairs
-    }
-    late = np.zeros(count, int)
+    curves: dict[tuple[int, int], NDArray] = {}
+    for i, j in product(range(count), range(count)):
+        of = [match for key, match in pairs.items() if (key[0], key[2]) == (i, j)]
+        if of:
+            curves[i, j] = np.minimum(min(of, key=lambda match: match.cost).unlike, 1.0)
+    late, at = np.zeros(count, int), np.arange(-most, most + 1)
     for turn in range(2 * count):
         before = late.copy()
         for j in range(1, count):
-            others = [i for i in range(count) if (i, j) in curves and (i < j or turn)]
-            at = np.arange(-most, most + 1)
             total = np.zeros(len(at))
-            for i in others:
-                lag = late[i] - at  # of j's frames behind i's
-                curve = curves[i, j]
-                total += np.where(np.abs(lag) <= most, curve[np.clip(lag + most, 0, 2 * most)], 1.0)
+            for i in range(count):
+                if (i, j) in curves and (i < j or turn):
+                    lag = late[i] - at  # of j's frames behind i's
+                    known = np.abs(lag) <= most
+                    total += np.where(known, curves[i, j][np.clip(lag + most, 0, 2 * most)], 1.0)
             late[j] = at[np.argmin(total)]
         if turn and np.array_equal(before, late):
             break
     return late
+
+
+def _people(counts: Sequence[int], pairs: dict[_Pair, _Match], late: NDArray, most: int) -> list[dict[int, int]]:
+    """People as {camera: which}, those in most cameras first; with the clocks set, whom two cameras show move alike."""
+
+    def unlike(i: int, p: int, j: int, q: int) -> float:
+        lag = int(late[i] - late[j])
+        match = pairs.get((i, p, j, q))
+        return np.inf if match is None or abs(lag) > most else float(match.unlike[lag + most])
+
+    left = {(c, p) for c, count in enumerate(counts) for p in range(count)}
+    out: list[tuple[int, float, dict[int, int]]] = []
+    while left:
+        tried = []
+        for root in left:
+            one, cost = {root[0]: root[1]}, 0.0
+            while True:
+                near = [(unlike(i, p, *other), other) for i, p in one.items() for other in left if other[0] not in one]
+                best = min(near, default=(np.inf, (0, 0)))
+                if best[0] > (_STRANGERS if counts[best[1][0]] == 1 else _ALIKE):
+                    break
+                one[best[1][0]], cost = best[1][1], cost + best[0]
+            tried.append((-len(one), cost, one))
+        out.append(min(tried, key=lambda trial: trial[:2]))
+        left -= set(out[-1][2].items())
+    return [one for size, _, one in sorted(out, key=lambda trial: trial[:2]) if size <= -2]
 
 
 def _laid(a: _Skeleton, b: _Skeleton, lag: int) -> NDArray:
@@ -283,14 +319,3 @@ def _laid(a: _Skeleton, b: _Skeleton, lag: int) -> NDArray:
     moved = b.hips[frames[1]] - a.hips[frames[0]] @ R.T
     moved = moved[np.isfinite(moved).all(axis=1)]
     return se3.transform(R, np.median(moved, axis=0) if len(moved) else np.zeros(3))
-
-
-def _strangers(cameras: Sequence[Camera], pairs: dict[tuple[int, int, int, int], _Match]) -> CalibrationError:
-    """The error that names the camera which agrees least with any other."""
-    best = {c: min((m.cost for k, m in pairs.items() if k[0] == c), default=np.inf) for c in range(len(cameras))}
-    worst = max(best, key=lambda c: best[c])
-    return CalibrationError(
-        f"what {cameras[worst].name} saw agrees with no other camera", place=f"camera {cameras[worst].name}",
-        remedy="Check that it is of the same recording, shows the same person at the same time, and was started within "
-        "two seconds of the others; or leave it out.",
-    )

@@ -114,11 +114,18 @@ def prior_sigma(cameras: int, *, focal: bool, distortion: bool, time_offsets: bo
 
 def refine_from(
     rig: Rig, trial: PersonTrial, prior: CameraPrior, gauge: Gauge, *, static_points: StaticPoints | None = None,
-    progress: Progress | None = None, from_scratch: bool = False,
+    free: PointPixels | None = None, progress: Progress | None = None, from_scratch: bool = False,
 ) -> Refinement:  # fmt: skip
-    """As `refine`, from any start with any prior; `gauge` puts the rig into its final frame and says by which rule."""
+    """As `refine`, from any start with any prior; `gauge` puts the rig into its final frame and says by which rule.
+
+    `free`: pixels of more points in space, of which nothing is known.
+    """
     step = progress or (lambda *_: None)
     names, static = static_pixels(rig, static_points or {}, _STATIC_SIGMA)
+    if free is not None and len(free.point):
+        joined = zip(("camera", "uv", "weight"), (free.camera, free.uv, free.weight), strict=True)
+        more = {what: np.concatenate([getattr(static, what), values]) for what, values in joined}
+        static = PointPixels(point=np.concatenate([static.point, len(names) + free.point]), **more)
     offsets = np.zeros(len(rig))
     first: PersonSighting | None = None
     rounds = _CLOCK_ROUNDS if prior.freedom[:, TIME].any() else _ROUNDS
@@ -147,7 +154,7 @@ def refine_from(
     assert first is not None
     changes, distance = changes_of(prior.rig, rig, first, last, covariance, offsets)
     step("refining", rounds + 1, rounds + 1)
-    _check_result(rig, changes, distance, _FAR_OFF if from_scratch else 1.0)
+    check_result(rig, changes, distance, times=_FAR_OFF if from_scratch else 1.0)
     left = _static_residuals(rig, static, names)
     return Refinement(
         rig, dict(zip(rig.names, offsets.tolist(), strict=True)), changes, rule, chosen,
@@ -248,8 +255,18 @@ def _check_frames(seen: PersonSighting, frames: NDArray) -> None:
         )
 
 
-def _check_result(rig: Rig, changes: Mapping[str, CameraChange], distance: float, times: float) -> None:
-    """Refuse cameras that still fit nothing, and those that the recording does not tell."""
+def check_result(rig: Rig, changes: Mapping[str, CameraChange], distance: float, *, times: float = 1.0) -> None:
+    """Refuse cameras that still fit nothing, and those that the recording does not tell.
+
+    Parameters
+    ----------
+    distance : float [m] how well a point about the person is known.
+    times : of the usual limits.
+
+    Raises
+    ------
+    CalibrationError
+    """
     wrong = [
         name for name, c in changes.items()
         if not c.residual_after < _IMPLAUSIBLE * float(np.hypot(*rig[name].size))

@@ -106,11 +106,13 @@ def _frame(floor: str | None, sources: dict) -> int | None:
         seconds = float(floor[:-1])
     except ValueError:
         raise click.BadParameter(f"'{floor}' is no frame; write 12, or 3.5s", param_hint="--floor") from None
-    first = next(iter(sources.values()))
-    if isinstance(first, dict):
-        raise click.BadParameter("pictures have no times; give the number of one", param_hint="--floor")
-    with Video(first) as video:
-        return round(seconds * video.rate)
+    rates = [0.0]
+    for source in sources.values():
+        if isinstance(source, dict):
+            raise click.BadParameter("pictures have no times; give the number of one", param_hint="--floor")
+        with Video(source) as video:
+            rates.append(video.rate)
+    return round(seconds * max(rates))
 
 
 def _tell(result: BoardCalibration) -> None:

@@ -68,10 +68,11 @@ def _ground(check: Check, camera: Camera, frame: int) -> tuple[NDArray, ImageFra
     seen = check.observations
     entry = next((e for e in check.take.cameras if e.name == camera.name), None) if check.take else None
     if check.take and seen is not None and entry is not None and camera.name in seen.videos:
-        at = frame + seen.frames[0] - round(entry.time_offset * seen.rate) - check.frames_late.get(camera.name, 0)
+        step = frame + seen.frames[0] - check.frames_late.get(camera.name, 0)
         try:
             with shown_video(check.take, seen, camera.name) as video:
-                return np.array(video.read(min(max(at, 0), len(video) - 1))), seen.images[camera.name]
+                time = float(np.clip(step / seen.rate - entry.time_offset, 0.0, video.times[-1]))
+                return np.array(video.read(video.frame_at(time) or 0)), seen.images[camera.name]
         except KinefitError:
             pass
     return np.full((camera.size[1], camera.size[0], 3), 70, np.uint8), ImageFrame.identity()

@@ -25,6 +25,7 @@ from kinefit.exporters.surface_files import (
 )
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
+from kinefit.observations.clocks import is_even
 from kinefit.photogrammetry.fields import field_camera, field_of
 from kinefit.photogrammetry.flat import measure_flat
 from kinefit.photogrammetry.least_squares_matching import windows_by_texture
@@ -35,7 +36,7 @@ from kinefit.photogrammetry.surface import MeasuredSurface
 from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
 from kinefit.photogrammetry.trajectories import Trajectories, filtered
 from kinefit.readers.motion import read_motion
-from kinefit.readers.video import Video, check_rates
+from kinefit.readers.video import Video
 
 Progress = Callable[[str, int, int], None]
 
@@ -235,7 +236,11 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
     motion = None if wanted.motion is None else read_motion(wanted.motion)
     with ExitStack() as opened:
         videos = [opened.enter_context(Video(path)) for path in views.videos]
-        check_rates({name: video.rate for name, video in zip(views.names, videos)})
+        if not all(is_even(video.times, videos[0].rate) for video in videos):
+            rates = [video.unevenness or f"{video.rate:.6g} Hz" for video in videos]
+            listed = ", ".join(f"{name} {rate}" for name, rate in zip(views.names, rates))
+            remedy = "A surface is matched between images taken at once: record with cameras in step."
+            raise ObservationError(f"videos of different or varying rate: {listed}", remedy=remedy)
         if motion is not None:
             _check_motion(motion, wanted.motion, videos[0].rate)
         count = min(len(video) for video in videos)

@@ -124,8 +124,9 @@ def track(
 
     TAKE is one TOML file that names calibration, cameras, videos and keypoints, or a folder of videos, in which a first
     one is written as by `kinefit init`; docs/take-file.md explains it. Where it names no keypoints they are detected in
-    the videos first (extra `detect`); where it has no calibration the cameras are found from the people in view. Ctrl-C stops the tracking and writes the frames that are done; the same command
-    then goes on from there, as it does after a crash. Meanwhile OUT/unfinished/so-far.csv grows.
+    the videos first (extra `detect`); where it has no calibration the cameras are found from the people in view. Ctrl-C
+    stops the tracking and writes the frames that are done; the same command then goes on from there, as it does after a
+    crash. Meanwhile OUT/unfinished/so-far.csv grows.
 
     Faults of the inputs (a camera that moved, a wrong unit, vertical, focal length or clock, exchanged names, mirrored
     images) stand on top of what is printed and of report.html, with what to do: `kinefit check` looks closer.

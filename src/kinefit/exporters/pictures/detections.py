@@ -28,6 +28,8 @@ def write_detections(detections: Detections, path: str | PathLike[str], *, key: 
         name: array.astype(np.float32) for name in ("lifted", "hands", "hand_confidence")
         if (array := getattr(detections, name)) is not None
     }  # fmt: skip
+    if detections.times is not None:
+        extra["times"] = detections.times
     with writing(path) as temporary:
         np.savez_compressed(
             temporary, format=np.array(FORMAT), version=np.array(VERSION), key=np.array(key),

@@ -22,6 +22,7 @@ from kinefit.motion import Motion, Residuals
 from kinefit.readers.video import Video
 
 _NOTE = (255, 200, 60)
+_TICK = Fraction(1, 60000)  # [s] of times in a video: MPEG-4 has 16 bits for it
 _CODECS = {"libx264": {"preset": "superfast", "crf": "21"}, "mpeg4": {"qscale": "3"}}
 
 
@@ -63,22 +64,22 @@ def write_overlay(
         The file cannot be written.
     """
     width, height = (side - side % 2 for side in video.size)  # the encoder wants even sides
-    span = frames_of(motion, np.arange(len(video)) / video.rate + time_offset)
+    span = frames_of(motion, video.times + time_offset)
 
     def drawn() -> Iterator[NDArray[np.uint8]]:
         for i, image in zip(span, video.frames(span.start, span.stop)):
-            frame = nearest_frame(motion, i / video.rate + time_offset)
+            frame = nearest_frame(motion, video.times[i] + time_offset)
             label = f"frame {i}"
             yield draw_overlay(
                 image, motion, frame, camera, image_frame=image_frame, residuals=residuals, label=label
             )[:height, :width]
 
-    write_pictures(drawn(), path, video.rate, (width, height), progress)
+    write_pictures(drawn(), path, video.rate, (width, height), progress, times=video.times[span.start : span.stop])
 
 
 def write_pictures(
     pictures: Iterator[NDArray[np.uint8]], path: str | PathLike[str], rate: float, size: tuple[int, int],
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int], None] | None = None, *, times: NDArray | None = None,
 ) -> None:  # fmt: skip
     """Write a video of pictures (H, W, 3) uint8 RGB at a rate [Hz], each drawn while the one before it is encoded.
 
@@ -86,6 +87,7 @@ def write_pictures(
     ----------
     size : (width, height) [px] of all, even
     progress : called with the number of pictures done
+    times : (N,) [s], optional, when each is shown; default: at the rate
 
     Raises
     ------
@@ -94,7 +96,7 @@ def write_pictures(
     """
     with writing(path) as temporary, _encoder(path, temporary, rate, *size) as encode:
         for done, image in enumerate(ahead(pictures), start=1):
-            encode(image)
+            encode(image, None if times is None else float(times[done - 1] - times[0]))
             if progress:
                 progress(done)
 
@@ -201,26 +203,30 @@ def _notes(motion: Motion, residuals: Residuals | None, frame: int) -> list[str]
 
 
 class _encoder:
-    """Context that gives a function to encode one picture (H, W, 3) after the other."""
+    """Context that gives a function to encode one picture (H, W, 3) after the other, each with its time [s] or None."""
 
     def __init__(self, path: Any, temporary: Any, rate: float, width: int, height: int) -> None:
         self.path, self.temporary = path, temporary
         self.codec = next((name for name in _CODECS if name in av.codecs_available), None)
         self.rate, self.size = Fraction(rate).limit_denominator(10000), (width, height)
         self.container: Any = None
+        self.done = 0
 
-    def __enter__(self) -> Callable[[NDArray], None]:
+    def __enter__(self) -> Callable[[NDArray, float | None], None]:
         if self.codec is None:
             raise ExportError(f"FFmpeg has none of the codecs {', '.join(_CODECS)}", file=self.path)
         self.container = _told_by_system(av.open, str(self.temporary), "w")
         self.stream = self.container.add_stream(self.codec, rate=self.rate, options=_CODECS[self.codec])
         self.stream.width, self.stream.height = self.size
         self.stream.pix_fmt = "yuv420p"
+        self.stream.codec_context.time_base = _TICK
         return self._encode
 
-    def _encode(self, image: NDArray) -> None:
+    def _encode(self, image: NDArray, time: float | None) -> None:
         planes = cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420)  # four times as fast as FFmpeg's
         frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
+        frame.time_base, frame.pts = _TICK, round((self.done / self.rate if time is None else time) / _TICK)
+        self.done += 1
         for packet in self.stream.encode(frame):
             _told_by_system(self.container.mux, packet)
 

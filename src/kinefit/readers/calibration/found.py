@@ -10,6 +10,7 @@ from kinefit._files import parse_toml
 from kinefit.errors import FileError
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import read_calibration, write_calibration
+from kinefit.readers.take.entries import CalibrationEntry
 
 _KEY = "kinefit_found_from"
 
@@ -68,3 +69,9 @@ def read_found(path: str | PathLike[str]) -> FoundCameras | None:
         )  # fmt: skip
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(f"its [metadata] lacks {error}", file=path, remedy="Delete it: it is found anew.") from error
+
+
+def found_notes(entry: CalibrationEntry | None) -> tuple[str, ...]:
+    """What is worth saying of a take's calibration: where it was found from people, how sure it is."""
+    found = read_found(entry.file) if entry is not None else None
+    return () if found is None else found.notes

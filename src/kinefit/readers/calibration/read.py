@@ -135,7 +135,8 @@ def write_calibration(
     """
     path = Path(path)
     more = "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in metadata.items())
-    text = "\n".join([*(_toml(camera, path) for camera in rig), f'[metadata]\nadjusted = false\nerror = 0.0\nunit = "m"\n{more}'])
+    last = f'[metadata]\nadjusted = false\nerror = 0.0\nunit = "m"\n{more}'
+    text = "\n".join([*(_toml(camera, path) for camera in rig), last])
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         temporary.write_text(text, encoding="utf-8", newline="\n")

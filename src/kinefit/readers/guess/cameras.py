@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
 from numpy.typing import NDArray
 
-from kinefit.errors import KinefitError, TakeError
+from kinefit.errors import KinefitError, ObservationError, TakeError
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.observations import Keypoints
+from kinefit.observations.clocks import frame_times, is_even, on_steps, steps_of
 from kinefit.readers.guess import views as guess_views
 from kinefit.readers.guess.draft import Draft, Told
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile, KeypointFile
@@ -18,7 +19,7 @@ from kinefit.readers.guess.keypoints import keypoint_entries, keypoint_sources, 
 from kinefit.readers.guess.names import HOW, Trial, trials
 from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.take.one_camera import USUAL
-from kinefit.readers.video import Video
+from kinefit.readers.video import Video, common_frames
 
 UNSTATED = 1.0  # [Hz] of what states no rate, until the user does
 _LABORATORY = (0.2, 15.0)  # [m] from a desk to a sports hall: how far cameras stand from their middle
@@ -40,8 +41,11 @@ def describe_cameras(
         names = [name for name in rig.names if name in opened or any(name in record for record in records)]
         if not names:
             raise _nothing_fits(draft, calibration, found=bool(sources))
+        draft.head["rate"] = draft.tell("rate", _rate(draft, opened, records), "rate")
+        rate = max((video.rate for video in opened.values()), default=UNSTATED)
+        clocks = _clocks(opened, records, rate)
+        records = _on_steps(records, clocks, opened, rate)
         first = next((record for record in records if record), {})
-        draft.head["rate"] = draft.tell("rate", _rate(opened, first), "rate")
         sizes = {name: video.size for name, video in opened.items()}
         images = _pictures(draft, rig, names, opened, chosen, guess_views.guess_turn(rig, first, sizes))
         shown: dict[str, ImageFrame] = {}
@@ -55,7 +59,7 @@ def describe_cameras(
                 shown = images
             entries.append((source, record, frame))
         _world(draft, calibration, first, shown)
-        _cut(draft, [*opened.values(), *first.values()])
+        _cut(draft, clocks, rate)
         for source, record, frame in entries:
             keypoint_entries(draft, source, record, frame, images, active=record is first)
     if len(names) == 1:
@@ -86,9 +90,7 @@ def describe_uncalibrated(draft: Draft, videos: Sequence[Path]) -> None:
                     remedy="Name the folder of one recording, with one video of each camera.",
                 )  # fmt: skip
             opened[path.stem] = stack.enter_context(Video(path, rate=UNSTATED))
-        draft.head["rate"] = draft.tell("rate", _rate(opened, {}), "rate")
-        if len(opened) > 1:
-            _cut(draft, list(opened.values()))
+        draft.head["rate"] = draft.tell("rate", _rate(draft, opened, []), "rate")
         counts = {name: f"{len(video)} frames" for name, video in opened.items()}
     more = "a tenth more, a tenth nearer" if len(opened) == 1 else "it is found with where the cameras stand"
     why = f"degrees across the longer side; {USUAL:g} is usual for telephones; {more}"
@@ -96,11 +98,13 @@ def describe_uncalibrated(draft: Draft, videos: Sequence[Path]) -> None:
         video = Told(path, "likely", counts[path.stem]) if len(videos) > 1 else Told(path)
         draft.cameras[path.stem] = {"video": video, "field_of_view": Told(USUAL, "guess", why)}
     if len(videos) == 1:
-        draft.note("camera", "likely", f"{draft.name(videos[0])} alone: a network tells how far limbs are; state height")
+        alone = f"{draft.name(videos[0])} alone: a network tells how far limbs are; state height"
+        draft.note("camera", "likely", alone)
         return
     draft.head["up"] = Told("z", "sure", "found with the floor, from the people in view")
     draft.note("cameras", "likely", f"{len(videos)} videos of one moment: {', '.join(map(draft.name, videos))}")
-    draft.note("calibration", "guess", "none here: kinefit track finds lenses, places and clocks from the people in view")
+    found = "none here: kinefit track finds lenses, places and clocks from the people in view"
+    draft.note("calibration", "guess", found)
 
 
 def _nothing_fits(draft: Draft, calibration: CalibrationFile, *, found: bool) -> TakeError:
@@ -113,10 +117,39 @@ def _nothing_fits(draft: Draft, calibration: CalibrationFile, *, found: bool) ->
     return TakeError(problem, file=draft.folder, place=draft.name(calibration.path), remedy=remedy)
 
 
-def _cut(draft: Draft, streams: Sequence[Video | Keypoints]) -> None:
+def _clocks(
+    opened: Mapping[str, Video], records: Sequence[Mapping[str, Keypoints]], rate: float
+) -> dict[str, NDArray]:
+    """{stream: (N,) [s]} times of the frames of the videos, and of the keypoints of the first detector."""
+    out = {f"video {name}": video.times for name, video in opened.items()}
+    for name, record in next((record for record in records if record), {}).items():
+        video = opened.get(name)
+        own, clock = (video.rate, video.times) if video else (rate, None)
+        out[f"keypoints {name}"] = frame_times(len(record), own, clock)
+    return out
+
+
+def _on_steps(
+    records: Sequence[dict[str, Keypoints]], clocks: Mapping[str, NDArray], opened: Mapping[str, Video], rate: float
+) -> list[dict[str, Keypoints]]:
+    """Keypoints at the same steps of time in all cameras, where the times of the videos differ."""
+    if all(is_even(times, rate) for times in clocks.values()):
+        return list(records)
+    stop = min(steps_of(times, rate)[1] for times in clocks.values())
+
+    def stepped(name: str, k: Keypoints) -> Keypoints:
+        video = opened.get(name)
+        return on_steps(k, frame_times(len(k), video.rate, video.times), rate, (0, stop)) if video else k
+
+    return [{name: stepped(name, k) for name, k in record.items()} for record in records]
+
+
+def _cut(draft: Draft, clocks: Mapping[str, NDArray], rate: float) -> None:
     """Enter the frames that all streams have, where they differ in length."""
-    lengths = sorted({len(stream) for stream in streams})
-    if len(lengths) > 1:
+    try:
+        common_frames(clocks, rate)
+    except ObservationError:
+        lengths = sorted({steps_of(times, rate)[1] for times in clocks.values()})
         listed = ", ".join(map(str, lengths))
         told = Told((0, lengths[0]), "guess", f"streams of {listed} frames, taken as if they began together")
         draft.head["frames"] = draft.tell("frames", told, "frames")
@@ -201,14 +234,21 @@ def _turn(entry: dict[str, Told]) -> int:
     return int(str(entry["rotation"].value)) if "rotation" in entry else 0
 
 
-def _rate(opened: dict[str, Video], records: dict[str, Keypoints]) -> Told:
-    rates = sorted(video.rate for video in opened.values() if video.path.is_file())
-    tables = [record.rate for record in records.values() if record.rate != UNSTATED]
-    if rates and rates[-1] > 1.001 * rates[0]:
-        listed = ", ".join(f"{name} {video.rate:.6g}" for name, video in opened.items())
-        return Told(None, "open", f"videos of different rate: {listed} Hz; resample them: ffmpeg -i IN -r RATE OUT")
-    if rates:
-        return Told(rates[0], "sure", "of the videos")
+def _rate(draft: Draft, opened: Mapping[str, Video], records: Sequence[Mapping[str, Keypoints]]) -> Told:
+    files = {name: video for name, video in opened.items() if video.path.is_file()}
+    first = next((record for record in records if record), {})
+    tables = [k.rate for k in first.values() if k.rate != UNSTATED]
+    for name, video in files.items():
+        if video.unevenness:
+            draft.note(f"camera {name}", "likely", video.unevenness)
+    if files:
+        rate = max(video.rate for video in files.values())
+        if all(is_even(video.times, rate) for video in files.values()):
+            return Told(rate, "sure", "of the videos")
+        if min(video.rate for video in files.values()) > 0.999 * rate:
+            return Told(rate, "likely", "nominal, of the videos; points are interpolated between their frames")
+        listed = ", ".join(f"{name} {video.rate:.4g}" for name, video in files.items())
+        return Told(rate, "likely", f"the highest of the videos ({listed} Hz); points are interpolated between frames")
     if tables:
         return Told(round(min(tables), 3), "likely", "median of the table's own times")
     return Told(None, "open", "nothing here tells the frames per second: write it")

@@ -26,6 +26,10 @@ _CALIBRATE = (
 )
 
 
+OPEN_HEIGHT = "height = 1.75  # open: the stature in metres, where you know it"
+"""The line of a take file that waits for the person's height, as a comment."""
+
+
 @dataclass(frozen=True)
 class Guess:
     """A take file that is not yet written: its text (TOML), and what was guessed, line by line."""
@@ -82,7 +86,7 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
     for path in [file for file in files if file.name == "trajectories.csv"] if draft.cameras else []:
         told = Told(path, "likely", "a surface that kinefit surface followed; it needs a [start] or another sensor")
         draft.surface_points.append((not draft.surface_points, {"file": draft.tell("surface", told, "file")}))
-    draft.comments.append('height = 1.75  # open: the stature in metres, where you know it')
+    draft.comments.append(OPEN_HEIGHT)
     return Guess(draft.text(), tuple(draft.notes))
 
 

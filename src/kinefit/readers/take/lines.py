@@ -74,9 +74,9 @@ def _rows(path: Path) -> Iterable[tuple[str, Mapping[str, Any]]]:
 
 
 def load_lines(
-    take: Take, images: Mapping[str, ImageFrame], rates: Mapping[str, float]
+    take: Take, images: Mapping[str, ImageFrame], rate: float | None, clocks: Mapping[str, NDArray]
 ) -> tuple[LineVideo, ...]:
-    """All `[[lines]]` of a take, then its clicked joints; `rates` [Hz] of its other streams.
+    """All `[[lines]]` of a take, then its clicked joints; `rate` [Hz] of its steps, `clocks` (N,) [s] of its videos.
 
     Raises
     ------
@@ -88,14 +88,14 @@ def load_lines(
     out = []
     for entry in take.lines:
         try:
-            out.append(_lines(entry, take, images[entry.camera], rates))
+            out.append(_lines(entry, take, images[entry.camera], rate, clocks.get(entry.camera)))
         except KinefitError as error:
             place = ", ".join(part for part in (f"lines of camera {entry.camera}", error.place) if part)
             raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error
-    return (*out, *_clicks(take, images, rates))
+    return (*out, *_clicks(take, images, rate))
 
 
-def _clicks(take: Take, images: Mapping[str, ImageFrame], rates: Mapping[str, float]) -> list[LineVideo]:
+def _clicks(take: Take, images: Mapping[str, ImageFrame], rate: float | None) -> list[LineVideo]:
     """Joints that were clicked: each is two image lines that cross in it, along u and v, with its landmark on both."""
     if take.pose is None or take.pose.clicks is None:
         return []
@@ -104,7 +104,6 @@ def _clicks(take: Take, images: Mapping[str, ImageFrame], rates: Mapping[str, fl
         if camera not in images or camera in {entry.camera for entry in take.lines}:
             problem = choices("camera", camera, images) if camera not in images else f"{camera} has [[lines]] too"
             raise TakeError(problem, file=take.pose.clicks, place="[start] clicks", remedy="Leave out its clicks.")
-        rate = rates.get(f"video {camera}") or take.rate
         if rate is None:
             raise TakeError("nothing states the rate", file=take.path, remedy="Write rate = ... into [take].")
         mine = [of for of in steps if of.points.get(camera)]
@@ -120,12 +119,14 @@ def _clicks(take: Take, images: Mapping[str, ImageFrame], rates: Mapping[str, fl
     return out
 
 
-def _lines(entry: LinesEntry, take: Take, image: ImageFrame, rates: Mapping[str, float]) -> LineVideo:
+def _lines(
+    entry: LinesEntry, take: Take, image: ImageFrame, rate: float | None, clock: NDArray | None
+) -> LineVideo:
     same = np.allclose(image.T_image_calibration, np.eye(3), atol=1e-9)
     if entry.frame is None and not same:
         problem = "the video's image is not the calibration's, and it is not stated in which the lines are"
         raise TakeError(problem, remedy='Write frame = "calibration" or frame = "video".')
-    rate = entry.rate or rates.get(f"video {entry.camera}") or take.rate
+    rate = entry.rate or rate
     if rate is None:
         raise TakeError("nothing states the rate", remedy="Write rate = ... into [take].")
     names = tuple(entry.landmarks)
@@ -133,7 +134,9 @@ def _lines(entry: LinesEntry, take: Take, image: ImageFrame, rates: Mapping[str,
     if entry.frame == "video" and not same:
         ends = image.to_calibration(ends)
     offset = next(camera.time_offset for camera in take.cameras if camera.name == entry.camera)
+    of_video = entry.rate is None and clock is not None and frames[-1] < len(clock)
+    times = clock[frames] if of_video and clock is not None else frames / rate
     return LineVideo(
-        entry.camera, rate, offset + frames / rate, names, tuple(map(tuple, entry.landmarks.values())), ends,
+        entry.camera, rate, offset + times, names, tuple(map(tuple, entry.landmarks.values())), ends,
         source=str(entry.file),
     )  # fmt: skip

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit.errors import CalibrationError, ObservationError, TakeError, choices, command
@@ -26,8 +27,9 @@ from kinefit.observations import (
     SilhouetteVideo,
     SurfacePointVideo,
 )
+from kinefit.observations.clocks import frame_times, is_even, on_steps
 from kinefit.readers.body_trackers import read_body_trackers
-from kinefit.readers.calibration.found import read_found
+from kinefit.readers.calibration.found import found_notes
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoints import read_keypoints
@@ -41,7 +43,7 @@ from kinefit.readers.take.silhouettes import load_regions, load_silhouettes
 from kinefit.readers.take.skin import load_skin
 from kinefit.readers.take.streams import refuse_streams
 from kinefit.readers.take.surface_points import load_surface_points
-from kinefit.readers.video import Video, check_rates, common_frames
+from kinefit.readers.video import Video, common_frames
 
 _Timed = DepthVideo | CloudVideo | LineVideo | SurfacePointVideo | BodyTrackerVideo
 _Whole = _Timed | SilhouetteVideo | ColourVideo | KeypointVideo
@@ -130,23 +132,34 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     CalibrationError
         A camera without calibration; an image of another size than the calibration's where the take does not state how.
     ObservationError
-        Streams of different length or rate, with each stream's; and what the readers of the files raise.
+        Streams of different length, with each stream's; keypoints of as many frames as the video, and another rate;
+        a rate of the take above its videos'; and what the readers of the files raise.
     FileError
         A file that is damaged.
     """
     refuse_streams(take)
     rig = read_rig(take, exteriors)
-    rates: dict[str, float] = {"take": take.rate} if take.rate else {}
-    lengths: dict[str, int] = {}
-    offsets: dict[str, float] = {}
+    rates: dict[str, float] = {}
+    streams: dict[str, NDArray] = {}  # (N,) [s] in the take
+    clocks: dict[str, NDArray] = {}  # (N,) [s] of each camera's video, from its first frame
+    offsets = {entry.name: entry.time_offset for entry in take.cameras}
     sizes: dict[str, tuple[int, int]] = {}
+    notes = []
     for entry in take.cameras:
         if entry.video is not None:
             with Video(entry.video, rate=take.rate) as video:
                 stream = f"video {entry.name}"
-                rates[stream], lengths[stream], offsets[stream] = video.rate, len(video), entry.time_offset
-                sizes[entry.name] = video.size
-    if is_alone(take) or is_uncalibrated(take) and not exteriors:
+                rates[stream], clocks[entry.name], sizes[entry.name] = video.rate, video.times, video.size
+                streams[stream] = video.times + entry.time_offset
+                notes += [f"{stream}: {video.unevenness}"] * bool(video.unevenness)
+    listed = ", ".join(f"{stream} {rate:.6g} Hz" for stream, rate in rates.items())
+    if take.rate and rates and take.rate > 1.001 * max(rates.values()):
+        problem = f"a rate above that of every video: take {take.rate:.6g} Hz, {listed}"
+        raise ObservationError(problem, file=take.path, remedy="Leave rate out of [take]: the videos state theirs.")
+    rate = take.rate or max(rates.values(), default=0.0)
+    if not all(is_even(times, rate) for times in clocks.values()):
+        notes.append(f"take {rate:.6g} Hz, {listed}: points are interpolated between frames")
+    if is_alone(take) or (is_uncalibrated(take) and not exteriors):
         rig = Rig(tuple(assumed_camera(e, sizes.get(e.name, e.size), take) for e in take.cameras))
     elif is_uncalibrated(take):
         remedy = f"They are found from the people in view: {command('track', take.path)}"
@@ -154,16 +167,20 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     images = {entry.name: image_frame(entry, rig, sizes.get(entry.name), take) for entry in take.cameras}
     keypoints, markers = [], tuple(_read_markers(entry) for entry in take.markers)
     for number, source in enumerate(take.keypoints):
-        keypoints.append(read := _read_keypoints(source, images[source.camera], take, rates, number))
+        read, times = _read_keypoints(source, images[source.camera], take, rates, clocks, number)
         stream = f"keypoints {source.camera}" + f" ({source.format})" * (len(take.keypoints) > len(take.cameras))
-        rates[stream], lengths[stream], offsets[stream] = read.rate, len(read), read.time_offset
+        if times is not clocks.get(source.camera):
+            rates[stream] = read.rate
+        streams[stream] = times + offsets[source.camera]
+        keypoints.append((read, streams[stream]))
     sensors = load_depth(take, rig, rates)
-    silhouettes = load_silhouettes(take, rig, images, rates)
+    silhouettes = load_silhouettes(take, rig, images, rates, clocks)
     for outlines in silhouettes:
-        stream = f"silhouettes {outlines.sensor}"
-        rates[stream], lengths[stream], offsets[stream] = outlines.rate, len(outlines), float(outlines.times[0])
-    skin = load_skin(take, images, {e.name: e.video for e in take.cameras if e.video is not None})
-    lines = load_lines(take, images, rates)
+        rates[f"silhouettes {outlines.sensor}"] = outlines.rate
+        streams[f"silhouettes {outlines.sensor}"] = outlines.times
+    fastest = take.rate or max(rates.values(), default=None)
+    skin = load_skin(take, images, {e.name: e.video for e in take.cameras if e.video is not None}, fastest)
+    lines = load_lines(take, images, fastest, clocks)
     surfaces = load_surface_points(take)
     trackers = tuple(
         read_body_trackers(e.file, e.points, sensor_name("trackers", take.trackers, k), time_offset=e.time_offset,
@@ -171,14 +188,13 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         for k, e in enumerate(take.trackers)
     )  # fmt: skip
     recordings: tuple[_Timed, ...] = (*sensors.depth, *sensors.clouds, *surfaces, *trackers)
-    if not (lengths or lines or markers or recordings):
+    if not (streams or lines or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
         raise TakeError("cameras, but nothing that they saw", file=take.path, remedy=remedy)
-    check_rates(rates or {f"markers {m.source}": m.rate for m in markers[:1]} or {"take": 1.0}, file=take.path)
     own = [*(recording.rate for recording in (*recordings, *lines)), *(m.rate for m in markers)]
-    rate = take.rate or next(iter(rates.values()), None) or own[0]
-    if lengths:
-        frames = common_frames(lengths, offsets, rate, take.frames, file=take.path)
+    rate = fastest or own[0]
+    if streams:
+        frames = common_frames(streams, rate, take.frames, file=take.path)
     elif recordings or lines:
         frames = take.frames or _span(recordings or lines, rate)
     else:
@@ -188,18 +204,12 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     return Observations(
         rate=rate, frames=frames, rig=Rig(cameras) if cameras else None,
         markers=markers,
-        keypoints=tuple(_cut(k, frames, entry.frames) for k, entry in zip(keypoints, take.keypoints)),
+        keypoints=tuple(_cut(*k, rate, frames, entry.frames) for k, entry in zip(keypoints, take.keypoints)),
         videos={entry.name: entry.video for entry in take.cameras if entry.video is not None}, images=images,
         depth=sensors.depth, clouds=sensors.clouds, silhouettes=silhouettes,
         regions=load_regions(take, rig, images), skin=skin, lines=lines, surface_points=surfaces, trackers=trackers,
-        notes=(*sensors.notes(rate), *(what_is_assumed(take) if is_alone(take) else calibration_notes(take))),
+        notes=(*notes, *sensors.notes(rate), *found_notes(take.calibration), *what_is_assumed(take)),
     )
-
-
-def calibration_notes(take: Take) -> tuple[str, ...]:
-    """What is worth saying of a calibration that was found from people; nothing of any other."""
-    found = read_found(take.calibration.file) if take.calibration is not None else None
-    return found.notes if found is not None else ()
 
 
 def _span(recordings: Sequence[_Timed], rate: float) -> tuple[int, int]:
@@ -271,8 +281,10 @@ def image_frame(entry: CameraEntry, rig: Rig | None, video_size: tuple[int, int]
 
 
 def _read_keypoints(
-    source: KeypointsEntry, image: ImageFrame, take: Take, rates: Mapping[str, float], number: int
-) -> Keypoints:
+    source: KeypointsEntry, image: ImageFrame, take: Take, rates: Mapping[str, float], clocks: Mapping[str, NDArray],
+    number: int,
+) -> tuple[Keypoints, NDArray]:
+    """Keypoints of a camera, and the times (F,) [s] of their frames from the first on."""
     place = f"[[keypoints]] {number + 1}, camera {source.camera}"
     same = np.allclose(image.T_image_calibration, np.eye(3), atol=1e-9)
     if source.frame is None and not same and source.format != "detect":
@@ -281,9 +293,12 @@ def _read_keypoints(
             file=take.path, place=place, remedy='Write frame = "calibration" or frame = "video".',
         )
     offset = next(entry.time_offset for entry in take.cameras if entry.name == source.camera)
+    clock = clocks.get(source.camera)
     if source.format == "detect":
         file = source.file or detections_file(take.path, source.camera)
-        return read_detections(file).keypoints(source.camera, image_frame=None if same else image, time_offset=offset)
+        found = read_detections(file)
+        seen = found.keypoints(source.camera, image_frame=None if same else image, time_offset=offset)
+        return seen, frame_times(len(found), found.rate, clock if found.times is None else found.times)
     rate = source.rate or rates.get(f"video {source.camera}") or take.rate
     if rate is None:
         raise TakeError("nothing states the rate", file=take.path, place=place, remedy="Write rate = ... into [take].")
@@ -294,8 +309,15 @@ def _read_keypoints(
         image_frame=image if source.frame == "video" and not same else None,
         time_offset=offset, **options,
     )
+    times = frame_times(len(record), rate, clock)
+    if times is clock and source.rate and not is_even(times, source.rate):
+        own = rates[f"video {source.camera}"]
+        raise ObservationError(
+            f"the keypoints have {source.rate:.6g} Hz, and the video of as many frames {own:.6g} Hz", file=take.path,
+            place=place, remedy="Leave rate out of [[keypoints]]: they take the times of the video's frames.",
+        )
     hands_unwanted = source.set == "MEDIAPIPE_33" and record.keypoint_set == "MEDIAPIPE_75"
-    return record.first_points(source.set, MEDIAPIPE_33) if source.set and hands_unwanted else record
+    return record.first_points(source.set, MEDIAPIPE_33) if source.set and hands_unwanted else record, times
 
 
 def _read_markers(entry: MarkersEntry) -> Markers:
@@ -307,11 +329,16 @@ def _read_markers(entry: MarkersEntry) -> Markers:
     return replace(markers, positions=se3.apply(entry.T_world_file, markers.positions), up=up)
 
 
-def _cut(keypoints: Keypoints, frames: tuple[int, int], used: tuple[int, int] | None) -> Keypoints:
-    """Frames at the steps [start, stop) of the common time; seen are only those at the steps that are used."""
-    begin = frames[0] - round(keypoints.time_offset * keypoints.rate)
-    rows = slice(begin, begin + frames[1] - frames[0])
-    cut = keypoints.rows(rows, keypoints.time_offset + begin / keypoints.rate)
+def _cut(
+    keypoints: Keypoints, times: NDArray, rate: float, frames: tuple[int, int], used: tuple[int, int] | None
+) -> Keypoints:
+    """Keypoints at the steps [start, stop) of the common time; seen are only those at the steps that are used."""
+    if is_even(times, rate):
+        begin = frames[0] - round(keypoints.time_offset * rate)
+        rows = slice(begin, begin + frames[1] - frames[0])
+        cut = replace(keypoints.rows(rows, keypoints.time_offset + begin / rate), rate=rate)
+    else:
+        cut = on_steps(keypoints, times, rate, frames)
     if used is None:
         return cut
     steps = np.arange(*frames)

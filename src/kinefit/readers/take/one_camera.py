@@ -50,7 +50,9 @@ def assumed_camera(entry: CameraEntry, size: tuple[int, int] | None, take: Take)
 
 
 def what_is_assumed(take: Take) -> list[str]:
-    """What the report of such a take has to say."""
+    """What the report of a take with one camera and no calibration has to say; nothing of any other."""
+    if not is_alone(take):
+        return []
     entry = take.cameras[0]
     told = f"a field of view of {entry.field_of_view or USUAL:g}°" + ("" if entry.field_of_view else ", the usual one")
     out = [

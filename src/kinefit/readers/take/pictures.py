@@ -40,8 +40,8 @@ class TakePictures:
             if video is None:
                 return None
             time = (self._seen.frames[0] + frame) / self._seen.rate - self._offsets[camera]
-            number = round(time * video.rate)
-            return (video.read(number), self._seen.images[camera]) if 0 <= number < len(video) else None
+            number = video.frame_at(time)
+            return None if number is None else (video.read(number), self._seen.images[camera])
         except KinefitError:
             self._open[camera] = None
             return None

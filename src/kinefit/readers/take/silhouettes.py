@@ -16,6 +16,7 @@ from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.images.silhouette import colour_mask
 from kinefit.images.silhouette_background import BackgroundPlate
 from kinefit.observations import ColourVideo, Detections, SilhouetteVideo
+from kinefit.observations.clocks import frame_times
 from kinefit.readers.depth.images import listed
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.take.file import CameraEntry, SilhouetteEntry, Take
@@ -28,7 +29,7 @@ _PICTURES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
 
 def read_silhouettes(
     path: Path, *, camera: str, rate: float, size: tuple[int, int], image_frame: ImageFrame | None = None,
-    time_offset: float = 0.0,
+    time_offset: float = 0.0, clock: NDArray | None = None,
 ) -> SilhouetteVideo:  # fmt: skip
     """Masks in a folder of images, or of a pattern such as "masks/*.png", one a frame; white is the body.
 
@@ -40,6 +41,7 @@ def read_silhouettes(
     image_frame : ImageFrame, optional
         From the calibration's image to the masks'; default: they are the same.
     time_offset : float [s] of the first mask.
+    clock : (N,) [s], optional, when the frames of the camera's video are shown: masks of as many frames take its times.
 
     Raises
     ------
@@ -60,14 +62,15 @@ def read_silhouettes(
             raise ObservationError(problem, file=files[i], remedy="All masks of a camera are of its image's size.")
         return in_calibration(mask, size, image_frame)
 
-    times = time_offset + np.arange(len(files)) / rate
+    times = time_offset + frame_times(len(files), rate, clock)
     return SilhouetteVideo(camera, rate, times, size, image, str(path))
 
 
 def load_silhouettes(
-    take: Take, rig: Rig | None, images: Mapping[str, ImageFrame], rates: Mapping[str, float]
+    take: Take, rig: Rig | None, images: Mapping[str, ImageFrame], rates: Mapping[str, float],
+    clocks: Mapping[str, NDArray],
 ) -> tuple[SilhouetteVideo, ...]:
-    """All `[[silhouette]]` of a take, in its order; `rates` [Hz] of its other streams.
+    """All `[[silhouette]]` of a take, in its order; `rates` [Hz] of its other streams, `clocks` [s] of its videos.
 
     Raises
     ------
@@ -79,7 +82,7 @@ def load_silhouettes(
     out = []
     for entry in take.silhouettes:
         try:
-            out.append(_silhouettes(entry, take, rig, images[entry.camera], rates))
+            out.append(_silhouettes(entry, take, rig, images[entry.camera], rates, clocks.get(entry.camera)))
         except KinefitError as error:
             place = ", ".join(part for part in (f"silhouette of camera {entry.camera}", error.place) if part)
             raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error
@@ -87,7 +90,8 @@ def load_silhouettes(
 
 
 def _silhouettes(
-    entry: SilhouetteEntry, take: Take, rig: Rig | None, frame: ImageFrame, rates: Mapping[str, float]
+    entry: SilhouetteEntry, take: Take, rig: Rig | None, frame: ImageFrame, rates: Mapping[str, float],
+    clock: NDArray | None,
 ) -> SilhouetteVideo:
     assert rig is not None
     camera = next(c for c in take.cameras if c.name == entry.camera)
@@ -104,20 +108,21 @@ def _silhouettes(
         return read_silhouettes(
             entry.file, camera=entry.camera, rate=rate, size=size,
             image_frame=frame if entry.frame == "video" and not same else None, time_offset=offset,
+            clock=None if entry.rate else clock,
         )  # fmt: skip
     if entry.format == "threshold":
         return _coloured(entry, camera, size, frame, take.rate)
     if entry.format == "background":
         assert camera.video is not None
         scene = _BeforeBackground(Video(camera.video, rate=take.rate), entry.file, size, frame)
-        times = offset + np.arange(len(scene.video)) / scene.video.rate
+        times = offset + scene.video.times
         return SilhouetteVideo(entry.camera, scene.video.rate, times, size, scene.mask, str(camera.video))
     file = entry.file or detections_file(take.path, entry.camera)
     found = read_detections(file)
     if found.seen.any() and not len(found.mask_runs):
         remedy = "Run `kinefit detect` on this take, which keeps outlines."
         raise TakeError("the detector's file has no outlines", file=file, remedy=remedy)
-    times = offset + np.arange(len(found)) / found.rate
+    times = offset + frame_times(len(found), found.rate, clock if found.times is None else found.times)
     return SilhouetteVideo(
         entry.camera, found.rate, times, size, lambda i: in_calibration(_everybody(found, i), size, frame), found.source
     )
@@ -143,7 +148,7 @@ def _coloured(
         mask = colour_mask(picture if space is None else cv2.cvtColor(picture, space), low, high)
         return in_calibration(np.asarray(cv2.GaussianBlur(mask, (0, 0), smooth)), size, frame)
 
-    times = camera.time_offset + np.arange(len(video)) / video.rate
+    times = camera.time_offset + video.times
     return SilhouetteVideo(entry.camera, video.rate, times, size, image, str(camera.video))
 
 
@@ -223,7 +228,7 @@ def load_regions(take: Take, rig: Rig | None, images: Mapping[str, ImageFrame]) 
         camera = next(c for c in take.cameras if c.name == entry.camera)
         assert camera.video is not None
         video, size, frame = Video(camera.video, rate=take.rate), rig[entry.camera].size, images[entry.camera]
-        times = camera.time_offset + np.arange(len(video)) / video.rate
+        times = camera.time_offset + video.times
         image = lambda i, video=video, size=size, frame=frame: in_calibration(video.read(i), size, frame)
         out.append(ColourVideo(entry.camera, video.rate, times, size, image, str(camera.video)))
     return tuple(out)

@@ -20,8 +20,12 @@ from kinefit.readers.video import Video
 _NAMES = {"HANDS": LANDMARKS, "WRISTS": WRISTS}
 
 
-def load_skin(take: Take, images: Mapping[str, ImageFrame], videos: Mapping[str, Path]) -> tuple[KeypointVideo, ...]:
+def load_skin(
+    take: Take, images: Mapping[str, ImageFrame], videos: Mapping[str, Path], rate: float | None
+) -> tuple[KeypointVideo, ...]:
     """All `[[keypoints]]` of a take with format = "skin"; images are read when their frames are asked for.
+
+    `rate` [Hz] is that of the take's steps.
 
     Raises
     ------
@@ -33,27 +37,28 @@ def load_skin(take: Take, images: Mapping[str, ImageFrame], videos: Mapping[str,
     out = []
     for entry in take.skin:
         try:
-            out.append(_skin(entry, take, images[entry.camera], videos[entry.camera]))
+            out.append(_skin(entry, take, images[entry.camera], videos[entry.camera], rate))
         except KinefitError as error:
             place = ", ".join(part for part in (f"keypoints of camera {entry.camera}", error.place) if part)
             raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error
     return tuple(out)
 
 
-def _skin(entry: KeypointsEntry, take: Take, image: ImageFrame, file: Path) -> KeypointVideo:
+def _skin(entry: KeypointsEntry, take: Take, image: ImageFrame, file: Path, rate: float | None) -> KeypointVideo:
     video = Video(file, rate=take.rate)
     offset = next(camera.time_offset for camera in take.cameras if camera.name == entry.camera)
-    rate = take.rate or video.rate
-    used = entry.frames or take.frames or (round(offset * rate), round((offset + len(video) / video.rate) * rate))
-    begin, end = (round((step / rate - offset) * video.rate) for step in used)
-    begin, end = max(begin, 0), min(end, len(video))
+    used = entry.frames or take.frames
+    begin, end = 0, len(video)
+    if used is not None:  # half a step before the first of them, and before the one after the last
+        bounds = (np.array(used) - 0.5) / (rate or video.rate) - offset
+        begin, end = (int(k) for k in np.searchsorted(video.times, bounds))
     if begin >= end:
         raise TakeError("none of its frames is in the video", remedy=f"The video has {len(video)} frames.")
     face = entry.face
     if face is None:
         begin, face = _detected_face(take, entry, begin, end)
     seen = _Seen(video, begin, face, image)
-    times = offset + np.arange(begin, end) / video.rate
+    times = offset + video.times[begin:end]
     return KeypointVideo(
         entry.camera, video.rate, times, _NAMES[entry.set or "HANDS"], seen.points, source=str(file)
     )

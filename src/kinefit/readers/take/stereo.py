@@ -27,7 +27,8 @@ class _Pair:
     right: Video
 
     def image(self, i: int) -> NDArray:
-        return self.rectifier.frame(self.left.read(i), self.right.read(i), 0.0).depth
+        right = self.right.frame_at(float(self.left.times[i])) or 0
+        return self.rectifier.frame(self.left.read(i), self.right.read(right), 0.0).depth
 
 
 def load_stereo(take: Take, seen: Observations) -> tuple[DepthVideo, ...]:
@@ -62,8 +63,8 @@ def _pair(take: Take, seen: Observations, entry: StereoEntry) -> DepthVideo:
     except KinefitError as error:
         raise CalibrationError(error.problem, file=take.path, place=error.place, remedy=error.remedy) from error
     both = _Pair(rectifier, *(Video(seen.videos[name], rate=seen.rate) for name in (entry.left, entry.right)))
-    count = min(len(both.left), len(both.right))
+    times = both.left.times[: np.searchsorted(both.left.times, both.right.times[-1] + 0.5 / seen.rate)]
     return DepthVideo(
-        sensor=entry.name, rate=seen.rate, times=np.arange(count) / seen.rate, size=rectifier.camera.size,
+        sensor=entry.name, rate=seen.rate, times=times, size=rectifier.camera.size,
         image=both.image, near=near, far=far, camera=rectifier.camera, source=str(seen.videos[entry.left]),
     )  # fmt: skip
