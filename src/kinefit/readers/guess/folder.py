@@ -90,9 +90,10 @@ def _choose_calibration(
     draft: Draft, files: list[Path], seen: Sequence[Path], markers: bool
 ) -> CalibrationFile | None:
     """The calibration that most files fit; from the folder above where there is none here."""
-    found, singles, faults = guess_files.find_calibrations(files)
+    videos = guess_files.find_videos(files, draft.folder)
+    found, singles, faults = guess_files.find_calibrations(files, videos, draft.folder)
     if not found:
-        found = guess_files.find_calibrations(_above(draft.folder))[0]
+        found = guess_files.find_calibrations(_above(draft.folder), videos, draft.folder)[0]
     if not found and markers:
         draft.note("calibration", "open", f"none, so that videos and keypoints are left out. {_CALIBRATE}")
         return None
@@ -103,7 +104,7 @@ def _choose_calibration(
             remedy=f"{fault.remedy or ''} {_CALIBRATE}".strip(),
         )
     if not found:
-        if len(seen) == 1 and seen[0] in guess_files.find_videos(files, draft.folder):
+        if len(seen) == 1 and seen[0] in videos:
             describe_one(draft, seen[0])
             return None
         alone = f" ({draft.name(singles[0])} is of one camera alone)" if singles else ""
@@ -127,6 +128,8 @@ def _choose_calibration(
         why += f"; taken before {', '.join(map(draft.name, draft.others))}, since {reason}"
     told = Told(best.path, "likely" if others else "sure", why)
     draft.note("calibration", told.sure, f"{draft.name(best.path)}: {why}")
+    if best.sized:
+        draft.note("calibration", "likely", f"no size of the images of {', '.join(best.sized)}: their videos' is taken")
     draft.calibration = best, {"file": told}
     return best
 
