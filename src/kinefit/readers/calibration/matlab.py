@@ -37,7 +37,8 @@ def read_mat(path: Path) -> Table:
     except Exception as error:  # whatever a damaged file makes of the reader
         raise FileError(f"no file of MATLAB that can be read: {error}", file=path, remedy="Save it again.") from None
     variables = {key: _plain(value, path) for key, value in found.items() if not key.startswith("__")}
-    return matlab_tree(variables, path, of_mat=True)
+    pair = next((v for v in variables.values() if isinstance(v, dict) and "CameraParameters1" in v), variables)
+    return matlab_tree(pair, path, of_mat=True)
 
 
 def _plain(value: Any, path: Path) -> Any:

@@ -59,7 +59,7 @@ def read_table(text: str, kind: str, path: Path) -> Table:
     """Parse "toml", "json", "yaml" or "xml" (the last two: OpenCV FileStorage) into nested tables."""
     try:
         if kind == "toml":
-            return parse_toml(text, path, CalibrationError)
+            return dict(_matrices(parse_toml(text, path, CalibrationError)))
         tree = _matrices(_PARSERS[kind](text))
         return tree if isinstance(tree, dict) else {"cameras": tree}
     except (ValueError, TypeError, RecursionError, OverflowError, ElementTree.ParseError) as error:
