@@ -6,9 +6,11 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.io import savemat
 
-from kinefit.errors import CalibrationError, FileError
+from kinefit.errors import CalibrationError, FileError, KinefitError
 from kinefit.readers.calibration.read import read_calibration, write_calibration
 from kinefit.readers.calibration.write import write_calibration_like
 
@@ -474,3 +476,66 @@ def test_sizes_are_asked_for_by_name(tmp_path):
         read_calibration(tmp_path, image_size={"01": SIZE}.get)
     write_calibration(read_calibration(tmp_path, image_size=SIZE), tmp_path / "all.toml")
     assert_projects(read_calibration(tmp_path / "all.toml"))
+
+
+# ---------------------------------------------------------------- written back, and damaged
+
+
+def trees():
+    panoptic = [{"type": "hd", "panel": 0, "node": i, **camera(name, 100)} for i, name in enumerate(K)]
+    stereo = {f"CameraParameters{i}": matlab(name, True) for i, name in enumerate(K, 1)}
+    stereo |= {"RotationOfCamera2": np.eye(3).tolist(), "TranslationOfCamera2": [100.0, 0, 0]}
+    own = {key: {f"c{name}": make(name) for name in K} for key, make in NAMINGS.items()}
+    return own | {"panoptic": {"cameras": panoptic}, "stereo": stereo}
+
+
+@pytest.mark.parametrize("kind", ["panoptic", "freemocap", "camera to world", "c2w 3 x 4", "RT"])
+def test_units_and_directions_are_kept_where_a_rig_is_written_like_another(tmp_path, kind):
+    path = tmp_path / ("a.toml" if kind == "freemocap" else "a.json")
+    path.write_text(freemocap(58.0) if kind == "freemocap" else json.dumps(trees()[kind]))
+    rig = read_calibration(path)
+    turn = np.array([[0, -1, 0, 0.3], [1, 0, 0, -0.2], [0, 0, 1, 0.1], [0, 0, 0, 1]])
+    write_calibration_like(rig.moved(turn), path, tmp_path / f"b{path.suffix}")
+    for one, other in zip(read_calibration(tmp_path / f"b{path.suffix}"), rig.moved(turn)):
+        np.testing.assert_allclose(one.T_camera_world, other.T_camera_world, atol=1e-9)
+
+
+def leaves(tree, path=()):
+    yield path
+    for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ():
+        yield from leaves(value, (*path, key))
+
+
+JUNK = [None, "x", "", [], {}, 0, -1, True, [[1], [2, 3]], {"K": [1]}, [None], 1e300, [[0, 0, 0]] * 3, {"data": "x"}]
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.data())
+def test_a_value_that_is_wrong_anywhere_is_a_typed_error_or_a_rig(tmp_path_factory, data):
+    tree = json.loads(json.dumps(trees()[data.draw(st.sampled_from(sorted(trees())))]))
+    *way, last = data.draw(st.sampled_from([path for path in leaves(tree) if path]))
+    inner = tree
+    for key in way:
+        inner = inner[key]
+    inner[last] = data.draw(st.sampled_from(JUNK))
+    path = tmp_path_factory.mktemp("wrong") / "a.json"
+    path.write_text(json.dumps(tree))
+    _typed_or_rig(path)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_a_text_that_is_cut_is_a_typed_error_or_a_rig(tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("cut")
+    write_easymocap(folder)
+    text = data.draw(st.sampled_from([vicon(), theia(), freemocap(58.0), (folder / "intri.yml").read_text()]))
+    path = folder / "cut.txt"
+    path.write_text(text[: data.draw(st.integers(0, len(text)))])
+    _typed_or_rig(path)
+
+
+def _typed_or_rig(path):
+    try:
+        assert len(read_calibration(path, image_size=SIZE)) >= 1
+    except KinefitError as error:
+        assert str(path) in str(error) and error.remedy

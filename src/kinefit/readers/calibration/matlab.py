@@ -66,18 +66,19 @@ def matlab_tree(tree: Any, path: Path, of_mat: bool = False) -> Any:
         return [matlab_tree(one, path, of_mat) for one in tree]
     if not isinstance(tree, dict):
         return tree
-    if "CameraParameters1" in tree and "CameraParameters2" in tree:
-        unit = tree["CameraParameters1"].get("WorldUnits") if isinstance(tree["CameraParameters1"], dict) else None
+    if isinstance(tree.get("CameraParameters1"), dict) and isinstance(tree.get("CameraParameters2"), dict):
+        unit = tree["CameraParameters1"].get("WorldUnits")
         stated = {"unit": unit} if isinstance(unit, str) and worth(unit, LENGTHS) is not None else {}
         return {"cameras": _stereo(tree, path)} | stated
     if "MappingCoefficients" in tree:
         remedy = "Undistort the videos in MATLAB (undistortFisheyeImage), and give the parameters that it returns."
         raise CalibrationError("MATLAB's fisheye model (Scaramuzza's)", file=path, remedy=remedy)
-    if "RadialDistortion" not in tree and not (of_mat and np.shape(find(tree, "matrix")) == (3, 3)):
+    matrix = find(tree, "matrix")
+    if "RadialDistortion" not in tree and not (of_mat and isinstance(matrix, list)):
         return {key: matlab_tree(value, path, of_mat) for key, value in tree.items()}
-    K = numbers(find(tree, "matrix"), (3, 3), path, "camera matrix")
+    K = numbers(matrix, (3, 3), path, "camera matrix")
     shift = np.array([[0, 0, 1.0], [0, 0, 1.0], [0, 0, 0]])
-    rest = {key: value for key, value in tree.items() if value is not find(tree, "matrix")}
+    rest = {key: value for key, value in tree.items() if value is not matrix}
     out = {"matrix": (K - (shift.T if is_transposed(K) else shift)).tolist()}
     if "RadialDistortion" in tree:
         radial = numbers(rest.pop("RadialDistortion"), None, path, "RadialDistortion").ravel().tolist()

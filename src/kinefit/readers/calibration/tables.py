@@ -77,7 +77,8 @@ def _matrices(value: Any) -> Any:
 
 def _matrix(table: Table) -> Any:
     """Array of a stored OpenCV matrix (OpenCV 5 writes vectors with `sizes`); any other table as it is."""
-    if "data" not in table or not ("dt" in table or {"rows", "cols"} <= table.keys()):  # ROS writes no dt
+    of_ros = {"rows", "cols"} <= table.keys() and isinstance(table.get("data"), list)  # without dt
+    if not (of_ros or {"dt", "data"} <= table.keys()):
         return table
     shape = table.get("sizes") or (table.get("rows", -1), table.get("cols", 1))  # XML gives one length as a number
     return np.array(table["data"], dtype=float).reshape([int(n) for n in np.ravel(shape).tolist()]).tolist()
@@ -184,8 +185,8 @@ def stated_unit(tree: Table) -> str | None:
         if isinstance(unit, str):
             return unit
     cameras = tree.get("cameras")
-    if isinstance(cameras, list) and cameras and {"panel", "node"} <= set(cameras[0]):
-        return "cm"
+    if isinstance(cameras, list) and all(isinstance(c, dict) and {"panel", "node"} <= c.keys() for c in cameras[:1]):
+        return "cm" if cameras else None
     square = metadata.get("charuco_square_size")
     return "mm" if isinstance(square, int | float) and square > 1 else None  # 1: in squares of a board
 
@@ -303,8 +304,9 @@ def rigid(R: NDArray, t: NDArray, path: Path, place: str) -> NDArray:
 
 def _size(table: Table, path: Path, place: str) -> tuple[int, int] | None:
     size, width, height = find(table, "size"), find(table, "width"), find(table, "height")
-    if size is None and (shape := find(table, "shape")) is not None:
-        height, width, *_ = [*shape, None] if isinstance(shape, list) else (None, None)
+    shape = find(table, "shape")
+    if size is None and isinstance(shape, list) and len(shape) > 1:
+        height, width = shape[:2]
     if isinstance(size, dict):
         width, height, size = find(size, "width"), find(size, "height"), None
     if size is None and (width is None or height is None):

@@ -71,7 +71,7 @@ def _radial(frame: Element, centre: NDArray, path: Path, place: str) -> NDArray:
     if not words:
         k = numbers((frame.get("VICON_RADIAL") or "0 0").split(), None, path, f"{place}, VICON_RADIAL").ravel()
     else:
-        model = words.pop(0) if not words[0][-1].isdigit() or words[0][0].isalpha() else ""
+        model = words.pop(0) if words[0][0].isalpha() else ""
         k = numbers(words, (5,), path, f"{place}, VICON_RADIAL2")
         known = model in ("", "Vicon3Parameter", "ViconRadial2")
         if k[2:].any() and (not known or np.abs(k[:2] - centre).max() > _MAX_CENTRE_OFFSET_PX):
