@@ -263,7 +263,7 @@ def test_vicon_lenses_lead_from_distorted_to_ideal(tmp_path, square, k, second):
         assert np.abs(ideal - offset).max() > 5  # it is no trifle
         rays = np.hstack([ideal / K[camera.name][0][0], np.ones((len(u), 1))]) @ ROT[camera.name]
         seen = camera.project(CENTRE[camera.name] + 3.0 * rays)
-        np.testing.assert_allclose(seen, np.stack([u, v], axis=1), atol=0.05)
+        np.testing.assert_allclose(seen, np.stack([u, v], axis=1), atol=0.01)
 
 
 @pytest.mark.parametrize(

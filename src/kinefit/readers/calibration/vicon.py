@@ -13,7 +13,7 @@ from kinefit.geometry.camera import Camera
 from kinefit.geometry.se3 import rotation_from_quaternion
 from kinefit.readers.calibration.tables import build_camera, numbers, rigid
 
-_MAX_LENS_ERROR_PX = 0.05  # of the lens in OpenCV's terms against Vicon's, anywhere in the image
+_MAX_LENS_ERROR_PX = 0.01  # of the lens in OpenCV's terms against Vicon's, anywhere in the image
 _MAX_CENTRE_OFFSET_PX = 0.5  # of the distortion's centre from the principal point
 _SAME = 1e-3  # share by which a pixel's sides may differ
 _RADII = 400  # at which both lenses are compared
@@ -94,19 +94,14 @@ def _opencv_radial(radial: NDArray, corner: float, focal: float, path: Path, pla
     """
     distorted = np.linspace(0, corner, _RADII + 1)[1:]
     ideal = distorted * (1 + np.stack([distorted**2, distorted**4, distorted**6], axis=1) @ radial)
-    error = np.inf
-    k = np.zeros(8)
-    if np.all(np.diff(ideal) > 0) and ideal[0] > 0:
+    k, error = np.zeros(8), np.inf
+    if np.all(np.diff(ideal, prepend=0) > 0):
         squares = (ideal / ideal[-1]) ** 2
         ratio, powers = distorted / ideal, np.stack([squares, squares**2, squares**3], axis=1)
-        for columns in (powers, np.hstack([powers, -ratio[:, None] * powers])):  # a polynomial, else a fraction of two
-            a = np.linalg.lstsq(columns * ideal[:, None], (ratio - 1) * ideal, rcond=None)[0]
-            a = np.pad(a, (0, 6 - a.size))
-            found = ideal * (1 + powers @ a[:3]) / (1 + powers @ a[3:])
-            error = float(np.abs(found - distorted).max())
-            k[[0, 1, 4, 5, 6, 7]] = a / np.tile((ideal[-1] / focal) ** (2.0 * np.arange(1, 4)), 2)
-            if error < 0.1 * _MAX_LENS_ERROR_PX:
-                break
+        columns = np.hstack([powers, -ratio[:, None] * powers])  # ratio (1 + powers b) = 1 + powers a
+        a = np.linalg.lstsq(columns * ideal[:, None], distorted - ideal, rcond=None)[0]
+        error = float(np.abs(ideal * (1 + powers @ a[:3]) / (1 + powers @ a[3:]) - distorted).max())
+        k[[0, 1, 4, 5, 6, 7]] = a / np.tile((ideal[-1] / focal) ** (2.0 * np.arange(1, 4)), 2)
     if error > _MAX_LENS_ERROR_PX:
         remedy = "Undistort the video in Vicon's program, or calibrate with a board."
         raise CalibrationError("a distortion that OpenCV's lens cannot hold", file=path, place=place, remedy=remedy)
