@@ -323,6 +323,19 @@ def test_matlab_stereo_parameters(tmp_path, old, ending):
     assert_projects(rig.moved(np.linalg.inv(T_first)), {"01": "left", "02": "right"})
 
 
+@pytest.mark.parametrize("names", [("cameraMatrix1", "distCoeffs1"), ("K1", "D1"), ("K_1", "dist_1"), ("M1", "D1")])
+def test_a_stereo_pair_by_any_names(tmp_path, names):
+    R = ROT["02"] @ ROT["01"].T
+    tree = {"R": R.tolist(), "T": (T["02"] - R @ T["01"]).tolist(), "imageSize": SIZE}
+    for i, name in enumerate(K, 1):
+        tree |= {key.replace("1", str(i)): values[name] for key, values in zip(names, (K, DIST))}
+    (tmp_path / "stereo.json").write_text(json.dumps(tree))
+    T_first = np.eye(4)
+    T_first[:3, :3], T_first[:3, 3] = ROT["01"], T["01"]
+    rig = read_calibration(tmp_path / "stereo.json")
+    assert_projects(rig.moved(np.linalg.inv(T_first)), {"01": "left", "02": "right"})
+
+
 @pytest.mark.parametrize("old", [True, False])
 def test_matlab_structs_of_cameras(tmp_path, old):
     cameras = {}

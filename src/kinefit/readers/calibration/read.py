@@ -28,6 +28,7 @@ from kinefit.readers.calibration.tables import (
     camera_tables,
     read_table,
     stated_unit,
+    stereo_named,
     stereo_tables,
 )
 from kinefit.readers.calibration.vicon import vicon_cameras
@@ -206,11 +207,14 @@ def calibration_sources(path: Path) -> list[tuple[str, list[Path]]]:
 
 def _calibration_files(folder: Path) -> list[Path]:
     endings = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt", ".xcp", ".mat")
-    return sorted(file for file in folder.iterdir() if file.is_file() and file.name.lower().endswith(endings))
+    files = sorted(file for file in folder.iterdir() if file.is_file() and file.name.lower().endswith(endings))
+    tables = [file for file in files if file.suffix.lower() not in (".xcp", ".mat")]  # these may be of anything
+    return tables or files
 
 
 def tables_of(tree: dict, name: str, path: Path, exteriors: bool = True) -> list[tuple[str, dict]]:
     """All tables of a parsed file that hold a camera, with the camera's name."""
+    tree = stereo_named(tree)
     if "M1" in tree:
         return stereo_tables(tree if exteriors else {"R": [0, 0, 0], "T": [0, 0, 0]} | tree, path)
     return camera_tables(tree, name)

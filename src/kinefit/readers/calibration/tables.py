@@ -52,6 +52,7 @@ _OTHER_MODELS = (
     "inverse",
 )  # fmt: skip
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # OpenCV's order
+_OF_PAIR = re.compile(r"(?:(M|K|mtx|camera_?[mM]atrix)|(D|dist|dist_?[cC]oeffs))_?([12])")
 _PARSERS: dict[str, Callable[[str], Any]] = {"json": json.loads, "yaml": storage_of_yaml, "xml": storage_of_xml}
 
 
@@ -155,6 +156,15 @@ def _with_scalars(table: Table) -> Table:
     return table
 
 
+def stereo_named(tree: Table) -> Table:
+    """The table with OpenCV's names M1, D1, M2, D2 for the two cameras of a pair, whose pose is R, T; else as it is."""
+    named = {}
+    for key, value in tree.items():
+        found = _OF_PAIR.fullmatch(str(key))
+        named[f"{'M' if found[1] else 'D'}{found[3]}" if found else key] = value
+    return named if {"M1", "M2", "R", "T"} <= named.keys() else tree
+
+
 def stereo_tables(tree: Table, path: Path, names: tuple[str, str] = ("left", "right")) -> list[tuple[str, Table]]:
     """The two cameras of OpenCV's stereo calibration; the first is the world."""
     missing = [key for key in ("M1", "D1", "M2", "D2", "R", "T") if key not in tree]
@@ -165,7 +175,9 @@ def stereo_tables(tree: Table, path: Path, names: tuple[str, str] = ("left", "ri
             remedy="Give the folder that holds both intrinsics.yml and extrinsics.yml, or both to read_opencv_stereo.",
         )
     poses = (([0, 0, 0], [0, 0, 0]), (tree["R"], tree["T"]))
-    common = {key: value for key, value in tree.items() if key in ("image_width", "image_height", "fisheye_model")}
+    kinds = ("size", "shape", "width", "height", "model")
+    common = {key: value for kind in kinds for key, value in tree.items() if find({key: value}, kind) is not None}
+    common |= {"fisheye_model": tree.get("fisheye_model", False)}
     return [
         (name, common | {"matrix": tree[f"M{i}"], "distortion": tree[f"D{i}"], "rotation": R, "translation": t})
         for i, (name, (R, t)) in enumerate(zip(names, poses), 1)
