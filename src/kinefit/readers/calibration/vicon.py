@@ -27,7 +27,8 @@ def vicon_cameras(root: Element, path: Path) -> list[Camera]:
     along its z, y down. VICON_RADIAL (k1 k2) and VICON_RADIAL2 ("Vicon3Parameter" cx cy k1 k2 k3) take an image point d
     [px] from its centre to d (1 + k1 |d|² + k2 |d|⁴ + k3 |d|⁶) of an ideal lens: from distorted to ideal, the reverse
     of OpenCV. The pixel (0, 0) is taken for the centre of the first.
-    Source: Vicon CaraPost's reference, "About calibration data (XCP) files".
+    Source: Vicon CaraPost's reference, "About calibration data (XCP) files", for the attributes; that the lens leads
+    from distorted to ideal was found by other readers of these files, on positions that were known.
     """
     cameras = [one for one in root.iter("Camera") if one.find("KeyFrames/KeyFrame") is not None]
     filming = [one for one in cameras if one.get("ISDV", "0") != "0" or "video" in one.get("TYPE", "").lower()]

@@ -177,7 +177,7 @@ def _folders(files: list[Path], singles: list[Path]) -> list[Path]:
 
 def _is_xml_text(path: Path) -> bool:
     """Whether a text file has the tags of Qualisys and Theia3D."""
-    if path.suffix.lower() != ".txt":
+    if path.suffix.lower() != ".txt" or not path.is_file():
         return False
     with path.open("rb") as file:
         return b"<calibration" in file.read(1000)
