@@ -16,7 +16,7 @@ from kinefit.readers.guess.folder import guess_take
 from kinefit.readers.guess.names import trials
 from kinefit.readers.keypoint_sets import KEYPOINT_SETS
 from kinefit.readers.take.file import read_take
-from kinefit.readers.take.load import load_observations
+from kinefit.readers.take.load import load_observations, read_rig
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
 
 SIZE = (272, 480)
@@ -332,6 +332,65 @@ def test_calibrations_of_one_file_a_camera_are_found_as_a_folder(folder, rig):
     assert take.calibration.file == folder / "calib" and len(seen.rig) == 4
 
 
+def without_sizes(rig):
+    cameras = [
+        {"name": c.name, "K": c.matrix.tolist(), "R": c.T_camera_world[:3, :3].tolist(),
+         "t": c.T_camera_world[:3, 3].tolist()}
+        for c in rig
+    ]  # fmt: skip
+    return json.dumps({"cameras": cameras})
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_sizes_that_a_calibration_lacks_are_those_of_the_videos(folder, motion, rig, turned):
+    (folder / "calibration.json").write_text(without_sizes(rig))
+    write_videos(folder, [f"{name}.mp4" for name in rig.names], size=SIZE[::-1] if turned else SIZE)
+    write_video(folder / "calib" / f"board_{rig.names[0]}.mp4", size=(64, 48))
+    write_mediapipe(folder, motion, rig, [f"{name}.npy" for name in rig.names])
+    _, seen, guess = taken(folder)
+    assert {camera.size for camera in seen.rig} == {SIZE[::-1] if turned else SIZE}
+    assert f"likely calibration: no size of the images of {', '.join(rig.names)}" in notes(guess)
+    text = (folder / "take.toml").read_text()
+    turn = re.sub(r"^(video = .*)$", r"\1\nrotation = 90", text, flags=re.M)
+    (folder / "take.toml").write_text(turn)
+    assert {c.size for c in read_rig(read_take(folder / "take.toml"))} == {SIZE if turned else SIZE[::-1]}
+    two = "".join(re.split(r"(?=\[\[)", text)[:3])  # of the four cameras two
+    (folder / "take.toml").write_text(two)
+    assert read_rig(read_take(folder / "take.toml")).names == rig.names[:2]
+    for change in ('image = "scaled"', "size = [10, 10]"):
+        (folder / "take.toml").write_text(re.sub(r"^video = .*$", change, text, flags=re.M))
+        if "size" in change:
+            assert {c.size for c in read_rig(read_take(folder / "take.toml"))} == {(10, 10)}
+        else:
+            with pytest.raises(CalibrationError, match=f"camera {rig.names[0]}: the size of its image is missing"):
+                read_rig(read_take(folder / "take.toml"))
+
+
+def test_a_calibration_without_sizes_or_videos_is_told(folder, motion, rig):
+    (folder / "calibration.json").write_text(without_sizes(rig))
+    write_mediapipe(folder, motion, rig, [f"{name}.npy" for name in rig.names])
+    missing = rf"camera {rig.names[0]}: .*size of its image is missing.*\[\[camera\]\]"
+    with pytest.raises(CalibrationError, match=missing):
+        guess_take(folder)
+
+
+def test_easymocap_and_calibrations_in_txt_are_found(folder, motion, rig):
+    write_videos(folder, [f"{name}.mp4" for name in rig.names])
+    intri = extri = ""
+    for c in rig:
+        intri += f"K_{c.name}: {c.matrix.tolist()}\ndist_{c.name}: {c.distortion.tolist()}\n"
+        extri += f"Rot_{c.name}: {c.T_camera_world[:3, :3].tolist()}\nT_{c.name}: {c.T_camera_world[:3, 3].tolist()}\n"
+    (folder / "intri.yml").write_text("%YAML:1.0\n---\n" + intri)
+    (folder / "extri.yml").write_text("%YAML:1.0\n---\n" + extri)
+    _, seen, _ = taken(folder)
+    for one, other in zip(seen.rig, rig):
+        np.testing.assert_allclose(one.packed, other.packed, atol=1e-9)
+    (folder / "intri.yml").unlink()
+    (folder / "calib.txt").write_text("<calibration><cameras><camera")
+    with pytest.raises(CalibrationError, match=r"calib\.txt.*no calibration can be used: broken XML"):
+        guess_take(folder)
+
+
 def test_normalised_coordinates_and_odd_arrays_are_told(folder, motion, rig):
     write_calibration(rig, folder / "calibration.toml")
     write_videos(folder, [f"{name}.mp4" for name in rig.names])
@@ -465,6 +524,22 @@ def test_the_balancing_trial(data_dir, tmp_path):
     assert seen.frames == (0, 100) and len(seen.keypoints) == 4
 
 
+@pytest.mark.parametrize("calibration", ["Calib_refined_static.toml", "calibration"])
+def test_the_frame_of_keypoints_follows_the_evidence_that_is_printed(data_dir, tmp_path, calibration):
+    """A calibration that is off by 12 px, and no static trial: SOURCE.txt, trap 1, tells the frames."""
+    data = data_dir("video_balancing_4cam")
+    for name in ("videos", "openpose_json", calibration, *(f"mediapipe_landmarks_cam0{k}.npy" for k in (1, 2, 3, 4))):
+        (tmp_path / name).symlink_to(data / name)
+    guess = guess_take(tmp_path)
+    (tmp_path / "take.toml").write_text(guess.text, encoding="utf-8")
+    take = read_take(tmp_path / "take.toml")
+    assert {k.frame for k in take.keypoints if k.camera in ("cam01", "cam02")} == {"calibration"}
+    for detector, frame in (("openpose", "calibration"), ("mediapipe", "video")):
+        told = notes(guess, f"keypoints, {detector}")
+        taken_px, other_px = map(float, re.findall(r"([\d.]+) px", told))
+        assert f'guess keypoints, {detector}: frame = "{frame}"' in told and taken_px < other_px
+
+
 def test_its_static_trial_tells_the_frame_of_the_keypoints(data_dir, tmp_path):
     guess = guess_take(data_dir("video_balancing_4cam") / "static_trial", beside=tmp_path)
     (tmp_path / "take.toml").write_text(guess.text, encoding="utf-8")
@@ -503,6 +578,17 @@ def test_videos_alone_become_cameras_that_are_found(folder):
     assert take.calibration is None and [c.name for c in take.cameras] == ["left", "right"]
     assert all(camera.field_of_view == 64.0 for camera in take.cameras) and take.up == "z"
     assert any(note.about == "calibration" and "people in view" in note.told for note in guess.notes)
+
+
+def test_a_calibration_of_one_camera_is_left_out_and_a_damaged_one_refused(folder, rig):
+    write_videos(folder, ["cam01.mp4", "cam02.mp4"], frames=2)
+    write_calibration(Rig((rig["cam01"],)), folder / "cam01.toml")
+    (folder / "docker-compose.yml").write_text("a: [1,")  # of something else
+    guess = guess_take(folder)
+    assert any("cam01.toml is of one camera alone" in note.told for note in guess.notes)
+    (folder / "cam01.toml").write_text('[cam01]\nmatrix = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n[cam02]\nmatrix = "x"\n')
+    with pytest.raises(CalibrationError, match=r"cam01.toml.*no calibration can be used"):
+        guess_take(folder)
 
 
 def test_videos_of_one_name_are_not_mixed(folder):

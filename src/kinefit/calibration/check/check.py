@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from kinefit.multiview.followed import PersonKeypoints, follow
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.take.file import Take, read_take
-from kinefit.readers.take.load import Observations, load_observations
+from kinefit.readers.take.load import Observations, calibrated_size, load_observations
 from kinefit.readers.take.one_camera import is_alone
 from kinefit.readers.take.pictures import TakePictures
 from kinefit.subject.subject import Subject
@@ -156,7 +157,8 @@ def load_leniently(take: Take) -> Loaded:
         )
     try:
         stated = take.calibration
-        rig = Rig(()) if stated is None else read_calibration(stated.file, unit=stated.unit)
+        sizes = partial(calibrated_size, take)
+        rig = Rig(()) if stated is None else read_calibration(stated.file, unit=stated.unit, image_size=sizes)
     except KinefitError as error:
         return Loaded(take, None, (finding_of(error),))
     findings: list[Finding] = []

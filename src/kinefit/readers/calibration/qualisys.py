@@ -1,4 +1,4 @@
-"""Cameras of a Qualisys calibration (.qca XML)."""
+"""Cameras of a Qualisys calibration (.qca XML), and of Theia3D's, which has the same tags."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.readers.calibration.tables import build_camera, rigid
 
 _SUBPIXELS = 64.0  # focal lengths and centres are in 1/64 px; distortion coefficients are not scaled
+_MAX_SIDE = 16384.0  # [px] of an image: a larger number is in 1/64 px
 _FLIP = np.diag([1.0, -1.0, -1.0])  # Qualisys' cameras look along -z with y up
 
 _DISTORTION = (
@@ -27,9 +28,16 @@ _DISTORTION = (
 def qualisys_cameras(root: Element, path: Path) -> list[Camera]:
     """Active cameras of a parsed file; translation in the file's unit (millimetres).
 
-    The file gives the camera's position p and, in r11..r33, the rotation r from world to camera axes:
-    T_camera_world = (F r, -F r p) with F = diag(1, -1, -1).
+    Qualisys' file gives the camera's position p and, in r11..r33, the rotation r from world to camera axes:
+    T_camera_world = (F r, -F r p) with F = diag(1, -1, -1), and lengths in the image in 1/64 px. Theia3D writes the
+    same tags without `fov_video`, with lengths in px and the size as `sensorDimU` or the largest `sensorMaxU`; x, y, z
+    are the translation: T_camera_world = (r, (x, y, z)) (docs.theiamarkerless.com, Calibration Files).
     """
+    for element in root.iter():  # QTM's own protocol writes the same names with other capitals
+        element.tag = element.tag.lower()
+        attributes = {key.lower().replace("tangential", "tangental"): text for key, text in element.attrib.items()}
+        element.attrib.clear()
+        element.attrib.update(attributes)
     return [
         _camera(element, path)
         for element in root.iterfind("cameras/camera")
@@ -42,7 +50,7 @@ def _camera(element: Element, path: Path) -> Camera:
 
     def value(group: str, key: str, default: float | None = None) -> float:
         found = element.find(group)
-        text = None if found is None else found.get(key)
+        text = None if found is None else found.get(key.lower())
         try:
             number = default if text is None else float(text)
         except ValueError:
@@ -56,24 +64,34 @@ def _camera(element: Element, path: Path) -> Camera:
             )
         return number
 
-    if element.get("viewrotation", "0") not in ("0", "0.0"):
+    left = top = 0.0
+    subpixels = _SUBPIXELS
+    intrinsic = element.find("intrinsic")
+    if element.find("fov_video") is not None:
+        left, top = value("fov_video", "left"), value("fov_video", "top")
+        size = (int(value("fov_video", "right") - left) + 1, int(value("fov_video", "bottom") - top) + 1)
+    elif intrinsic is not None and "sensordimu" in intrinsic.attrib:
+        subpixels, size = 1.0, (int(value("intrinsic", "sensorDimU")), int(value("intrinsic", "sensorDimV")))
+    else:
+        largest = [value("intrinsic", f"sensorMax{axis}") for axis in "UV"]
+        subpixels = _SUBPIXELS if max(largest) > _MAX_SIDE else 1.0
+        size = (int(largest[0] / subpixels) + 1, int(largest[1] / subpixels) + 1)
+    if subpixels == _SUBPIXELS and element.get("viewrotation", "0") not in ("0", "0.0"):
         raise CalibrationError(
             f"its view is rotated by {element.get('viewrotation')} degrees",
             file=path,
             place=f"camera {name}",
             remedy="Set the view rotation to 0, export again, and set the rotation of the video in the take file.",
         )
-    left, top = value("fov_video", "left"), value("fov_video", "top")
-    size = (int(value("fov_video", "right") - left) + 1, int(value("fov_video", "bottom") - top) + 1)
-    focal = [value("intrinsic", f"focalLength{axis}") / _SUBPIXELS for axis in "UV"]
-    centre = [value("intrinsic", f"centerPoint{axis}") / _SUBPIXELS for axis in "UV"]
-    skew = value("intrinsic", "skew", 0.0) / _SUBPIXELS
+    focal = [value("intrinsic", f"focalLength{axis}") / subpixels for axis in "UV"]
+    centre = [value("intrinsic", f"centerPoint{axis}") / subpixels for axis in "UV"]
+    skew = value("intrinsic", "skew", 0.0) / subpixels
     K = np.array([[focal[0], skew, centre[0] - left], [0, focal[1], centre[1] - top], [0, 0, 1]])
     k = np.array([value("intrinsic", key, 0.0) for key in _DISTORTION])
     r = np.array([[value("transform", f"r{i}{j}") for j in (1, 2, 3)] for i in (1, 2, 3)])
-    position = np.array([value("transform", axis) for axis in "xyz"])
-    R = _FLIP @ r
-    return build_camera(name, size, K, k, "radtan", rigid(R, -R @ position, path, f"camera {name}, transform"), path)
+    xyz = np.array([value("transform", axis) for axis in "xyz"])
+    R, t = (r, xyz) if subpixels == 1.0 else (_FLIP @ r, -_FLIP @ r @ xyz)
+    return build_camera(name, size, K, k, "radtan", rigid(R, t, path, f"camera {name}, transform"), path)
 
 
 def qualisys_text(rig: Rig, text: str, metres_per_unit: float, path: Path) -> str:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from os import PathLike
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -19,26 +20,33 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
 from kinefit.readers.calibration.colmap import colmap_cameras
 from kinefit.readers.calibration.file_storage import parse_xml
+from kinefit.readers.calibration.matlab import matlab_tree, read_mat
 from kinefit.readers.calibration.qualisys import qualisys_cameras
 from kinefit.readers.calibration.tables import (
+    Sizes,
     camera_from_table,
     camera_tables,
     read_table,
     stated_unit,
+    stereo_named,
     stereo_tables,
 )
+from kinefit.readers.calibration.vicon import vicon_cameras
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.ros.rig import mcap_rig
 from kinefit.readers.units import LENGTHS, worth
 
 FORMATS = (
-    "OpenCV YAML/XML/JSON, Pose2Sim, aniposelib or caliscope TOML, Qualisys .qca XML, COLMAP text "
-    "(cameras.txt and images.txt), MCAP of ROS 2"
+    "OpenCV YAML/XML/JSON, Pose2Sim, aniposelib, caliscope or FreeMoCap TOML, EasyMocap, CMU Panoptic, Qualisys or "
+    "Theia3D XML, Vicon .xcp, MATLAB .mat, COLMAP text (cameras.txt and images.txt), MCAP of ROS 2"
 )
 MAX_CALIBRATION_BYTES = 2_000_000
 """Bytes of one file of a calibration; a camera takes about a thousand."""
+PAIRS = (("intrinsics", "extrinsics"), ("intri", "extri"))
+"""Names of two files that are one calibration: of OpenCV's stereo calibration, of EasyMocap."""
 
 _MAX_CAMERAS = 1000  # of a rig; the largest domes have 500
+_XML_MAKERS = {"qualisys": qualisys_cameras, "vicon": vicon_cameras}  # both in millimetres
 _FARTHEST = 200.0  # [m] a camera farther from the world's origin was not measured in metres
 
 
@@ -47,7 +55,7 @@ def read_calibration(
     path: str | PathLike[str],
     *,
     unit: str | float = "auto",
-    image_size: tuple[int, int] | None = None,
+    image_size: tuple[int, int] | Callable[[str], tuple[int, int] | None] | None = None,
     exteriors: bool = True,
 ) -> Rig:
     """Read the cameras of a calibration; its format is recognised from its content.
@@ -56,14 +64,16 @@ def read_calibration(
     ----------
     path : file or folder
         OpenCV YAML/XML/JSON (one file with all cameras; a folder with one file or one folder a camera; a folder with
-        intrinsics.yml and extrinsics.yml), Pose2Sim, aniposelib or caliscope TOML, Qualisys .qca XML,
-        COLMAP text (the folder), MCAP of ROS 2 (CameraInfo and
-        /tf_static; extra `ros`). Poses are world to camera. A single camera without a pose becomes the world.
+        intrinsics.yml and extrinsics.yml, or with EasyMocap's intri.yml and extri.yml), Pose2Sim, aniposelib,
+        caliscope or FreeMoCap TOML, CMU Panoptic JSON, Qualisys or Theia3D XML, Vicon .xcp, MATLAB .mat (extra
+        `matlab`), COLMAP text (the folder), MCAP of ROS 2 (CameraInfo and /tf_static; extra `ros`). Other JSON, YAML
+        and TOML is read by the names of its keys (docs/calibration.md). Poses are world to camera unless their name
+        says otherwise. A single camera without a pose becomes the world.
     unit : "auto", "m", "dm", "cm", "mm", "inch" or float [m]
         Unit of length of the file. "auto": what the file states (`unit = "mm"`, alone or under [metadata]), or what
-        its format defines (Qualisys: mm), else metres unless that cannot be.
-    image_size : (width, height) [px], optional
-        Size of the images, for files that do not state it.
+        its format defines (Qualisys, Vicon, FreeMoCap: mm, Panoptic: cm), else metres unless that cannot be.
+    image_size : (width, height) [px], or a function of the camera's name, optional
+        Size of the images, for files that do not state it; of the function None for a camera that it does not know.
     exteriors : bool
         False: cameras without a pose are taken too, and stand at the origin.
 
@@ -88,12 +98,9 @@ def read_calibration(
         return _read_folder(path, unit, image_size, exteriors)
     if path.name in ("cameras.txt", "images.txt"):
         return _read_folder(path.parent, unit, image_size, exteriors)
-    text = _read_text(path)
-    kind = recognise(text, path)
-    if kind == "qualisys":
-        cameras = qualisys_cameras(_xml_root(text, path), path)
-        return _rig(cameras, path, "mm" if unit == "auto" else unit)
-    tree = read_table(text, kind, path)
+    kind, tree = _parse(path)
+    if kind in _XML_MAKERS:
+        return _rig(_XML_MAKERS[kind](tree, path), path, "mm" if unit == "auto" else unit)
     tables = [(name, table, path) for name, table in tables_of(tree, path.stem, path, exteriors)]
     return _rig_of(tables, path, _chosen_unit(tree, unit), image_size, exteriors)
 
@@ -168,7 +175,7 @@ def _toml(camera: Camera, path: Path) -> str:
     return f"[{key}]\n" + "".join(f"{entry} = {value}\n" for entry, value in entries.items())
 
 
-def _read_folder(folder: Path, unit: str | float, image_size: tuple[int, int] | None, exteriors: bool) -> Rig:
+def _read_folder(folder: Path, unit: str | float, image_size: Sizes | None, exteriors: bool) -> Rig:
     if (folder / "cameras.txt").exists() or (folder / "cameras.bin").exists():
         return _rig(colmap_cameras(folder), folder, unit)
     sources = calibration_sources(folder)
@@ -196,8 +203,9 @@ def calibration_sources(path: Path) -> list[tuple[str, list[Path]]]:
     if path.is_file():
         return [(path.stem, [path])]
     files = _calibration_files(path)
-    if {"intrinsics", "extrinsics"} <= {file.stem for file in files}:
-        return [(path.name, [file for file in files if file.stem in ("intrinsics", "extrinsics")])]
+    for pair in PAIRS:
+        if set(pair) <= {file.stem for file in files}:
+            return [(path.name, [file for file in files if file.stem in pair])]
     if files:
         return [(file.stem, [file]) for file in files]
     inner = [(sub.name, _calibration_files(sub)) for sub in sorted(path.iterdir()) if sub.is_dir()]
@@ -205,12 +213,15 @@ def calibration_sources(path: Path) -> list[tuple[str, list[Path]]]:
 
 
 def _calibration_files(folder: Path) -> list[Path]:
-    endings = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt")
-    return sorted(file for file in folder.iterdir() if file.is_file() and file.name.lower().endswith(endings))
+    endings = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt", ".xcp", ".mat")
+    files = sorted(file for file in folder.iterdir() if file.is_file() and file.name.lower().endswith(endings))
+    tables = [file for file in files if file.suffix.lower() not in (".xcp", ".mat")]  # these may be of anything
+    return tables or files
 
 
 def tables_of(tree: dict, name: str, path: Path, exteriors: bool = True) -> list[tuple[str, dict]]:
     """All tables of a parsed file that hold a camera, with the camera's name."""
+    tree = stereo_named(tree)
     if "M1" in tree:
         return stereo_tables(tree if exteriors else {"R": [0, 0, 0], "T": [0, 0, 0]} | tree, path)
     return camera_tables(tree, name)
@@ -220,7 +231,7 @@ def _rig_of(
     tables: list[tuple[str, dict, Path]],
     path: Path,
     unit: str | float,
-    image_size: tuple[int, int] | None,
+    image_size: Sizes | None,
     exteriors: bool = True,
 ) -> Rig:
     if len(tables) > _MAX_CAMERAS:
@@ -233,12 +244,21 @@ def _rig_of(
     return _rig(cameras, path, unit)
 
 
-def _tree(path: Path) -> dict:
+def _parse(path: Path) -> tuple[str, Any]:
+    """Kind of a file, as `recognise` tells it, or "mat", and its tables, or the root of its XML."""
+    if path.suffix.lower() == ".mat":
+        return "mat", read_mat(path)
     text = _read_text(path)
     kind = recognise(text, path)
-    if kind == "qualisys":
-        raise CalibrationError("a Qualisys file", file=path, remedy="Give the path of this file itself.")
-    return read_table(text, kind, path)
+    return kind, _xml_root(text, path) if kind in _XML_MAKERS else matlab_tree(read_table(text, kind, path), path)
+
+
+def _tree(path: Path) -> dict:
+    kind, tree = _parse(path)
+    if kind in _XML_MAKERS:
+        problem = f"a file of {kind.capitalize()}"
+        raise CalibrationError(problem, file=path, remedy="Give the path of this file itself.")
+    return dict(tree)
 
 
 def _read_text(path: Path) -> str:
@@ -252,12 +272,12 @@ def _read_text(path: Path) -> str:
 
 
 def recognise(text: str, path: Path) -> str:
-    """Tell "toml", "json", "yaml", "xml" (OpenCV) or "qualisys" from the content."""
+    """Tell "toml", "json", "yaml", "xml" (OpenCV), "qualisys" or "vicon" from the content."""
     start = text.lstrip()
     if start.startswith("<"):
-        tag = _xml_root(text, path).tag
-        if tag in ("calibration", "opencv_storage"):
-            return "qualisys" if tag == "calibration" else "xml"
+        tag = _xml_root(text, path).tag.lower()
+        if tag in (roots := {"calibration": "qualisys", "opencv_storage": "xml", "cameras": "vicon"}):
+            return roots[tag]
     elif start.startswith("{") or (start.startswith("[") and path.suffix.lower() == ".json"):
         return "json"
     elif start.startswith(("%YAML", "---")):

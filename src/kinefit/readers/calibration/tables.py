@@ -3,37 +3,56 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from kinefit._files import parse_toml
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera
-from kinefit.geometry.se3 import exp_so3, transform
+from kinefit.geometry.se3 import exp_so3, inverse, transform
 from kinefit.readers.calibration.file_storage import storage_of_xml, storage_of_yaml
 
 Table = dict[str, Any]
+Sizes = tuple[int, int] | Callable[[str], tuple[int, int] | None]
+"""(width, height) [px] of all images, or a function of the camera's name, None where it knows none."""
 
-# Names that the formats use for one thing, lower case and without underscores.
+# Names that the formats use for one thing, lower case, without underscores and blanks.
 _KEYS = {
-    "matrix": ("matrix", "cameramatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "k", "m", "mtx"),
-    "distortion": (
-        "distortions", "distortion", "distortioncoefficients", "distcoeffs", "distcoef", "distcoefs", "dist", "d",
+    "matrix": (
+        "matrix", "cameramatrix", "cammatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "intrinsicparameters",
+        "k", "m", "mtx",
     ),
-    "size": ("size", "imagesize", "resolution"),
-    "width": ("imagewidth", "width", "w"),
-    "height": ("imageheight", "height", "h"),
-    "rotation": ("rotation", "rotationmatrix", "r", "rvec", "rot", "rmat"),
+    "distortion": (
+        "distortions", "distortion", "distortioncoefficients", "distortioncoeffs", "distortionparameters",
+        "distcoeffs", "distcoeff", "distcoef", "distcoefs", "dist", "d",
+    ),
+    "size": ("size", "imagesize", "imgsize", "resolution", "imageresolution", "framesize"),
+    "shape": ("imageshape", "imgshape", "frameshape"),  # as numpy has it: (height, width)
+    "width": ("imagewidth", "imgwidth", "framewidth", "width", "w"),
+    "height": ("imageheight", "imgheight", "frameheight", "height", "h"),
+    "rotation": ("rotation", "rotationmatrix", "rotationvector", "r", "rvec", "rot", "rmat", "rotmat"),
     "translation": ("translation", "translationvector", "t", "tvec"),
-    "pose": ("tcameraworld", "extrinsic", "extrinsics", "extrinsicmatrix"),
+    "pose": (
+        "tcameraworld", "extrinsic", "extrinsics", "extrinsicmatrix", "extrinsicparameters", "rt", "tcw", "w2c",
+        "worldtocamera", "worldtocam", "world2camera", "world2cam",
+    ),
+    "inverse pose": ("tworldcamera", "twc", "c2w", "cameratoworld", "camtoworld", "camera2world", "cam2world"),
     "model": ("distortionmodel", "model", "cameramodel"),
+    **{key: (key, f"{key[0]}l{key[1]}" if key[0] == "f" else f"pp{key[1]}") for key in ("fx", "fy", "cx", "cy")},
 }  # fmt: skip
 _FISHEYE = ("fisheye", "equidistant", "kannalabrandt")
+_OTHER_MODELS = (
+    "omni", "mei", "unified", "doublesphere", "eucm", "division", "fov", "scaramuzza", "ocam", "thinprism", "ftheta",
+    "inverse",
+)  # fmt: skip
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # OpenCV's order
+_OF_PAIR = re.compile(r"(?:(M|K|mtx|camera_?[mM]atrix)|(D|dist|dist_?[cC]oeffs))_?([12])")
 _PARSERS: dict[str, Callable[[str], Any]] = {"json": json.loads, "yaml": storage_of_yaml, "xml": storage_of_xml}
 
 
@@ -41,7 +60,7 @@ def read_table(text: str, kind: str, path: Path) -> Table:
     """Parse "toml", "json", "yaml" or "xml" (the last two: OpenCV FileStorage) into nested tables."""
     try:
         if kind == "toml":
-            return parse_toml(text, path, CalibrationError)
+            return dict(_matrices(parse_toml(text, path, CalibrationError)))
         tree = _matrices(_PARSERS[kind](text))
         return tree if isinstance(tree, dict) else {"cameras": tree}
     except (ValueError, TypeError, RecursionError, OverflowError, ElementTree.ParseError) as error:
@@ -59,18 +78,21 @@ def _matrices(value: Any) -> Any:
 
 def _matrix(table: Table) -> Any:
     """Array of a stored OpenCV matrix (OpenCV 5 writes vectors with `sizes`); any other table as it is."""
-    if not {"dt", "data"} <= table.keys():
+    of_ros = {"rows", "cols"} <= table.keys() and isinstance(table.get("data"), list)  # without dt
+    if not (of_ros or {"dt", "data"} <= table.keys()):
         return table
     shape = table.get("sizes") or (table.get("rows", -1), table.get("cols", 1))  # XML gives one length as a number
     return np.array(table["data"], dtype=float).reshape([int(n) for n in np.ravel(shape).tolist()]).tolist()
 
 
+def find_all(table: Table, kind: str) -> list[Any]:
+    """Values that a table gives for a kind of key, under whichever of its names."""
+    return [value for key, value in table.items() if re.sub(r"[\W_]", "", str(key)).lower() in _KEYS[kind]]
+
+
 def find(table: Table, kind: str) -> Any:
-    """Value that a table gives for a kind of key, under whichever of its names; None without."""
-    for key, value in table.items():
-        if isinstance(key, str) and key.lower().replace("_", "") in _KEYS[kind]:
-            return value
-    return None
+    """First value that a table gives for a kind of key; None without."""
+    return next(iter(find_all(table, kind)), None)
 
 
 def camera_tables(tree: Any, name: str) -> list[tuple[str, Table]]:
@@ -80,13 +102,67 @@ def camera_tables(tree: Any, name: str) -> list[tuple[str, Table]]:
         return [found for group in inner for found in group]
     if not isinstance(tree, dict):
         return []
-    for part in ("intrinsics", "extrinsics"):  # {"intrinsics": {"K": ...}, "extrinsics": {"R": ..., "t": ...}}
-        if isinstance(tree.get(part), dict):
+    for part in ("intrinsics", "intrinsic", "extrinsics", "extrinsic"):  # {"intrinsics": {"K": ...}, "extrinsics": ...}
+        if isinstance(tree.get(part), dict) and not _is_by_camera(tree[part]):
             tree = {key: value for key, value in tree.items() if key != part} | tree[part]
+    tree = _with_scalars(_by_camera(tree))
     if find(tree, "matrix") is not None and not isinstance(find(tree, "matrix"), dict):
-        return [] if tree.get("ignore") else [(str(tree.get("name") or name), tree)]
+        own = tree.get("name") or tree.get("camera_name") or name
+        return [] if tree.get("ignore") else [(str(own), tree)]
     inner = [camera_tables(value, name if key == "cameras" else str(key)) for key, value in tree.items()]
     return [found for group in inner for found in group]
+
+
+def _is_by_camera(value: Any) -> bool:
+    """Whether a table has a matrix for each of several cameras: {"cam1": [[...]], "cam2": ...}."""
+    if not isinstance(value, dict) or not value or find(value, "matrix") is not None:
+        return False
+    return all(isinstance(v, list) and len(v) == 3 and isinstance(v[0], list) for v in value.values())
+
+
+def _by_camera(tree: Table) -> Table:
+    """One table a camera, of a table whose keys bear the cameras' names, or whose values are tables of cameras.
+
+    EasyMocap's intri.yml and extri.yml have keys K_01, dist_01, Rot_01 (R_01 is the same as a vector), T_01, H_01.
+    """
+    matrices = find(tree, "matrix")
+    if _is_by_camera(matrices):
+        parts = {key: value for key, value in tree.items() if isinstance(value, dict)}
+        common = {key: value for key, value in tree.items() if key not in parts}
+        return {name: common | {key: part[name] for key, part in parts.items() if name in part} for name in matrices}
+    names = [key[2:] for key, value in tree.items() if str(key).startswith("K_") and isinstance(value, list)]
+    if not names:
+        return tree
+    ends = {name: f"_{name}" for name in names}
+    return {
+        name: {key.removesuffix(end): value for key, value in tree.items() if key.endswith(end)}
+        for name, end in ends.items()
+    }
+
+
+def _with_scalars(table: Table) -> Table:
+    """The table with a matrix of its fx, fy, cx, cy and a distortion of its k1, k2, p1 ..., where it has only these."""
+    if "K" in table and "k" in table:  # a matrix and coefficients
+        table = {"distortion" if key == "k" else key: value for key, value in table.items()}
+    pinhole = [find(table, key) for key in ("fx", "fy", "cx", "cy")]
+    if find(table, "matrix") is None and None not in pinhole:
+        table = table | {"matrix": pinhole}
+    given = find(table, "distortion")
+    scalars = given if isinstance(given, dict) else table
+    if (given is None or given is scalars) and "k1" in scalars:
+        names = ("k1", "k2", "k3", "k4") if _is_fisheye(table) else _COEFFICIENTS
+        rest = {key: value for key, value in table.items() if value is not given}
+        table = rest | {"distortion": [scalars.get(key, 0.0) for key in names]}
+    return table
+
+
+def stereo_named(tree: Table) -> Table:
+    """The table with OpenCV's names M1, D1, M2, D2 for the two cameras of a pair, whose pose is R, T; else as it is."""
+    named = {}
+    for key, value in tree.items():
+        found = _OF_PAIR.fullmatch(str(key))
+        named[f"{'M' if found[1] else 'D'}{found[3]}" if found else key] = value
+    return named if {"M1", "M2", "R", "T"} <= named.keys() else tree
 
 
 def stereo_tables(tree: Table, path: Path, names: tuple[str, str] = ("left", "right")) -> list[tuple[str, Table]]:
@@ -99,7 +175,9 @@ def stereo_tables(tree: Table, path: Path, names: tuple[str, str] = ("left", "ri
             remedy="Give the folder that holds both intrinsics.yml and extrinsics.yml, or both to read_opencv_stereo.",
         )
     poses = (([0, 0, 0], [0, 0, 0]), (tree["R"], tree["T"]))
-    common = {key: value for key, value in tree.items() if key in ("image_width", "image_height", "fisheye_model")}
+    kinds = ("size", "shape", "width", "height", "model")
+    common = {key: value for kind in kinds for key, value in tree.items() if find({key: value}, kind) is not None}
+    common |= {"fisheye_model": tree.get("fisheye_model", False)}
     return [
         (name, common | {"matrix": tree[f"M{i}"], "distortion": tree[f"D{i}"], "rotation": R, "translation": t})
         for i, (name, (R, t)) in enumerate(zip(names, poses), 1)
@@ -107,56 +185,95 @@ def stereo_tables(tree: Table, path: Path, names: tuple[str, str] = ("left", "ri
 
 
 def stated_unit(tree: Table) -> str | None:
-    """Unit of length that a file states: `unit`, alone or under `metadata`."""
+    """Unit of length that a file states: `unit`, alone or under `metadata`; or that its program writes.
+
+    The CMU Panoptic Studio's cameras (each has a `panel` and a `node`) stand in centimetres, FreeMoCap's (its
+    `metadata` has the board's `charuco_square_size`, in mm as a rule) in millimetres.
+    """
     metadata = tree.get("metadata")
-    for table in (tree, metadata if isinstance(metadata, dict) else {}):
+    metadata = metadata if isinstance(metadata, dict) else {}
+    for table in (tree, metadata):
         unit = table.get("unit", table.get("units"))
         if isinstance(unit, str):
             return unit
-    return None
+    cameras = tree.get("cameras")
+    if isinstance(cameras, list) and all(isinstance(c, dict) and {"panel", "node"} <= c.keys() for c in cameras[:1]):
+        return "cm" if cameras else None
+    square = metadata.get("charuco_square_size")
+    return "mm" if isinstance(square, int | float) and square > 1 else None  # 1: in squares of a board
 
 
 def camera_from_table(
-    name: str, table: Table, path: Path, *, image_size: tuple[int, int] | None, pose_needed: bool
+    name: str, table: Table, path: Path, *, image_size: Sizes | None, pose_needed: bool
 ) -> Camera:
-    """Camera of one table; translation in the file's unit."""
+    """Camera of one table; translation in the file's unit.
+
+    A matrix that is transposed, [[fx, 0, 0], [s, fy, 0], [cx, cy, 1]], tells that points are rows, as in MATLAB before
+    R2022b and in JARVIS: x_camera = x_world R + t, so that R is transposed, too.
+    """
     place = f"camera {name}"
-    K = numbers(find(table, "matrix"), (3, 3), path, f"{place}, camera matrix")
-    size = _size(table, path, place) or image_size
+    K = numbers(find(table, "matrix"), None, path, f"{place}, camera matrix")
+    if K.shape == (4,):
+        K = np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]])
+    K = numbers(K, (3, 3), path, f"{place}, camera matrix")
+    of_rows = is_transposed(K)
+    K = K.T if of_rows else K
+    size = _size(table, path, place) or (image_size(name) if callable(image_size) else image_size)
     if size is None:
         raise CalibrationError(
-            "the size of its image is missing", file=path, place=place, remedy="Pass image_size=(width, height)."
-        )
+            "the size of its image is missing", file=path, place=place,
+            remedy="Write size = [width, height] beside its matrix, or its video or size into the take's [[camera]] "
+            "(from Python: image_size=(width, height)).",
+        )  # fmt: skip
     model = "fisheye" if _is_fisheye(table) else "radtan"
+    named = str(find(table, "model") or "").lower().replace("_", "")
+    if any(word in named for word in _OTHER_MODELS) and find(table, "distortion") is not None:
+        remedy = "Undistort the videos, or calibrate again with OpenCV's model: k1, k2, p1, p2, k3, or its fisheye."
+        raise CalibrationError(f"a lens of the model {find(table, 'model')}", file=path, place=place, remedy=remedy)
     given = find(table, "distortion")
     k = numbers([] if given is None else given, None, path, f"{place}, distortion").ravel()
     allowed = 8 if model == "radtan" else 4
     if k.size > allowed and not k[allowed:].any():  # OpenCV's unused thin-prism and tilt terms
         k = k[:allowed]
-    rotation, translation, pose = find(table, "rotation"), find(table, "translation"), find(table, "pose")
-    if pose is not None:
+    return build_camera(name, size, K, k, model, _pose(table, of_rows, pose_needed, path, place), path)
+
+
+def is_transposed(K: ArrayLike) -> bool:
+    """Whether a camera matrix (3, 3) is written for points as rows."""
+    K = np.asarray(K, float) if np.shape(K) == (3, 3) else np.eye(3)
+    return bool(K[2, :2].any()) and not K[:2, 2].any()
+
+
+def _pose(table: Table, of_rows: bool, pose_needed: bool, path: Path, place: str) -> NDArray:
+    """T_camera_world of a table, in the file's unit."""
+    rotation, translation = find(table, "rotation"), find(table, "translation")
+    for kind in ("pose", "inverse pose"):
+        pose = find(table, kind)
+        if pose is None:
+            continue
         matrix = numbers(pose, None, path, f"{place}, pose")
-        if matrix.shape not in ((3, 4), (4, 4)):
-            raise CalibrationError(f"pose has shape {matrix.shape}", file=path, place=place, remedy="Give (4, 4).")
+        if matrix.shape not in ((3, 4), (4, 4)) or (matrix.shape == (4, 4) and np.any(matrix[3] != (0, 0, 0, 1))):
+            told = f"pose of shape {matrix.shape}" + ", whose last row is not 0 0 0 1" * (matrix.shape == (4, 4))
+            raise CalibrationError(told, file=path, place=place, remedy="Give (4, 4), a point being a column.")
         T = rigid(matrix[:3, :3], matrix[:3, 3], path, place)
-    elif rotation is not None and translation is not None:
+        return T if kind == "pose" else inverse(T)
+    if rotation is not None and translation is not None:
         R = numbers(rotation, None, path, f"{place}, rotation").squeeze()
         t = numbers(translation, (3,), path, f"{place}, translation")
         if R.shape not in ((3,), (3, 3)):
             raise CalibrationError(
                 f"rotation has shape {R.shape}", file=path, place=place, remedy="Give a (3,) vector or a (3, 3) matrix."
             )
-        T = rigid(exp_so3(R) if R.shape == (3,) else R, t, path, place)
-    elif rotation is None and translation is None and not pose_needed:
-        T = np.eye(4)
-    else:
-        missing = " and ".join(
-            key for key, value in (("rotation", rotation), ("translation", translation)) if value is None
-        )
-        raise CalibrationError(
-            f"{missing} missing", file=path, place=place, remedy="Calibrate the extrinsics too: every camera's pose."
-        )
-    return build_camera(name, size, K, k, model, T, path)
+        R = exp_so3(R) if R.shape == (3,) else R.T if of_rows else R
+        return rigid(R, t, path, place)
+    if rotation is None and translation is None and not pose_needed:
+        return np.eye(4)
+    missing = " and ".join(
+        key for key, value in (("rotation", rotation), ("translation", translation)) if value is None
+    )
+    raise CalibrationError(
+        f"{missing} missing", file=path, place=place, remedy="Calibrate the extrinsics too: every camera's pose."
+    )
 
 
 def build_camera(
@@ -199,6 +316,9 @@ def rigid(R: NDArray, t: NDArray, path: Path, place: str) -> NDArray:
 
 def _size(table: Table, path: Path, place: str) -> tuple[int, int] | None:
     size, width, height = find(table, "size"), find(table, "width"), find(table, "height")
+    shape = find(table, "shape")
+    if size is None and isinstance(shape, list) and len(shape) > 1:
+        height, width = shape[:2]
     if isinstance(size, dict):
         width, height, size = find(size, "width"), find(size, "height"), None
     if size is None and (width is None or height is None):

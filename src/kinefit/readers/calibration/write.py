@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit._arguments import checked
 from kinefit.errors import CalibrationError, ExportError, KinefitError, choices
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.geometry.se3 import log_so3
+from kinefit.geometry.se3 import inverse, log_so3
 from kinefit.readers.calibration.colmap import colmap_texts
 from kinefit.readers.calibration.qualisys import qualisys_text
 from kinefit.readers.calibration.read import (
@@ -27,7 +27,7 @@ from kinefit.readers.calibration.read import (
     tables_of,
 )
 from kinefit.readers.calibration.spans import value_span
-from kinefit.readers.calibration.tables import find, read_table
+from kinefit.readers.calibration.tables import find, find_all, is_transposed, read_table
 from kinefit.readers.ros.recordings import inside
 
 _REMEDY = "Write it as Pose2Sim TOML instead: kinefit.readers.calibration.read.write_calibration."
@@ -158,6 +158,8 @@ def _texts(rig: Rig, like: Path, unit: str | float) -> tuple[dict[str, str], Rig
         return texts, rig
     texts = {}
     for name, group in calibration_sources(like):
+        if odd := [file for file in group if file.suffix.lower() in (".mat", ".xcp")]:
+            raise CalibrationError("files of MATLAB and Vicon are read, not written", file=odd[0], remedy=_REMEDY)
         files = {file: file.read_bytes().decode("utf-8-sig") for file in group}
         kinds = {file: recognise(text, file) for file, text in files.items()}
         if "qualisys" in kinds.values():
@@ -227,22 +229,29 @@ def _entries(camera: Camera, table: dict, scale: float) -> list[tuple[str, Any, 
     """(key for a new entry, what stands there or None, what shall) of each entry of a camera."""
     T = np.array(camera.T_camera_world)
     T[:3, 3] /= scale
-    pose = find(table, "pose")
-    k, given = camera.distortion, find(table, "distortion")
+    pose, inverse_pose = find(table, "pose"), find(table, "inverse pose")
+    matrix, k, given = find(table, "matrix"), camera.distortion, find(table, "distortion")
+    of_rows = is_transposed(matrix)
     count = np.size([] if given is None else given)
     entries = [
-        ("matrix", find(table, "matrix"), _shaped(camera.matrix, find(table, "matrix"))),
+        ("matrix", matrix, _shaped(camera.matrix.T if of_rows else camera.matrix, matrix)),
         ("distortions", given, _shaped(np.pad(k, (0, max(0, count - k.size))), given)),
     ]
     if given is None and not k.any():
         entries.pop()
     if pose is not None:
         return [*entries, ("pose", pose, T if np.shape(pose) == (4, 4) else T[:3])]
-    rotation, translation = find(table, "rotation"), find(table, "translation")
-    R = T[:3, :3] if rotation is not None and np.size(rotation) == 9 else log_so3(T[:3, :3])
+    if inverse_pose is not None:
+        return [*entries, ("c2w", inverse_pose, inverse(T) if np.shape(inverse_pose) == (4, 4) else inverse(T)[:3])]
+    R, translation = T[:3, :3], find(table, "translation")
+    whole = R.T if of_rows else R
+    rotations = [  # EasyMocap's Rot and R are the same
+        ("rotation", old, _shaped(whole if np.size(old) == 9 else log_so3(R), old))
+        for old in find_all(table, "rotation") or [None]
+    ]
     return [
         *entries,
-        ("rotation", rotation, _shaped(R, rotation)),
+        *rotations,
         ("translation", translation, _shaped(T[:3, 3], translation)),
     ]
 

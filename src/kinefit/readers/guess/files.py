@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import os
 import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 
@@ -18,14 +20,15 @@ from kinefit._files import npy_header
 from kinefit._pictures import read_picture
 from kinefit.errors import CalibrationError, FileError, KinefitError
 from kinefit.geometry.camera import Rig
-from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, read_calibration
-from kinefit.readers.guess.names import natural
+from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, PAIRS, read_calibration
+from kinefit.readers.guess.names import camera_of, natural
 from kinefit.readers.image_folders import ENDINGS, ImageFolder
 from kinefit.readers.keypoints import decode_openpose
 from kinefit.readers.ros.recordings import inside
+from kinefit.readers.video import Video
 
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts", ".m2ts", ".ts", ".wmv", ".mxf"}
-CALIBRATIONS = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt")
+CALIBRATIONS = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt", ".xcp", ".mat")
 MARKERS = {".c3d", ".trc"}
 OF_CALIBRATION = re.compile(
     r"(?<![a-z])(?:(?:intrinsic|extrinsic|charuco|checker|chess|calib)\w*|board|wand|int|ext)(?![a-z])", re.IGNORECASE
@@ -50,11 +53,15 @@ _BLACK, _GREY = 10, 0.1  # how far from black or white a mask's pixels are, comp
 
 @dataclass(frozen=True, eq=False)
 class CalibrationFile:
-    """A calibration of several cameras, and the unit of length it was read with."""
+    """A calibration of several cameras, and the unit of length it was read with.
+
+    `sized`: its cameras whose image size it does not state, so that it is their videos'.
+    """
 
     path: Path
     rig: Rig
     unit: str = "auto"
+    sized: tuple[str, ...] = ()
 
     @property
     def spread(self) -> float:
@@ -107,8 +114,14 @@ def find_recordings(files: list[Path]) -> list[Path]:
     return sorted(whole, key=lambda path: -path.stat().st_size)
 
 
-def find_calibrations(files: list[Path]) -> tuple[list[CalibrationFile], list[Path], list[KinefitError]]:
+def find_calibrations(
+    files: list[Path], videos: Sequence[Path] = (), folder: Path | None = None
+) -> tuple[list[CalibrationFile], list[Path], list[KinefitError]]:
     """All calibrations of two or more cameras among files, by trying to read them.
+
+    Parameters
+    ----------
+    videos : whose size cameras have of which none is stated, by their names below `folder`.
 
     Returns
     -------
@@ -117,22 +130,24 @@ def find_calibrations(files: list[Path]) -> tuple[list[CalibrationFile], list[Pa
     found: list[CalibrationFile] = []
     singles: list[Path] = []
     faults: list[KinefitError] = []
+    sizes = partial(_video_size, sorted(videos, key=lambda path: bool(OF_CALIBRATION.search(path.name))), folder)
     detectors = {folder for folder, group in _by_folder(files) if sum(map(_numbered, group)) > _MANY}
     for path in files:
-        if not path.name.lower().endswith(CALIBRATIONS) or (path.parent in detectors and _numbered(path)):
+        known = path.name.lower().endswith(CALIBRATIONS) or _is_xml_text(path)
+        if not known or (path.parent in detectors and _numbered(path)):
             continue
         if path.stat().st_size > MAX_CALIBRATION_BYTES:
             continue
-        read = _try(path, faults)
+        read = _try(path, faults, sizes)
         if read and len(read.rig) > 1:
             found.append(read)
         elif read:
             singles.append(path)
-    for folder in _folders(files, singles):
-        read = _try(folder, faults)
+    for place in _folders(files, singles):
+        read = _try(place, faults, sizes)
         if read and len(read.rig) > 1:
             found.append(read)
-            faults = [fault for fault in faults if Path(str(fault.file)).parent != folder]
+            faults = [fault for fault in faults if Path(str(fault.file)).parent != place]
     return found, singles, faults
 
 
@@ -151,7 +166,7 @@ def _folders(files: list[Path], singles: list[Path]) -> list[Path]:
     for folder, group in _by_folder(files):
         names = {path.name for path in group}
         stems = {path.stem.lower() for path in group}
-        if {"cameras.txt", "images.txt"} <= names or {"intrinsics", "extrinsics"} <= stems:
+        if {"cameras.txt", "images.txt"} <= names or any(set(pair) <= stems for pair in PAIRS):
             out.append(folder)
     per_folder = _by_folder(singles)
     out += [folder for folder, group in per_folder if len(group) > 1]
@@ -160,10 +175,37 @@ def _folders(files: list[Path], singles: list[Path]) -> list[Path]:
     return list(dict.fromkeys(out))
 
 
-def _try(path: Path, faults: list[KinefitError]) -> CalibrationFile | None:
+def _is_xml_text(path: Path) -> bool:
+    """Whether a text file has the tags of Qualisys and Theia3D."""
+    if path.suffix.lower() != ".txt" or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return b"<calibration" in file.read(1000)
+
+
+def _video_size(videos: Sequence[Path], folder: Path | None, camera: str) -> tuple[int, int] | None:
+    """(width, height) [px] of the first video whose name, or number, is a camera's; None without."""
+    for path in videos:
+        if folder is not None and camera_of(path, folder, [camera]):
+            try:
+                with Video(path, rate=1.0) as video:
+                    return video.size
+            except KinefitError:
+                continue
+    return None
+
+
+def _try(
+    path: Path, faults: list[KinefitError], video_size: Callable[[str], tuple[int, int] | None]
+) -> CalibrationFile | None:
     """Read a calibration; without a unit that can be, in the one that puts the cameras most like a laboratory's."""
+    sized: dict[str, tuple[int, int] | None] = {}
+
+    def size_of(camera: str) -> tuple[int, int] | None:
+        return sized.setdefault(camera, video_size(camera))
+
     try:
-        return CalibrationFile(path, read_calibration(path))
+        return CalibrationFile(path, read_calibration(path, image_size=size_of), sized=tuple(sized))
     except CalibrationError as error:
         if "cannot be metres" not in error.problem:
             if "no camera in it" not in error.problem and (error.place or _CALLED.search(path.name)):
@@ -171,9 +213,9 @@ def _try(path: Path, faults: list[KinefitError]) -> CalibrationFile | None:
             return None
     except (KinefitError, RecursionError):
         return None
-    rigs = {unit: read_calibration(path, unit=unit) for unit in _UNITS}
+    rigs = {unit: read_calibration(path, unit=unit, image_size=size_of) for unit in _UNITS}
     unit = min(rigs, key=lambda u: abs(np.log(_spread(rigs[u]) / 3.0)))  # [m] usual between cameras and what they see
-    return CalibrationFile(path, rigs[unit], unit)
+    return CalibrationFile(path, rigs[unit], unit, tuple(sized))
 
 
 def _spread(rig: Rig) -> float:

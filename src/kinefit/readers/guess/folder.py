@@ -94,9 +94,10 @@ def _choose_calibration(
     draft: Draft, files: list[Path], seen: Sequence[Path], markers: bool
 ) -> CalibrationFile | None:
     """The calibration that most files fit; from the folder above where there is none here."""
-    found, singles, faults = guess_files.find_calibrations(files)
+    videos = guess_files.find_videos(files, draft.folder)
+    found, singles, faults = guess_files.find_calibrations(files, videos, draft.folder)
     if not found:
-        found = guess_files.find_calibrations(_above(draft.folder))[0]
+        found = guess_files.find_calibrations(_above(draft.folder), videos, draft.folder)[0]
     if not found and markers:
         draft.note("calibration", "open", f"none, so that videos and keypoints are left out. {_CALIBRATE}")
         return None
@@ -107,8 +108,9 @@ def _choose_calibration(
             remedy=f"{fault.remedy or ''} {_CALIBRATE}".strip(),
         )
     if not found:
-        videos = guess_files.find_videos(files, draft.folder)
         if videos and len(seen) == len(videos):
+            if singles:
+                draft.note("calibration", "open", f"{draft.name(singles[0])} is of one camera alone: left out")
             describe_uncalibrated(draft, _of_one_moment(draft, videos))
             return None
         alone = f" ({draft.name(singles[0])} is of one camera alone)" if singles else ""
@@ -132,6 +134,8 @@ def _choose_calibration(
         why += f"; taken before {', '.join(map(draft.name, draft.others))}, since {reason}"
     told = Told(best.path, "likely" if others else "sure", why)
     draft.note("calibration", told.sure, f"{draft.name(best.path)}: {why}")
+    if best.sized:
+        draft.note("calibration", "likely", f"no size of the images of {', '.join(best.sized)}: their videos' is taken")
     draft.calibration = best, {"file": told}
     return best
 

@@ -75,7 +75,7 @@ def trials(
     ways: dict[str, str] = {}
     left: list[Path] = []
     for path in sorted(paths, key=lambda p: natural(str(p))):
-        found = _camera_of(path, folder, names)
+        found = camera_of(path, folder, names)
         if found is None or found[0] in groups[found[2]]:
             left.append(path)
             continue
@@ -91,8 +91,8 @@ def trials(
     return sorted(out, key=lambda t: (-len(t.files), natural(t.place))), left
 
 
-def _camera_of(path: Path, folder: Path, names: Sequence[str]) -> tuple[str, str, str] | None:
-    """Camera, way and place of one file: from its own name, else from the folders above it."""
+def camera_of(path: Path, folder: Path, names: Sequence[str]) -> tuple[str, str, str] | None:
+    """Camera, way (of `HOW`) and place of one file: from its own name, else from the folders above it."""
     parts = list(path.relative_to(folder).parts)
     parts[-1] = PurePath(parts[-1]).stem if not path.is_dir() else parts[-1]
     for find, how in ((_by_name, "name"), (_by_number, "number")):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -239,7 +240,8 @@ def read_rig(take: Take, exteriors: bool = True) -> Rig | None:
     """The calibrated cameras that a take names; None where it has no calibration, or no cameras."""
     if take.calibration is None or not (take.cameras or take.depth):
         return None
-    rig = read_calibration(take.calibration.file, unit=take.calibration.unit, exteriors=exteriors)
+    sizes = partial(calibrated_size, take)
+    rig = read_calibration(take.calibration.file, unit=take.calibration.unit, image_size=sizes, exteriors=exteriors)
     names = [entry.name for entry in take.cameras] + [entry.camera or entry.name for entry in take.depth]
     for name in names:
         if name not in rig:
@@ -248,6 +250,24 @@ def read_rig(take: Take, exteriors: bool = True) -> Rig | None:
                 remedy=f"Correct the camera's name in {take.path.name}, or calibrate this camera too.",
             )
     return rig.select(tuple(dict.fromkeys(names)))
+
+
+def calibrated_size(take: Take, name: str) -> tuple[int, int] | None:
+    """(width, height) [px] of a camera's image, for a calibration that does not state it; None where nothing tells it.
+
+    It is that of the camera's video, or its `size`, unless the take says that the image is not the calibration's. A
+    camera that the take leaves out has a size that nobody asks for: (1, 1).
+    """
+    if name not in {one.camera or one.name for one in take.depth} | {one.name for one in take.cameras}:
+        return 1, 1
+    entry = next((entry for entry in take.cameras if entry.name == name), None)
+    if entry is None or entry.image != "as calibrated":
+        return None
+    size = entry.size
+    if entry.video is not None:
+        with Video(entry.video, rate=take.rate or 1.0) as video:
+            size = video.size
+    return size[::-1] if size and entry.rotation % 180 else size
 
 
 def image_frame(entry: CameraEntry, rig: Rig | None, video_size: tuple[int, int] | None, take: Take) -> ImageFrame:

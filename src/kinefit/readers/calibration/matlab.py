@@ -1,0 +1,112 @@
+"""MATLAB's camera parameters, in .mat files (extra `matlab`) and in JSON, as tables with OpenCV's conventions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kinefit.errors import CalibrationError, FileError
+from kinefit.readers.calibration.tables import Table, find, is_transposed, numbers
+from kinefit.readers.units import LENGTHS, worth
+
+_AS_STRUCT = "In MATLAB: s = toStruct(params); save('calibration.mat', '-struct', 's', '-v7')"
+
+
+def read_mat(path: Path) -> Table:
+    """Variables of a .mat file as tables; matrices of cameras count pixels from one, and sizes are (rows, columns).
+
+    Raises
+    ------
+    FileError
+        The extra `matlab` is not installed; no file of MATLAB, or one of version 7.3.
+    CalibrationError
+        Objects in place of structs.
+    """
+    try:
+        from scipy.io import loadmat
+    except ImportError:
+        remedy = "Run: pip install 'kinefit[matlab]'. Or in MATLAB: writelines(jsonencode(toStruct(params)), 'a.json')"
+        raise FileError("reading .mat files needs the package scipy", file=path, remedy=remedy) from None
+    try:
+        found = loadmat(path, simplify_cells=True)
+    except NotImplementedError:
+        remedy = "Save it again: save('calibration.mat', '-struct', 's', '-v7')."
+        raise FileError("a file of MATLAB's version 7.3", file=path, remedy=remedy) from None
+    except Exception as error:  # whatever a damaged file makes of the reader
+        raise FileError(f"no file of MATLAB that can be read: {error}", file=path, remedy="Save it again.") from None
+    variables = {key: _plain(value, path) for key, value in found.items() if not key.startswith("__")}
+    pair = next((v for v in variables.values() if isinstance(v, dict) and "CameraParameters1" in v), variables)
+    return matlab_tree(pair, path, of_mat=True)
+
+
+def _plain(value: Any, path: Path) -> Any:
+    """Dicts, lists, texts and numbers of what scipy gives."""
+    if isinstance(value, dict):
+        return {key: _plain(inner, path) for key, inner in value.items()}
+    if isinstance(value, np.ndarray) and value.dtype.names is None and value.dtype != object:
+        return value.tolist()
+    if isinstance(value, list | np.ndarray) and type(value).__name__ != "MatlabOpaque":
+        return [_plain(inner, path) for inner in value]
+    if not isinstance(value, str | int | float | np.generic):
+        raise CalibrationError("MATLAB's objects, which no other program reads", file=path, remedy=f"{_AS_STRUCT}.")
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def matlab_tree(tree: Any, path: Path, of_mat: bool = False) -> Any:
+    """A tree with MATLAB's cameras in OpenCV's terms; all else as it is.
+
+    MATLAB's `toStruct` gives ImageSize (rows, columns), RadialDistortion (k1 k2 [k3]), TangentialDistortion (p1 p2),
+    and K, or before R2022b IntrinsicMatrix = Kᵀ; the centre of the first pixel is (1, 1) (`cameraIntrinsicsToOpenCV`
+    takes one off). Of a stereo pair RotationOfCamera2 and TranslationOfCamera2 are for points as rows: x2 = x1 R + t;
+    the first camera is the world. `of_mat`: tables of other names count pixels and give sizes like that, too.
+    """
+    if isinstance(tree, list):
+        return [matlab_tree(one, path, of_mat) for one in tree]
+    if not isinstance(tree, dict):
+        return tree
+    if isinstance(tree.get("CameraParameters1"), dict) and isinstance(tree.get("CameraParameters2"), dict):
+        unit = tree["CameraParameters1"].get("WorldUnits")
+        stated = {"unit": unit} if isinstance(unit, str) and worth(unit, LENGTHS) is not None else {}
+        return {"cameras": _stereo(tree, path)} | stated
+    if "MappingCoefficients" in tree:
+        remedy = "Undistort the videos in MATLAB (undistortFisheyeImage), and give the parameters that it returns."
+        raise CalibrationError("MATLAB's fisheye model (Scaramuzza's)", file=path, remedy=remedy)
+    matrix = find(tree, "matrix")
+    if "RadialDistortion" not in tree and not (of_mat and isinstance(matrix, list)):
+        return {key: matlab_tree(value, path, of_mat) for key, value in tree.items()}
+    K = numbers(matrix, (3, 3), path, "camera matrix")
+    shift = np.array([[0, 0, 1.0], [0, 0, 1.0], [0, 0, 0]])
+    rest = {key: value for key, value in tree.items() if value is not matrix}
+    out = {"matrix": (K - (shift.T if is_transposed(K) else shift)).tolist()}
+    if "RadialDistortion" in tree:
+        radial = numbers(rest.pop("RadialDistortion"), None, path, "RadialDistortion").ravel().tolist()
+        tangential = numbers(rest.pop("TangentialDistortion", [0, 0]), (2,), path, "TangentialDistortion").tolist()
+        out["distortion"] = [*radial[:2], *tangential, *radial[2:]]
+    size = find(rest, "size")
+    if size is not None and np.size(size) == 2:
+        rows, columns = numbers(size, (2,), path, "ImageSize")
+        across, down = (K.T if is_transposed(K) else K)[:2, 2]
+        if not (0 < across <= columns and 0 < down <= rows):
+            where = f"({across:.0f}, {down:.0f})"
+            problem = f"the principal point {where} lies outside {rows:.0f} rows x {columns:.0f} columns"
+            raise CalibrationError(problem, file=path, remedy="Write ImageSize as [rows, columns], as MATLAB does.")
+        rest = {key: value for key, value in rest.items() if value is not size}
+        out["size"] = [columns, rows]
+    return rest | out
+
+
+def _stereo(tree: Table, path: Path) -> list[Table]:
+    """Both cameras of `toStruct(stereoParams)`; the first is the world."""
+    first, second = (matlab_tree(tree[f"CameraParameters{i}"], path) for i in (1, 2))
+    pose = tree.get("PoseCamera2")
+    if isinstance(pose, dict):
+        R, t = pose.get("R"), pose.get("Translation")
+    else:
+        R = np.transpose(numbers(tree.get("RotationOfCamera2"), (3, 3), path, "RotationOfCamera2")).tolist()
+        t = tree.get("TranslationOfCamera2")
+    if is_transposed(find(second, "matrix")):
+        second = second | {"matrix": np.transpose(find(second, "matrix")).tolist()}
+    zero = {"rotation": [0, 0, 0], "translation": [0, 0, 0]}
+    return [{"name": "left"} | first | zero, {"name": "right"} | second | {"rotation": R, "translation": t}]
