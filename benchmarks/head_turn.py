@@ -8,7 +8,7 @@ A turn's error is of the head in the world, about its own axes. Error bars are s
 trunk: their share inside is of these.
 
 Of the face: a face mesh beside, from four cameras 1.5 m away (a face is some 150 px high); each point stands 2 mm from
-its place on this face, those of an eye 1.5 mm together.
+its place on this face, those of an eye 1.5 mm together; left and right alike.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from kinefit.geometry import se3
 from kinefit.sensors.points.lifted import HIPS
 from kinefit.simulation import simulate_keypoints, studio_rig
 from kinefit.simulation.retarget import known_motion
+from kinefit.solvers.bundle.shape import mirror_points
 
 POSE, FACE = "MEDIAPIPE_33", "MEDIAPIPE_478"
 ERRORS = {"noise_px": 2.0, "drift_px": 1.0, "drift_time": 0.3, "outliers": 0.03, "missing": 0.05}
@@ -63,11 +64,13 @@ def head_moving(seed: int, body_name: str = "humanoid", *, seconds: float = _SEC
 
 def with_own_face(truth: Motion, seed: int) -> Motion:
     """The motion, of a face whose points stand 2 mm elsewhere; those of an eye 1.5 mm together and 0.5 mm each."""
-    random, points = np.random.default_rng(seed), truth.body.keypoints(FACE)
-    eyes = [truth.body.tree.segments[s].startswith("eye") for s in points.segments]
-    shift = np.where(np.array(eyes)[:, None], 0.0005, 0.002) * random.normal(size=(len(points), 3))
-    for eye in ("eye_l", "eye_r"):
-        shift[points.segments == truth.body.tree.segment(eye)] += 0.0015 * random.normal(size=3)
+    random, segments, points = np.random.default_rng(seed), truth.body.tree.segments, truth.body.keypoints(FACE)
+    eye = np.array([segments[s].startswith("eye") for s in points.segments])[:, None]
+    shift = np.where(eye, 0.0005, 0.002) * random.normal(size=(len(points), 3))
+    shift = shift + np.where(eye, 0.0015, 0.0) * random.normal(size=3)
+    lead, sign = mirror_points(points, segments)
+    shift = shift[lead]
+    shift[:, 2] *= sign
     return replace(truth, body=truth.body.with_keypoints(FACE, points.points + shift))
 
 
