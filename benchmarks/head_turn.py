@@ -106,7 +106,7 @@ def _scores(truth: Motion, motion: Motion, names: list[str]) -> tuple[NDArray, N
 def run() -> None:
     """Print every figure."""
     seconds = amount(_SECONDS, 1.0)
-    for cameras, what in ((4, "head_turn"), (1, "head_turn_one_camera")):
+    for cameras, what in ((4, "turn"), (1, "turn_one_camera")):
         turns, neck, inside = [], [], []
         for seed in amount(_SEEDS, _SEEDS[:1]):
             truth = somebody(head_moving(seed, seconds=seconds), seed, POSE)
@@ -122,11 +122,11 @@ def run() -> None:
             for to, values in zip((neck, inside), _scores(truth, motion, _NECK)):
                 to.append(values)
         for name, value in zip(("vertical", "nod", "tilt"), np.concatenate(turns).mean(axis=0)):
-            figure(f"{what}_{name}", float(value), "deg", "<= 2")
-        figure(f"{what}_neck", float(np.concatenate(neck).mean()), "deg", "<= 2")
+            figure(f"head_{what}_{name}", float(value), "deg", "<= 2")
+        figure(f"head_{what}_neck", float(np.concatenate(neck).mean()), "deg", "<= 2")
         share = 100.0 * float(np.concatenate(inside).mean())
-        figure(f"{what}_inside_least", share, "%", ">= 90")
-        figure(f"{what}_inside_most", share, "%", "<= 98")
+        figure(f"head_{what}_inside_least", share, "%", ">= 90")
+        figure(f"head_{what}_inside_most", share, "%", "<= 98")
     found = []
     for seed in amount(_SEEDS, _SEEDS[:1]):
         truth = with_own_face(somebody(head_moving(seed, "humanoid_face", seconds=seconds), seed, POSE), seed)
