@@ -1,4 +1,4 @@
-"""Every figure of hands with fingers: `python -m benchmarks.hands`; some parts: `... hands hands_simulated`."""
+"""Every figure of hands with fingers, and of heads: `python -m benchmarks.hands`; some parts: `... hands head_turn`."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from benchmarks.figures import run_parts
 PARTS = {
     "hands_simulated": "random motions of fingers before four cameras, through the command; speed beside the humanoid",
     "hands_real": "a seated person with both hands before four cameras, each of them held out of the fit",
+    "head_turn": "random turns of the head before four cameras and one, through the command; jaw and gaze before four",
 }
 
 if __name__ == "__main__":

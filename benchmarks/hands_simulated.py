@@ -77,22 +77,22 @@ def hands_moving(seed: int, *, seconds: float = _SECONDS) -> Motion:
     return known_motion(body, _RATE, roots, angles, name="hands")
 
 
-def somebody(truth: Motion, seed: int) -> Motion:
+def somebody(truth: Motion, seed: int, keypoint_set: str = SET) -> Motion:
     """The motion of somebody else, whose detector's points stand elsewhere."""
     random = np.random.default_rng(seed)
     body = truth.body.scaled(random.normal(1.0, 0.05, len(truth.body.scale_groups)))
-    points = body.keypoints(SET)
+    points = body.keypoints(keypoint_set)
     lead, sign = mirror_points(points, body.tree.segments)
     shift = np.where(fingers(body)[0][points.segments, None], 0.002, 0.008) * random.normal(size=(len(points), 3))
     shift = shift[lead]
     shift[:, 2] *= sign
-    return replace(truth, body=body.with_keypoints(SET, points.points + shift))
+    return replace(truth, body=body.with_keypoints(keypoint_set, points.points + shift))
 
 
-def near_rig(truth: Motion) -> Rig:
-    """Four cameras in front, about 1.5 m from the hands."""
+def near_rig(truth: Motion, landmarks: tuple[str, ...] = ("l_wrist", "r_wrist")) -> Rig:
+    """Four cameras in front, about 1.5 m from the hands or the middle of other landmarks."""
     rig = studio_rig(size=(1280, 960))
-    middle = truth.positions(truth.body.landmarks.select(("l_wrist", "r_wrist"))).mean(axis=(0, 1))
+    middle = truth.positions(truth.body.landmarks.select(landmarks)).mean(axis=(0, 1))
     cameras = []
     for k, (camera, azimuth) in enumerate(zip(rig, np.radians((-55.0, -18.0, 20.0, 60.0)))):
         place = middle + 1.5 * np.array([np.cos(azimuth), 0.25 + 0.2 * (k % 2), np.sin(azimuth)])
@@ -122,21 +122,21 @@ def seen_by(truth: Motion, rig: Rig, seed: int) -> list[Keypoints]:
     return out
 
 
-def tracked(rig: Rig, seen: list[Keypoints], folder: Path) -> Motion:
+def tracked(rig: Rig, seen: list[Keypoints], folder: Path, body: str = "humanoid_hands") -> Motion:
     """What `kinefit track` makes of it by its defaults."""
     write_calibration(rig, folder / "calibration.toml")
-    lines = ['[take]\nname = "hands"\nrate = 30.0\nup = "y"\nbody = "humanoid_hands"\n']
+    lines = [f'[take]\nname = "simulated"\nrate = 30.0\nup = "y"\nbody = "{body}"\n']
     lines += ['[calibration]\nfile = "calibration.toml"\n']
+    lines += [f'[[camera]]\nname = "{name}"\n' for name in dict.fromkeys(one.camera for one in seen)]
     for one in seen:
         values = np.concatenate([one.points[:, 0], one.confidence[:, 0, :, None]], axis=-1)
-        np.save(folder / f"{one.camera}.npy", np.nan_to_num(values))
-        lines += [f'[[camera]]\nname = "{one.camera}"\n']
-        lines += [f'[[keypoints]]\ncamera = "{one.camera}"\nfile = "{one.camera}.npy"\nformat = "mediapipe"\n']
+        np.save(folder / (file := f"{one.camera}_{one.keypoint_set}.npy"), np.nan_to_num(values))
+        lines += [f'[[keypoints]]\ncamera = "{one.camera}"\nfile = "{file}"\nformat = "mediapipe"\n']
     (folder / "take.toml").write_text("\n".join(lines))
     command = [sys.executable, "-m", "kinefit", "track", str(folder / "take.toml"), "-o", str(folder / "out")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     if done.returncode:
-        FAILED.append("hands_simulated track")
+        FAILED.append(f"track {body}")
         raise RuntimeError(done.stderr[-2000:])
     return read_motion(folder / "out" / "motion.npz")
 

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import LEFT_OUT, data, figure, quick
 from benchmarks.phones_rooms import turns_between
-from kinefit import Motion, track_take
+from kinefit import Motion, find_cameras, track_take
+from kinefit.calibration.people.of_take import cameras_file
 from kinefit.errors import KinefitError
 from kinefit.evaluation import angle_errors
 from kinefit.exporters.atomic import write_text
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.preparing.cameras import cameras_file
 from kinefit.readers.calibration.found import read_found
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.guess.folder import guess_take
@@ -70,7 +70,7 @@ def _tracked(videos: Path, calibration: Path, work: Path) -> tuple[Rig, Motion, 
     for path in sorted(videos.glob("*.mp4")):
         (work / path.name).symlink_to(path)
     write_text(work / "take.toml", guess_take(work).text)
-    motion = track_take(work / "take.toml")[0]
+    motion = track_take(find_cameras(work / "take.toml"))[0]
     found = read_found(cameras_file(work / "take.toml"))
     assert found is not None
     (work / calibration.name).symlink_to(calibration)

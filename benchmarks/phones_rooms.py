@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
 from benchmarks.motions import library
-from kinefit import Keypoints, Motion, track_take
+from kinefit import Keypoints, Motion, find_cameras, track_take
+from kinefit.calibration.people.of_take import cameras_file
 from kinefit.errors import KinefitError
 from kinefit.evaluation import angle_errors
 from kinefit.exporters.pictures.detections import write_detections
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import Detections
-from kinefit.preparing.cameras import cameras_file
 from kinefit.readers.calibration.found import FoundCameras, read_found
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.keypoint_sets import MEDIAPIPE_33
@@ -204,7 +204,7 @@ def score(draw: Room) -> Score:
     """Track a room with nothing known, and with everything."""
     with tempfile.TemporaryDirectory() as work:
         path = write_take(draw, Path(work), known=False)
-        motion = track_take(path)[0]
+        motion = track_take(find_cameras(path))[0]
         found = read_found(cameras_file(path))
         assert found is not None
         known = track_take(write_take(draw, Path(work), known=True))[0]

@@ -21,6 +21,7 @@ from kinefit.sensors.scene import Scene as Scene
 
 # From a recording to a motion
 from kinefit.batch.many import track_takes as track_takes
+from kinefit.calibration.people.of_take import find_cameras as find_cameras
 from kinefit.frame.results import FrameResult as FrameResult
 from kinefit.motion import Motion as Motion
 from kinefit.readers.take.file import read_take as read_take

@@ -6,8 +6,10 @@ from tests.oracle import posture, rig_around
 
 from kinefit.bodies import BodyState, load_body
 from kinefit.errors import TrackingError
+from kinefit.geometry import se3
 from kinefit.multiview.association import choose_people
 from kinefit.observations import Keypoints
+from kinefit.readers.keypoint_sets import keypoint_names
 
 BODY = load_body("humanoid")
 SET = "BODY_25B"
@@ -26,7 +28,7 @@ def walker(start, frames=12, seed=0):
     return np.array(out)
 
 
-def records(people, *, sure=1.0, seed=0, noise=3.0, hidden=()):
+def records(people, *, sure=1.0, seed=0, noise=3.0, hidden=(), rig=RIG, keypoint_set=SET):
     """Keypoints of people (F, K, 3) in every camera, in an order that changes from frame to frame; and who is where.
 
     `sure` is each person's confidence; hidden: (person, camera) pairs that are not seen.
@@ -35,7 +37,7 @@ def records(people, *, sure=1.0, seed=0, noise=3.0, hidden=()):
     frames, count = len(people[0]), len(people)
     sure = np.broadcast_to(sure, count)
     out, truth = [], []
-    for c, camera in enumerate(RIG):
+    for c, camera in enumerate(rig):
         order = np.stack([random.permutation(count) for _ in range(frames)])
         points = np.stack([camera.project(x) for x in people], axis=1)
         points = points + noise * random.normal(size=points.shape)
@@ -45,7 +47,7 @@ def records(people, *, sure=1.0, seed=0, noise=3.0, hidden=()):
                 points[:, person], confidence[:, person] = np.nan, 0.0
         points = np.take_along_axis(points, order[:, :, None, None], axis=1)
         confidence = np.take_along_axis(confidence, order[:, :, None], axis=1)
-        out.append(Keypoints(camera.name, SET, NAMES, 25.0, points, confidence))
+        out.append(Keypoints(camera.name, keypoint_set, keypoint_names(keypoint_set), 25.0, points, confidence))
         truth.append(np.argsort(order, axis=1))
     return out, truth  # truth[camera][frame, person] = place in the list
 
@@ -211,3 +213,22 @@ def test_where_the_surer_detector_sees_nobody_the_other_goes_on():
     chosen = choose_people(RIG, [*first, *(of_another_detector(k) for k in second)])
     np.testing.assert_array_equal(chosen[2][:5], -1)
     np.testing.assert_array_equal(chosen[len(first) + 2], 0)
+
+
+@pytest.mark.parametrize("meshes_first", [False, True])
+def test_a_face_mesh_goes_with_the_person_whose_face_it_is(meshes_first):
+    body = load_body("humanoid_face")
+    rig = rig_around((0.0, 0.0, 0.0))
+    people = {"BODY_25B": [], "MEDIAPIPE_478": []}
+    for place in (-0.5, 0.5):
+        state = BodyState(se3.transform(np.eye(3), np.array([0.0, 0.0, place])), body.tree.usual)
+        for name, seen in people.items():
+            points = body.keypoints(name)
+            full = np.full((len(keypoint_names(name)), 3), np.nan)
+            full[[keypoint_names(name).index(n) for n in points.names]] = body.positions(state, points)
+            seen.append(np.tile(full, (12, 1, 1)))
+    pose, where_pose = records(people["BODY_25B"], sure=(1.0, 0.8), seed=1, rig=rig)
+    mesh, where_mesh = records(people["MEDIAPIPE_478"], seed=2, rig=rig, keypoint_set="MEDIAPIPE_478")
+    both = [*mesh, *pose] if meshes_first else [*pose, *mesh]
+    found, truth = choose_people(rig, both), where_mesh + where_pose if meshes_first else where_pose + where_mesh
+    assert all(np.array_equal(chosen, of[:, 0]) for chosen, of in zip(found, truth, strict=True))

@@ -37,7 +37,7 @@ def test_sets_have_the_detectors_sizes_and_unique_names():
     sizes = {name: len(names) for name, names in KEYPOINT_SETS.items()}
     assert sizes == {
         "BODY_25B": 25, "BODY_25": 25, "COCO_17": 17, "HALPE_26": 26, "MEDIAPIPE_33": 33,
-        "BODY_25_HANDS": 67, "COCO_WHOLEBODY_133": 133, "MEDIAPIPE_75": 75,
+        "BODY_25_HANDS": 67, "COCO_WHOLEBODY_133": 133, "MEDIAPIPE_75": 75, "MEDIAPIPE_478": 478,
     }
     assert all(len(set(names)) == len(names) for names in KEYPOINT_SETS.values())
     assert KEYPOINT_SETS["MEDIAPIPE_33"][23:26] == ("left_hip", "right_hip", "left_knee")
@@ -201,6 +201,23 @@ def test_mediapipe_bad_arrays(tmp_path):
     (tmp_path / "cut.npy").write_bytes((tmp_path / "m.npy").read_bytes()[:300])
     with pytest.raises(FileError, match="not a numpy array"):
         read_mediapipe(tmp_path / "cut.npy", camera="c", rate=30)
+
+
+@pytest.mark.parametrize("points", [468, 478])
+def test_a_face_mesh_has_a_depth_in_place_of_a_visibility(tmp_path, points):
+    mesh = np.random.default_rng(0).uniform(100.0, 600.0, (5, points, 3))
+    mesh[..., 2] = -0.1
+    mesh[1], mesh[2] = 0.0, np.nan
+    np.save(tmp_path / "m.npy", mesh)
+    seen = read_mediapipe(tmp_path / "m.npy", camera="c", rate=30)
+    assert seen.keypoint_set == "MEDIAPIPE_478" and seen.points.shape == (5, 1, 478, 2)
+    assert [seen.names[k] for k in (7, 33, 473)] == ["face_7", "right_face_eye_outer", "left_face_iris"]
+    assert np.array_equal(seen.points[0, 0, :points], mesh[0, :, :2])
+    assert np.array_equal(seen.confidence[:, 0, :468].all(axis=1), [True, False, False, True, True])
+    assert seen.confidence[0, 0, 468:].all() == (points == 478)
+    np.save(tmp_path / "shares.npy", mesh / 600.0)
+    with pytest.raises(ObservationError, match="0 to 1"):
+        read_mediapipe(tmp_path / "shares.npy", camera="c", rate=30)
 
 
 def test_caliscope_table(data_dir, tmp_path):

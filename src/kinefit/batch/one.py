@@ -105,12 +105,13 @@ def check_drawable(take: Take) -> None:
 def people_of(take: Take, out: Path, step: Step, tell: Tell) -> tuple[InView | None, list[tuple[Take, Path]]]:
     """Who is to be tracked: what the cameras saw, and a take and a folder of results for each person.
 
-    Keypoints are detected and bodies fetched first, where the take needs them.
+    Keypoints are detected, cameras found and bodies fetched first, where the take needs them.
     """
+    from kinefit.calibration.people.of_take import find_cameras
     from kinefit.preparing.take import prepared
     from kinefit.tracking.takes.in_view import people_in_view
 
-    take = prepared(take, step, tell)
+    take = prepared(find_cameras(take, step, tell), step, tell)
     view = people_in_view(take) if take.person is None else None
     people = len(view.people) if view else 0
     if people < 2:

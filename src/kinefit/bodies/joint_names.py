@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
+from kinefit.bodies.limbs import FACE
 from kinefit.bodies.toml.bodies import read_toml_body
 from kinefit.errors import BodyError, ObservationError, choices
 
@@ -240,7 +241,7 @@ def joint_map(names: Sequence[str], table: Mapping[str, str] | None = None, *, s
     Parameters
     ----------
     names : (J,) of the joints.
-    table : segment of `SEGMENTS` or `FINGERS` -> name of a joint, optional
+    table : segment of `SEGMENTS`, `FINGERS` or `FACE` -> name of a joint, optional
         Goes before what the names tell.
     source : str
         File of the character, for messages.
@@ -260,7 +261,7 @@ def joint_map(names: Sequence[str], table: Mapping[str, str] | None = None, *, s
         index = find(names, name)
         if index is None:
             raise BodyError(choices("joint", name, names), file=source or None, place=f"table of names, {segment}")
-        if segment in SEGMENTS or segment in FINGERS:
+        if segment in (*SEGMENTS, *FINGERS, *FACE):
             told[segment] = index
     found = [
         (family, {s: i for s, n in family.joints.items() if (i := find(names, n)) is not None} | told)
@@ -273,15 +274,15 @@ def joint_map(names: Sequence[str], table: Mapping[str, str] | None = None, *, s
         known = ", ".join(family.name for family in FAMILIES)
         remedy = f"Name its joints by a table (--names-table), or as one of: {known}. It has: {', '.join(names)}"
         raise BodyError(f"the character has no joint for {', '.join(wanted)}", file=source or None, remedy=remedy)
-    twice = [names[i] for i in set(best.values()) if list(best.values()).count(i) > 1]
-    if twice:
+    if twice := [names[i] for i in set(best.values()) if list(best.values()).count(i) > 1]:
         raise BodyError(f"the joint '{twice[0]}' is named for two segments", file=source or None)
     explicit = ({s: n for s, n in f.trunk.items() if s in FINGERS} for f in conventions() if f not in FAMILIES)
     fingers = [
         {s: i for s, n in table.items() if (i := find(names, n)) is not None and i not in best.values()}
         for table in (*_FINGER_NAMES, *explicit)
     ]
-    return max(fingers, key=len) | best
+    face = {s: i for s, known in FACE.items() for n in known if (i := find(names, n)) is not None}
+    return {s: i for s, i in face.items() if i not in best.values()} | max(fingers, key=len) | best
 
 
 def lacking(segments: Iterable[str]) -> list[str]:

@@ -9,6 +9,13 @@ from kinefit.bodies.body import Body
 
 _MAX_BRANCHES = 4  # of a trunk; what forks into more, none of which forks again, is a hand
 
+FACE = {
+    "jaw": ("jaw", "CC_Base_JawRoot", "temporomandibular"),
+    "eye_l": ("leftEye", "eye.L", "CC_Base_L_Eye", "l_eyeball_joint"),
+    "eye_r": ("rightEye", "eye.R", "CC_Base_R_Eye", "r_eyeball_joint"),
+}
+"""Segments of the face of `humanoid_face` -> names in VRM, Rigify, iClone, H-Anim; a character may lack any."""
+
 
 def limbs(body: Body) -> tuple[tuple[int, ...], ...]:
     """Segments from each leaf up to where the tree branches, the nearest to the trunk first; fingers with their arm."""

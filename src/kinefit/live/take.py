@@ -29,10 +29,10 @@ from kinefit.preparing.each_video import Tell
 from kinefit.preparing.take import warn
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.motion import read_motion
+from kinefit.readers.take.cameras import assumed_camera, image_frame, is_alone, read_rig
 from kinefit.readers.take.depth import stated_camera
 from kinefit.readers.take.file import CameraEntry, DepthEntry, Take
-from kinefit.readers.take.load import image_frame, load_observations, read_rig
-from kinefit.readers.take.one_camera import assumed_camera, is_alone
+from kinefit.readers.take.load import load_observations
 from kinefit.readers.take.streams import streams_of
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import tracker_of

@@ -15,7 +15,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
 from kinefit.multiview.boxes import same_people
 from kinefit.multiview.medians import medians
-from kinefit.observations import Keypoints
+from kinefit.observations import MEDIAPIPE_478, Keypoints
 from kinefit.observations.arrays import sealed
 
 _ENOUGH = 4  # points of a person that must be seen
@@ -36,8 +36,8 @@ def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
     whom the groups show most over the whole take, by the number of keypoints seen and how sure the detector was of
     them; gone after from frame to frame, so that nobody else stands in for a moment (dynamic programming).
 
-    Where a camera has records of several detectors, the person is sought in those of the surest one, and in the others
-    by the boxes; alone where the surest sees nobody, if both are of one person elsewhere.
+    Where a camera has records of several detectors, the person is sought in those of the surest one (in a face mesh
+    last), and in the others by the boxes; alone where the surest sees nobody, if both are of one person elsewhere.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
         chosen |= zip(own, _of_one_detector(rig, [keypoints[q] for q in own]))
     frames = min(len(k) for k in keypoints)
     sure = {n: sum(float(surety_of(keypoints[q], frames).sum()) for q in own) for n, own in each.items()}
-    surest = {keypoints[q].camera: q for q in reversed(each[max(sure, key=lambda names: sure[names])])}
+    surest = {keypoints[q].camera: q for q in reversed(each[max(sure, key=lambda n: (n != MEDIAPIPE_478, sure[n]))])}
     for q, record in enumerate(keypoints):
         main = surest.get(record.camera, q)
         if main != q:

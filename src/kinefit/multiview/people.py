@@ -22,7 +22,7 @@ from kinefit.multiview.boxes import once, same_people
 from kinefit.multiview.likeness import Pictures
 from kinefit.multiview.medians import distances, medians
 from kinefit.multiview.returns import BRIEF, Chain, PresenceSpan, Return, chains_of
-from kinefit.observations import Keypoints
+from kinefit.observations import MEDIAPIPE_478, Keypoints
 from kinefit.sensors.channels import mirror_name
 from kinefit.solvers.assignment import assign
 
@@ -97,7 +97,7 @@ def people_of(rig: Rig, keypoints: Sequence[Keypoints], pictures: Pictures | Non
     if not keypoints:
         return []
     sets = [k.names for k in keypoints]
-    usual = max(sets, key=sets.count)
+    usual = max(sets, key=lambda names: (names != MEDIAPIPE_478, sets.count(names)))
     main = list({k.camera: q for q, k in reversed(list(enumerate(keypoints))) if k.names == usual}.values())
     search = _Search(rig, [keypoints[q] for q in main])
     for f in range(search.frames):

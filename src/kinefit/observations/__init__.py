@@ -7,7 +7,7 @@ one sensor, `frames` what it saw at one time.
 from kinefit.observations.body_trackers import BodyTrackerFrame, BodyTrackerVideo
 from kinefit.observations.colours import ColourVideo
 from kinefit.observations.depth import CloudVideo, DepthVideo
-from kinefit.observations.detections import MEDIAPIPE_33, MEDIAPIPE_75, MEDIAPIPE_HAND_21, Detections
+from kinefit.observations.detections import MEDIAPIPE_33, MEDIAPIPE_75, MEDIAPIPE_478, MEDIAPIPE_HAND_21, Detections
 from kinefit.observations.features import KeypointVideo, LineVideo, NamedMarkers
 from kinefit.observations.frames import (
     KEYPOINTS,
@@ -32,6 +32,7 @@ __all__ = [
     "KEYPOINT_SIGMA",
     "MEDIAPIPE_33",
     "MEDIAPIPE_75",
+    "MEDIAPIPE_478",
     "MEDIAPIPE_HAND_21",
     "BodyTrackerFrame",
     "BodyTrackerVideo",

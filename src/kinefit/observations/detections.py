@@ -33,6 +33,22 @@ MEDIAPIPE_HAND_21 = (
 MEDIAPIPE_75 = (*MEDIAPIPE_33, *(f"{side}_{name}" for side in ("left", "right") for name in MEDIAPIPE_HAND_21))
 """Names of the landmarks of a person with both hands: of the pose network, then of the left and the right hand."""
 
+_MESH = {  # points that bodies know
+    10: "forehead_top", 151: "forehead", 9: "glabella", 168: "nose_bridge", 6: "nose_bone", 195: "nose_ridge",
+    4: "nose_point", 2: "nose_base", 17: "lower_lip", 18: "chin_groove", 200: "chin_upper", 199: "chin_front",
+    152: "chin",
+}  # fmt: skip
+_MESH_SIDES = {  # right and left
+    "eye_outer": (33, 263), "eye_inner": (133, 362), "forehead_side": (103, 332), "cheekbone": (116, 345),
+    "temple": (127, 356), "chin_side": (32, 262), "chin_below": (176, 400), "iris": (468, 473),
+    "iris_top": (470, 475), "iris_bottom": (472, 477), "iris_inner": (469, 476), "iris_outer": (471, 474),
+}  # fmt: skip
+_MESH_NAMES = {k: f"face_{name}" for k, name in _MESH.items()} | {
+    k: f"{side}_face_{name}" for name, pair in _MESH_SIDES.items() for side, k in zip(("right", "left"), pair)
+}
+MEDIAPIPE_478 = tuple(_MESH_NAMES.get(k, f"face_{k}") for k in range(478))
+"""Names of the points of MediaPipe's face mesh, in its order; the last ten are the irises'."""
+
 
 @dataclass(frozen=True, eq=False)
 class Detections:

@@ -11,7 +11,6 @@ import msgspec
 
 from kinefit.bodies import load_body
 from kinefit.errors import ObservationError
-from kinefit.preparing.cameras import with_cameras
 from kinefit.preparing.detecting import DetectionJob, detect, jobs_of_take
 from kinefit.preparing.each_video import Step, Tell
 from kinefit.preparing.faces import ensure_faces
@@ -30,8 +29,7 @@ def prepared(take: Take, progress: Step | None = None, tell: Tell = warn) -> Tak
 
     Its body is fetched, where it is one that has to be. The built-in detector looks through the videos of a take that
     names no keypoints, nor another sensor that shows a body, or that asks for it; what it finds is kept beside the take
-    and not looked for again. So are faces, where the take hides them,
-    and where cameras stand that no calibration tells (`with_cameras`).
+    and not looked for again. So are faces, where the take hides them.
 
     Parameters
     ----------
@@ -43,7 +41,7 @@ def prepared(take: Take, progress: Step | None = None, tell: Tell = warn) -> Tak
     KinefitError
         As `ensure_detections`; what cannot be fetched.
     """
-    take = with_cameras(with_detections(take, progress, tell), progress, tell)
+    take = with_detections(take, progress, tell)
     if take.hide_faces and any(camera.video for camera in take.cameras):
         ensure_faces(take, progress, tell)
     if take.body == "anny":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from kinefit.errors import ObservationError, choices
-from kinefit.observations import MEDIAPIPE_33, MEDIAPIPE_75
+from kinefit.observations import MEDIAPIPE_33, MEDIAPIPE_75, MEDIAPIPE_478
 
 _FACE_ARMS_LEGS = (
     "Nose LEye REye LEar REar LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle RAnkle"
@@ -37,6 +37,7 @@ KEYPOINT_SETS: dict[str, tuple[str, ...]] = {
     ),
     "MEDIAPIPE_33": MEDIAPIPE_33,
     "MEDIAPIPE_75": MEDIAPIPE_75,
+    "MEDIAPIPE_478": MEDIAPIPE_478,
 }  # names in each detector's own order; of OpenPose both hands come after the body, left first
 
 HAND_POINTS = 21

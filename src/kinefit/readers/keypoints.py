@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import no_column, read_npy
-from kinefit._mapped import kept
 from kinefit.errors import FileError, ObservationError, choices
 from kinefit.observations import Keypoints
-from kinefit.observations.arrays import sealed
+from kinefit.readers.keypoint_arrays import FACE_POINTS, cut_frames, face_mesh, keypoint_record
 from kinefit.readers.keypoint_sets import HAND_POINTS, KEYPOINT_SETS, MEDIAPIPE_SETS, OPENPOSE_HANDS, keypoint_names
 
 if TYPE_CHECKING:
@@ -84,7 +83,7 @@ def read_openpose(
     """
     folder = Path(folder)
     names = keypoint_names(keypoint_set)
-    paths, start = _cut(_numbered_files(folder), frames, folder)
+    paths, start = cut_frames(_numbered_files(folder), frames, folder)
     people = [_read_people(path, len(names), keypoint_set) for path in paths]
     if folder.is_dir() and not any(map(len, people)):
         raise ObservationError(
@@ -94,7 +93,7 @@ def read_openpose(
     data = np.zeros((len(people), max(map(len, people)), len(names), 3))
     for row, persons in zip(data, people, strict=True):
         row[: len(persons)] = persons
-    return _keypoints(data, camera, keypoint_set, rate, time_offset, start, folder, image_frame)
+    return keypoint_record(data, camera, keypoint_set, rate, time_offset, start, folder, image_frame)
 
 
 @checked
@@ -102,13 +101,14 @@ def read_mediapipe(
     path: str | PathLike[str], *, camera: str, rate: float, frames: tuple[int, int] | None = None,
     time_offset: float = 0.0, image_frame: ImageFrame | None = None,
 ) -> Keypoints:  # fmt: skip
-    """Read MediaPipe landmarks from an array file (.npy): of the pose alone, or of both hands too.
+    """Read MediaPipe landmarks from an array file (.npy): of the pose alone, of both hands too, or of the face mesh.
 
     Parameters
     ----------
     path : path
         (F, 33, 3), or (F, 75, 3) with the left and the right hand after the pose: x, y [px] in the video's image
         frame, visibility; frames with nobody are all NaN or all zero, as is a hand that is not seen.
+        (F, 478, 3), or (F, 468, 3) without irises, is a face mesh: x, y [px], and a depth that is not used.
     camera, rate, frames, time_offset
         As in `read_openpose`.
     image_frame : ImageFrame, optional
@@ -117,21 +117,22 @@ def read_mediapipe(
     Raises
     ------
     ObservationError
-        Another shape, single NaNs, nobody at all.
+        Another shape, single NaNs, nobody at all; a face mesh in shares of the image's size in place of pixels.
     FileError
         Missing or not an array file.
     """
     path = Path(path)
     data = read_npy(path, remedy="Write it by numpy.save.")
     sets = {(len(KEYPOINT_SETS[name]), 3): name for name in MEDIAPIPE_SETS}
+    sets |= dict.fromkeys(((n, 3) for n in FACE_POINTS), "MEDIAPIPE_478")
     if data.dtype.kind not in "fiu" or data.shape[1:] not in sets:
-        remedy = "Give (frames, 33, 3) numbers, or (frames, 75, 3) with hands: x, y [px], visibility."
+        remedy = "Give x, y [px], visibility: (frames, 33, 3), with hands (frames, 75, 3), of a face (frames, 478, 3)."
         raise ObservationError(f"landmarks have shape {data.shape}", file=path, remedy=remedy)
-    data, start = _cut(data, frames, path)
+    data, start = cut_frames(data, frames, path)
     data, keypoint_set = np.array(data, dtype=float), sets[data.shape[1:]]
     names = KEYPOINT_SETS[keypoint_set]
     pose = len(KEYPOINT_SETS["MEDIAPIPE_33"])
-    for part in np.split(data, range(pose, len(names), HAND_POINTS), axis=1):
+    for part in np.split(data, range(pose, len(names), HAND_POINTS) if len(names) < min(FACE_POINTS) else (), axis=1):
         part[np.isnan(part).all(axis=(1, 2))] = 0
     if not np.isfinite(data).all():
         frame, point, _ = np.argwhere(~np.isfinite(data))[0]
@@ -139,12 +140,14 @@ def read_mediapipe(
             f"NaN or infinity at {names[point]}", file=path, place=f"frame {start + frame}",
             remedy="A frame with nobody must be NaN (or zero) as a whole.",
         )
+    if keypoint_set == "MEDIAPIPE_478":
+        data = face_mesh(data, path)
     if not data[..., 2].any():
         raise ObservationError(
             f"nobody is seen in any of the {len(data)} frames of camera {camera}", file=path,
             remedy="Check that the detector ran on this camera's video; or leave this camera out.",
         )
-    return _keypoints(data[:, None], camera, keypoint_set, rate, time_offset, start, path, image_frame)
+    return keypoint_record(data[:, None], camera, keypoint_set, rate, time_offset, start, path, image_frame)
 
 
 _CALISCOPE_HANDS = (100, 200)  # first indices of the right and of the left hand
@@ -214,7 +217,7 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
         data = np.zeros((frame.max() + 1, 1, len(KEYPOINT_SETS[keypoint_set]), 3))
         rows = port == p
         data[frame[rows], 0, point[rows]] = np.column_stack([table[rows, 4:6], np.ones(rows.sum())])
-        keypoints[f"cam_{p}"] = _keypoints(data, f"cam_{p}", keypoint_set, rate, 0.0, 0, path, None)
+        keypoints[f"cam_{p}"] = keypoint_record(data, f"cam_{p}", keypoint_set, rate, 0.0, 0, path, None)
     return keypoints
 
 
@@ -314,34 +317,3 @@ def _read_people(path: Path, count: int, keypoint_set: str) -> NDArray:
     if not np.isfinite(data).all():
         raise ObservationError("numbers too large", file=path, remedy="Run the detector again on this frame.")
     return data
-
-
-def _cut(items: Any, frames: tuple[int, int] | None, file: Path) -> tuple[Any, int]:
-    """Slice of the frames [start, stop) and its start."""
-    if frames is None:
-        return items, 0
-    if not 0 <= frames[0] < frames[1] <= len(items):
-        raise ObservationError(
-            f"frames [{frames[0]}, {frames[1]}] of {len(items)}", file=file,
-            remedy=f"There are frames = [0, {len(items)}].",
-        )
-    return items[frames[0] : frames[1]], frames[0]
-
-
-def _keypoints(
-    data: NDArray, camera: str, keypoint_set: str, rate: float, time_offset: float, start: int, source: Path,
-    image_frame: ImageFrame | None,
-) -> Keypoints:  # fmt: skip
-    """Record from (F, P, K, 3) x, y, confidence with zeros where unseen."""
-    if not rate > 0 or not np.isfinite(rate):
-        raise ObservationError(f"rate {rate} Hz", file=source, remedy="Give a positive frame rate.")
-    confidence = np.clip(data[..., 2], 0, 1)
-    points = data[..., :2]
-    seen = (confidence > 0) | points.any(axis=-1)
-    if image_frame is not None:
-        points = image_frame.to_calibration(points)
-    points = sealed(kept(np.where(seen[..., None], points, np.nan)))
-    confidence = sealed(kept(np.where(seen, confidence, 0.0)))
-    offset = time_offset + start / rate
-    names = keypoint_names(keypoint_set)
-    return Keypoints(camera, keypoint_set, names, rate, points, confidence, time_offset=offset, source=str(source))

@@ -115,7 +115,7 @@ def test_a_camera_of_another_day_is_named():
 
 def test_a_motion_that_tells_no_lens_is_refused():
     still = CameraChange(5.0, 5.0, np.zeros(2), 0.1, 0.1, 0.2, 0.0, 0.02, 0.1, 0.3, 0.0, 20.0)
-    changes = {name: still for name in room().names}
+    changes = dict.fromkeys(room().names, still)
     with pytest.raises(CalibrationError, match="does not tell the lenses.*cam01 to 30 %.*walks"):
         check_result(room(), changes, 0.2, times=10.0)
 

@@ -36,6 +36,15 @@ def test_fingers_come_back(tmp_path):
     assert np.abs(back.positions[:, columns] - motion.segment_poses()[..., :3, 3]).max() < 1e-6
 
 
+def test_jaw_and_eyes_come_back(tmp_path):
+    motion = smooth_motion(10, body=load_body("humanoid_face"))
+    write_bvh(motion, tmp_path / "a.bvh", unit="m")
+    back = read_bvh(tmp_path / "a.bvh", unit=1.0)
+    for name, segment in (("Jaw", "jaw"), ("LeftEye", "eye_l"), ("RightEye", "eye_r")):
+        of_file = back.Ts_world_joint[:, back.names.index(name)]
+        assert np.abs(of_file - motion.segment_poses()[:, motion.body.tree.segment(segment)]).max() < 1e-6
+
+
 def test_limbs_end_where_their_surfaces_end(tmp_path):
     motion = smooth_motion(3)
     write_bvh(motion, tmp_path / "a.bvh")

@@ -73,9 +73,9 @@ class Glb:
         return T
 
 
-@pytest.fixture(scope="module")
-def motion():
-    return smooth_motion(60, up="z", turns=2.0)
+@pytest.fixture(scope="module", params=[None, "humanoid_face"])
+def motion(request):
+    return smooth_motion(60, up="z", turns=2.0, body=request.param and load_body(request.param))
 
 
 @pytest.fixture(scope="module")

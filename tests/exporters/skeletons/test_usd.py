@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.exporters.synthetic import smooth_motion
 
-from kinefit.bodies import parse_body
+from kinefit.bodies import load_body, parse_body
 from kinefit.errors import ExportError
 from kinefit.exporters import write_usd
 from kinefit.exporters.skeletons.usd import joint_paths
@@ -14,9 +14,9 @@ from kinefit.exporters.skeletons.usd import joint_paths
 pxr = pytest.importorskip("pxr")
 
 
-@pytest.fixture(scope="module")
-def motion():
-    return smooth_motion(20, up="z")
+@pytest.fixture(scope="module", params=[None, "humanoid_face"])
+def motion(request):
+    return smooth_motion(20, up="z", body=request.param and load_body(request.param))
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +66,18 @@ def test_the_skin_rests_upright_and_follows_the_joints(motion, stage):
         low, high = (np.array(v) for v in UsdGeom.Boundable(stage.GetDefaultPrim()).GetExtentAttr().Get(frame))
         assert np.all(at >= low) and np.all(at <= high)
     assert isinstance(skeleton.ComputeJointLocalTransforms(0)[0], Gf.Matrix4d)
+
+
+def test_joints_are_where_the_motion_has_them(motion, stage):
+    skeleton, _ = skinning(stage)
+    order = [str(path).rsplit("/", 1)[-1] for path in skeleton.GetJointOrder()]
+    columns = [order.index(name) for name in motion.body.tree.segments]
+    truth = motion.segment_poses()[..., :3, 3]
+    for frame in (0, 7):
+        found = np.array([np.array(T)[3, :3] for T in skeleton.ComputeJointSkelTransforms(frame)])[columns]
+        assert np.linalg.norm(np.diff(found, axis=0), axis=1) == pytest.approx(
+            np.linalg.norm(np.diff(truth[frame], axis=0), axis=1), abs=1e-4
+        )
 
 
 def test_the_checker_of_usd_has_nothing_to_say(stage):

@@ -205,6 +205,10 @@ def test_fingers_are_those_of_the_avatar():
                      for k in ("Proximal", "Intermediate", "Distal")}  # fmt: skip
 
 
+def test_jaw_and_eyes_are_those_of_the_avatar():
+    assert {s: BONES[s] for s in ("jaw", "eye_l", "eye_r")} == {"jaw": "Jaw", "eye_l": "LeftEye", "eye_r": "RightEye"}
+
+
 def test_an_avatar_at_rest_stands_as_a_t():
     """A body in T pose that faces z has no turn in any bone: Unity's humanoid at rest."""
     from kinefit.bodies import load_body

@@ -9,9 +9,9 @@ from kinefit.errors import TakeError, TrackingError
 from kinefit.exporters.pictures.detections import write_detections
 from kinefit.observations import MEDIAPIPE_33, Detections
 from kinefit.readers.detections import read_detections
+from kinefit.readers.take.cameras import USUAL
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.readers.take.one_camera import USUAL
 from kinefit.simulation import squat_and_wave
 from kinefit.tracking.takes.in_view import people_in_view
 from kinefit.tracking.takes.take import track_take

@@ -25,10 +25,10 @@ from kinefit.findings import Finding, ranked
 from kinefit.geometry.camera import Rig
 from kinefit.multiview.followed import PersonKeypoints, follow
 from kinefit.readers.calibration.read import read_calibration
+from kinefit.readers.take.cameras import calibrated_size, is_alone
 from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.take.file import Take, read_take
-from kinefit.readers.take.load import Observations, calibrated_size, load_observations
-from kinefit.readers.take.one_camera import is_alone
+from kinefit.readers.take.load import Observations, load_observations
 from kinefit.readers.take.pictures import TakePictures
 from kinefit.subject.subject import Subject
 from kinefit.tracking.sizing import SizedPerson, sized_by_depth

@@ -133,7 +133,8 @@ def in_step(record: Keypoints, late: int, length: int) -> Keypoints:
 def _skeletons(camera: Camera, record: Keypoints) -> list[_Skeleton]:
     """Everybody whom a camera followed, the one seen best first."""
     assert record.lifted is not None
-    out, left = [], record
+    out: list[_Skeleton] = []
+    left = record
     columns = [record.names.index(name) for name in _JOINTS]
     for _ in range(min(record.points.shape[1], _PEOPLE)):
         try:

@@ -22,7 +22,7 @@ _ROW, _GREY = 190, "#8a949e"  # [px] height of one plot
 _JOINTS = {
     "hip": "Hip", "knee": "Knee", "ankle": "Ankle", "mtp": "Toes", "pelvis": "Pelvis", "back": "Lower back",
     "thoracic": "Upper back", "neck": "Neck", "sternoclavicular": "Collarbone", "shoulder": "Shoulder",
-    "elbow": "Elbow and forearm", "wrist": "Wrist",
+    "elbow": "Elbow and forearm", "wrist": "Wrist", "jaw": "Jaw", "eye": "Eyes",
     **{f"{digit}_{joint}": word for digit, word in DIGITS.items() for joint in FINGER_JOINTS},
 }  # fmt: skip
 
@@ -35,6 +35,7 @@ _POSITIVE = {
     "clav_prot": "shoulder forward", "clav_elev": "shoulder up", "arm_flex": "forward", "arm_add": "towards the middle",
     "arm_rot": "inwards", "elbow_flex": "flexion", "pro_sup": "pronation", "wrist_flex": "flexion",
     "wrist_dev": "towards the little finger", "pelvis_tilt": "backward", "pelvis_list": "right side down",
+    "jaw_opening": "down", "eye_abduction": "outwards", "eye_elevation": "up",
     **{f"{digit}_mcp_dev": "towards the little finger" for digit in DIGITS},
     **{f"thumb_{joint}_abd": "away from the palm" for joint in FINGER_JOINTS},
 }  # fmt: skip

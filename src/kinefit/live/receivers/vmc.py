@@ -26,10 +26,10 @@ from kinefit.geometry import se3
 from kinefit.live.packets import PosePacket
 from kinefit.motion import rotation_between_up
 
-_TRUNK = {"pelvis": "Hips", "abdomen": "Spine", "thorax": "Chest", "neck": "Neck", "head": "Head"}
+_TRUNK = {"pelvis": "Hips", "abdomen": "Spine", "thorax": "Chest", "neck": "Neck", "head": "Head", "jaw": "Jaw"}
 _SIDES = {
     "clavicle": "Shoulder", "upperarm": "UpperArm", "forearm": "LowerArm", "hand": "Hand", "thigh": "UpperLeg",
-    "shank": "LowerLeg", "foot": "Foot", "toes": "Toes",
+    "shank": "LowerLeg", "foot": "Foot", "toes": "Toes", "eye": "Eye",
 }  # fmt: skip
 BONES = _TRUNK | {f"{k}_{s}": words["Side"] + v for k, v in _SIDES.items() for s, words in SIDES.items()}
 BONES |= {segment: name[0].upper() + name[1:] for segment, name in VRM0_FINGERS.items()}

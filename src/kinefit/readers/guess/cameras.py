@@ -17,8 +17,8 @@ from kinefit.readers.guess.draft import Draft, Told
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile, KeypointFile
 from kinefit.readers.guess.keypoints import keypoint_entries, keypoint_sources, read_sources
 from kinefit.readers.guess.names import HOW, Trial, trials
+from kinefit.readers.take.cameras import USUAL
 from kinefit.readers.take.checks import ONE_CAMERA
-from kinefit.readers.take.one_camera import USUAL
 from kinefit.readers.video import Video, common_frames
 
 UNSTATED = 1.0  # [Hz] of what states no rate, until the user does

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from kinefit._files import parse_toml
 from kinefit.bodies.joint_names import FAMILIES, FINGERS, MORE, SEGMENTS, VRM0_FINGERS, VRM1_FINGERS
+from kinefit.bodies.limbs import FACE
 from kinefit.errors import FileError, choices
 from kinefit.motion import rotation_between_up
 from kinefit.readers.skeletons.bvh import read_bvh
@@ -96,7 +97,7 @@ def read_names(path: str | PathLike[str]) -> dict[str, str]:
 
     Returns
     -------
-    segment (of `SEGMENTS`, `FINGERS` or `MORE`) -> name of a joint
+    segment (of `SEGMENTS`, `FINGERS`, `FACE` or `MORE`) -> name of a joint
 
     Raises
     ------
@@ -108,7 +109,7 @@ def read_names(path: str | PathLike[str]) -> dict[str, str]:
     except (OSError, UnicodeDecodeError) as error:
         raise FileError(f"cannot be read ({error})", file=path, remedy="Give a TOML file.") from error
     for segment, name in table.items():
-        if segment not in (known := (*SEGMENTS, *FINGERS, *MORE)):
+        if segment not in (known := (*SEGMENTS, *FINGERS, *FACE, *MORE)):
             remedy = 'A line is: thigh_l = "LeftUpLeg".'
             raise FileError(choices("segment", segment, known), file=path, remedy=remedy)
         if not isinstance(name, str):
@@ -206,7 +207,7 @@ def _told(file: Mapping[str, Any]) -> dict[str, int]:
     old = more.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
     bones = {name: bone["node"] for name, bone in new.items()} | {bone["bone"]: bone["node"] for bone in old}
     joints = next(family for family in FAMILIES if family.name == "VRM, Unity").joints
-    joints |= VRM1_FINGERS if new else VRM0_FINGERS
+    joints |= (VRM1_FINGERS if new else VRM0_FINGERS) | {segment: known[0] for segment, known in FACE.items()}
     out = {segment: int(bones[name]) for segment, name in joints.items() if name in bones}
     if wrong := [name for name, node in out.items() if not 0 <= node < len(file["nodes"])]:
         raise ValueError(f"humanBones names a node for {wrong[0]} that the file does not have")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit.errors import CalibrationError, ObservationError, TakeError, choices, command
+from kinefit.errors import ObservationError, TakeError, command
 from kinefit.geometry import se3
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.observations import (
@@ -31,15 +30,21 @@ from kinefit.observations import (
 from kinefit.observations.clocks import frame_times, is_even, on_steps
 from kinefit.readers.body_trackers import read_body_trackers
 from kinefit.readers.calibration.found import found_notes
-from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoints import read_keypoints
 from kinefit.readers.markers import read_markers
+from kinefit.readers.take.cameras import (
+    assumed_camera,
+    image_frame,
+    is_alone,
+    is_uncalibrated,
+    read_rig,
+    what_is_assumed,
+)
 from kinefit.readers.take.depth import load_depth
 from kinefit.readers.take.entries import MarkersEntry, sensor_name
-from kinefit.readers.take.file import CameraEntry, KeypointsEntry, Take
+from kinefit.readers.take.file import KeypointsEntry, Take
 from kinefit.readers.take.lines import load_lines
-from kinefit.readers.take.one_camera import assumed_camera, is_alone, is_uncalibrated, what_is_assumed
 from kinefit.readers.take.silhouettes import load_regions, load_silhouettes
 from kinefit.readers.take.skin import load_skin
 from kinefit.readers.take.streams import refuse_streams
@@ -234,70 +239,6 @@ def _check_times(
                 place=f"{kinds.get(type(recording), 'depth')} {recording.sensor}",
                 remedy="Correct its time_offset, its rate, or frames.",
             )  # fmt: skip
-
-
-def read_rig(take: Take, exteriors: bool = True) -> Rig | None:
-    """The calibrated cameras that a take names; None where it has no calibration, or no cameras."""
-    if take.calibration is None or not (take.cameras or take.depth):
-        return None
-    sizes = partial(calibrated_size, take)
-    rig = read_calibration(take.calibration.file, unit=take.calibration.unit, image_size=sizes, exteriors=exteriors)
-    names = [entry.name for entry in take.cameras] + [entry.camera or entry.name for entry in take.depth]
-    for name in names:
-        if name not in rig:
-            raise CalibrationError(
-                choices("calibration of camera", name, rig.names), file=take.calibration.file,
-                remedy=f"Correct the camera's name in {take.path.name}, or calibrate this camera too.",
-            )
-    return rig.select(tuple(dict.fromkeys(names)))
-
-
-def calibrated_size(take: Take, name: str) -> tuple[int, int] | None:
-    """(width, height) [px] of a camera's image, for a calibration that does not state it; None where nothing tells it.
-
-    It is that of the camera's video, or its `size`, unless the take says that the image is not the calibration's. A
-    camera that the take leaves out has a size that nobody asks for: (1, 1).
-    """
-    if name not in {one.camera or one.name for one in take.depth} | {one.name for one in take.cameras}:
-        return 1, 1
-    entry = next((entry for entry in take.cameras if entry.name == name), None)
-    if entry is None or entry.image != "as calibrated":
-        return None
-    size = entry.size
-    if entry.video is not None:
-        with Video(entry.video, rate=take.rate or 1.0) as video:
-            size = video.size
-    return size[::-1] if size and entry.rotation % 180 else size
-
-
-def image_frame(entry: CameraEntry, rig: Rig | None, video_size: tuple[int, int] | None, take: Take) -> ImageFrame:
-    """How the image of a camera relates to the calibration's; an error proposes the line to write."""
-    assert rig is not None
-    if video_size and entry.size and entry.size != video_size:
-        raise TakeError(
-            f"size = {list(entry.size)}, but the video has {video_size[0]}x{video_size[1]}", file=take.path,
-            place=f"camera {entry.name}", remedy="Leave size out where there is a video.",
-        )
-    calibrated = rig[entry.name].size
-    turned = calibrated if entry.rotation % 180 == 0 else calibrated[::-1]
-    size = video_size or entry.size or turned
-    frame = ImageFrame.rotated(calibrated, entry.rotation)
-    if entry.image == "scaled":
-        return frame.then(ImageFrame.scaled(turned, size))
-    if entry.image == "letterboxed":
-        return frame.then(ImageFrame.letterboxed(turned, size))
-    if size == turned:
-        return frame
-    ratio = size[0] * turned[1] / (size[1] * turned[0])
-    line = (
-        "rotation = 90 (or 270)" if size == turned[::-1]
-        else 'image = "scaled"' if abs(ratio - 1) < 0.002
-        else 'image = "letterboxed" (bars were added) or image = "scaled" (it was stretched)'
-    )
-    raise CalibrationError(
-        f"the image has {size[0]}x{size[1]} px, but the calibration is of {calibrated[0]}x{calibrated[1]} px",
-        file=take.path, place=f"camera {entry.name}", remedy=f"State how the image came about: {line}.",
-    )
 
 
 def _read_keypoints(

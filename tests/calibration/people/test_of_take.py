@@ -6,10 +6,11 @@ from tests.calibration.people.test_skeletons import FRAMES, LATE, seen, turn_err
 from tests.calibration.people_data import BODY, room, walker
 
 from kinefit import read_take, track_take
+from kinefit.calibration.people import of_take
+from kinefit.calibration.people.of_take import cameras_file, find_cameras
 from kinefit.errors import TakeError
 from kinefit.exporters.pictures.detections import write_detections
 from kinefit.observations import Detections
-from kinefit.preparing.cameras import cameras_file, with_cameras
 from kinefit.readers.calibration.found import read_found
 from kinefit.readers.take.load import load_observations
 
@@ -38,7 +39,7 @@ def take_text(head):
 
 def test_a_take_without_calibration_is_tracked(folder):
     with pytest.warns(UserWarning, match="found from the people in view"):
-        motion, observations = track_take(folder / "take.toml")
+        motion, observations = track_take(find_cameras(folder / "take.toml"))
     found = read_found(cameras_file(folder / "take.toml"))
     assert turn_errors(found.rig).max() < 0.6
     np.testing.assert_allclose(np.array(found.time_offsets) * 30.0, LATE, atol=0.2)
@@ -51,17 +52,15 @@ def test_a_take_without_calibration_is_tracked(folder):
 
 
 def test_what_was_found_is_used_again_until_something_changes(folder, monkeypatch):
-    from kinefit.calibration.people import calibrate
-
     def never(*args, **options):
         raise AssertionError("found anew")
 
-    monkeypatch.setattr(calibrate, "calibrate_people", never)
-    take = with_cameras(read_take(folder / "take.toml"), None, lambda text: None)
+    monkeypatch.setattr(of_take, "calibrate_people", never)
+    take = find_cameras(folder / "take.toml", tell=lambda text: None)
     assert take.calibration.file.name == "take-cameras.toml" and take.calibration.position_sigma > 0
     (folder / "take.toml").write_text(take_text("height = 1.6"))
     with pytest.raises(AssertionError, match="found anew"):
-        with_cameras(read_take(folder / "take.toml"), None, lambda text: None)
+        find_cameras(folder / "take.toml", tell=lambda text: None)
 
 
 def test_reading_alone_says_what_finds_them(folder):
@@ -74,5 +73,5 @@ def test_a_camera_that_sees_nobody_is_left_out(folder):
     name = room().names[3]
     text = text.replace(f'[[keypoints]]\ncamera = "{name}"\nformat = "detect"\nfile = "{name}.npz"\nsigma = 2.0\n', "")
     (folder / "three.toml").write_text(text)
-    take = with_cameras(read_take(folder / "three.toml"), None, lambda text: None)
+    take = find_cameras(folder / "three.toml", tell=lambda text: None)
     assert [camera.name for camera in take.cameras] == list(room().names[:3])

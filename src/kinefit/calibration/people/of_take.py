@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import replace
+from os import PathLike
 from pathlib import Path
 from statistics import median
 
 import msgspec
 import numpy as np
 
+from kinefit._arguments import checked
 from kinefit.bodies import load_body
+from kinefit.calibration.people.calibrate import calibrate_people
 from kinefit.preparing.each_video import Step, Tell
+from kinefit.preparing.take import warn, with_detections
 from kinefit.readers.calibration.found import FoundCameras, read_found, write_found
+from kinefit.readers.take.cameras import USUAL, is_uncalibrated
 from kinefit.readers.take.entries import CalibrationEntry
-from kinefit.readers.take.file import Take
+from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.readers.take.one_camera import USUAL, is_uncalibrated
 
 
 def cameras_file(take: Path) -> Path:
@@ -24,21 +28,33 @@ def cameras_file(take: Path) -> Path:
     return take.with_name(f"{take.stem}-cameras.toml")
 
 
-def with_cameras(take: Take, progress: Step | None, tell: Tell) -> Take:
+@checked
+def find_cameras(
+    take: Take | str | PathLike[str], progress: Step | None = None, tell: Tell = warn
+) -> Take:  # fmt: skip
     """The take with cameras where the people in view put them; as it is where it has a calibration, or one camera.
 
-    Lenses, places and clocks are found together (`calibrate_people`) and written beside the take, TAKE-cameras.toml;
+    Keypoints are detected first where it names none. Lenses, places and clocks are found together (`calibrate_people`) and written beside the take, TAKE-cameras.toml;
     they are found anew where keypoints, height or fields of view changed.
+
+    Parameters
+    ----------
+    progress : called with (what, done, total)
+    tell : called with what was found, in sentences; default: a warning.
 
     Raises
     ------
+    KinefitError
+        What reading a take and detecting raise.
     CalibrationError
         The people do not tell where the cameras stand.
     ExportError
         The file cannot be written.
     """
+    take = take if isinstance(take, Take) else read_take(take)
     if not is_uncalibrated(take):
         return take
+    take = with_detections(take, progress, tell)
     seen = {entry.camera for entry in take.keypoints}
     if not (take.silhouettes or take.regions or take.skin or take.lines):
         take = replace(take, cameras=tuple(camera for camera in take.cameras if camera.name in seen))
@@ -64,8 +80,6 @@ def with_cameras(take: Take, progress: Step | None, tell: Tell) -> Take:
 
 def _find(take: Take, made_from: str, progress: Step | None) -> FoundCameras:
     """Cameras from a take's keypoints."""
-    from kinefit.calibration.people.calibrate import calibrate_people
-
     seen = load_observations(take, exteriors=False)
     assert seen.rig is not None
     found = calibrate_people(

@@ -1,0 +1,132 @@
+"""Cameras of a take: as calibrated, and how images relate to that; without calibration level, of a usual lens."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from kinefit.errors import CalibrationError, TakeError, choices
+from kinefit.geometry.camera import Camera, ImageFrame, Rig
+from kinefit.motion import UP_AXES
+from kinefit.readers.calibration.read import read_calibration
+from kinefit.readers.take.entries import CameraEntry
+from kinefit.readers.take.file import Take
+from kinefit.readers.video import Video
+
+USUAL = 64.0
+"""[deg] across the longer side of the image where nothing is told: videos of telephones have some 60 to 70."""
+
+
+def is_alone(take: Take) -> bool:
+    """Whether a take has one camera, and no calibration; `check_take` lets no sensor of another world beside it."""
+    return take.calibration is None and len(take.cameras) == 1
+
+
+def is_uncalibrated(take: Take) -> bool:
+    """Whether a take has several cameras and nothing that tells where they stand but the people in view."""
+    return take.calibration is None and len(take.cameras) > 1
+
+
+def assumed_camera(entry: CameraEntry, size: tuple[int, int] | None, take: Take) -> Camera:
+    """The camera as the take tells it, or as cameras usually are.
+
+    It looks level, along the axis before the vertical one: y where z is up, x where y is.
+
+    Raises
+    ------
+    TakeError
+        Nothing tells the size of its image.
+    """
+    if size is None:
+        raise TakeError(
+            "nothing tells the size of the image", file=take.path, place=f"camera {entry.name}",
+            remedy="Give the camera its video, or size = [width, height].",
+        )  # fmt: skip
+    width, height = size
+    focal = 0.5 * max(size) / np.tan(np.radians(entry.field_of_view or USUAL) / 2.0)
+    matrix = np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
+    up = np.array(UP_AXES[take.up], float)
+    ahead = np.roll(np.abs(up), -1)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([np.cross(ahead, up), -up, ahead])
+    return Camera(entry.name, size, matrix, T_camera_world=T)
+
+
+def what_is_assumed(take: Take) -> list[str]:
+    """What the report of a take with one camera and no calibration has to say; nothing of any other."""
+    if not is_alone(take):
+        return []
+    entry = take.cameras[0]
+    told = f"a field of view of {entry.field_of_view or USUAL:g}°" + ("" if entry.field_of_view else ", the usual one")
+    out = [
+        f"camera {entry.name} is alone and not calibrated: it is taken to look level, with {told}; where it is a tenth "
+        "wider, the person is a tenth nearer. Error bars do not hold this."
+    ]
+    if take.height is None:
+        out.append("no height is stated: lengths and distances are as unsure as the person's size, about a tenth")
+    return out
+
+
+def read_rig(take: Take, exteriors: bool = True) -> Rig | None:
+    """The calibrated cameras that a take names; None where it has no calibration, or no cameras."""
+    if take.calibration is None or not (take.cameras or take.depth):
+        return None
+    sizes = partial(calibrated_size, take)
+    rig = read_calibration(take.calibration.file, unit=take.calibration.unit, image_size=sizes, exteriors=exteriors)
+    names = [entry.name for entry in take.cameras] + [entry.camera or entry.name for entry in take.depth]
+    for name in names:
+        if name not in rig:
+            raise CalibrationError(
+                choices("calibration of camera", name, rig.names), file=take.calibration.file,
+                remedy=f"Correct the camera's name in {take.path.name}, or calibrate this camera too.",
+            )
+    return rig.select(tuple(dict.fromkeys(names)))
+
+
+def calibrated_size(take: Take, name: str) -> tuple[int, int] | None:
+    """(width, height) [px] of a camera's image, for a calibration that does not state it; None where nothing tells it.
+
+    It is that of the camera's video, or its `size`, unless the take says that the image is not the calibration's. A
+    camera that the take leaves out has a size that nobody asks for: (1, 1).
+    """
+    if name not in {one.camera or one.name for one in take.depth} | {one.name for one in take.cameras}:
+        return 1, 1
+    entry = next((entry for entry in take.cameras if entry.name == name), None)
+    if entry is None or entry.image != "as calibrated":
+        return None
+    size = entry.size
+    if entry.video is not None:
+        with Video(entry.video, rate=take.rate or 1.0) as video:
+            size = video.size
+    return size[::-1] if size and entry.rotation % 180 else size
+
+
+def image_frame(entry: CameraEntry, rig: Rig | None, video_size: tuple[int, int] | None, take: Take) -> ImageFrame:
+    """How the image of a camera relates to the calibration's; an error proposes the line to write."""
+    assert rig is not None
+    if video_size and entry.size and entry.size != video_size:
+        raise TakeError(
+            f"size = {list(entry.size)}, but the video has {video_size[0]}x{video_size[1]}", file=take.path,
+            place=f"camera {entry.name}", remedy="Leave size out where there is a video.",
+        )
+    calibrated = rig[entry.name].size
+    turned = calibrated if entry.rotation % 180 == 0 else calibrated[::-1]
+    size = video_size or entry.size or turned
+    frame = ImageFrame.rotated(calibrated, entry.rotation)
+    if entry.image == "scaled":
+        return frame.then(ImageFrame.scaled(turned, size))
+    if entry.image == "letterboxed":
+        return frame.then(ImageFrame.letterboxed(turned, size))
+    if size == turned:
+        return frame
+    ratio = size[0] * turned[1] / (size[1] * turned[0])
+    line = (
+        "rotation = 90 (or 270)" if size == turned[::-1]
+        else 'image = "scaled"' if abs(ratio - 1) < 0.002
+        else 'image = "letterboxed" (bars were added) or image = "scaled" (it was stretched)'
+    )
+    raise CalibrationError(
+        f"the image has {size[0]}x{size[1]} px, but the calibration is of {calibrated[0]}x{calibrated[1]} px",
+        file=take.path, place=f"camera {entry.name}", remedy=f"State how the image came about: {line}.",
+    )
