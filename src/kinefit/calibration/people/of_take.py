@@ -34,8 +34,9 @@ def find_cameras(
 ) -> Take:  # fmt: skip
     """The take with cameras where the people in view put them; as it is where it has a calibration, or one camera.
 
-    Keypoints are detected first where it names none. Lenses, places and clocks are found together (`calibrate_people`) and written beside the take, TAKE-cameras.toml;
-    they are found anew where keypoints, height or fields of view changed.
+    Keypoints are detected first where it names none. Lenses, places and clocks are found together (`calibrate_people`)
+    and written beside the take, TAKE-cameras.toml; they are found anew where keypoints, height or fields of view
+    changed.
 
     Parameters
     ----------
