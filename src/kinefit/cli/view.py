@@ -64,9 +64,9 @@ def gather(sources: tuple[Path, ...], take_file: Path | None, *, hide_faces: boo
     """Read everything that is to be shown."""
     import numpy as np
 
+    from kinefit.calibration.people.of_take import find_cameras
     from kinefit.preparing.faces import ensure_faces, shown_video
     from kinefit.readers.motion import read_motion
-    from kinefit.readers.take.file import read_take
     from kinefit.readers.take.find import takes_in
     from kinefit.readers.take.load import load_observations
     from kinefit.viewers.pictures import CameraImages
@@ -88,7 +88,7 @@ def gather(sources: tuple[Path, ...], take_file: Path | None, *, hide_faces: boo
             beside = beside or there
         motions.append(read_motion(source))
     if take_file is not None:
-        take = read_take(take_file)
+        take = find_cameras(take_file, tell=_screen.note)
         seen = load_observations(take)
     elif found := _fitting(beside, motions[0].name):
         take, seen = found
@@ -114,6 +114,7 @@ def gather(sources: tuple[Path, ...], take_file: Path | None, *, hide_faces: boo
 
 def _fitting(file: Path | None, name: str) -> tuple[Take, Observations] | None:
     """The take beside a folder of results and what its sensors saw, where it can be read and is the motion's."""
+    from kinefit.calibration.people.of_take import find_cameras
     from kinefit.errors import KinefitError
     from kinefit.readers.take.file import read_take
     from kinefit.readers.take.load import load_observations
@@ -125,6 +126,7 @@ def _fitting(file: Path | None, name: str) -> tuple[Take, Observations] | None:
         if take.name != name:
             _screen.note(f"Without {file}, which is of '{take.name}' and not of '{name}'; --take names another.")
             return None
+        take = find_cameras(take, tell=_screen.note)
         seen = load_observations(take)
     except KinefitError as error:
         _screen.note(f"Without the take beside it: {error}")

@@ -51,6 +51,7 @@ def check(
     if points is not None and not points.is_file():
         raise click.BadParameter(f"no such file: {points}", param_hint="--points")
     from kinefit.calibration.check.check import check_take
+    from kinefit.calibration.people.of_take import find_cameras
     from kinefit.cli._results import check_file
     from kinefit.cli.checks._page import check_page
     from kinefit.cli.checks._refine import refined_of, write_refined
@@ -73,6 +74,7 @@ def check(
             entry = with_detections(entry, step, _screen.note)
         except KinefitError as error:  # the rest can be checked without
             _screen.note(f"note: no keypoints: {error}")
+        entry = find_cameras(entry, step, _screen.note)
         if entry.hide_faces and any(camera.video for camera in entry.cameras):
             ensure_faces(entry, step, _screen.note)
         found = check_take(entry, progress=step)

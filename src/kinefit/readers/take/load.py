@@ -168,7 +168,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     if is_alone(take) or (is_uncalibrated(take) and not exteriors):
         rig = Rig(tuple(assumed_camera(e, sizes.get(e.name, e.size), take) for e in take.cameras))
     elif is_uncalibrated(take):
-        remedy = f"They are found from the people in view: {command('track', take.path)}"
+        remedy = f"They are found from the people in view: {command('track', take.path)}, or find_cameras in Python."
         raise TakeError("cameras that are not calibrated yet", file=take.path, remedy=remedy)
     images = {entry.name: image_frame(entry, rig, sizes.get(entry.name), take) for entry in take.cameras}
     keypoints, markers = [], tuple(_read_markers(entry) for entry in take.markers)
