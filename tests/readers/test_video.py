@@ -233,3 +233,10 @@ def test_rotation_is_found_whatever_the_side_data_iterates_over(over):
     assert _rotation(SimpleNamespace(side_data=SideData(kept, over))) == 90.0
     del kept["DISPLAYMATRIX"]
     assert _rotation(SimpleNamespace(side_data=SideData(kept, over))) == 0.0
+
+
+def test_streams_that_began_when_they_liked_have_what_all_saw():
+    clocks = {"a": np.arange(100) / 30.0, "b": np.arange(60) / 30.0 + 0.5}
+    assert common_frames(clocks, 30.0, overlap=True) == (15, 75)
+    with pytest.raises(ObservationError, match="streams of different length"):
+        common_frames(clocks, 30.0)

@@ -173,6 +173,7 @@ def common_frames(
     rate: float,
     frames: tuple[int, int] | None = None,
     *,
+    overlap: bool = False,
     file: str | PathLike[str] | None = None,
 ) -> tuple[int, int]:
     """Steps (start, stop) of the common time t = step / rate that the frames of every stream reach.
@@ -184,6 +185,7 @@ def common_frames(
     clocks : {stream: (N,) [s]} times of its frames in the take
     rate : float [Hz] of the take
     frames : (start, stop), optional, steps that are asked for
+    overlap : bool, streams began and ended when they liked: without `frames`, what all saw
     file : path, optional, of the take, for messages
 
     Raises
@@ -202,7 +204,7 @@ def common_frames(
         raise ObservationError(f"no time that all streams saw: {listed}", file=file, remedy="Check the time offsets.")
     if frames is None:
         slack = np.ceil(2.0 * rate * max(uneven.values(), default=0.0) - 1e-6)
-        if np.ptp([end - begin for begin, end in spans.values()]) > slack:
+        if not overlap and np.ptp([end - begin for begin, end in spans.values()]) > slack:
             raise ObservationError(
                 f"streams of different length: {listed}", file=file,
                 remedy=f"If they start together, take what all saw: frames = [{start}, {stop}].",

@@ -43,7 +43,7 @@ def test_a_take_without_calibration_is_tracked(folder):
     found = read_found(cameras_file(folder / "take.toml"))
     assert turn_errors(found.rig).max() < 0.6
     np.testing.assert_allclose(np.array(found.time_offsets) * 30.0, LATE, atol=0.2)
-    assert any("clock" in note for note in observations.notes) and "known to" in observations.notes[0]
+    assert any("clock" in note for note in observations.notes) and any("known to" in n for n in observations.notes)
     truth = walker(FRAMES)
     at = np.round(motion.times * 30.0).astype(int)
     x, y = motion.joint_centres, truth.joint_centres[at]

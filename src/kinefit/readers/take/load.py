@@ -200,7 +200,10 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     own = [*(recording.rate for recording in (*recordings, *lines)), *(m.rate for m in markers)]
     rate = fastest or own[0]
     if streams:
-        frames = common_frames(streams, rate, take.frames, file=take.path)
+        overlap = is_uncalibrated(take) or bool(found_notes(take.calibration))
+        frames = common_frames(streams, rate, take.frames, overlap=overlap, file=take.path)
+        if overlap and not take.frames and (whole := max(map(len, streams.values()))) > 1.1 * (frames[1] - frames[0]):
+            notes.append(f"all cameras saw {(frames[1] - frames[0]) / rate:.3g} s, the longest {whole / rate:.3g} s")
     elif recordings or lines:
         frames = take.frames or _span(recordings or lines, rate)
     else:
