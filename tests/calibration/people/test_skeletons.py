@@ -123,7 +123,7 @@ def test_a_motion_that_tells_no_lens_is_refused():
 def test_somebody_who_stands_still_tells_nothing_of_clocks():
     still = [replace(r, **{w: np.repeat(getattr(r, w)[:1], 30, axis=0) for w in ("points", "confidence", "lifted")})
              for r in seen()]
-    with pytest.raises(CalibrationError, match="moves like nobody.*somebody who moves"):
+    with pytest.raises(CalibrationError, match="move like none.*somebody who moves"):
         first_cameras(guessed(), still, within=1.0)
 
 

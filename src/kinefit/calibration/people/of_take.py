@@ -101,14 +101,14 @@ def _find(take: Take, made_from: str, progress: Step | None) -> FoundCameras:
 
 def _made_from(take: Take) -> str:
     """A hash of everything that the cameras are found from."""
-    told = hashlib.sha256(repr((take.height, take.up, take.rate, take.frames, take.body)).encode())
+    digest = hashlib.sha256(repr((take.height, take.up, take.rate, take.frames, take.body)).encode())
     for camera in take.cameras:
-        told.update(repr((camera.name, camera.field_of_view or USUAL, camera.size, camera.time_offset)).encode())
+        digest.update(repr((camera.name, camera.field_of_view or USUAL, camera.size, camera.time_offset)).encode())
     for entry in take.keypoints:
         files = [] if entry.file is None else sorted(entry.file.rglob("*")) if entry.file.is_dir() else [entry.file]
         for file in files:
-            told.update(f"{file.name} {_content(file)}".encode())
-    return told.hexdigest()[:32]
+            digest.update(f"{file.name} {_content(file)}".encode())
+    return digest.hexdigest()[:32]
 
 
 def _content(file: Path) -> str:

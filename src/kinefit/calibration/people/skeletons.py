@@ -250,7 +250,7 @@ def _tree(cameras: Sequence[Camera], pairs: dict[_Pair, _Match]) -> list[_Pair]:
         if best is None or pairs[best].cost > _STRANGERS:
             alone = next(c for c in range(len(cameras)) if c not in there)
             raise CalibrationError(
-                f"whom {cameras[alone].name} saw moves like nobody before the other cameras",
+                f"the people before {cameras[alone].name} move like none before the other cameras",
                 place=f"camera {cameras[alone].name}",
                 remedy="Record somebody who moves. Check that it is of the same recording, shows the same person at "
                 "the same time, and was started within two seconds of the others; or leave it out.",
