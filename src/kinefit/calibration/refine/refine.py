@@ -282,7 +282,8 @@ def check_result(rig: Rig, changes: Mapping[str, CameraChange], distance: float,
     if loose:
         shares = ", ".join(f"{name} to {100 * changes[name].focal_std:.0f} %" for name in loose)
         raise CalibrationError(
-            f"the motion does not tell the lenses: focal lengths would be known in {shares}", place=f"camera {loose[0]}",
+            f"the motion does not tell the lenses: focal lengths would be known in {shares}",
+            place=f"camera {loose[0]}",
             remedy="Record someone who walks towards the cameras and away, raises the arms and is seen whole; or state "
             "field_of_view, or calibrate the lenses with a board.",
         )  # fmt: skip
