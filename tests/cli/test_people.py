@@ -46,11 +46,11 @@ def test_what_the_cameras_saw_is_read_once_for_all(take, tmp_path, monkeypatch):
     from kinefit.tracking.takes import take as module
 
     calls = []
-    for of, name in ((module, "load_observations"), (in_view, "load_observations"), (followed, "people_of")):
+    for of, name in ((module, "load_uncovered"), (in_view, "load_uncovered"), (followed, "people_of")):
         original = getattr(of, name)
         monkeypatch.setattr(of, name, lambda *a, f=original, n=name, **more: (calls.append(n), f(*a, **more))[1])
     assert run("track", take, *QUIET, "--out", tmp_path).exit_code == 0
-    assert sorted(calls) == ["load_observations", "people_of"]
+    assert sorted(calls) == ["load_uncovered", "people_of"]
 
 
 @pytest.mark.parametrize(("who", "index"), [("moving", 1), ("nearest 1.2 0.9 0", 1), ("nearest 0 0.9 0", 0)])

@@ -44,10 +44,11 @@ def test_a_folder_without_a_take_is_answered_with_init(take, monkeypatch):
     take.unlink()
     folder = take.parent.rename(take.parent.with_name("my take"))
     monkeypatch.chdir(folder.parent)
-    for command in ("track", "check"):
-        told = run(command, "my take")
-        assert told.exit_code == 2 and "no take file in this folder" in told.stderr
-        assert "kinefit init 'my take'" in told.stderr
+    told = run("check", "my take")
+    assert told.exit_code == 2 and "no take file in this folder" in told.stderr
+    assert "kinefit init 'my take'" in told.stderr
+    told = run("track", "my take", "--no-overlays", "--no-report")
+    assert told.exit_code == 0 and (folder / "take.toml").is_file() and "used from now on" in told.stdout
 
 
 def test_several_takes_in_a_folder_are_named(take):
