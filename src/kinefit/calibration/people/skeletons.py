@@ -25,6 +25,7 @@ _SCALE = 0.05  # [m] of the loss: landmarks of two cameras that are farther apar
 _STRANGERS = 0.5  # of 1 less the correlation of their movements: one person in two cameras has 0.06 to 0.29, two
 # people or two days 0.57 to 0.89, of the real recordings that were looked at
 _OVERLAP = 0.25  # power of the share of frames in common: who jumps moves alike a jump later, too, in fewer frames
+_NEAR = 0.15  # [s] about a period's best, in which the frames in common say nothing more
 _SAME = 1.0  # [px] two cameras whose landmarks are mostly nearer show one video twice
 
 
@@ -63,17 +64,19 @@ class _Skeleton:
 class _Match:
     """Two skeletons laid on each other: b ≈ R a, frame f of a being frame f + lag of b.
 
-    unlike: (2 · most + 1,) for lags from −most to most, 1 less the correlation of the movements about their means
-    (times a power of the overlap), inf where too little is in common; lag is where it is least.
+    unlike: (2 · most + 1,) for lags from −most to most, 1 less the correlation of the movements about their means, inf
+    where too little is in common; score: the same with the correlation
+    times a power of the overlap; lag is where that is least.
     """
 
     R: NDArray
     lag: int
     unlike: NDArray
+    score: NDArray
 
     @property
     def cost(self) -> float:
-        return float(self.unlike.min())
+        return float(self.score.min())
 
 
 def first_cameras(cameras: Sequence[Camera], keypoints: Sequence[Keypoints], *, within: float) -> FirstCameras:
@@ -103,9 +106,9 @@ def first_cameras(cameras: Sequence[Camera], keypoints: Sequence[Keypoints], *, 
         for p, q in product(range(len(seen[i])), range(len(seen[j]))):
             if (match := _matched(seen[i][p], seen[j][q], most)) is not None:
                 pairs[i, p, j, q] = match
-                pairs[j, q, i, p] = _Match(match.R.T, -match.lag, match.unlike[::-1])
+                pairs[j, q, i, p] = _Match(match.R.T, -match.lag, match.unlike[::-1], match.score[::-1])
     tree = _tree(cameras, pairs)
-    late = _clocks(len(seen), pairs, most)
+    late = _clocks(len(seen), keypoints[0].rate, pairs, most)
     Ts = {0: np.eye(4)}
     for i, p, j, q in tree:  # in the order in which they were taken in
         Ts[j] = _laid(seen[i][p], seen[j][q], int(late[i] - late[j])) @ Ts[i]
@@ -222,7 +225,7 @@ def _turned(a: _Skeleton, b: _Skeleton, lag: int) -> NDArray | None:
 
 def _matched(a: _Skeleton, b: _Skeleton, most: int) -> _Match | None:
     """The turn and the lag, within so many frames, with which two skeletons move alike; None for no frames."""
-    unlike = np.full(2 * most + 1, np.inf)
+    unlike, score = np.full(2 * most + 1, np.inf), np.full(2 * most + 1, np.inf)
     for lag in range(-most, most + 1):
         R, frames = _turned(a, b, lag), _common(a, b, lag)
         if R is not None and frames is not None:
@@ -233,13 +236,14 @@ def _matched(a: _Skeleton, b: _Skeleton, most: int) -> _Match | None:
             y = y - np.einsum("fk,fkd->kd", w, y) / total
             power = np.sum(w[..., None] * x * x) * np.sum(w[..., None] * y * y)
             alike = np.sum(w[..., None] * x * y) / max(float(np.sqrt(power)), 1e-12)
-            unlike[lag + most] = 1.0 - alike * (len(x) / min(len(a.x), len(b.x))) ** _OVERLAP
+            unlike[lag + most] = 1.0 - alike
+            score[lag + most] = 1.0 - alike * (len(x) / min(len(a.x), len(b.x))) ** _OVERLAP
     if not np.isfinite(unlike).any():
         return None
-    lag = int(np.argmin(unlike)) - most
+    lag = int(np.argmin(score)) - most
     R = _turned(a, b, lag)
     assert R is not None
-    return _Match(R, lag, unlike)
+    return _Match(R, lag, unlike, score)
 
 
 def _tree(cameras: Sequence[Camera], pairs: dict[_Pair, _Match]) -> list[_Pair]:
@@ -262,25 +266,29 @@ def _tree(cameras: Sequence[Camera], pairs: dict[_Pair, _Match]) -> list[_Pair]:
     return tree
 
 
-def _clocks(count: int, pairs: dict[_Pair, _Match], most: int) -> NDArray:
-    """(C,) int [frames] to add to each camera's: with which all pairs together move most alike."""
-    curves: dict[tuple[int, int], NDArray] = {}
-    for i, j in product(range(count), range(count)):
-        of = [match for key, match in pairs.items() if (key[0], key[2]) == (i, j)]
-        if of:
-            curves[i, j] = np.minimum(min(of, key=lambda match: match.cost).unlike, 1.0)
+def _clocks(count: int, rate: float, pairs: dict[_Pair, _Match], most: int) -> NDArray:
+    """(C,) int [frames] to add to each camera's: with which all pairs together move most alike.
+
+    Frames in common count in the choice between periods, and not in the last frames about it.
+    """
+    best: dict[tuple[int, int], _Match] = {}
+    for (i, _, j, _), match in pairs.items():
+        if (i, j) not in best or match.cost < best[i, j].cost:
+            best[i, j] = match
     late, at = np.zeros(count, int), np.arange(-most, most + 1)
+    near = round(_NEAR * rate)
     for turn in range(2 * count):
-        before = late.copy()
+        before, last = late.copy(), turn >= count
         for j in range(1, count):
             total = np.zeros(len(at))
             for i in range(count):
-                if (i, j) in curves and (i < j or turn):
+                if (i, j) in best and (i < j or turn):
                     lag = late[i] - at  # of j's frames behind i's
-                    known = np.abs(lag) <= most
-                    total += np.where(known, curves[i, j][np.clip(lag + most, 0, 2 * most)], 1.0)
+                    curve = np.minimum(best[i, j].unlike if last else best[i, j].score, 1.0)
+                    total += np.where(np.abs(lag) <= most, curve[np.clip(lag + most, 0, 2 * most)], 1.0)
+            total[np.abs(at - late[j]) > (near if last else 2 * most)] = np.inf
             late[j] = at[np.argmin(total)]
-        if turn and np.array_equal(before, late):
+        if last and np.array_equal(before, late):
             break
     return late
 
