@@ -186,3 +186,15 @@ def test_the_nearest_rotation_is_no_reflection():
     np.testing.assert_allclose(se3.nearest_rotation(R * 2.5), R, atol=1e-13)
     mirrored = R @ np.diag([3.0, 2.0, -1.0])  # the axis of least weight gives way
     np.testing.assert_allclose(se3.nearest_rotation(mirrored), R, atol=1e-13)
+
+
+def test_the_shortest_turn_takes_one_direction_to_another():
+    random = np.random.default_rng(0)
+    a, b = random.normal(size=(2, 50, 3))
+    b[:2] = 3.0 * a[0], -2.0 * a[1]  # the same direction, and the opposite one
+    R = se3.shortest_turn(a, b)
+    unit = lambda v: v / np.linalg.norm(v, axis=1, keepdims=True)
+    np.testing.assert_allclose((R @ unit(a)[..., None])[..., 0], np.concatenate([unit(a)[:1], unit(b)[1:]]), atol=1e-9)
+    np.testing.assert_allclose(R @ R.swapaxes(1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
+    angles = np.arccos(np.clip(np.sum(unit(a) * unit(b), axis=1), -1.0, 1.0))
+    np.testing.assert_allclose(np.linalg.norm(se3.log_so3(R), axis=1), angles, atol=1e-6)

@@ -105,6 +105,18 @@ def nearest_rotation(M: NDArray) -> NDArray:
     return np.asarray(u @ vt)
 
 
+def shortest_turn(a: NDArray, b: NDArray) -> NDArray:
+    """Smallest rotations (..., 3, 3) that take directions a (..., 3) to b (..., 3); of opposite ones half a turn."""
+    a, b = (v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12) for v in np.broadcast_arrays(a, b))
+    axis, cosine = np.cross(a, b), np.sum(a * b, axis=-1, keepdims=True)
+    sine = np.linalg.norm(axis, axis=-1, keepdims=True)
+    beside = np.eye(3)[np.argmin(np.abs(a), axis=-1)]
+    beside = beside - np.sum(beside * a, axis=-1, keepdims=True) * a
+    beside = beside / np.linalg.norm(beside, axis=-1, keepdims=True)
+    axis = np.where(sine > 1e-12, axis / np.maximum(sine, 1e-12), beside)
+    return exp_so3(axis * np.arctan2(sine, cosine))
+
+
 def aligned(x: NDArray, y: NDArray, weight: NDArray | None = None) -> NDArray:
     """T_y_x (4, 4) that lays points x (K, 3) onto y (K, 3) best, by least squares with weights (K,) (Kabsch)."""
     w = np.full(len(x), 1.0 / len(x)) if weight is None else weight / weight.sum()

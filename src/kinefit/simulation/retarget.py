@@ -234,12 +234,7 @@ def _frames(bone: NDArray, across: NDArray, rest: NDArray, *, keep_across: bool 
 def _turn_from_usual(directions: NDArray, R: NDArray) -> NDArray:
     """Smallest rotations (F, 3, 3) in the frames R (F, 3, 3) from the usual (median) direction to each (F, 3)."""
     local = (directions[:, None] @ R)[:, 0]
-    usual = np.median(local, axis=0)
-    usual /= np.linalg.norm(usual)
-    axis = np.cross(usual, local)
-    sine = np.linalg.norm(axis, axis=1, keepdims=True)
-    angle = np.arctan2(sine, (local @ usual)[:, None])
-    return se3.exp_so3(axis / np.where(sine > 0, sine, 1.0) * angle)
+    return se3.shortest_turn(np.median(local, axis=0), local)
 
 
 def cut(motion: Motion, start: int, stop: int | None = None) -> Motion:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit._jit import cache_directory
 from kinefit.bodies.anny.cylinders import as_wide, widths
 from kinefit.bodies.anny.files import FACTORS, AnnyData, read_anny
-from kinefit.bodies.anny.rest import between, frame, swapped
+from kinefit.bodies.anny.rest import frame, swapped
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.state import BodyState
@@ -219,10 +219,10 @@ class AnnyModel:
         at = lambda name: joints[tree.segment(name + "_r")]
         limb = segment.removesuffix("_r")
         if limb in ("thigh", "shank"):
-            return between(at(_BEYOND[limb]) - at(limb), _DOWN)
+            return se3.shortest_turn(at(_BEYOND[limb]) - at(limb), _DOWN)
         if limb in ("foot", "toes"):
             forward = (at("toes") - at("foot")) * (1.0, 0.0, 1.0)
-            return between(forward, np.array([1.0, 0.0, 0.0]))
+            return se3.shortest_turn(forward, np.array([1.0, 0.0, 0.0]))
         if limb not in ("upperarm", "forearm", "hand"):
             return np.eye(3)
         upper, fore = at("forearm") - at("upperarm"), at("hand") - at("forearm")
@@ -236,7 +236,7 @@ class AnnyModel:
         if limb == "forearm":
             return R
         fingers = R @ (heads[names.index("RightHandFinger1")] - at("hand"))
-        return between(fingers, _DOWN) @ R
+        return se3.shortest_turn(fingers, _DOWN) @ R
 
     def _other_side(self, heads: NDArray) -> NDArray:
         """(B, 3) heads in the mirror."""

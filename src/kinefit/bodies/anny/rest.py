@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.body import Body
-from kinefit.geometry import se3
 
 
 def swapped(joints: NDArray, base: Body) -> NDArray:
@@ -14,14 +13,6 @@ def swapped(joints: NDArray, base: Body) -> NDArray:
     tree = base.tree
     twin = lambda n: n[:-2] + {"_r": "_l", "_l": "_r"}[n[-2:]] if n[-2:] in ("_r", "_l") else n
     return joints[[tree.segment(twin(n)) for n in tree.segments]]
-
-
-def between(direction: NDArray, wanted: NDArray) -> NDArray:
-    """(3, 3) the least turn of a direction to a unit vector."""
-    a = direction / np.linalg.norm(direction)
-    axis = np.cross(a, wanted)
-    sine = np.linalg.norm(axis)
-    return se3.exp_so3(axis * (np.arctan2(sine, a @ wanted) / sine)) if sine > 1e-12 else np.eye(3)
 
 
 def frame(along: NDArray, hinge: NDArray) -> NDArray:

@@ -36,12 +36,12 @@ def settled(
     balance : (F, 3) [m] centre of mass; default: unknown, and up is how the whole body stands.
     up : str, vertical axis of the result.
     """
-    R = _level(_upward(x_world, rest_height))
+    R = _upright(_upward(x_world, rest_height))
     for _ in range(3 if balance is not None else 0):
-        R = _level(R.T @ np.nanmean(balance @ R.T - _stand(x_world @ R.T, rest_height), axis=0))
+        R = _upright(R.T @ np.nanmean(balance @ R.T - _stand(x_world @ R.T, rest_height), axis=0))
     for _ in range(3):
         low, height = _soles(x_world @ R.T, rest_height)
-        R = _level(R.T @ np.append(-_tilt(low, height), 1.0)) if len(low) >= 3 else R
+        R = _upright(R.T @ np.append(-_tilt(low, height), 1.0)) if len(low) >= 3 else R
     x = x_world @ R.T
     _, height = _soles(x, rest_height)
     ground = float(np.percentile(height, _LOW)) if len(height) else float(np.nanmin(x[..., 2]))
@@ -68,14 +68,9 @@ def centre_of_mass(motion: Motion) -> NDArray:
     return out / total if total > 0 else joints.mean(axis=1)
 
 
-def _level(up: NDArray) -> NDArray:
+def _upright(up: NDArray) -> NDArray:
     """(3, 3) smallest rotation that takes a direction to z."""
-    u = up / np.linalg.norm(up)
-    axis = np.cross(u, [0.0, 0.0, 1.0])
-    sine = np.linalg.norm(axis)
-    if sine < 1e-12:
-        return np.eye(3) if u[2] > 0 else np.diag([1.0, -1.0, -1.0])
-    return se3.exp_so3(axis / sine * np.arctan2(sine, u[2]))
+    return se3.shortest_turn(up, np.array([0.0, 0.0, 1.0]))
 
 
 def _upward(x: NDArray, rest_height: NDArray) -> NDArray:

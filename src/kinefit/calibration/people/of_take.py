@@ -59,7 +59,7 @@ def find_cameras(
     seen = {entry.camera for entry in take.keypoints}
     if not (take.silhouettes or take.regions or take.skin or take.lines):
         take = replace(take, cameras=tuple(camera for camera in take.cameras if camera.name in seen))
-    if len(take.cameras) < 2:  # the others see nobody, as was said
+    if len(take.cameras) < 2:  # in the others no person is seen, as was said
         return take
     file = cameras_file(take.path)
     made_from = _made_from(take)
@@ -112,5 +112,8 @@ def _made_from(take: Take) -> str:
 
 
 def _content(file: Path) -> str:
-    """What tells one file from another: its bytes, or for one of thousands its size."""
-    return hashlib.sha256(file.read_bytes()).hexdigest() if file.suffix == ".npz" else str(file.stat().st_size)
+    """What tells one version of a file from another: its bytes, or for one of thousands its size and time."""
+    if file.suffix != ".json":
+        return hashlib.sha256(file.read_bytes()).hexdigest()
+    stat = file.stat()
+    return f"{stat.st_size} {stat.st_mtime_ns}"

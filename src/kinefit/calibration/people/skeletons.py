@@ -18,6 +18,7 @@ from kinefit.observations import Keypoints
 _JOINTS = tuple(
     f"{side}_{joint}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in ("left", "right")
 )
+_AHEAD = np.array([0.0, 0.0, 1.0])
 _SURE = 0.6  # confidence of a landmark that takes part
 _PEOPLE = 4  # of one camera that are tried
 _LEAST, _SHARE = 10, 0.4  # frames in common, and share of the shorter record, without which clocks are not compared
@@ -34,13 +35,13 @@ _Pair = tuple[int, int, int, int]  # camera, person of it, camera, person of it
 
 @dataclass(frozen=True, eq=False)
 class FirstCameras:
-    """Where cameras stand roughly, whom they saw, and how late their clocks are.
+    """Where cameras stand roughly, the people that they saw, and how late their clocks are.
 
     Parameters
     ----------
     rig : Rig, in the first camera's axes [m], of a person of the network's idea of size.
-    people : for each camera the record of the one person alone, whom most cameras show.
-    others : the same of others; of a camera that does not show them, a record of nobody.
+    people : for each camera the record of the one person that most cameras show.
+    others : the same of each other person; of a camera that does not show them, a record in which all is unseen.
     frames_late : (C,) int [frames] to add to each camera's own, the first camera's being 0.
     """
 
@@ -65,8 +66,7 @@ class _Match:
     """Two skeletons laid on each other: b ≈ R a, frame f of a being frame f + lag of b.
 
     unlike: (2 · most + 1,) for lags from −most to most, 1 less the correlation of the movements about their means, inf
-    where too little is in common; score: the same with the correlation
-    times a power of the overlap; lag is where that is least.
+    where too little is in common. score: the same with the correlation times a power of the overlap; least at lag.
     """
 
     R: NDArray
@@ -113,12 +113,15 @@ def first_cameras(cameras: Sequence[Camera], keypoints: Sequence[Keypoints], *, 
     for i, p, j, q in tree:  # in the order in which they were taken in
         Ts[j] = _laid(seen[i][p], seen[j][q], int(late[i] - late[j])) @ Ts[i]
     rig = Rig(tuple(camera.with_pose(Ts[c]) for c, camera in enumerate(cameras)))
-    people = [
+    groups = _people([len(people) for people in seen], pairs, late, most)
+    if not groups:  # clocks that suit all pairs together suit none
+        raise _strangers(cameras[1])
+    first, *others = (
         tuple(seen[c][one[c]].record if c in one else record.of_one(np.full(len(record), -1))
               for c, record in enumerate(keypoints))
-        for one in _people([len(them) for them in seen], pairs, late, most)
-    ]  # fmt: skip
-    return FirstCameras(rig, people[0], tuple(people[1:]), late)
+        for one in groups
+    )  # fmt: skip
+    return FirstCameras(rig, first, tuple(others), late)
 
 
 def in_step(record: Keypoints, late: int, length: int) -> Keypoints:
@@ -135,7 +138,7 @@ def in_step(record: Keypoints, late: int, length: int) -> Keypoints:
 
 
 def _skeletons(camera: Camera, record: Keypoints) -> list[_Skeleton]:
-    """Everybody whom a camera followed, the one seen best first."""
+    """The people that a camera followed, the one seen best first."""
     assert record.lifted is not None
     out: list[_Skeleton] = []
     left = record
@@ -169,7 +172,8 @@ def _placed(camera: Camera, record: Keypoints, x: NDArray, uv: NDArray, weight: 
     w = np.where(np.isfinite(ray).all(axis=-1), weight, 0.0)
     total = np.maximum(w.sum(axis=1), 1e-9)
     ahead = np.einsum("fk,fkd->fd", w, np.nan_to_num(ray)) / total[:, None]
-    x = np.einsum("fij,fkj->fki", _towards(ahead), x)  # a crop is seen as if the camera looked at its middle
+    crop = se3.shortest_turn(_AHEAD, ahead)  # it is seen as if the camera looked at its middle
+    x = np.einsum("fij,fkj->fki", crop, x)
     A = np.zeros((*uv.shape, 3))
     A[..., 0, 0] = A[..., 1, 1] = 1.0
     A[..., 2] = -np.nan_to_num(ray[..., :2])
@@ -178,14 +182,6 @@ def _placed(camera: Camera, record: Keypoints, x: NDArray, uv: NDArray, weight: 
     hips = np.linalg.solve(normal, np.einsum("fk,fkdi,fkd->fi", w, A, b)[..., None])[..., 0]
     far = (w > 0).sum(axis=1) >= len(_JOINTS) // 2
     return _Skeleton(record, x, w * far[:, None], np.where((far & (hips[:, 2] > 0))[:, None], hips, np.nan))
-
-
-def _towards(ahead: NDArray) -> NDArray:
-    """(F, 3, 3) smallest rotations that take z to directions (F, 3)."""
-    u = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
-    axis = np.stack([-u[:, 1], u[:, 0], np.zeros(len(u))], axis=1)
-    sine = np.linalg.norm(axis, axis=1, keepdims=True)
-    return se3.exp_so3(axis / np.maximum(sine, 1e-12) * np.arctan2(sine, u[:, 2:]))
 
 
 def _refuse_doubles(seen: Sequence[Sequence[_Skeleton]]) -> None:
@@ -208,10 +204,8 @@ def _common(a: _Skeleton, b: _Skeleton, lag: int) -> tuple[slice, slice] | None:
     return slice(first, last), slice(first + lag, last + lag)
 
 
-def _turned(a: _Skeleton, b: _Skeleton, lag: int) -> NDArray | None:
-    """(3, 3) turn that lays one skeleton on the other, robustly."""
-    if (frames := _common(a, b, lag)) is None:
-        return None
+def _turned(a: _Skeleton, b: _Skeleton, frames: tuple[slice, slice]) -> NDArray | None:
+    """(3, 3) turn that lays one skeleton on the other in frames of both, robustly; None for too few joints."""
     x, y, w = a.x[frames[0]], b.x[frames[1]], np.minimum(a.weight[frames[0]], b.weight[frames[1]])
     x, y, w = (v[w > 0] for v in (x, y, w))
     if len(w) < _LEAST * len(_JOINTS) // 4:
@@ -226,24 +220,27 @@ def _turned(a: _Skeleton, b: _Skeleton, lag: int) -> NDArray | None:
 def _matched(a: _Skeleton, b: _Skeleton, most: int) -> _Match | None:
     """The turn and the lag, within so many frames, with which two skeletons move alike; None for no frames."""
     unlike, score = np.full(2 * most + 1, np.inf), np.full(2 * most + 1, np.inf)
+    best: tuple[NDArray, int] | None = None
     for lag in range(-most, most + 1):
-        R, frames = _turned(a, b, lag), _common(a, b, lag)
-        if R is not None and frames is not None:
-            x, y, w = a.x[frames[0]], b.x[frames[1]], np.minimum(a.weight[frames[0]], b.weight[frames[1]])
-            known, total = w > 0, np.maximum(w.sum(axis=0), 1e-9)[:, None]
-            x, y = np.where(known[..., None], x, 0.0), np.where(known[..., None], y, 0.0)
-            x = (x - np.einsum("fk,fkd->kd", w, x) / total) @ R.T
-            y = y - np.einsum("fk,fkd->kd", w, y) / total
-            power = np.sum(w[..., None] * x * x) * np.sum(w[..., None] * y * y)
-            alike = np.sum(w[..., None] * x * y) / max(float(np.sqrt(power)), 1e-12)
-            unlike[lag + most] = 1.0 - alike
-            score[lag + most] = 1.0 - alike * (len(x) / min(len(a.x), len(b.x))) ** _OVERLAP
-    if not np.isfinite(unlike).any():
-        return None
-    lag = int(np.argmin(score)) - most
-    R = _turned(a, b, lag)
-    assert R is not None
-    return _Match(R, lag, unlike, score)
+        frames = _common(a, b, lag)
+        if frames is None or (R := _turned(a, b, frames)) is None:
+            continue
+        alike = _correlation(a, b, frames, R)
+        share = (frames[0].stop - frames[0].start) / min(len(a.x), len(b.x))
+        unlike[lag + most], score[lag + most] = 1.0 - alike, 1.0 - alike * share**_OVERLAP
+        if score[lag + most] <= score.min():
+            best = R, lag
+    return None if best is None else _Match(*best, unlike, score)
+
+
+def _correlation(a: _Skeleton, b: _Skeleton, frames: tuple[slice, slice], R: NDArray) -> float:
+    """Of the movements of two skeletons about their means, one turned by R, in frames of both."""
+    w = np.minimum(a.weight[frames[0]], b.weight[frames[1]])[..., None]
+    x, y = np.where(w > 0, a.x[frames[0]] @ R.T, 0.0), np.where(w > 0, b.x[frames[1]], 0.0)
+    total = np.maximum(w.sum(axis=0), 1e-9)
+    x, y = (v - np.sum(w * v, axis=0) / total for v in (x, y))
+    power = float(np.sum(w * x * x) * np.sum(w * y * y))
+    return float(np.sum(w * x * y)) / max(np.sqrt(power), 1e-12)
 
 
 def _tree(cameras: Sequence[Camera], pairs: dict[_Pair, _Match]) -> list[_Pair]:
@@ -254,16 +251,18 @@ def _tree(cameras: Sequence[Camera], pairs: dict[_Pair, _Match]) -> list[_Pair]:
         near = [key for key in pairs if key[0] in there and key[2] not in there]
         best = min(near, key=lambda k: pairs[k].cost, default=None)
         if best is None or pairs[best].cost > _STRANGERS:
-            alone = next(c for c in range(len(cameras)) if c not in there)
-            raise CalibrationError(
-                f"the people before {cameras[alone].name} move like none before the other cameras",
-                place=f"camera {cameras[alone].name}",
-                remedy="Record somebody who moves. Check that it is of the same recording, shows the same person at "
-                "the same time, and was started within two seconds of the others; or leave it out.",
-            )  # fmt: skip
+            raise _strangers(next(camera for c, camera in enumerate(cameras) if c not in there))
         tree.append(best)
         there.add(best[2])
     return tree
+
+
+def _strangers(camera: Camera) -> CalibrationError:
+    return CalibrationError(
+        f"the people before {camera.name} move like none before the other cameras", place=f"camera {camera.name}",
+        remedy="Record somebody who moves. Check that it is of the same recording, shows the same person at the same "
+        "time, and was started within two seconds of the others; or leave it out.",
+    )
 
 
 def _clocks(count: int, rate: float, pairs: dict[_Pair, _Match], most: int) -> NDArray:
@@ -294,7 +293,7 @@ def _clocks(count: int, rate: float, pairs: dict[_Pair, _Match], most: int) -> N
 
 
 def _people(counts: Sequence[int], pairs: dict[_Pair, _Match], late: NDArray, most: int) -> list[dict[int, int]]:
-    """People as {camera: which}, those in most cameras first; with the clocks set, whom two cameras show move alike."""
+    """People as {camera: which}, those in most cameras first: with the clocks set, they move alike in each."""
 
     def unlike(i: int, p: int, j: int, q: int) -> float:
         lag = int(late[i] - late[j])
@@ -321,7 +320,8 @@ def _people(counts: Sequence[int], pairs: dict[_Pair, _Match], late: NDArray, mo
 
 def _laid(a: _Skeleton, b: _Skeleton, lag: int) -> NDArray:
     """T_b_a (4, 4) [m] of two cameras from one person's skeletons and places in both."""
-    frames, R = _common(a, b, lag), _turned(a, b, lag)
+    frames = _common(a, b, lag)
+    R = None if frames is None else _turned(a, b, frames)
     if frames is None or R is None:
         raise CalibrationError(
             f"{a.record.camera} and {b.record.camera} hardly saw the person at the same time",

@@ -123,9 +123,9 @@ def refine_from(
     step = progress or (lambda *_: None)
     names, static = static_pixels(rig, static_points or {}, _STATIC_SIGMA)
     if free is not None and len(free.point):
-        joined = zip(("camera", "uv", "weight"), (free.camera, free.uv, free.weight), strict=True)
-        more = {what: np.concatenate([getattr(static, what), values]) for what, values in joined}
-        static = PointPixels(point=np.concatenate([static.point, len(names) + free.point]), **more)
+        both = ((static.camera, free.camera), (static.point, len(names) + free.point), (static.uv, free.uv),
+                (static.weight, free.weight))  # fmt: skip
+        static = PointPixels(*map(np.concatenate, both))
     offsets = np.zeros(len(rig))
     first: PersonSighting | None = None
     rounds = _CLOCK_ROUNDS if prior.freedom[:, TIME].any() else _ROUNDS

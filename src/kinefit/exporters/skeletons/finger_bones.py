@@ -45,7 +45,7 @@ def add_finger_axes(axes: dict[str, NDArray], character: Character, used: Mappin
                 s = tree.segment(name)
                 own = tree.offsets[[*np.flatnonzero(tree.parents == s), s][0]]
                 mine = _direction(character, [used[n] for n in (f"hand_{side}", *chain)], used[name])
-                axes[name] = _shortest(axes[above] @ own, mine) @ axes[above]
+                axes[name] = se3.shortest_turn(axes[above] @ own, mine) @ axes[above]
                 above = name
 
 
@@ -71,10 +71,3 @@ def _direction(character: Character, chain: Sequence[int], node: int) -> NDArray
     if len(away) and (lengths := np.linalg.norm(away, axis=1)).max() > _SHORTEST_BONE:
         return np.asarray(away[np.argmax(lengths)])
     return np.asarray(x[node] - x[chain[chain.index(node) - 1]])
-
-
-def _shortest(a: NDArray, b: NDArray) -> NDArray:
-    """(3, 3) turn about the common perpendicular that takes one direction to another."""
-    across = np.cross(a, b)
-    sine = np.linalg.norm(across)
-    return se3.exp_so3(across * (np.arctan2(sine, a @ b) / max(sine, 1e-12)))

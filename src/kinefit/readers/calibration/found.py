@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
-from kinefit._files import parse_toml
+from kinefit._files import parse_toml, read_bytes
 from kinefit.errors import FileError
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import read_calibration, write_calibration
@@ -56,10 +57,7 @@ def read_found(path: str | PathLike[str]) -> FoundCameras | None:
         One of `write_found` that was changed so that it cannot be read.
     """
     path = Path(path)
-    if path.suffix != ".toml" or not path.is_file():
-        return None
-    metadata = parse_toml(path.read_text("utf-8"), path).get("metadata")
-    if not isinstance(metadata, dict) or _KEY not in metadata:
+    if (metadata := _metadata(path)) is None:
         return None
     try:
         return FoundCameras(
@@ -73,5 +71,16 @@ def read_found(path: str | PathLike[str]) -> FoundCameras | None:
 
 def found_notes(entry: CalibrationEntry | None) -> tuple[str, ...]:
     """What is worth saying of a take's calibration: where it was found from people, how sure it is."""
-    found = read_found(entry.file) if entry is not None else None
-    return () if found is None else found.notes
+    metadata = _metadata(entry.file) if entry is not None else None
+    return () if metadata is None else tuple(map(str, metadata.get("notes", ())))
+
+
+def _metadata(path: Path) -> dict[str, Any] | None:
+    """[metadata] of a file of `write_found`; None for any other."""
+    if path.suffix != ".toml" or not path.is_file():
+        return None
+    content = read_bytes(path)
+    if _KEY.encode() not in content:
+        return None
+    metadata = parse_toml(content.decode("utf-8", "replace"), path).get("metadata")
+    return metadata if isinstance(metadata, dict) and _KEY in metadata else None

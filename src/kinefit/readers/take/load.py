@@ -144,7 +144,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         A file that is damaged.
     """
     refuse_streams(take)
-    rig = read_rig(take, exteriors)
+    rig, found = read_rig(take, exteriors), found_notes(take.calibration)
     rates: dict[str, float] = {}
     streams: dict[str, NDArray] = {}  # (N,) [s] in the take
     clocks: dict[str, NDArray] = {}  # (N,) [s] of each camera's video, from its first frame
@@ -200,7 +200,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     own = [*(recording.rate for recording in (*recordings, *lines)), *(m.rate for m in markers)]
     rate = fastest or own[0]
     if streams:
-        overlap = is_uncalibrated(take) or bool(found_notes(take.calibration))
+        overlap = is_uncalibrated(take) or bool(found)
         frames = common_frames(streams, rate, take.frames, overlap=overlap, file=take.path)
         if overlap and not take.frames and (whole := max(map(len, streams.values()))) > 1.1 * (frames[1] - frames[0]):
             notes.append(f"all cameras saw {(frames[1] - frames[0]) / rate:.3g} s, the longest {whole / rate:.3g} s")
@@ -217,7 +217,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         videos={entry.name: entry.video for entry in take.cameras if entry.video is not None}, images=images,
         depth=sensors.depth, clouds=sensors.clouds, silhouettes=silhouettes,
         regions=load_regions(take, rig, images), skin=skin, lines=lines, surface_points=surfaces, trackers=trackers,
-        notes=(*notes, *sensors.notes(rate), *found_notes(take.calibration), *what_is_assumed(take)),
+        notes=(*notes, *sensors.notes(rate), *found, *what_is_assumed(take)),
     )
 
 
