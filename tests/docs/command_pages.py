@@ -29,6 +29,7 @@ NOT_RUN = {
     ("detect", "kinefit detect"): "needs videos of a real person; tests/cli/test_detect.py runs it on a recording",
     ("init", "kinefit init my_recording --click"): "waits for a person who clicks; tests/cli/test_init.py clicks",
     ("live", "kinefit live studio.toml"): "needs two cameras; tests/live has some that pretend",
+    ("telephones", ""): "needs videos of a real person; tests/calibration/people goes this way with a recording",
     ("one-camera", ""): "needs a video of a real person; tests/cli/test_init.py goes this way with a recording",
     ("recipes/silhouettes", "kinefit track"): "shows one camera of four; tests/tracking/test_kinds.py has such takes",
     ("regions", "kinefit track"): "needs video and mesh of one object; tests/tracking/test_kinds.py has such takes",
@@ -41,7 +42,7 @@ NOT_RUN = {
     ("which-setup", "kinefit track"): "the same",
     ("recipes/voodoo", "kinefit evaluate"): "minutes to an hour; tests/evaluation/test_experiment.py runs a part",
 }
-"""{(page, how a line begins): why it is not run}; of the page `one-camera` nothing is."""
+"""{(page, how a line begins): why it is not run}; of `one-camera` and `telephones` nothing is."""
 
 ADDED = {"view": ["--html", "scene.html"], "live": ["--port", "0"]}
 """{command: what is added, so that it ends by itself and takes no fixed port}."""
@@ -183,7 +184,7 @@ PREPARED = {
     "closed-chains": nothing, "comparison": comparison, "detect": nothing, "first-recording": first_recording,
     "init": init, "live": take, "one-camera": nothing, "recipes/depth-fusion": depth_fusion,
     "recipes/silhouettes": nothing, "regions": nothing, "sensors": walk, "simulate": simulate, "surfaces": surfaces,
-    "view": motion, "recipes/voodoo": nothing, "which-setup": which_setup,
+    "telephones": nothing, "view": motion, "recipes/voodoo": nothing, "which-setup": which_setup,
 }  # fmt: skip
 """{page: its function}."""
 

@@ -85,7 +85,7 @@ def matlab_tree(tree: Any, path: Path, of_mat: bool = False) -> Any:
         tangential = numbers(rest.pop("TangentialDistortion", [0, 0]), (2,), path, "TangentialDistortion").tolist()
         out["distortion"] = [*radial[:2], *tangential, *radial[2:]]
     size = find(rest, "size")
-    if size is not None and np.size(size) == 2:
+    if isinstance(size, list) and len(size) == 2:
         rows, columns = numbers(size, (2,), path, "ImageSize")
         across, down = (K.T if is_transposed(K) else K)[:2, 2]
         if not (0 < across <= columns and 0 < down <= rows):

@@ -46,6 +46,8 @@ _KEYS = {
     "model": ("distortionmodel", "model", "cameramodel"),
     **{key: (key, f"{key[0]}l{key[1]}" if key[0] == "f" else f"pp{key[1]}") for key in ("fx", "fy", "cx", "cy")},
 }  # fmt: skip
+_LARGEST = 1e12
+"""Of any number: coefficients of distortion reach millions, and squares must not overflow."""
 _FISHEYE = ("fisheye", "equidistant", "kannalabrandt")
 _OTHER_MODELS = (
     "omni", "mei", "unified", "doublesphere", "eucm", "division", "fov", "scaramuzza", "ocam", "thinprism", "ftheta",
@@ -287,15 +289,15 @@ def build_camera(
 
 
 def numbers(value: Any, shape: tuple[int, ...] | None, path: Path, place: str) -> NDArray:
-    """Finite float array of a shape (any order of one column), or a typed error."""
+    """Float array of a shape (any order of one column), no value beyond 1e12, or a typed error."""
     try:
         array = np.array(value, dtype=float)
         array = array if shape is None else array.reshape(shape)
     except (TypeError, ValueError, OverflowError):
         wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "numbers"
         raise CalibrationError(f"expected {wanted}", file=path, place=place, remedy="Repair this entry.") from None
-    if not np.isfinite(array).all():
-        raise CalibrationError("a number is not finite", file=path, place=place, remedy="Repair this entry.")
+    if not np.isfinite(array).all() or np.abs(array).max(initial=0.0) > _LARGEST:
+        raise CalibrationError("a number is not finite or absurdly large", file=path, place=place, remedy="Repair this entry.")
     return array
 
 
