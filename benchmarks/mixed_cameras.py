@@ -79,7 +79,7 @@ def errors(truth: Motion, motion: Motion) -> tuple[NDArray, NDArray, float]:
 
 def _named(motion: Motion) -> set[str]:
     said = " ".join([
-        *contradicting(motion.provenance["contradictions"]), *moved(motion.provenance, TrackSettings().camera_std)
+        *contradicting(motion.provenance["contradictions"]), *moved(motion.provenance, TrackSettings().camera_errors)
     ])  # fmt: skip
     every = (*takes.CAMERAS, takes.SENSOR.name)
     return {name for name in every if f"camera {name} " in said or f"{name} contr" in said}

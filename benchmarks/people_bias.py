@@ -68,7 +68,7 @@ class Seen:
     def _knowing(self, table: ViewBias, camera: str) -> Motion:
         recording = self.without(camera)
         channels = channels_of(recording, _BODY, _PLAIN)
-        subject = fit_subject(_BODY, channels, cameras=_PLAIN.camera_std)
+        subject = fit_subject(_BODY, channels, cameras=_PLAIN.camera_errors)
         return track(recording, _BODY, subject=replace(subject, view_bias=table), settings=_PLAIN)
 
     def frames(self) -> SeenFrames:

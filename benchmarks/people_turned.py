@@ -23,7 +23,7 @@ from kinefit import Recording, load_body
 from kinefit.errors import AssetError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.sensors.settings import TrackSettings
+from kinefit.sensors.settings import CameraErrors, TrackSettings
 from kinefit.simulation import simulate_keypoints, studio_rig
 from kinefit.tracking.agreement import sentences as contradicting
 from kinefit.tracking.cameras import sentences as moved
@@ -97,9 +97,9 @@ def _axis(random: np.random.Generator) -> NDArray:
 
 
 def _figures(kind: str, recording: Recording, turns: list[tuple[str, NDArray]]) -> None:
-    body, rig, std = load_body("humanoid"), recording.rig, TrackSettings().camera_std
+    body, rig, errors = load_body("humanoid"), recording.rig, TrackSettings().camera_errors
     motion = track(recording, body)
-    x, alone = motion.segment_poses()[..., :3, 3], _named(motion.provenance, std, rig)
+    x, alone = motion.segment_poses()[..., :3, 3], _named(motion.provenance, errors, rig)
     print(f"# as calibrated: {', '.join(sorted(alone)) or 'none'} named")
     gaps, named, inside = [], [], []
     for name, axis in turns:
@@ -109,7 +109,7 @@ def _figures(kind: str, recording: Recording, turns: list[tuple[str, NDArray]]) 
         away = motion.segment_poses()[..., :3, 3] - x
         known = np.isfinite(motion.joint_std)
         gaps.append(1e3 * float(np.linalg.norm(away, axis=-1).mean()))
-        named.append(_named(motion.provenance, std, rig) == {name})
+        named.append(_named(motion.provenance, errors, rig) == {name})
         inside.append(100 * float(np.mean(np.abs(away[known]) < 1.96 * motion.joint_std[known])))
         sigma = 1e3 * float(np.median(motion.joint_std[known]))
         print(f"# {name} turned about {axis.round(2)}: joints {gaps[-1]:.1f} mm, named {named[-1]}, inside "
@@ -118,7 +118,7 @@ def _figures(kind: str, recording: Recording, turns: list[tuple[str, NDArray]]) 
         figure(f"people_{kind}_{what}", value, *_GOALS[what])
 
 
-def _named(provenance: dict, std: tuple[float, float] | None, rig: Rig) -> set[str]:
+def _named(provenance: dict, errors: CameraErrors | None, rig: Rig) -> set[str]:
     """Cameras that the notes of `kinefit track` name."""
-    said = " ".join([*contradicting(provenance["contradictions"]), *moved(provenance, std)])
+    said = " ".join([*contradicting(provenance["contradictions"]), *moved(provenance, errors)])
     return {name for name in rig.names if name in said}

@@ -10,6 +10,7 @@ from kinefit.correspondences import pixel_rows, prior_rows
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.channels import make_channels
 from kinefit.sensors.layout import Layout
+from kinefit.sensors.settings import CameraErrors
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.uncertainty import Known, lasting
@@ -120,7 +121,7 @@ def test_a_camera_that_stands_elsewhere_moves_the_pose_as_refitting_does(scene, 
     count = len(subject.fit.mean)
     Sigma = np.zeros((count + len(twist),) * 2)
     Sigma[count:, count:] = np.outer(twist, twist)
-    told = np.sqrt(np.diag(covariance(scene, noise_of(channels), Sigma, (0.003, 0.002)).dofs))
+    told = np.sqrt(np.diag(covariance(scene, noise_of(channels), Sigma, CameraErrors(0.003, 0.002)).dofs))
     sure = (told < 0.1) & (told > 1e-4)
     np.testing.assert_allclose(np.abs(moved)[sure], told[sure], rtol=0.25, atol=2e-3)
     assert told[:6].max() > 1e-3
@@ -129,12 +130,12 @@ def test_a_camera_that_stands_elsewhere_moves_the_pose_as_refitting_does(scene, 
 def test_a_subject_of_other_cameras_tells_its_shape_and_nothing_of_these(scene):
     _, channels, _, _ = scene
     body = load_body("humanoid")
-    other = fit_subject(body, channels, cameras=(0.003, 0.002))
-    mine = Known.of(other, channels, (0.003, 0.002))
+    other = fit_subject(body, channels, cameras=CameraErrors(0.003, 0.002))
+    mine = Known.of(other, channels, CameraErrors(0.003, 0.002))
     assert mine.cameras is other.fit.cameras and mine.covariance.shape == other.covariance.shape
     names = tuple(f"other {name}" for name in RIG.names)
     elsewhere = replace(channels, rig=Rig(tuple(replace(c, name=n) for c, n in zip(RIG, names))))
-    known = Known.of(other, elsewhere, (0.003, 0.002))
+    known = Known.of(other, elsewhere, CameraErrors(0.003, 0.002))
     assert known.cameras.free == names
     count = len(other.fit.mean) - 6 * len(RIG)
     np.testing.assert_array_equal(known.covariance[:count, :count], other.covariance[:count, :count])

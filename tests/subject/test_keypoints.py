@@ -11,6 +11,7 @@ from kinefit.errors import TakeError
 from kinefit.observations import Keypoints
 from kinefit.readers.take.file import read_take
 from kinefit.sensors.channels import make_channels
+from kinefit.sensors.settings import CameraErrors
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.solvers.bundle.shape import mirror_points
 from kinefit.subject.keypoints import fit_subject
@@ -65,8 +66,8 @@ def test_cameras_are_found_along_as_near_to_their_calibration_as_it_is_sure():
     twist = np.concatenate([random.normal(0.0, (0.01,) * 3 + (0.005,) * 3) for _ in RIG])
     off = errors.apply(World(BODY, RIG), twist).rig
     channels = replace(channels_of(MOTION, 1.0), rig=off)
-    exact, moved = fit_subject(BODY, channels), fit_subject(BODY, channels, cameras=(0.01, 0.005))
-    held = fit_subject(BODY, channels, cameras=(1e-6, 1e-6))
+    exact, moved = fit_subject(BODY, channels), fit_subject(BODY, channels, cameras=CameraErrors(0.01, 0.005))
+    held = fit_subject(BODY, channels, cameras=CameraErrors(1e-6, 1e-6))
     assert exact.fit.rig is off and len(held.fit.mean) == len(exact.fit.mean) + 24
 
     def apart(rig):  # between cameras: all together may stand elsewhere

@@ -1,6 +1,7 @@
 """Parameters apply as they say; lasting errors are told from fresh ones."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -115,6 +116,17 @@ def test_cameras_move_but_the_one_that_is_held():
     assert np.allclose(rig.cameras[2].T_camera_world, expected)
     with pytest.raises(CalibrationError, match="no camera 'roof'"):
         CameraExtrinsics(RIG, "roof")
+
+
+def test_a_common_motion_of_cameras_is_held_where_the_world_is_their_own():
+    of = partial(CameraExtrinsics, RIG, None, (0.02, 0.01))
+    single, own = of().information, of(own_world=True).information
+    common = np.concatenate([se3.adjoint(camera.T_camera_world) for camera in RIG])
+    for motion in common.T:
+        assert motion @ own @ motion > 1e3 * motion @ single @ motion
+    others = np.random.default_rng(0).normal(size=(len(single), 5))
+    others -= common @ np.linalg.lstsq(np.sqrt(single) @ common, np.sqrt(single) @ others, rcond=None)[0]
+    np.testing.assert_allclose(own @ others, single @ others, atol=1e-5 * np.abs(single).max())
 
 
 def test_points_move_with_the_cameras_that_see_them_as_differences_say():

@@ -9,6 +9,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.observations import KeypointFrame, MarkerFrame
 from kinefit.readers.take.load import load_observations
+from kinefit.sensors.settings import CameraErrors
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.subject.parameters import World
 from kinefit.subject.sensor_parameters import CameraExtrinsics
@@ -70,9 +71,9 @@ def test_an_exact_calibration_stays_and_leaves_smaller_bars(take):
 
 def test_a_camera_that_is_farther_off_than_it_can_be_is_named():
     told = {"cameras": {"a": {"moved": [0.004, 0, 0, 0, 0.006, 0]}, "b": {"moved": [0.0, 0.004, 0, 0, 0.001, 0]}}}
-    (sentence,) = sentences(told, (0.003, 0.00175))
+    (sentence,) = sentences(told, CameraErrors(0.003, 0.00175))
     assert sentence.startswith("camera a was found 4 mm and 0.34 degrees from its calibration")
-    assert not sentences(told, None) and not sentences({}, (0.003, 0.00175))
+    assert not sentences(told, None) and not sentences({}, CameraErrors(0.003, 0.00175))
 
 
 def test_a_camera_turned_about_any_axis_is_moved_back_and_named():
@@ -82,7 +83,7 @@ def test_a_camera_turned_about_any_axis_is_moved_back_and_named():
     seen = simulate_keypoints(motion, rig, noise_px=1.0, drift_px=0.5, outliers=0.05, missing=0.05)
     told = {name: track(Recording.of_keypoints(r, seen), motion.body) for name, r in (("right", rig), ("wrong", wrong))}
     assert "cameras" not in told["right"].provenance
-    (named,) = sentences(told["wrong"].provenance, TrackSettings().camera_std)
+    (named,) = sentences(told["wrong"].provenance, TrackSettings().camera_errors)
     assert named.startswith("camera cam02 was found")
     found = as_found(wrong, told["wrong"].provenance)["cam02"].T_camera_world
     left = se3.log(found @ se3.inverse(rig["cam02"].T_camera_world))

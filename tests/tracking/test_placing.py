@@ -7,6 +7,7 @@ from kinefit import Recording, TrackSettings, load_body, track
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.observations import KeypointFrame
+from kinefit.sensors.settings import CameraErrors
 from kinefit.simulation import DepthSensor, in_front, simulate_depth, simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.subject.keypoints import fit_subject
 from kinefit.tracking.cameras import CAMERAS, LEFT_OUT, sentences
@@ -14,7 +15,7 @@ from kinefit.tracking.placing import placed_cameras
 from kinefit.tracking.sizing import channels_of
 
 SENSOR = DepthSensor("depth", (128, 96), 110.0, 0.5, 5.5, (0.004, 0.0008, 0.0), holes=0.01)
-PRIOR = (0.003, 0.001745)
+PRIOR = CameraErrors(0.003, 0.001745)
 
 
 @pytest.fixture(scope="module")

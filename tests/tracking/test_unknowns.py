@@ -9,6 +9,7 @@ from tests.oracle import rig_around
 from kinefit import Keypoints, MarkerFrame, Markers, load_body, track
 from kinefit.geometry.camera import Rig
 from kinefit.observations import NamedMarkers
+from kinefit.sensors.settings import CameraErrors
 from kinefit.simulation import squat_and_wave
 from kinefit.subject.parameters import KnownLengths, PointOffsets, SegmentScales, World
 from kinefit.subject.sensor_parameters import CameraExtrinsics
@@ -39,7 +40,7 @@ def test_cameras_are_sought_from_their_calibration_and_begin_where_they_were_fou
         for name in CALIBRATED.names[:3]
     )  # fmt: skip
     recording = replace(a_recording(), rig=moved, keypoints=seen)
-    unknown = of_points(recording, BODY, SIZED, None, None, calibrated=CALIBRATED, cameras=(0.003, 0.002))
+    unknown = of_points(recording, BODY, SIZED, None, None, calibrated=CALIBRATED, cameras=CameraErrors(0.003, 0.002))
     assert kinds(unknown) == [SegmentScales, PointOffsets, CameraExtrinsics]
     assert unknown.world.rig is moved and unknown.parameters[2].free == CALIBRATED.names[:3]
     assert not unknown.start[-18:].any()

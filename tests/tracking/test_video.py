@@ -87,7 +87,7 @@ def test_a_camera_that_was_turned_is_named_and_spoils_little(truth, smooth, exac
         assert set(told) == {"cam03"} and told["cam03"]["median_px"] > 50.0 > told["cam03"]["others_px"]
         assert "cam03 contradicts the other cameras" in sentences(told)[0] and "px" in sentences(told)[0]
     else:
-        (named,) = moved_cameras(motion.provenance, TrackSettings().camera_std)
+        (named,) = moved_cameras(motion.provenance, TrackSettings().camera_errors)
         assert not told and named.startswith("camera cam03 was found")
     assert joint_errors(truth, motion).mean() < 0.02
     right = Recording.of_keypoints(rig, keypoints, sigma=3.0, up=truth.up)

@@ -161,7 +161,7 @@ def track_person(
             )
             notes += [*seen.notes, *sentences(motion.provenance["contradictions"])]
             notes += followed.sentences(motion.provenance, asked=take.person is not None)
-            notes += cameras.sentences(motion.provenance, settings_of(take).camera_std)
+            notes += cameras.sentences(motion.provenance, settings_of(take).camera_errors)
             notes += motion.provenance.get(CLOCKS, ())
         except TrackingInterrupted as stopped:
             motion, total = stopped.motion, stopped.total

@@ -13,6 +13,21 @@ MARKER_LOSS = geman_mcclure(5.0)
 
 
 @dataclass(frozen=True)
+class CameraErrors:
+    """How far each camera may stand from where its calibration has it, one standard deviation along each axis.
+
+    Parameters
+    ----------
+    position, direction : float [m], [rad]
+    own_world : bool, nothing but the cameras says where the world is: what they are off by in common is no error.
+    """
+
+    position: float
+    direction: float
+    own_world: bool = False
+
+
+@dataclass(frozen=True)
 class TrackSettings:
     """Settings of the tracker and of the smoother.
 
@@ -68,7 +83,7 @@ class TrackSettings:
         Shift: with silhouettes of the balancing trial's first 30 frames, 0 left keypoints 1.25 times as far off as
         without silhouettes, 0.01 1.07 times, 0.02 1.02 times, on a trunk that lay 1 to 1.5 cm further forward than the
         catalogue's; on the catalogue's 0.02 leaves 1.03 times. Turn: not swept. 0 takes surfaces for exact everywhere.
-    camera_std : (2,) [m] and [rad], or None
+    camera_std : (2,) [m] and [rad], or None; own_world : bool, see `CameraErrors`
         Standard deviations of each camera's calibrated position and of its direction, before a take shows how large
         they are; of three cameras or more one that is surely three of them off is moved. None takes calibrations for
         exact.
@@ -131,6 +146,7 @@ class TrackSettings:
     skin_shift: float = 0.02
     skin_turn: float = 0.1
     camera_std: tuple[float, float] | None = (0.003, 0.001745)
+    own_world: bool = False
     view_bias: bool = True
     angle_acceleration: float = 60.0
     root_acceleration: float = 15.0
@@ -147,3 +163,8 @@ class TrackSettings:
     smooth_memory: float = 1.0
     acceleration_memory: float = 0.2
     smooth_rounds: int = 8
+
+    @property
+    def camera_errors(self) -> CameraErrors | None:
+        """Of the calibration; None where it is taken for exact."""
+        return None if self.camera_std is None else CameraErrors(*self.camera_std, self.own_world)

@@ -25,6 +25,7 @@ from kinefit.frame.results import FrameResult
 from kinefit.rows import Rows
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.layout import Layout
+from kinefit.sensors.settings import CameraErrors
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import OtherNoise, covariance_alone, leverages
 from kinefit.smoothing.shape_errors import SAMPLED, ShapeErrors
@@ -69,7 +70,7 @@ class Lasting:
 def with_lasting_errors(
     results: Sequence[FrameResult], subject: Subject, take: SmoothTake, weight: NDArray,
     others: OtherNoise | None = None, answers: Sequence[Answers] = (), *,
-    cameras: tuple[float, float] | None = None, shared: SharedErrors | None = None,
+    cameras: CameraErrors | None = None, shared: SharedErrors | None = None,
 ) -> tuple[Iterator[FrameResult], VarianceComponents]:  # fmt: skip
     """The same results, one by one, with the deviations that lasting errors and the shape add; the detectors' noise.
 
@@ -81,7 +82,7 @@ def with_lasting_errors(
     weight : (F, N) [1/px²] with which every channel took part, robust factor included
     others : noise of all other sensors
     answers : what shapes add that were found from several kinds of sensors together
-    cameras : (2,) standard deviations [m], [rad] of the cameras' poses, where neither the subject nor the answers know
+    cameras : errors of the cameras' poses, where neither the subject nor the answers know; None for exact ones
     shared : what points of one segment err by together, as the fit took it; None: each for itself
     """
     body, channels, rate = subject.body, take.channels, 1.0 / take.dt
@@ -165,8 +166,8 @@ class Known:
     closing: ClosureMoves | None = None
 
     @classmethod
-    def of(cls, subject: Subject, channels: Channels, std: tuple[float, float] | None) -> Known:
-        """Of a subject; cameras that its fit did not seek are as sure as `std`, their calibration; None for exact."""
+    def of(cls, subject: Subject, channels: Channels, errors: CameraErrors | None) -> Known:
+        """Of a subject; cameras that its fit did not seek err as their calibration; None for exact."""
         if subject.fit is not None and subject.covariance is not None:
             cameras = subject.fit.cameras
             moves, covariance = point_moves(subject.fit), subject.covariance
@@ -179,10 +180,10 @@ class Known:
                 covariance = covariance[: -len(cameras.names), : -len(cameras.names)]
         else:
             moves, covariance, closing = None, np.zeros((0, 0)), None
-        if std is None or not len(channels.camera):
+        if errors is None or not len(channels.camera):
             return cls(moves, None, covariance, closing)
         used = tuple(channels.rig.names[c] for c in np.unique(channels.camera))
-        cameras = CameraExtrinsics(channels.rig, None, std, used)
+        cameras = CameraExtrinsics.of(errors, channels.rig, used)
         whole = block_diagonal(covariance, np.linalg.inv(cameras.information))
         return cls(moves, cameras, whole, closing)
 

@@ -20,6 +20,7 @@ from kinefit.sensors.points.left_right import find_swaps, limb_groups
 from kinefit.sensors.points.triangulation import triangulated
 from kinefit.sensors.points.view_bias import ViewBias
 from kinefit.sensors.scene import Scene
+from kinefit.sensors.settings import CameraErrors
 from kinefit.solvers.equations import inverse
 from kinefit.subject import fit as joint
 from kinefit.subject.gear import Gear
@@ -46,7 +47,7 @@ def fit_subject(
     frames: int = 25,
     height: float | None = None,
     trial: Subject | None = None,
-    cameras: tuple[float, float] | None = None,
+    cameras: CameraErrors | None = None,
     moved: CameraExtrinsics | None = None,
     view_bias: bool = False,
     progress: Progress | None = None,
@@ -59,8 +60,7 @@ def fit_subject(
     frames : int, how many frames spread over the take are used.
     height : float [m] of the person: lengths that no two points measure follow it.
     trial : what another trial of the same person gave: lengths start from there, and stay as near as it was sure.
-    cameras : (2,) standard deviations of the cameras' positions [m] and directions [rad], which are then found along;
-        default: the calibration is exact.
+    cameras : how far cameras may be off, which are then found along; default: the calibration is exact.
     moved : what an earlier fit found of these cameras, which stand now where it found them.
     view_bias : whether the detectors' bias by direction of view is found along, of points that three cameras show.
 
@@ -109,7 +109,7 @@ def fit_subject(
 
 def _fitted(
     body: Body, channels: Channels, steps: Sequence[Sequence[KeypointMeasurement]], states: Sequence[BodyState],
-    lengths: SegmentScales, scales: NDArray, std: tuple[float, float] | None,
+    lengths: SegmentScales, scales: NDArray, errors: CameraErrors | None,
     known: CameraExtrinsics | None, by_view: bool,
 ) -> tuple[SubjectFit, NDArray, ViewBias]:  # fmt: skip
     """Lengths, points, gear and cameras, with as much freedom for points as this take asks for; and their covariance.
@@ -126,8 +126,8 @@ def _fitted(
     cameras: CameraExtrinsics | None = None
     bare = body if body.morphs else replace(body, surfaces=(), skin=None)  # surfaces would be stretched for nothing
     used = tuple(channels.rig.names[c] for c in np.unique(channels.camera))
-    if std is not None:
-        cameras = replace(known or CameraExtrinsics(channels.rig, None, std, used), rig=channels.rig)
+    if errors is not None:
+        cameras = replace(known or CameraExtrinsics.of(errors, channels.rig, used), rig=channels.rig)
     for k in range(_ROUNDS):
         offsets = [
             PointOffsets(body, name, spread[(own < 1.0).astype(int)] * own) for name, own in zip(sets, shares)

@@ -16,6 +16,7 @@ from kinefit.rows import Rows
 from kinefit.sensors.base import Sensor, Unknown
 from kinefit.sensors.checks import of_kind
 from kinefit.sensors.displaced import AXES, CLOCK
+from kinefit.sensors.settings import CameraErrors
 from kinefit.solvers import _kernels_border
 from kinefit.solvers.equations import inverse
 from kinefit.subject.parameters import World, place_spread
@@ -26,6 +27,7 @@ FAR_OFF = 3.0
 _WRONG = 2.0  # times its calibration's standard deviations, found of a camera, from which on it is moved
 _ROUNDS = 30  # of spreads and moves in turn; the slowest change by less than a hundredth from then on
 _STEP = 1e-4  # [m, rad] from which derivatives are taken
+_HELD = 1e4  # times the information that single cameras have, of their common motion where it means nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +45,7 @@ class CameraExtrinsics:
     cameras : names of those that move, besides the one that is held; default: all.
     factors : (C,) of each camera that moves, on its standard deviations; default 1, see `with_errors_of`.
     calibrated : Rig, the prior mean; default: `rig`.
+    own_world : bool, the mean motion of all cameras is held: the world is theirs, nothing else measures it.
     """
 
     rig: Rig
@@ -51,12 +54,21 @@ class CameraExtrinsics:
     cameras: tuple[str, ...] | None = None
     factors: NDArray | None = None
     calibrated: Rig | None = None
+    own_world: bool = False
 
     def __post_init__(self) -> None:
         for name in (*(self.cameras or ()), *(() if self.held is None else (self.held,))):
             self.rig.index(name)
         if not all(std > 0 for std in self.std):
             raise ObservationError(f"standard deviations of {self.std}", remedy="Give metres and radians above 0.")
+
+    @classmethod
+    def of(
+        cls, errors: CameraErrors, rig: Rig, cameras: tuple[str, ...], factors: NDArray | None = None,
+        calibrated: Rig | None = None,
+    ) -> CameraExtrinsics:  # fmt: skip
+        """Of cameras that stand where a calibration of these errors has them; none is held."""
+        return cls(rig, None, (errors.position, errors.direction), cameras, factors, calibrated, errors.own_world)
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -77,7 +89,12 @@ class CameraExtrinsics:
     @property
     def information(self) -> NDArray:
         """(6 C, 6 C)."""
-        return np.diag(self.spreads.ravel() ** -2.0)
+        own = np.diag(self.spreads.ravel() ** -2.0)
+        if not (self.own_world and self.free):
+            return own
+        together = own @ np.concatenate([se3.adjoint(self.rig[name].T_camera_world) for name in self.free])
+        common = together.T @ (together / np.diag(own)[:, None])
+        return own + _HELD * together @ np.linalg.solve(common, together.T)
 
     @property
     def spreads(self) -> NDArray:

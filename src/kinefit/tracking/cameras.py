@@ -9,6 +9,7 @@ import numpy as np
 
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
+from kinefit.sensors.settings import CameraErrors
 from kinefit.subject.sensor_parameters import FAR_OFF, CameraExtrinsics, moved_rig
 from kinefit.subject.subject import SubjectFit
 
@@ -51,17 +52,18 @@ def composed(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[str, Any
     return out
 
 
-def sentences(provenance: Mapping[str, Any], std: tuple[float, float] | None) -> list[str]:
+def sentences(provenance: Mapping[str, Any], errors: CameraErrors | None) -> list[str]:
     """What is worth saying of cameras that were found far from where their calibration has them.
 
     Parameters
     ----------
-    std : (2,) [m, rad] of the calibration
+    errors : of the calibration
     """
     out = []
-    for name, one in provenance.get(CAMERAS, {}).items() if std is not None else ():
+    most = np.inf if errors is None else FAR_OFF * np.repeat([errors.position, errors.direction], 3)
+    for name, one in provenance.get(CAMERAS, {}).items():
         moved = np.array(one["moved"])
-        if np.any(np.abs(moved) > FAR_OFF * np.repeat(std, 3)):  # type: ignore[arg-type]
+        if np.any(np.abs(moved) > most):
             shift, turn = 1e3 * np.linalg.norm(moved[:3]), np.degrees(np.linalg.norm(moved[3:]))
             out.append(
                 f"camera {name} was found {shift:.0f} mm and {turn:.2f} degrees from its calibration, more than it may "

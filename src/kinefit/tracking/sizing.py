@@ -125,7 +125,7 @@ def fitted_to_person(
         for last in (False,) * _MOVES + (True,):
             by_keypoints = fit_subject(
                 body, channels_of(person.recording, body, settings), frames=frames or 25, height=height, trial=trial,
-                cameras=settings.camera_std, moved=moved, view_bias=settings.view_bias and not others,
+                cameras=settings.camera_errors, moved=moved, view_bias=settings.view_bias and not others,
                 progress=progress,
             )  # fmt: skip
             if last or not (errors := by_keypoints.camera_errors):
@@ -288,7 +288,7 @@ def _by_all(
     points = None
     if size:
         points = of_points(
-            r, generic, person.subject, height, trial, calibrated=person.calibrated, cameras=settings.camera_std
+            r, generic, person.subject, height, trial, calibrated=person.calibrated, cameras=settings.camera_errors
         )  # fmt: skip
     if points is not None:
         seen, stated = [[m for m in several if m.settled] for several in steps], points

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.geometry.camera import Rig
+from kinefit.sensors.settings import CameraErrors
 from kinefit.subject.gear import Gear
 from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales, World, place_spread
 from kinefit.subject.sensor_parameters import CameraExtrinsics, OwnUnknowns
@@ -64,7 +65,7 @@ class Unknowns:
 
 def of_points(
     recording: Recording, generic: Body, subject: Subject, height: float | None, trial: Subject | None, *,
-    calibrated: Rig | None = None, cameras: tuple[float, float] | None = None,
+    calibrated: Rig | None = None, cameras: CameraErrors | None = None,
 ) -> Unknowns | None:  # fmt: skip
     """Lengths, places of keypoints, markers and cameras, where there are markers; else the keypoints' fit is that.
 
@@ -77,7 +78,7 @@ def of_points(
     subject : what the first fit found
     height, trial : as of `track`
     calibrated : Rig of the calibration, from which the recording's may have been moved; default: it is the recording's
-    cameras : (2,) [m, rad] how sure it is; default: exact
+    cameras : how far they may be from there; default: exact
     """
     sets = {m.marker_set: m.std for m in recording.markers if m.marker_set}
     if not sets and recording.alone is None:
@@ -103,7 +104,7 @@ def of_points(
     if cameras is not None and used:
         before = subject.cameras
         factors = before.factors if before is not None and before.free == used else None
-        poses = CameraExtrinsics(recording.rig, None, cameras, used, factors, calibrated)
+        poses = CameraExtrinsics.of(cameras, recording.rig, used, factors, calibrated)
         found.append((poses, np.zeros(len(poses.names))))
     return _together(World(generic, recording.rig), found)
 

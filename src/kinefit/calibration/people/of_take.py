@@ -94,7 +94,8 @@ def _find(take: Take, made_from: str, progress: Step | None) -> FoundCameras:
         notes.append("No height is stated: all lengths are as unsure as the person's size, about 5 %. Write height.")
     return FoundCameras(
         found.rig, tuple(found.time_offsets[name] for name in found.rig.names),
-        float(median(c.shift_std for c in changes)), float(np.degrees(median(c.turn_std for c in changes))),
+        float(median(c.shift_std for c in changes)) / np.sqrt(3.0),
+        float(np.degrees(median(c.turn_std for c in changes))) / np.sqrt(3.0),
         tuple(notes), made_from,
     )  # fmt: skip
 

@@ -297,7 +297,8 @@ def numbers(value: Any, shape: tuple[int, ...] | None, path: Path, place: str) -
         wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "numbers"
         raise CalibrationError(f"expected {wanted}", file=path, place=place, remedy="Repair this entry.") from None
     if not np.isfinite(array).all() or np.abs(array).max(initial=0.0) > _LARGEST:
-        raise CalibrationError("a number is not finite or absurdly large", file=path, place=place, remedy="Repair this entry.")
+        problem = "a number is not finite or absurdly large"
+        raise CalibrationError(problem, file=path, place=place, remedy="Repair this entry.")
     return array
 
 

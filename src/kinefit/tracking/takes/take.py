@@ -17,6 +17,7 @@ from kinefit.motion import Motion
 from kinefit.multiview.association import choose_people, person_records
 from kinefit.multiview.followed import follow
 from kinefit.preparing.take import prepared
+from kinefit.readers.calibration.found import found_notes
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.checks import check_enough
 from kinefit.readers.take.file import Take, read_take
@@ -110,7 +111,7 @@ def settings_of(take: Take, settings: TrackSettings | None = None) -> TrackSetti
     if entry is None or entry.position_sigma is None or entry.rotation_sigma is None:
         return settings
     std = entry.position_sigma, float(np.radians(entry.rotation_sigma))
-    return replace(settings, camera_std=std if min(std) > 0.0 else None)
+    return replace(settings, camera_std=std if min(std) > 0.0 else None, own_world=bool(found_notes(entry)))
 
 
 def load_keypoints(take: Take, *, exteriors: bool = True) -> Observations:
@@ -137,7 +138,7 @@ def trial_of(take: Take, *, frames: int = 50) -> Subject | None:
         )
     seen, body = load_keypoints(trial), load_body(take.body)
     assert seen.rig is not None
-    sigma, cameras = [entry.sigma for entry in trial.keypoints], settings_of(trial).camera_std
+    sigma, cameras = [entry.sigma for entry in trial.keypoints], settings_of(trial).camera_errors
     keypoints = follow(seen.rig, seen.keypoints, trial.person).keypoints
     channels = make_channels(body, seen.rig, person_records(keypoints, choose_people(seen.rig, keypoints)), sigma)
     return fit_subject(body, channels, frames=frames, height=trial.height or take.height, cameras=cameras)
