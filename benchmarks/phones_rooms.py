@@ -36,7 +36,7 @@ from kinefit.readers.keypoint_sets import MEDIAPIPE_33
 from kinefit.simulation import cut, known_motion, resampled, simulate_keypoints
 from kinefit.simulation.keypoints import drift
 
-FIRST, ROOMS = amount(40, 44), amount(10, 1)
+FIRST, ROOMS = amount(40, 44), amount(30, 1)
 FINE = 120.0  # [Hz] at which the truth is known
 NOISE = {"noise_px": 3.0, "drift_px": 5.0, "outliers": 0.03, "missing": 0.05}
 TURNED, LATERAL, DEEP, LASTS = 8.0, 0.03, 0.06, 0.5  # [deg], [m], [m], [s] of the lifted landmarks
