@@ -7,6 +7,7 @@ from benchmarks.figures import run_parts
 PARTS = {
     "phones_time": "videos that dropped frames, and cameras of unequal rates",
     "phones_rooms": "simulated rooms of which nothing is known: cameras, clocks and motion from the people in view",
+    "phones_speed": "from a folder with four videos of ten seconds to the report: time and memory",
     "phones_real": "real recordings without their calibrations, from the videos to the motion",
 }
 

@@ -33,7 +33,8 @@ _SURE = 0.3  # confidence of a keypoint that takes part in the start
 _MOST = 2500  # points in space of the start
 _FREE = 1000  # of more people, beside the one whose body is fitted
 _ANYWHERE = 20.0, 3.0  # [m], [rad] no prior to speak of
-_GUESSED = 0.25  # of a focal length's logarithm: 64 degrees stand for 52 to 78 (one standard deviation)
+GUESSED = 0.25  # of a focal length's logarithm: 64 degrees stand for 52 to 78 (one standard deviation)
+STATED = 0.1  # where a file or a user states it: videos are cut out of the sensor by a part that differs as much
 _CLOCKS, _NEAR_CLOCKS = 2.0, 0.05  # [s] clocks of cameras that were started by hand; what the first look leaves
 _COARSE = 8.0, 4.0, 2.0, 1.0  # standard deviations of a keypoint at which the robust loss begins, and ends
 _TOGETHER = 20.0  # pixels of a detector that tell as much of a lens as one: their errors come together
@@ -50,7 +51,7 @@ def calibrate_people(
     *,
     height: float | None = None,
     known_length: Length | None = None,
-    focal: bool = False,
+    focal: bool | Sequence[float] = False,
     time_offsets: bool = False,
     up: str = "z",
     sigma: float = KEYPOINT_SIGMA,
@@ -70,7 +71,8 @@ def calibrate_people(
     body : Body, generic.
     height : float [m] stature of the person: sets the scale; default: the generic body's bones.
     known_length : (point, point, [m]) of the body: sets the scale instead.
-    focal : bool, the cameras' lenses are guesses: estimate focal lengths, too.
+    focal : bool or (C,) floats, the cameras' lenses are guesses: estimate focal lengths, too; how far each may be off,
+        as a share of it, default 0.25.
     time_offsets : bool, estimate time offsets, too: up to 2 s with `lifted` keypoints, else a few frames.
     up : str, vertical axis that the world shall have.
 
@@ -99,13 +101,13 @@ def calibrate_people(
     (points, uv), *beside = seen
     rig = first or first_rig(given, uv.reshape(-1, len(given), 2), sigma)
     step("first cameras", 1, 2)
-    spread = _GUESSED if focal else 0.0
+    spread = np.broadcast_to(GUESSED if focal is True else focal, len(given)).astype(float)
     clock = _NEAR_CLOCKS if time_offsets else 0.0
     rig, x = _adjusted(rig, given, [u for _, u in seen], sigma, focal=spread, clock=clock, rate=rate)
     factor = _whole_scale(body, points, x, height)
     rig = settled(resized(rig, factor), factor * x, _above_soles(body, points), up=up)
     step("first cameras", 2, 2)
-    prior_std = prior_sigma(len(rig), focal=focal, distortion=False, time_offsets=time_offsets)
+    prior_std = prior_sigma(len(rig), focal=bool(spread.any()), distortion=False, time_offsets=time_offsets)
     prior_std[:, :3], prior_std[:, 3:6], prior_std[:, FOCAL] = *_ANYWHERE, spread
     prior = CameraPrior(Rig(tuple(replace(a, matrix=b.matrix) for a, b in zip(rig, given, strict=True))), prior_std)
 
@@ -152,12 +154,12 @@ def common_pixels(channels: Channels) -> NDArray:
 
 
 def _adjusted(
-    rig: Rig, given: Rig, people: Sequence[NDArray], sigma: float, *, focal: float, clock: float, rate: float
+    rig: Rig, given: Rig, people: Sequence[NDArray], sigma: float, *, focal: NDArray, clock: float, rate: float
 ) -> tuple[Rig, NDArray]:
     """The rig adjusted with free points, from coarse to fine, and the first person's points (F, K, 3) in its units.
 
-    focal: standard deviation of the logarithm of the lenses' focal lengths about the given ones, clock [s] of what is
-    left of the cameras' offsets; 0 holds them.
+    focal: (C,) standard deviations of the logarithms of the lenses' focal lengths about the given ones, clock [s] of
+    what is left of the cameras' offsets; 0 holds them.
     """
     flat = np.concatenate([uv.reshape(-1, len(rig), 2) for uv in people])
     speed = np.concatenate([np.gradient(uv, axis=0).reshape(-1, len(rig), 2) for uv in people])

@@ -13,7 +13,7 @@ import numpy as np
 
 from kinefit._arguments import checked
 from kinefit.bodies import load_body
-from kinefit.calibration.people.calibrate import calibrate_people
+from kinefit.calibration.people.calibrate import GUESSED, STATED, calibrate_people
 from kinefit.preparing.each_video import Step, Tell
 from kinefit.preparing.take import warn, with_detections
 from kinefit.readers.calibration.found import FoundCameras, read_found, write_found
@@ -83,8 +83,10 @@ def _find(take: Take, made_from: str, progress: Step | None) -> FoundCameras:
     """Cameras from a take's keypoints."""
     seen = load_observations(take, exteriors=False)
     assert seen.rig is not None
+    stated = {e.name for e in take.cameras if e.field_of_view not in (None, USUAL)}
+    focal = [STATED if name in stated else GUESSED for name in seen.rig.names]
     found = calibrate_people(
-        tuple(seen.rig), seen.keypoints, load_body(take.body), height=take.height, focal=True, time_offsets=True,
+        tuple(seen.rig), seen.keypoints, load_body(take.body), height=take.height, focal=focal, time_offsets=True,
         up=take.up, sigma=median(entry.sigma for entry in take.keypoints), progress=progress,
     )
     changes = found.cameras.values()

@@ -16,6 +16,7 @@ from kinefit.readers.guess import views as guess_views
 from kinefit.readers.guess.draft import Draft, Told
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile, KeypointFile
 from kinefit.readers.guess.keypoints import keypoint_entries, keypoint_sources, read_sources
+from kinefit.readers.guess.lens import field_of_view, stated_focal_length
 from kinefit.readers.guess.names import HOW, Trial, trials
 from kinefit.readers.take.cameras import USUAL
 from kinefit.readers.take.checks import ONE_CAMERA
@@ -96,7 +97,11 @@ def describe_uncalibrated(draft: Draft, videos: Sequence[Path]) -> None:
     why = f"degrees across the longer side; {USUAL:g} is usual for telephones; {more}"
     for path in videos:
         video = Told(path, "likely", counts[path.stem]) if len(videos) > 1 else Told(path)
-        draft.cameras[path.stem] = {"video": video, "field_of_view": Told(USUAL, "guess", why)}
+        wide = Told(USUAL, "guess", why)
+        if (stated := stated_focal_length(path)) is not None:
+            whence = f"degrees across the longer side; the file states a lens of {stated:g} mm; {more}"
+            wide = Told(round(field_of_view(stated), 1), "likely", whence)
+        draft.cameras[path.stem] = {"video": video, "field_of_view": wide}
     if len(videos) == 1:
         alone = f"{draft.name(videos[0])} alone: a network tells how far limbs are; state height"
         draft.note("camera", "likely", alone)
