@@ -14,7 +14,10 @@ from pathlib import Path
 
 from benchmarks.figures import figure, run_parts
 
-PARTS = {"house": "code lines, questions of type, parameters, rooms and class names of the package"}
+PARTS = {
+    "house": "code lines, questions of type, parameters, rooms and class names of the package",
+    "house_words": "private words, names of constants, docstrings of public functions",
+}
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "kinefit"
 
 _LAYOUT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
