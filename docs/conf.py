@@ -8,14 +8,15 @@ author = "the kinefit authors"
 release = version = installed_version("kinefit")
 
 extensions = [
-    "myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx.ext.mathjax",
+    "myst_parser", "sphinx_click", "sphinx_design", "sphinx.ext.autodoc", "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon", "sphinx.ext.mathjax",
 ]
-exclude_patterns = ["_build", "_templates"]
+exclude_patterns = ["_build", "_templates", "draw.py"]
 templates_path = ["_templates"]
 html_theme = "furo"
 html_title = f"kinefit {release}"
 
-myst_enable_extensions = ["dollarmath", "deflist"]
+myst_enable_extensions = ["dollarmath", "deflist", "colon_fence"]
 myst_heading_anchors = 3
 
 default_role = "literal"  # `name` in a docstring is code

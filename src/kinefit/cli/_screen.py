@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -25,19 +25,34 @@ INTERRUPTED = 130
 REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
 """Errors of the system for which nobody is to blame but the disk."""
 
-_VERBOSE = "kinefit.verbose"
+_VERBOSE, _QUIET = "kinefit.verbose", "kinefit.quiet"
 _STYLES = {"fault": "bold red", "doubt": "yellow", "note": "cyan", "good": "green"}
+
+
+def _remember(key: str) -> Callable[[click.Context, click.Parameter, bool], bool]:
+    """Callback of a flag that the functions of this module ask for."""
+
+    def remember(ctx: click.Context, parameter: click.Parameter, value: bool) -> bool:
+        ctx.find_root().meta[key] = value or ctx.find_root().meta.get(key, False)
+        return value
+
+    return remember
 
 
 def verbose_option(command: Callable) -> Callable:
     """Add `-v` to a command, which asks `is_verbose` for it."""
-
-    def remember(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
-        ctx.meta[_VERBOSE] = value
-
     text = "Show more: the points of every camera, and where an error arose."
-    option = click.option("-v", "--verbose", is_flag=True, expose_value=False, callback=remember, help=text)
+    option = click.option("-v", "--verbose", is_flag=True, expose_value=False, callback=_remember(_VERBOSE), help=text)
     return option(command)
+
+
+def quiet_options(command: Callable) -> Callable:
+    """Add `-q` and `--json` (parameter `as_json`) to a command; both let it print nothing else but errors."""
+    quiet = click.option(
+        "-q", "--quiet", is_flag=True, expose_value=False, callback=_remember(_QUIET), help="Print errors alone."
+    )
+    text = "Print the result as one JSON object, and nothing else but errors."
+    return quiet(click.option("--json", "as_json", is_flag=True, callback=_remember(_QUIET), help=text)(command))
 
 
 def token_option(command: Callable) -> Callable:
@@ -48,15 +63,26 @@ def token_option(command: Callable) -> Callable:
 
 def is_verbose() -> bool:
     """Whether the command that runs was given `-v`."""
+    return _is_set(_VERBOSE)
+
+
+def _is_set(key: str) -> bool:
     ctx = click.get_current_context(silent=True)
-    return bool(ctx and ctx.find_root().meta.get(_VERBOSE))
+    return bool(ctx and ctx.find_root().meta.get(key))
 
 
-def console(*, stderr: bool = False) -> Console:
-    """Where to print; colours only on a terminal."""
+def console(*, stderr: bool = False, always: bool = False) -> Console:
+    """Where to print; colours only on a terminal. With -q or --json only what is printed `always`."""
     from rich.console import Console
 
-    return Console(stderr=stderr, highlight=False)
+    return Console(stderr=stderr, highlight=False, quiet=_is_set(_QUIET) and not always)
+
+
+def print_json(result: Mapping[str, Any]) -> None:
+    """Print the result of a command that was given --json."""
+    import json
+
+    click.echo(json.dumps(result, indent=2, ensure_ascii=False))
 
 
 def say(text: str = "", *, style: str = "", stderr: bool = False) -> None:
@@ -78,7 +104,7 @@ def _complain(problem: str, **lines: str) -> None:
     for name, line in lines.items():
         if line:
             text.append_text(Text.assemble(f"\n{name:>6} ", (line, "bold" if name == "at" else "")))
-    console(stderr=True).print(text, soft_wrap=True)
+    console(stderr=True, always=True).print(text, soft_wrap=True)
 
 
 def _traceback(error: BaseException) -> None:

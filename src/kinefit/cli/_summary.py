@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -60,6 +60,20 @@ def print_summary(motion: Motion, *, points: bool = False) -> None:
         say("bone lengths [cm]: " + ", ".join(lengths))
     if points:
         _print_points(motion)
+
+
+def as_record(motion: Motion, notes: Iterable[str], files: Mapping[str, Path]) -> dict[str, Any]:
+    """The summary for programs: `kinefit track --json`."""
+    from kinefit.findings import FINDINGS
+
+    return {
+        "name": motion.name, "frames": len(motion), "rate_hz": motion.rate, "body": motion.body.name,
+        "quality": round(float(motion.quality.mean()), 4),
+        "residuals": {name: {"median": _median_of(r), "unit": r.unit} for name, r in motion.residuals.items()},
+        "lost_frames": {name: frames.tolist() for name, frames in lost_segments(motion).items()},
+        "findings": list(motion.provenance.get(FINDINGS, [])), "notes": list(notes),
+        "files": {format: str(path) for format, path in files.items()},
+    }  # fmt: skip
 
 
 def print_files(files: Mapping[str, Path]) -> None:
@@ -121,9 +135,14 @@ def bone_lengths(motion: Motion) -> dict[str, str]:
 
 
 def _median(r: Residuals) -> str:
-    factor, unit = _UNITS[r.unit]
+    (factor, unit), median = _UNITS[r.unit], _median_of(r)
+    return "nothing seen" if median is None else f"{factor * median:.1f} {unit}"
+
+
+def _median_of(r: Residuals) -> float | None:
+    """Median length of the residuals, in their unit; None where no point was seen."""
     seen = np.isfinite(r.norms)
-    return f"{factor * np.median(r.norms[seen]):.1f} {unit}" if seen.any() else "nothing seen"
+    return float(np.median(r.norms[seen])) if seen.any() else None
 
 
 def _left_out(r: Residuals) -> float:

@@ -94,6 +94,20 @@ def test_only_what_is_asked_for_is_written(take, tmp_path):
     assert {path.name for path in (tmp_path / "there").iterdir()} == {"motion.bvh", "motion.trc"}
 
 
+def test_programs_get_one_json_object_and_quiet_prints_nothing(take, tmp_path, change):
+    change(take, "[take]\n", "[take]\nframes = [0, 8]\n")
+    done = run("track", take, "--json", "--formats", "csv", "--no-overlays", "--no-report", "-o", tmp_path / "out")
+    result = json.loads(done.stdout)
+    (person,) = result["people"]
+    assert (done.exit_code, result["exit_code"], person["frames"]) == (0, 0, 8) and not done.stderr
+    assert set(person["residuals"]) == {f"cam0{c}" for c in (1, 2, 3, 4)}
+    assert person["files"]["csv"] == str(tmp_path / "out" / "tables") and not person["findings"]
+    quiet = run("track", take, "-q", "--formats", "csv", "--no-overlays", "--no-report", "-o", tmp_path / "out")
+    assert (quiet.exit_code, quiet.output) == (0, "")
+    missing = run("track", tmp_path / "nowhere.toml", "--json")
+    assert missing.exit_code == 2 and not missing.stdout and "no such take file" in missing.stderr
+
+
 def test_in_real_time_nothing_is_smoothed_and_contacts_need_the_whole_take(take, tmp_path):
     told = run("track", take, "--no-overlays", "--no-report", "--realtime", "--formats", "motion", "--out", tmp_path)
     assert told.exit_code == 0

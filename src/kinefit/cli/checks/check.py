@@ -35,10 +35,11 @@ _PRINTED = ("camera", "bias u, v [px]", "±", "spread", "late [frames]", "l/r ex
 )
 @_screen.hide_faces_option
 @click.option("--strict", is_flag=True, help="Exit code 2 where there is a fault.")
+@_screen.quiet_options
 @_screen.verbose_option
 def check(
     take: Path, out: Path | None, refine: bool, focal: bool, distortion: bool, time_offsets: bool,
-    points: Path | None, strict: bool, hide_faces: bool,
+    points: Path | None, strict: bool, hide_faces: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Find out what is wrong with a recording, how sure that is, and what would fix it.
 
@@ -57,6 +58,7 @@ def check(
     from kinefit.cli.checks._refine import refined_of, write_refined
     from kinefit.errors import KinefitError
     from kinefit.exporters.atomic import write_text
+    from kinefit.findings import as_records, ranked
     from kinefit.preparing.faces import ensure_faces
     from kinefit.preparing.take import with_detections
     from kinefit.readers.take.file import read_take
@@ -88,6 +90,9 @@ def check(
     _print(found)
     write_text(out, check_page(found, refinement=refined, up=entry.up))
     _screen.say(f"\nWritten: {out}")
+    if as_json:
+        found_here = as_records(ranked(found.findings))
+        _screen.print_json({"take": str(take), "faults": len(found.faults), "findings": found_here, "page": str(out)})
     if failed is not None:
         raise failed
     if refined is not None:

@@ -115,10 +115,11 @@ def _check(choices: Choices, wanted: bool) -> None:
 @click.argument("take", type=click.Path(path_type=Path))
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="Folder of results.  [default: TAKE-kinefit]")
 @choices_options
+@_screen.quiet_options
 @_screen.verbose_option
 @click.pass_context
 def track(
-    ctx: click.Context, take: Path, out: Path | None, choices: Choices, wanted: bool
+    ctx: click.Context, take: Path, out: Path | None, choices: Choices, wanted: bool, as_json: bool
 ) -> None:
     """Track the people of a take file and write all results.
 
@@ -138,11 +139,21 @@ def track(
 
     take = write_first_take(take) if take.is_dir() and not takes_in(take) else find_take(take)
     out = out or take.with_name(f"{take.stem}-kinefit")
-    ctx.exit(run(take, out, choices, wanted=wanted))
+    people: list[dict[str, Any]] = []
+    code = run(take, out, choices, wanted=wanted, results=people)
+    if as_json:
+        _screen.print_json({"take": str(take), "folder": str(out), "exit_code": code, "people": people})
+    ctx.exit(code)
 
 
-def run(path: Path, out: Path, choices: Choices, *, wanted: bool = False) -> int:
-    """Track a take and write what comes of it; returns the exit code. Overlays that are `wanted` must be possible."""
+def run(
+    path: Path, out: Path, choices: Choices, *, wanted: bool = False, results: list[dict[str, Any]] | None = None
+) -> int:  # fmt: skip
+    """Track a take and write what comes of it; returns the exit code. Overlays that are `wanted` must be possible.
+
+    `results` is filled with a record of each person, for --json.
+    """
+    results = [] if results is None else results
     from kinefit.batch.one import asked_take, check_drawable, people_of
     from kinefit.batch.outcome import Row, failed
     from kinefit.batch.people_report import write_people_report
@@ -156,14 +167,14 @@ def run(path: Path, out: Path, choices: Choices, *, wanted: bool = False) -> int
     with _screen.bars() as step:
         view, people = people_of(take, out, step, _screen.note)
     if len(people) == 1:
-        return _track_one(*people[0], choices, view)[0]
+        return _track_one(*people[0], choices, view, results)[0]
     code, rows = 0, []
     for k, (person, folder) in enumerate(people, 1):
         _screen.say(f"person {k} of {len(people)}: {folder}", style="bold")
         folder.mkdir(parents=True, exist_ok=True)
         row = Row(take=take.name, person=k, folder=folder.name)
         try:
-            own, done = _track_one(person, folder, choices, view)
+            own, done = _track_one(person, folder, choices, view, results)
             rows.append(of_motion(row, done.motion, done.notes))
         except KinefitError as error:  # of one person: the others are tracked all the same
             _screen.tell_error(error)
@@ -179,11 +190,11 @@ def run(path: Path, out: Path, choices: Choices, *, wanted: bool = False) -> int
 
 
 def _track_one(
-    take: Take, out: Path, choices: Choices, view: InView | None
+    take: Take, out: Path, choices: Choices, view: InView | None, results: list[dict[str, Any]]
 ) -> tuple[int, TrackedPerson]:  # fmt: skip
     """Track one person of a take, write what comes of it and tell it; returns the exit code and what was tracked."""
     from kinefit.batch.one import track_person
-    from kinefit.cli._summary import print_files, print_summary
+    from kinefit.cli._summary import as_record, print_files, print_summary
     from kinefit.cli.tracking._agreement import print_agreement
     from kinefit.errors import TrackingError
     from kinefit.findings import of_provenance
@@ -204,6 +215,7 @@ def _track_one(
         _screen.tell_finding(found)
     for note in done.notes:
         _screen.say(f"note: {note}")
+    results.append(as_record(done.motion, done.notes, files))
     print_summary(done.motion, points=_screen.is_verbose())
     print_files(files)
     if done.total:
