@@ -43,7 +43,21 @@ def branch_of_the_page(app, pagename, templatename, context, doctree):
         context["toctree"] = lambda **options: whole(**{**options, "collapse": True})
 
 
+def plain_help(app, ctx, lines):
+    """The same for what commands say of themselves."""
+    lines[:] = [line.replace("*", r"\*") for line in lines]
+
+
+def examples(app, ctx, lines):
+    """Let examples stand as they are printed."""
+    text = [line.removeprefix("|").removeprefix(" ") for line in lines]
+    lines[:] = ["::", "", *(f"   {line}".rstrip() for line in text), ""] if any(text) else lines
+
+
 def setup(app):
     """Run before napoleon and the theme, which have the default priority of 500."""
     app.connect("autodoc-process-docstring", plain_text, priority=400)
     app.connect("html-page-context", branch_of_the_page, priority=400)
+    for part in ("description", "options", "arguments"):
+        app.connect(f"sphinx-click-process-{part}", plain_help)
+    app.connect("sphinx-click-process-epilog", examples)
