@@ -29,6 +29,8 @@ NOT_RUN = {
     ("detect", "kinefit detect"): "needs videos of a real person; tests/cli/test_detect.py runs it on a recording",
     ("init", "kinefit init my_recording --click"): "waits for a person who clicks; tests/cli/test_init.py clicks",
     ("live", "kinefit live studio.toml"): "needs two cameras; tests/live has some that pretend",
+    ("index", "kinefit demo"): "fetches a recording; tests/cli/tracking/test_demo.py runs it with that",
+    ("install", ""): "makes an environment and installs into it, as README's commands do",
     ("telephones", ""): "needs videos of a real person; tests/calibration/people goes this way with a recording",
     ("one-camera", ""): "needs a video of a real person; tests/cli/test_init.py goes this way with a recording",
     ("recipes/silhouettes", "kinefit track"): "shows one camera of four; tests/tracking/test_kinds.py has such takes",
@@ -42,7 +44,7 @@ NOT_RUN = {
     ("which-setup", "kinefit track"): "the same",
     ("recipes/voodoo", "kinefit evaluate"): "minutes to an hour; tests/evaluation/test_experiment.py runs a part",
 }
-"""{(page, how a line begins): why it is not run}; of `one-camera` and `telephones` nothing is."""
+"""{(page, how a line begins): why it is not run}; of `install`, `one-camera` and `telephones` nothing is."""
 
 ADDED = {"view": ["--html", "scene.html"], "live": ["--port", "0"]}
 """{command: what is added, so that it ends by itself and takes no fixed port}."""
@@ -50,11 +52,6 @@ ADDED = {"view": ["--html", "scene.html"], "live": ["--port", "0"]}
 SLOW = {"batch", "calibration", "comparison", "first-recording", "recipes/depth-fusion", "sensors", "simulate",
         "surfaces", "which-setup"}  # fmt: skip
 """Pages whose commands take more than a few seconds."""
-
-
-def readme(folder):
-    drawn.write_recording(folder / "my_take")
-    yield
 
 
 def batch(folder):
@@ -180,10 +177,10 @@ def surfaces(folder):
 
 
 PREPARED = {
-    "README": readme, "batch": batch, "blender": blender, "calibration": calibration, "check": take,
+    "README": nothing, "batch": batch, "blender": blender, "calibration": calibration, "check": take,
     "closed-chains": nothing, "comparison": comparison, "detect": nothing, "first-recording": first_recording,
-    "init": init, "live": take, "one-camera": nothing, "recipes/depth-fusion": depth_fusion,
-    "recipes/silhouettes": nothing, "regions": nothing, "sensors": walk, "simulate": simulate, "surfaces": surfaces,
+    "index": nothing, "init": init, "install": nothing, "live": take, "one-camera": nothing,
+    "recipes/depth-fusion": depth_fusion, "recipes/silhouettes": nothing, "regions": nothing, "sensors": walk, "simulate": simulate, "surfaces": surfaces,
     "telephones": nothing, "view": motion, "recipes/voodoo": nothing, "which-setup": which_setup,
 }  # fmt: skip
 """{page: its function}."""
