@@ -180,7 +180,8 @@ PREPARED = {
     "README": nothing, "batch": batch, "blender": blender, "calibration": calibration, "check": take,
     "closed-chains": nothing, "comparison": comparison, "detect": nothing, "first-recording": first_recording,
     "index": nothing, "init": init, "install": nothing, "live": take, "one-camera": nothing,
-    "recipes/depth-fusion": depth_fusion, "recipes/silhouettes": nothing, "regions": nothing, "sensors": walk, "simulate": simulate, "surfaces": surfaces,
+    "recipes/depth-fusion": depth_fusion, "recipes/silhouettes": nothing,
+    "regions": nothing, "sensors": walk, "simulate": simulate, "surfaces": surfaces,
     "telephones": nothing, "view": motion, "recipes/voodoo": nothing, "which-setup": which_setup,
 }  # fmt: skip
 """{page: its function}."""
