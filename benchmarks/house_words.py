@@ -51,10 +51,11 @@ def vague_constants(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 def public_functions(tree: ast.Module) -> Iterator[ast.FunctionDef]:
-    """Functions and methods of public classes that are public."""
+    """Functions and methods of public classes that are public; commands, whose docstrings are help, are left out."""
     for node in tree.body:
         if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
-            yield node
+            if not any("command" in ast.unparse(decorator) for decorator in node.decorator_list):
+                yield node
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
             yield from (m for m in node.body if isinstance(m, ast.FunctionDef) and not m.name.startswith("_"))
 

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from kinefit.readers.take.load import Observations
 
 _INSIDE = 1e-6  # [rad] or [m] from a joint's limits, that rounding does not cross them
-_FAR = 0.1  # [m] of a clicked joint from the pose: the worst of those clicked with care is 2 to 5 cm off
-_LISTED = 4  # joints that a warning names
+_MAX_CLICK_ERROR_M = 0.1  # [m] of a clicked joint from the pose: the worst of those clicked with care is 2 to 5 cm off
+_MAX_LISTED_JOINTS = 4  # joints that a warning names
 BODY = "clicked-body.npz"
 CLICKS = "clicks.json"
 
@@ -56,8 +56,8 @@ def _ask(out: Path, take: Take, seen: Observations, body: Body, step: int, brows
     from kinefit.readers.clicks import clicks_of
     from kinefit.viewers.clicks import ClickPage
 
-    def taken(told: Any) -> str:
-        return _started(out, take, seen, body, [clicks_of(told)])
+    def taken(clicks: Any) -> str:
+        return _started(out, take, seen, body, [clicks_of(clicks)])
 
     page = ClickPage(_pictures(take, seen, step), clickable(body), taken, step=step)
     try:
@@ -138,13 +138,13 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, steps: Seque
     write_text(out.with_name(CLICKS), clicks_text(steps))
     write_text(out, f"{text.rstrip()}\n\n{start}\n")
     known = np.isfinite(x_world).all(axis=1).sum()
-    told = f"{known} points known in space, {100 * left:.1f} cm from the pose (median)."
+    text = f"{known} points known in space, {100 * left:.1f} cm from the pose (median)."
     if once:
-        told += f" Clicked in one image alone, and no part of the start: {', '.join(once)}."
+        text += f" Clicked in one image alone, and no part of the start: {', '.join(once)}."
     off = np.linalg.norm(fitted.positions(state, fitted.landmarks.select(names)) - x_world, axis=1)
-    if np.nanmax(off) > _FAR:
-        worst = np.argsort(-np.nan_to_num(off))[:_LISTED].tolist()
-        told += " Warning: no pose of this body has them; the worst are "
-        told += ", ".join(f"{names[n]} ({100 * off[n]:.0f} cm)" for n in worst)
-        told += ". Look whether left and right are exchanged, the same in every image."
-    return told
+    if np.nanmax(off) > _MAX_CLICK_ERROR_M:
+        worst = np.argsort(-np.nan_to_num(off))[:_MAX_LISTED_JOINTS].tolist()
+        text += " Warning: no pose of this body has them; the worst are "
+        text += ", ".join(f"{names[n]} ({100 * off[n]:.0f} cm)" for n in worst)
+        text += ". Look whether left and right are exchanged, the same in every image."
+    return text

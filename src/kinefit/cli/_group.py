@@ -13,10 +13,10 @@ class CommandGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The command that is meant; the nearest one is told where there is none of the name."""
+        """The command of a name; an error suggests the nearest one where there is none."""
         names = self.list_commands(ctx)
         if args and args[0] not in names and not args[0].startswith("-"):
             near = get_close_matches(args[0].lower(), names, n=1, cutoff=0.5)
-            told = f" Did you mean '{near[0]}'?" if near else f" There are: {', '.join(names)}."
-            raise click.UsageError(f"No such command '{args[0]}'.{told}", ctx)
+            hint = f" Did you mean '{near[0]}'?" if near else f" There are: {', '.join(names)}."
+            raise click.UsageError(f"No such command '{args[0]}'.{hint}", ctx)
         return super().resolve_command(ctx, args)

@@ -11,10 +11,10 @@ from kinefit.errors import ExportError
 
 def no_format(name: str, valid: Iterable[str]) -> str:
     """What to say of a format that there is not."""
-    told = f"there is no format '{name}'; there are: {', '.join(valid)}"
+    problem = f"there is no format '{name}'; there are: {', '.join(valid)}"
     if name.lower().strip(".") == "fbx":
-        told += ". FBX is a closed format: write glb or bvh, which Blender, Unity and Unreal read"
-    return told
+        problem += ". FBX is a closed format: write glb or bvh, which Blender, Unity and Unreal read"
+    return problem
 
 
 def check_folder(folder: Path, option: str = "--out") -> None:

@@ -133,9 +133,9 @@ def tell_finding(found: Finding) -> None:
             say(f"   {what}: {text}")
 
 
-def tell_interrupted(told: str) -> None:
+def tell_interrupted(text: str) -> None:
     """Say that Ctrl-C came, and what is there."""
-    note(f"Stopped. {told or 'Nothing half written is left.'}")
+    note(f"Stopped. {text or 'Nothing half written is left.'}")
 
 
 def tell_refused(error: OSError) -> None:

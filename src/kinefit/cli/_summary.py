@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from kinefit.motion import Motion, Residuals
 
-MOMENTS = 5  # doubtful moments that are told, the worst first
+MOMENTS = 5  # doubtful moments that are listed, the worst first
 _UNITS = {"px": (1.0, "px"), "m": (1000.0, "mm")}
 
 
@@ -48,14 +48,14 @@ def print_summary(motion: Motion, *, points: bool = False) -> None:
     if len(nobody):
         say(f"nobody seen: frames {frame_ranges(nobody)}")
     bare = without_markers(motion)
-    for told, gone in (("no markers", bare), ("lost", lost_segments(motion))):
+    for label, gone in (("no markers", bare), ("lost", lost_segments(motion))):
         never = [name for name, frames in gone.items() if len(frames) == len(motion) - len(nobody)]
         if never:
             names = ", ".join(_hands_together(motion, {n: gone[n] for n in never}))
-            say(f"{'nothing supports' if told == 'lost' else told + ' on'}: {names} (no frame)")
+            say(f"{'nothing supports' if label == 'lost' else label + ' on'}: {names} (no frame)")
         for name, frames in _hands_together(motion, {n: f for n, f in gone.items() if n not in never}).items():
-            say(f"{told}: {name} in frames {frame_ranges(frames)}")
-    lengths = [f"{name} {told}" for name, told in bone_lengths(motion).items()]
+            say(f"{label}: {name} in frames {frame_ranges(frames)}")
+    lengths = [f"{name} {label}" for name, label in bone_lengths(motion).items()]
     if lengths:
         say("bone lengths [cm]: " + ", ".join(lengths))
     if points:
@@ -109,11 +109,11 @@ def without_markers(motion: Motion) -> dict[str, NDArray]:
 
     Empty where other sensors looked too.
     """
-    told = [r for r in motion.residuals.values() if r.of_points and r.unit == "m"]
-    if not told or len(told) < len(motion.residuals):
+    markers = [r for r in motion.residuals.values() if r.of_points and r.unit == "m"]
+    if not markers or len(markers) < len(motion.residuals):
         return {}
     seen = np.zeros((len(motion), len(motion.body.tree.segments)), bool)
-    for r in told:
+    for r in markers:
         for s in np.unique(r.segments):
             seen[:, s] |= np.isfinite(r.norms[:, r.segments == s]).any(axis=1)
     bare = motion.lost & ~seen & (motion.quality > 0)[:, None]

@@ -31,10 +31,11 @@ def body(ctx: click.Context) -> None:
     for name in catalogue():
         one = load_body(name)
         gear = [s for s, g in zip(one.tree.segments, one.segment_scale) if one.gear_scale[g]]
-        told = f"{len(one.tree.segments)} segments, {one.tree.n_dofs - 6 * (not one.tree.root_free)} degrees of freedom"
+        n_dofs = one.tree.n_dofs - 6 * (not one.tree.root_free)
+        parts = f"{len(one.tree.segments)} segments, {n_dofs} degrees of freedom"
         if gear:
-            told += f", {len(one.closures)} closure{'s' * (len(one.closures) != 1)}; gear: {', '.join(gear)}"
-        _screen.say(f"{name:18s} {told}")
+            parts += f", {len(one.closures)} closure{'s' * (len(one.closures) != 1)}; gear: {', '.join(gear)}"
+        _screen.say(f"{name:18s} {parts}")
 
 
 @body.command(short_help="A body file of the catalogue, to change.")

@@ -16,7 +16,7 @@ Examples:
   kinefit detect left.mp4 right.mp4     videos alone, into left-detect.npz and right-detect.npz
   kinefit detect take.toml --people 1   faster where nobody else is in view
 """
-_SEEN = 0.5  # confidence of a hand
+_MIN_HAND_CONFIDENCE = 0.5  # confidence of a hand
 
 
 @click.command(short_help="Find people, their keypoints and outlines in the videos of a take.", epilog=_EXAMPLES)
@@ -93,10 +93,10 @@ def _show(jobs: list[detecting.DetectionJob], done: list[detecting.DetectionJob]
     for job in jobs:
         found = read_detections(job.file)
         seen = found.seen.sum(axis=0)
-        told = ", ".join(f"person {p + 1} in {n}" for p, n in enumerate(seen)) or "nobody"
+        text = ", ".join(f"person {p + 1} in {n}" for p, n in enumerate(seen)) or "nobody"
         if found.hand_confidence is not None:
-            left, right = (found.hand_confidence > _SEEN).any(axis=(1, 3)).sum(axis=0)
-            told += f"; a left hand in {left}, a right one in {right}"
+            left, right = (found.hand_confidence > _MIN_HAND_CONFIDENCE).any(axis=(1, 3)).sum(axis=0)
+            text += f"; a left hand in {left}, a right one in {right}"
         state = "" if job in done else " (already there)"
-        _screen.say(f"{job.camera}: {len(found)} pictures, {told}{state}")
+        _screen.say(f"{job.camera}: {len(found)} pictures, {text}{state}")
         _screen.say(f"  {job.file}")

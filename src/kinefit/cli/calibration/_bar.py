@@ -24,7 +24,7 @@ Examples:
   kinefit calibrate bar centroids.csv --length 0.9 --size 1920x1080
   kinefit calibrate bar videos/ --length 0.9 --interiors lenses.toml --distance cam01:cam03:4.21
 """
-_MAGNIFIED = 200  # times: residuals in the picture of coverage
+_RESIDUAL_SCALE = 200  # a residual of 0.1 px is drawn 20 px long
 
 
 @click.command(short_help="Lenses, places and scale from a bar with two bright targets.", epilog=_EXAMPLES)
@@ -151,12 +151,12 @@ def _write_picture(result: BarCalibration, file: Path) -> None:
         panel = np.full((round(camera.size[1] * scale), 640, 3), 32, np.uint8)
         uv, left = (a[:, c].reshape(-1, 2) for a in (result.uv, result.residuals))
         fine = np.isfinite(left).all(axis=1)
-        for at, off in zip(scale * uv[fine], scale * _MAGNIFIED * left[fine]):
+        for at, off in zip(scale * uv[fine], scale * _RESIDUAL_SCALE * left[fine]):
             cv2.line(panel, _at(at), _at(at + off), (60, 140, 255), 1, cv2.LINE_AA)
             cv2.circle(panel, _at(at), 2, (90, 240, 255), -1, cv2.LINE_AA)
         report = result.cameras[camera.name]
-        told = f"{camera.name}: {report.used} places, {report.rms_px:.2f} px, residuals x {_MAGNIFIED}"
-        panels.append(_titled(panel, told))
+        title = f"{camera.name}: {report.used} places, {report.rms_px:.2f} px, residuals x {_RESIDUAL_SCALE}"
+        panels.append(_titled(panel, title))
     height = max(len(panel) for panel in panels)
     panels = [np.pad(panel, ((0, height - len(panel)), (4, 4), (0, 0))) for panel in panels]
     columns = min(len(panels), 2 if len(panels) < 5 else 3)

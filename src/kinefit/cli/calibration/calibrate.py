@@ -124,12 +124,12 @@ def _tell(result: BoardCalibration) -> None:
         table.add_column(column, justify="left" if left else "right", no_wrap=left)
     for camera in result.rig:
         report = result.cameras[camera.name]
-        told = (
+        cells = (
             f"{camera.matrix[0, 0]:.1f}", f"{report.focal_std_px:.1f}" if report.focal_std_px else "given",
             f"{report.used} of {report.views}", f"{100 * report.coverage:.0f} %", f"{report.rms_px:.2f}",
             f"{report.own_rms_px:.2f}", f"{1e3 * report.position_std:.1f}" if report.position_std < 1e3 else "-",
         )  # fmt: skip
-        table.add_row(camera.name, *told)
+        table.add_row(camera.name, *cells)
     _screen.console().print(table)
     for (a, b), distance in result.rig.distances.items() if result.shared else ():
         told_frames = f"{result.shared.get((a, b), 0)} frames agree"

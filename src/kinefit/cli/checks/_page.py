@@ -37,12 +37,11 @@ def check_page(check: Check, *, refinement: Refined | None = None, up: str = "z"
 def verdict(check: Check) -> str:
     """One sentence: how many faults and doubts there are."""
     count = {s: sum(found.severity == s for found in check.findings) for s in ("fault", "doubt", "note")}
-    told = [f"{n} {s}{'s' if n > 1 else ''}" for s, n in count.items() if n]
+    counts = [f"{n} {s}{'s' if n > 1 else ''}" for s, n in count.items() if n]
     if count["fault"]:
-        return (
-            f"{' and '.join(told[:2])}: fix the faults before you trust results." if len(told) > 1 else f"{told[0]}."
-        )
-    return f"No fault; {told[0]}." if told and count["doubt"] else "No fault and no doubt."
+        rest = ": fix the faults before you trust results" if len(counts) > 1 else ""
+        return f"{' and '.join(counts[:2])}{rest}."
+    return f"No fault; {counts[0]}." if counts and count["doubt"] else "No fault and no doubt."
 
 
 def _findings(check: Check) -> p.Section:
@@ -87,8 +86,8 @@ def _share(value: float) -> str:
 
 def _cameras(check: Check) -> p.Section:
     columns, rows = camera_rows(check)
-    told = "Bias: where the calibration places the person's points minus where the camera sees them, median."
-    return p.section("Cameras", p.table(columns, rows), p.paragraph(told, small=True), anchor="cameras")
+    caption = "Bias: where the calibration places the person's points minus where the camera sees them, median."
+    return p.section("Cameras", p.table(columns, rows), p.paragraph(caption, small=True), anchor="cameras")
 
 
 def _plan(check: Check, up: str) -> p.Section:
@@ -151,12 +150,12 @@ def _times(check: Check) -> p.Section:
         "xaxis": {"title": "the second camera taken later by [frames]"},
         "yaxis": {"title": "the rays miss by [px]", "rangemode": "tozero"},
     }
-    told = (
+    text = (
         "How far the rays of two cameras miss each other when one is shifted in time against the other. In "
         "step, the valley is at 0; a flat line means too little motion to decide."
     )
     return p.section(
-        "Time", told, p.plot(traces, layout, height=340, label="Misses against shift in time"), anchor="time"
+        "Time", text, p.plot(traces, layout, height=340, label="Misses against shift in time"), anchor="time"
     )
 
 

@@ -1,4 +1,4 @@
-"""Pictures for the page of `kinefit check`: points seen and told by the other cameras, and errors by place."""
+"""Images for the page of `kinefit check`: points as detected and as the other cameras predict them, errors by place."""
 
 from __future__ import annotations
 
@@ -14,12 +14,15 @@ from kinefit.exporters.report import page as p
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.preparing.faces import shown_video
 
-_SEEN, _TOLD, _DARK, _ARROW = (255, 240, 60), (90, 200, 255), (15, 15, 15), (255, 90, 60)  # RGB
-_MAGNIFIED = 10  # times: bias arrows
-_CELLS = (6, 10)  # of the picture along its shorter and longer side, in the map of residuals
-_FEWEST = 15  # points in a cell that tell something
-_MARGIN = 0.12  # of the person's size, shown around the person
-_EDGE = 1100  # [px] longer side of the pictures for which lines are drawn as wide as told
+_DETECTED_RGB = (255, 240, 60)
+_EXPECTED_RGB = (90, 200, 255)
+_CONTOUR_RGB = (15, 15, 15)
+_BIAS_RGB = (255, 90, 60)
+_ARROW_SCALE = 10  # a bias of 2 px is drawn 20 px long
+_MAP_CELLS = (6, 10)  # of the map of residuals, along the shorter and the longer side of the image
+_MIN_CELL_POINTS = 15  # fewer give no mean worth an arrow
+_CROP_MARGIN = 0.12  # of the person's size, shown around the person
+_LINE_REFERENCE_PX = 1100  # longer side of the pictures for which the stated line widths hold
 
 
 def picture_section(check: Check) -> p.Section:
@@ -40,10 +43,10 @@ def picture_section(check: Check) -> p.Section:
         maps.append(p.picture(_map(check, c, ground, image), caption=f"{b.camera}: mean error by place"))
     first = (
         "One frame of each camera. Yellow rings: the points as the detector saw them. Blue dots: where the other "
-        f"cameras say they are. The red arrow shows the bias against the others, {_MAGNIFIED} times as long."
+        f"cameras say they are. The red arrow shows the bias against the others, {_ARROW_SCALE} times as long."
     )
     second = (
-        f"The mean of (calibration minus seen) in each part of the picture, {_MAGNIFIED} times as long. Arrows that "
+        f"The mean of (calibration minus seen) in each part of the picture, {_ARROW_SCALE} times as long. Arrows that "
         "are alike: the camera was turned or moved. Arrows towards the middle or away: focal length. Curved "
         "ones: distortion."
     )
@@ -79,50 +82,50 @@ def _ground(check: Check, camera: Camera, frame: int) -> tuple[NDArray, ImageFra
 
 
 def _points(ground: NDArray, image: ImageFrame, seen: NDArray, others: NDArray, b: CameraBias) -> NDArray:
-    scale = max(ground.shape) / _EDGE
+    scale = max(ground.shape) / _LINE_REFERENCE_PX
     out = (ground * 0.75).astype(np.uint8)
-    for uv, told in zip(image.from_calibration(seen), image.from_calibration(others), strict=True):
-        if np.isfinite(uv).all() and np.isfinite(told).all():
-            cv2.line(out, _at(uv), _at(told), _TOLD, max(1, round(1.5 * scale)), cv2.LINE_AA)
-    for uv, told in zip(image.from_calibration(seen), image.from_calibration(others), strict=True):
-        if np.isfinite(told).all():
-            cv2.circle(out, _at(told), round(4.5 * scale), _DARK, -1, cv2.LINE_AA)
-            cv2.circle(out, _at(told), round(3.5 * scale), _TOLD, -1, cv2.LINE_AA)
+    for uv, expected in zip(image.from_calibration(seen), image.from_calibration(others), strict=True):
+        if np.isfinite(uv).all() and np.isfinite(expected).all():
+            cv2.line(out, _at(uv), _at(expected), _EXPECTED_RGB, max(1, round(1.5 * scale)), cv2.LINE_AA)
+    for uv, expected in zip(image.from_calibration(seen), image.from_calibration(others), strict=True):
+        if np.isfinite(expected).all():
+            cv2.circle(out, _at(expected), round(4.5 * scale), _CONTOUR_RGB, -1, cv2.LINE_AA)
+            cv2.circle(out, _at(expected), round(3.5 * scale), _EXPECTED_RGB, -1, cv2.LINE_AA)
         if np.isfinite(uv).all():
-            cv2.circle(out, _at(uv), round(6 * scale), _DARK, round(4 * scale), cv2.LINE_AA)
-            cv2.circle(out, _at(uv), round(6 * scale), _SEEN, round(2 * scale), cv2.LINE_AA)
+            cv2.circle(out, _at(uv), round(6 * scale), _CONTOUR_RGB, round(4 * scale), cv2.LINE_AA)
+            cv2.circle(out, _at(uv), round(6 * scale), _DETECTED_RGB, round(2 * scale), cv2.LINE_AA)
     bias = b.alone if np.isfinite(b.alone).all() else b.bias
     person = image.from_calibration(seen)[np.isfinite(seen).all(-1)]
     start = np.median(person, axis=0) if len(person) else np.array(out.shape[1::-1]) / 2
-    _arrow(out, start, start + _MAGNIFIED * bias, 3 * scale)
-    return _cropped(out, np.concatenate([person, [start, start + _MAGNIFIED * bias]]))
+    _arrow(out, start, start + _ARROW_SCALE * bias, 3 * scale)
+    return _cropped(out, np.concatenate([person, [start, start + _ARROW_SCALE * bias]]))
 
 
 def _cropped(picture: NDArray, shown: NDArray) -> NDArray:
     """The part of a picture about some points (N, 2)."""
     low, high = shown.min(axis=0), shown.max(axis=0)
-    margin = max(40.0, _MARGIN * float(np.max(high - low)))
+    margin = max(40.0, _CROP_MARGIN * float(np.max(high - low)))
     (left, top), (right, bottom) = (np.rint(edge).astype(int) for edge in (low - margin, high + margin))
     return picture[max(top, 0) : max(bottom, 1), max(left, 0) : max(right, 1)]
 
 
 def _map(check: Check, c: int, ground: NDArray, image: ImageFrame) -> NDArray:
     assert check.views is not None and check.x_world is not None
-    camera, scale = check.views.rig.cameras[c], max(ground.shape) / _EDGE
+    camera, scale = check.views.rig.cameras[c], max(ground.shape) / _LINE_REFERENCE_PX
     uv = check.views.uv[:, :, c].reshape(-1, 2)
     error = camera.project(check.x_world.reshape(-1, 3)) - uv
     fine = np.linalg.norm(error, axis=-1) < check.views.limit
     uv, error, size = uv[fine], error[fine], np.array(camera.size)
-    cells = np.where(size == size.max(), _CELLS[1], _CELLS[0])
+    cells = np.where(size == size.max(), _MAP_CELLS[1], _MAP_CELLS[0])
     cell = np.clip((uv / size * cells).astype(int), 0, cells - 1)
     out = (ground * 0.4).astype(np.uint8)
     for i in range(cells[0]):
         for j in range(cells[1]):
             here = (cell == (i, j)).all(axis=1)
-            if here.sum() >= _FEWEST:
+            if here.sum() >= _MIN_CELL_POINTS:
                 start = image.from_calibration(np.median(uv[here], axis=0))
-                cv2.circle(out, _at(start), round(3 * scale), _TOLD, -1, cv2.LINE_AA)
-                _arrow(out, start, start + _MAGNIFIED * np.median(error[here], axis=0), 2 * scale)
+                cv2.circle(out, _at(start), round(3 * scale), _EXPECTED_RGB, -1, cv2.LINE_AA)
+                _arrow(out, start, start + _ARROW_SCALE * np.median(error[here], axis=0), 2 * scale)
     return out
 
 
@@ -134,7 +137,7 @@ def _at(uv: NDArray) -> tuple[int, int]:
 def _arrow(out: NDArray, start: NDArray, end: NDArray, width: float) -> None:
     length = float(np.linalg.norm(end - start))
     if length > 1:
-        for colour, thick in ((_DARK, width + 3), (_ARROW, width)):
+        for colour, thick in ((_CONTOUR_RGB, width + 3), (_BIAS_RGB, width)):
             cv2.arrowedLine(
                 out,
                 _at(start),

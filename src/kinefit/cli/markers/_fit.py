@@ -58,7 +58,7 @@ def fit_file(
     out : folder, default beside the file: NAME-kinefit; with several people one folder for each in it.
     unit : str, optional, of files that state none or a wrong one.
     formats : names of `results.NAMES`, and "markers" for the measured ones as OpenSim takes them.
-    step : (what, done, total) -> None, told of progress.
+    step : (what, done, total) -> None, called as the fit advances.
 
     Returns
     -------

@@ -115,8 +115,8 @@ def export(
     if table is not None:
         raise click.UsageError("--names-table names the joints of a --retarget CHARACTER.")
     if format is None:
-        told = f"Missing option '--to' (or --retarget CHARACTER). Give --to [{'|'.join(FREEDOM)}]."
-        raise click.UsageError(told)
+        problem = f"Missing option '--to' (or --retarget CHARACTER). Give --to [{'|'.join(FREEDOM)}]."
+        raise click.UsageError(problem)
     options = {
         key: _choice(format, key, _meant(key, value, getattr(FREEDOM[format], key)))
         for key, value in choices.items() if value is not None
@@ -128,8 +128,8 @@ def export(
     (_results.check_folder if format in ("csv", "parquet") else _results.check_file)(out)
     recorded = read_motion(motion)
     results.write_format(recorded, format, out, **options)
-    told = ", ".join(f"{key} {value}" for key, value in options.items())
-    _screen.say(f"{out}: {results.ABOUT[format]}, {len(recorded)} frames{', ' + told if told else ''}")
+    stated = ", ".join(f"{key} {value}" for key, value in options.items())
+    _screen.say(f"{out}: {results.ABOUT[format]}, {len(recorded)} frames{', ' + stated if stated else ''}")
 
 
 def _meant(key: str, value: str, valid: Sequence[str]) -> str:

@@ -136,11 +136,11 @@ def _write_all(
     surfaces: Sequence[MeasuredSurface], photographs: Sequence[Path], wanted: Wanted, window: int
 ) -> list[str]:
     """Write all states; lines about them."""
-    told = []
+    lines = []
     for k, surface in enumerate(surfaces):
         reference = surfaces[max(k - 1, 0) if wanted.incremental else 0] if k else None
-        told += _write(surface, reference, _grey(photographs[k], wanted.field), wanted, k, window)
-    return told
+        lines += _write(surface, reference, _grey(photographs[k], wanted.field), wanted, k, window)
+    return lines
 
 
 class _States(Sequence[list[SplineImage]]):
@@ -170,7 +170,7 @@ def _write(
     surface: MeasuredSurface, reference: MeasuredSurface | None, grey: NDArray, wanted: Wanted, k: int, window: int
 ) -> list[str]:
     """Write one state; lines about it."""
-    out, told = wanted.out, [_about(surface, k)]
+    out, lines = wanted.out, [_about(surface, k)]
     strain = None
     if reference is not None:
         T, residual = rigid_motion(reference.x_world, surface.x_world)
@@ -178,14 +178,14 @@ def _write(
         middle = np.nanmean(reference.x_world, axis=0)
         moved = 1e3 * float(np.linalg.norm(T[:3, :3] @ middle + T[:3, 3] - middle))
         turned = np.rad2deg(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
-        told.append(
+        lines.append(
             f"   moved by {moved:.3f} mm, turned by {turned:.3f} degrees; the rest {rms:.4f} mm RMS a coordinate"
         )
         if wanted.gauge is not None:
             strain = surface_strain(reference, surface, wanted.gauge / 1e3, window)
             levels = {name: 1e6 * value for name, value in strain.rms().items()}
             kind = "noise floor" if k == wanted.still else "strain"
-            told.append(
+            lines.append(
                 f"   {kind} over {1e3 * strain.gauge:.2f} mm, RMS: xx {levels['xx']:.0f}e-6, yy {levels['yy']:.0f}e-6, "
                 f"xy {levels['xy']:.0f}e-6"
             )
@@ -203,7 +203,7 @@ def _write(
             file = out / f"strain_{name}_{k:03d}.png"
             title = f"strain {name}, {1e3 * strain.gauge:.1f} mm"
             write_field_picture(surface, grey, 1e6 * getattr(strain, name), file, title=title, unit="1e-6")
-    return told
+    return lines
 
 
 def _about(surface: MeasuredSurface, k: int) -> str:
@@ -250,13 +250,13 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
         )  # fmt: skip
         seeds = None if wanted.seeds is None else read_seeds(wanted.seeds, len(rig))
         tracker = SurfaceTracker(rig, videos[0].rate, settings, mask_of(wanted.mask, wanted.field), seeds, motion)
-        told = []
+        lines = []
         for k in range(count):
             images = [spline_of(video.read(k), wanted.field, wanted.smooth) for video in videos]
             try:
                 points = tracker.update(images)
             except TrackingError as error:
-                told.append(f"stopped: {error}")
+                lines.append(f"stopped: {error}")
                 break
             if k in (0, count // 2, count - 1):
                 write_point_picture(points.uv[:, 0], images[0].grey, wanted.out / f"points_{k:06d}.png")
@@ -276,10 +276,10 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
     lengths = lengths[lengths > 0] if lengths.any() else np.zeros(1, int)
     count = int(kept.live.any(axis=0).sum())
     about = f"{len(paths.times)} frames: {count} of {before} paths kept, {live.min()} to {live.max()} a frame"
-    told.insert(0, f"{about}, {np.median(lengths):.0f} frames a path (median), speed {speed:.3f} m/s (99 %)")
+    lines.insert(0, f"{about}, {np.median(lengths):.0f} frames a path (median), speed {speed:.3f} m/s (99 %)")
     if cut:
-        told.insert(1, "places cut off by the filters: " + ", ".join(f"{name} {count}" for name, count in cut.items()))
-    return told
+        lines.insert(1, "places cut off by the filters: " + ", ".join(f"{name} {count}" for name, count in cut.items()))
+    return lines
 
 
 def _check_motion(motion: Motion, path: Path | None, rate: float) -> None:

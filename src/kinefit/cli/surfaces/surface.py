@@ -79,14 +79,14 @@ def surface(
     if of_videos and flat is not None:
         raise ObservationError(f"{of_videos[0]} with --flat", remedy="It is for videos, which are followed in time.")
     if flat is not None:
-        told = measure_one_camera([calibration, *map(Path, views)], flat, wanted)
+        lines = measure_one_camera([calibration, *map(Path, views)], flat, wanted)
     else:
         rig, paths = read_views(calibration, unit, views)
         if of_videos and not paths.videos:
             problem = f"{of_videos[0]} with photographs"
             raise ObservationError(problem, remedy="It is for videos, which are followed in time.")
         with _screen.bars() as progress:
-            told = (measure_videos if paths.videos else measure_photographs)(rig, paths, wanted, progress)
-    for line in told:
+            lines = (measure_videos if paths.videos else measure_photographs)(rig, paths, wanted, progress)
+    for line in lines:
         _screen.say(line)
     _screen.say(f"\nWritten: {out}")

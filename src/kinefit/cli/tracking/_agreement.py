@@ -30,8 +30,8 @@ def print_agreement(take: Take) -> None:
     for a, b in combinations(seen.keypoints, 2):
         if seen.rig is not None and a.camera != b.camera and a.names == b.names:
             errors = pair_errors(seen.rig, a, b)
-            told = f"{np.median(errors):.1f} px" if len(errors) else "-"
-            table.add_row(f"{a.camera} - {b.camera}", str(len(errors)), told)
+            median = f"{np.median(errors):.1f} px" if len(errors) else "-"
+            table.add_row(f"{a.camera} - {b.camera}", str(len(errors)), median)
     say("\nA pair far worse than the others: its calibration is wrong, it is out of step, or it sees someone else.")
     console().print(table)
 

@@ -74,13 +74,13 @@ def live(
     from kinefit.readers.take.file import read_take
     from kinefit.simulation.warm import warm_depth, warm_keypoints
 
-    told = read_take(take)
+    entry = read_take(take)
     quiet = lines == "-"
     receivers: list[Receiver] = []
-    folder = (out or folder_of(told)) if record else None
-    session: LiveSession = live_session(told, speed=speed, folder=folder, tell=_screen.note)
+    folder = (out or folder_of(entry)) if record else None
+    session: LiveSession = live_session(entry, speed=speed, folder=folder, tell=_screen.note)
     try:
-        rate, up = session.tracker.rate, told.up
+        rate, up = session.tracker.rate, entry.up
         if lines is not None:
             from kinefit.live.receivers.lines import JsonLines
 
@@ -93,13 +93,13 @@ def live(
             from kinefit.live.receivers.lsl import Lsl
 
             receivers.append(Lsl(lsl, rate=rate))
-        kept = None if folder is None else MotionRecord(folder, rate=rate, up=up, name=told.name)
+        kept = None if folder is None else MotionRecord(folder, rate=rate, up=up, name=entry.name)
         if kept is not None:
             receivers.append(kept)
         if page:  # the last: its thread, once it has a pose, takes its turns with whoever is still to get it
             from kinefit.live.receivers.websocket import WebSockets
 
-            served = WebSockets(port, host=host, token=token, title=told.name, ask=session.ask)
+            served = WebSockets(port, host=host, token=token, title=entry.name, ask=session.ask)
             receivers.append(served)
             if served.access.warning:
                 _screen.note(f"warning: {served.access.warning}")
@@ -110,7 +110,7 @@ def live(
         session.close()
         raise
     session.receivers = tuple(receivers)
-    warm_depth() if told.depth or told.stereo else warm_keypoints()
+    warm_depth() if entry.depth or entry.stereo else warm_keypoints()
     with _ctrl_c(session):
         session.run(seconds)
     _tell(session, kept, quiet)
@@ -137,8 +137,8 @@ def _tell(session: LiveSession, kept: Any, quiet: bool) -> None:
     _screen.say(f"{steps}; {dropped} of {came} frames dropped", stderr=quiet)
     if session.latencies:
         ms = sorted(session.latencies)
-        told = f"{1000 * ms[len(ms) // 2]:.1f} ms, 99 % within {1000 * ms[int(0.99 * (len(ms) - 1))]:.1f} ms"
-        _screen.say(f"from frame to pose: median {told}", stderr=quiet)
+        text = f"{1000 * ms[len(ms) // 2]:.1f} ms, 99 % within {1000 * ms[int(0.99 * (len(ms) - 1))]:.1f} ms"
+        _screen.say(f"from frame to pose: median {text}", stderr=quiet)
     if session.size is not None:
         _screen.say(f"note: {session.size.told or 'the session ended before the size of the person was found'}",
                     stderr=quiet)  # fmt: skip

@@ -79,14 +79,14 @@ def choices_options(command: Callable) -> Callable:
     def called(*args: Any, **given: Any) -> Any:
         from kinefit.batch.one import Choices
 
-        told = {parameter: given.pop(parameter) for parameter in _CHOICES}
+        chosen = {parameter: given.pop(parameter) for parameter in _CHOICES}
         source = click.get_current_context().get_parameter_source("overlays")
-        wanted = told["overlays"] and source == click.core.ParameterSource.COMMANDLINE
-        if told["pictures"] == "blurred":
+        wanted = chosen["overlays"] and source == click.core.ParameterSource.COMMANDLINE
+        if chosen["pictures"] == "blurred":
             _screen.note("--pictures blurred is now --hide-faces, which hides everybody's face.")
-            told |= {"pictures": "full", "hide_faces": True}
-        told["smooth"] = not told.pop("realtime")
-        choices = Choices(**told)
+            chosen |= {"pictures": "full", "hide_faces": True}
+        chosen["smooth"] = not chosen.pop("realtime")
+        choices = Choices(**chosen)
         _check(choices, wanted)
         return command(*args, **given, choices=choices, wanted=wanted)
 
@@ -219,7 +219,7 @@ def _track_one(
     print_summary(done.motion, points=_screen.is_verbose())
     print_files(files)
     if done.total:
-        told = f"{len(done.motion)} of {done.total} frames are done and written; no video or report was begun."
-        _screen.tell_interrupted(f"{told} The same command goes on.")
+        text = f"{len(done.motion)} of {done.total} frames are done and written; no video or report was begun."
+        _screen.tell_interrupted(f"{text} The same command goes on.")
         return _screen.INTERRUPTED, done
     return 0, done
