@@ -1,11 +1,13 @@
 """Images of the pages: `python docs/draw.py NAME ...`.
 
 demo    images/demo.webp: the four overlay videos of `kinefit demo` beside the figure in 3D
+people  images/people.jpg: `kinefit track --hide-faces` of two people, from $KINEFIT_DATA/video_two_people_4cam
 studio  images/studio.svg: where four cameras stand, seen from above
 """
 
 from __future__ import annotations
 
+import os
 import sys
 import tempfile
 from itertools import combinations
@@ -46,6 +48,21 @@ def demo() -> None:
         ]
     first, *others = map(Image.fromarray, [*frames, *frames[-2:0:-1]])
     first.save(_IMAGES / "demo.webp", save_all=True, append_images=others, duration=_SPEED, loop=0, quality=60)
+
+
+def people() -> None:
+    """The image of several people: one of two who were tracked, in all views."""
+    recording = Path(os.environ["KINEFIT_DATA"]) / "video_two_people_4cam"
+    with tempfile.TemporaryDirectory() as work:
+        for path in recording.iterdir():
+            (Path(work) / path.name).symlink_to(path)
+        done = CliRunner().invoke(main, ["track", work, "--hide-faces", "--no-report", "-q"])
+        if done.exit_code:
+            raise SystemExit(done.output)
+        montage = cv2.imread(str(Path(work) / "take-kinefit" / "person-2" / "montage.png"))
+    height, width = montage.shape[:2]
+    small = cv2.resize(montage, (1000, round(1000 * height / width)), interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(_IMAGES / "people.jpg"), small, [cv2.IMWRITE_JPEG_QUALITY, 85])
 
 
 def _reduced(image: NDArray) -> NDArray:
@@ -132,4 +149,4 @@ def studio() -> None:
 
 if __name__ == "__main__":
     for name in sys.argv[1:]:
-        {"demo": demo, "studio": studio}[name]()
+        {"demo": demo, "people": people, "studio": studio}[name]()
