@@ -75,3 +75,22 @@ def test_a_camera_that_sees_nobody_is_left_out(folder):
     (folder / "three.toml").write_text(text)
     take = find_cameras(folder / "three.toml", tell=lambda text: None)
     assert [camera.name for camera in take.cameras] == list(room().names[:3])
+
+
+def test_clocks_start_from_sound(folder, tmp_path, monkeypatch):
+    early = 30  # frames that the second telephone began later than the others: a third of all
+    names = room().names
+    for camera, record, late in zip(room(), seen(LATE), (0, early, 0, 0), strict=True):
+        kept = slice(late, FRAMES)
+        masks = np.zeros(0, np.uint32), np.zeros(FRAMES - late + 1, int)
+        parts = record.points[kept], record.confidence[kept], *masks, "", record.lifted[kept]
+        write_detections(Detections(camera.name, 30.0, camera.size, *parts), tmp_path / f"{camera.name}.npz")
+    (tmp_path / "take.toml").write_text(take_text(f"height = {BODY.stature}"))
+    truth = (np.array(LATE) + [0, early, 0, 0]) / 30.0
+    heard = dict(zip(names, (truth + [0.0, 0.03, -0.02, 0.04]).tolist(), strict=True))
+    monkeypatch.setattr(of_take, "_heard", lambda take: heard)
+    take = find_cameras(tmp_path / "take.toml", tell=lambda text: None)
+    found = read_found(cameras_file(tmp_path / "take.toml"))
+    np.testing.assert_allclose((np.array(found.time_offsets) - found.time_offsets[0]) * 30.0, truth * 30.0, atol=0.25)
+    assert turn_errors(found.rig).max() < 1.0 and any("Clocks by sound" in note for note in found.notes)
+    assert [camera.time_offset for camera in take.cameras] == pytest.approx(found.time_offsets)

@@ -52,7 +52,7 @@ def calibrate_people(
     height: float | None = None,
     known_length: Length | None = None,
     focal: bool | Sequence[float] = False,
-    time_offsets: bool = False,
+    time_offsets: bool | float = False,
     up: str = "z",
     sigma: float = KEYPOINT_SIGMA,
     progress: Progress | None = None,
@@ -73,7 +73,8 @@ def calibrate_people(
     known_length : (point, point, [m]) of the body: sets the scale instead.
     focal : bool or (C,) floats, the cameras' lenses are guesses: estimate focal lengths, too; how far each may be off,
         as a share of it, default 0.25.
-    time_offsets : bool, estimate time offsets, too: up to 2 s with `lifted` keypoints, else a few frames.
+    time_offsets : bool or float [s], estimate time offsets, too: up to so much, default 2 s, with `lifted` keypoints,
+        else a few frames.
     up : str, vertical axis that the world shall have.
 
     Raises
@@ -92,7 +93,7 @@ def calibrate_people(
     first: Rig | None = None
     others: Sequence[Sequence[Keypoints]] = ()
     if all(record.lifted is not None for record in keypoints):
-        start = first_cameras(cameras, keypoints, within=_CLOCKS if time_offsets else 0.0)
+        start = first_cameras(cameras, keypoints, within=_CLOCKS if time_offsets is True else float(time_offsets))
         first, alone, others, late = start.rig, list(start.people), start.others, start.frames_late
     else:
         alone = [steady_person(record) for record in keypoints]
@@ -107,7 +108,7 @@ def calibrate_people(
     factor = _whole_scale(body, points, x, height)
     rig = settled(resized(rig, factor), factor * x, _above_soles(body, points), up=up)
     step("first cameras", 2, 2)
-    prior_std = prior_sigma(len(rig), focal=bool(spread.any()), distortion=False, time_offsets=time_offsets)
+    prior_std = prior_sigma(len(rig), focal=bool(spread.any()), distortion=False, time_offsets=bool(time_offsets))
     prior_std[:, :3], prior_std[:, 3:6], prior_std[:, FOCAL] = *_ANYWHERE, spread
     prior = CameraPrior(Rig(tuple(replace(a, matrix=b.matrix) for a, b in zip(rig, given, strict=True))), prior_std)
 

@@ -17,10 +17,13 @@ from kinefit.calibration.people.calibrate import GUESSED, STATED, calibrate_peop
 from kinefit.preparing.each_video import Step, Tell
 from kinefit.preparing.take import warn, with_detections
 from kinefit.readers.calibration.found import FoundCameras, read_found, write_found
+from kinefit.readers.sound import sound_offsets
 from kinefit.readers.take.cameras import USUAL, is_uncalibrated
 from kinefit.readers.take.entries import CalibrationEntry
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import load_observations
+
+_MAX_SOUND_ERROR_S = 0.2  # of clocks set by sound: 30 ms for 10 m, and telephones record sound before or after images
 
 
 def cameras_file(take: Path) -> Path:
@@ -79,23 +82,40 @@ def find_cameras(
     return replace(take, cameras=cameras, calibration=entry)
 
 
+def _heard(take: Take) -> dict[str, float]:
+    """{camera: [s]} to add to its times, by sound; nothing where the take states clocks, or sound tells none."""
+    videos = {e.name: e.video for e in take.cameras if e.video is not None and e.video.is_file()}
+    if len(videos) < 2 or any(e.time_offset for e in take.cameras):
+        return {}
+    offsets = dict(zip(videos, sound_offsets(tuple(videos.values())), strict=True))
+    heard = {name: float(offset) for name, offset in offsets.items() if np.isfinite(offset)}
+    return heard if len(heard) > 1 else {}
+
+
 def _find(take: Take, made_from: str, progress: Step | None) -> FoundCameras:
-    """Cameras from a take's keypoints."""
+    """Cameras from a take's keypoints, clocks by sound first."""
+    heard = _heard(take)
+    cameras = tuple(msgspec.structs.replace(e, time_offset=heard.get(e.name, e.time_offset)) for e in take.cameras)
+    take = replace(take, cameras=cameras)
     seen = load_observations(take, exteriors=False)
     assert seen.rig is not None
     stated = {e.name for e in take.cameras if e.field_of_view not in (None, USUAL)}
     focal = [STATED if name in stated else GUESSED for name in seen.rig.names]
     found = calibrate_people(
-        tuple(seen.rig), seen.keypoints, load_body(take.body), height=take.height, focal=focal, time_offsets=True,
+        tuple(seen.rig), seen.keypoints, load_body(take.body), height=take.height, focal=focal,
+        time_offsets=_MAX_SOUND_ERROR_S if len(heard) == len(cameras) else True,
         up=take.up, sigma=median(entry.sigma for entry in take.keypoints), progress=progress,
     )
     changes = found.cameras.values()
     first, *lines = found.told()
     notes = [f"Nothing tells where the cameras stand: found from the people in view. {first}", "; ".join(lines)]
+    if heard:
+        clocks = ", ".join(f"{name} {1e3 * offset:+.0f} ms" for name, offset in heard.items())
+        notes.append(f"Clocks by sound, before the people's movements refined them: {clocks}.")
     if take.height is None:
         notes.append("No height is stated: all lengths are as unsure as the person's size, about 5 %. Write height.")
     return FoundCameras(
-        found.rig, tuple(found.time_offsets[name] for name in found.rig.names),
+        found.rig, tuple(heard.get(name, 0.0) + found.time_offsets[name] for name in found.rig.names),
         float(median(c.shift_std for c in changes)) / np.sqrt(3.0),
         float(np.degrees(median(c.turn_std for c in changes))) / np.sqrt(3.0),
         tuple(notes), made_from,
