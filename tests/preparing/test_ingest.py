@@ -24,7 +24,7 @@ class SeesMiddle:
         return np.array([[image.shape[1] / 2, image.shape[0] / 2, 30.0, 0.0]])
 
 
-def look(job, networks, people, masks, key, tell, threads, hands):
+def look(job, networks, people, masks, key, tell, threads, hands, face):
     """One person whose face is near the upper left corner."""
     with Video(job.video) as video:
         frames, size = len(video), video.size
