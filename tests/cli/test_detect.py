@@ -34,7 +34,7 @@ class Networks:
     pictures = 0
     lock = threading.Lock()
 
-    def __init__(self, folder, threads=1, landmarks=None):
+    def __init__(self, folder, threads=1, landmarks=None, *, mirrored=False):
         pass
 
     def find_people(self, image):
@@ -324,6 +324,15 @@ def test_another_quality_is_looked_through_anew_and_none_keeps_what_is_there(tak
         assert run(take, "--network", own).exit_code == 0 and networks.pictures == times * first
     own.write_bytes(b"another network")
     assert run(take, "--network", own).exit_code == 0 and networks.pictures == 4 * first
+
+
+def test_one_video_alone_at_best_is_looked_at_mirrored_too(take, networks, monkeypatch):
+    asked = []
+    monkeypatch.setattr(detecting, "_look_through", lambda job, files, *more: asked.append(files.mirrored))
+    run(take.with_name("cam01.mp4"), "--quality", "best")
+    run(take.with_name("cam01.mp4"), "--quality", "balanced")
+    run(take, "--quality", "best")
+    assert asked == [True, False] + [False] * 4
 
 
 def test_hands_are_looked_for_where_they_are_asked_for_and_kept(take, networks, monkeypatch):

@@ -27,7 +27,7 @@ def found(write_frames, tmp_path, monkeypatch):
     def run(steps, seconds=None):
         video = write_frames(tmp_path / "a.mp4", steps, size=(64, 48))
         job = detecting.DetectionJob("a", video, tmp_path / "a.npz", seconds=seconds)
-        files = SimpleNamespace(folder=tmp_path, landmarks=tmp_path, name="best")
+        files = detecting.Networks(tmp_path, tmp_path, "best")
         detecting._look_through(job, files, 1, False, "key", lambda *said: None, 1, False, False)
         return read_detections(job.file)
 

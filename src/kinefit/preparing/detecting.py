@@ -72,11 +72,14 @@ class Networks:
         The network that sees their landmarks.
     name : str
         Of its quality, or what tells a file of one's own from others.
+    mirrored : bool
+        Whether each crop is looked at a second time, mirrored.
     """
 
     folder: Path
     landmarks: Path
     name: str
+    mirrored: bool = False
 
 
 def jobs_of_take(take: Take) -> list[DetectionJob]:
@@ -139,11 +142,14 @@ def detect(
     if not todo:
         return []
     files = networks(progress, tell, QUALITY if quality is None else quality)
+    if files.name == "best" and len(jobs) == 1:  # depths of one camera gain by it; several give the same motion
+        files = replace(files, mirrored=True)
     number, outlines = PEOPLE if people is None else people, bool(masks)
     threads = max(cores() // len(todo), 1)  # cameras run side by side; what cores are left help them
 
     def work(job: DetectionJob, step: Step) -> None:
-        key = f"{keys[job]} {_settings(number, outlines, bool(hands), bool(face), job.seconds)} quality={files.name}"
+        key = f"{keys[job]} {_settings(number, outlines, bool(hands), bool(face), job.seconds)}"
+        key += f"{' mirrored=True' * files.mirrored} quality={files.name}"
         _look_through(job, files, number, outlines, key, step, threads, bool(hands), bool(face))
 
     with hushed():
@@ -192,7 +198,7 @@ def _look_through(
     from kinefit.images.detectors.models import Models
     from kinefit.readers.video import Video
 
-    models = Models(files.folder, threads, files.landmarks)
+    models = Models(files.folder, threads, files.landmarks, mirrored=files.mirrored)
     with Video(job.video, rate=job.rate) as video:
         first, last = seconds_of(job, video)
 
