@@ -15,8 +15,9 @@ from kinefit.assets import CAMERAS
 from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.geometry.triangulation import triangulate
+from kinefit.images.detectors.pose_model import MIRROR
 from kinefit.multiview.association import choose_people
-from kinefit.observations import MEDIAPIPE_33, Detections
+from kinefit.observations import Detections
 from kinefit.preparing import detecting
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.detections import read_detections
@@ -28,9 +29,6 @@ _GOALS = {
     "detect_processor_time": ("ms a picture", "<= 41.7"),
 }  # fmt: skip
 _RUNS = amount(3, 1)  # the fastest counts: other programs only slow it down
-MIRROR = [
-    MEDIAPIPE_33.index(n.replace("left", "?").replace("right", "left").replace("?", "right")) for n in MEDIAPIPE_33
-]
 
 
 def run() -> None:

@@ -12,6 +12,7 @@ PARTS = {
     "detect": "the built-in detector",
     "detect_quality": "its qualities: each camera predicted by the others",
     "hands_detect": "hands found, and seen alike by two cameras",
+    "faces_detect": "faces found, and seen alike by four cameras",
     "hide_faces": "faces left open in images that leave the program",
     "smoothing": "whole takes at once",
     "error_bars": "truth within the error bars",

@@ -34,7 +34,7 @@ class Networks:
     pictures = 0
     lock = threading.Lock()
 
-    def __init__(self, folder, threads=1, landmarks=None):
+    def __init__(self, folder, threads=1, landmarks=None, *, mirrored=False):
         pass
 
     def find_people(self, image):
@@ -326,6 +326,15 @@ def test_another_quality_is_looked_through_anew_and_none_keeps_what_is_there(tak
     assert run(take, "--network", own).exit_code == 0 and networks.pictures == 4 * first
 
 
+def test_one_video_alone_at_best_is_looked_at_mirrored_too(take, networks, monkeypatch):
+    asked = []
+    monkeypatch.setattr(detecting, "_look_through", lambda job, files, *more: asked.append(files.mirrored))
+    run(take.with_name("cam01.mp4"), "--quality", "best")
+    run(take.with_name("cam01.mp4"), "--quality", "balanced")
+    run(take, "--quality", "best")
+    assert asked == [True, False] + [False] * 4
+
+
 def test_hands_are_looked_for_where_they_are_asked_for_and_kept(take, networks, monkeypatch):
     class NoHands:
         def __init__(self, folder, threads=1):
@@ -348,6 +357,30 @@ def test_hands_are_looked_for_where_they_are_asked_for_and_kept(take, networks, 
     assert run(take).exit_code == 0 and run(take, "--hands").exit_code == 0 and networks.pictures == 2 * first
     assert run(take, "--no-hands").exit_code == 0 and read_detections(file).hands is None
     assert run(take, "--people", "0").exit_code == 2
+
+
+def test_faces_are_looked_for_where_they_are_asked_for_and_kept(take, networks, monkeypatch):
+    class NoFaces:
+        def __init__(self, folder, threads=1):
+            pass
+
+        def landmarks(self, image, roi):
+            return SimpleNamespace(presence=0.1)
+
+    monkeypatch.setattr("kinefit.images.detectors.faces.FaceModels", NoFaces)
+    file = detections_file(take, "cam01")
+    assert run(take).exit_code == 0 and read_detections(file).face is None
+    told = run(take, "--face")
+    assert told.exit_code == 0 and "a face in 0" in told.output
+    pictures = networks.pictures
+    assert read_detections(file).face.shape[2:] == (478, 2)
+    assert run(take).exit_code == 0 and run(take, "--face").exit_code == 0 and networks.pictures == pictures
+    take.write_text(take.read_text() + '[[keypoints]]\ncamera = "cam01"\nformat = "detect"\nset = "MEDIAPIPE_478"\n')
+    with pytest.raises(ObservationError, match="no face is seen"):
+        load_observations(with_detections(read_take(take)))
+    assert run(take, "--no-face").exit_code == 0 and read_detections(file).face is None
+    with pytest.raises(ObservationError, match="not looked for"):
+        load_observations(read_take(take))
 
 
 def test_a_network_that_is_not_there_and_two_wishes_at_once_are_told(take, tmp_path):
@@ -377,7 +410,7 @@ def drawn(drawn_take, tmp_path):
     return take
 
 
-def look(job, networks, people, masks, key, tell, threads, hands):
+def look(job, networks, people, masks, key, tell, threads, hands, face):
     landmarks = np.load(job.video.with_name(f"mediapipe_{job.camera}.npy"))[:, None]
     points = np.where(landmarks[..., 2:] > 0, landmarks[..., :2], 0.5)
     nothing = np.zeros(0, np.uint32), np.zeros(len(points) + 1, int)

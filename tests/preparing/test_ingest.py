@@ -1,6 +1,5 @@
 """Copies of the videos with faces hidden take their place in a take; its keypoints are of the videos themselves."""
 
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ class SeesMiddle:
         return np.array([[image.shape[1] / 2, image.shape[0] / 2, 30.0, 0.0]])
 
 
-def look(job, networks, people, masks, key, tell, threads, hands):
+def look(job, networks, people, masks, key, tell, threads, hands, face):
     """One person whose face is near the upper left corner."""
     with Video(job.video) as video:
         frames, size = len(video), video.size
@@ -35,7 +34,7 @@ def look(job, networks, people, masks, key, tell, threads, hands):
 
 @pytest.fixture
 def take(copy_take, tmp_path, monkeypatch):
-    networks = SimpleNamespace(folder=tmp_path, landmarks=tmp_path, name="best")
+    networks = detecting.Networks(tmp_path, tmp_path, "best")
     monkeypatch.setattr("kinefit.images.detectors.face_detector.FaceDetector", SeesMiddle)
     monkeypatch.setattr("kinefit.images.detectors.models.Models", lambda *given, **more: None)
     monkeypatch.setattr(detecting, "networks", lambda *given: networks)

@@ -64,6 +64,27 @@ def test_hands_are_written_and_read(found, tmp_path):
         replace(found, hands=hands)
 
 
+def test_faces_are_written_and_read(found, tmp_path):
+    rng = np.random.default_rng(1)
+    face, confidence = rng.uniform(0, 4, (3, 2, 478, 2)), rng.uniform(size=(3, 2, 478))
+    face[:2, 1], confidence[:2, 1] = np.nan, 0
+    write_detections(replace(found, face=face, face_confidence=confidence), tmp_path / "left.npz")
+    read = read_detections(tmp_path / "left.npz")
+    keypoints = read.keypoints(face=True)
+    assert keypoints.keypoint_set == "MEDIAPIPE_478" and keypoints.names[468] == "right_face_iris"
+    assert np.allclose(keypoints.points, face, equal_nan=True, atol=1e-5) and keypoints.lifted is None
+    assert read.keypoints().keypoint_set == "MEDIAPIPE_33"
+    longer = read.within(1, 6)
+    assert np.allclose(longer.face[1:4], face, equal_nan=True, atol=1e-5)
+    assert not longer.face_confidence[[0, 4, 5]].any()
+    with pytest.raises(ObservationError, match="not looked for"):
+        found.keypoints(face=True)
+    with pytest.raises(ObservationError, match="no face is seen"):
+        replace(read, face_confidence=np.zeros_like(confidence)).keypoints(face=True)
+    with pytest.raises(ObservationError, match="face"):
+        replace(found, face=face)
+
+
 def test_masks_run_down_the_columns(found):
     mask = found.mask(0, 0)
     assert mask.shape == (4, 6) and np.argwhere(mask).tolist() == [[1, 1], [2, 1]]

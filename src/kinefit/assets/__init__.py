@@ -66,7 +66,7 @@ def sample_recording(progress: Progress | None = None) -> Path:
 
 
 def detector_models(progress: Progress | None = None) -> Path:
-    """Folder with the networks of the built-in detector; fetched (36 MB, 18 are kept) and verified as the recording is.
+    """Folder with the networks of the built-in detector; fetched (36 MB, 22 are kept) and verified as the recording is.
 
     Raises
     ------

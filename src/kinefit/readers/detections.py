@@ -15,6 +15,8 @@ the video's picture, the centre of the first pixel is (0, 0):
     lifted (F, P, 33, 3)       float32 [m], optional: landmarks in space, see Detections; NaN where a person is not seen
     hands (F, P, 2, 21, 2)     float32 [px], optional: landmarks of MEDIAPIPE_HAND_21 of the left and the right hand
     hand_confidence (F, P, 2, 21)   float32, 0..1, with hands; 0 where a hand is not seen
+    face (F, P, 478, 2)        float32 [px], optional: points of MEDIAPIPE_478; NaN where a face is not seen
+    face_confidence (F, P, 478)     float32, 0..1, with face; 0 where a face is not seen
     times (F,)                 float64 [s], optional: when each frame is shown, from the first on; without: at the rate
     mask_starts (F * P + 1,)   where each mask begins in mask_runs, by frame, then person; the same twice: no mask
 """
@@ -67,7 +69,7 @@ def read_detections(path: str | PathLike[str]) -> Detections:
         found = Detections(
             str(arrays["camera"]), float(arrays["rate"]), (width, height), arrays["points"], arrays["confidence"],
             arrays["mask_runs"], arrays["mask_starts"], str(file), arrays.get("lifted"),
-            arrays.get("hands"), arrays.get("hand_confidence"), arrays.get("times"),
+            *(arrays.get(name) for name in ("hands", "hand_confidence", "times", "face", "face_confidence")),
         )
     except (KinefitError, KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
         raise FileError(f"contents that do not fit together ({error})", file=file, remedy=again) from error

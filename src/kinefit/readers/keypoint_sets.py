@@ -49,6 +49,9 @@ OPENPOSE_HANDS = "BODY_25_HANDS"
 MEDIAPIPE_SETS = ("MEDIAPIPE_33", "MEDIAPIPE_75")
 """Sets of MediaPipe, without and with hands."""
 
+FACE_SET = "MEDIAPIPE_478"
+"""The face mesh with irises."""
+
 SETS_WITH_HANDS = (OPENPOSE_HANDS, "COCO_WHOLEBODY_133", "MEDIAPIPE_75")
 """Keypoint sets that have the points of both hands."""
 

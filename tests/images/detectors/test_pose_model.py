@@ -1,9 +1,11 @@
 """Reading of the landmark network's numbers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from kinefit.images.detectors.pose_model import PoseModel, refine
+from kinefit.images.detectors.pose_model import MIRROR, SIZE, PersonLandmarks, PoseModel, mean_with_mirrored, refine
 
 
 def heat(*peaks):
@@ -83,3 +85,40 @@ def test_outputs_are_told_apart_by_their_shape_and_probabilities_do_not_overflow
     assert pose.score == 0.75
     assert np.allclose(pose.visibility, 1 / (1 + np.exp(-2))) and np.all(pose.presence == 0)
     assert pose.mask.sum() == pytest.approx(10 * 20) and pose.mask[15, 40] == 1
+
+
+def mirror_image(seen):
+    """What a network without errors sees in the mirror image."""
+
+    def flip(points):
+        return np.column_stack([SIZE - 1 - points[:, 0], points[:, 1]])
+
+    middle, rim = flip(np.stack([seen.middle, seen.rim]))
+    return PersonLandmarks(
+        flip(seen.points)[MIRROR], seen.visibility[MIRROR], seen.presence[MIRROR], middle, rim, seen.score,
+        seen.mask[:, ::-1], (seen.lifted * [-1, 1, 1])[MIRROR],
+    )  # fmt: skip
+
+
+@pytest.fixture
+def seen():
+    rng = np.random.default_rng(4)
+    points, mask = rng.uniform(20, 230, (33, 2)), rng.uniform(size=(SIZE, SIZE)).astype(np.float32)
+    sure = rng.uniform(0.5, 1, (2, 33))
+    return PersonLandmarks(points, *sure, points[0], points[1], 0.9, mask, rng.normal(size=(33, 3)))
+
+
+def test_errors_that_lean_to_one_side_cancel_in_the_mirror_image(seen):
+    lean = {"points": seen.points + [3, 0], "middle": seen.middle + [3, 0], "lifted": seen.lifted + [0.1, 0, 0]}
+    both = mean_with_mirrored(replace(seen, **lean), replace(
+        mirror_image(seen), **{name: getattr(mirror_image(seen), name) + error for name, error in
+                               (("points", [3, 0]), ("middle", [3, 0]), ("lifted", [0.1, 0, 0]))}
+    ))  # fmt: skip
+    for name in ("points", "visibility", "presence", "middle", "rim", "mask", "lifted"):
+        assert np.allclose(getattr(both, name), getattr(seen, name), atol=1e-6), name
+
+
+def test_a_mirror_image_of_nobody_or_with_sides_exchanged_does_not_count(seen):
+    assert mean_with_mirrored(seen, replace(mirror_image(seen), score=0.2)) is seen
+    turned = replace(mirror_image(seen), points=mirror_image(seen).points[MIRROR])
+    assert mean_with_mirrored(seen, turned) is seen

@@ -25,7 +25,8 @@ def write_detections(detections: Detections, path: str | PathLike[str], *, key: 
     if Path(path).suffix != ".npz":
         raise ExportError("a file of detections ends in .npz", file=path, remedy=f"Call it {Path(path).stem}.npz.")
     extra: dict[str, Any] = {
-        name: array.astype(np.float32) for name in ("lifted", "hands", "hand_confidence")
+        name: array.astype(np.float32)
+        for name in ("lifted", "hands", "hand_confidence", "face", "face_confidence")
         if (array := getattr(detections, name)) is not None
     }  # fmt: skip
     if detections.times is not None:

@@ -10,10 +10,10 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.images.detectors.masks import MIN_MASK, cover, mask_runs, moved_mask, without_others
 from kinefit.images.detectors.models import Models
 from kinefit.images.detectors.person_detector import DetectedPerson
 from kinefit.images.detectors.pose_model import SIZE
@@ -23,11 +23,8 @@ from kinefit.observations import Detections
 _THERE = 0.5  # least probability of a person in a region
 _VISIBLE = 0.65  # least mean confidence of landmarks in the picture: 0.71 and more for people, 0.62 for a pile of boxes
 _SURE, _CLEAR = 0.9, 0.75  # the same two of those who were searched for: small people 0.78, machines 0.71
-_RATHER = 0.5  # probability from which on a pixel is the person's
 _MOST = 0.5  # share of a mask
-_HARDLY, _RIM, _GREY = 0.3, 7, 128  # probability and rim [px of the crop] of what is painted over, and the paint
 _SAME_PERSON = 0.05  # two who are followed are one where their heads, or all of them, differ by less (in sides)
-_BESIDE = 0.3  # middles of the hips of two people are further apart (in sides); of one who is followed twice, nearer
 _NEAR = 0.3  # somebody comes back where the head is no further from where it was (in sides)
 _FEW, _BRIEF = 3, 0.2  # [frames], [s]: who is seen for less in all is a deception of the networks
 _SMALLEST, _LARGEST = 16, 8  # [px], [sides of the picture]: regions beyond show nothing that could be recognised
@@ -51,7 +48,8 @@ class _DetectionTrack:
 class PersonDetection:
     """One person in one picture: column, landmarks (33, 2) [px], confidence, runs of the mask, lifted (33, 3) [m].
 
-    And points (2, 21, 2) [px] and confidence (2, 21) of the left and the right hand, where they were looked for.
+    And points (2, 21, 2) [px] and confidence (2, 21) of the left and the right hand, points (478, 2) [px] and
+    confidence (478,) of the face, where they were looked for.
     """
 
     column: int
@@ -60,6 +58,10 @@ class PersonDetection:
     runs: NDArray
     lifted: NDArray
     hands: tuple[NDArray, NDArray] | None = None
+    face: tuple[NDArray, NDArray] | None = None
+
+
+_Adder = Callable[[NDArray[np.uint8], list[PersonDetection]], list[PersonDetection]]
 
 
 @dataclass
@@ -179,7 +181,7 @@ class Follower:
         roi = track.steady.roi
         if not _SMALLEST < roi.side < _LARGEST * max(image.shape[:2]):
             return None
-        pose = self.models.pose(_alone(roi.crop(image, SIZE), roi, track.shape, others), mask=mask)
+        pose = self.models.pose(without_others(roi.crop(image, SIZE), roi, track.shape, others), mask=mask)
         if pose.score < score:
             return None
         points = roi.to_image(pose.points, SIZE)
@@ -193,32 +195,6 @@ class Follower:
         )
         shape = None if pose.mask is None else (roi, pose.mask)
         return replace(track, steady=steady, points=points, last=self._frame, shape=shape), sighting
-
-
-def _alone(
-    crop: NDArray[np.uint8], roi: Roi, own: tuple[Roi, NDArray] | None, others: Sequence[tuple[Roi, NDArray]]
-) -> NDArray[np.uint8]:
-    """A region with other people in it painted over, but for pixels that were the person's own.
-
-    Those at the very same place are not: they may be the same person, followed twice.
-    """
-    beside = [
-        shape for shape in others
-        if np.linalg.norm(shape[0].centre - roi.centre) > _BESIDE * min(shape[0].side, roi.side)
-    ]  # fmt: skip
-    theirs = [cv2.dilate(_moved(shape, roi, _RATHER), np.ones((_RIM, _RIM), np.uint8)) for shape in beside]
-    theirs = [mask for mask in theirs if mask.any()]
-    if theirs:
-        mine = _moved(own, roi, _RATHER) if own else np.zeros(crop.shape[:2], np.uint8)
-        crop[(np.maximum.reduce(theirs) > 0) & (mine == 0)] = _GREY
-    return crop
-
-
-def _moved(shape: tuple[Roi, NDArray], roi: Roi, least: float) -> NDArray[np.uint8]:
-    """Pixels of a region (SIZE, SIZE), 0 or 1, that a mask of another region holds for likely."""
-    A_roi_image = cv2.invertAffineTransform(roi.A_image_crop(SIZE))
-    A = A_roi_image @ np.vstack([shape[0].A_image_crop(SIZE), [0, 0, 1]])
-    return (cv2.warpAffine(shape[1], A, (SIZE, SIZE)) > least).astype(np.uint8)
 
 
 def _clearness(seen: PersonDetection, image: NDArray) -> float:
@@ -235,9 +211,9 @@ def _is_part(new: _DetectionTrack, known: _DetectionTrack) -> bool:
     """Whether most of what looks like another person is somebody who is known."""
     assert new.shape and known.shape
     (roi, mask), (other_roi, other) = new.shape, known.shape
-    moved = _moved((roi, mask), other_roi, _RATHER) > 0
-    area = float((mask > _RATHER).sum()) * (roi.side / other_roi.side) ** 2
-    return bool((moved & (other > _RATHER)).sum() > _MOST * area) or _is_same(new, known)
+    moved = moved_mask((roi, mask), other_roi) > 0
+    area = float((mask > MIN_MASK).sum()) * (roi.side / other_roi.side) ** 2
+    return bool((moved & (other > MIN_MASK)).sum() > _MOST * area) or _is_same(new, known)
 
 
 def _apart(a: _DetectionTrack, b: _DetectionTrack, points: slice) -> float:
@@ -247,46 +223,10 @@ def _apart(a: _DetectionTrack, b: _DetectionTrack, points: slice) -> float:
     return float(np.median(np.linalg.norm(a.points[points] - b.points[points], axis=1))) / side
 
 
-def mask_runs(mask: NDArray[np.float32], roi: Roi, shape: tuple[int, int]) -> NDArray[np.uint32]:
-    """Run lengths, down the columns of a picture (height, width), of the pixels that are likely the person's."""
-    height, width = shape
-    nothing = np.array([width * height], np.uint32)
-    rows, columns = (np.flatnonzero((mask > _RATHER).any(axis=axis)) for axis in (1, 0))
-    if not len(rows):
-        return nothing
-    box = np.array([[u, v] for u in (columns[0] - 1, columns[-1] + 1) for v in (rows[0] - 1, rows[-1] + 1)])
-    corners = roi.to_image(box, SIZE)
-    u0, v0 = np.clip(np.floor(corners.min(axis=0)).astype(int), 0, [width, height])
-    u1, v1 = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 1, 0, [width, height])
-    if u0 >= u1 or v0 >= v1:
-        return nothing
-    A = roi.A_image_crop(SIZE)[::-1]  # each row of what is drawn is a column of the picture, between two empty pixels
-    A[:, 2] -= v0 - 1, u0
-    soft = cv2.warpAffine(mask, A, (int(v1 - v0) + 2, int(u1 - u0)), flags=cv2.INTER_LINEAR)
-    inside = soft > _RATHER
-    inside[:, [0, -1]] = False
-    u, v = np.divmod(np.flatnonzero(inside[:, 1:] != inside[:, :-1]), v1 - v0 + 1)
-    changes = (u + u0) * height + v + v0
-    return np.diff(np.concatenate([[0], changes, [width * height]])).astype(np.uint32)
-
-
-def cover(image: NDArray[np.uint8], shapes: Iterable[tuple[Roi, NDArray]]) -> NDArray[np.uint8]:
-    """The picture with those who are known painted over, so that the detector sees whoever else is there.
-
-    It was made for one person in the picture and overlooks those beside another.
-    """
-    covered = image.copy()
-    for roi, mask in shapes:
-        wide = cv2.dilate((mask > _HARDLY).astype(np.uint8), np.ones((_RIM, _RIM), np.uint8))
-        size = (image.shape[1], image.shape[0])
-        covered[cv2.warpAffine(wide, roi.A_image_crop(SIZE), size, flags=cv2.INTER_NEAREST) > 0] = _GREY
-    return covered
-
-
 def detect_people(
     images: Iterable[NDArray[np.uint8]], models: Models, *, camera: str, rate: float, people: int = 3,
     masks: bool = True, source: str = "",
-    with_hands: Callable[[NDArray[np.uint8], list[PersonDetection]], list[PersonDetection]] | None = None,
+    with_hands: _Adder | None = None, with_faces: _Adder | None = None,
 ) -> Detections:
     """Keypoints and masks of the people in a video.
 
@@ -300,8 +240,8 @@ def detect_people(
         How many are followed at most at a time.
     masks : bool
         Whether outlines are wanted.
-    with_hands : callable, optional
-        Adds their hands to the people in an image, such as a `HandFollower`.
+    with_hands, with_faces : callable, optional
+        Adds hands, or faces, to the people in an image: a `HandFollower`, a `FaceFinder`.
 
     Returns
     -------
@@ -315,7 +255,9 @@ def detect_people(
     for image in images:
         size = (image.shape[1], image.shape[0])
         seen = follower.update(image)
-        frames.append(with_hands(image, seen) if with_hands else seen)
+        for add in filter(None, (with_hands, with_faces)):
+            seen = add(image, seen)
+        frames.append(seen)
     times = Counter(s.column for frame in frames for s in frame)
     least = min(max(_FEW, round(_BRIEF * rate)), len(frames) // 2)
     column = {c: k for k, c in enumerate(sorted(c for c in times if times[c] >= least))}
@@ -324,15 +266,27 @@ def detect_people(
     counts = np.zeros((len(frames), len(column)), int)
     lifted = np.full((len(frames), len(column), 33, 3), np.nan)
     runs = [np.zeros(0, np.uint32)]
-    hands = np.full((*counts.shape, 2, 21, 2), np.nan), np.zeros((*counts.shape, 2, 21))
     for f, frame in enumerate(frames):
         for s in sorted((s for s in frame if s.column in column), key=lambda s: s.column):
             at = f, column[s.column]
             points[at], confidence[at], counts[at], lifted[at] = s.points, s.confidence, len(s.runs), s.lifted
             runs.append(s.runs)
-            if s.hands:
-                hands[0][at], hands[1][at] = s.hands
+    hands, hand_confidence = _stacked(frames, column, "hands", (2, 21)) if with_hands else (None, None)
+    face, face_confidence = _stacked(frames, column, "face", (478,)) if with_faces else (None, None)
     return Detections(
         camera, rate, size, points, confidence, np.concatenate(runs), np.concatenate([[0], np.cumsum(counts)]), source,
-        lifted, *(hands if with_hands else ()),
+        lifted, hands, hand_confidence, None, face, face_confidence,
     )
+
+
+def _stacked(
+    frames: list[list[PersonDetection]], column: dict[int, int], part: str, shape: tuple[int, ...]
+) -> tuple[NDArray, NDArray]:
+    """Points (F, P, *shape, 2) [px] and confidence (F, P, *shape) of hands or faces of those who have a column."""
+    points = np.full((len(frames), len(column), *shape, 2), np.nan)
+    confidence = np.zeros(points.shape[:-1])
+    for f, frame in enumerate(frames):
+        for s in frame:
+            if s.column in column and (found := getattr(s, part)):
+                points[f, column[s.column]], confidence[f, column[s.column]] = found
+    return points, confidence

@@ -32,7 +32,8 @@ _FACE_REACH = 0.9  # radius of what is hidden, in sides of the box of a face
 _PERSON_REACH = 0.25  # the same, in radii of the circle around a person
 _POINTS_REACH, _MIN_RADIUS_PX = 2.2, 12.0  # the same, in distances of the outermost of nose, eyes, ears; and at least
 _OUTLIER_SHARE = 8.0  # of the median distance from the median: a point further away is not on the head; ears are nearer
-_HEAD = slice(0, 11)  # landmarks of MEDIAPIPE_33 on the face
+HEAD = slice(0, 11)
+"""Landmarks of MEDIAPIPE_33 on the face."""
 
 
 class FaceDetector:
@@ -93,7 +94,7 @@ class FaceDetector:
         seen = self._people.pose(person.roi.crop(part, SIZE), mask=False)
         if seen.score >= _MIN_LANDMARK_SCORE:
             points = person.roi.to_image(seen.points, SIZE)
-            return head_circles(points[None, _HEAD]).tolist(), points
+            return head_circles(points[None, HEAD]).tolist(), points
         if person.head is None or person.score < _MIN_UNCONFIRMED_SCORE:
             return [], np.zeros((0, 2))
         body = float(np.linalg.norm(np.diff(person.points, axis=0)))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from kinefit.images.detectors.box_detector import BoxDetector
 from kinefit.images.detectors.detection import PersonDetection
 from kinefit.images.detectors.models import interpreter
-from kinefit.images.detectors.roi import Roi
+from kinefit.images.detectors.roi import Roi, is_inside
 
 PALMS, HANDS = "palm_detection_full.tflite", "hand_landmark_full.tflite"
 ALONE = -1
@@ -94,12 +94,7 @@ class HandModels:
 
 def around_hand(points: NDArray) -> Roi:
     """The region around a hand's points (21, 2) [px], its fingers upwards."""
-    du, dv = points[_MIDDLE] - points[_WRIST]
-    turn = float(np.arctan2(du, -dv))
-    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    turned = points @ R
-    low, high = turned.min(axis=0), turned.max(axis=0)
-    return Roi(R @ (low + high) / 2, _LANDMARK_SIDES * float((high - low).max()), turn)
+    return Roi.around_points(points, points[_MIDDLE] - points[_WRIST], _LANDMARK_SIDES)
 
 
 def around_wrist(points: NDArray, side: int) -> Roi:
@@ -185,9 +180,9 @@ def hands_of(
     points, confidence = np.full((2, 21, 2), np.nan), np.zeros((2, 21))
     for side in (0, 1):
         if hand := found.get((column, side)):
-            inside = ((hand.points > -0.5) & (hand.points < np.array(shape[1::-1]) - 0.5)).all(axis=1)
             points[side] = hand.points
-            confidence[side] = hand.presence * (1 - hand.left if side else hand.left) * inside
+            sure = hand.presence * (1 - hand.left if side else hand.left)
+            confidence[side] = sure * is_inside(hand.points, shape)
     return points, confidence
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kinefit._jit import cache_directory
 from kinefit.errors import FileError, ObservationError
 from kinefit.images.detectors.person_detector import DetectedPerson, PersonDetector
-from kinefit.images.detectors.pose_model import MASK, PersonLandmarks, PoseModel
+from kinefit.images.detectors.pose_model import MASK, PersonLandmarks, PoseModel, mean_with_mirrored
 
 DETECTOR, LANDMARKS = "pose_detection.tflite", "pose_landmark_full.tflite"
 _REMEDY = "Delete its folder; it is then fetched again."
@@ -36,6 +36,8 @@ class Models:
         That each network runs on; the answers are the same.
     landmarks : path
         Of another landmark network than the folder's, with the same inputs and outputs.
+    mirrored : bool
+        Whether each crop is looked at a second time, mirrored, and the mean of both counts.
 
     Raises
     ------
@@ -46,8 +48,10 @@ class Models:
     """
 
     def __init__(
-        self, folder: str | PathLike[str], threads: int = 1, landmarks: str | PathLike[str] | None = None
-    ) -> None:
+        self, folder: str | PathLike[str], threads: int = 1, landmarks: str | PathLike[str] | None = None, *,
+        mirrored: bool = False,
+    ) -> None:  # fmt: skip
+        self._mirrored = mirrored
         self._landmarks, self._threads = Path(folder) / LANDMARKS if landmarks is None else Path(landmarks), threads
         self._points = _pose_model(self._landmarks, threads, without=MASK)
         self._detect = PersonDetector(interpreter(Path(folder) / DETECTOR, threads))
@@ -58,7 +62,9 @@ class Models:
 
     def pose(self, crop: NDArray[np.uint8], *, mask: bool = True) -> PersonLandmarks:
         """Pose of the person in an RGB crop (256, 256, 3); its mask takes nearly as long as all the rest."""
-        return (self._outlines if mask else self._points)(crop)
+        network = self._outlines if mask else self._points
+        seen = network(crop)
+        return mean_with_mirrored(seen, network(crop[:, ::-1])) if self._mirrored else seen
 
     def find_people(self, image: NDArray[np.uint8]) -> list[DetectedPerson]:
         """People in a picture (H, W, 3) RGB, the surest first; a quarter of the picture's height or more."""

@@ -5,11 +5,13 @@ Source: Bazarevsky et al., BlazePose, 2020; the refinement by heatmaps is that o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from kinefit.observations import MEDIAPIPE_33
 
 SIZE = 256  # [px] side of the network's picture
 MASK = (1, SIZE, SIZE, 1)  # shape of the output that is the mask
@@ -17,6 +19,13 @@ _POINTS = 33  # landmarks of MEDIAPIPE_33; two more tell where the person is in 
 _HEAT = 64  # [px] side of the heatmaps
 _WINDOW = np.arange(-3, 4)  # of a heatmap around a landmark
 _PEAK = 0.5  # least height of a heatmap that moves its landmark
+_MIN_SCORE = 0.5  # of somebody in the mirror image
+_MAX_EXCHANGED = 0.5  # of the median distance of both answers, left where sides are exchanged: one of them is wrong
+
+MIRROR = [
+    MEDIAPIPE_33.index(n.replace("left", "?").replace("right", "left").replace("?", "right")) for n in MEDIAPIPE_33
+]
+"""For each landmark the one on the other side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +94,32 @@ class PoseModel:
             float(read(self._score).item()), mask,
             read(self._lifted).reshape(39, 3)[:_POINTS].astype(float),
         )
+
+
+def mean_with_mirrored(seen: PersonLandmarks, mirrored: PersonLandmarks) -> PersonLandmarks:
+    """Mean of what a network sees in a crop and in its mirror image: errors that lean to one side cancel.
+
+    What it sees in the crop counts alone where there is nobody in the mirror image, or left and right are exchanged.
+    """
+
+    def back(points: NDArray) -> NDArray:
+        return np.column_stack([SIZE - 1 - points[:, 0], points[:, 1]])
+
+    points = back(mirrored.points)[MIRROR]
+    apart, exchanged = (np.median(np.linalg.norm(seen.points - p, axis=1)) for p in (points, points[MIRROR]))
+    if mirrored.score < _MIN_SCORE or exchanged < _MAX_EXCHANGED * apart:
+        return seen
+    ends = (np.stack([seen.middle, seen.rim]) + back(np.stack([mirrored.middle, mirrored.rim]))) / 2
+    mask = seen.mask
+    if mask is not None and mirrored.mask is not None:
+        mask = (mask + mirrored.mask[:, ::-1]) * np.float32(0.5)
+    return replace(
+        seen, points=(seen.points + points) / 2, middle=ends[0], rim=ends[1],
+        visibility=(seen.visibility + mirrored.visibility[MIRROR]) / 2,
+        presence=(seen.presence + mirrored.presence[MIRROR]) / 2,
+        lifted=(seen.lifted + mirrored.lifted[MIRROR] * [-1, 1, 1]) / 2,
+        mask=mask,
+    )  # fmt: skip
 
 
 def refine(points: NDArray, heat: NDArray) -> NDArray:

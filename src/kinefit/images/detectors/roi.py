@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -39,6 +40,15 @@ class Roi:
         du, dv = rim - middle
         return cls(middle, 2 * _MARGIN * float(np.hypot(du, dv)), float(np.arctan2(du, -dv)))
 
+    @classmethod
+    def around_points(cls, points: NDArray, up: NDArray, sides: float) -> Roi:
+        """Square of `sides` times the extent of points (N, 2) [px] around them, turned upright along `up` (2,)."""
+        turn = float(np.arctan2(up[0], -up[1]))
+        R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        turned = points @ R
+        low, high = turned.min(axis=0), turned.max(axis=0)
+        return cls(R @ (low + high) / 2, sides * float((high - low).max()), turn)
+
     def A_image_crop(self, size: int) -> NDArray:
         """(2, 3) map of the pixels of a crop of `size` px to those of the picture."""
         scale = self.side / size
@@ -66,6 +76,11 @@ class Roi:
     def corners(self) -> NDArray:
         """(4, 2) [px]."""
         return self.to_image(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), 1)
+
+
+def is_inside(points: NDArray, shape: Sequence[int]) -> NDArray:
+    """(...) bool, which points (..., 2) [px] lie in an image of a shape (H, W, ...)."""
+    return np.asarray(((points > -0.5) & (points < np.array(shape[1::-1]) - 0.5)).all(axis=-1))
 
 
 @dataclass(frozen=True, eq=False)

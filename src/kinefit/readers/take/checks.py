@@ -13,7 +13,7 @@ from kinefit.errors import FileError, ObservationError, TakeError, choices
 from kinefit.motion import UP_AXES
 from kinefit.observations.person import PersonChoice
 from kinefit.readers.depth.images import listed
-from kinefit.readers.keypoint_sets import KEYPOINT_SETS, MEDIAPIPE_SETS
+from kinefit.readers.keypoint_sets import FACE_SET, KEYPOINT_SETS, MEDIAPIPE_SETS
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.entries import SKIN_SETS, CalibrationEntry, StartEntry
 from kinefit.readers.take.streams import odd_streams, refuse_streams
@@ -111,7 +111,8 @@ def _values(take: Take) -> None:
             refuse(f"size {camera.size}, time offset {camera.time_offset} s", f"camera {camera.name}", "Give px and s.")
     for source in (*take.keypoints, *take.skin):
         place = f"keypoints of camera {source.camera}"
-        sets = {"openpose": tuple(KEYPOINT_SETS), "skin": SKIN_SETS}.get(source.format, MEDIAPIPE_SETS)
+        known = {"openpose": tuple(KEYPOINT_SETS), "skin": SKIN_SETS, "detect": (*MEDIAPIPE_SETS, FACE_SET)}
+        sets = known.get(source.format, MEDIAPIPE_SETS)
         if source.set is not None and source.set not in sets:
             kind = "keypoint set" if source.format == "openpose" else f"keypoint set of {source.format}"
             refuse(choices(kind, source.set, sets), place, f'Use set = "{sets[0]}", or leave it out.')
@@ -299,7 +300,8 @@ def _names(take: Take) -> None:
         for camera in repeated(s.camera for s in several):  # type: ignore[attr-defined]
             raise TakeError(f"two {kind}", file=take.path, place=f"camera {camera}", remedy="Leave one out.")
     told: list[tuple[object, ...]] = [
-        (f"keypoints of camera {k.camera}", k.file, k.format, k.frames) for k in (*take.keypoints, *take.skin)
+        (f"keypoints of camera {k.camera}", k.file, k.format, k.frames, k.set == FACE_SET)
+        for k in (*take.keypoints, *take.skin)
     ]
     told += [(f"markers {m.file.name}", m.file, m.set) for m in take.markers]
     told += [(f"surface points {p.file.name}", p.file) for p in take.surface_points]

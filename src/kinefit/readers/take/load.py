@@ -31,6 +31,7 @@ from kinefit.observations.clocks import frame_times, is_even, on_steps
 from kinefit.readers.body_trackers import read_body_trackers
 from kinefit.readers.calibration.found import found_notes
 from kinefit.readers.detections import detections_file, read_detections
+from kinefit.readers.keypoint_sets import FACE_SET
 from kinefit.readers.keypoints import read_keypoints
 from kinefit.readers.markers import read_markers
 from kinefit.readers.take.cameras import (
@@ -261,7 +262,8 @@ def _read_keypoints(
     if source.format == "detect":
         file = source.file or detections_file(take.path, source.camera)
         found = read_detections(file)
-        seen = found.keypoints(source.camera, image_frame=None if same else image, time_offset=offset)
+        frame, face = None if same else image, source.set == FACE_SET
+        seen = found.keypoints(source.camera, image_frame=frame, time_offset=offset, face=face)
         return seen, frame_times(len(found), found.rate, clock if found.times is None else found.times)
     rate = source.rate or rates.get(f"video {source.camera}") or take.rate
     if rate is None:
