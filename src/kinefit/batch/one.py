@@ -134,11 +134,12 @@ def track_person(
         What tracking and writing raise.
     """
     from kinefit.batch.report import provenance, write_track_report
-    from kinefit.findings import CLOCKS
+    from kinefit.findings import CLOCKS, STATURE
     from kinefit.multiview import followed
     from kinefit.tracking import cameras
     from kinefit.tracking.agreement import sentences
     from kinefit.tracking.checkpoints.checkpoint import Checkpoint, key_of
+    from kinefit.tracking.takes.floor_level import floor_sentences
     from kinefit.tracking.takes.take import settings_of, track_take
     from kinefit.tracking.video import TrackingInterrupted
 
@@ -162,7 +163,7 @@ def track_person(
             notes += [*seen.notes, *sentences(motion.provenance["contradictions"])]
             notes += followed.sentences(motion.provenance, asked=take.person is not None)
             notes += cameras.sentences(motion.provenance, settings_of(take).camera_std)
-            notes += motion.provenance.get(CLOCKS, ())
+            notes += [*motion.provenance.get(CLOCKS, ()), *motion.provenance.get(STATURE, ()), *floor_sentences(motion.provenance)]
         except TrackingInterrupted as stopped:
             motion, total = stopped.motion, stopped.total
         motion = replace(motion, provenance=provenance(take, **motion.provenance))
