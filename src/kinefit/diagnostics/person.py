@@ -167,8 +167,8 @@ def size_findings(height: float | None, stated: float | None) -> list[Finding]:
     if stated is None and not _MIN_ADULT <= height <= _MAX_ADULT:
         text = f"The person would be {height:.2f} m tall. Few adults are below {_MIN_ADULT} m or above {_MAX_ADULT} m."
         remedy = (
-            "The scale of the calibration is wrong (check the size of the board's squares), or a child is in view. "
-            "Write height = ... into [take]."
+            "Either the scale is wrong (check the size of the calibration's board squares; nothing measures it where "
+            "cameras are not calibrated), or a child is in view. Write height = ... into [take]."
         )
         return [Finding("doubt", "scale", text, (), "", remedy)]
     return [Finding("good", "scale", f"The person measures about {height:.2f} m by the long bones: the unit is right.")]
