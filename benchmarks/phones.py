@@ -8,6 +8,7 @@ PARTS = {
     "phones_time": "videos that dropped frames, and cameras of unequal rates",
     "phones_rooms": "simulated rooms of which nothing is known: cameras, clocks and motion from the people in view",
     "phones_speed": "from a folder with four videos of ten seconds to the report: time and memory",
+    "phones_floor": "the floor under one walker, rooms and a balancing trial: tilt, height, feet that slide",
     "phones_real": "real recordings without their calibrations, from the videos to the motion",
 }
 

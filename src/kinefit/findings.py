@@ -20,6 +20,9 @@ FINDINGS = "findings"
 CLOCKS = "clocks"
 """Key of `Motion.provenance`: sentences about cameras whose clocks are off, with what to write."""
 
+STATURE = "stature"
+"""Key of `Motion.provenance`: sentences about a person who is as tall as few adults are, with what to do."""
+
 INVERTED = "upside down"
 """Key of `Motion.provenance`: the depth camera in which people are explained better upside down."""
 

@@ -96,6 +96,20 @@ def _middle(r: Residuals) -> str:
     return f"{factor * np.median(seen):.1f} {unit}" if len(seen) else "nothing seen"
 
 
+def _turned_std(std: NDArray, R: NDArray, rays: NDArray | None = None) -> NDArray:
+    """(..., 3) standard deviations along new axes; of errors along rays (..., 3) in the old ones, or along its axes."""
+    var = np.square(std)
+    finite = np.isfinite(var)
+    var = np.where(finite, var, 0.0)
+    if rays is None:
+        out = var @ np.square(R).T
+    else:
+        across = var.min(axis=-1, keepdims=True)
+        along = np.square(rays @ R.T) / np.sum(np.square(rays), axis=-1, keepdims=True)
+        out = across + (var.sum(axis=-1, keepdims=True) - 3.0 * across) * along
+    return np.where(finite.all(axis=-1, keepdims=True), np.sqrt(out), np.inf)
+
+
 @dataclass(frozen=True, eq=False)
 class Motion:
     """A body's motion.
@@ -238,6 +252,29 @@ class Motion:
     def lost(self) -> NDArray:
         """(F, S) bool: segments that no measurement supports, or that more speaks against than for."""
         return np.asarray(self.segment_quality < BELIEVED)
+
+    def moved(self, T_new_world: NDArray, eye: NDArray | None = None) -> Motion:
+        """The same motion in another world with the same vertical axis, such as one whose floor is level.
+
+        Parameters
+        ----------
+        T_new_world : (4, 4) [m]
+        eye : (3,) [m] in the old world, of a camera that is the only sensor: errors are taken to lie along its rays.
+            Default: along the old axes.
+        """
+        R, roots, old = T_new_world[:3, :3], T_new_world @ self.Ts_world_root, self.joint_centres
+        rays = None if eye is None else old - eye
+        residuals = {
+            name: replace(r, values=r.values @ R.T, measured=r.measured @ R.T + T_new_world[:3, 3])
+            if r.unit == "m" and r.values.shape[-1] == 3 else r
+            for name, r in self.residuals.items()
+        }  # fmt: skip
+        shift = _turned_std(self.dof_std[:, :3], R, None if rays is None else rays[:, 0])
+        turn = _turned_std(self.dof_std[:, 3:6], R)
+        return replace(
+            self, Ts_world_root=roots, joint_std=_turned_std(self.joint_std, R, rays), residuals=residuals,
+            dof_std=np.concatenate([shift, turn, self.dof_std[:, 6:]], axis=1),
+        )  # fmt: skip
 
     def turned(self, up: str) -> Motion:
         """The same motion in a world whose vertical axis is `up`."""

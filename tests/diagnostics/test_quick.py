@@ -11,7 +11,7 @@ from kinefit.diagnostics.groups import group_findings
 from kinefit.diagnostics.keypoints import check_keypoints
 from kinefit.diagnostics.quick import input_findings, motion_findings, with_cause, with_findings
 from kinefit.errors import TrackingError
-from kinefit.findings import CLOCKS, FINDINGS, INVERTED, Finding, faults_of, of_provenance
+from kinefit.findings import CLOCKS, FINDINGS, INVERTED, STATURE, Finding, faults_of, of_provenance
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
@@ -78,6 +78,21 @@ def test_a_child_is_no_fault_where_the_take_states_the_height():
     small = changed(translated(0.6))
     assert [f.kind for f in quick(small)] == ["scale"]
     assert quick(small, height=0.6 * load_body("humanoid").stature) == ()
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.0, 1.2])
+def test_a_person_of_a_size_that_few_adults_have_is_questioned(scale):
+    """1.36 m and 2.1 m: `check` doubts it, `track` says so; not where the take states the height."""
+    body = load_body("humanoid")
+    person = replace(MOTION, body=body.scaled(np.full(len(body.scale_groups), scale)))
+    told = with_findings(person, (), Nothing, None).provenance.get(STATURE)
+    doubts = [f for f in check_keypoints(changed(translated(scale)), SEEN).findings if f.kind == "scale"]
+    assert [f.severity for f in doubts] == ["good" if scale == 1.0 else "doubt"]
+    assert (told is None) == (scale == 1.0)
+    if told:
+        assert f"{person.body.stature:.2f} m tall" in told[0] and "a child" in told[0] and "board" in told[0]
+        assert "height = " in told[0] and doubts[0].remedy in told[0]
+    assert STATURE not in with_findings(person, (), Nothing, 1.36).provenance
 
 
 def test_a_large_scale_of_a_lens_is_not_taken_for_a_unit():

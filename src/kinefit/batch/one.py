@@ -107,10 +107,14 @@ def people_of(take: Take, out: Path, step: Step, tell: Tell) -> tuple[InView | N
 
     Keypoints are detected, cameras found and bodies fetched first, where the take needs them.
     """
+    from kinefit.calibration.people.altered import refuse_videos
     from kinefit.calibration.people.of_take import find_cameras
-    from kinefit.preparing.take import prepared
+    from kinefit.preparing.take import prepared, with_detections
+    from kinefit.readers.take.cameras import is_uncalibrated
     from kinefit.tracking.takes.in_view import people_in_view
 
+    if is_uncalibrated(take):
+        refuse_videos(with_detections(take, step, tell))
     take = prepared(find_cameras(take, step, tell), step, tell)
     view = people_in_view(take) if take.person is None else None
     people = len(view.people) if view else 0
@@ -134,11 +138,12 @@ def track_person(
         What tracking and writing raise.
     """
     from kinefit.batch.report import provenance, write_track_report
-    from kinefit.findings import CLOCKS
+    from kinefit.findings import CLOCKS, STATURE
     from kinefit.multiview import followed
     from kinefit.tracking import cameras
     from kinefit.tracking.agreement import sentences
     from kinefit.tracking.checkpoints.checkpoint import Checkpoint, key_of
+    from kinefit.tracking.takes.floor_level import floor_sentences
     from kinefit.tracking.takes.take import settings_of, track_take
     from kinefit.tracking.video import TrackingInterrupted
 
@@ -163,6 +168,7 @@ def track_person(
             notes += followed.sentences(motion.provenance, asked=take.person is not None)
             notes += cameras.sentences(motion.provenance, settings_of(take).camera_errors)
             notes += motion.provenance.get(CLOCKS, ())
+            notes += [*motion.provenance.get(STATURE, ()), *floor_sentences(motion.provenance)]
         except TrackingInterrupted as stopped:
             motion, total = stopped.motion, stopped.total
         motion = replace(motion, provenance=provenance(take, **motion.provenance))

@@ -21,6 +21,9 @@ _FLOOR = 0.15  # [m] foot points lie above the sole, by up to this
 # [m] From the smallest boys of eight (CDC growth charts, Kuczmarski et al. 2002, Vital and Health Statistics 11(246):
 # 5th percentile 1.18 m) to the tallest men (2.03 m, 1 in 1,000), whose bones two noisy cameras see 13 % too long.
 _MIN_STATURE, _MAX_STATURE = 1.2, 2.3
+# [m] Adults: women are 1.629 +- 0.064 m tall, men 1.756 +- 0.069 m (Gordon et al., 2012 anthropometric survey of U.S.
+# Army personnel, NATICK/TR-15/007); below and above, one in 300 women and one in 10,000 men.
+_MIN_ADULT, _MAX_ADULT = 1.45, 2.03
 _LONG = 0.15  # [m] bones from here on are measured; shorter ones are mostly the detector's habits
 _MAX_STATURE_ERROR = 0.08  # log ratio of a stated height and the bones: detectors' points are off the joints
 _MIN_SCALE_FAULT = 0.22  # the same, that no detector and no build explains: three times as much
@@ -161,6 +164,13 @@ def size_findings(height: float | None, stated: float | None) -> list[Finding]:
             f"{_unit_remedy(height / 1.75)}. Of a child, write height = ... into [take]."
         )
         return [Finding("fault", "scale", text, (), "Sure, unless it is a child, a doll or an animal.", remedy)]
+    if stated is None and not _MIN_ADULT <= height <= _MAX_ADULT:
+        text = f"The person would be {height:.2f} m tall. Few adults are below {_MIN_ADULT} m or above {_MAX_ADULT} m."
+        remedy = (
+            "Either the scale is wrong (check the size of the calibration's board squares; nothing measures it where "
+            "cameras are not calibrated), or a child is in view. Write height = ... into [take]."
+        )
+        return [Finding("doubt", "scale", text, (), "", remedy)]
     return [Finding("good", "scale", f"The person measures about {height:.2f} m by the long bones: the unit is right.")]
 
 

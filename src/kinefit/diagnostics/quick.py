@@ -13,7 +13,7 @@ from kinefit.diagnostics.images import fit_image
 from kinefit.diagnostics.keypoints import Check, check_keypoints
 from kinefit.diagnostics.person import size_findings
 from kinefit.errors import KinefitError
-from kinefit.findings import CLOCKS, FINDINGS, INVERTED, Finding, as_records, faults_of
+from kinefit.findings import CLOCKS, FINDINGS, INVERTED, STATURE, Finding, as_records, faults_of
 from kinefit.motion import UP_AXES, Motion
 from kinefit.observations import Keypoints
 from kinefit.readers.guess.views import nearest_axis
@@ -100,7 +100,7 @@ def motion_findings(motion: Motion, height: float | None) -> tuple[Finding, ...]
 
 
 def with_findings(motion: Motion, findings: Sequence[Finding], seen: Observations, height: float | None) -> Motion:
-    """The motion with faults and late clocks in its `provenance`.
+    """The motion with faults, late clocks and a stature that few adults have in its `provenance`.
 
     The faults of `motion_findings` are among them where it has metric sensors.
     """
@@ -109,8 +109,11 @@ def with_findings(motion: Motion, findings: Sequence[Finding], seen: Observation
     if len({k.camera for k in seen.keypoints}) < 2 and (seen.markers or seen.depth or seen.clouds):
         inverted = inverted_findings(motion.provenance, motion.up)
         findings = [*findings, *motion_findings(motion, height), *inverted]
-    clocks = {CLOCKS: late} if late else {}
-    return replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings), **clocks})
+    told: dict[str, Any] = {CLOCKS: late} if late else {}
+    sizes = size_findings(motion.body.stature, height) if motion.body.stature and height is None else []
+    if any(f.severity == "doubt" for f in sizes) and not any(f.kind == "scale" for f in findings):
+        told[STATURE] = [f"{f.text} {f.remedy}" for f in sizes]
+    return replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings), **told})
 
 
 def inverted_findings(provenance: Mapping[str, Any], up: str) -> list[Finding]:

@@ -63,7 +63,7 @@ class SmoothedTake:
 
 def smooth_results(
     body: Body, frames: TrackedFrames, settings: TrackSettings, *, contacts: bool = False, up: str = "z",
-    eye: NDArray | None = None, window: int = 300, overlap: int = 60,
+    eye: NDArray | None = None, level: bool = True, window: int = 300, overlap: int = 60,
 ) -> SmoothedTake:  # fmt: skip
     """Tracked frames of any sensors, smoothed together.
 
@@ -76,6 +76,7 @@ def smooth_results(
         Hold the soles still where they rest on a level floor; `up` is the world's vertical axis.
     eye : (3,) [m] of the camera that is the only sensor, for the contacts, see `find_contacts`; its pixels then stay
         no surer than they are stated, since no other view shows what they are off by
+    level : whether `up` is measured, so that the floor is level
     window, overlap : frames of a part that is solved at once, and how many it shares with the next.
     """
     take = replace(_take(as_tracked(body, frames, settings), settings), one_view=eye is not None)
@@ -89,7 +90,7 @@ def smooth_results(
         take, swapped = replace(take, uv=uv, confidence=confidence, swapped=again), again
         take, covariances, others_matched = solved_surely(take, strength, window, overlap)
     for _ in range(_LOOKS if contacts else 0):  # error bars stay those without: that a sole rests is no measurement
-        found = find_contacts(body, take.roots, take.angles, frames.rate, up, eye)
+        found = find_contacts(body, take.roots, take.angles, frames.rate, up, eye, level=level)
         take, others_matched = solved(replace(take, contacts=found), strength, window, overlap)
     take = replace(take, angles=unwrap(body.tree, take.angles))
     hard = hard_equations(body)

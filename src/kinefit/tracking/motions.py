@@ -43,6 +43,7 @@ class Estimation:
     smooth : fit all frames together with a motion prior
     contacts : hold the soles still where they rest on a level floor, when smoothing
     eye : (3,) [m] of the camera that is the only sensor: soles are then held where they hardly move in its image
+    level : whether the vertical was measured; otherwise soles are held on the plane that they rest on, when smoothing
     lag : [s], instead of smoothing: each frame knows of those before it, and of later ones so far ahead alone
     noise : that is known beforehand, for a lag
     """
@@ -50,6 +51,7 @@ class Estimation:
     smooth: bool = True
     contacts: bool = False
     eye: NDArray | None = None
+    level: bool = True
     lag: float | None = None
     noise: KnownNoise | None = None
 
@@ -75,7 +77,8 @@ def motion_of(
     shared = None
     matched: Sequence[tuple[Matched, ...]] | None = None  # of all sensors but the keypoints
     if smooth:
-        done = smooth_results(body, frames, settings, contacts=how.contacts or eye is not None, up=up, eye=eye)
+        held = how.contacts or eye is not None or not how.level
+        done = smooth_results(body, frames, settings, contacts=held, up=up, eye=eye, level=how.level)
         results, take, weight, shared = done.results, done.take, done.weight, done.shared
         provenance["smoothing"] = done.provenance
         matched = done.matched

@@ -68,6 +68,7 @@ class Recording:
     others : motions of other people in view, in the same world and time, by whom depth images, masks and colours are
         parted
     up : vertical axis of the world
+    level : whether that was measured; otherwise the floor is the plane on which the feet rest
     name : str
     """
 
@@ -86,6 +87,7 @@ class Recording:
     start: tuple[int, BodyState] | None = None
     others: tuple[Motion, ...] = ()
     up: str = "z"
+    level: bool = True
     name: str = "motion"
 
     def __post_init__(self) -> None:

@@ -104,7 +104,8 @@ def track(
         told["body shape"] = {name: round(value, 3) for name, value in family.shape.items()}
     how = Estimation(
         smooth and lag is None and tracked.complete, contacts,
-        None if recording.alone is None else recording.alone.centre_world, lag if tracked.complete else None, noise,
+        None if recording.alone is None else recording.alone.centre_world, recording.level,
+        lag if tracked.complete else None, noise,
     )  # fmt: skip
     motion = motion_of(
         tracked, person.subject, settings, how, up=recording.up, name=recording.name, told=told, found=person.joint

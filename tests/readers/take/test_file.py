@@ -242,7 +242,7 @@ WRONG = {
         take_text(keys='format = "mediapipe"\nset = "COCO_17"'), "no keypoint set of mediapipe 'COCO_17'"
     ),
     "frames": (take_text(head="frames = [9, 2]"), r"frames \[9, 2\]"),
-    "height in cm": (take_text(head="height = 175"), "height 175 m"),
+    "height in cm": (take_text(head="height = 175"), "height 175 m. Give the stature in metres: height = 1.75"),
     "rate": (take_text(head="rate = -1"), "rate -1 Hz"),
     "nan": (take_text(a="time_offset = nan"), "time offset nan"),
     "sigma": (take_text(keys='sigma = 0'), "sigma 0"),

@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 
 from kinefit.errors import TakeError, TrackingError
+from kinefit.exporters.motion_file import write_motion
 from kinefit.exporters.pictures.detections import write_detections
+from kinefit.geometry import se3
 from kinefit.observations import MEDIAPIPE_33, Detections
 from kinefit.readers.detections import read_detections
 from kinefit.readers.take.cameras import USUAL
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation import squat_and_wave
+from kinefit.smoothing.foot_contacts import soles
 from kinefit.tracking.takes.in_view import people_in_view
 from kinefit.tracking.takes.take import track_take
 
@@ -20,6 +23,11 @@ SIZE, RATE = (720, 1280), 30.0
 HEAD = f"[take]\nrate = {RATE}\n"
 CAMERA = '[[camera]]\nname = "phone"\nsize = [720, 1280]\n'
 DETECTED = '[[keypoints]]\ncamera = "phone"\nformat = "detect"\nfile = "phone.npz"\n'
+
+
+def tilted(T):
+    """The truth's world as a telephone has it that was held 8 degrees downwards and taken to look level."""
+    return se3.transform(se3.exp_so3(np.radians([8.0, 0.0, 0.0])), np.zeros(3)) @ T
 
 
 def truth():
@@ -33,10 +41,14 @@ def truth():
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Pixels with 3 px of noise, and landmarks that are off by 6 cm in depth for as long as the take lasts."""
-    folder, rng = tmp_path_factory.mktemp("phone"), np.random.default_rng(1)
-    (folder / "take.toml").write_text(HEAD + CAMERA)
+    folder = tmp_path_factory.mktemp("phone")
     (folder / "take.toml").write_text(HEAD + "height = 1.75\n" + CAMERA + DETECTED)
-    motion, T = truth()
+    write_phone(folder / "phone.npz", truth()[1])
+    return folder
+
+
+def write_phone(path, T):
+    motion, rng = truth()[0], np.random.default_rng(1)
     x = motion.positions(motion.body.keypoints("MEDIAPIPE_33").select(MEDIAPIPE_33)) @ T[:3, :3].T + T[:3, 3]
     focal = 0.5 * max(SIZE) / np.tan(np.radians(USUAL) / 2)
     own = np.stack([x[..., 0], -x[..., 2], x[..., 1]], axis=-1)  # along u, v and away
@@ -45,17 +57,16 @@ def folder(tmp_path_factory):
     lifted = 0.95 * (own - hips)
     lifted[..., 2] += rng.normal(scale=0.06, size=33)
     nothing = np.zeros(0, np.uint32), np.zeros(len(x) + 1, int)
+    sure = np.full((len(x), 1, 33), 0.9)
     write_detections(
-        Detections("phone", RATE, SIZE, uv[:, None], np.full((len(x), 1, 33), 0.9), *nothing, lifted=lifted[:, None]),
-        folder / "phone.npz",
+        Detections("phone", RATE, SIZE, uv[:, None], sure, *nothing, lifted=lifted[:, None]), path
     )  # fmt: skip
-    return folder
 
 
 def test_a_person_is_followed_in_space_by_one_camera(folder):
     motion, seen = track_take(folder / "take.toml")
     right, T = truth()
-    x = right.joint_centres @ T[:3, :3].T + T[:3, 3]
+    x = right.joint_centres @ T[:3, :3].T + T[:3, 3] + [0.0, 0.0, 1.0]  # the floor is at zero
     hips = [right.body.tree.segment(f"thigh_{side}") for side in "lr"]
     found = motion.joint_centres
     apart = (found - found[:, hips].mean(axis=1, keepdims=True)) - (x - x[:, hips].mean(axis=1, keepdims=True))
@@ -69,6 +80,41 @@ def test_a_person_is_followed_in_space_by_one_camera(folder):
     assert set(sigma.values()) == {8.0}  # as stated, though nothing is left over but a jitter of 3 px
     assert {"phone", "lifted phone"} <= set(motion.residuals)
     assert any("field of view of 64°, the usual one" in note for note in seen.notes)
+
+
+def test_the_world_stands_on_the_floor(folder):
+    """Feet that rest tell the floor, and the telephone's tilt as far as they and the upright body do."""
+    right, T = truth()
+    write_phone(folder / "tilted.npz", tilted(T))
+    (folder / "tilted.toml").write_text(HEAD + "height = 1.75\n" + CAMERA + DETECTED.replace("phone.npz", "tilted.npz"))
+    motion, seen = track_take(folder / "tilted.toml")
+    told = motion.provenance["floor"]
+    x = right.joint_centres @ T[:3, :3].T + T[:3, 3]
+    up = se3.aligned(motion.joint_centres.reshape(-1, 3), x.reshape(-1, 3))[:3, :3] @ [0.0, 0.0, 1.0]
+    assert np.degrees(np.arccos(up[2])) < min(4.0, 2.5 * told["tilt_std_deg"])
+    points = soles(motion.body)
+    lowest = motion.positions(points)[..., 2].min(axis=1)
+    assert abs(np.median(lowest)) < 0.01 and np.ptp(lowest) < 0.03
+    feet = motion.positions(points)
+    assert np.linalg.norm(feet - np.median(feet, axis=0), axis=2).max() < 0.015  # the person stays
+    (camera,), overlay = seen.rig, motion.residuals["phone"]
+    assert camera.centre_world[2] > 0.5
+    names = list(overlay.names)
+    fitted = overlay.measured - overlay.values
+    points = motion.body.keypoints("MEDIAPIPE_33").select(tuple(names))
+    assert np.allclose(camera.project(motion.positions(points)[10]), fitted[10], atol=0.5)  # cameras moved along
+
+
+def test_a_take_may_start_from_its_own_motion(folder):
+    """The motion's world stands on the floor, the take's camera at the origin."""
+    (folder / "first.toml").write_text(HEAD + "frames = [0, 20]\nheight = 1.75\n" + CAMERA + DETECTED)
+    motion, _ = track_take(folder / "first.toml")
+    write_motion(motion, folder / "first-motion.npz")
+    (folder / "again.toml").write_text(
+        HEAD + 'frames = [0, 20]\nstart = "first-motion.npz"\n' + CAMERA + DETECTED
+    )
+    again, _ = track_take(folder / "again.toml")
+    assert np.linalg.norm(again.joint_centres - motion.joint_centres, axis=2).mean() < 0.03
 
 
 def test_lengths_are_unsure_where_no_height_is_stated(folder):

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion, rotation_between_up
+from kinefit.smoothing.foot_contacts import fit_plane, upward
 
 _SOLE = 0.12  # [m] points this little above the soles are the foot's
-_LEAN = np.radians(4.0)  # how far a person leans on average over a take
 _FLAT = 0.02  # [m] how well a foot on the floor tells its height
 _STEPS = 20.0  # looks at the floor that are news, over a take
 _NEAR = 0.03  # [m] the lower foot bears more than one this much higher
@@ -36,12 +36,14 @@ def settled(
     balance : (F, 3) [m] centre of mass; default: unknown, and up is how the whole body stands.
     up : str, vertical axis of the result.
     """
-    R = _upright(_upward(x_world, rest_height))
+    R = _upright(upward(x_world, rest_height))
     for _ in range(3 if balance is not None else 0):
         R = _upright(R.T @ np.nanmean(balance @ R.T - _stand(x_world @ R.T, rest_height), axis=0))
     for _ in range(3):
         low, height = _soles(x_world @ R.T, rest_height)
-        R = _upright(R.T @ np.append(-_tilt(low, height), 1.0)) if len(low) >= 3 else R
+        if len(low) >= 3:
+            fit, _ = fit_plane(low, height, np.full(len(low), _STEPS / len(low) / _FLAT**2))
+            R = _upright(R.T @ np.append(-fit[:2], 1.0))
     x = x_world @ R.T
     _, height = _soles(x, rest_height)
     ground = float(np.percentile(height, _LOW)) if len(height) else float(np.nanmin(x[..., 2]))
@@ -73,17 +75,6 @@ def _upright(up: NDArray) -> NDArray:
     return se3.shortest_turn(up, np.array([0.0, 0.0, 1.0]))
 
 
-def _upward(x: NDArray, rest_height: NDArray) -> NDArray:
-    """(3,) mean direction in which a point lies higher the higher it is at rest."""
-    known = np.isfinite(x).all(axis=-1)
-    share = known / np.maximum(known.sum(axis=1, keepdims=True), 1)
-    y = (rest_height - (share @ rest_height)[:, None]) * known
-    slope = np.einsum("fk,fkd->fd", y, np.nan_to_num(x))
-    length = np.linalg.norm(slope, axis=1, keepdims=True)
-    out: NDArray = np.sum(slope / np.maximum(length, 1e-12), axis=0)
-    return out
-
-
 def _stand(x: NDArray, rest_height: NDArray) -> NDArray:
     """(F, 3) where the person stands: the feet's points, the lower ones more; NaN where none is known."""
     feet = np.flatnonzero(rest_height < _SOLE)
@@ -108,15 +99,3 @@ def _soles(x: NDArray, rest_height: NDArray) -> tuple[NDArray, NDArray]:
     move = np.linalg.norm(np.gradient(at, axis=0), axis=-1)[np.arange(len(at)), lowest]
     still = move <= np.median(move)
     return point[still, :2], point[still, 2]
-
-
-def _tilt(place: NDArray, height: NDArray) -> NDArray:
-    """(2,) slope of the floor; none where the feet did not walk about (ridge regression, robust to feet in the air)."""
-    A = np.column_stack([place - place.mean(axis=0), np.ones(len(place))])
-    prior = np.diag([_LEAN**-2, _LEAN**-2, 0.0])
-    weight, fit = np.ones(len(height)), np.zeros(3)
-    for _ in range(20):
-        w = weight * _STEPS / len(height) / _FLAT**2
-        fit = np.linalg.solve(A.T @ (w[:, None] * A) + prior + 1e-9 * np.eye(3), A.T @ (w * height))
-        weight = 1.0 / np.square(1.0 + np.square((height - A @ fit) / (3.0 * _FLAT)))
-    return fit[:2]

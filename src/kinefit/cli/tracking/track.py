@@ -58,7 +58,8 @@ def choices_options(command: Callable) -> Callable:
             help="What report and overlays show of the videos: all, or nothing; faces are hidden by --hide-faces.",
         ),
         _screen.hide_faces_option,
-        click.option("--contacts", is_flag=True, help="Hold soles still where they rest on a level floor."),
+        click.option("--contacts", is_flag=True, help="Hold soles still where they rest; always so "
+            "with one camera, and with cameras that were found from the people in view."),
         click.option("--realtime", is_flag=True, help="Do not smooth over the whole take."),
         click.option(
             "--lag", type=float, metavar="SECONDS",

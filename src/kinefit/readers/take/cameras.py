@@ -9,6 +9,7 @@ import numpy as np
 from kinefit.errors import CalibrationError, TakeError, choices
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
 from kinefit.motion import UP_AXES
+from kinefit.readers.calibration.found import found_notes
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.take.entries import CameraEntry
 from kinefit.readers.take.file import Take
@@ -26,6 +27,11 @@ def is_alone(take: Take) -> bool:
 def is_uncalibrated(take: Take) -> bool:
     """Whether a take has several cameras and nothing that tells where they stand but the people in view."""
     return take.calibration is None and len(take.cameras) > 1
+
+
+def is_level(take: Take) -> bool:
+    """Whether a calibration tells the vertical; cameras found from people or taken to look level do not."""
+    return not (is_alone(take) or (is_uncalibrated(take) or found_notes(take.calibration)))
 
 
 def assumed_camera(entry: CameraEntry, size: tuple[int, int] | None, take: Take) -> Camera:

@@ -83,7 +83,8 @@ def _values(take: Take) -> None:
     if take.rate is not None and not 0 < take.rate < 1e6:
         refuse(f"rate {take.rate:g} Hz", "[take] rate", "Give frames per second, or leave it out.")
     if take.height is not None and not 0.3 < take.height < 3:
-        refuse(f"height {take.height:g} m", "[take] height", "Give the stature in metres, or leave it out.")
+        metres = f": height = {take.height / 100:g}" if 30.0 < take.height < 300.0 else ""
+        refuse(f"height {take.height:g} m", "[take] height", f"Give the stature in metres{metres}, or leave it out.")
     if take.person is not None:
         try:
             PersonChoice.of(take.person)

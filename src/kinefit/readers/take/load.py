@@ -54,6 +54,7 @@ from kinefit.readers.video import Video, common_frames
 
 _Timed = DepthVideo | CloudVideo | LineVideo | SurfacePointVideo | BodyTrackerVideo
 _Whole = _Timed | SilhouetteVideo | ColourVideo | KeypointVideo
+_MIN_COMMON_FRAMES = 10  # without a calibration: fewer tell neither clocks nor places of cameras
 _LEVEL = 45.0  # [deg] turned by less, the axis of a marker file that was vertical still is the nearest to it
 
 
@@ -203,8 +204,17 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     if streams:
         overlap = is_uncalibrated(take) or bool(found)
         frames = common_frames(streams, rate, take.frames, overlap=overlap, file=take.path)
-        if overlap and not take.frames and (whole := max(map(len, streams.values()))) > 1.1 * (frames[1] - frames[0]):
-            notes.append(f"all cameras saw {(frames[1] - frames[0]) / rate:.3g} s, the longest {whole / rate:.3g} s")
+        if is_uncalibrated(take) and frames[1] - frames[0] < _MIN_COMMON_FRAMES:
+            shortest = min(streams, key=lambda stream: len(streams[stream]))
+            problem = f"all cameras together saw {frames[1] - frames[0]} frames; the shortest is {shortest}, with "
+            problem += f"{len(streams[shortest])}"
+            raise ObservationError(
+                problem, file=take.path, place=shortest,
+                remedy="Leave that video out, or use a longer one: two seconds or more tell where cameras stand.",
+            )  # fmt: skip
+        common, whole = (frames[1] - frames[0]) / rate, max(float(np.ptp(t)) for t in streams.values()) + 1.0 / rate
+        if overlap and not take.frames and whole > 1.1 * common:
+            notes.append(f"all cameras saw {common:.3g} s, the longest {whole:.3g} s")
     elif recordings or lines:
         frames = take.frames or _span(recordings or lines, rate)
     else:

@@ -23,6 +23,7 @@ from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.take.pictures import TakePictures
 from kinefit.sensors.settings import TrackSettings
+from kinefit.smoothing.foot_contacts import FloorPlane
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.takes.take_recording import recording_of
 from kinefit.tracking.video import track
@@ -46,12 +47,14 @@ class InView:
     people : the one of whom most is seen first; empty where nobody but one was ever detected
     depth : of each of them, some depth images by step that show nobody else; empty where keypoints tell who is there
     starts : of each of them step and state to begin with, likewise
+    floors : the floor that the first tracked person stands on, once it is found: the others share that world
     """
 
     seen: Observations
     people: tuple[PersonTrack, ...]
     depth: tuple[Mapping[int, DepthFrame], ...] = ()
     starts: tuple[tuple[int, BodyState], ...] = ()
+    floors: list[FloorPlane] = field(default_factory=list)
     _motions: dict[int, Motion] = field(default_factory=dict)
 
     def recording(

@@ -30,6 +30,7 @@ from kinefit.subject.subject import Subject
 from kinefit.tracking.cameras import as_found
 from kinefit.tracking.checkpoints.checkpoint import Checkpoint
 from kinefit.tracking.checkpoints.interrupted import TrackingInterrupted
+from kinefit.tracking.takes.floor_level import on_floor, rig_on_floor
 from kinefit.tracking.takes.in_view import InView, people_in_view
 from kinefit.tracking.takes.take_recording import from_afar, recording_of
 from kinefit.tracking.video import Progress, track
@@ -102,7 +103,10 @@ def track_take(
     except KinefitError as error:
         raise with_cause(error, findings) from error
     motion = with_findings(motion, findings, seen, take.height)
-    return motion, seen if seen.rig is None else replace(seen, rig=as_found(seen.rig, motion.provenance))
+    motion = on_floor(motion, recording, view.floors if view else [])
+    if seen.rig is not None:
+        seen = replace(seen, rig=rig_on_floor(as_found(seen.rig, motion.provenance), motion.provenance))
+    return motion, seen
 
 
 def settings_of(take: Take, settings: TrackSettings | None = None) -> TrackSettings:

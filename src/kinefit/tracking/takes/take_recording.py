@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.marker_sets import bare, find_placement, known_set, matched
 from kinefit.errors import BodyError, KinefitError, ObservationError, TakeError, choices
+from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.images.depth_scene import background_model
 from kinefit.initialization.from_silhouettes import coarse_to_fine
@@ -20,6 +21,7 @@ from kinefit.motion import UP_AXES
 from kinefit.multiview.people import PersonTrack
 from kinefit.observations import DepthFrame, DepthVideo, KeypointVideo, NamedMarkers, SilhouetteFrame, by_record
 from kinefit.readers.motion import read_motion
+from kinefit.readers.take.cameras import is_level
 from kinefit.readers.take.entries import sensor_name
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
@@ -29,6 +31,7 @@ from kinefit.sensors.points.body_trackers import BodyTrackerSensor
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surfaces.surface_points import SurfacePointSensor
 from kinefit.tracking.recording import Recording, spread
+from kinefit.tracking.takes.floor_level import FLOOR
 
 _EMPTY = 30  # images of an empty scene that are looked at: more add nothing
 _SIZES, _FIRST = 4, 5.0  # depth images from which a person's size is found, spread over so much of the beginning [s]
@@ -80,7 +83,8 @@ def recording_of(
     recording = Recording(
         times, rate, rig, steps=steps, sigma=_sigma(take, seen, stereo), markers=tuple(marked),
         depth=_first_depth(depth, seen), on_body=tuple(v.sensor for v in depth if v.on_body),
-        backgrounds=_backgrounds(depth), start=start, up=take.up, name=take.name,
+        backgrounds=_backgrounds(depth), start=start, up=take.up, level=is_level(take),
+        name=take.name,
         sensors=_own_sensors(take, seen, body),
     )  # fmt: skip
     if seen.keypoints:
@@ -194,7 +198,10 @@ def _motion_start(take: Take, body: Body) -> tuple[int, BodyState]:
             f"the motion that the take starts from has the body {motion.body.name}", file=take.path,
             place="[take] start", remedy="Start from a motion of the take's own body.",
         )  # fmt: skip
-    return 0, BodyState(motion.Ts_world_root[0], motion.angles[0])
+    root = motion.Ts_world_root[0]
+    if not is_level(take) and FLOOR in motion.provenance:
+        root = se3.inverse(np.array(motion.provenance[FLOOR]["T_level_world"])) @ root
+    return 0, BodyState(root, motion.angles[0])
 
 
 def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[NamedMarkers], Body]:
