@@ -107,14 +107,10 @@ def people_of(take: Take, out: Path, step: Step, tell: Tell) -> tuple[InView | N
 
     Keypoints are detected, cameras found and bodies fetched first, where the take needs them.
     """
-    from kinefit.calibration.people.altered import refuse_videos
     from kinefit.calibration.people.of_take import find_cameras
-    from kinefit.preparing.take import prepared, with_detections
-    from kinefit.readers.take.cameras import is_uncalibrated
+    from kinefit.preparing.take import prepared
     from kinefit.tracking.takes.in_view import people_in_view
 
-    if is_uncalibrated(take):
-        refuse_videos(with_detections(take, step, tell))
     take = prepared(find_cameras(take, step, tell), step, tell)
     view = people_in_view(take) if take.person is None else None
     people = len(view.people) if view else 0

@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from kinefit.calibration.people.skeletons import _matched, _Skeleton, _skeletons
+from kinefit.calibration.people.skeletons import LiftedSkeleton, match_skeletons, skeletons_of
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera
 from kinefit.observations import MEDIAPIPE_33, Detections, Keypoints
@@ -47,8 +47,10 @@ def refuse_videos(take: Take) -> None:
     found = [read_detections(files[entry.name]) for entry in cameras]  # type: ignore[arg-type]
     if any(one.lifted is None or not one.seen.any() for one in found):
         return
+    latest = max(entry.time_offset for entry in cameras)
+    begins = [latest - entry.time_offset for entry in cameras]  # [s] into each video, when all record
     lenses = [assumed_camera(entry, one.size, take) for entry, one in zip(cameras, found, strict=True)]
-    direct = [_skeleton(camera, one) for camera, one in zip(lenses, found, strict=True)]
+    direct = [_skeleton(*one) for one in zip(lenses, found, begins, strict=True)]
     if min(len(one.x) for one in direct) < _MIN_COMMON:
         return  # `load_observations` refuses videos that are so short
     for i, own in enumerate(direct):
@@ -63,7 +65,7 @@ def refuse_videos(take: Take) -> None:
             continue
         trials = {
             (b, how): _cost(direct[a], other)
-            for a, b in ((i, j), (j, i)) for how, other in _altered(lenses[b], found[b])
+            for a, b in ((i, j), (j, i)) for how, other in _altered(lenses[b], found[b], begins[b])
         }  # fmt: skip
         trials[i, 0] = trials[j, 0]  # of a pair, either may be mirrored
         least = min(trials.values())
@@ -85,11 +87,12 @@ def refuse_videos(take: Take) -> None:
     )
 
 
-def _skeleton(camera: Camera, seen: Detections, speed: int = 1, mirrored: bool = False) -> _Skeleton:
-    """Of the person seen best, at `_RATE`; of a video that plays so many times slower than it was filmed."""
+def _skeleton(camera: Camera, seen: Detections, begin: float, speed: int = 1, mirrored: bool = False) -> LiftedSkeleton:
+    """Of the person seen best, at `_RATE` from `begin` [s] on; of a video that plays `speed` times too slowly."""
     count = len(seen.points)
     times = np.arange(count) / seen.rate if seen.times is None else seen.times
-    wanted = np.arange(0.0, min(float(times[-1]) / speed, _SECONDS) + 1e-9, 1.0 / _RATE) * speed
+    length = min((float(times[-1]) - begin) / speed, _SECONDS)
+    wanted = begin + np.arange(0.0, max(length, 0.0) + 1e-9, 1.0 / _RATE) * speed
     at = np.minimum(np.searchsorted(times, wanted - 0.5 / seen.rate), count - 1)
     names = MEDIAPIPE_33
     assert seen.lifted is not None
@@ -101,18 +104,18 @@ def _skeleton(camera: Camera, seen: Detections, speed: int = 1, mirrored: bool =
             record, points=points[:, :, order] * _FLIP[:2] + [camera.size[0] - 1.0, 0.0],
             confidence=confidence[:, :, order], lifted=lifted[:, :, order] * _FLIP,
         )  # fmt: skip
-    return _skeletons(camera, record)[0]
+    return skeletons_of(camera, record)[0]
 
 
-def _altered(camera: Camera, seen: Detections) -> Iterator[tuple[int, _Skeleton]]:
+def _altered(camera: Camera, seen: Detections, begin: float) -> Iterator[tuple[int, LiftedSkeleton]]:
     """What a camera saw, mirrored back (0), and as if it had played so many times slower."""
-    yield 0, _skeleton(camera, seen, mirrored=True)
+    yield 0, _skeleton(camera, seen, begin, mirrored=True)
     for speed in _SLOWER:
         if len(seen.points) / seen.rate / speed * _RATE > 10:
-            yield speed, _skeleton(camera, seen, speed)
+            yield speed, _skeleton(camera, seen, begin, speed)
 
 
-def _frames_in_common(a: _Skeleton, b: _Skeleton) -> int:
+def _frames_in_common(a: LiftedSkeleton, b: LiftedSkeleton) -> int:
     """Most frames in which both show somebody, of all clocks that may be."""
     one, other = (np.pad(s.weight.any(axis=1).astype(int), round(_CLOCKS_S * _RATE)) for s in (a, b))
     most = round(_CLOCKS_S * _RATE)
@@ -122,6 +125,6 @@ def _frames_in_common(a: _Skeleton, b: _Skeleton) -> int:
     )
 
 
-def _cost(a: _Skeleton, b: _Skeleton) -> float:
-    match = _matched(a, b, round(_CLOCKS_S * _RATE))
+def _cost(a: LiftedSkeleton, b: LiftedSkeleton) -> float:
+    match = match_skeletons(a, b, round(_CLOCKS_S * _RATE))
     return 1.0 if match is None else min(match.cost, 1.0)

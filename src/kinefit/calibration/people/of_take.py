@@ -13,6 +13,7 @@ import numpy as np
 
 from kinefit._arguments import checked
 from kinefit.bodies import load_body
+from kinefit.calibration.people.altered import refuse_videos
 from kinefit.calibration.people.calibrate import GUESSED, STATED, calibrate_people
 from kinefit.preparing.each_video import Step, Tell
 from kinefit.preparing.take import warn, with_detections
@@ -97,6 +98,7 @@ def _find(take: Take, made_from: str, progress: Step | None) -> FoundCameras:
     heard = _heard(take)
     cameras = tuple(msgspec.structs.replace(e, time_offset=heard.get(e.name, e.time_offset)) for e in take.cameras)
     take = replace(take, cameras=cameras)
+    refuse_videos(take)
     seen = load_observations(take, exteriors=False)
     assert seen.rig is not None
     stated = {e.name for e in take.cameras if e.field_of_view not in (None, USUAL)}

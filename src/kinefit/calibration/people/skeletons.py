@@ -52,7 +52,7 @@ class FirstCameras:
 
 
 @dataclass(frozen=True, eq=False)
-class _Skeleton:
+class LiftedSkeleton:
     """One person of one camera: x (F, J, 3) [m] in its axes, about the hips; weight (F, J); where the hips are."""
 
     record: Keypoints
@@ -62,7 +62,7 @@ class _Skeleton:
 
 
 @dataclass(frozen=True, eq=False)
-class _Match:
+class SkeletonMatch:
     """Two skeletons laid on each other: b ≈ R a, frame f of a being frame f + lag of b.
 
     unlike: (2 · most + 1,) for lags from −most to most, 1 less the correlation of the movements about their means, inf
@@ -76,6 +76,7 @@ class _Match:
 
     @property
     def cost(self) -> float:
+        """The least score: 0 of skeletons that move alike in all frames, 1 of strangers."""
         return float(self.score.min())
 
 
@@ -98,15 +99,15 @@ def first_cameras(cameras: Sequence[Camera], keypoints: Sequence[Keypoints], *, 
     CalibrationError
         A camera that saw nobody, the same video twice, cameras that never show the same person.
     """
-    seen = [_skeletons(c, k) for c, k in zip(cameras, keypoints, strict=True)]
+    seen = [skeletons_of(c, k) for c, k in zip(cameras, keypoints, strict=True)]
     _refuse_doubles(seen)
     most = round(within * keypoints[0].rate)
-    pairs: dict[_Pair, _Match] = {}
+    pairs: dict[_Pair, SkeletonMatch] = {}
     for i, j in combinations(range(len(seen)), 2):
         for p, q in product(range(len(seen[i])), range(len(seen[j]))):
-            if (match := _matched(seen[i][p], seen[j][q], most)) is not None:
+            if (match := match_skeletons(seen[i][p], seen[j][q], most)) is not None:
                 pairs[i, p, j, q] = match
-                pairs[j, q, i, p] = _Match(match.R.T, -match.lag, match.unlike[::-1], match.score[::-1])
+                pairs[j, q, i, p] = SkeletonMatch(match.R.T, -match.lag, match.unlike[::-1], match.score[::-1])
     tree = _tree(cameras, pairs)
     late = _clocks(len(seen), keypoints[0].rate, pairs, most)
     Ts = {0: np.eye(4)}
@@ -137,10 +138,10 @@ def in_step(record: Keypoints, late: int, length: int) -> Keypoints:
     return replace(record, points=points, confidence=confidence, lifted=lifted)
 
 
-def _skeletons(camera: Camera, record: Keypoints) -> list[_Skeleton]:
+def skeletons_of(camera: Camera, record: Keypoints) -> list[LiftedSkeleton]:
     """The people that a camera followed, the one seen best first."""
     assert record.lifted is not None
-    out: list[_Skeleton] = []
+    out: list[LiftedSkeleton] = []
     left = record
     columns = [record.names.index(name) for name in _JOINTS]
     for _ in range(min(record.points.shape[1], _PEOPLE)):
@@ -165,7 +166,7 @@ def _skeletons(camera: Camera, record: Keypoints) -> list[_Skeleton]:
     return out
 
 
-def _placed(camera: Camera, record: Keypoints, x: NDArray, uv: NDArray, weight: NDArray) -> _Skeleton:
+def _placed(camera: Camera, record: Keypoints, x: NDArray, uv: NDArray, weight: NDArray) -> LiftedSkeleton:
     """With the axes of the crop turned to the camera's, and the distance at which it has its size in the image."""
     ray = camera.with_pose(np.eye(4)).ray(uv.reshape(-1, 2)).reshape(*uv.shape[:2], 3)
     ray = ray / np.where(ray[..., 2:] > 1e-6, ray[..., 2:], np.nan)
@@ -181,10 +182,10 @@ def _placed(camera: Camera, record: Keypoints, x: NDArray, uv: NDArray, weight: 
     normal = np.einsum("fk,fkdi,fkdj->fij", w, A, A) + 1e-9 * np.eye(3)
     hips = np.linalg.solve(normal, np.einsum("fk,fkdi,fkd->fi", w, A, b)[..., None])[..., 0]
     far = (w > 0).sum(axis=1) >= len(_JOINTS) // 2
-    return _Skeleton(record, x, w * far[:, None], np.where((far & (hips[:, 2] > 0))[:, None], hips, np.nan))
+    return LiftedSkeleton(record, x, w * far[:, None], np.where((far & (hips[:, 2] > 0))[:, None], hips, np.nan))
 
 
-def _refuse_doubles(seen: Sequence[Sequence[_Skeleton]]) -> None:
+def _refuse_doubles(seen: Sequence[Sequence[LiftedSkeleton]]) -> None:
     """Refuse one video under two names, which shows nothing from a second side."""
     for a, b in combinations([people[0].record for people in seen], 2):
         frames = min(len(a), len(b))
@@ -196,7 +197,7 @@ def _refuse_doubles(seen: Sequence[Sequence[_Skeleton]]) -> None:
             )
 
 
-def _common(a: _Skeleton, b: _Skeleton, lag: int) -> tuple[slice, slice] | None:
+def _common(a: LiftedSkeleton, b: LiftedSkeleton, lag: int) -> tuple[slice, slice] | None:
     """Frames of both that belong together with a lag; None for too few."""
     first, last = max(0, -lag), min(len(a.x), len(b.x) - lag)
     if last - first < max(_LEAST, _SHARE * min(len(a.x), len(b.x))):
@@ -204,7 +205,7 @@ def _common(a: _Skeleton, b: _Skeleton, lag: int) -> tuple[slice, slice] | None:
     return slice(first, last), slice(first + lag, last + lag)
 
 
-def _turned(a: _Skeleton, b: _Skeleton, frames: tuple[slice, slice]) -> NDArray | None:
+def _turned(a: LiftedSkeleton, b: LiftedSkeleton, frames: tuple[slice, slice]) -> NDArray | None:
     """(3, 3) turn that lays one skeleton on the other in frames of both, robustly; None for too few joints."""
     x, y, w = a.x[frames[0]], b.x[frames[1]], np.minimum(a.weight[frames[0]], b.weight[frames[1]])
     x, y, w = (v[w > 0] for v in (x, y, w))
@@ -217,7 +218,7 @@ def _turned(a: _Skeleton, b: _Skeleton, frames: tuple[slice, slice]) -> NDArray 
     return R
 
 
-def _matched(a: _Skeleton, b: _Skeleton, most: int) -> _Match | None:
+def match_skeletons(a: LiftedSkeleton, b: LiftedSkeleton, most: int) -> SkeletonMatch | None:
     """The turn and the lag, within so many frames, with which two skeletons move alike; None for no frames."""
     unlike, score = np.full(2 * most + 1, np.inf), np.full(2 * most + 1, np.inf)
     best: tuple[NDArray, int] | None = None
@@ -230,10 +231,10 @@ def _matched(a: _Skeleton, b: _Skeleton, most: int) -> _Match | None:
         unlike[lag + most], score[lag + most] = 1.0 - alike, 1.0 - alike * share**_OVERLAP
         if score[lag + most] <= score.min():
             best = R, lag
-    return None if best is None else _Match(*best, unlike, score)
+    return None if best is None else SkeletonMatch(*best, unlike, score)
 
 
-def _correlation(a: _Skeleton, b: _Skeleton, frames: tuple[slice, slice], R: NDArray) -> float:
+def _correlation(a: LiftedSkeleton, b: LiftedSkeleton, frames: tuple[slice, slice], R: NDArray) -> float:
     """Of the movements of two skeletons about their means, one turned by R, in frames of both."""
     w = np.minimum(a.weight[frames[0]], b.weight[frames[1]])[..., None]
     x, y = np.where(w > 0, a.x[frames[0]] @ R.T, 0.0), np.where(w > 0, b.x[frames[1]], 0.0)
@@ -243,7 +244,7 @@ def _correlation(a: _Skeleton, b: _Skeleton, frames: tuple[slice, slice], R: NDA
     return float(np.sum(w * x * y)) / max(np.sqrt(power), 1e-12)
 
 
-def _tree(cameras: Sequence[Camera], pairs: dict[_Pair, _Match]) -> list[_Pair]:
+def _tree(cameras: Sequence[Camera], pairs: dict[_Pair, SkeletonMatch]) -> list[_Pair]:
     """Pairs along which all cameras are taken in, those first whose people move most alike."""
     tree: list[_Pair] = []
     there = {0}
@@ -265,12 +266,12 @@ def _strangers(camera: Camera) -> CalibrationError:
     )
 
 
-def _clocks(count: int, rate: float, pairs: dict[_Pair, _Match], most: int) -> NDArray:
+def _clocks(count: int, rate: float, pairs: dict[_Pair, SkeletonMatch], most: int) -> NDArray:
     """(C,) int [frames] to add to each camera's: with which all pairs together move most alike.
 
     Frames in common count in the choice between periods, and not in the last frames about it.
     """
-    best: dict[tuple[int, int], _Match] = {}
+    best: dict[tuple[int, int], SkeletonMatch] = {}
     for (i, _, j, _), match in pairs.items():
         if (i, j) not in best or match.cost < best[i, j].cost:
             best[i, j] = match
@@ -292,7 +293,7 @@ def _clocks(count: int, rate: float, pairs: dict[_Pair, _Match], most: int) -> N
     return late
 
 
-def _people(counts: Sequence[int], pairs: dict[_Pair, _Match], late: NDArray, most: int) -> list[dict[int, int]]:
+def _people(counts: Sequence[int], pairs: dict[_Pair, SkeletonMatch], late: NDArray, most: int) -> list[dict[int, int]]:
     """People as {camera: which}, those in most cameras first: with the clocks set, they move alike in each."""
 
     def unlike(i: int, p: int, j: int, q: int) -> float:
@@ -318,7 +319,7 @@ def _people(counts: Sequence[int], pairs: dict[_Pair, _Match], late: NDArray, mo
     return [one for size, _, one in sorted(out, key=lambda trial: trial[:2]) if size <= -2]
 
 
-def _laid(a: _Skeleton, b: _Skeleton, lag: int) -> NDArray:
+def _laid(a: LiftedSkeleton, b: LiftedSkeleton, lag: int) -> NDArray:
     """T_b_a (4, 4) [m] of two cameras from one person's skeletons and places in both."""
     frames = _common(a, b, lag)
     R = None if frames is None else _turned(a, b, frames)
