@@ -15,7 +15,7 @@ from kinefit.bodies.marker_sets.files import LANDMARK_SPREAD, MarkerRecord, SetR
 from kinefit.bodies.marker_sets.labels import bare, plain
 from kinefit.bodies.marker_sets.placement import placed
 from kinefit.errors import KinefitError
-from kinefit.identification.model.learn import learn_model, usable
+from kinefit.identification.model.learn import learn_model, usable_markers
 from kinefit.markers.fit import fit_markers
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.observations import Markers
@@ -73,7 +73,7 @@ def first_set(markers: Markers, *, body: Body, name: str = "MY_SET") -> FirstSet
     ObservationError
         Too few markers are seen.
     """
-    _, labels, _ = usable(markers, None)
+    _, labels, _ = usable_markers(markers, None)
     labels = [bare(label) for label in labels]
     pairs = sides(labels)
     words = known_words(labels, pairs)

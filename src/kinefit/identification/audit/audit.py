@@ -251,7 +251,7 @@ def _leaves_segment(consistency: Consistency, positions: NDArray, broken: NDArra
     previous, current = positions[frame - 1, label], positions[frame, label]
     if not np.isfinite(previous).all() or not np.isfinite(current).all():
         return True
-    return consistency.carried(positions, frame - 1, frame, current, label)[0] > MIN_JUMP
+    return consistency.motion_misfit(positions, frame - 1, frame, current, label)[0] > MIN_JUMP
 
 
 def _is_better(before: NDArray, after: NDArray, jumps: int) -> bool:
@@ -323,7 +323,7 @@ def _find_strays(positions: NDArray, model: MarkerModel, labels: Sequence[str]) 
             if last - first + 1 < MIN_SPAN_FRAMES or typical[k] < np.nanmax(typical):
                 continue
             x = positions[first : last + 1]
-            off = np.abs(np.linalg.norm(x[:, k, None] - x[:, consistency.who[k]], axis=-1) - consistency.mean[k])
+            off = np.abs(np.linalg.norm(x[:, k, None] - x[:, consistency.partners[k]], axis=-1) - consistency.mean[k])
             size = float(np.nanmedian(off))
             if size < MIN_STRAY_DISTANCE:
                 continue

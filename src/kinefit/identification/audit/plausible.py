@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies.marker_sets import MarkerSet
 from kinefit.identification.model.from_frame import similarity
-from kinefit.identification.model.learn import distances
+from kinefit.identification.model.learn import distance_statistics
 from kinefit.identification.model.model import MarkerModel
 
 MIN_PLACEMENT_RMS = 0.035
@@ -179,7 +179,7 @@ def _joint_places(model: MarkerModel, s: int) -> list[NDArray]:
 
 def _swaps_by_motion(positions: NDArray, model: MarkerModel) -> Iterator[PairFinding]:
     """Pairs of labels that each move with the other's segment."""
-    deviation = np.nan_to_num(distances(positions[:: max(1, len(positions) // 400)])[1])
+    deviation = np.nan_to_num(distance_statistics(positions[:: max(1, len(positions) // 400)])[1])
     mates_of: dict[int, list[int]] = {}
     for members in model.segments:
         for m in members:
