@@ -277,18 +277,18 @@ class _Search:
                 accepted.append((kept, found))
 
     def _is_same_person(
-        self, frame: int, nodes: list[Node], x: NDArray | None, others: list[Node], place: NDArray, sides: Collection[Node],
+        self, frame: int, nodes: list[Node], x: NDArray | None, kept: list[Node], at: NDArray, sides: Collection[Node],
     ) -> bool:  # fmt: skip
-        """Whether a track's views show the person of another track at `place` (k, 3) [m]: all views agree together."""
+        """Whether a track's views show the person of another track at `at` (k, 3) [m]: all views agree together."""
         if x is None:
             q, p = nodes[0]
             uv = (self.swapped_uv if nodes[0] in sides else self.uv)[q][frame, p]
-            return self._view_error(place, nodes[0], uv) <= _MAX_VIEW_ERROR
-        distance, cameras = _distance(x, place), {q for q, _ in others}
+            return self._view_error(at, nodes[0], uv) <= _MAX_VIEW_ERROR
+        distance, cameras = _distance(x, at), {q for q, _ in kept}
         added = [node for node in nodes if node[0] not in cameras]
         if distance < _MIN_PERSON_DISTANCE or distance > 2.0 * MAX_STEP or not added:
             return distance < _MIN_PERSON_DISTANCE
-        both = [*others, *added]
+        both = [*kept, *added]
         return len(self._consistent_views(frame, both, None, sides)[0]) == len(both)
 
     def _view_error(self, x: NDArray, node: Node, uv: NDArray) -> float:
