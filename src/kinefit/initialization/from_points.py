@@ -56,16 +56,16 @@ def first_scales(
             remedy="Check the calibration (its unit and its camera names) and that the cameras are in step.",
         )
     means = {g: float(np.average([r for r, _ in v], weights=[w for _, w in v])) for g, v in ratios.items()}
-    weights = {g: sum(w for _, w in v) for g, v in ratios.items()}
+    sums = {g: sum(w for _, w in v) for g, v in ratios.items()}
     prior = PROPORTIONS**-2
     if height and body.stature:
         size = height / body.stature
     elif weighted:
-        size = float(np.average(list(means.values()), weights=[1.0 / (1.0 / w + 1.0 / prior) for w in weights.values()]))
+        size = float(np.average(list(means.values()), weights=[1.0 / (1.0 / w + 1.0 / prior) for w in sums.values()]))
     else:
         size = float(np.median(list(means.values())))
     if weighted:
-        means = {g: (weights[g] * m + prior * size) / (weights[g] + prior) for g, m in means.items()}
+        means = {g: (sums[g] * m + prior * size) / (sums[g] + prior) for g, m in means.items()}
     if not 0.2 < size < 5.0:
         raise TrackingError(
             f"the person would be {float(f'{size:.2g}'):g} times the body's size: the calibration's unit is wrong",

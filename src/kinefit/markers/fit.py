@@ -118,13 +118,14 @@ def _refit_outliers(data: _MarkerData, roots: NDArray, angles: NDArray) -> tuple
 
 
 def _interpolate_unobserved(
-    data: _MarkerData, roots: NDArray, angles: NDArray, sure: Certainty, rate: float
+    data: _MarkerData, roots: NDArray, angles: NDArray, certainty: Certainty, rate: float
 ) -> tuple[NDArray, NDArray]:
     """Interpolate unobserved angles and roots from adjacent frames; observed ones stay."""
     tree, x = data.body.tree, data.x
-    lost = ~((sure.dof_std[:, :3].max(axis=1) < _MAX_ROOT_STD) & (sure.dof_std[:, 3:6].max(axis=1) < _MAX_ANGLE_STD))
-    enough = np.minimum(np.where(tree.prismatic, _MAX_ROOT_STD, _MAX_ANGLE_STD), BLIND * tree.spread)
-    observed = (sure.dof_std[:, 6:] < enough) & ~lost[:, None]
+    std = certainty.dof_std
+    lost = ~((std[:, :3].max(axis=1) < _MAX_ROOT_STD) & (std[:, 3:6].max(axis=1) < _MAX_ANGLE_STD))
+    max_std = np.minimum(np.where(tree.prismatic, _MAX_ROOT_STD, _MAX_ANGLE_STD), BLIND * tree.spread)
+    observed = (std[:, 6:] < max_std) & ~lost[:, None]
     ever_observed = observed.any(axis=0)
     if lost.all() or (observed[:, ever_observed].all() and not lost.any()):
         return roots, angles
@@ -149,19 +150,19 @@ def _interpolate_unobserved(
 
 
 def _motion(
-    data: _MarkerData, roots: NDArray, angles: NDArray, sure: Certainty, markers: Markers, up: str | None
+    data: _MarkerData, roots: NDArray, angles: NDArray, certainty: Certainty, markers: Markers, up: str | None
 ) -> Motion:
     """Assemble the motion; its quality is the share of a segment's evidence that agrees."""
     body, points, x = data.body, data.points, data.x
-    dof_std = np.array(sure.dof_std)
+    dof_std = np.array(certainty.dof_std)
     dof_std[:, 6:][dof_std[:, 6:] > BLIND * body.tree.spread] = np.inf
     values = x - body.trajectories(roots, angles, points)
     squares = np.square(values / data.sigma[:, None]).sum(axis=2)
     quality = of_points(body, points, squares).segment_quality(body.tree)
-    residuals = Residuals(points.names, points.segments, values, sure.factors, "m", x, np.zeros(len(x), bool))
+    residuals = Residuals(points.names, points.segments, values, certainty.factors, "m", x, np.zeros(len(x), bool))
     return Motion(
         body=body, rate=markers.rate, times=markers.times, Ts_world_root=roots, angles=angles, dof_std=dof_std,
-        joint_std=sure.joint_std, quality=quality.mean(axis=1), segment_quality=quality,
+        joint_std=certainty.joint_std, quality=quality.mean(axis=1), segment_quality=quality,
         residuals={"markers": residuals}, up=up or markers.up or upright(roots),
         name=Path(markers.source).stem or "markers",
     )  # fmt: skip

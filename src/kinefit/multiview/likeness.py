@@ -200,8 +200,8 @@ def clothes_colours(
     Parameters
     ----------
     keypoints : records of one kind
-    views : {frame: (record, person in it)}
-    pictures : Pictures
+    views : for each frame its (record, detection) pairs
+    images : of the cameras
     """
     joints = joints_of(keypoints[0].names)
     frames = _spread_frames(views, _MAX_COLOUR_FRAMES)

@@ -89,7 +89,7 @@ def check_images(rig: Rig, images: Sequence[SplineImage]) -> None:
     centres = np.array([camera.centre_world for camera in rig])
     for camera, centre in zip(rig.cameras[1:], centres[1:]):
         if np.linalg.norm(centre - centres[0]) < _MIN_BASELINE:
-            problem = f"it stands where camera {rig.names[0]} does: nothing tells a distance"
+            problem = f"it stands where camera {rig.names[0]} does: distances cannot be measured"
             remedy = "Put the cameras apart, or check the calibration and its unit."
             raise CalibrationError(problem, place=f"camera {camera.name}", remedy=remedy)
 
@@ -161,7 +161,7 @@ def _raise_unmatched(first: SplineImage, camera: str) -> None:
     """Raise ObservationError with the reason why nothing was matched."""
     reject_untextured(first, "first camera")
     problem = "nothing of the first image is found in it"
-    remedy = "Give seeds by hand, a larger window, or a mask; texture that repeats is found nowhere for sure."
+    remedy = "Give seeds by hand, a larger window, or a mask; repeated texture has no unique match."
     raise ObservationError(problem, place=f"camera {camera}", remedy=remedy)
 
 
