@@ -64,7 +64,7 @@ class PersonTrack:
 
 
 def views_needed(cameras: int) -> int:
-    """Number of cameras that must detect a person: three, or two in rigs of two or three."""
+    """Number of cameras that must detect a person: three, two in rigs of two or three, one with a single camera."""
     return 3 if cameras > 3 else min(cameras, 2)
 
 
