@@ -18,7 +18,7 @@ from kinefit.bodies import Body, load_body
 from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.motion import Motion
-from kinefit.multiview.likeness import Pictures, joints_of
+from kinefit.multiview.likeness import ImageSource, joints_of
 from kinefit.multiview.people import PersonTrack, people_of
 from kinefit.observations import Keypoints
 from kinefit.preparing import detecting
@@ -63,7 +63,7 @@ class Scene:
     there: NDArray
     gone: tuple[int, ...]
     back: int
-    pictures: Pictures
+    pictures: ImageSource
 
 
 def scene(kind: str, seed: int) -> Scene:
@@ -121,7 +121,7 @@ def _adult(body: Body, random: np.random.Generator) -> Body:
     return body.scaled(factors)
 
 
-def _drawn(motions: list[Motion], rig: Rig, there: NDArray, worn: list[tuple], seed: int) -> Pictures:
+def _drawn(motions: list[Motion], rig: Rig, there: NDArray, worn: list[tuple], seed: int) -> ImageSource:
     """Pictures of people as trunks and legs in the colours of their clothes, the nearer before the farther.
 
     Cameras differ in exposure (15 %) and white (6 %); light differs by place (12 %); cloth has folds.
@@ -200,7 +200,7 @@ def _real() -> None:
             gap = round(seconds * seen.rate)
             records = [_cut(k, half, gap) for k in seen.keypoints]
             with TakePictures(take, seen) as pictures:
-                own: Pictures = lambda c, f, gap=gap: pictures(c, f if f < half else f - gap)
+                own: ImageSource = lambda c, f, gap=gap: pictures(c, f if f < half else f - gap)
                 found = people_of(seen.rig, records, own)
             known += sum(any(_is_same(one, other, records, half, gap) for other in found) for one in whole)
     figure(name, float(known), unit, goal)
@@ -228,7 +228,7 @@ def run() -> None:
     """Print every figure."""
     _real()
     of: dict[tuple[str, bool], NDArray] = {}
-    by: dict[str, Callable[[Scene], Pictures | None]] = {
+    by: dict[str, Callable[[Scene], ImageSource | None]] = {
         "size": lambda s: None, "size and clothes": lambda s: s.pictures,
     }  # fmt: skip
     for kind in KINDS[:1] if quick() else KINDS:

@@ -12,8 +12,8 @@ from tests.tracking.movements import BODY, RATE, a_motion, a_rig, cloud_frame, k
 from kinefit.errors import CalibrationError
 from kinefit.frame.routing import Sensors
 from kinefit.initialization.candidates import (
-    GAIN,
     LEAP,
+    MIN_GAIN,
     dofs_of_limbs,
     find_limbs,
     starts_from_points,
@@ -118,7 +118,7 @@ def test_a_limb_that_is_somewhere_else_is_found(search):
     assert off(wrong, 0)[wrist] > 0.4 and min(off(state, 0)[wrist] for state, _ in found) < 0.08
     now = search.score.of(wrong)
     for state, least in found:
-        assert least in (GAIN, LEAP) and search.score.of(state) > now + least
+        assert least in (MIN_GAIN, LEAP) and search.score.of(state) > now + least
         assert (state.angles >= BODY.tree.lower - 1e-9).all() and (state.angles <= BODY.tree.upper + 1e-9).all()
 
 
@@ -133,7 +133,7 @@ def test_the_same_is_found_again(search):
 
 def test_a_limb_that_is_where_it_is_does_not_leap(search):
     for state, least in find_limbs(search, TRUTH, segments("forearm_l"), tries=60):
-        assert least == GAIN and off(state, 0).max() < 0.1
+        assert least == MIN_GAIN and off(state, 0).max() < 0.1
 
 
 def test_a_trunk_that_is_sought_is_no_limb(search):

@@ -8,7 +8,7 @@ import pytest
 from kinefit import load_body
 from kinefit.bodies import BodyState
 from kinefit.bodies.marker_sets import placement
-from kinefit.markers.valleys import PointTake, profiled, settled_by_motion
+from kinefit.markers.valleys import PointTake, profile_frames, resolve_by_motion
 from kinefit.sensors.settings import MARKER_LOSS
 from kinefit.solvers.sequence import fit_sequence, point_equations
 
@@ -30,7 +30,7 @@ def bow():
     fit = fit_sequence(
         BODY, BodyState(roots[0], angles[0]), points, x, sigma=take.sigma, loss=MARKER_LOSS, posture=1.0
     )
-    return take, angles, fit, profiled(take, fit.Ts_world_root, fit.angles, RATE)
+    return take, angles, fit, profile_frames(take, fit.Ts_world_root, fit.angles, RATE)
 
 
 def _rise(take, roots, angles, frame, d, step):
@@ -66,7 +66,7 @@ def test_what_is_determined_keeps_its_bars(bow):
 
 def test_motion_decides_in_a_valley(bow):
     take, truth, fit, (roots, angles, _, _, flat) = bow
-    found = settled_by_motion(take, roots, angles, flat, RATE)[1]
+    found = resolve_by_motion(take, roots, angles, flat, RATE)[1]
     off = [np.abs(some[:, TRUNK] - truth[:, TRUNK]).max(axis=0) for some in (found, fit.angles)]
     assert (off[0] < 0.9 * off[1]).all()
     steps = [np.abs(np.diff(some[:, TRUNK], axis=0)).max() for some in (found, fit.angles)]
@@ -77,7 +77,7 @@ def test_a_frame_in_a_worse_minimum_takes_the_better_one(bow):
     take, _, fit, _ = bow
     roots, angles = fit.Ts_world_root.copy(), fit.angles.copy()
     angles[20:30, TRUNK] += np.radians([25.0, -25.0])
-    found = profiled(take, roots, angles, RATE)[1]
+    found = profile_frames(take, roots, angles, RATE)[1]
     np.testing.assert_allclose(found[20:30, TRUNK], fit.angles[20:30, TRUNK], atol=np.radians(3.0))
 
 

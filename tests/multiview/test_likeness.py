@@ -5,7 +5,15 @@ import pytest
 from tests.multiview.test_people import RIG, records
 from tests.multiview.test_returns import BODY, RATE, sized, stay
 
-from kinefit.multiview.likeness import Looks, bones_of, colour_likeness, colours_of, joints_of, likeness, size_likeness
+from kinefit.multiview.likeness import (
+    Appearance,
+    bones_of,
+    clothes_colours,
+    colour_log_ratio,
+    joints_of,
+    same_log_ratio,
+    size_log_ratio,
+)
 from kinefit.observations import Keypoints
 
 NOTHING = np.full(7, np.nan)
@@ -13,7 +21,7 @@ GREY = np.full((2, 6), np.nan)
 
 
 def looks(bones=NOTHING, colours=GREY, std=0.01):
-    return Looks(np.asarray(bones, float), np.full(7, std), np.asarray(colours, float))
+    return Appearance(np.asarray(bones, float), np.full(7, std), np.asarray(colours, float))
 
 
 @pytest.mark.parametrize("name", BODY.keypoint_sets)
@@ -26,29 +34,29 @@ def test_joints_are_found_in_every_set_of_the_catalogue(name):
 
 
 def test_nothing_known_says_nothing():
-    assert likeness(looks(), looks(np.zeros(7))) == 0.0 and not looks().is_known
+    assert same_log_ratio(looks(), looks(np.zeros(7))) == 0.0 and not looks().is_known
 
 
 def test_the_same_size_speaks_for_and_another_against():
     same, other = looks(np.zeros(7)), looks(np.full(7, 0.12))
-    assert size_likeness(same, same) > 1.5 and size_likeness(same, other) < -1.5
-    assert size_likeness(same, other) == pytest.approx(size_likeness(other, same))
+    assert size_log_ratio(same, same) > 1.5 and size_log_ratio(same, other) < -1.5
+    assert size_log_ratio(same, other) == pytest.approx(size_log_ratio(other, same))
     vague = looks(np.full(7, 0.12), std=0.5)  # who knows no length says nothing
-    assert abs(size_likeness(same, vague)) < 0.1
+    assert abs(size_log_ratio(same, vague)) < 0.1
 
 
 def test_no_size_speaks_louder_than_that_lengths_may_be_wrong():
-    assert size_likeness(looks(np.zeros(7)), looks(np.full(7, 5.0))) == pytest.approx(np.log(0.02), abs=0.01)
+    assert size_log_ratio(looks(np.zeros(7)), looks(np.full(7, 5.0))) == pytest.approx(np.log(0.02), abs=0.01)
 
 
 def test_clothes_speak_less_than_that_people_change_and_wear_the_same():
     red = np.tile([50.0, 40.0, 20.0, 5.0, 2.0, 2.0], (2, 1))
     blue = np.tile([30.0, 5.0, -40.0, 5.0, 2.0, 2.0], (2, 1))
-    same, other = (colour_likeness(looks(colours=red), looks(colours=c)) for c in (red, blue))
+    same, other = (colour_log_ratio(looks(colours=red), looks(colours=c)) for c in (red, blue))
     assert 1.5 < same <= np.log(1 / 0.1) and np.log(0.05) - 0.1 < other < -2.0
     one_part = red.copy()
     one_part[1] = np.nan
-    assert 0.5 < colour_likeness(looks(colours=one_part), looks(colours=red)) < same + 0.01
+    assert 0.5 < colour_log_ratio(looks(colours=one_part), looks(colours=red)) < same + 0.01
 
 
 def test_bones_are_those_of_the_body():
@@ -60,7 +68,7 @@ def test_bones_are_those_of_the_body():
         found.append(bones_of(RIG, keypoints, views))
     np.testing.assert_allclose(found[1].bones - found[0].bones, np.log(1.1 / 0.9), atol=0.05)
     assert (found[0].bones_std < 0.08).all()
-    assert size_likeness(*found) < 0.0 < size_likeness(found[0], found[0])
+    assert size_log_ratio(*found) < 0.0 < size_log_ratio(found[0], found[0])
 
 
 def test_colours_are_those_of_trunk_and_legs_where_nobody_is_in_the_way():
@@ -70,9 +78,9 @@ def test_colours_are_those_of_trunk_and_legs_where_nobody_is_in_the_way():
     image[:95], image[95:] = (200, 30, 30), (30, 30, 200)
     points = np.stack([uv, uv + [500.0, 0.0]])[None]
     record = Keypoints("cam1", "", names, RATE, points, np.ones((1, 2, 6)))
-    found = colours_of([record], {0: [(0, 0)]}, lambda camera, frame: (image, None))
+    found = clothes_colours([record], {0: [(0, 0)]}, lambda camera, frame: (image, None))
     assert found[0, 1] > 40 and found[1, 2] < -40  # red above, blue below
-    assert np.isnan(colours_of([record], {0: [(0, 0)]}, lambda camera, frame: None)).all()
+    assert np.isnan(clothes_colours([record], {0: [(0, 0)]}, lambda camera, frame: None)).all()
     near = Keypoints("cam1", "", names, RATE, np.stack([uv, uv + [20.0, 10.0]])[None], np.ones((1, 2, 6)))
-    hidden = colours_of([near], {0: [(0, 0)]}, lambda camera, frame: (image, None))
+    hidden = clothes_colours([near], {0: [(0, 0)]}, lambda camera, frame: (image, None))
     assert np.isnan(hidden[0]).all() and hidden[1, 2] < -40  # one leg stands free

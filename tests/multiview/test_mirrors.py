@@ -7,7 +7,7 @@ from tests.oracle import look_at
 
 from kinefit.geometry.camera import Rig
 from kinefit.multiview.followed import follow, sentences
-from kinefit.multiview.mirrors import with_images
+from kinefit.multiview.mirrors import mark_mirror_images
 from kinefit.multiview.people import people_of
 from kinefit.sensors.channels import mirror_name
 
@@ -33,7 +33,7 @@ def test_the_image_in_a_mirror_is_nobody_else(listed_first):
         found = found[::-1]
     if listed_first == "image":
         found = found[::-1]
-    told = with_images(RIG, keypoints, found)
+    told = mark_mirror_images(RIG, keypoints, found)
     assert [one.image_of for one in told] == [None, 0]
     assert np.mean(told[0].chosen[0] == truth[0][:, 0]) > 0.9
     followed = follow(RIG, keypoints)
@@ -51,4 +51,4 @@ def test_two_who_move_alike_are_two(alike):
     else:
         other = behind_glass(np.roll(x, 12, axis=0), normal, plane)
     keypoints, _ = records([x, other], seed=3, rig=RIG)
-    assert all(one.image_of is None for one in with_images(RIG, keypoints, people_of(RIG, keypoints)))
+    assert all(one.image_of is None for one in mark_mirror_images(RIG, keypoints, people_of(RIG, keypoints)))

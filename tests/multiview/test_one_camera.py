@@ -5,7 +5,7 @@ import pytest
 
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.multiview.followed import follow
-from kinefit.multiview.one_camera import lifted_alone
+from kinefit.multiview.one_camera import only_lifted
 from kinefit.observations import MEDIAPIPE_33, Keypoints
 
 T = np.eye(4)
@@ -61,4 +61,4 @@ def test_who_is_seen_for_a_moment_is_nobody():
 def test_one_camera_is_alone_where_no_other_has_keypoints():
     one = record(STANDS)
     other = Keypoints("cam2", "MEDIAPIPE_33", MEDIAPIPE_33, RATE, one.points, one.confidence)
-    assert lifted_alone([one]) is one and lifted_alone([one, other]) is None and lifted_alone([]) is None
+    assert only_lifted([one]) is one and only_lifted([one, other]) is None and only_lifted([]) is None

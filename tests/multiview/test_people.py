@@ -8,7 +8,7 @@ from tests.oracle import posture, rig_around
 
 from kinefit.bodies import BodyState, load_body
 from kinefit.multiview import people
-from kinefit.multiview.association import some_points
+from kinefit.multiview.association import some_columns
 from kinefit.multiview.people import people_of, views_needed
 from kinefit.observations import Keypoints
 
@@ -100,9 +100,9 @@ def _found(told, rig=RIG):
 def test_two_do_not_share_the_views_of_one(off):
     keypoints, _ = records([along(line((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 2), 1)])
     search = people._Search(RIG, keypoints)
-    x = along([(0.0, 0.0, 0.0)], 1)[0][some_points(len(NAMES))]
+    x = along([(0.0, 0.0, 0.0)], 1)[0][some_columns(len(NAMES))]
     search.tracks = [people._OpenTrack(x + d, np.zeros_like(x), 0, 0, 0) for d in ((off, 0, 0), (0, 0, off))]
-    search._go_on(1, search.tracks)
+    search._continue_tracks(1, search.tracks)
     assert [len(track.nodes.get(1, ())) for track in search.tracks] == [2, 0]
 
 
@@ -126,7 +126,7 @@ def test_who_leaves_and_comes_back_is_the_same():
     check_each_is_one(found, truth)
     other = found[1]
     np.testing.assert_array_equal(other.views[35:65], 0)
-    assert found[0].surety > other.surety
+    assert found[0].confidence > other.confidence
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -127,7 +127,7 @@ def test_what_is_said_of_those_who_come_back():
 
 
 def test_what_few_views_took_for_somebody_beside_who_follows_is_left_out():
-    from kinefit.multiview.returns import PresenceSpan, chains_of
+    from kinefit.multiview.returns import PresenceSpan, link_spans
 
     def span(views, x=0.0):
         nodes = {f: [(c, 0) for c in range(n)] for f, n in enumerate(views) if n}
@@ -135,7 +135,7 @@ def test_what_few_views_took_for_somebody_beside_who_follows_is_left_out():
 
     def views(spans):
         keypoints, _ = records([stay([AT[0]] * 2, 7)])
-        chains = chains_of(RIG, keypoints, spans, 3, None)
+        chains = link_spans(RIG, keypoints, spans, 3, None)
         return [[len(chain.span.nodes.get(f, ())) for f in range(100)] for chain in chains]
 
     assert views([span([4] * 50 + [2] * 50), span([0] * 30 + [2] * 20 + [4] * 50)]) == [[4] * 100]

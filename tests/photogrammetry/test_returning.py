@@ -81,7 +81,7 @@ def test_what_faces_away_is_not_expected(images):
     assert same.maps == pytest.approx(np.tile(np.eye(2), (len(same.ids), len(RIG), 1, 1)))
     turned = vanished.expected(4)
     assert 0 < len(turned.ids) < len(same.ids)
-    vanished.found(4, turned.index)
+    vanished.mark_found(4, turned.index)
     assert len(vanished) == len(there) - len(turned.ids)
     assert vanished.expected(len(MOTION)) is None  # the motion has ended
 

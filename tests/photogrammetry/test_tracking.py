@@ -9,7 +9,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
-from kinefit.photogrammetry.trajectories import Trajectories, accompanied, filtered, uniform, within_bounds
+from kinefit.photogrammetry.trajectories import Trajectories, filtered, has_neighbours, uniform, within_bounds
 
 TEXTURE = scenes.Texture(0.005, 3)
 
@@ -104,7 +104,7 @@ def test_both_filters_and_the_neighbours_in_turn():
     x[6:, 4, 1] += 0.004 * np.arange(1, 7)
     x[8:, 2, 2] += 0.5
     paths = Trajectories(np.arange(12) / 30.0, x, np.full_like(x, 1e-4), np.zeros((12, 20, 2, 2)))
-    assert not accompanied(paths, radius=0.1)[:, 7].any() and accompanied(paths, radius=0.1)[:8, :4].all()
+    assert not has_neighbours(paths, radius=0.1)[:, 7].any() and has_neighbours(paths, radius=0.1)[:8, :4].all()
     kept, cut = filtered(paths, radius=0.1, bounds=(2.0, 100.0), neighbours=True)
     assert not kept.live[:, 7].any() and not kept.live[7:, 4].any() and not kept.live[8:, 2].any()
     assert cut["bounds"] >= 4 and cut["uniformity"] >= 5 and cut["neighbours"] == 12

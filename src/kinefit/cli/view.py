@@ -164,7 +164,7 @@ def _triangulated(take: Take, seen: Observations) -> NDArray | None:
         return None
     try:
         with TakePictures(take, seen) as pictures:
-            keypoints = follow(seen.rig, seen.keypoints, take.person, pictures=pictures).keypoints
+            keypoints = follow(seen.rig, seen.keypoints, take.person, images=pictures).keypoints
         people = choose_people(seen.rig, keypoints)
     except TrackingError as error:
         _screen.note(f"Only cameras are shown: {error.problem}.")

@@ -1,4 +1,4 @@
-"""Inverse kinematics of one limb, from many starts."""
+"""Inverse kinematics of one limb, from many starts: numba."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from kinefit._jit import jit
 from kinefit.bodies._kernels import forward
 
-_MAX_STEP_RAD = 0.6  # of an angle in an iteration: the linear step of a bent limb overshoots
+_MAX_STEP_RAD = 0.6  # per iteration: linear steps of a bent limb overshoot
 
 
 @jit
-def reach(parents, dof_start, prismatic, axes, rest, root, angles, dofs, segment, tips, targets, mean, std, lower,
+def reach_for(parents, dof_start, prismatic, axes, rest, root, angles, dofs, segment, tips, targets, mean, std, lower,
           upper, sigma, iterations):  # fmt: skip
-    """Move points of a segment to targets in the world, by some coordinates, held to a mean (iterated Kalman update).
+    """Move points of a segment to targets by some coordinates with a Gaussian prior (iterated Kalman update).
 
-    angles (B, D) are changed; dofs (d,) are the coordinates that move; tips (B, 3) [m] at rest, in
-    the root frame; targets (B, 3) [m], found to `sigma` [m]; mean, std, lower, upper (D,).
+    angles (B, D) [rad or m] are changed in place; dofs (d,) int: coordinates that move; tips (B, 3) [m] in the rest
+    pose, root frame; targets (B, 3) [m] in the world, with sigma `sigma` [m]; mean, std, lower, upper (D,).
     """
     frames, screws = np.empty((parents.size, 12)), np.empty((axes.shape[0], 6))
     J, S, y = np.empty((3, dofs.size)), np.empty((3, 3)), np.empty(3)

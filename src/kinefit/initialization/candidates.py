@@ -1,6 +1,6 @@
-"""Where a body may be when nothing is known before: from markers, from keypoints of several cameras, from depth.
+"""Candidate states of a body without an initial pose: from markers, keypoints, depth images, or rays.
 
-A start from rays on which points lie, such as those of one camera's keypoints, and from other sensors' rows.
+Rays, such as those of one camera's keypoints, give a start together with another sensor's rows.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from kinefit.sensors.surfaces.depth_view import camera_at
 from kinefit.sensors.visibility.parting import without_others
 from kinefit.solvers.least_squares import levenberg_marquardt
 
-GAIN = 0.01  # of the score, a hundredth of the person's pixels, that another pose must explain more
-LEAP = 0.05  # the same, for a limb that would be somewhere else: a forearm is about this much of a person
+MIN_GAIN = 0.01  # of the score (share of the person's pixels) by which another pose must be better
+LEAP = 0.05  # the same for a limb that moves elsewhere: about the share of a forearm
 
 
 def starts_from_points(
     body: Body, measurements: Sequence[Measurement], scene: Scene, up: NDArray, *, rays: bool = True
 ) -> list[BodyState]:
-    """States to begin with from six points or more that are known in space: markers, keypoints of several cameras.
+    """Initial states from six or more points known in space: markers, or keypoints of several cameras.
 
-    Where fewer are known, from the rays of one camera's keypoints, if another sensor measures something beside them.
+    With fewer points, the states follow from the rays of one camera's keypoints if there is another sensor.
 
     Parameters
     ----------
-    measurements : of all sensors that place named points
+    measurements : of all sensors with named points
     scene : of the body, in any state
-    up : (3,) unit, upwards in the world
-    rays : whether rays are used, which takes several fits
+    up : (3,) unit vector, upwards in the world
+    rays : whether to use rays, which needs several fits
     """
     given = [m for m in measurements if m.settled]
     points, x, directions = known_points(given, scene)
@@ -61,15 +61,21 @@ def starts_from_views(
     scene: Scene, frames: Sequence[Any], up: NDArray, measurements: Sequence[Measurement], count: int = 3, *,
     backgrounds: Mapping[str, NDArray] | None = None, forward: NDArray | None = None,
 ) -> Iterator[list[BodyState]]:  # fmt: skip
-    """States to begin with from one depth image or cloud, attempt by attempt; those that known points agree with first.
+    """Yield initial states from one depth image or cloud, attempt by attempt, those nearest to known points first.
 
-    `backgrounds`: {depth camera: (H, W) [m]} of the empty scene, where it is known; `forward`: (3,) where the body
-    faced before.
+    Parameters
+    ----------
+    frames : of all sensors at one time
+    up : (3,) unit vector, upwards in the world
+    measurements : with named points, for the order
+    count : most states per attempt
+    backgrounds : (H, W) [m] depth of the empty scene, by depth camera; default: unknown
+    forward : (3,) direction in which the body faced before; default: unknown
     """
     points, x, _ = known_points(measurements, scene)
     known = np.isfinite(x).all(axis=1)
 
-    def off(start: Start) -> float:
+    def distance_of(start: Start) -> float:
         return float(np.median(np.linalg.norm(scene.body.positions(start.state, points)[known] - x[known], axis=1)))
 
     for view in _views(scene, frames):
@@ -77,15 +83,15 @@ def starts_from_views(
         with suppress(KinefitError):
             for starts in starts_by_attempt(scene.body, *view, background=empty, up=up, count=count, forward=forward):
                 if known.any():
-                    starts.sort(key=off)
+                    starts.sort(key=distance_of)
                 yield [start.state for start in starts]
             return
 
 
 def known_points(measurements: Sequence[Measurement], scene: Scene) -> tuple[PointSet, NDArray, NDArray]:
-    """Points of the body as all measurements show them: places (K, 3) [m] and rays (K, 2, 3), NaN where unknown."""
+    """Points of the body in all measurements, with positions (K, 3) [m] and rays (K, 2, 3); NaN where unknown."""
     sets, places, rays = [], [np.zeros((0, 3))], [np.zeros((0, 2, 3))]
-    for m in (m for m in measurements if m.settled):  # surfaces give views alone
+    for m in (m for m in measurements if m.settled):  # surfaces have no named points
         hints = m.hints(scene)
         if hints.points is None:
             continue
@@ -100,68 +106,68 @@ def known_points(measurements: Sequence[Measurement], scene: Scene) -> tuple[Poi
 def find_limbs(
     search: PostureSearch, state: BodyState, seek: NDArray, tries: int = 200
 ) -> list[tuple[BodyState, float]]:
-    """States that a view speaks for more than for the given one, with the gain in score that each must show.
+    """Search a view for better poses of some limbs: states with the gain in score that each must exceed.
 
-    Near ones come first: all else held, then the whole body moved. A limb that is found somewhere else altogether
-    must explain `LEAP` more.
+    First the limbs, then the whole body are moved locally. A limb found elsewhere must gain `LEAP`.
 
     Parameters
     ----------
-    seek : (S,) bool, segments of which the whole limb is sought.
-    tries : int, random poses of each limb
+    seek : (S,) bool, segments whose whole limbs are searched
+    tries : number of random poses per limb
     """
-    now, ends = search.score.of(state), search.ends(state)
-    chosen = [limb for limb in search.limbs if seek[list(limb)].any()]
-    own = np.flatnonzero(dofs_of_limbs(search.body, seek))
-    near, value = search.polish(state, None, own, 6, 48, 1.5) if len(own) else (state, float(now))
-    whole, better = search.polish(near, None, np.arange(search.body.tree.n_dofs), 8, 40, 0.6)
-    out = [(near, value - now, GAIN), (whole, better - now, GAIN)]
-    found = [(state, now)]
-    for limb in chosen:
+    current_score, ends = search.score.of(state), search.ends(state)
+    sought = [limb for limb in search.limbs if seek[list(limb)].any()]
+    limb_dofs = np.flatnonzero(dofs_of_limbs(search.body, seek))
+    near, value = search.polish(state, None, limb_dofs, 6, 48, 1.5) if len(limb_dofs) else (state, float(current_score))
+    whole, whole_value = search.polish(near, None, np.arange(search.body.tree.n_dofs), 8, 40, 0.6)
+    out = [(near, value - current_score, MIN_GAIN), (whole, whole_value - current_score, MIN_GAIN)]
+    found = [(state, current_score)]
+    for limb in sought:
         found = search.limb(found[0][0], limb, None, ends, tries)
-    out += [(s, v - now, LEAP) for s, v in found[:2]]
-    return [(s, least) for s, gain, least in sorted(out, key=lambda o: o[2] - o[1]) if gain > least]
+    out += [(s, v - current_score, LEAP) for s, v in found[:2]]
+    return [(s, min_gain) for s, gain, min_gain in sorted(out, key=lambda o: o[2] - o[1]) if gain > min_gain]
 
 
 def dofs_of_limbs(body: Body, lost: NDArray) -> NDArray:
-    """(6 + D,) bool: degrees of freedom of all limbs of which a segment is lost (S,)."""
-    away = {s for limb in limbs(body) if lost[list(limb)].any() for s in limb}
-    return np.concatenate([np.zeros(6, bool), np.isin(body.tree.owners, sorted(away))])
+    """(6 + D,) bool: degrees of freedom of all limbs with a lost segment; lost (S,) bool."""
+    segments = {s for limb in limbs(body) if lost[list(limb)].any() for s in limb}
+    return np.concatenate([np.zeros(6, bool), np.isin(body.tree.owners, sorted(segments))])
 
 
 def _views(scene: Scene, frames: Sequence[Any]) -> Iterator[tuple[NDArray | None, Camera, NDArray | None]]:
-    """Points, camera and image of all that can be searched, without the other bodies of the scene."""
-    seen = by_record(frames)
-    for frame in seen[DepthFrame]:
+    """Points, camera and image of all depth sensors, without the other bodies of the scene."""
+    records = by_record(frames)
+    for frame in records[DepthFrame]:
         camera = scene.rig[frame.sensor]
         yield None, camera, without_others(frame, scene.others, camera).depth
-    for cloud in seen[PointCloud]:
+    for cloud in records[PointCloud]:
         if cloud.on_body and cloud.segment is None and len(cloud):
             yield cloud.points, camera_at(cloud.points, cloud.viewpoint), None
 
 
-_HEADINGS = 4
-"""Headings about the vertical at which fits begin: from each a fit reaches minima within 45 degrees."""
+_HEADING_COUNT = 4
+"""Initial headings about the vertical: a fit reaches minima within 45 degrees."""
 
 _MIN_POINTS = 6
-_ITERATIONS, _TOLERANCE = 60, 1e-4
+_MAX_ITERATIONS = 60
+_TOLERANCE = 1e-4
 
 
 def starts_from_rays(
     scene: Scene, points: PointSet, rays: NDArray, measurements: Sequence[Measurement], up: NDArray
 ) -> list[BodyState]:
-    """States that fit all measurements, in order of increasing cost; none where fewer than six rays are known.
+    """States that fit all measurements, in order of increasing cost; empty with fewer than six rays.
 
-    The body begins upright on the mean ray, as far away as its size on the rays says, at several headings. The rows of
-    all measurements then decide: rays alone leave a body that is smaller and nearer, a range or a contact does not.
+    The body starts upright on the mean ray, at the distance given by its size on the rays, with several headings. The
+    rows of all measurements then decide. Rays alone cannot distinguish a smaller, nearer body; a range or contact can.
 
     Parameters
     ----------
     scene : of the body, in any state
-    points : PointSet of K points
-    rays : (K, 2, 3) origin [m] and unit direction in the world of the ray on which each point lies; NaN where unknown
-    measurements : of which all rows are used
-    up : (3,) unit, upwards in the world
+    points : K points of the body
+    rays : (K, 2, 3) origin [m] and unit direction, in the world, of each point's ray; NaN where unknown
+    measurements : all their rows are used
+    up : (3,) unit vector, upwards in the world
     """
     known = np.isfinite(rays).all(axis=(1, 2))
     if known.sum() < _MIN_POINTS:
@@ -173,8 +179,8 @@ def starts_from_rays(
     angle = np.sqrt(np.mean(np.sum(np.square(direction - axis), axis=1)))
 
     def rows(state: BodyState) -> list[AnyRows]:
-        here = scene.at(state, measurements=tuple(measurements))
-        return [*(r for m in measurements for r in m.match(here, np.inf).rows(here)), prior_rows(body, state)]
+        scene_at = scene.at(state, measurements=tuple(measurements))
+        return [*(r for m in measurements for r in m.match(scene_at, np.inf).rows(scene_at)), prior_rows(body, state)]
 
     fits = []
     for heading in _headings(axis, up):
@@ -185,15 +191,15 @@ def starts_from_rays(
         distance = np.sqrt(np.mean(np.sum(np.square(across), axis=1))) / max(angle, 1e-6)
         T[:3, 3] = origin.mean(axis=0) + distance * axis - x.mean(axis=0)
         start = body.usual_state(T)
-        fits.append(levenberg_marquardt(body, start, rows, max_iterations=_ITERATIONS, tolerance=_TOLERANCE))
+        fits.append(levenberg_marquardt(body, start, rows, max_iterations=_MAX_ITERATIONS, tolerance=_TOLERANCE))
     return [fit.state for fit in sorted(fits, key=lambda fit: fit.equations.cost)]
 
 
 def _headings(axis: NDArray, up: NDArray) -> list[NDArray]:
-    """(3,) horizontal directions, the first of them against the viewing axis."""
+    """(3,) horizontal unit vectors, the first towards the camera."""
     forward = (axis @ up) * up - axis
     if np.linalg.norm(forward) < 1e-6:  # seen from above
         forward = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     forward /= np.linalg.norm(forward)
     side = np.cross(up, forward)
-    return [np.cos(a) * forward + np.sin(a) * side for a in 2.0 * np.pi * np.arange(_HEADINGS) / _HEADINGS]
+    return [np.cos(a) * forward + np.sin(a) * side for a in 2.0 * np.pi * np.arange(_HEADING_COUNT) / _HEADING_COUNT]

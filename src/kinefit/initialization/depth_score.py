@@ -1,4 +1,4 @@
-"""How well poses of a body explain a view, many at a time."""
+"""Score many poses of a body by how well they explain a depth view."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from kinefit.rendering import Canvas, rasterise
 from kinefit.sensors.surfaces import _kernels_depth_view as kernels
 from kinefit.sensors.surfaces.depth_view import DepthView
 
-TOLERANCE = 0.10  # [m] a drawn surface this far from the measured one explains nothing: the radius of a thigh
-OVERLAP = 0.5  # [1/m] share of the score that a metre of parts within parts costs: 2 cm, the softness of flesh, 1 %
-POSTURE = 0.004  # share of the score that one standard deviation of every angle from the prior mean costs
+MAX_DEPTH_ERROR = 0.10  # [m] between rendered and measured surface of an explained pixel: the radius of a thigh
+OVERLAP_COST = 0.5  # [1/m] of the score per metre of self-penetration: 1 % for 2 cm, the softness of flesh
+POSTURE_COST = 0.004  # of the score for one standard deviation of every angle from the prior mean
 
 
-def spreads(body: Body) -> NDArray:
-    """(D,) [rad or m] prior standard deviation of each coordinate; half its range at most, and 1 without any limit."""
+def prior_sigmas(body: Body) -> NDArray:
+    """(D,) [rad or m] prior standard deviation of each coordinate, at most half its range, or 1 without limits."""
     tree = body.tree
     half = 0.5 * (tree.upper - tree.lower)
     return np.minimum(tree.spread, np.where(np.isfinite(half), half, 1.0))
 
 
-class _Parts(NamedTuple):
-    """Some segments: vertices (V, 3) [m] at rest and their segments (V,), triangles (T, 3), whose fingers each is (T,).
+class _SelectedMesh(NamedTuple):
+    """Mesh of some segments: vertices (V, 3) [m] in the rest pose, segment (V,), faces (T, 3), hand of each (T,).
 
-    And which pairs of segments are both among them.
+    pairs : (P,) bool, collision pairs of segments that are both among them
     """
 
     vertices: NDArray
@@ -46,7 +46,7 @@ class _Parts(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Compares poses of a body with a view.
+    """Scores poses of a body in a depth view.
 
     Parameters
     ----------
@@ -59,96 +59,96 @@ class Score:
 
     @cached_property
     def mesh(self) -> BodyMesh:
-        """The body's surface, coarse: a pixel of the view is two centimetres wide."""
+        """Coarse mesh of the body's surface: a pixel of the view is two centimetres wide."""
         return body_mesh(self.body, around=10, along=3)
 
     @cached_property
     def trunk(self) -> tuple[int, ...]:
-        """Segments that belong to no limb."""
+        """Indices of the segments that belong to no limb."""
         of_limbs = {s for limb in limbs(self.body) for s in limb}
         return tuple(s for s in range(len(self.body.tree.segments)) if s not in of_limbs)
 
     @cached_property
     def core(self) -> tuple[int, ...]:
-        """The trunk and limbs of one segment (a head): what is placed first."""
+        """Indices of the trunk's segments and of limbs with one segment (a head), which are placed first."""
         return tuple(sorted((*self.trunk, *(limb[0] for limb in limbs(self.body) if len(limb) == 1))))
 
     @cached_property
     def pixels(self) -> float:
-        """Pixels of the person, one at least."""
+        """Number of the person's pixels, at least 1."""
         return max(float(self.view.seen.sum()), 1.0)
 
     @cached_property
     def _spread(self) -> NDArray:
-        return spreads(self.body)
+        return prior_sigmas(self.body)
 
     @cached_property
-    def _pairs(self) -> CollisionPairs:
+    def _collision_pairs(self) -> CollisionPairs:
         return collision_pairs(self.body)
 
     @cached_property
-    def _nothing(self) -> NDArray:
+    def _empty_depth(self) -> NDArray:
         return np.full(self.view.observed.shape, np.inf, np.float32)
 
     @cached_property
-    def _chosen(self) -> dict[tuple[int, ...], _Parts]:
+    def _selected_meshes(self) -> dict[tuple[int, ...], _SelectedMesh]:
         return {}
 
     @cached_property
     def _fingers(self) -> NDArray:
-        """(T,) int: of which hand's fingers triangles are, counted from 1; 0 for the others."""
+        """(T,) int: hand (from 1) of each face of the fingers; 0 for others."""
         mesh = self.mesh
         bends = of_fingers(self.body, mesh.face_segment, mesh.vertices[mesh.faces].mean(axis=1))
         out = np.zeros(len(bends), np.int64)
         out[bends] = 1 + np.unique(mesh.face_segment[bends], return_inverse=True)[1]
         return out
 
-    def _parts(self, segments: tuple[int, ...]) -> _Parts:
-        if segments not in self._chosen:
+    def _mesh_of(self, segments: tuple[int, ...]) -> _SelectedMesh:
+        if segments not in self._selected_meshes:
             mesh, among = self.mesh, np.zeros(len(self.body.tree.segments), bool)
             among[list(segments)] = True
             own = among[mesh.face_segment]
             used, faces = np.unique(mesh.faces[own], return_inverse=True)
-            self._chosen[segments] = _Parts(
+            self._selected_meshes[segments] = _SelectedMesh(
                 np.ascontiguousarray(mesh.vertices[used]), mesh.segment[used], faces.reshape(-1, 3).astype(np.int32),
-                self._fingers[own], among[self._pairs.segment[self._pairs.pairs]].all(axis=1),
+                self._fingers[own], among[self._collision_pairs.segment[self._collision_pairs.pairs]].all(axis=1),
             )  # fmt: skip
-        return self._chosen[segments]
+        return self._selected_meshes[segments]
 
     def __call__(
         self, roots: NDArray, angles: NDArray, drawn: tuple[int, ...] | None = None, *,
         moving: tuple[int, ...] | None = None, base: NDArray | None = None,
     ) -> NDArray:  # fmt: skip
-        """(B,) score of poses, 1 at best: share of the person explained, less what speaks against them.
+        """(B,) score of poses, at most 1: the share of the person's pixels that the pose explains, minus costs.
 
-        That is: what is drawn where the sensor saw past it, parts within parts, uncommon postures. Fingers are
-        stretched or folded, as they are better.
+        Costs are rendered pixels where the sensor saw farther, self-penetration, and improbable postures. Fingers are
+        stretched or folded, whichever is better.
 
         Parameters
         ----------
-        roots : (B, 4, 4), angles : (B, D)
-        drawn : segments that take part; default all
-        moving, base : those of them that differ between the poses, and all others as `depth` draws them: faster
+        roots, angles : (B, 4, 4), (B, D) [rad or m]
+        drawn : segments that are rendered; default: all
+        moving, base : segments that differ between the poses, and the depth (h, w) [m] of all others; faster
         """
-        tree, view, p = self.body.tree, self.view, self._pairs
+        tree, view, p = self.body.tree, self.view, self._collision_pairs
         drawn = tuple(range(len(tree.segments))) if drawn is None else drawn
-        part = self._parts(drawn if moving is None else moving)
-        out, within = np.empty((len(roots), 2)), np.empty(len(roots))
+        part = self._mesh_of(drawn if moving is None else moving)
+        out, overlap = np.empty((len(roots), 2)), np.empty(len(roots))
         roots, angles = np.ascontiguousarray(roots, float), np.ascontiguousarray(angles, float)
         pose = tree.parents, tree.dof_start, tree.prismatic, tree.axes, tree.rest, roots, angles
         kernels.agreement(
             *pose, part.vertices, part.owner, part.faces, part.fingers, view.T_view_world, view.lens,
-            view.observed, view.behind, view.trust, self._nothing if base is None else base, TOLERANCE, out,
+            view.observed, view.behind, view.trust, self._empty_depth if base is None else base, MAX_DEPTH_ERROR, out,
         )  # fmt: skip
-        use = self._parts(drawn).pairs
-        kernels.overlaps(*pose, p.segment, p.starts, p.ends, p.pairs[use], p.apart[use], within)
-        odd = np.mean(((angles - tree.usual) / self._spread) ** 2, axis=1) if angles.shape[1] else 0.0
-        scores: NDArray = (out[:, 0] - out[:, 1]) / self.pixels - OVERLAP * within - POSTURE * odd
+        pair_mask = self._mesh_of(drawn).pairs
+        kernels.overlaps(*pose, p.segment, p.starts, p.ends, p.pairs[pair_mask], p.apart[pair_mask], overlap)
+        improbability = np.mean(((angles - tree.usual) / self._spread) ** 2, axis=1) if angles.shape[1] else 0.0
+        scores: NDArray = (out[:, 0] - out[:, 1]) / self.pixels - OVERLAP_COST * overlap - POSTURE_COST * improbability
         return scores
 
     def depth(self, state: BodyState, drawn: tuple[int, ...]) -> NDArray:
-        """(h, w) [m] depth of some segments in the view, inf where none is; fingers are folded where that is better."""
-        view, part = self.view, self._parts(drawn)
+        """(h, w) [m] rendered depth of some segments, inf elsewhere; fingers are folded where that is better."""
+        view, part = self.view, self._mesh_of(drawn)
         frames, _ = self.body.tree.forward(state.T_world_root, state.angles)
         x = BodyMesh(part.vertices, part.faces, part.owner, np.zeros(0, np.int32)).posed(frames)
         x = x @ view.T_view_world[:3, :3].T + view.T_view_world[:3, 3]
@@ -157,43 +157,43 @@ class Score:
         hands = np.zeros((1 + part.fingers.max(initial=0), 2))
         if len(hands) > 1:
             hand = np.append(part.fingers, 0)[shown.face]
-            kernels.of_hands(shown.depth, hand, view.observed, view.behind, view.trust, TOLERANCE, hands)
+            kernels.of_hands(shown.depth, hand, view.observed, view.behind, view.trust, MAX_DEPTH_ERROR, hands)
             folded = (hands[:, 0] <= hands[:, 1]) & (np.arange(len(hands)) > 0)
             if folded.any():
                 shown = rasterise(x, part.faces[~folded[part.fingers]], view.lens, (width, height))
         return shown.depth
 
     def of(self, state: BodyState) -> float:
-        """Score of one state."""
+        """Score of one state, a number of at most 1; see `__call__`."""
         return float(self(state.T_world_root[None], state.angles[None])[0])
 
     def missing(self, state: BodyState) -> float:
-        """Share of the person in pieces of a limb's size that nothing of the body is drawn at, nor near it."""
+        """Share (0 to 1) of the person's pixels in unexplained pieces, see `unexplained`."""
         return sum(map(len, self.unexplained(state))) / self.pixels
 
     def unexplained(self, state: BodyState) -> list[NDArray]:
-        """Pieces (N, 3) [m] of the person that nothing of the body is drawn at, nor near it.
+        """Connected pieces (N, 3) [m] of the measured person that the rendered body does not explain.
 
-        What is longer than half of the person is a floor, a wall, furniture.
+        Pieces longer than half of the stature are excluded: floor, wall, furniture.
         """
         view, longest = self.view, 0.5 * self.body.stature
-        drawn = self.depth(state, tuple(range(len(self.body.tree.segments))))
-        far = view.seen & ~(np.abs(drawn - view.observed) < TOLERANCE)
-        around, nothing = np.ones((3, 3), np.uint8), np.float32(1e3)
-        nearest = cv2.erode(np.where(view.seen, view.observed, nothing), around)
-        whole = cv2.dilate(view.observed, around) - nearest < TOLERANCE  # no step in depth parts it
-        thick = cv2.morphologyEx((far & whole).astype(np.uint8), cv2.MORPH_OPEN, around)  # no sliver along an outline
+        rendered = self.depth(state, tuple(range(len(self.body.tree.segments))))
+        unmatched = view.seen & ~(np.abs(rendered - view.observed) < MAX_DEPTH_ERROR)
+        kernel, nothing = np.ones((3, 3), np.uint8), np.float32(1e3)
+        nearest = cv2.erode(np.where(view.seen, view.observed, nothing), kernel)
+        whole = cv2.dilate(view.observed, kernel) - nearest < MAX_DEPTH_ERROR  # no depth step nearby
+        thick = cv2.morphologyEx((unmatched & whole).astype(np.uint8), cv2.MORPH_OPEN, kernel)  # without slivers
         count, piece = cv2.connectedComponents(thick)
         pieces = [view.points[piece == k] for k in range(1, count)]
         return [x for x in pieces if np.linalg.norm(np.ptp(x, axis=0)) < longest]
 
     def visible(self, state: BodyState) -> NDArray:
-        """(S,) share of each segment's own outline that the sensor could see: within its image, behind nothing."""
+        """(S,) share (0 to 1) of each segment's rendered area that the sensor could see: in its image, not occluded."""
         tree, view, mesh = self.body.tree, self.view, self.mesh
         frames, _ = tree.forward(state.T_world_root, state.angles)
         x = mesh.posed(frames) @ view.T_view_world[:3, :3].T + view.T_view_world[:3, 3]
         h, w = view.observed.shape
-        canvas = Canvas((3 * w, 3 * h))  # the view in the middle: how much lies beside it counts too
+        canvas = Canvas((3 * w, 3 * h))  # with the view in the middle: parts outside count as invisible
         lens = view.lens + (0, 0, w, h)
         raster = canvas.draw(x, mesh.faces, lens)
         middle = (slice(h, 2 * h), slice(w, 2 * w))
@@ -201,5 +201,5 @@ class Score:
         shown = (raster.face[middle] >= 0) & (view.trust > 0) & (raster.depth[middle] < nearer)
         count = np.bincount(mesh.face_segment[raster.face[middle][shown]], minlength=len(tree.segments))
         faces = [mesh.faces[mesh.face_segment == s] for s in range(len(tree.segments))]
-        own = [np.sum(canvas.draw(x, f, lens).face >= 0) for f in faces]
-        return count / np.maximum(own, 1.0)
+        areas = [np.sum(canvas.draw(x, f, lens).face >= 0) for f in faces]
+        return count / np.maximum(areas, 1.0)

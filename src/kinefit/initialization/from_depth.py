@@ -1,8 +1,8 @@
-"""A start with no pose given, from one depth image: where is the trunk, who is which limb, how is it bent.
+"""Find an initial pose in one depth image, without a former pose.
 
-Geodesic ends of the person's surface (Plagemann et al., ICRA 2010; Baak et al., ICCV 2011) propose where hands and
-feet are, random poses within the joints' ranges propose the rest. What decides is one score, both ways: how much of
-the person is explained by the body drawn there, less what is drawn where the sensor saw past it.
+Geodesic ends of the person's surface (Plagemann et al., ICRA 2010; Baak et al., ICCV 2011) propose positions of hands
+and feet. Random poses within the joints' ranges propose the rest. Poses are compared by one score: the share of the
+person that the rendered body explains, minus rendered pixels where the sensor saw farther.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ from kinefit.sensors.surfaces.depth_view import DepthView, splat, view_of
 from kinefit.subject.depth import fit_surfaces
 from kinefit.subject.subject import SubjectFit
 
-_GAPS = (0.15, 0.075)  # [m] as `people` takes it: forearms towards the sensor are torn off by holes of 0.2 m; and half
-# of it, for those who stand by a table or a wall: people are then still closed, a pixel is some centimetres wide
-_SAME = 0.65  # overlap of two outlines of one person: an upper body without both arms keeps 0.7 (rule of nines)
-_FLAT = 0.015  # [m] deviation from a plane, of a wall; a person who faces the sensor, arms down, has 0.02 or more
-_GOOD = 0.7  # score of a pose that needs no second attempt: right ones of rendered bodies have 0.73 to 0.9
-_FAIR = 0.55  # score of a pose from which a size may be found, by a body of another size
-_MOST = 3  # largest things in view that are tried
-_FEWEST = 60  # measured points; a person 7.5 m from a camera of 160 x 124 pixels has several hundred
+_JOINING_GAPS = (0.15, 0.075)  # [m] for `people`: forearms towards the sensor are separated by holes of 0.2 m. Half of
+# it for people next to a table or a wall: a person is still connected, as a pixel is some centimetres wide
+_MIN_SAME_OVERLAP = 0.65  # of two masks of one person: an upper body without both arms keeps 0.7 (rule of nines)
+_MAX_WALL_DEVIATION = 0.015  # [m] from a plane; a person who faces the sensor, arms down, has 0.02 or more
+_MIN_GOOD_SCORE = 0.7  # needs no second attempt: right poses of rendered bodies have 0.73 to 0.9
+_MIN_SIZE_SCORE = 0.55  # of a pose for sizing, by a body of another size
+_MAX_BLOBS = 3  # largest objects in view that are tried
+_MIN_POINTS = 60  # a person 7.5 m from a camera of 160 x 124 pixels has several hundred
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A pose found with none given.
+    """A pose found without a former pose.
 
     Parameters
     ----------
-    state : BodyState
-    score : float, 1 at best
-        Share of the person that the body explains, less what contradicts it. 0.5 is common for a body of another
-        person's size, 0.8 for the right one.
+    state : of the body
+    score : at most 1
+        Share of the person that the body explains, minus what contradicts it. 0.5 is common for a body of another size,
+        0.8 for one of the right size.
     visible : (S,) in 0..1
-        Share of each segment that the sensor could see. One that is 0 (beside the image, behind another part) is
-        held by the prior posture alone.
+        Share of each segment that the sensor could see. At 0 (outside of the image, or occluded) the prior posture
+        alone determines it.
     """
 
     state: BodyState
@@ -67,32 +67,32 @@ def start_from_points(
     seed: int = 0,
     forward: ArrayLike | None = None,
 ) -> list[Start]:
-    """Poses of a body in one depth image or cloud, the best first.
+    """Find poses of a body in one depth image or point cloud, the best first.
 
     Parameters
     ----------
-    body : Body with surfaces; of about the person's size (see `fit_surfaces`).
+    body : Body with surfaces, of about the person's size (see `fit_surfaces`)
     points : (N, 3) [m] in the world, or None
-        Points on the person and nothing else. None: the person is sought in `depth`, and where several are in view
-        the one that the body explains best is taken.
+        Points on the person only. None: the person is searched in `depth`; of several, the one that the body explains
+        best.
     camera : Camera of the sensor
     depth : (H, W) [m], optional
-        Its image, 0 where nothing was measured. It shows what is empty.
+        Its depth image, 0 where nothing was measured; it shows empty space.
     background : (H, W) [m], optional
-        What it sees of the empty scene, 0 where that is not known: the person is sought in what is new.
+        Depth of the empty scene, 0 where unknown: the person is searched in the foreground only.
     up : (3,) upwards, in the world
-    count : int, poses at most
+    count : most poses
     attempts : int
-        How often all is tried at most, until a good pose is found: about 1.1 s of one core each.
-    seed : int of the random tries; the same gives the same poses.
-    forward : (3,) where the root faced a moment ago, optional; a person seldom turns about in a second.
+        Most attempts until a good pose is found: about 1.1 s of one core each.
+    seed : of the random search; the same seed gives the same poses
+    forward : (3,) heading of the root a moment ago; people rarely turn around within a second. Default: unknown
 
     Raises
     ------
     ObservationError
-        No points, an image of another size, or neither points nor an image.
+        There are no points, the image has another size, or there is neither.
     TrackingError
-        Nothing in view is of a person's size.
+        Nothing in view has a person's size.
     BodyError
         The body has no surfaces.
     """
@@ -108,22 +108,22 @@ def starts_by_attempt(
     background: NDArray | None = None, up: ArrayLike = (0.0, 1.0, 0.0), count: int = 5, attempts: int = 2,
     seed: int = 0, forward: ArrayLike | None = None,
 ) -> Iterator[list[Start]]:  # fmt: skip
-    """The best poses after each attempt, until one is good; arguments as of `start_from_points`."""
+    """Yield the best poses after each attempt, until one is good; parameters and errors as in `start_from_points`."""
     found: list[tuple[PostureSearch, BodyState]] = []
     views: list[DepthView] = []
-    more = _views(body, points, camera, depth, up, background)
+    view_batches = _views(body, points, camera, depth, up, background)
     for attempt in range(max(attempts, 1)):
-        views += next(more, [])
+        views += next(view_batches, [])
         searches = _searches(body, views, up, seed + attempt, forward)
         found += [(search, state) for search in searches for state in search.best(count)]
-        found.sort(key=lambda f: -_meant(*f))
+        found.sort(key=lambda f: -_person_score(*f))
         yield [Start(state, search.value(state), search.score.visible(state)) for search, state in found[:count]]
-        if _meant(*found[0]) > _GOOD:
+        if _person_score(*found[0]) > _MIN_GOOD_SCORE:
             return
 
 
-def _meant(search: PostureSearch, state: BodyState) -> float:
-    """Score of a person among several: one of whom little is seen (less than head and shoulders) counts for less."""
+def _person_score(search: PostureSearch, state: BodyState) -> float:
+    """Score for choosing among several people: lower if less than head and shoulders is visible."""
     area = float(np.sum((search.view.observed / search.view.lens[0]) ** 2))
     return search.value(state) * min(area / (0.1 * max(search.body.stature, 0.1) ** 2), 1.0)
 
@@ -138,16 +138,15 @@ def sized_start(
     rounds: int = 2,
     seed: int = 0,
 ) -> tuple[SubjectFit, list[Start]]:
-    """The person's own size, and a pose in each of a few depth images: poses, sizes, better poses, better sizes.
+    """Fit a person's size, and a pose in each of a few depth images, by alternating poses and sizes.
 
-    With a body of another size limbs lie on the trunk's border; once the trunk is as wide as the person's they are
-    free to be found.
+    With a body of another size, limbs seem to lie on the trunk's border until the trunk has the right width.
 
     Parameters
     ----------
-    depths : K x (H, W) [m]; three to five, the more different the postures the better.
+    depths : K images (H, W) [m], three to five with different postures
     camera, background, up, seed : see `start_from_points`
-    rounds : int
+    rounds : number of alternations
 
     Raises
     ------
@@ -157,21 +156,21 @@ def sized_start(
     found: list[tuple[DepthView, BodyState]] = []
     scores: list[float] = []
     for depth in depths:
-        tried: list[tuple[PostureSearch, BodyState]] = []
+        candidates: list[tuple[PostureSearch, BodyState]] = []
         for views in _views(body, None, camera, depth, up, background):
-            tried += [(s, s.best(1)[0]) for s in _searches(body, views, up, seed)]
-            if max(_meant(*t) for t in tried) > _FAIR:
+            candidates += [(s, s.best(1)[0]) for s in _searches(body, views, up, seed)]
+            if max(_person_score(*t) for t in candidates) > _MIN_SIZE_SCORE:
                 break
-        search, state = max(tried, key=lambda t: _meant(*t))
+        search, state = max(candidates, key=lambda t: _person_score(*t))
         found.append((search.view, state))
         scores.append(search.value(state))
-    used = [k for k, score in enumerate(scores) if score > min(_FAIR, max(scores) - 1e-9)]  # wrong poses tell no size
+    used = [k for k, score in enumerate(scores) if score > min(_MIN_SIZE_SCORE, max(scores) - 1e-9)]
     views = [view for view, _ in found]
     states = [state for _, state in found]
     mean: NDArray | None = None
     for _ in range(rounds):
-        some = [views[k] for k in used]
-        fit = fit_surfaces(body, [v.cloud for v in some], [states[k] for k in used], views=some, start=mean)
+        used_views = [views[k] for k in used]
+        fit = fit_surfaces(body, [v.cloud for v in used_views], [states[k] for k in used], views=used_views, start=mean)
         for k, state in zip(used, fit.states):
             states[k] = state
         mean, searches = fit.mean, [PostureSearch(fit.body, v, _unit(up), np.random.default_rng(seed)) for v in views]
@@ -190,15 +189,15 @@ def _unit(up: ArrayLike) -> NDArray:
 def _searches(
     body: Body, views: Sequence[DepthView], up: ArrayLike, seed: int, forward: ArrayLike | None = None
 ) -> list[PostureSearch]:
-    ahead = None if forward is None else np.asarray(forward, float)
-    return [PostureSearch(body, view, _unit(up), np.random.default_rng(seed), ahead) for view in views]
+    heading = None if forward is None else np.asarray(forward, float)
+    return [PostureSearch(body, view, _unit(up), np.random.default_rng(seed), heading) for view in views]
 
 
 def _views(
     body: Body, points: ArrayLike | None, camera: Camera, depth: NDArray | None, up: ArrayLike,
     background: NDArray | None,
 ) -> Iterator[list[DepthView]]:  # fmt: skip
-    """Views of the persons that may be meant; then of parts of them, where those may be a person by a table."""
+    """Yield views of the candidate people; then of parts of them, for a person next to a table."""
     direction = _unit(up)
     if not body.surfaces:
         raise BodyError(f"body '{body.name}' has no surfaces", remedy="Depth needs some; see the catalogue's bodies.")
@@ -211,12 +210,12 @@ def _views(
     if points is None:
         if depth is None:
             raise ObservationError("neither points nor a depth image", remedy="Give one of them.")
-        smooth, none = denoised(depth, camera), True
-        new = None if background is None else foreground(smooth, background)
-        for blobs in _blobs(smooth, camera, direction, new):
+        smooth, is_empty = denoised(depth, camera), True
+        new_mask = None if background is None else foreground(smooth, background)
+        for blobs in _blobs(smooth, camera, direction, new_mask):
             yield [view_of(smooth, blob.mask, camera) for blob in blobs]
-            none = False
-        if none:
+            is_empty = False
+        if is_empty:
             raise TrackingError(
                 "nothing in the depth image is of a person's size", remedy=_scale_remedy(depth[depth > 0], body)
             )
@@ -224,7 +223,7 @@ def _views(
     cloud = np.asarray(points, float).reshape(-1, 3)
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     coarse, small = splat(cloud, camera)
-    if np.sum(coarse > 0) < min(_FEWEST, len(cloud)) or len(cloud) < _FEWEST:
+    if np.sum(coarse > 0) < min(_MIN_POINTS, len(cloud)) or len(cloud) < _MIN_POINTS:
         remedy = "Check the unit (metres), the camera's pose and the range gate."
         raise ObservationError(f"only {len(cloud)} points, {np.sum(coarse > 0)} in the camera's image", remedy=remedy)
     if np.ptp(cloud, axis=0).max() > 3.0 * max(body.stature, 1.0):
@@ -242,24 +241,25 @@ def _views(
 
 
 def _blobs(depth: NDArray, camera: Camera, up: NDArray, mask: NDArray | None) -> Iterator[list[DepthBlob]]:
-    """Things of a person's size, the likeliest first; then those that are only things if less is joined to them."""
+    """Yield objects of a person's size, the most likely first; then those found with a smaller joining gap."""
     floor = find_floor(to_points(depth, camera, step=max(camera.size[0] // 160, 1)), up)
     known: list[DepthBlob] = []
-    for gap in _GAPS:
-        new = [b for b in people(depth, camera, mask=mask, floor=floor, gap=gap) if not any(_same(b, k) for k in known)]
-        new.sort(key=lambda b: _flat(to_points(depth, camera, mask=b.mask)))
+    for gap in _JOINING_GAPS:
+        blobs = people(depth, camera, mask=mask, floor=floor, gap=gap)
+        new = [blob for blob in blobs if not any(_is_same_blob(blob, k) for k in known)]
+        new.sort(key=lambda b: _is_flat(to_points(depth, camera, mask=b.mask)))
         known += new
         if new:
-            yield new[:_MOST]
+            yield new[:_MAX_BLOBS]
 
 
-def _same(a: DepthBlob, b: DepthBlob) -> bool:
-    return bool(np.sum(a.mask & b.mask) > _SAME * np.sum(a.mask | b.mask))
+def _is_same_blob(a: DepthBlob, b: DepthBlob) -> bool:
+    return bool(np.sum(a.mask & b.mask) > _MIN_SAME_OVERLAP * np.sum(a.mask | b.mask))
 
 
-def _flat(x: NDArray) -> bool:
-    """Whether points (N, 3) [m] lie in a plane, as of a wall."""
-    return bool(np.linalg.eigvalsh(np.cov(x.T))[0] < _FLAT**2)
+def _is_flat(x: NDArray) -> bool:
+    """Whether points (N, 3) [m] lie in a plane, like a wall."""
+    return bool(np.linalg.eigvalsh(np.cov(x.T))[0] < _MAX_WALL_DEVIATION**2)
 
 
 def _resized(coarse: NDArray, shape: tuple[int, ...]) -> NDArray:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import TakeError, TrackingError
 from kinefit.geometry.camera import Rig
-from kinefit.multiview.association import choose_people, meetings_of, surety_of
+from kinefit.multiview.association import choose_people, confidences, meeting_points
 from kinefit.observations import KeypointFrame, Keypoints, LiftedFrame
 from kinefit.observations.person import PersonChoice
 from kinefit.sensors.channels import known_points
@@ -56,7 +56,7 @@ class LivePerson:
         body : Body
         state : its last pose, None before a start
         """
-        seen = [k for k in records if surety_of(k, 1).any()]
+        seen = [k for k in records if confidences(k, 1).any()]
         chosen = [-1] * len(seen)
         if state is not None:
             sets = {k.keypoint_set: known_points(body, k.keypoint_set) for k in seen}
@@ -95,7 +95,7 @@ class LivePerson:
 
     def _nearest(self, records: Sequence[Keypoints], place: NDArray) -> list[int]:
         """Of each record the one who is in the group of two whose middle is nearest to a place."""
-        meetings = meetings_of(self.rig, records, [surety_of(k, 1) for k in records], 1)
+        meetings = meeting_points(self.rig, records, [confidences(k, 1) for k in records], 1)
         apart = {pair: float(np.linalg.norm(x[0] - place)) for pair, x in meetings.items() if np.isfinite(x[0, 0])}
         out = [-1] * len(records)
         for pair in sorted(apart, key=lambda one: apart[one]):

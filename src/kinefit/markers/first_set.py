@@ -1,4 +1,4 @@
-"""A first marker set for labels that no set of the catalogue knows: who is left of whom, rigid groups, places."""
+"""Propose a marker set for labels unknown to the catalogue: left and right pairs, segments, places."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from kinefit.bodies.marker_sets.files import LANDMARK_SPREAD, MarkerRecord, SetR
 from kinefit.bodies.marker_sets.labels import bare, plain
 from kinefit.bodies.marker_sets.placement import placed
 from kinefit.errors import KinefitError
-from kinefit.identification.model.learn import learn_model, usable
+from kinefit.identification.model.learn import learn_model, usable_markers
 from kinefit.markers.fit import fit_markers
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.observations import Markers
@@ -23,29 +23,30 @@ from kinefit.observations import Markers
 PREFIXES = (("Right", "Left"), ("right", "left"), ("R", "L"), ("r", "l"), ("r", "L"), ("R", "l"))
 SUFFIXES = (("_R", "_L"), ("_r", "_l"), (".R", ".L"), (".r", ".l"), ("_Right", "_Left"), ("R", "L"))
 
-FIRM = 2 * LANDMARK_SPREAD
-"""[m] spread of a marker's place up to which a known word places a label: those on wands and clusters say little."""
+MAX_SPREAD = 2 * LANDMARK_SPREAD
+"""[m] largest spread of a marker whose word places a label: words of wands and clusters do not."""
 
-ENOUGH, PARTS = 8, 3
-"""Labels with a known word, and segments that they are on, from which a body is fitted to them."""
+MIN_KNOWN_LABELS = 8
+MIN_SEGMENTS = 3
+"""Labels with a known word, and their segments, that a body can be fitted to."""
 
-NEARER = 0.03
-"""By which a marker's way to a segment's bone counts, as a spread would: what was held still goes to the nearest."""
+BONE_DISTANCE_WEIGHT = 0.03
+"""Weight of a marker's distance from the bone against its spread: without motion the nearest segment is chosen."""
 
-SHARED, AROUND = 0.010, 0.12
-"""[m] a marker that strays less than the first from a neighbouring segment, and is nearer than the second to their
-joint, is both segments'."""
+MAX_SHARED_SIGMA = 0.010
+MAX_JOINT_DISTANCE = 0.12
+"""[m] a marker with less spread on a neighbouring segment, and nearer to their joint, belongs to both segments."""
 
 
 @dataclass(frozen=True)
 class FirstSet:
-    """A marker set to begin with.
+    """A proposed marker set.
 
     Parameters
     ----------
-    text : of its TOML file
-    segments : name -> labels
-    placed : labels whose place on the humanoid a fit told; none where too few labels have a known word
+    text : TOML text of its file
+    segments : labels by name of segment
+    placed : labels whose place on the humanoid was fitted; none if too few labels have a known word
     paired : (right, left) labels
     """
 
@@ -57,11 +58,11 @@ class FirstSet:
 
 @checked
 def first_set(markers: Markers, *, body: Body, name: str = "MY_SET") -> FirstSet:
-    """A marker set of a labelled take in which joints move, to be looked through and put right.
+    """Propose a marker set for a labelled take in which joints move, for the user to correct.
 
-    Labels whose words the catalogue knows ("R.Knee", "knee_R") lie on its landmarks; the body is fitted to them, and
-    every label goes to the segment that it moves with, the left with the right. Where too few are known, groups and
-    joints are those that motion alone tells, without places.
+    Labels with words of the catalogue ("R.Knee", "knee_R") lie on its landmarks. The body is fitted to them, and every
+    label is assigned to the segment that it moves with, symmetrically. If too few are known, segments and joints are
+    learnt from motion alone, without places.
 
     Parameters
     ----------
@@ -71,13 +72,13 @@ def first_set(markers: Markers, *, body: Body, name: str = "MY_SET") -> FirstSet
     Raises
     ------
     ObservationError
-        Too few markers are seen.
+        Too few markers are visible.
     """
-    _, labels, _ = usable(markers, None)
+    _, labels, _ = usable_markers(markers, None)
     labels = [bare(label) for label in labels]
     pairs = sides(labels)
     words = known_words(labels, pairs)
-    found = _by_fit(markers, labels, pairs, words, body)
+    found = _fit_segments(markers, labels, pairs, words, body)
     if found is None:
         model = learn_model(markers, template="")
         parents = {j.child: model.names[j.parent] for j in model.joints}
@@ -89,7 +90,7 @@ def first_set(markers: Markers, *, body: Body, name: str = "MY_SET") -> FirstSet
 
 
 def sides(labels: Sequence[str]) -> dict[str, str]:
-    """Right labels with the left ones that differ from them by the side alone."""
+    """Pairs of right and left labels that differ by their side only: a dictionary from right to left."""
     known, out = set(labels), dict[str, str]()
     for label in labels:
         for right, left in PREFIXES:
@@ -104,13 +105,13 @@ def sides(labels: Sequence[str]) -> dict[str, str]:
 
 
 def known_words(labels: Sequence[str], pairs: dict[str, str]) -> dict[str, tuple[MarkerRecord, bool]]:
-    """Labels whose word a set of the catalogue has on a landmark: its row, and whether that is to be mirrored."""
+    """Labels whose word a set of the catalogue places on a landmark: the set's row, and whether to mirror it."""
     middle, sided = dict[str, MarkerRecord](), dict[str, MarkerRecord]()
     for record in catalogue().values():
         for label, entry in record.markers.items():
             right = [r for r, _ in record.sides if record.mirror(label) and label.startswith(r)]
             word = label[len(right[0]) :] if right else None
-            if entry.spread <= FIRM:
+            if entry.spread <= MAX_SPREAD:
                 (middle if word is None else sided).setdefault(plain(label if word is None else word), entry)
     out = dict[str, tuple[MarkerRecord, bool]]()
     left = {v: k for k, v in pairs.items()}
@@ -119,82 +120,82 @@ def known_words(labels: Sequence[str], pairs: dict[str, str]) -> dict[str, tuple
             if plain(label) in middle:
                 out[label] = middle[plain(label)], False
             continue
-        word = plain(_word(left.get(label, label), pairs))
+        word = plain(_common_word(left.get(label, label), pairs))
         if word in sided:
             out[label] = sided[word], label in left
     return out
 
 
-def _word(label: str, pairs: dict[str, str]) -> str:
-    """What a right label and its left one have in common."""
-    other = pairs[label]
-    same = next((i for i in range(min(len(label), len(other))) if label[::-1][i] != other[::-1][i]), 0)
-    start = next((i for i in range(min(len(label), len(other))) if label[i] != other[i]), 0)
+def _common_word(label: str, pairs: dict[str, str]) -> str:
+    """The common part of a right label and its left one."""
+    left = pairs[label]
+    common_tail = next((i for i in range(min(len(label), len(left))) if label[::-1][i] != left[::-1][i]), 0)
+    start = next((i for i in range(min(len(label), len(left))) if label[i] != left[i]), 0)
     if start:
         return label[:start]
-    tail = label[len(label) - same :]
+    tail = label[len(label) - common_tail :]
     return tail[1:] if plain(tail) in ("ight", "eft") else tail
 
 
 Link = tuple[str | None, NDArray | None]
-"""A segment's parent and the joint with it (3,) [m]; none for the root, or where it is not known."""
+"""A segment's parent and their joint (3,) [m]; None for the root or if unknown."""
 
-Found = tuple[dict[str, tuple[str, ...]], dict[str, Link], dict[str, NDArray], dict[str, tuple[str, NDArray]]]
+FittedSegments = tuple[dict[str, tuple[str, ...]], dict[str, Link], dict[str, NDArray], dict[str, tuple[str, NDArray]]]
 
 
-def _by_fit(
+def _fit_segments(
     markers: Markers, labels: list[str], pairs: dict[str, str], words: dict[str, tuple[MarkerRecord, bool]], body: Body
-) -> Found | None:
-    """Segments, their parents and joints, places at rest, places on segments; None where no body can be fitted."""
+) -> FittedSegments | None:
+    """Segments, links, places in the rest pose, places on segments [m]; None if no body can be fitted."""
     rows = {label: replace_side(entry, mirrored) for label, (entry, mirrored) in words.items()}
     points = placed(body, SetRecord(name="words", markers=rows)).points
-    if len(points) < ENOUGH or len(set(points.segments.tolist())) < PARTS:
+    if len(points) < MIN_KNOWN_LABELS or len(set(points.segments.tolist())) < MIN_SEGMENTS:
         return None
-    plainly = replace(markers, names=tuple(bare(n) for n in markers.names))
+    bare_markers = replace(markers, names=tuple(bare(n) for n in markers.names))
     try:
-        subject = fit_marker_subject(replace(body, marker_sets={"words": points}), plainly, "words")
-        motion = fit_markers(subject.body, plainly, "words", sigma=subject.sigma)
+        subject = fit_marker_subject(replace(body, marker_sets={"words": points}), bare_markers, "words")
+        motion = fit_markers(subject.body, bare_markers, "words", sigma=subject.sigma)
     except KinefitError:
         return None
     poses = motion.segment_poses()
     scale = subject.scales[body.segment_scale]
     tree = body.tree
-    usual = {image for r in catalogue().values() for s in r.segment for image in (s.name, f"{s.name[:-2]}_l")}
-    candidates = np.array([s for s, n in enumerate(tree.segments) if n in usual])
+    catalogue_names = {image for r in catalogue().values() for s in r.segment for image in (s.name, f"{s.name[:-2]}_l")}
+    candidates = np.array([s for s, n in enumerate(tree.segments) if n in catalogue_names])
     ends = {s: [tree.rest[c] - tree.rest[s] for c in np.flatnonzero(tree.parents == s)] for s in candidates.tolist()}
-    at, cost, stray, poses = {}, {}, {}, poses[:, candidates]
+    at, cost, sigma, poses = {}, {}, {}, poses[:, candidates]
     for label in labels:
-        x = plainly.positions[:, plainly.names.index(label)]
-        own = np.einsum("fsji,fsj->fsi", poses[..., :3, :3], x[:, None] - poses[..., :3, 3])
-        middle = np.nanmedian(own, axis=0)
-        stray[label] = np.sqrt(np.nanmedian(((own - middle) ** 2).sum(-1), axis=0) / 3)
+        x = bare_markers.positions[:, bare_markers.names.index(label)]
+        local = np.einsum("fsji,fsj->fsi", poses[..., :3, :3], x[:, None] - poses[..., :3, 3])
+        middle = np.nanmedian(local, axis=0)
+        sigma[label] = np.sqrt(np.nanmedian(((local - middle) ** 2).sum(-1), axis=0) / 3)
         at[label] = middle / scale[candidates, None]
-        bone = [_off(at[label][i], ends[s]) for i, s in enumerate(candidates.tolist())]
-        cost[label] = stray[label] + NEARER * np.array(bone)
-    mirror = np.array([_mirrored(tree.segments, candidates, s) for s in candidates.tolist()])
-    home = {label: int(np.argmin(cost[label])) for label in labels}
+        bone = [_bone_distance(at[label][i], ends[s]) for i, s in enumerate(candidates.tolist())]
+        cost[label] = sigma[label] + BONE_DISTANCE_WEIGHT * np.array(bone)
+    mirror = np.array([_mirror_index(tree.segments, candidates, s) for s in candidates.tolist()])
+    home_of = {label: int(np.argmin(cost[label])) for label in labels}
     for right, left in pairs.items():
         if right in cost and left in cost:
-            home[right] = int(np.argmin(cost[right] + cost[left][mirror]))
-            home[left] = int(mirror[home[right]])
-    members = {i: [label for label in labels if home[label] == i] for i in sorted(set(home.values()))}
-    tied = _tied(members, candidates, tree.parents)
+            home_of[right] = int(np.argmin(cost[right] + cost[left][mirror]))
+            home_of[left] = int(mirror[home_of[right]])
+    members = {i: [label for label in labels if home_of[label] == i] for i in sorted(set(home_of.values()))}
+    tied = _link_groups(members, candidates, tree.parents)
     joints = {c: tree.rest[candidates[max(c, p)]] for c, p in tied.items() if p is not None}
     for c, p in tied.items():
         for a, b in ((c, p), (p, c)) if p is not None else ():
-            for label in [k for k in labels if home[k] == a]:
-                near = np.linalg.norm(at[label][a] + tree.rest[candidates[a]] - joints[c]) < AROUND
-                if near and b is not None and stray[label][b] < SHARED:
+            for label in [k for k in labels if home_of[k] == a]:
+                near = np.linalg.norm(at[label][a] + tree.rest[candidates[a]] - joints[c]) < MAX_JOINT_DISTANCE
+                if near and b is not None and sigma[label][b] < MAX_SHARED_SIGMA:
                     members[b].append(label)
     name = {i: tree.segments[candidates[i]] for i in members}
     segments = {name[i]: tuple(members[i]) for i in tied}
     linked: dict[str, Link] = {name[i]: (None if p is None else name[p], joints.get(i)) for i, p in tied.items()}
-    places = {label: at[label][home[label]] + tree.rest[candidates[home[label]]] for label in labels}
-    return segments, linked, places, {label: (name[home[label]], at[label][home[label]]) for label in labels}
+    places = {label: at[label][home_of[label]] + tree.rest[candidates[home_of[label]]] for label in labels}
+    return segments, linked, places, {label: (name[home_of[label]], at[label][home_of[label]]) for label in labels}
 
 
 def replace_side(entry: MarkerRecord, mirrored: bool) -> MarkerRecord:
-    """A row of a set, or that of the other side."""
+    """A row of a marker set, mirrored to the other side if `mirrored`."""
     if not mirrored:
         return entry
     landmark, segment = entry.landmark, entry.segment
@@ -207,8 +208,8 @@ def replace_side(entry: MarkerRecord, mirrored: bool) -> MarkerRecord:
     return MarkerRecord(landmark=landmark, segment=segment, at=at, offset=(x, y, -z), spread=entry.spread)
 
 
-def _off(at: NDArray, ends: list[NDArray]) -> float:
-    """[m] from a point to the bones of a segment, from its origin to its ends."""
+def _bone_distance(at: NDArray, ends: list[NDArray]) -> float:
+    """[m] distance of a point from a segment's bones, the lines from its origin to `ends`."""
     out = [float(np.linalg.norm(at))]
     for end in ends:
         along = float(np.clip(at @ end / max(end @ end, 1e-9), 0.0, 1.0))
@@ -216,33 +217,33 @@ def _off(at: NDArray, ends: list[NDArray]) -> float:
     return min(out)
 
 
-def _mirrored(names: Sequence[str], candidates: NDArray, s: int) -> int:
-    """Place among the candidates of the segment of the other side."""
+def _mirror_index(names: Sequence[str], candidates: NDArray, s: int) -> int:
+    """Index among the candidates of the segment on the other side."""
     name = names[s]
     other = f"{name[:-2]}_l" if name.endswith("_r") else f"{name[:-2]}_r" if name.endswith("_l") else name
     return [names[c] for c in candidates].index(other)
 
 
-def _tied(members: dict[int, list[str]], candidates: NDArray, parents: NDArray) -> dict[int, int | None]:
-    """Each group's parent, parents first: the nearest group above it in the body; the root has three markers."""
+def _link_groups(members: dict[int, list[str]], candidates: NDArray, parents: NDArray) -> dict[int, int | None]:
+    """Each group's parent, parents first: its nearest ancestor with markers; the root has three markers."""
     place = {int(candidates[i]): i for i in members}
     links: dict[int, set[int]] = {i: set() for i in members}
     for i in members:
         s = int(parents[candidates[i]])
         while s >= 0 and s not in place:
             s = int(parents[s])
-        above = place[s] if s >= 0 else min(members)
-        if above != i:
-            links[i].add(above)
-            links[above].add(i)
+        ancestor = place[s] if s >= 0 else min(members)
+        if ancestor != i:
+            links[i].add(ancestor)
+            links[ancestor].add(i)
     root = next((i for i in members if len(members[i]) >= 3), min(members))
     out: dict[int, int | None] = {root: None}
-    todo = [root]
-    while todo:
-        i = todo.pop(0)
+    queue = [root]
+    while queue:
+        i = queue.pop(0)
         for k in sorted(links[i] - set(out)):
             out[k] = i
-            todo.append(k)
+            queue.append(k)
     return out
 
 
@@ -250,7 +251,7 @@ def _toml(
     name: str, segments: dict[str, tuple[str, ...]], links: dict[str, Link],
     places: dict[str, NDArray], at: dict[str, tuple[str, NDArray]],
 ) -> str:  # fmt: skip
-    """The file."""
+    """The TOML text of the set."""
     def row(values: NDArray) -> str:
         return "[" + ", ".join(f"{v + 0.0:.3f}" for v in values) + "]"
 
@@ -263,7 +264,7 @@ def _toml(
         lines += ["[places]", *(f"{json.dumps(k)} = {row(v)}" for k, v in places.items()), "", "[markers]"]
         for label, (segment, x) in at.items():
             lines.append(
-                f"{json.dumps(label)} = {{ segment = {json.dumps(segment)}, at = {row(x)}, spread = {FIRM:g} }}"
+                f"{json.dumps(label)} = {{ segment = {json.dumps(segment)}, at = {row(x)}, spread = {MAX_SPREAD:g} }}"
             )
         lines.append("")
     for segment, labels in segments.items():

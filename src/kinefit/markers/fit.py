@@ -1,4 +1,4 @@
-"""Labelled markers on a body of the subject's size: joint angles of every frame (its size: `marker_subject`)."""
+"""Fit a body of the subject's size to labelled markers: joint angles of every frame. For its size see `subject`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from kinefit.findings import runs_of
 from kinefit.frame.results import BLIND
 from kinefit.losses import Loss
 from kinefit.markers.poses import columns, sequence_both_ways
-from kinefit.markers.valleys import PointTake, profiled, settled_by_motion
+from kinefit.markers.valleys import PointTake, profile_frames, resolve_by_motion
 from kinefit.motion import UP_AXES, Motion, Residuals
 from kinefit.observations import Markers
 from kinefit.sensors.points.markers import of_points
@@ -26,12 +26,12 @@ from kinefit.smoothing.gaps import bridged
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.solvers.sequence import Certainty, fit_sequence
 
-_TOLD = 0.35  # [rad] an angle less sure than that is not observed by its frame, but by those before and after
-_HELD = 0.1  # [m] likewise for the root
-_MEMORY = 0.3  # [s] in which the velocity of a body that is not seen forgets itself
-_WORSE = 0.3  # standard deviations that a frame's markers may fit worse for following its neighbours
-_OFF = 4.0  # times the take's median misfit from which a frame is tried anew, from nowhere
-_MOST_RUNS = 50  # of such frames
+_MAX_ANGLE_STD = 0.35  # [rad] an angle with a larger sigma is interpolated from adjacent frames
+_MAX_ROOT_STD = 0.1  # [m] likewise for the root's position
+_VELOCITY_MEMORY_S = 0.3  # time constant of the velocity of an unobserved root
+_MAX_MISFIT_INCREASE = 0.3  # standard deviations by which interpolation may worsen a frame's fit
+_OUTLIER_MISFIT_RATIO = 4.0  # times the take's median misfit: such frames are fitted again without initial pose
+_MAX_REFIT_RUNS = 50  # runs of such frames
 
 
 @checked
@@ -45,127 +45,130 @@ def fit_markers(
     limits: bool = True,
     up: str | None = None,
 ) -> Motion:
-    """Motion of a body from labelled markers, each frame from the last, the first with no pose given.
+    """Fit a body's motion to labelled markers, frame by frame, without an initial pose.
 
-    What a frame does not show (a limb whose markers are hidden) follows from the frames before and after it, and what
-    no frame observes stays at the body's prior mean; error bars and quality say so.
+    Angles that a frame does not observe (a limb with occluded markers) are interpolated from adjacent frames. Angles
+    that no frame observes stay at the body's prior mean. Standard deviations and quality show both.
 
     Parameters
     ----------
-    body : Body, of the subject's size, its markers at their own places: from `fit_marker_subject`.
+    body : Body of the subject's size with its marker offsets, from `fit_marker_subject`
     markers : Markers
-        Labels that the set does not have are left out; prefix ("Anna:LASI"), case and marks do not count.
+        (F, N, 3) [m]. Labels outside of the set are excluded; prefix ("Anna:LASI"), case and punctuation are ignored.
     marker_set : str
-        Default: the set that shares most labels, of the body's own first.
-    sigma : scalar or (K,) for each marker of the set that is used [m], along each axis.
-    loss : Loss of a marker, so that a wrong label or a ghost does not pull.
-    up : vertical axis of the world; default: the file's where it says so, else the one along which the body stands.
+        Default: the set that shares most labels, the body's own sets first.
+    sigma : scalar or (K,) [m], standard deviation of each marker of the set along each axis
+    loss : Loss of a marker, robust to wrong labels and ghosts
+    limits : whether joint limits hold
+    up : vertical axis of the world; default: the file's, or else the axis along which the body stands
 
     Raises
     ------
     ObservationError
-        Fewer than four labels are known to the body.
+        The body knows fewer than four of the labels.
     TrackingError
         No frame shows enough markers to start from.
     """
-    whole = find_placement(body, markers.names, marker_set)
-    points = whole.points
+    placement = find_placement(body, markers.names, marker_set)
+    points = placement.points
     if np.ndim(sigma) and marker_set is not None and len(np.asarray(sigma)) != len(points):
-        own = body.marker_sets.get(str(marker_set), points)
-        sigma = np.asarray(sigma, float)[[own.index(n) for n in points.names]]
+        labels = body.marker_sets.get(str(marker_set), points)
+        sigma = np.asarray(sigma, float)[[labels.index(n) for n in points.names]]
     x = columns(markers, points.names)
     sigma = np.broadcast_to(np.asarray(sigma, float), len(points))
     data = _MarkerData(body, points, x, sigma, loss, limits)
-    roots, angles = _tried_anew(data, *data.poses(slice(None)))
-    roots, angles, sure, wide, flat = profiled(data, roots, angles, markers.rate)
-    roots, angles = settled_by_motion(data, roots, unwrap(body.tree, angles), flat, markers.rate)
-    roots, angles = _bridged(data, roots, angles, sure, markers.rate)
-    return _motion(data, roots, angles, wide, markers, up)
+    roots, angles = _refit_outliers(data, *data.poses(slice(None)))
+    roots, angles, certainty, widened, flat = profile_frames(data, roots, angles, markers.rate)
+    roots, angles = resolve_by_motion(data, roots, unwrap(body.tree, angles), flat, markers.rate)
+    roots, angles = _interpolate_unobserved(data, roots, angles, certainty, markers.rate)
+    return _motion(data, roots, angles, widened, markers, up)
+
 
 @dataclass(frozen=True, eq=False)
 class _MarkerData(PointTake):
-    """Markers on a body."""
+    """Markers measured on a body."""
 
     def poses(self, frames: slice) -> tuple[NDArray, NDArray]:
-        """Roots and angles of some frames, with no pose given."""
+        """Roots (F, 4, 4) and angles (F, D) [rad] of some frames, fitted without initial pose."""
         return sequence_both_ways(
             self.body, self.points, self.x[frames], self.sigma, loss=self.loss, limits=self.limits
         )  # fmt: skip
 
     def misfit(self, roots: NDArray, angles: NDArray, frames: slice = slice(None)) -> NDArray:
-        """Mean misfit of each of these frames' markers in standard deviations, none counting for more than ten."""
+        """(F,) mean misfit of the markers in each frame, in standard deviations, each clipped at ten."""
         off = np.linalg.norm(self.x[frames] - self.body.trajectories(roots, angles, self.points), axis=2) / self.sigma
         seen = np.isfinite(off)
         return np.where(seen, np.minimum(np.nan_to_num(off), 10.0), 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
 
 
-def _tried_anew(data: _MarkerData, roots: NDArray, angles: NDArray) -> tuple[NDArray, NDArray]:
-    """Frames that fit far worse than the others, fitted from nowhere where that does better."""
+def _refit_outliers(data: _MarkerData, roots: NDArray, angles: NDArray) -> tuple[NDArray, NDArray]:
+    """Fit frames with an outlying misfit again without initial pose; keep the better fit."""
     roots, angles = roots.copy(), angles.copy()
     misfit = data.misfit(roots, angles)
-    bad = misfit > max(_OFF * float(np.median(misfit)), 3.0)
-    for a, b in sorted(runs_of(bad), key=lambda run: run[0] - run[1])[:_MOST_RUNS]:
-        some = slice(a, b)
+    is_outlier = misfit > max(_OUTLIER_MISFIT_RATIO * float(np.median(misfit)), 3.0)
+    for a, b in sorted(runs_of(is_outlier), key=lambda run: run[0] - run[1])[:_MAX_REFIT_RUNS]:
+        frames = slice(a, b)
         try:
-            other_roots, other_angles = data.poses(some)
+            other_roots, other_angles = data.poses(frames)
         except TrackingError:
             continue
-        better = data.misfit(other_roots, other_angles, some) < 0.9 * misfit[some]
-        roots[some][better], angles[some][better] = other_roots[better], other_angles[better]
+        better = data.misfit(other_roots, other_angles, frames) < 0.9 * misfit[frames]
+        roots[frames][better], angles[frames][better] = other_roots[better], other_angles[better]
     return roots, angles
 
 
-def _bridged(
-    data: _MarkerData, roots: NDArray, angles: NDArray, sure: Certainty, rate: float
+def _interpolate_unobserved(
+    data: _MarkerData, roots: NDArray, angles: NDArray, certainty: Certainty, rate: float
 ) -> tuple[NDArray, NDArray]:
-    """Poses whose untold angles follow from the frames around them; the others stay as measured."""
+    """Interpolate unobserved angles and roots from adjacent frames; observed ones stay."""
     tree, x = data.body.tree, data.x
-    lost = ~((sure.dof_std[:, :3].max(axis=1) < _HELD) & (sure.dof_std[:, 3:6].max(axis=1) < _TOLD))
-    enough = np.minimum(np.where(tree.prismatic, _HELD, _TOLD), BLIND * tree.spread)
-    told = (sure.dof_std[:, 6:] < enough) & ~lost[:, None]
-    some = told.any(axis=0)
-    if lost.all() or (told[:, some].all() and not lost.any()):
+    std = certainty.dof_std
+    lost = ~((std[:, :3].max(axis=1) < _MAX_ROOT_STD) & (std[:, 3:6].max(axis=1) < _MAX_ANGLE_STD))
+    max_std = np.minimum(np.where(tree.prismatic, _MAX_ROOT_STD, _MAX_ANGLE_STD), BLIND * tree.spread)
+    observed = (std[:, 6:] < max_std) & ~lost[:, None]
+    ever_observed = observed.any(axis=0)
+    if lost.all() or (observed[:, ever_observed].all() and not lost.any()):
         return roots, angles
     frames = np.arange(len(x))
-    meant = angles.copy()
-    for d in np.flatnonzero(some):
-        meant[:, d] = np.interp(frames, frames[told[:, d]], angles[told[:, d], d])
-    held, (roots, _) = roots, bridged(roots, meant, lost, _MEMORY * rate)
-    before, measured = data.misfit(roots, angles), angles
-    roots, angles = np.array(roots), np.where(told | ~some, angles, meant)
-    again = ~lost & ~told[:, some].all(axis=1)
-    for a, b in runs_of(again):
-        inside = bool(((angles[a:b] >= tree.lower) & (angles[a:b] <= tree.upper)).all())  # not in another chart
-        fit = fit_sequence(  # the rest of the chain settles about what is now known
+    interpolated = angles.copy()
+    for d in np.flatnonzero(ever_observed):
+        interpolated[:, d] = np.interp(frames, frames[observed[:, d]], angles[observed[:, d], d])
+    measured_roots, (roots, _) = roots, bridged(roots, interpolated, lost, _VELOCITY_MEMORY_S * rate)
+    before, measured_angles = data.misfit(roots, angles), angles
+    roots, angles = np.array(roots), np.where(observed | ~ever_observed, angles, interpolated)
+    refitted = ~lost & ~observed[:, ever_observed].all(axis=1)
+    for a, b in runs_of(refitted):
+        inside = bool(((angles[a:b] >= tree.lower) & (angles[a:b] <= tree.upper)).all())  # else in another chart
+        fit = fit_sequence(  # adapt the observed angles to the interpolated ones
             data.body, BodyState(roots[a], angles[a]), data.points, x[a:b], sigma=data.sigma, loss=data.loss,
-            limits=data.limits and inside, posture=1.0, usual=meant[a:b],
+            limits=data.limits and inside, posture=1.0, usual=interpolated[a:b],
         )  # fmt: skip
         roots[a:b], angles[a:b] = fit.Ts_world_root, fit.angles
-    worse = again & (data.misfit(roots, angles) > before + _WORSE)
-    roots[worse], angles[worse] = held[worse], measured[worse]
-    return roots, unwrap(tree, angles) if again.any() else angles
+    worse = refitted & (data.misfit(roots, angles) > before + _MAX_MISFIT_INCREASE)
+    roots[worse], angles[worse] = measured_roots[worse], measured_angles[worse]
+    return roots, unwrap(tree, angles) if refitted.any() else angles
 
 
 def _motion(
-    data: _MarkerData, roots: NDArray, angles: NDArray, sure: Certainty, markers: Markers, up: str | None
+    data: _MarkerData, roots: NDArray, angles: NDArray, certainty: Certainty, markers: Markers, up: str | None
 ) -> Motion:
-    """Quality as of every other track: the share of what shows a segment that agrees with it."""
+    """Assemble the motion; its quality is the share of a segment's evidence that agrees."""
     body, points, x = data.body, data.points, data.x
-    dof_std = np.array(sure.dof_std)
+    dof_std = np.array(certainty.dof_std)
     dof_std[:, 6:][dof_std[:, 6:] > BLIND * body.tree.spread] = np.inf
     values = x - body.trajectories(roots, angles, points)
     squares = np.square(values / data.sigma[:, None]).sum(axis=2)
     quality = of_points(body, points, squares).segment_quality(body.tree)
-    residuals = Residuals(points.names, points.segments, values, sure.factors, "m", x, np.zeros(len(x), bool))
+    residuals = Residuals(points.names, points.segments, values, certainty.factors, "m", x, np.zeros(len(x), bool))
     return Motion(
         body=body, rate=markers.rate, times=markers.times, Ts_world_root=roots, angles=angles, dof_std=dof_std,
-        joint_std=sure.joint_std, quality=quality.mean(axis=1), segment_quality=quality,
+        joint_std=certainty.joint_std, quality=quality.mean(axis=1), segment_quality=quality,
         residuals={"markers": residuals}, up=up or markers.up or upright(roots),
         name=Path(markers.source).stem or "markers",
     )  # fmt: skip
 
 
 def upright(roots: NDArray) -> str:
-    """The world's axis along which the root's own vertical axis points on average."""
+    """The world axis nearest to the mean vertical axis of the roots (F, 4, 4)."""
     mean = roots[:, :3, 1].mean(axis=0)
     return max(UP_AXES, key=lambda axis: float(np.dot(mean, UP_AXES[axis])))

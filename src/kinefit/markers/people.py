@@ -1,4 +1,4 @@
-"""Several people in one marker file: told apart by the prefix of their labels ("Anna:LASI")."""
+"""Split the markers of several people in one file by the prefix of their labels ("Anna:LASI")."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ from kinefit.bodies.marker_sets import bare, subject_of
 from kinefit.errors import ObservationError
 from kinefit.observations import Markers
 
-FEWEST = 4
-"""Labels that a person bears at least; fewer belong to a thing ("Sync:Sync")."""
+MIN_LABELS = 4
+"""Least number of a person's labels; fewer belong to an object ("Sync:Sync")."""
 
 
 @checked
 def split_people(markers: Markers) -> dict[str, Markers]:
-    """Markers of every person by name, labels without the name; one person without any is called "".
+    """Split markers by person: a dictionary from prefix to markers whose labels have no prefix.
 
-    Labels without a prefix stand beside those with one only where they are no person's: they are left out then.
+    Without any prefixed person, all labels belong to one person called "". Otherwise the others are excluded.
 
     Raises
     ------
     ObservationError
-        A label is there twice for one person.
+        A label appears twice for one person.
     """
     columns: dict[str, list[int]] = {}
     for i, name in enumerate(markers.names):
         columns.setdefault(subject_of(name), []).append(i)
-    named = {person: own for person, own in columns.items() if person and len(own) >= FEWEST}
-    kept = named or {"": list(range(len(markers.names)))}
+    prefixed = {person: indices for person, indices in columns.items() if person and len(indices) >= MIN_LABELS}
+    people = prefixed or {"": list(range(len(markers.names)))}
     out = {}
-    for person, own in kept.items():
-        labels = tuple(bare(markers.names[i]) for i in own)
-        twice = sorted({n for n in labels if labels.count(n) > 1})
-        if twice:
+    for person, indices in people.items():
+        labels = tuple(bare(markers.names[i]) for i in indices)
+        duplicates = sorted({n for n in labels if labels.count(n) > 1})
+        if duplicates:
             raise ObservationError(
-                f"labels appear twice{f' for {person}' if person else ''}: {', '.join(twice)}",
+                f"labels appear twice{f' for {person}' if person else ''}: {', '.join(duplicates)}",
                 file=markers.source or None, remedy="Name every marker of a person once.",
             )
-        residual = None if markers.residual is None else markers.residual[:, own]
-        out[person] = replace(markers, names=labels, positions=markers.positions[:, own], residual=residual)
+        residual = None if markers.residual is None else markers.residual[:, indices]
+        out[person] = replace(markers, names=labels, positions=markers.positions[:, indices], residual=residual)
     return out

@@ -1,4 +1,4 @@
-"""Poses of a body that wears markers, frame after frame from one that is found with no pose given."""
+"""Fit the poses of a body to markers frame by frame, beginning at a frame fitted without initial pose."""
 
 from __future__ import annotations
 
@@ -17,21 +17,29 @@ from kinefit.observations import Markers
 from kinefit.sensors.settings import MARKER_LOSS
 from kinefit.solvers.sequence import fit_sequence
 
-_FEWEST = 6  # markers of a frame to start from
-_ROUGH = 0.03  # [m] how far a body that is not yet the subject's may be off
-_NEAR = 0.03  # [m] median distance of a start that needs no other
+_MIN_START_MARKERS = 6  # of the first frame
+_MIN_START_SIGMA = 0.03  # [m] error of a body that does not have the subject's size yet
+_GOOD_START_DISTANCE = 0.03  # [m] median distance at which no further start is tried
 
 
 def columns(markers: Markers, names: Sequence[str]) -> NDArray:
-    """(F, K, 3) [m] the named markers of a recording, by the rule for labels; NaN for those that it does not have."""
-    meant = matched(markers.names, names)
-    exact = [label == bare(n) for n, label in zip(markers.names, meant)]
-    where = {n: [i for i, label in enumerate(meant) if label == n] for n in names}
-    where = {n: [i for i in own if exact[i]] or own for n, own in where.items()}  # spelt as the set has it comes first
-    twice = sorted(n for n, own in where.items() if len(own) > 1)
-    if twice:
+    """(F, K, 3) [m] positions of the named markers of a recording; NaN for markers that it lacks.
+
+    Labels are matched without subject, case and punctuation; exact spelling wins.
+
+    Raises
+    ------
+    ObservationError
+        A label belongs to more than one subject.
+    """
+    labels_of = matched(markers.names, names)
+    is_exact = [label == bare(n) for n, label in zip(markers.names, labels_of)]
+    where = {n: [i for i, label in enumerate(labels_of) if label == n] for n in names}
+    where = {n: [i for i in candidates if is_exact[i]] or candidates for n, candidates in where.items()}
+    duplicates = sorted(n for n, candidates in where.items() if len(candidates) > 1)
+    if duplicates:
         raise ObservationError(
-            f"{len(twice)} labels are there for more than one subject: {', '.join(twice[:6])}",
+            f"{len(duplicates)} labels are there for more than one subject: {', '.join(duplicates[:6])}",
             file=markers.source or None, remedy="Fit one subject at a time: see `split_people`.",
         )
     out = np.full((len(markers), len(names), 3), np.nan)
@@ -44,7 +52,12 @@ def columns(markers: Markers, names: Sequence[str]) -> NDArray:
 def sequence_both_ways(
     body: Body, points: PointSet, x: NDArray, sigma: NDArray, *, loss: Loss = MARKER_LOSS, limits: bool = True
 ) -> tuple[NDArray, NDArray]:
-    """Roots (F, 4, 4) and angles (F, D) of all frames, from the one that shows most, onwards and backwards.
+    """Roots (F, 4, 4) and angles (F, D) [rad] of all frames, fitted forwards and backwards from the best visible one.
+
+    Parameters
+    ----------
+    points : K points of the body
+    x, sigma : (F, K, 3), (K,) [m] positions, NaN where not visible, and standard deviations
 
     Raises
     ------
@@ -61,21 +74,21 @@ def sequence_both_ways(
 
 
 def _start(body: Body, points: PointSet, x: NDArray, sigma: NDArray) -> tuple[int, BodyState]:
-    """The frame to start from, and its state, found with no pose given: the best of a few that show most."""
+    """Index and state of the first frame: the best fit of a few frames with most visible markers."""
     count = np.isfinite(x).all(axis=2).sum(axis=1)
-    if not count.max(initial=0) >= _FEWEST:
+    if not count.max(initial=0) >= _MIN_START_MARKERS:
         raise TrackingError(
             f"no frame shows enough markers to start from: {int(count.max(initial=0))} at most",
-            remedy=f"{_FEWEST} markers in one frame are the least.",
+            remedy=f"{_MIN_START_MARKERS} markers in one frame are the least.",
         )
     most = np.flatnonzero(count == count.max())
-    spread = np.maximum(sigma, _ROUGH)
+    spread = np.maximum(sigma, _MIN_START_SIGMA)
     best: tuple[float, int, BodyState] | None = None
     for frame in most[np.unique(np.linspace(0, len(most) - 1, min(len(most), 4)).astype(int))]:
-        state, left = pose_from_points(body, points, x[frame], sigma=spread)
-        if best is None or left < best[0]:
-            best = left, int(frame), state
-        if left < _NEAR:
+        state, residual = pose_from_points(body, points, x[frame], sigma=spread)
+        if best is None or residual < best[0]:
+            best = residual, int(frame), state
+        if residual < _GOOD_START_DISTANCE:
             break
     assert best is not None
     return best[1], best[2]

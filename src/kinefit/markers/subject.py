@@ -1,4 +1,4 @@
-"""Who wears the markers: a body's size and where each marker sits on it, from one or several trials, all at once."""
+"""Fit a subject's body size and marker offsets jointly to one or several trials."""
 
 from __future__ import annotations
 
@@ -26,40 +26,40 @@ from kinefit.subject.subject import SubjectFit
 
 Progress = Callable[[str, int, int], None]
 
-_LEAST, _MOST = 0.005, 0.03  # [m] no marker is held to be better fixed or looser than this
-_FAR = 0.5  # share of its distance from the set's place that a marker's spread is at least
-_SLIDES = 0.1  # share of a marker's spread: one on soft parts, which may sit anywhere, slides more than one on a bone
-_SIZES = 0.3, 3.0  # of a person, as a share of the generic body's: beyond is a wrong unit
-_INDEPENDENT = 1.0
-"""How many frames with errors of their own all the frames of one trial count for.
+_MIN_SIGMA = 0.005  # [m] of a marker on its segment
+_MAX_SIGMA = 0.03  # [m]
+_MIN_SPREAD_SHARE = 0.5  # least prior spread of a marker, as a share of its distance from the set's place
+_SLIDING_SHARE = 0.1  # least sigma as a share of the prior spread: markers on soft parts slide more than on bone
+_SIZE_RANGE = 0.3, 3.0  # relative to the generic body; outside, the unit is wrong
+_INDEPENDENT_FRAMES = 1.0
+"""Weight of all frames of one trial, as a number of frames with independent errors.
 
-Marker errors last: skin slides with the posture, and a joint is not quite a ball or a hinge. So many frames say little
-more than their extremes do. Of 0.5, 1, 2, 4, 16 and 80 the joint centres of four laboratories' subjects are met best
-from 0.5 to 2 (15 to 16 mm, as they are; 20 mm by 16). Counted as `subject.lasting` counts errors, the left toe marker
-of Plug-in-Gait's trial goes 13 cm off, and the ankle's angle 37 degrees. This and the constants above were chosen on
-trials that `benchmarks.markers_fit` reports on: its figures are no test on recordings that were held back.
+Marker errors are systematic: skin slides with the posture, and joints are no exact balls or hinges. Of 0.5, 1, 2, 4, 16
+and 80, values from 0.5 to 2 give the best joint centres for four laboratories' subjects (15 to 16 mm; 20 mm with 16).
+With errors counted as in `subject.lasting`, the left toe marker of Plug-in-Gait's trial is 13 cm off, the ankle's angle
+37 degrees. This and the constants above were chosen on the trials of `benchmarks.markers_fit`, which are no test set.
 """
-_POSTURES = 40  # random ones, in which the generic body's distances are looked up
-_RATE = 30.0  # [Hz] enough to follow a person from frame to frame
-_ENOUGH = 300  # frames of a trial, of which the most different are taken
-_ROUNDS = 3  # of calibration: poses of the whole trial, frames chosen anew, shape
+_RANDOM_POSTURES = 40  # of the generic body, for the first estimate of the size
+_MAX_RATE_HZ = 30.0  # trials are thinned to this rate
+_MIN_FRAMES = 300  # kept when thinning a trial
+_CALIBRATION_ROUNDS = 3  # poses of all frames, selection of frames, subject fit
 
 
 @dataclass(frozen=True, eq=False)
 class MarkerSubject:
-    """A body of the subject's size that wears its markers.
+    """A body of the subject's size with its marker offsets.
 
     Parameters
     ----------
-    body : Body, scaled; its marker set `marker_set` holds the K markers at the subject's own places.
-    marker_set : str
-    scales : (G,) of the generic body.
+    body : Body, scaled; its marker set `marker_set` holds the K markers at the subject's offsets.
+    marker_set : name of the set
+    scales : (G,) factor on the generic body per scale group.
     scale_std : (G,) standard deviation of each.
-    sigma : (K,) [m] how far each marker moved on its segment, along each axis.
-    moved : (K,) [m] how far each marker was found from where the set has it; far ones may be mislabelled.
-    rms : float [m] of all residuals (lengths) of the frames used, outliers left out.
-    frames : how many were used.
-    fit : of lengths and places together.
+    sigma : (K,) [m] standard deviation of each marker on its segment, along each axis.
+    moved : (K,) [m] distance of each marker from the set's place; a large one may be mislabelled.
+    rms : [m] root mean square of the residuals' lengths in the frames used, without outliers.
+    frames : number of frames used.
+    fit : joint fit of lengths and offsets.
     """
 
     body: Body
@@ -88,25 +88,25 @@ def fit_marker_subject(
     height: float | None = None,
     progress: Progress | None = None,
 ) -> MarkerSubject:
-    """Size of a body and places of the markers on it, from static or moving trials of one subject, all together.
+    """Fit body size and marker offsets jointly to static or moving trials of one subject.
 
-    Where a trial moves a joint, its centre (and the knee's axis) comes from how the markers of both segments move;
-    where it does not, from the landmarks that markers sit on and from proportions. A static trial alone so gives what
-    scaling by landmarks would give.
+    If a trial moves a joint, its centre (and the knee's axis) follows from the markers of both segments. Otherwise it
+    follows from the landmarks under the markers and from proportions, so a static trial gives scaling by landmarks.
 
     Parameters
     ----------
     body : Body, generic.
     trials : labelled; labels may carry a subject's prefix ("Anna:LASI").
     marker_set : see `bodies.marker_sets.find_placement`.
-    frames : how many are used at most, those of most different postures.
-    height : float [m] of the subject, barefoot.
+    frames : most frames used, those with the most different postures.
+    height : [m] of the subject, barefoot. Default: estimated from the markers.
+    progress : (what, done, total) -> None
 
     Raises
     ------
     ObservationError
-        Too few labels are known, or they are those of two subjects; a unit that makes a giant of a person; a height or
-        number of frames that cannot be.
+        Too few labels are known, labels belong to two subjects, the unit gives an impossible size, or `height` or
+        `frames` is out of range.
     TrackingError
         No frame shows enough markers to start from.
     """
@@ -117,46 +117,46 @@ def fit_marker_subject(
             remedy="Give one trial at least, one frame at least, and a height in metres.",
         )
     progress = progress or (lambda what, done, total: None)
-    progress("marker offsets", 0, _ROUNDS)
+    progress("marker offsets", 0, _CALIBRATION_ROUNDS)
     labels = dict.fromkeys(n for t in trials for n in t.names)
     placed = find_placement(body, labels, marker_set)
-    given = [columns(t, placed.points.names)[:: _stride(t)] for t in trials]
-    x = np.concatenate(given)
+    positions = [columns(t, placed.points.names)[:: _stride(t)] for t in trials]
+    x = np.concatenate(positions)
     if not np.isfinite(x).all(axis=2).any():
         raise ObservationError("none of the markers is seen in any frame", remedy="Is this the right recording?")
-    starts = np.cumsum([0, *map(len, given)])
-    seen = np.isfinite(x).all(axis=2)
-    placed, x, seen = _worn(placed, x, seen)
+    starts = np.cumsum([0, *map(len, positions)])
+    visible = np.isfinite(x).all(axis=2)
+    placed, x, visible = _visible_markers(placed, x, visible)
     known = height / body.stature if height and body.stature else None
     size = known if known is not None else _first_size(body, placed, x)
-    generic = replace(body, marker_sets={placed.name: placed.points}, surfaces=(), skin=None)  # no need to scale those
+    generic = replace(body, marker_sets={placed.name: placed.points}, surfaces=(), skin=None)
     lengths, groups = SegmentScales(generic, known, size), len(body.scale_groups)
-    sigma = floor = np.hypot(_LEAST, _SLIDES * placed.spread)
+    sigma = floor = np.hypot(_MIN_SIGMA, _SLIDING_SHARE * placed.spread)
     theta = np.concatenate([lengths.mean, np.zeros(3 * len(placed.points))])
     fitted, spread_factor = generic.scaled(np.exp(lengths.mean)), 1.0
-    for turn in range(_ROUNDS):
-        looseness = np.hypot(sigma, placed.spread) if turn == 0 else sigma
+    for round_ in range(_CALIBRATION_ROUNDS):
+        looseness = np.hypot(sigma, placed.spread) if round_ == 0 else sigma
         roots, angles, good = _all_poses(fitted, fitted.markers(placed.name), x, starts, looseness)
-        count = max((frames if turn else frames // 4) // len(trials), min(frames, 8))
-        parts = [a + _spread_frames(seen[a:b], angles[a:b], good[a:b], count) for a, b in pairwise(starts)]
+        count = max((frames if round_ else frames // 4) // len(trials), min(frames, 8))
+        parts = [a + _spread_frames(visible[a:b], angles[a:b], good[a:b], count) for a, b in pairwise(starts)]
         chosen = np.concatenate(parts)
-        if turn == 0:
-            theta[groups:] = _moved(fitted, fitted.markers(placed.name), roots[good], angles[good], x[good]).ravel()
-        away = np.linalg.norm(theta[groups:].reshape(-1, 3), axis=1)
-        # A marker that is far from the set's place in all frames may have been placed there.
-        spread = np.maximum(spread_factor * placed.spread, _FAR * away)
+        if round_ == 0:
+            theta[groups:] = _shifts(fitted, fitted.markers(placed.name), roots[good], angles[good], x[good]).ravel()
+        shifts = np.linalg.norm(theta[groups:].reshape(-1, 3), axis=1)
+        # A marker far from the set's place in all frames may have been placed there.
+        spread = np.maximum(spread_factor * placed.spread, _MIN_SPREAD_SHARE * shifts)
         found = joint.fit_subject(
             generic, Rig(()), [_measured(placed, x[f], sigma) for f in chosen],
             [BodyState(roots[f], angles[f]) for f in chosen], (lengths, PointOffsets(generic, placed.name, spread)),
-            start=theta, reach=joint.REACH[-1:], rounds=1, looks=_INDEPENDENT * sum(len(p) > 0 for p in parts),
+            start=theta, reach=joint.REACH[-1:], rounds=1, looks=_INDEPENDENT_FRAMES * sum(len(p) > 0 for p in parts),
         )  # fmt: skip
         theta, fitted = found.mean, found.body
-        stated = np.repeat(placed.spread, 3)
-        variance = np.square(found.std[groups:] / stated)
-        spread_factor = place_spread(theta[groups:] / stated, variance, spread_factor, 1.0)
+        prior_spread = np.repeat(placed.spread, 3)
+        variance = np.square(found.std[groups:] / prior_spread)
+        spread_factor = place_spread(theta[groups:] / prior_spread, variance, spread_factor, 1.0)
         residuals = _residuals(found, placed.name, x[chosen])
-        sigma = np.clip(_noise(residuals, len(chosen), body.tree.n_dofs), floor, _MOST)
-        progress("marker offsets", turn + 1, _ROUNDS)
+        sigma = np.clip(_noise(residuals, len(chosen), body.tree.n_dofs), floor, _MAX_SIGMA)
+        progress("marker offsets", round_ + 1, _CALIBRATION_ROUNDS)
     inlier, scales = residuals < 5.0 * 1.7 * sigma, np.exp(theta[:groups])
     whole = body.scaled(scales)
     named = {**whole.marker_sets, **fitted.marker_sets}
@@ -168,28 +168,28 @@ def fit_marker_subject(
 
 
 def _stride(trial: Markers) -> int:
-    """Which frames of a trial are enough: every so many."""
-    return max(1, min(round(trial.rate / _RATE), len(trial) // _ENOUGH))
+    """Step by which a trial is thinned."""
+    return max(1, min(round(trial.rate / _MAX_RATE_HZ), len(trial) // _MIN_FRAMES))
 
 
-def _worn(placed: MarkerPlacement, x: NDArray, seen: NDArray) -> tuple[MarkerPlacement, NDArray, NDArray]:
-    """Without markers that are never seen."""
+def _visible_markers(placed: MarkerPlacement, x: NDArray, seen: NDArray) -> tuple[MarkerPlacement, NDArray, NDArray]:
+    """Remove markers that are never visible."""
     keep = seen.any(axis=0)
     return placed.select(placed.points.names[k] for k in np.flatnonzero(keep)), x[:, keep], seen[:, keep]
 
 
 def _first_size(body: Body, placed: MarkerPlacement, x: NDArray) -> float:
-    """How many times the generic body's size the subject has: by distances that postures change little."""
+    """Size of the subject relative to the generic body, from distances that hardly depend on posture."""
     rng, tree = np.random.default_rng(0), body.tree
-    away = 0.5 * tree.spread * rng.normal(size=(_POSTURES, len(tree.usual)))
+    away = 0.5 * tree.spread * rng.normal(size=(_RANDOM_POSTURES, len(tree.usual)))
     angles = np.clip(tree.usual + away, tree.lower, tree.upper)
     angles = np.where(np.isfinite(angles), angles, 0.0)
-    own = body.trajectories(np.tile(np.eye(4), (_POSTURES, 1, 1)), angles, placed.points)
-    some = x[np.linspace(0, len(x) - 1, min(len(x), 100)).astype(int)]
+    body_points = body.trajectories(np.tile(np.eye(4), (_RANDOM_POSTURES, 1, 1)), angles, placed.points)
+    sample = x[np.linspace(0, len(x) - 1, min(len(x), 100)).astype(int)]
     i, j = np.triu_indices(len(placed.points), 1)
-    d_own = np.linalg.norm(own[:, i] - own[:, j], axis=2)
+    d_own = np.linalg.norm(body_points[:, i] - body_points[:, j], axis=2)
     with np.errstate(invalid="ignore"):
-        d = np.linalg.norm(some[:, i] - some[:, j], axis=2)
+        d = np.linalg.norm(sample[:, i] - sample[:, j], axis=2)
     known = np.isfinite(d).any(axis=0) & (np.median(d_own, axis=0) > 0.1)
     if not known.any():
         return 1.0
@@ -199,7 +199,7 @@ def _first_size(body: Body, placed: MarkerPlacement, x: NDArray) -> float:
     order = np.argsort(ratio := middle / middle_own)
     half = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
     size = float(ratio[order][half])
-    if not _SIZES[0] < size < _SIZES[1]:
+    if not _SIZE_RANGE[0] < size < _SIZE_RANGE[1]:
         raise ObservationError(
             f"the person would be {size:.3g} times the body's size: the unit of the file is wrong",
             remedy="State the right one (--unit mm ...); or check that the labels are those of the marker set.",
@@ -207,11 +207,10 @@ def _first_size(body: Body, placed: MarkerPlacement, x: NDArray) -> float:
     return size
 
 
-def _moved(body: Body, points: PointSet, roots: NDArray, angles: NDArray, x: NDArray) -> NDArray:
-    """(K, 3) [m] by which every marker was seen beside its place on its segment, by the median over some frames.
+def _shifts(body: Body, points: PointSet, roots: NDArray, angles: NDArray, x: NDArray) -> NDArray:
+    """(K, 3) [m] median shift of every marker from its place on its segment, over some frames.
 
-    A set says which segment a marker sits on, but laboratories differ in where; to a robust fit that begins far away
-    such a marker would be an outlier in every frame.
+    Laboratories place markers differently; a robust fit that starts far away would treat them as outliers.
     """
     some = np.unique(np.linspace(0, len(x) - 1, min(len(x), 200)).astype(int))
     Ts = body.tree.segment_poses(roots[some], angles[some])[:, points.segments]
@@ -221,7 +220,7 @@ def _moved(body: Body, points: PointSet, roots: NDArray, angles: NDArray, x: NDA
 
 
 def _measured(placed: MarkerPlacement, x: NDArray, sigma: NDArray) -> list[Measurement]:
-    """Markers (K, 3) [m] of one frame, those that were seen, each as sure as it sits on its segment."""
+    """Measurement of the visible markers (K, 3) [m] of one frame, with standard deviations sigma (K,) [m]."""
     here = np.flatnonzero(np.isfinite(x).all(axis=1))
     names = tuple(placed.points.names[k] for k in here)
     sensor = MarkerSensor("markers", 1.0, MARKER_LOSS, joint.REACH[-1], dict(zip(names, sigma[here].tolist())))
@@ -231,7 +230,7 @@ def _measured(placed: MarkerPlacement, x: NDArray, sigma: NDArray) -> list[Measu
 def _all_poses(
     body: Body, points: PointSet, x: NDArray, starts: NDArray, sigma: NDArray
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Roots (F, 4, 4), angles (F, D) of every frame of every trial, and which are to be believed (F,)."""
+    """Roots (F, 4, 4) and angles (F, D) of every frame of all trials, and whether each fits (F,)."""
     parts, errors = [], []
     for a, b in pairwise(starts):
         try:
@@ -244,23 +243,23 @@ def _all_poses(
     if len(errors) == len(parts):
         raise errors[0]
     roots, angles = (np.concatenate(p) for p in zip(*parts, strict=True))
-    off = np.linalg.norm(x - body.trajectories(roots, angles, points), axis=2)
-    enough = np.isfinite(off).sum(axis=1) >= min(6, len(points))
+    distances = np.linalg.norm(x - body.trajectories(roots, angles, points), axis=2)
+    visible = np.isfinite(distances).sum(axis=1) >= min(6, len(points))
     with np.errstate(invalid="ignore"):
-        ratio = np.nanmedian(np.where(enough[:, None], off / sigma, np.inf), axis=1)
-    return roots, angles, enough & (ratio < 3.0 * max(float(np.nanmedian(ratio[enough])), 1.0))
+        ratio = np.nanmedian(np.where(visible[:, None], distances / sigma, np.inf), axis=1)
+    return roots, angles, visible & (ratio < 3.0 * max(float(np.nanmedian(ratio[visible])), 1.0))
 
 
-def _spread_frames(seen: NDArray, angles: NDArray, good: NDArray, count: int) -> NDArray:
-    """Frames of most different postures (farthest points), of those that show most of the markers."""
-    usable = np.flatnonzero(good & (seen.sum(axis=1) >= 0.5 * seen.sum(axis=1).max(initial=0)))
+def _spread_frames(visible: NDArray, angles: NDArray, is_good: NDArray, count: int) -> NDArray:
+    """Indices of the most different postures by farthest-point sampling, among well visible frames."""
+    usable = np.flatnonzero(is_good & (visible.sum(axis=1) >= 0.5 * visible.sum(axis=1).max(initial=0)))
     if not len(usable):
         return usable
     usable = usable[np.unique(np.linspace(0, len(usable) - 1, min(len(usable), 2000)).astype(int))]
     if len(usable) <= count:
         return usable
     a = angles[usable]
-    chosen = [int(np.argmax(seen[usable].sum(axis=1)))]
+    chosen = [int(np.argmax(visible[usable].sum(axis=1)))]
     distance = np.sum((a - a[chosen[0]]) ** 2, axis=1)
     while len(chosen) < count:
         chosen.append(int(np.argmax(distance)))
@@ -269,21 +268,21 @@ def _spread_frames(seen: NDArray, angles: NDArray, good: NDArray, count: int) ->
 
 
 def _residuals(found: SubjectFit, marker_set: str, x: NDArray) -> NDArray:
-    """(F, K) [m] lengths of residuals of the frames that a fit is of."""
+    """(F, K) [m] lengths of the residuals in the frames of a fit."""
     roots, angles = (np.stack([getattr(s, n) for s in found.states]) for n in ("T_world_root", "angles"))
     return np.linalg.norm(x - found.body.trajectories(roots, angles, found.body.markers(marker_set)), axis=2)
 
 
 def _noise(residuals: NDArray, frames: int, dofs: int) -> NDArray:
-    """(K,) [m] standard deviation of every marker along each axis, drawn together where there are few frames.
+    """(K,) [m] standard deviation of every marker along each axis, shrunk to the common one if there are few frames.
 
-    Of three residuals in space the median length is 1.54 standard deviations; what a pose takes up is put back.
+    The median length of a residual in space is 1.54 standard deviations. Corrected for the degrees of freedom.
     """
-    seen = np.isfinite(residuals)
+    visible = np.isfinite(residuals)
     with np.errstate(all="ignore"):
-        own = np.nanmedian(residuals, axis=0) / 1.538
+        marker_sigma = np.nanmedian(residuals, axis=0) / 1.538
         typical = float(np.nanmedian(residuals)) / 1.538
-    count = seen.sum(axis=0)
-    shrunk = np.sqrt((count * np.nan_to_num(own) ** 2 + 10 * typical**2) / (count + 10))
-    free = 1.0 - min(dofs / max(3.0 * seen.sum() / max(frames, 1), 1.0), 0.75)
-    return np.asarray(shrunk / np.sqrt(free))
+    count = visible.sum(axis=0)
+    shrunk = np.sqrt((count * np.nan_to_num(marker_sigma) ** 2 + 10 * typical**2) / (count + 10))
+    freedom = 1.0 - min(dofs / max(3.0 * visible.sum() / max(frames, 1), 1.0), 0.75)
+    return np.asarray(shrunk / np.sqrt(freedom))

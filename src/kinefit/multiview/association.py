@@ -1,4 +1,4 @@
-"""Which person: the same one in all cameras and over time, among bystanders, posters and false detections."""
+"""Associate the detections of one target person across cameras and time, among bystanders and false positives."""
 
 from __future__ import annotations
 
@@ -13,52 +13,55 @@ from kinefit._mapped import kept
 from kinefit.errors import TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
-from kinefit.multiview.boxes import same_people
+from kinefit.multiview.boxes import match_by_boxes
 from kinefit.multiview.medians import medians
 from kinefit.observations import MEDIAPIPE_478, Keypoints
 from kinefit.observations.arrays import sealed
 
-_ENOUGH = 4  # points of a person that must be seen
-_SOME = 13  # points, spread over the set, that decide whether two detections are of one person
-STRIDE = 0.6  # [m] by which the middle of a person leaps at most from frame to frame: half of the body may be unseen
-SPEED = 3.0  # [m/s] people do not go further while they are unseen
-_SWITCH = 1.0  # [s] going on with somebody else must show that much more of a person, seen by all cameras
-_SWAY = 0.1  # frames of the same that a leap of one stride must show more: of two who stand close, the same one
-_PATHS = 16  # how many people and gaps are borne in mind at a time
-_CLOCK = 0.01  # frames, below the resolution of any clock
-_AGREE = 0.04  # two views of one person differ by less than this share of the person's height in the picture
+_MIN_POINTS = 4  # visible keypoints of a detection
+_MAX_COMPARED_POINTS = 13  # keypoints, spread over the set, by which two detections are compared
+MAX_STEP = 0.6  # [m] of a person's centre between frames: half of the body may be occluded
+MAX_SPEED = 3.0  # [m/s] of an unobserved person
+_SWITCH_COST_S = 1.0  # of full visibility: what a switch to another person must gain
+_STEP_COST_FRAMES = 0.1  # of full visibility: what a step of MAX_STEP must gain
+_MAX_PATHS = 16  # kept by the dynamic programming
+_TIME_RESOLUTION_FRAMES = 0.01  # below any clock's resolution
+_MAX_ERROR_SHARE = 0.04  # of two views of one person, relative to its height in the image
 
 
 def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
-    """For each record the index (F,) of the person to follow in each frame, -1 for none.
+    """Choose the target person: for each record the index (F,) of its detection in each frame, -1 for none.
 
-    In every frame people of different records are grouped when their keypoints meet in space. The person is the one of
-    whom the groups show most over the whole take, by the number of keypoints seen and how sure the detector was of
-    them; gone after from frame to frame, so that nobody else stands in for a moment (dynamic programming).
+    In every frame, detections of different records are grouped if their keypoints intersect in space. Dynamic
+    programming finds the path through the groups with the largest sum of keypoint confidences over the take and few
+    switches. Of several detectors' records of a camera, the most confident one is used (a face mesh last). The others
+    follow by bounding boxes, or by themselves where the first sees nobody and both agree elsewhere.
 
-    Where a camera has records of several detectors, the person is sought in those of the surest one (in a face mesh
-    last), and in the others by the boxes; alone where the surest sees nobody, if both are of one person elsewhere.
+    Parameters
+    ----------
+    keypoints : records of F frames, each with detections (F, P, k, 2) [px] of one or several people
 
     Raises
     ------
     TrackingError
-        Nobody is seen in any frame.
+        No person is detected in any frame.
     """
     sets = list(dict.fromkeys(k.names for k in keypoints))
-    each = {names: [q for q, k in enumerate(keypoints) if k.names == names] for names in sets}
+    of_set = {names: [q for q, k in enumerate(keypoints) if k.names == names] for names in sets}
     chosen: dict[int, NDArray] = {}
-    for own in each.values():
-        chosen |= zip(own, _of_one_detector(rig, [keypoints[q] for q in own]))
+    for indices in of_set.values():
+        chosen |= zip(indices, _choose_in_one_set(rig, [keypoints[q] for q in indices]))
     frames = min(len(k) for k in keypoints)
-    sure = {n: sum(float(surety_of(keypoints[q], frames).sum()) for q in own) for n, own in each.items()}
-    surest = {keypoints[q].camera: q for q in reversed(each[max(sure, key=lambda n: (n != MEDIAPIPE_478, sure[n]))])}
+    totals = {n: sum(float(confidences(keypoints[q], frames).sum()) for q in own) for n, own in of_set.items()}
+    main_set = max(totals, key=lambda n: (n != MEDIAPIPE_478, totals[n]))
+    main_of = {keypoints[q].camera: q for q in reversed(of_set[main_set])}
     for q, record in enumerate(keypoints):
-        main = surest.get(record.camera, q)
+        main = main_of.get(record.camera, q)
         if main != q:
-            by_box = same_people([chosen[main]], keypoints[main], record)[0][:frames]
+            by_box = match_by_boxes([chosen[main]], keypoints[main], record)[0][:frames]
             both = (by_box >= 0) & (chosen[q] >= 0)
-            alone = (chosen[main] < 0) & (np.mean((by_box == chosen[q])[both]) > 0.5 if both.any() else False)
-            chosen[q] = np.where(alone, chosen[q], by_box)
+            is_own = (chosen[main] < 0) & (np.mean((by_box == chosen[q])[both]) > 0.5 if both.any() else False)
+            chosen[q] = np.where(is_own, chosen[q], by_box)
     out = [chosen[q] for q in range(len(keypoints))]
     if all(np.all(c < 0) for c in out):
         raise TrackingError("nobody is seen in any frame", remedy="Check that the keypoints belong to this recording.")
@@ -66,30 +69,30 @@ def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
 
 
 def person_records(keypoints: Sequence[Keypoints], people: Sequence[NDArray]) -> tuple[Keypoints, ...]:
-    """Records of one person alone, all of them at the times of one clock.
+    """Reduce records to one person, and resample them to common times.
 
-    A camera whose frames lie between those times has its points interpolated, linearly between two frames that both
-    show the point.
+    If a camera's frames lie between those times, its points are interpolated linearly between two frames that both show
+    the point.
 
     Parameters
     ----------
     keypoints : Q records of the same number of frames F
-    people : Q arrays (F,) int, which person of each record, -1 for none; see `choose_people`
+    people : Q arrays (F,) int, index of the person in each record, -1 for none; see `choose_people`
     """
     start = common_start(keypoints)
-    return tuple(_at_times(_alone(record, p), start) for record, p in zip(keypoints, people, strict=True))
+    return tuple(_at_times(_select_person(record, p), start) for record, p in zip(keypoints, people, strict=True))
 
 
-def _alone(record: Keypoints, person: NDArray) -> Keypoints:
+def _select_person(record: Keypoints, person: NDArray) -> Keypoints:
     if record.points.shape[1] == 1 and np.all(person == 0):
         return record
-    one = record.of_one(person)
-    return replace(one, points=sealed(kept(one.points)), confidence=sealed(kept(one.confidence)))
+    selected = record.of_one(person)
+    return replace(selected, points=sealed(kept(selected.points)), confidence=sealed(kept(selected.confidence)))
 
 
 def _at_times(record: Keypoints, start: float) -> Keypoints:
     late = float(start - record.times[0]) * record.rate if len(record) else 0.0
-    if abs(late) < _CLOCK or len(record) < 2:
+    if abs(late) < _TIME_RESOLUTION_FRAMES or len(record) < 2:
         return record
     lifted = None if record.lifted is None else between_frames(record.lifted, late)
     points, confidence = (between_frames(v, late) for v in (record.points, record.confidence))
@@ -100,13 +103,13 @@ def _at_times(record: Keypoints, start: float) -> Keypoints:
 
 
 def common_start(keypoints: Sequence[Keypoints]) -> float:
-    """Time [s] of the first frame of all records together: the step of the common time next to most of them."""
+    """Common time [s] of the records' first frames: their median, rounded to a multiple of the frame interval."""
     rate = keypoints[0].rate
     return float(np.round(np.median([k.times[0] for k in keypoints if len(k)] or [0.0]) * rate) / rate)
 
 
 def between_frames(values: NDArray, late: float) -> NDArray:
-    """Values (F, ...) of frames `late` frames later, a fraction, linear between neighbours; NaN beside unseen ones."""
+    """Values (F, ...) interpolated linearly at a fraction `late` of frames later; NaN next to missing ones."""
     at = np.clip(np.arange(len(values)) + late, 0, len(values) - 1)
     before = np.minimum(at.astype(int), len(values) - 2)
     share = (at - before).reshape(-1, *[1] * (values.ndim - 1))
@@ -115,24 +118,24 @@ def between_frames(values: NDArray, late: float) -> NDArray:
     return out
 
 
-def _of_one_detector(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
-    """(F,) the person to follow in each of several records of one kind of keypoints."""
+def _choose_in_one_set(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
+    """(F,) index of the target person in each of several records of one keypoint set."""
     frames = min(len(k) for k in keypoints)
-    surety = [surety_of(k, frames) for k in keypoints]
+    confidence = [confidences(k, frames) for k in keypoints]
     chosen = [np.full(frames, -1) for _ in keypoints]
     if all(k.points.shape[1] == 1 for k in keypoints):
-        for c, sure in zip(chosen, surety, strict=True):
-            c[sure[:, 0] > 0] = 0
+        for c, sums in zip(chosen, confidence, strict=True):
+            c[sums[:, 0] > 0] = 0
     else:
-        meetings = meetings_of(rig, keypoints, surety, frames)
-        everybody = len(keypoints) * max(len(k.names) for k in keypoints)
+        meetings = meeting_points(rig, keypoints, confidence, frames)
+        full_score = len(keypoints) * max(len(k.names) for k in keypoints)
         groups = []
         for f in range(frames):
-            ranked = [(float(s[f, p]), q, int(p)) for q, s in enumerate(surety) for p in np.flatnonzero(s[f] > 0)]
+            ranked = [(float(s[f, p]), q, int(p)) for q, s in enumerate(confidence) for p in np.flatnonzero(s[f] > 0)]
             people = [(q, p) for _, q, p in sorted(ranked, reverse=True)]
             links = {pair: centre[f] for pair, centre in meetings.items() if np.isfinite(centre[f, 0])}
-            groups.append(groups_of(people, links, surety, f, everybody))
-        for f, group in enumerate(_one_person(groups, keypoints[0].rate)):
+            groups.append(group_views(people, links, confidence, f, full_score))
+        for f, group in enumerate(_best_path(groups, keypoints[0].rate)):
             for q, p in group:
                 chosen[q][f] = p
     return chosen
@@ -141,22 +144,22 @@ def _of_one_detector(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
 Node = tuple[int, int]  # record, person in it
 
 
-def surety_of(record: Keypoints, frames: int) -> NDArray:
-    """(F, P) summed confidence of each person's points, 0 for one of whom too few are seen."""
-    seen = np.isfinite(record.points[:frames]).all(axis=-1) & (record.confidence[:frames] > 0.1)
-    total = np.where(seen, record.confidence[:frames], 0.0).sum(axis=-1)
-    return np.where(seen.sum(axis=-1) >= _ENOUGH, total, 0.0)
+def confidences(record: Keypoints, frames: int) -> NDArray:
+    """(F, P) sum of the keypoint confidences of each detection; 0 with too few visible points."""
+    visible = np.isfinite(record.points[:frames]).all(axis=-1) & (record.confidence[:frames] > 0.1)
+    total = np.where(visible, record.confidence[:frames], 0.0).sum(axis=-1)
+    return np.where(visible.sum(axis=-1) >= _MIN_POINTS, total, 0.0)
 
 
-def some_points(count: int) -> NDArray:
-    """(k,) int: some of so many points, spread over the set."""
-    return np.unique(np.linspace(0, count - 1, _SOME).astype(int))
+def some_columns(count: int) -> NDArray:
+    """(k,) int, at most 13 columns of `count` keypoints, spread over the set."""
+    return np.unique(np.linspace(0, count - 1, _MAX_COMPARED_POINTS).astype(int))
 
 
-def meetings_of(
-    rig: Rig, keypoints: Sequence[Keypoints], surety: Sequence[NDArray], frames: int
+def meeting_points(
+    rig: Rig, keypoints: Sequence[Keypoints], confidence: Sequence[NDArray], frames: int
 ) -> dict[tuple[Node, Node], NDArray]:
-    """Centre (F, 3) [m] in space of two detections where they are of one person, NaN elsewhere."""
+    """For each pair of detections its centre (F, 3) [m] where both are of one person; NaN elsewhere."""
     out = {}
     for i, a in enumerate(keypoints):
         for j, b in enumerate(keypoints[i + 1 :], start=i + 1):
@@ -165,121 +168,131 @@ def meetings_of(
             pair = rig.select((a.camera, b.camera))
             for pa in range(a.points.shape[1]):
                 for pb in range(b.points.shape[1]):
-                    both = np.flatnonzero((surety[i][:, pa] > 0) & (surety[j][:, pb] > 0))
+                    both = np.flatnonzero((confidence[i][:, pa] > 0) & (confidence[j][:, pb] > 0))
                     centre = np.full((frames, 3), np.nan)
                     if both.size:
-                        at = both[:, None], some_points(len(a.names))
+                        at = both[:, None], some_columns(len(a.names))
                         uv = (np.where((k.confidence[:, p][at] > 0.1)[..., None], k.points[:, p][at], np.nan)
                               for k, p in ((a, pa), (b, pb)))  # fmt: skip
-                        centre[both] = _meet(pair, *uv)
+                        centre[both] = _meeting_points_of(pair, *uv)
                     out[(i, pa), (j, pb)] = centre
     return out
 
 
-def links_of(
+def link_views(
     pairs: Mapping[tuple[int, int], Rig], uv: Sequence[NDArray], nodes: Sequence[Node]
 ) -> dict[tuple[Node, Node], NDArray]:
-    """Centre (3,) [m] in space of every two detections of one frame that are of one person.
+    """Centre (3,) [m] of every pair of detections of one frame that are of one person.
 
     Parameters
     ----------
-    pairs : {records of two cameras: their rig}
-    uv : (P, k, 2) [px] of each record some points of everybody in this frame, NaN where they are not seen
-    nodes : detections to look at
+    pairs : rigs of two cameras, by the indices of their records
+    uv : for each record (P, k, 2) [px] of all detections in this frame; NaN where not visible
+    nodes : detections to compare
     """
     out = {}
     for (i, j), pair in pairs.items():
         a, b = ([p for q, p in nodes if q == record] for record in (i, j))
         if a and b:
             pa, pb = (k.ravel() for k in np.meshgrid(a, b, indexing="ij"))
-            for m, n, centre in zip(pa, pb, _meet(pair, uv[i][pa], uv[j][pb])):
+            for m, n, centre in zip(pa, pb, _meeting_points_of(pair, uv[i][pa], uv[j][pb])):
                 if np.isfinite(centre[0]):
                     out[(i, int(m)), (j, int(n))] = centre
     return out
 
 
-def _meet(pair: Rig, a: NDArray, b: NDArray) -> NDArray:
-    """(N, 3) [m] median point where detections (N, k, 2) [px] of two cameras agree, NaN where they do not."""
+def _meeting_points_of(pair: Rig, a: NDArray, b: NDArray) -> NDArray:
+    """(N, 3) [m] median triangulated point of detections (N, k, 2) [px] of two cameras; NaN where they disagree."""
     uv = np.stack([a, b], axis=2)
     uv = np.where(np.isfinite(uv).all(axis=(2, 3))[..., None, None], uv, np.nan)
     x = triangulate(pair, uv.reshape(-1, 2, 2)).reshape(*uv.shape[:2], 3)
     error = np.stack([np.linalg.norm(c.project(x) - uv[:, :, k], axis=-1) for k, c in enumerate(pair)], axis=-1)
-    with warnings.catch_warnings():  # frames without a common point are NaN, and meant to be
+    with warnings.catch_warnings():  # frames without a common point stay NaN
         warnings.simplefilter("ignore", RuntimeWarning)
         size = np.mean(np.nanmax(uv[..., 1], axis=1) - np.nanmin(uv[..., 1], axis=1), axis=1)
-        agree = medians(error.reshape(len(uv), -1)) < _AGREE * size
-    agree &= np.isfinite(error).all(axis=-1).sum(axis=1) >= _ENOUGH
-    return np.where(agree[:, None], medians(np.moveaxis(x, 1, -1)), np.nan)
+        consistent = medians(error.reshape(len(uv), -1)) < _MAX_ERROR_SHARE * size
+    consistent &= np.isfinite(error).all(axis=-1).sum(axis=1) >= _MIN_POINTS
+    return np.where(consistent[:, None], medians(np.moveaxis(x, 1, -1)), np.nan)
 
 
 @dataclass(frozen=True)
 class DetectionGroup:
-    """Detections of one frame that are of one person."""
+    """Detections of one person in one frame."""
 
     nodes: tuple[Node, ...]
-    score: float  # 1: all cameras see all keypoints, quite sure
-    centre: NDArray  # (3,) [m], NaN where one camera alone sees the person
+    score: float  # 1: all keypoints in all cameras with confidence 1
+    centre: NDArray  # (3,) [m]; NaN with a single camera
 
 
-def groups_of(
-    people: list[Node], meetings: Mapping[tuple[Node, Node], NDArray], surety: Sequence[NDArray], frame: int,
+def group_views(
+    people: list[Node], meetings: Mapping[tuple[Node, Node], NDArray], confidence: Sequence[NDArray], frame: int,
     full: float,
 ) -> list[DetectionGroup]:  # fmt: skip
-    """Largest sets of people of different records that all meet in a frame; single ones where nobody meets."""
-    there = set(people)
-    links = {pair: centre for pair, centre in meetings.items() if pair[0] in there and pair[1] in there}
+    """Group the detections of different records in a frame into people: sets that all agree pairwise.
+
+    Without any agreeing pair, every detection is a group of its own.
+
+    Parameters
+    ----------
+    people : detections, the most confident first
+    meetings : centre (3,) [m] of each agreeing pair
+    confidence : (F, P) for each record, see `confidences`
+    full : sum of confidences that has the score 1
+    """
+    detections = set(people)
+    links = {pair: centre for pair, centre in meetings.items() if pair[0] in detections and pair[1] in detections}
     found: dict[frozenset[Node], DetectionGroup] = {}
     for pair in links:
         group = list(pair)
         for node in people:
             if all(node[0] != m[0] and ((node, m) in links or (m, node) in links) for m in group):
                 group.append(node)
-        score = sum(float(surety[q][frame, p]) for q, p in group) / full
-        # of all its pairs: one of them may have only half of the person in common
+        score = sum(float(confidence[q][frame, p]) for q, p in group) / full
+        # over all pairs, as one of them may share only half of the body
         middle = medians(np.array([c for (a, b), c in links.items() if a in group and b in group]).T)
         found.setdefault(frozenset(group), DetectionGroup(tuple(group), score, middle))
-    nowhere = np.full(3, np.nan)
+    unknown = np.full(3, np.nan)
     return list(found.values()) or [
-        DetectionGroup(((q, p),), float(surety[q][frame, p]) / full, nowhere) for q, p in people
+        DetectionGroup(((q, p),), float(confidence[q][frame, p]) / full, unknown) for q, p in people
     ]
 
 
-def _one_person(groups: Sequence[Sequence[DetectionGroup]], rate: float) -> list[tuple[Node, ...]]:
-    """The detections of one person in each frame, none where unseen: the path through the groups that shows most."""
-    value, centre, unseen = np.zeros(1), np.full((1, 3), np.nan), np.zeros(1)  # of every path that is borne in mind
-    history: list[tuple[NDArray, NDArray]] = []  # for each path the one it goes on from, and its group or -1
-    for there in groups:
-        at = np.array([g.centre for g in there]).reshape(-1, 3)
-        apart = np.linalg.norm(at[:, None] - centre, axis=-1)  # (groups, paths); NaN where a place is not known
-        far = apart > STRIDE + SPEED * (unseen + 1) / rate
-        sway = np.where(np.isnan(apart), 0.0, np.minimum(apart / STRIDE, 1))
-        cost = np.where(far, _SWITCH * rate, _SWAY * sway**2)
+def _best_path(groups: Sequence[Sequence[DetectionGroup]], rate: float) -> list[tuple[Node, ...]]:
+    """Detections of one person in each frame (dynamic programming): the path of largest score through the groups."""
+    value, centre, unseen = np.zeros(1), np.full((1, 3), np.nan), np.zeros(1)  # of every path kept
+    history: list[tuple[NDArray, NDArray]] = []  # for each path its predecessor, and its group or -1
+    for candidates in groups:
+        at = np.array([g.centre for g in candidates]).reshape(-1, 3)
+        distance = np.linalg.norm(at[:, None] - centre, axis=-1)  # (groups, paths); NaN if a centre is unknown
+        is_switch = distance > MAX_STEP + MAX_SPEED * (unseen + 1) / rate
+        step_share = np.where(np.isnan(distance), 0.0, np.minimum(distance / MAX_STEP, 1))
+        cost = np.where(is_switch, _SWITCH_COST_S * rate, _STEP_COST_FRAMES * step_share**2)
         total = value - cost
         before = total.argmax(axis=1)
-        gained = total.max(axis=1) + [g.score for g in there]
+        gain = total.max(axis=1) + [g.score for g in candidates]
         at = np.where(np.isfinite(at), at, centre[before])
-        value, centre = np.concatenate([gained, value]), np.concatenate([at, centre])
+        value, centre = np.concatenate([gain, value]), np.concatenate([at, centre])
         before = np.concatenate([before, np.arange(len(unseen))])
-        group = np.concatenate([np.arange(len(there)), np.full(len(unseen), -1)])
-        unseen = np.concatenate([np.zeros(len(there)), unseen + 1])
-        kept = _distinct(value, centre, unseen)
-        value, centre, unseen = value[kept], centre[kept], unseen[kept]
-        history.append((before[kept], group[kept]))
+        group = np.concatenate([np.arange(len(candidates)), np.full(len(unseen), -1)])
+        unseen = np.concatenate([np.zeros(len(candidates)), unseen + 1])
+        best = _prune_paths(value, centre, unseen)
+        value, centre, unseen = value[best], centre[best], unseen[best]
+        history.append((before[best], group[best]))
     path, chosen = 0, []
-    for (before, group), there in zip(reversed(history), reversed(groups)):
-        chosen.append(there[group[path]].nodes if group[path] >= 0 else ())
+    for (before, group), candidates in zip(reversed(history), reversed(groups)):
+        chosen.append(candidates[group[path]].nodes if group[path] >= 0 else ())
         path = int(before[path])
     return chosen[::-1]
 
 
-def _distinct(value: NDArray, centre: NDArray, unseen: NDArray) -> list[int]:
-    """The best paths that end at different places, the best first."""
-    kept: list[int] = []
-    beside = np.linalg.norm(centre[:, None] - centre, axis=-1) < STRIDE
-    covered = beside & (unseen <= unseen[:, None])
+def _prune_paths(value: NDArray, centre: NDArray, unseen: NDArray) -> list[int]:
+    """Indices of the best paths with different end points, the best first."""
+    best: list[int] = []
+    is_near = np.linalg.norm(centre[:, None] - centre, axis=-1) < MAX_STEP
+    covered = is_near & (unseen <= unseen[:, None])
     for path in np.argsort(-value, kind="stable"):
-        if not covered[path, kept].any():
-            kept.append(int(path))
-        if len(kept) == _PATHS:
+        if not covered[path, best].any():
+            best.append(int(path))
+        if len(best) == _MAX_PATHS:
             break
-    return kept
+    return best

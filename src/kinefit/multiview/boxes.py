@@ -1,4 +1,4 @@
-"""Detections of one person in one picture: those of two detectors, by their boxes, and two of the same detector."""
+"""Match the detections of two detectors in one image by bounding boxes; suppress duplicate detections of one."""
 
 from __future__ import annotations
 
@@ -10,69 +10,69 @@ from numpy.typing import NDArray
 from kinefit.observations import MEDIAPIPE_478, Keypoints
 from kinefit.solvers.assignment import assign
 
-_BOX = 0.3  # boxes that two detectors give one person differ by less, as a share of their height
-_HEAD = ("nose", "eye", "ear", "mouth", "face")  # in names of points, in any spelling, of which a face mesh has likes
-_HEAD_BOX = 0.5  # boxes of a face mesh and of another detector's points of the head differ by less, in their size
-_DOUBLE = 0.03  # points of two detections of one person differ by less, as a share of the height: detectors' noise
-_SHARED = 4  # points that both have, at the least
-_MOST = 0.5  # of them that must be so near
+_MAX_BOX_SHIFT = 0.3  # between two detectors' boxes of one person, relative to the height
+_HEAD_WORDS = ("nose", "eye", "ear", "mouth", "face")  # in names of points that a face mesh has too
+_MAX_HEAD_SHIFT = 0.5  # between boxes of a face mesh and of another detector's head, relative to their size
+_MAX_COPY_SHIFT = 0.03  # between points of duplicates, relative to the height: detectors' noise
+_MIN_SHARED_POINTS = 4  # common to two detections
+_MIN_NEAR_SHARE = 0.5  # of the common points
 
 
-def same_people(people: Sequence[NDArray], theirs: Keypoints, mine: Keypoints) -> list[NDArray]:
-    """(F,) for each of several people which of one record's detections they are, as known of another record.
+def match_by_boxes(people: Sequence[NDArray], source: Keypoints, target: Keypoints) -> list[NDArray]:
+    """(F,) index of each person's detection in one record, given its index in another record of the same camera.
 
     Parameters
     ----------
-    people : (F,) each, which of the other record's detections they are; -1 for none
-    theirs, mine : records of one camera; where one is a face mesh, the other's head is compared with it
+    people : (F,) int each, index of the person's detection in `source`; -1 for none
+    source, target : records of one camera; a face mesh is compared with the head of the other record
     """
-    heads = MEDIAPIPE_478 in (theirs.names, mine.names)
-    a, b, most = _boxes(theirs, heads), _boxes(mine, heads), _HEAD_BOX if heads else _BOX
-    out = [np.full(len(one), -1) for one in people]
+    heads = MEDIAPIPE_478 in (source.names, target.names)
+    a, b, limit = _boxes(source, heads), _boxes(target, heads), _MAX_HEAD_SHIFT if heads else _MAX_BOX_SHIFT
+    out = [np.full(len(indices), -1) for indices in people]
     for f in range(min(len(a), len(b))):
         cost = np.full((len(people), b.shape[1]), np.inf)
-        for i, one in enumerate(people):
-            if one[f] >= 0:
-                size = np.maximum(a[f, one[f], 2:].max(), b[f, :, 2:].max(axis=1)) if heads else a[f, one[f], 3]
-                off = np.linalg.norm(b[f, :, :2] - a[f, one[f], :2], axis=1) / np.maximum(size, 1.0)
-                cost[i] = np.where(np.isfinite(off), off, np.inf)
-        for i, p in assign(cost, most):
+        for i, indices in enumerate(people):
+            if indices[f] >= 0:
+                size = np.maximum(a[f, indices[f], 2:].max(), b[f, :, 2:].max(axis=1)) if heads else a[f, indices[f], 3]
+                distance = np.linalg.norm(b[f, :, :2] - a[f, indices[f], :2], axis=1) / np.maximum(size, 1.0)
+                cost[i] = np.where(np.isfinite(distance), distance, np.inf)
+        for i, p in assign(cost, limit):
             out[i][f] = p
     return out
 
 
-def once(record: Keypoints, surety: NDArray) -> NDArray:
-    """(F, P) how sure each detection is, as given, and 0 for the less sure of two detections of one person.
+def suppress_duplicates(record: Keypoints, confidence: NDArray) -> NDArray:
+    """Set the confidence (F, P) of duplicate detections to zero, the less confident of two each.
 
-    They are of one person where they share points enough, half of which lie on their likes.
+    Two detections are duplicates if they share enough points and half of these coincide.
     """
-    out = surety.copy()
-    frames, count = surety.shape
+    out = confidence.copy()
+    frames, count = confidence.shape
     points = np.where((record.confidence[:frames] > 0.1)[..., None], record.points[:frames], np.nan)
     height = _boxes(record)[:frames, :, 3]
     for a in range(count):
         for b in range(a + 1, count):
-            both = np.flatnonzero((surety[:, a] > 0) & (surety[:, b] > 0))
+            both = np.flatnonzero((confidence[:, a] > 0) & (confidence[:, b] > 0))
             if both.size:
                 off = np.linalg.norm(points[both, a] - points[both, b], axis=-1)
-                near = np.sum(off < _DOUBLE * np.maximum(height[both, a], height[both, b])[:, None], axis=1)
-                double = both[near >= np.maximum(_SHARED, _MOST * np.isfinite(off).sum(axis=1))]
-                less = np.where(surety[double, a] < surety[double, b], a, b)
-                out[double, less] = 0.0
+                near = np.sum(off < _MAX_COPY_SHIFT * np.maximum(height[both, a], height[both, b])[:, None], axis=1)
+                duplicate = both[near >= np.maximum(_MIN_SHARED_POINTS, _MIN_NEAR_SHARE * np.isfinite(off).sum(axis=1))]
+                weaker = np.where(confidence[duplicate, a] < confidence[duplicate, b], a, b)
+                out[duplicate, weaker] = 0.0
     return out
 
 
 def _boxes(record: Keypoints, head: bool = False) -> NDArray:
-    """(F, P, 4) [px] middle, width and height of the box about each person's points, or its head's; NaN for nothing.
+    """(F, P, 4) [px] centre, width and height of the box around each detection or its head; NaN without points.
 
-    Not about their mean: detectors have more points in the face, in the hands or in neither.
+    The centre of the box is independent of how many points a detector has in face or hands.
     """
-    seen = np.isfinite(record.points).all(axis=-1) & (record.confidence > 0.1)
+    visible = np.isfinite(record.points).all(axis=-1) & (record.confidence > 0.1)
     if head:
-        seen = seen & [any(word in name.lower() for word in _HEAD) for name in record.names]
-    uv = np.where(seen[..., None], record.points, np.nan)
+        visible = visible & [any(word in name.lower() for word in _HEAD_WORDS) for name in record.names]
+    uv = np.where(visible[..., None], record.points, np.nan)
     out = np.full((*uv.shape[:2], 4), np.nan)
-    some = seen.any(axis=2)
-    low, high = np.nanmin(uv[some], axis=1), np.nanmax(uv[some], axis=1)
-    out[some] = np.concatenate([(low + high) / 2.0, high - low], axis=1)
+    has_points = visible.any(axis=2)
+    low, high = np.nanmin(uv[has_points], axis=1), np.nanmax(uv[has_points], axis=1)
+    out[has_points] = np.concatenate([(low + high) / 2.0, high - low], axis=1)
     return out

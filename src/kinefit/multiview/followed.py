@@ -1,4 +1,4 @@
-"""Who of the people in view is followed, and what there is to tell of the others."""
+"""Select the target person among the people in view, and describe the others."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ import numpy as np
 
 from kinefit.errors import TrackingError
 from kinefit.geometry.camera import Rig
-from kinefit.multiview.likeness import Pictures
-from kinefit.multiview.mirrors import with_images
-from kinefit.multiview.one_camera import lifted_alone, people_before
+from kinefit.multiview.likeness import ImageSource
+from kinefit.multiview.mirrors import mark_mirror_images
+from kinefit.multiview.one_camera import only_lifted, people_of_one_camera
 from kinefit.multiview.people import PersonTrack, may_be_several, people_of
 from kinefit.observations import Keypoints
 from kinefit.observations.person import FORMS, PersonChoice
 
 PEOPLE = "people"
-"""Where `Motion.provenance` has who is in view."""
+"""Key of `Motion.provenance` for the people in view."""
 
 
 @dataclass(frozen=True, eq=False)
 class PersonKeypoints:
-    """One person's keypoints.
+    """The keypoints of the target person.
 
     Parameters
     ----------
-    keypoints : records; of this person alone where there are others
-    people : everybody in view, the one of whom most is seen first; empty where nobody but one was ever detected
-    number : of the person, from 1
-    rate : float [Hz] of the records
+    keypoints : records, reduced to this person if there are others
+    people : all people in view in order of decreasing confidence; empty if there is never more than one detection
+    number : of the target person, from 1
+    rate : [Hz] of the records
     """
 
     keypoints: tuple[Keypoints, ...]
@@ -39,7 +39,7 @@ class PersonKeypoints:
     rate: float = 1.0
 
     def as_told(self) -> dict[str, Any]:
-        """For `Motion.provenance`: nothing where there is one person."""
+        """Entry of `Motion.provenance`: people in view and their returns; empty with a single person."""
         if len(self.people) < 2:
             return {}
         return {PEOPLE: {
@@ -59,34 +59,35 @@ class PersonKeypoints:
 
 def follow(
     rig: Rig, keypoints: Sequence[Keypoints], person: int | str | None = None,
-    people: Sequence[PersonTrack] | None = None, pictures: Pictures | None = None,
+    people: Sequence[PersonTrack] | None = None, images: ImageSource | None = None,
 ) -> PersonKeypoints:  # fmt: skip
-    """The keypoints of one of the people in view.
+    """Select the keypoints of one of the people in view.
 
     Parameters
     ----------
-    rig : Rig
-    keypoints : records of the same number of frames and the same rate, each of one or several people.
-    person : "first" (default), "moving", "largest", "nearest X Y Z" [m], or a number from 1
-    people : everybody in view, where `follow` has found them in these keypoints before
-    pictures : of the cameras, by whose colours those who come back are known again
+    rig : of the cameras
+    keypoints : records with the same number of frames and rate, each of one or several people
+    person : "first" (default, the largest sum of confidences), "moving", "largest", "nearest X Y Z" [m], or a number
+        from 1
+    people : result of a former call with these keypoints; default: found here
+    images : of the cameras, for re-identification by colour; default: by size only
 
     Raises
     ------
     ObservationError
-        A person in none of these forms.
+        `person` has none of these forms.
     TrackingError
-        A number that is more than there are people.
+        The number exceeds that of the people.
     """
     PersonChoice.of(person)
     if people is None:
-        lifted = lifted_alone(keypoints)
+        lifted = only_lifted(keypoints)
         if not may_be_several(keypoints):
             people = ()
         elif lifted is not None:
-            people = people_before(rig, keypoints, lifted)
+            people = people_of_one_camera(rig, keypoints, lifted)
         else:
-            people = with_images(rig, keypoints, people_of(rig, keypoints, pictures))
+            people = mark_mirror_images(rig, keypoints, people_of(rig, keypoints, images))
     people = tuple(people)
     number = choose(people, person)
     if len(people) < 2:
@@ -96,11 +97,17 @@ def follow(
 
 
 def choose(people: Sequence[PersonTrack], person: int | str | None) -> int:
-    """Which of the people in view is meant, from 0; errors and forms as of `follow`."""
+    """Index of the target person, from 0.
+
+    Raises
+    ------
+    ObservationError, TrackingError
+        As `follow`.
+    """
     wanted = PersonChoice.of(person)
     if wanted.way == "number" and wanted.number > max(len(people), 1):
-        there = f"{len(people)} people are" if len(people) > 1 else "one person is"
-        raise TrackingError(f"person {wanted.number}, but {there} in view", remedy=f"Give {FORMS}.")
+        count = f"{len(people)} people are" if len(people) > 1 else "one person is"
+        raise TrackingError(f"person {wanted.number}, but {count} in view", remedy=f"Give {FORMS}.")
     if not people:
         return 0
     if wanted.way == "moving":
@@ -113,25 +120,25 @@ def choose(people: Sequence[PersonTrack], person: int | str | None) -> int:
 
 
 def sentences(provenance: Mapping[str, Any], *, asked: bool) -> list[str]:
-    """Who is in view and who is followed; nothing where there is one person. `asked`: somebody chose the person."""
-    told = provenance.get(PEOPLE)
-    if not told:
+    """Sentences on the people in view and the target person; empty with one person. asked: whether the user chose."""
+    entry = provenance.get(PEOPLE)
+    if not entry:
         return []
     listed = "; ".join(
         f"{k} near ({', '.join(f'{v:.1f}' for v in one['place_m'])}) m moves {one['speed_m_s']:.2f} m/s, "
-        f"{one['height_px']:.0f} px tall" for k, one in enumerate(told["each"], start=1)
+        f"{one['height_px']:.0f} px tall" for k, one in enumerate(entry["each"], start=1)
     )  # fmt: skip
-    why = "" if asked else ", of whom most is seen"
-    said = [f"{told['in view']} people are in view, person {told['followed']} is followed{why} ({listed})"]
-    for k, one in enumerate(told["each"], start=1):
-        for back in one.get("returns", ()):
-            said.append(
-                f"person {k} leaves at {back['left_s']:.1f} s, and who comes at {back['came_s']:.1f} s is taken for "
-                f"the same, by {', '.join(back['by'])} (odds {min(back['odds'], 1000):.0f} to 1)"
+    why = "" if asked else ", the most visible one"
+    out = [f"{entry['in view']} people are in view, person {entry['followed']} is followed{why} ({listed})"]
+    for k, one in enumerate(entry["each"], start=1):
+        for away in one.get("returns", ()):
+            out.append(
+                f"person {k} leaves at {away['left_s']:.1f} s, and who comes at {away['came_s']:.1f} s is taken for "
+                f"the same, by {', '.join(away['by'])} (odds {min(away['odds'], 1000):.0f} to 1)"
             )
         if one.get("maybe"):
             others = " or ".join(map(str, one["maybe"]))
-            said.append(f"person {k} may be person {others}, who left before: what was seen leaves it open")
+            out.append(f"person {k} may be person {others}, who left before: what was seen leaves it open")
         if one.get("image_of"):
-            said.append(f"person {k} is person {one['image_of']} in a mirror")
-    return said
+            out.append(f"person {k} is person {one['image_of']} in a mirror")
+    return out

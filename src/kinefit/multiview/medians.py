@@ -1,4 +1,4 @@
-"""Medians of what was seen."""
+"""Medians of finite values, and median image distances between people and detections."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from kinefit.multiview import _kernels_medians
 
 
 def medians(values: NDArray) -> NDArray:
-    """(...) medians along the last axis of values (..., k) that are finite; NaN where none is."""
+    """(...) medians of the finite values (..., k) along the last axis; NaN where none is finite."""
     rows = np.ascontiguousarray(values, float).reshape(-1, values.shape[-1])
     out = np.empty(len(rows))
     _kernels_medians.medians(rows, np.empty(rows.shape[1]), out)
@@ -18,11 +18,11 @@ def medians(values: NDArray) -> NDArray:
 
 
 def distances(camera: Camera, x_world: NDArray, uv: NDArray) -> NDArray:
-    """(T, P) median distance of people (T, k, 3) [m] from detections (P, k, 2) [px] in a camera, over their heights.
+    """(T, P) median image distance of people (T, k, 3) [m] from detections (P, k, 2) [px], relative to their heights.
 
-    Infinite where fewer than three points are finite in both.
+    Infinite with fewer than three common points.
     """
-    x, seen = np.ascontiguousarray(x_world, float), np.ascontiguousarray(uv, float)
-    out = np.empty((len(x), len(seen)))
-    _kernels_medians.distances(camera.packed, x, seen, out)
+    x, detections = np.ascontiguousarray(x_world, float), np.ascontiguousarray(uv, float)
+    out = np.empty((len(x), len(detections)))
+    _kernels_medians.distances(camera.packed, x, detections, out)
     return out

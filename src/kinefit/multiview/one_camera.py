@@ -1,4 +1,4 @@
-"""People before one camera, told apart by the detector that followed each of them, and placed by their size."""
+"""People in one camera's view: identities from the detector's tracks, positions from their assumed size."""
 
 from __future__ import annotations
 
@@ -9,52 +9,53 @@ from numpy.typing import NDArray
 
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.lifting import placed
-from kinefit.multiview.association import surety_of
-from kinefit.multiview.people import STEP, PersonTrack, lasting
+from kinefit.multiview.association import confidences
+from kinefit.multiview.people import SPEED_INTERVAL_S, PersonTrack, min_person_frames
 from kinefit.observations import Keypoints
 
 
-def lifted_alone(keypoints: Sequence[Keypoints]) -> Keypoints | None:
-    """The keypoints that a network lifted to space, where no other camera has any; None where there are none."""
+def only_lifted(keypoints: Sequence[Keypoints]) -> Keypoints | None:
+    """The keypoints lifted to space by a network, if there is only one camera; None otherwise."""
     of_one = len({k.camera for k in keypoints}) == 1
     return next((k for k in keypoints if k.lifted is not None), None) if of_one else None
 
 
-def people_before(rig: Rig, keypoints: Sequence[Keypoints], record: Keypoints) -> list[PersonTrack]:
-    """Everybody whom one camera sees for a second, the one of whom most is seen first.
+def people_of_one_camera(rig: Rig, keypoints: Sequence[Keypoints], record: Keypoints) -> list[PersonTrack]:
+    """People visible for a second in one camera, in order of decreasing confidence.
 
-    Each column of the record is a person: the built-in detector keeps them apart. Places are those of people of the
-    size that the network takes for granted.
+    Each column of the record is a person, as tracked by the built-in detector. Positions hold for people of the size
+    that the network assumes.
 
     Parameters
     ----------
-    keypoints : of the camera
+    keypoints : records of the camera
     record : the lifted one of them
     """
     frames = len(record)
-    surety, people = surety_of(record, frames), []
+    confidence, people = confidences(record, frames), []
     for column in range(record.points.shape[1]):
-        seen = surety[:, column] > 0
-        if seen.sum() < max(lasting(record.rate, frames), 1):
+        visible = confidence[:, column] > 0
+        if visible.sum() < max(min_person_frames(record.rate, frames), 1):
             continue
-        chosen = np.where(seen, column, -1)
-        x = _places(rig[record.camera], record, column)
-        speed, size = _speed(x, record.rate), np.nanmean(np.ptp(record.points[seen, column, :, 1], axis=1))
-        place = np.nanmedian(x[seen].mean(axis=1), axis=0)
-        each = tuple(chosen if k is record else np.full(frames, -1) for k in keypoints)
-        people.append(PersonTrack(each, seen.astype(int), float(surety[:, column].sum()), speed, float(size), place))
-    return sorted(people, key=lambda one: -one.surety)
+        chosen = np.where(visible, column, -1)
+        x = _points_world(rig[record.camera], record, column)
+        speed, size = _speed(x, record.rate), np.nanmean(np.ptp(record.points[visible, column, :, 1], axis=1))
+        place = np.nanmedian(x[visible].mean(axis=1), axis=0)
+        choices = tuple(chosen if k is record else np.full(frames, -1) for k in keypoints)
+        total = float(confidence[:, column].sum())
+        people.append(PersonTrack(choices, visible.astype(int), total, speed, float(size), place))
+    return sorted(people, key=lambda one: -one.confidence)
 
 
-def _places(camera: Camera, record: Keypoints, column: int) -> NDArray:
-    """(F, K, 3) [m] points of one person in the world."""
+def _points_world(camera: Camera, record: Keypoints, column: int) -> NDArray:
+    """(F, K, 3) [m] points of one person in the world frame."""
     assert record.lifted is not None
     return placed(camera, record.lifted[:, column], record.points[:, column])
 
 
 def _speed(x: NDArray, rate: float) -> float:
-    """[m/s] of points (F, K, 3), the mean over time of their median; 0 where they are seen too briefly."""
-    apart = max(round(STEP * rate), 1)
-    moved = np.linalg.norm(x[apart:] - x[:-apart], axis=2)
-    told = moved[np.isfinite(moved).all(axis=1)]
-    return float(np.median(told, axis=1).mean() * rate / apart) if len(told) else 0.0
+    """[m/s] speed of points (F, K, 3) [m]: mean over time of their median; 0 if visible too briefly."""
+    interval = max(round(SPEED_INTERVAL_S * rate), 1)
+    moved = np.linalg.norm(x[interval:] - x[:-interval], axis=2)
+    complete = moved[np.isfinite(moved).all(axis=1)]
+    return float(np.median(complete, axis=1).mean() * rate / interval) if len(complete) else 0.0

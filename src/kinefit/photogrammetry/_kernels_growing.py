@@ -1,4 +1,4 @@
-"""Compiled region growing: from a few matches to all of a grid, the best neighbour first (Otto and Chau 1989)."""
+"""Compiled region growing from seeds over a grid, the best neighbour first (Otto and Chau 1989)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from kinefit.photogrammetry.matching._kernels_matching import (
 
 @jit
 def push(keys, items, size, key, item):
-    """Put an item with its key onto a heap of `size`, the largest key first; the new size."""
+    """Push an item with its key onto a max-heap of `size`; returns the new size."""
     i = size
     while i > 0:
         up = (i - 1) // 2
@@ -36,7 +36,7 @@ def push(keys, items, size, key, item):
 
 @jit
 def pop(keys, items, size):
-    """Take the item of the largest key from a heap of `size` > 0: the item, and the new size."""
+    """Pop the item of the largest key from a max-heap of `size` > 0; returns the item and the new size."""
     item, size = items[0], size - 1
     key, last = keys[size], items[size]
     i = 0
@@ -54,12 +54,11 @@ def pop(keys, items, size):
 
 @jit
 def grow(first, second, at, columns, seeds, starts, halves, steps, tolerance, share, own, least, reach, out):
-    """Match a grid of places (N, 2) [px], `columns` a row, from seeds (S,) with starts (S, 6) in the second spline.
+    """Match a grid of points (N, 2) [px], `columns` per row, from seeds (S,) with starts (S, 6) in the second spline.
 
-    A place is tried from the found neighbour of the highest correlation, with its map carried over, and again from
-    later ones where that failed. A match of less than the `least` correlation, or further than `reach` [px] from where
-    the neighbour's map says, is none. A place with a NaN is left out. Fills out (N, 15); counts the matches that were
-    tried.
+    A point starts from the map of its matched neighbour with the highest correlation, and again from later neighbours
+    if that fails. A match is rejected if its correlation is below `least` or if it is more than `reach` [px] from the
+    neighbour's prediction. Points with NaN are skipped. Fills out (N, 15); returns the number of attempts.
     """
     count = at.shape[0]
     f, fx, fy, rows, m, b, kept = room(halves)

@@ -15,13 +15,13 @@ COLUMNS = 15
 
 @jit
 def strains(x, d, columns, reach, overlap, filled, out):
-    """Green-Lagrange strain of points (N, 3) that moved by d (N, 3), on a grid of `columns` a row.
+    """Green-Lagrange strain of points (N, 3) displaced by d (N, 3), on a grid of `columns` per row.
 
     Positions and displacements within `reach` rows and columns are each fitted by a plane over the indices i, j; the
-    change of the metric is the strain, in the tangent frame whose first axis runs along the row. Points with a NaN are
-    left out.
+    change of the metric is the strain, in the tangent frame whose first axis runs along the row. Points with NaN are
+    excluded.
     overlap : factor of the slopes' variance for windows of neighbours that share pixels.
-    filled : least part of the (2 reach + 1)² points that must be there. NaN in out (N, 12) where fewer are.
+    filled : least share of the (2 reach + 1)² points that must be present; else out (N, 15) is NaN.
     """
     count, height = x.shape[0], x.shape[0] // columns
     sums, right, a, b, c, e = np.empty(6), np.empty((6, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty(3)

@@ -1,4 +1,4 @@
-"""Interlaced video: its odd or even lines alone, which were taken at one instant, and cameras that see them so."""
+"""Fields of interlaced video (the odd or even lines, taken at one instant) and cameras for them."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ Field = Literal["odd", "even"]
 
 
 def field_of(image: NDArray, field: Field) -> NDArray:
-    """Lines of a field: "odd" are the first, third and so on, as the paper counts; half as high."""
+    """Lines of one field of an image (H, W, ...), about half as many; "odd" are the first, third, ... line."""
     return np.ascontiguousarray(image[_first(field) :: 2])
 
 
 def field_camera(camera: Camera, field: Field) -> Camera:
-    """Camera whose image are the lines of a field of another's: same rays, half the pixels down.
+    """Camera of a field: the same rays with half the pixels in the vertical direction.
 
     Raises
     ------
     CalibrationError
-        An image of a single line.
+        The image has a single line.
     """
     width, height = camera.size
     if height < 2:

@@ -1,4 +1,4 @@
-"""Forward intersection: places in several images to points in space, with their covariance."""
+"""Forward intersection (triangulation) of image points to points in space, with their covariance."""
 
 from __future__ import annotations
 
@@ -12,23 +12,22 @@ from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
 
-_STEPS = 5  # of Gauss-Newton, from the point of equal weights, which is nearly there
-_DONE = 1e-9  # [m] of a step, after which there is none
-_SINGULAR = 1e-15  # of the cube of its trace: a determinant at which rays are parallel but for rounding
-_ANGLE = np.deg2rad(0.5)  # between rays, below which a distance is 100 times less certain than a direction
-
-_EXACT = 1e-6  # [px] no match is surer: images that are equal have no residuals
+_MAX_ITERATIONS = 5  # of Gauss-Newton, from the close solution with equal weights
+_TOLERANCE = 1e-9  # [m] step at which the iteration ends
+_MIN_DETERMINANT = 1e-15  # of the normal matrix, relative to the cube of its trace: parallel rays
+_MIN_RAY_ANGLE = np.deg2rad(0.5)  # [rad] at which the sigma of distance is 100 times that across
+_MIN_PIXEL_SIGMA = 1e-6  # [px] added to each match: identical images have no residuals
 
 
 @dataclass(frozen=True, eq=False)
 class Intersections:
-    """Points in space where rays meet.
+    """Intersections of rays.
 
     Parameters
     ----------
-    x_world : (N, 3) [m]; NaN where fewer than two cameras saw the point
-    covariance : (N, 3, 3) [m²], of the places in the images; what is wrong with the calibration comes on top
-    parallax : (N,) [px] RMS distance of the rays' images from the places: what the calibration leaves over
+    x_world : (N, 3) [m]; NaN with fewer than two cameras
+    covariance : (N, 3, 3) [m²] due to the image points, without errors of the calibration
+    parallax : (N,) [px] RMS reprojection error
     """
 
     x_world: NDArray
@@ -42,59 +41,60 @@ class Intersections:
 
 
 def intersect(rig: Rig, uv: NDArray, covariance: NDArray) -> Intersections:
-    """Points of least squared error, weighted by the covariance of each place.
+    """Triangulate points by least squares, weighted by the covariance of each image point.
 
     Parameters
     ----------
-    uv : (N, C, 2) [px] in the cameras of the rig; NaN where not seen
+    rig : C cameras
+    uv : (N, C, 2) [px] image points; NaN where not visible
     covariance : (N, C, 2, 2) [px²]
 
     Raises
     ------
     ObservationError
-        Shapes that do not fit.
+        Shapes disagree.
     CalibrationError
-        Cameras whose rays are all but parallel where they meet: nothing tells a distance.
+        The cameras' rays are nearly parallel, so that distances are undetermined.
     """
     check_shape(uv, ("N", len(rig), 2), "places")
     check_shape(covariance, (*uv.shape, 2), "covariances of places")
-    seen = np.isfinite(uv).all(axis=2) & np.isfinite(covariance).all(axis=(2, 3))
-    points = triangulate(rig, np.where(seen[..., None], uv, np.nan))
-    good = np.isfinite(points).all(axis=1) & (seen.sum(axis=1) >= 2)
-    x = np.where(good[:, None], points, np.nan)
+    visible = np.isfinite(uv).all(axis=2) & np.isfinite(covariance).all(axis=(2, 3))
+    points = triangulate(rig, np.where(visible[..., None], uv, np.nan))
+    valid = np.isfinite(points).all(axis=1) & (visible.sum(axis=1) >= 2)
+    x = np.where(valid[:, None], points, np.nan)
     _check_angles(rig, x)
     weight = np.zeros_like(covariance)
-    weight[seen] = np.linalg.inv(covariance[seen] + _EXACT**2 * np.eye(2))
+    weight[visible] = np.linalg.inv(covariance[visible] + _MIN_PIXEL_SIGMA**2 * np.eye(2))
     normal = np.full((len(x), 3, 3), np.nan)
-    for _ in range(_STEPS):
+    for _ in range(_MAX_ITERATIONS):
         normal, right = np.zeros((len(x), 3, 3)), np.zeros((len(x), 3))
         for c, camera in enumerate(rig):
-            at, J = camera.project_with_jacobian(x)
-            use = seen[:, c] & np.isfinite(at).all(axis=1)
+            projected, J = camera.project_with_jacobian(x)
+            use = visible[:, c] & np.isfinite(projected).all(axis=1)
             JW = np.einsum("nij,nik->njk", J[use], weight[use, c])
             normal[use] += JW @ J[use]
-            right[use] += np.einsum("njk,nk->nj", JW, uv[use, c] - at[use])
-        good &= np.linalg.det(normal) > _SINGULAR * np.trace(normal, axis1=1, axis2=2) ** 3
-        step = np.linalg.solve(normal[good], right[good][..., None])[..., 0]
-        x[good] += step
-        if not len(step) or np.abs(step).max() < _DONE:
+            right[use] += np.einsum("njk,nk->nj", JW, uv[use, c] - projected[use])
+        valid &= np.linalg.det(normal) > _MIN_DETERMINANT * np.trace(normal, axis1=1, axis2=2) ** 3
+        step = np.linalg.solve(normal[valid], right[valid][..., None])[..., 0]
+        x[valid] += step
+        if not len(step) or np.abs(step).max() < _TOLERANCE:
             break
     out = np.full((len(x), 3, 3), np.nan)
-    out[good] = np.linalg.inv(normal[good])
-    x[~good] = np.nan
-    gaps = np.stack([((camera.project(x) - uv[:, c]) ** 2).sum(axis=1) for c, camera in enumerate(rig)], axis=1)
-    square = np.where(seen, gaps, 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
-    return Intersections(x, out, np.where(good, np.sqrt(square), np.nan))
+    out[valid] = np.linalg.inv(normal[valid])
+    x[~valid] = np.nan
+    errors = np.stack([((camera.project(x) - uv[:, c]) ** 2).sum(axis=1) for c, camera in enumerate(rig)], axis=1)
+    square = np.where(visible, errors, 0.0).sum(axis=1) / np.maximum(visible.sum(axis=1), 1)
+    return Intersections(x, out, np.where(valid, np.sqrt(square), np.nan))
 
 
 def _check_angles(rig: Rig, x: NDArray) -> None:
-    """Refuse cameras that stand in one place, as seen from the points."""
+    """Raise CalibrationError if the cameras stand in one place as seen from the points (N, 3) [m]."""
     middle = x[np.isfinite(x).all(axis=1)]
     if not len(middle):
         return
     rays = np.array([camera.centre_world - np.median(middle, axis=0) for camera in rig])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     widest = np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0))
-    if widest < _ANGLE:
+    if widest < _MIN_RAY_ANGLE:
         problem = f"the rays of cameras {', '.join(rig.names)} meet at {np.rad2deg(widest):.2f} degrees at most"
         raise CalibrationError(problem, remedy="Put the cameras further apart, or check the calibration.")

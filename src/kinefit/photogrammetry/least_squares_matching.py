@@ -1,4 +1,4 @@
-"""Adaptive least-squares matching: where a window of one image is in another, to hundredths of a pixel.
+"""Adaptive least-squares matching: find a window of one image in another with sub-pixel precision.
 
 The window is moved and deformed by an affine map, and its grey values are stretched and shifted, so that the sum of
 squared differences is least (A. Gruen, Adaptive least squares correlation, 1985). Every match has its standard
@@ -23,15 +23,15 @@ from kinefit.photogrammetry.spline_image import SplineImage, template_share
 WINDOW = 13
 """[px] side of the window, as in the paper."""
 
-STEPS = 30
+MAX_STEPS = 30
 TOLERANCE = 0.001
-"""[px] by which no part of the window moves any more: a tenth of the best that matching reaches."""
+"""[px] largest motion of the window's corners at convergence: a tenth of the best precision of matching."""
 
 STATUSES = ("found", "no texture", "outside", "not converged", "not tried")
-"""Of a match, by its number."""
+"""Names of a match's status numbers."""
 
-_LARGEST = 151  # [px] of a window
-_HELPFUL = 0.6  # correlation from which a coarser level's match is a better start than none
+_MAX_WINDOW_PX = 151  # side of a window
+_MIN_LEVEL_CORRELATION = 0.6  # a match of a coarser level is a start only above it
 
 
 _ROWS = ("uv", "deformation", "gain", "offset", "correlation", "covariance", "noise", "iterations", "status")
@@ -39,17 +39,17 @@ _ROWS = ("uv", "deformation", "gain", "offset", "correlation", "covariance", "no
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Windows of one image, found in another.
+    """Windows of one image matched in another.
 
     Parameters
     ----------
     points : (N, 2) [px] centres of the windows in the first image
-    uv : (N, 2) [px] where they are in the second; NaN where not found
-    deformation : (N, 2, 2) of an offset from the centre in the first image to the second
+    uv : (N, 2) [px] their centres in the second image; NaN where not found
+    deformation : (N, 2, 2) maps an offset from the centre in the first image to the second
     gain, offset : (N,) grey value of the second image = gain * that of the first + offset
     correlation : (N,) normalised cross-correlation of the windows
     covariance : (N, 2, 2) [px²] of `uv`, from the residuals and the texture
-    noise : (N,) standard deviation of the noise of both images together
+    noise : (N,) combined standard deviation of both images' noise, in grey values
     iterations : (N,) int
     status : (N,) int, into `STATUSES`
     """
@@ -69,7 +69,7 @@ class Matches:
     def of(
         cls, points: NDArray, rows: NDArray, first: SplineImage, second: SplineImage, halves: NDArray[np.int64]
     ) -> Matches:
-        """From rows (N, 15) of the kernels; covariances grow where the noise of neighbouring pixels goes together."""
+        """Make matches from rows (N, 15) of the kernels; covariances are scaled up for correlated noise."""
         status = rows[:, kernels.STATUS].astype(np.int64)
         found = status == kernels.FOUND
         out = np.where(found[:, None], rows, np.nan)
@@ -86,7 +86,7 @@ class Matches:
 
     @property
     def found(self) -> NDArray[np.bool_]:
-        """(N,) whether a window was found."""
+        """(N,) whether each window was found."""
         return self.status == kernels.FOUND
 
     @cached_property
@@ -96,43 +96,49 @@ class Matches:
 
     @cached_property
     def starts(self) -> NDArray:
-        """(N, 6) place and deformation, for the kernels."""
+        """(N, 6) position [px] and deformation, as start values of the kernels."""
         return np.concatenate([self.uv, self.deformation.reshape(-1, 4)], axis=1)
 
     def or_else(self, other: Matches) -> Matches:
-        """These, and those of another try at the same points where these were not found."""
-        own = self.found
+        """These matches, completed by another attempt at the same points where these were not found."""
+        is_found = self.found
 
         def either(a: NDArray, b: NDArray) -> NDArray:
-            return np.where(own.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+            return np.where(is_found.reshape(-1, *[1] * (a.ndim - 1)), a, b)
 
         rows = {name: either(value, getattr(other, name)) for name, value in vars(self).items() if name in _ROWS}
         return replace(self, **rows)
 
     def only(self, good: NDArray[np.bool_]) -> Matches:
-        """Those of `good` (N,); the others as not converged."""
+        """Mark all matches but those of `good` (N,) as not converged."""
         rows = {
             name: np.where(good.reshape(-1, *[1] * (value.ndim - 1)), value, np.nan)
             for name, value in vars(self).items()
             if name in _ROWS and np.issubdtype(value.dtype, np.floating)
         }
-        lost = self.found & ~good
-        return replace(self, **rows, status=np.where(lost, kernels.DIVERGED, self.status))
+        rejected = self.found & ~good
+        return replace(self, **rows, status=np.where(rejected, kernels.DIVERGED, self.status))
 
 
-def halves_of(window: int | ArrayLike, count: int) -> NDArray[np.int64]:
-    """(N,) half sides of windows, `window` = 2 half + 1 [px] of all or of each; refuses even ones."""
+def half_sides(window: int | ArrayLike, count: int) -> NDArray[np.int64]:
+    """(N,) half sides of windows of `window` = 2 half + 1 [px], one for all or for each.
+
+    Raises
+    ------
+    ObservationError
+        A window is even, outside of 5 to 151 px, or their number is wrong.
+    """
     sides = np.asarray(window)
     if sides.shape not in ((), (count,)) or not np.issubdtype(sides.dtype, np.integer):
         raise ObservationError(f"windows of shape {sides.shape}", remedy=f"Give a whole number of pixels, or {count}.")
-    if sides.size and (np.any(sides % 2 == 0) or sides.min() < 5 or sides.max() > _LARGEST):
+    if sides.size and (np.any(sides % 2 == 0) or sides.min() < 5 or sides.max() > _MAX_WINDOW_PX):
         problem = f"a window of {sides.min()} to {sides.max()} px"
-        raise ObservationError(problem, remedy=f"Take an odd number from 5 to {_LARGEST}.")
+        raise ObservationError(problem, remedy=f"Take an odd number from 5 to {_MAX_WINDOW_PX}.")
     return np.ascontiguousarray(np.broadcast_to(sides // 2, (count,)), dtype=np.int64)
 
 
-def places(points: ArrayLike) -> NDArray:
-    """(N, 2) [px] as the kernels take them."""
+def as_points(points: ArrayLike) -> NDArray:
+    """(N, 2) [px] as a contiguous array for the kernels; raises ObservationError for other shapes."""
     return np.array(shaped(points, ("N", 2), "points"))
 
 
@@ -146,26 +152,26 @@ def match(
     window: int | ArrayLike = WINDOW,
     levels: int = 0,
 ) -> Matches:
-    """Find windows of one image in another.
+    """Match windows of one image in another by least squares.
 
     Parameters
     ----------
-    first, second : of any sizes
-    points : (N, 2) [px] centres of the windows in the first image, between pixels or on them
-    starts : (N, 2) [px] where they are sought in the second; default: at the same place. Within about a third of the
-        size of the texture's grains, or of `2**levels` times that.
-    deformation : (2, 2) or (N, 2, 2) to start with; default: none
-    window : odd side [px], of all or of each (`windows_by_texture` chooses them)
-    levels : of the pyramid, each of half the size, from which to come down
+    first, second : images of any sizes
+    points : (N, 2) [px] centres of the windows in the first image, also between pixels
+    starts : (N, 2) [px] initial centres in the second image, right to about a third of the texture's grain size, or
+        `2**levels` times that; default: `points`
+    deformation : (2, 2) or (N, 2, 2) initial map; default: identity
+    window : odd side [px], of all or of each; see `windows_by_texture`
+    levels : number of coarser pyramid levels, each of half the size, that give the starts
 
     Raises
     ------
     ObservationError
-        Shapes that do not fit, an even window, a pyramid of more levels than the images have.
+        Shapes disagree, a window is even, or the images are too small for the pyramid.
     """
-    at = places(points)
-    halves = halves_of(window, len(at))
-    goal = at if starts is None else places(starts)
+    at = as_points(points)
+    halves = half_sides(window, len(at))
+    goal = at if starts is None else as_points(starts)
     maps = np.eye(2) if deformation is None else np.asarray(deformation, float)
     if goal.shape != at.shape or maps.shape not in ((2, 2), (len(at), 2, 2)):
         raise ObservationError(
@@ -174,19 +180,19 @@ def match(
         )
     begin = np.concatenate([goal, np.broadcast_to(maps, (len(at), 2, 2)).reshape(-1, 4)], axis=1)
     if levels:
-        begin = _from_above(first, second, at, begin, halves, levels)
+        begin = _coarse_starts(first, second, at, begin, halves, levels)
     out = np.empty((len(at), kernels.ROW))
     kernels.match_points(
-        first.coefficients, second.coefficients, at, begin, halves, STEPS, TOLERANCE, template_share(first, second),
-        first.noise**2, out,
+        first.coefficients, second.coefficients, at, begin, halves, MAX_STEPS, TOLERANCE,
+        template_share(first, second), first.noise**2, out,
     )  # fmt: skip
     return Matches.of(at, out, first, second, halves)
 
 
-def _from_above(
+def _coarse_starts(
     first: SplineImage, second: SplineImage, at: NDArray, begin: NDArray, halves: NDArray, levels: int
 ) -> NDArray:
-    """Starts (N, 6) from the levels of a pyramid; a window that is not found on one starts from the nearest."""
+    """Starts (N, 6) from coarser pyramid levels; windows not found there start from the nearest match."""
     if levels < 0 or min(*first.size, *second.size) >> levels < 32:
         problem = f"a pyramid of {levels} levels over images of {first.size} and {second.size} px"
         raise ObservationError(problem, remedy="Take fewer: the highest must have 32 px a side.")
@@ -200,8 +206,8 @@ def _from_above(
         start[:, :2] *= scale
         share = template_share(one, two)
         pair = one.coefficients, two.coefficients
-        kernels.match_points(*pair, at * scale, start, halves, STEPS, 0.01, share, one.noise**2, out)
-        good = (out[:, kernels.STATUS] == kernels.FOUND) & (out[:, kernels.CORRELATION] >= _HELPFUL)
+        kernels.match_points(*pair, at * scale, start, halves, MAX_STEPS, 0.01, share, one.noise**2, out)
+        good = (out[:, kernels.STATUS] == kernels.FOUND) & (out[:, kernels.CORRELATION] >= _MIN_LEVEL_CORRELATION)
         if good.any():
             near = np.flatnonzero(good)[_nearest(at, at[good])]
             maps = out[near, 2:6].reshape(-1, 2, 2)
@@ -211,7 +217,7 @@ def _from_above(
 
 
 def _nearest(at: NDArray, others: NDArray) -> NDArray[np.int64]:
-    """(N,) index of the nearest of others (M, 2) to each place (N, 2)."""
+    """(N,) index of the nearest of `others` (M, 2) to each point (N, 2)."""
     out = np.empty(len(at), np.int64)
     for k in range(0, len(at), 1000):  # rows of a table of distances
         gaps = at[k : k + 1000, None] - others[None]
@@ -227,21 +233,21 @@ def windows_by_texture(
     std: float = 0.02,
     windows: tuple[int, ...] = (9, 13, 17, 21, 27, 35, 45),
 ) -> NDArray[np.int64]:
-    """Side (N,) [px] of the smallest window whose texture promises a standard deviation.
+    """(N,) side [px] of the smallest window whose texture predicts a standard deviation.
 
     Parameters
     ----------
     points : (N, 2) [px] in the first image
-    std : [px], in the worst direction, at the noise of both images; 0.02 costs little resolution on good texture
-    windows : to choose from, odd and growing; the largest where none is enough, also where nothing but noise is there
+    std : [px] in the worst direction, given the noise of both images; 0.02 costs little resolution on good texture
+    windows : odd sides [px] in increasing order; the largest is taken if none suffices
     """
-    at = places(points)
+    at = as_points(points)
     sides = np.full(len(at), windows[-1], np.int64)
-    left = np.ones(len(at), bool)
+    undecided = np.ones(len(at), bool)
     variance = first.noise**2 + second.noise**2
-    for half, side in zip(halves_of(np.array(windows), len(windows)), windows):
-        out = np.empty(left.sum())
-        kernels.predict(first.coefficients, at[left], int(half), variance, template_share(first, second), out)
-        here = np.flatnonzero(left)[out <= std]
-        sides[here], left[here] = side, False
+    for half, side in zip(half_sides(np.array(windows), len(windows)), windows):
+        out = np.empty(undecided.sum())
+        kernels.predict(first.coefficients, at[undecided], int(half), variance, template_share(first, second), out)
+        sufficient = np.flatnonzero(undecided)[out <= std]
+        sides[sufficient], undecided[sufficient] = side, False
     return sides

@@ -1,4 +1,4 @@
-"""Dense matching of a grid, grown from a few seeds: the best neighbour first (Otto and Chau, 1989)."""
+"""Dense matching of a grid by region growing from a few seeds, the best neighbour first (Otto and Chau, 1989)."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
 from kinefit.photogrammetry import _kernels_growing
-from kinefit.photogrammetry.least_squares_matching import STEPS, TOLERANCE, WINDOW, Matches, halves_of, places
+from kinefit.photogrammetry.least_squares_matching import MAX_STEPS, TOLERANCE, WINDOW, Matches, as_points, half_sides
 from kinefit.photogrammetry.matching import _kernels_matching
 from kinefit.photogrammetry.spline_image import SplineImage, template_share
 
-LEAST_CORRELATION = 0.8
-"""Of a match: at 0.8 a third of the variance of the grey values is unexplained; wrong matches of 169 random pixels stay
-below 0.5."""
+MIN_CORRELATION = 0.8
+"""Least correlation of a match: at 0.8 a third of the grey values' variance is unexplained; wrong matches of 169 random
+pixels stay below 0.5."""
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Places of the first image, in rows and columns.
+    """Grid points of the first image, in rows and columns.
 
     Parameters
     ----------
-    points : (R * C, 2) [px], row by row; NaN where the grid has none
+    points : (R * C, 2) [px], row by row; NaN outside of the mask
     columns : C
-    step : [px] from one to the next
+    step : [px] between neighbours
     """
 
     points: NDArray
@@ -35,12 +35,18 @@ class Grid:
 
     @classmethod
     def of(cls, size: tuple[int, int], step: int, *, margin: int = 0, mask: ArrayLike | None = None) -> Grid:
-        """Grid over an image of a size (width, height) [px], `margin` from its edges, where a mask (H, W) is true.
+        """Make a grid over an image.
+
+        Parameters
+        ----------
+        size : (width, height) [px]
+        step, margin : [px] between points, and from the image's edges
+        mask : (H, W) bool; points outside are NaN
 
         Raises
         ------
         ObservationError
-            A step below 1, a mask of another size, or no place left.
+            The step is below 1, the mask has another size, or no point is left.
         """
         width, height = size
         if step < 1:
@@ -61,11 +67,11 @@ class Grid:
 
     @property
     def inside(self) -> NDArray[np.bool_]:
-        """(N,) where the grid has a place."""
+        """(N,) which points are inside the mask."""
         return np.isfinite(self.points).all(axis=1)
 
     def triangles(self, good: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """(M, 3) triangles between neighbours that are all `good` (N,), the same way round as rows and columns."""
+        """(M, 3) indices of triangles between neighbours that are all `good` (N,), oriented like rows and columns."""
         index = np.arange(len(self.points)).reshape(-1, self.columns)
         a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
         corners = np.stack([a, c, b, b, c, d], axis=-1).reshape(-1, 3)
@@ -74,12 +80,12 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class Seeds:
-    """Points known in both images: by hand, from keypoints or from SIFT.
+    """Corresponding points of two images: annotated manually, from keypoints or from SIFT.
 
     Parameters
     ----------
     first, second : (S, 2) [px]
-    deformation : (S, 2, 2) of the surroundings, first to second; `Seeds.of` estimates it
+    deformation : (S, 2, 2) local map from first to second; `Seeds.of` estimates it
     """
 
     first: NDArray
@@ -88,18 +94,20 @@ class Seeds:
 
     @classmethod
     def of(cls, first: ArrayLike, second: ArrayLike) -> Seeds:
-        """From points alone, those with a NaN left out. Of three or more, one affine map gives the deformation.
+        """Make seeds from corresponding points (S, 2) [px]; those with a NaN are excluded.
+
+        Three or more points give the deformation by one affine map; fewer, the identity.
 
         Raises
         ------
         ObservationError
-            No pair of points, or other shapes.
+            There is no pair of points, or shapes disagree.
         """
-        one, two = places(first), places(second)
+        one, two = as_points(first), as_points(second)
         if one.shape != two.shape:
             raise ObservationError(f"{len(one)} and {len(two)} seeds", remedy="Give each point in both images.")
-        seen = np.isfinite(one).all(axis=1) & np.isfinite(two).all(axis=1)
-        one, two = one[seen], two[seen]
+        finite = np.isfinite(one).all(axis=1) & np.isfinite(two).all(axis=1)
+        one, two = one[finite], two[finite]
         if not len(one):
             raise ObservationError("no seed", remedy="Give one point, or more, in both images.")
         deformation = np.eye(2)
@@ -109,7 +117,7 @@ class Seeds:
         return cls(one, two, np.tile(deformation, (len(one), 1, 1)))
 
     def on(self, grid: Grid) -> tuple[NDArray[np.int64], NDArray]:
-        """Nearest place of a grid (S,) to each seed, and the start there (S, 6)."""
+        """Index (S,) of the grid point nearest to each seed, and the start values there (S, 6)."""
         points = np.where(grid.inside[:, None], grid.points, np.inf)
         near = np.array([np.argmin(((points - seed) ** 2).sum(axis=1)) for seed in self.first], np.int64)
         goal = self.second + np.einsum("sij,sj->si", self.deformation, grid.points[near] - self.first)
@@ -123,27 +131,27 @@ def grow(
     seeds: Seeds,
     *,
     window: int | ArrayLike = WINDOW,
-    least: float = LEAST_CORRELATION,
+    least: float = MIN_CORRELATION,
 ) -> Matches:
-    """Match a grid of the first image in the second, from seeds outwards.
+    """Match a grid of the first image in the second by region growing from seeds.
 
-    A match may be off its neighbour's map by half of the grid's step, so that no two neighbours can change places.
+    A match may deviate from its neighbour's map by half of the grid's step, so that neighbours cannot swap.
 
     Parameters
     ----------
-    window : odd side [px], of all or of each place of the grid
-    least : correlation of a match
+    window : odd side [px], of all or of each grid point
+    least : least correlation, 0 to 1, of a match
 
     Returns
     -------
     Matches
-        One for each place of the grid.
+        (N,) one for each grid point.
     """
     index, starts = seeds.on(grid)
-    halves = halves_of(window, len(grid.points))
+    halves = half_sides(window, len(grid.points))
     out = np.empty((len(grid.points), _kernels_matching.ROW))
     _kernels_growing.grow(
-        first.coefficients, second.coefficients, grid.points, grid.columns, index, starts, halves, STEPS, TOLERANCE,
-        template_share(first, second), first.noise**2, least, grid.step / 2, out,
+        first.coefficients, second.coefficients, grid.points, grid.columns, index, starts, halves, MAX_STEPS,
+        TOLERANCE, template_share(first, second), first.noise**2, least, grid.step / 2, out,
     )  # fmt: skip
     return Matches.of(grid.points, out, first, second, halves)

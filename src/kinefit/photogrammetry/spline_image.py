@@ -1,4 +1,4 @@
-"""Images as smooth functions: grey values between the pixels, and how noisy the pixels are."""
+"""Images as quintic B-splines: grey values between pixels, and the noise of a pixel."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.errors import ObservationError
 from kinefit.photogrammetry.matching import _kernels_spline as kernels
 
-_MASK = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]]) / 6.0
-_SMALLEST = 16  # [px] a side, two windows' margins
-_LEAST_NOISE = 1.0 / np.sqrt(12.0)  # of whole grey values
+_NOISE_MASK = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]]) / 6.0
+_MIN_SIDE_PX = 16  # of an image: two windows' margins
+_MIN_NOISE = 1.0 / np.sqrt(12.0)  # rounding to whole grey values
 
 
 def grey(image: ArrayLike) -> NDArray[np.float32]:
@@ -22,12 +22,12 @@ def grey(image: ArrayLike) -> NDArray[np.float32]:
     Raises
     ------
     ObservationError
-        Another shape, too small, or a value that is not finite.
+        The shape is another, the image too small, or a value not finite.
     """
     pixels = np.asarray(image)
-    if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3) or min(pixels.shape[:2]) < _SMALLEST:
+    if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3) or min(pixels.shape[:2]) < _MIN_SIDE_PX:
         problem = f"an image of shape {pixels.shape}"
-        remedy = f"Give (height, width) or (height, width, 3), {_SMALLEST} or more a side."
+        remedy = f"Give (height, width) or (height, width, 3), {_MIN_SIDE_PX} or more a side."
         raise ObservationError(problem, remedy=remedy)
     out = np.ascontiguousarray(pixels, dtype=np.float32)
     if out.ndim == 3:
@@ -41,14 +41,14 @@ def grey(image: ArrayLike) -> NDArray[np.float32]:
 class SplineImage:
     """The quintic B-spline through the pixels of an image, mirrored at the edges.
 
-    A spline of the fifth degree is taken: a cubic one has four times its bias over the sub-pixel shift (0.0042 against
-    0.0010 px for grains of 1 px), and 1 to 2 % more noise on the DIC Challenge.
+    A cubic spline would have four times the bias over the sub-pixel shift (0.0042 against 0.0010 px for grains of 1 px)
+    and 1 to 2 % more noise on the DIC Challenge.
 
     Parameters
     ----------
     grey : (H, W) float32, the pixels
     coefficients : (H, W) float32
-    noise : standard deviation of the noise of a pixel; of texture as fine as noise it sees more
+    noise : standard deviation of a pixel's noise in grey values; too large if the texture is as fine as noise
     """
 
     grey: NDArray[np.float32]
@@ -57,11 +57,18 @@ class SplineImage:
 
     @classmethod
     def of(cls, image: ArrayLike, *, smooth: float = 0.0) -> SplineImage:
-        """From the pixels (H, W) or (H, W, 3) RGB; errors as of `grey`.
+        """Make a spline of pixels (H, W) or (H, W, 3) RGB.
 
-        `smooth` [px] is the standard deviation of a Gaussian over 5x5 px that comes first. It takes away what pixels do
-        not resolve, and helps where texture is sharper than pixels and noise is small, as in drawn pictures; of noisy
-        ones it makes points less precise (6 to 7 % at 1 px on the DIC Challenge).
+        Parameters
+        ----------
+        smooth : [px] standard deviation of a Gaussian filter over 5x5 px, applied first; default: none
+            It helps with texture sharper than the pixels and little noise, as in rendered images. With noisy images
+            points become less precise (6 to 7 % at 1 px on the DIC Challenge).
+
+        Raises
+        ------
+        ObservationError
+            As `grey`, or `smooth` is negative.
         """
         pixels = grey(image)
         if smooth < 0.0 or not np.isfinite(smooth):
@@ -77,7 +84,7 @@ class SplineImage:
         return self.grey.shape[1], self.grey.shape[0]
 
     def values(self, uv: ArrayLike) -> NDArray:
-        """Grey values (N,) at places (N, 2) [px]; NaN where less than three pixels surround them."""
+        """(N,) grey values at points (N, 2) [px]; NaN where fewer than three pixels surround a point."""
         places = np.array(uv, float, order="C").reshape(-1, 2)
         out = np.empty(len(places))
         kernels.values(self.coefficients, places, out)
@@ -85,14 +92,15 @@ class SplineImage:
 
 
 def pixel_noise(pixels: NDArray) -> float:
-    """Standard deviation of the noise of a pixel, from a mask that smooth texture does not pass (Immerkaer 1996).
+    """Estimate the standard deviation of the noise of pixels (H, W), in grey values (Immerkaer 1996).
 
-    The median is taken, as edges and fine texture do pass it; and no less than rounding to whole grey values leaves.
+    A filter mask removes smooth texture. The median of its output is robust to edges and fine texture. The noise is at
+    least that of rounding to whole grey values.
     """
-    passed = cv2.filter2D(pixels, cv2.CV_32F, _MASK.astype(np.float32))[1:-1, 1:-1]
-    return max(1.4826 * float(np.median(np.abs(passed))), _LEAST_NOISE)
+    passed = cv2.filter2D(pixels, cv2.CV_32F, _NOISE_MASK.astype(np.float32))[1:-1, 1:-1]
+    return max(1.4826 * float(np.median(np.abs(passed))), _MIN_NOISE)
 
 
 def template_share(first: SplineImage, second: SplineImage) -> float:
-    """Part of the variance of the noise of both images that is the first one's."""
+    """Share (0 to 1) of the first image in the noise variance of both images together."""
     return first.noise**2 / (first.noise**2 + second.noise**2)

@@ -1,4 +1,4 @@
-"""A surface in several states, before and after a load: matched against the first, or one after the other."""
+"""Measure a surface in several states of load, each matched with the first state or with the one before."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from kinefit.errors import ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches
-from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds
+from kinefit.photogrammetry.region_growing import MIN_CORRELATION, Grid, Seeds
 from kinefit.photogrammetry.seeding.unaided import grow_between, grow_over_time, grow_through
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.strain import Strain, grid_step, scatter, strain
@@ -28,7 +28,7 @@ def measure_states(
     *,
     seeds: Sequence[Seeds] | None = None,
     window: int | ArrayLike = WINDOW,
-    least: float = LEAST_CORRELATION,
+    least: float = MIN_CORRELATION,
     incremental: bool = False,
     progress: Progress | None = None,
 ) -> list[MeasuredSurface]:
@@ -36,16 +36,21 @@ def measure_states(
 
     Parameters
     ----------
-    states : of each the images of all cameras, in the rig's order; asked for one by one, in this order
-    grid, seeds, window, least : as in `measure`, of the first state
-    incremental : False: every image is matched with the first one of the first camera, so that errors do not add up.
-        True: with the state before, for motions so large that the first image is not recognised any more
-    progress : called with what is done, and how many states of how many
+    states : for each state the images of all cameras, in the rig's order; accessed once each, in order
+    grid, seeds, window [px], least : as in `measure`, for the first state
+    incremental : False: match every image with the first one of the first camera, so that errors do not accumulate.
+        True: match with the state before, for motions that change the image too much
+    progress : (what, done, total) -> None
 
     Returns
     -------
-    list of Surface
-        Points of one row are the same material points; NaN where one is lost.
+    list of MeasuredSurface
+        Rows (N,) are the same material points in all states; NaN where one is lost.
+
+    Raises
+    ------
+    ObservationError, CalibrationError
+        There is no state; or as `measure`.
     """
     if not len(states):
         raise ObservationError("no state", remedy="Give the images of one time, or more.")
@@ -58,39 +63,39 @@ def measure_states(
             progress("states", k, len(states))
         images = states[k]
         check_images(rig, images)
-        own = grow_over_time(template, images[0], places, window=window, least=least)
-        here, others = replace(places, points=own.uv), list[Matches]()
+        own_matches = grow_over_time(template, images[0], places, window=window, least=least)
+        current_grid, others = replace(places, points=own_matches.uv), list[Matches]()
         for image, camera in zip(images[1:], rig.cameras[1:]):
             pair = rig.cameras[0], camera
             if incremental:
-                others.append(grow_between(images[0], image, pair, here, window=window, least=least))
+                others.append(grow_between(images[0], image, pair, current_grid, window=window, least=least))
             else:
-                told = grow_through(template, images[0], image, pair, places, own, window=window, least=least)
-                others.append(told)
-        out.append(from_matches(rig, grid, own, others))
+                other = grow_through(template, images[0], image, pair, places, own_matches, window=window, least=least)
+                others.append(other)
+        out.append(from_matches(rig, grid, own_matches, others))
         if incremental:
-            template, places = images[0], here
+            template, places = images[0], current_grid
     if progress is not None:
         progress("states", len(states), len(states))
     return out
 
 
 def surface_strain(reference: MeasuredSurface, state: MeasuredSurface, gauge: float, window: int = 0) -> Strain:
-    """Strain from one state of a surface to another.
+    """Green-Lagrange strain between two states of a surface.
 
     Parameters
     ----------
-    gauge : [m] length over which it is taken
+    gauge : [m] gauge length
     window : [px] side of the matching windows
     """
-    moved = state.x_world - reference.x_world
-    return strain(reference.x_world, moved, reference.grid.columns, gauge=gauge, window=_side(reference, window))
+    displacement = state.x_world - reference.x_world
+    return strain(reference.x_world, displacement, reference.grid.columns, gauge=gauge, window=_side(reference, window))
 
 
 def displacement_std(reference: MeasuredSurface, state: MeasuredSurface, window: int) -> NDArray:
-    """(N, 3) [m] standard deviations of how far each point moved, by how displacements of neighbours differ.
+    """(N, 3) [m] standard deviations of displacements, estimated from their scatter among neighbours.
 
-    By the matches of both states where too few neighbours are measured.
+    With too few neighbours, they follow from the matches of both states. `window`: [px] side of the matching windows.
     """
     spread = scatter(
         reference.x_world, state.x_world - reference.x_world, reference.grid.columns, window=_side(reference, window)
@@ -99,21 +104,26 @@ def displacement_std(reference: MeasuredSurface, state: MeasuredSurface, window:
 
 
 def _side(surface: MeasuredSurface, window: int) -> float:
-    """[m] of a matching window of so many pixels, about."""
+    """[m] approximate side of a matching window of `window` [px]."""
     step = grid_step(surface.x_world, surface.grid.columns)
     return window * step / surface.grid.step if np.isfinite(step) else 0.0
 
 
 def rigid_motion(reference: NDArray, state: NDArray) -> tuple[NDArray, NDArray]:
-    """Rigid motion of points (N, 3) [m] by least squares, and what it leaves over.
+    """Least-squares rigid motion from points `reference` (N, 3) [m] to `state` (N, 3) [m], and the residuals.
 
     Returns
     -------
     T_state_reference : (4, 4)
     residual : (N, 3) [m]; NaN where a point is missing
+
+    Raises
+    ------
+    ObservationError
+        Fewer than three points are in both states.
     """
-    seen = np.isfinite(reference).all(axis=1) & np.isfinite(state).all(axis=1)
-    if seen.sum() < 3:
-        raise ObservationError(f"{seen.sum()} points in both states", remedy="Three are needed.")
-    T = se3.aligned(reference[seen], state[seen])
+    common = np.isfinite(reference).all(axis=1) & np.isfinite(state).all(axis=1)
+    if common.sum() < 3:
+        raise ObservationError(f"{common.sum()} points in both states", remedy="Three are needed.")
+    T = se3.aligned(reference[common], state[common])
     return T, state - se3.apply(T, reference)

@@ -1,4 +1,4 @@
-"""Strain of a measured surface or image: how the distances on it changed, over a stated gauge length."""
+"""Green-Lagrange strain of a measured surface or image over a given gauge length."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.errors import ObservationError
 from kinefit.photogrammetry import _kernels_strain as kernels
 
-_FILLED = 0.5  # part of a gauge's points without which a derivative would be of one side only
+_MIN_FILLED_SHARE = 0.5  # of a gauge's points; with fewer, derivatives would be one-sided
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,13 +19,13 @@ class Strain:
 
     Parameters
     ----------
-    xx, yy, xy : (N,) E = (F'F - 1) / 2; NaN where less than half of the gauge is measured
-    std_xx, std_yy, std_xy : (N,) standard deviations, from how the displacements scatter about the planes
+    xx, yy, xy : (N,) E = (F'F - 1) / 2, without unit; NaN where less than half of the gauge is measured
+    std_xx, std_yy, std_xy : (N,) standard deviations, from the scatter of displacements about the fitted planes
     first, second : (N,) principal strains, first >= second
-    angle : (N,) [rad] of the first principal direction from the grid's rows
+    angle : (N,) [rad] from the grid's rows to the first principal direction
     rotation : (N,) [rad] in the tangent plane
     gradient : (N, 2, 2) of the displacement in the tangent plane, F - 1
-    gauge : length over which each is measured: from the first to the last point of a row, in `unit`
+    gauge : gauge length in `unit`, from the first to the last point of a row
     unit : "m" or "px"
     """
 
@@ -44,29 +44,29 @@ class Strain:
     unit: str
 
     def rms(self) -> dict[str, float]:
-        """RMS of the components: of a still pair, the noise floor."""
+        """Root mean square of the components (numbers without unit): the noise floor if nothing moved."""
         return {name: float(np.sqrt(np.nanmean(getattr(self, name) ** 2))) for name in ("xx", "yy", "xy")}
 
 
 def strain(
     reference: ArrayLike, displacement: ArrayLike, columns: int, *, gauge: float, window: float = 0.0, unit: str = "m"
 ) -> Strain:
-    """Strain of a grid of points that moved.
+    """Green-Lagrange strain of a grid of displaced points.
 
     Parameters
     ----------
-    reference : (N, 2) [px] or (N, 3) [m], a grid of `columns` points a row, of the state that the strain is told
-        against
-    displacement : (N, 2 or 3) from there
-    gauge : length over which derivatives are taken, in the unit of `reference`: the planes reach over the points within
-        half of it on either side
-    window : side of the matching windows, in the same unit: where it is more than the grid's step, neighbours share
-        pixels and err alike, and the standard deviations grow accordingly
+    reference : (N, 2) [px] or (N, 3) [m], grid points of the reference state
+    displacement : (N, 2) [px] or (N, 3) [m]
+    columns : number of points per row
+    gauge : gauge length in the unit of `reference`: planes are fitted to the points within half of it on either side
+    window : side of the matching windows in the same unit. If it exceeds the grid's step, neighbours share pixels and
+        have correlated errors, which increases the standard deviations
+    unit : "m" or "px"
 
     Raises
     ------
     ObservationError
-        Shapes that do not fit, or a gauge of less than two steps of the grid.
+        Shapes disagree, or the gauge is shorter than two steps of the grid.
     """
     x, d = np.asarray(reference, float), np.asarray(displacement, float)
     if x.ndim != 2 or x.shape != d.shape or x.shape[1] not in (2, 3) or columns < 2 or len(x) % columns:
@@ -84,7 +84,7 @@ def strain(
     missing = ~(np.isfinite(x).all(axis=1) & np.isfinite(d).all(axis=1))
     x, d = np.where(missing[:, None], np.nan, x), np.where(missing[:, None], np.nan, d)
     slope, around = _overlap(window / step, 2 * reach + 1)
-    kernels.strains(x, d, columns, reach, slope / around, _FILLED, out)
+    kernels.strains(x, d, columns, reach, slope / around, _MIN_FILLED_SHARE, out)
     xx, yy, xy = out[:, 0], out[:, 1], out[:, 2]
     mean, radius = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
     std = np.sqrt(out[:, 3:6])
@@ -95,7 +95,7 @@ def strain(
 
 
 def grid_step(points: NDArray, columns: int) -> float:
-    """Median distance of neighbours on a grid (N, 3), NaN where there are none."""
+    """Median distance of neighbours on a grid of points (N, 3) [m]; NaN without neighbours."""
     grid = points.reshape(-1, columns, points.shape[1])
     gaps = np.concatenate([np.linalg.norm(np.diff(grid, axis=axis), axis=-1).ravel() for axis in (0, 1)])
     gaps = gaps[np.isfinite(gaps)]
@@ -103,9 +103,9 @@ def grid_step(points: NDArray, columns: int) -> float:
 
 
 def scatter(reference: NDArray, displacement: NDArray, columns: int, *, window: float) -> NDArray:
-    """(N, 3) standard deviations of displacements by how they scatter about planes over two windows; NaN at few points.
+    """(N, 3) [m] standard deviations of displacements from their scatter about planes over two windows; NaN if too few.
 
-    Errors that repeat from state to state, such as those of the texture in a window, are not in a displacement.
+    Errors that are equal in all states, such as those of a window's texture, cancel in a displacement.
 
     Parameters
     ----------
@@ -115,19 +115,19 @@ def scatter(reference: NDArray, displacement: NDArray, columns: int, *, window: 
     out, step = np.full((len(reference), kernels.COLUMNS), np.nan), grid_step(reference, columns)
     if np.isfinite(step):
         reach = max(2, int(np.ceil(window / step)))
-        kernels.strains(reference, displacement, columns, reach, 1.0, _FILLED, out)
+        kernels.strains(reference, displacement, columns, reach, 1.0, _MIN_FILLED_SHARE, out)
         out[:, 12:] /= _overlap(window / step, 2 * reach + 1)[1]
     return np.sqrt(out[:, 12:])
 
 
 def _overlap(ratio: float, n: int) -> tuple[float, float]:
-    """Of planes over n x n points: factors of their slopes' variance, and of the points' mean square about them.
+    """Factors of the slopes' variance and of the mean square residual of planes over n x n points with shared pixels.
 
-    Windows are `ratio` times as long as their step: errors of neighbours correlate by the share of pixels in common.
+    Windows are `ratio` times as long as the grid's step; errors of neighbours correlate by their share of pixels.
     """
     line = np.arange(n)
-    together = np.maximum(0.0, 1.0 - np.abs(line[:, None] - line) / max(ratio, 1.0))
+    correlation = np.maximum(0.0, 1.0 - np.abs(line[:, None] - line) / max(ratio, 1.0))
     centred = line - (n - 1) / 2
-    mean, slope = together.sum() / n, centred @ together @ centred / (centred @ centred)
-    left = max(n * n - mean**2 - 2.0 * mean * slope, 1.0)  # n² - 3, were they independent
-    return float(mean * slope), float(left / (n * n - 3))
+    mean, slope = correlation.sum() / n, centred @ correlation @ centred / (centred @ centred)
+    residual_freedom = max(n * n - mean**2 - 2.0 * mean * slope, 1.0)  # n² - 3 without correlation
+    return float(mean * slope), float(residual_freedom / (n * n - 3))

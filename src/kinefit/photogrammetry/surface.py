@@ -1,4 +1,4 @@
-"""A surface from images of one time: matched, intersected, with standard deviations and a mesh."""
+"""Measure a surface from images of one time: matching, intersection, standard deviations and a mesh."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.errors import CalibrationError, ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.photogrammetry.intersection import intersect
-from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches, halves_of
+from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches, half_sides
 from kinefit.photogrammetry.matching.correlation import search_box
 from kinefit.photogrammetry.matching.multi_image import match_along_rays
-from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds, grow
+from kinefit.photogrammetry.region_growing import MIN_CORRELATION, Grid, Seeds, grow
 from kinefit.photogrammetry.seeding.unaided import grow_between
 from kinefit.photogrammetry.spline_image import SplineImage
 
-_EXACT = 1e-6  # [px²] of the template's own place, which defines the point
-_FEWEST = 3  # points of a surface
-_REPEATED = 31  # [px] of windows in which a repetition is sought
-_ALIKE = 0.95  # of the best correlation; of random texture the runner-up has 0.6 to 0.8 of it
-_OUTLYING = 6.0  # robust deviations of the parallax beyond which a match is a wrong one
-_ONE_PLACE = 1e-5  # [m] between two cameras: less is a copy
-_LEAST_PARALLAX = 0.3  # [px] that is never called wrong: a good calibration leaves as much
+_EXACT_VARIANCE = 1e-6  # [px²] of the template's position, which is exact by definition
+_MIN_POINTS = 3  # of a surface
+_REPEAT_WINDOW_PX = 31  # of the search for repetitions
+_MIN_REPEAT_RATIO = 0.95  # of correlations, for repeated texture; random texture has 0.6 to 0.8
+_OUTLIER_SIGMAS = 6.0  # robust standard deviations of the parallax of a wrong match
+_MIN_BASELINE = 1e-5  # [m] between two cameras
+_MIN_OUTLIER_PARALLAX_PX = 0.3  # a good calibration leaves as much
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSurface:
-    """A measured surface.
+    """A surface measured on a grid of the first camera's image.
 
     Parameters
     ----------
-    grid : of the first camera's image in which the points were chosen
-    cameras : names
-    x_world : (N, 3) [m], one for each place of the grid; NaN where not measured
-    covariance : (N, 3, 3) [m²] by the matches
+    grid : grid points in the first camera's image
+    cameras : names of the C cameras
+    x_world : (N, 3) [m], one for each grid point; NaN where not measured
+    covariance : (N, 3, 3) [m²] due to the matches
     uv : (N, C, 2) [px] in each camera; NaN where not matched
-    correlation : (N,) the lowest of the matches
-    parallax : (N,) [px] by which the rays miss each other in the images
-    deformation : (N, C - 1, 2, 2) of an offset in the first image to each other one
+    correlation : (N,) lowest correlation of the matches
+    parallax : (N,) [px] reprojection error
+    deformation : (N, C - 1, 2, 2) maps an offset in the first image to each other image
     """
 
     grid: Grid
@@ -54,7 +54,7 @@ class MeasuredSurface:
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """(N,) which points there are."""
+        """(N,) which points are measured."""
         return np.isfinite(self.x_world).all(axis=1)
 
     @property
@@ -64,19 +64,19 @@ class MeasuredSurface:
 
     @property
     def triangles(self) -> NDArray[np.int64]:
-        """(M, 3) of the mesh, whose front faces the first camera."""
+        """(M, 3) point indices of the mesh, whose front faces the first camera."""
         return self.grid.triangles(self.measured)
 
 
 def check_images(rig: Rig, images: Sequence[SplineImage]) -> None:
-    """Refuse images that are not those of the cameras.
+    """Check that images belong to the cameras of a rig.
 
     Raises
     ------
     ObservationError
-        Fewer than two, or another number than cameras.
+        There are fewer than two images, or not one for each camera.
     CalibrationError
-        An image of another size than its camera's calibration; a camera that stands where the first one does.
+        An image differs in size from its camera's calibration, or a camera stands where the first one does.
     """
     if len(images) != len(rig) or len(rig) < 2:
         raise ObservationError(f"{len(images)} images for {len(rig)} cameras", remedy="Give one of each, two or more.")
@@ -88,8 +88,8 @@ def check_images(rig: Rig, images: Sequence[SplineImage]) -> None:
             raise CalibrationError(problem, place=f"camera {camera.name}", remedy=remedy)
     centres = np.array([camera.centre_world for camera in rig])
     for camera, centre in zip(rig.cameras[1:], centres[1:]):
-        if np.linalg.norm(centre - centres[0]) < _ONE_PLACE:
-            problem = f"it stands where camera {rig.names[0]} does: nothing tells a distance"
+        if np.linalg.norm(centre - centres[0]) < _MIN_BASELINE:
+            problem = f"it stands where camera {rig.names[0]} does: distances cannot be measured"
             remedy = "Put the cameras apart, or check the calibration and its unit."
             raise CalibrationError(problem, place=f"camera {camera.name}", remedy=remedy)
 
@@ -101,29 +101,30 @@ def measure(
     *,
     seeds: Sequence[Seeds] | None = None,
     window: int | ArrayLike = WINDOW,
-    least: float = LEAST_CORRELATION,
+    least: float = MIN_CORRELATION,
     constrained: bool | None = None,
 ) -> MeasuredSurface:
-    """Measure a surface that two or more cameras see at one time.
+    """Measure a surface from the images of two or more cameras at one time.
 
     Parameters
     ----------
-    rig, images : C cameras, and the image of each; the first holds the grid
-    seeds : from the first image to each other one, C - 1 of them; default: found along the first camera's rays,
-        or SIFT features that agree with the cameras (`grow_between`)
-    window : odd side [px] of all windows, or of each place of the grid
-    least : correlation of a match
-    constrained : match all images at once, along the cameras' rays (`match_along_rays`), after each was grown alone.
-        Default: with three cameras or more, where it gains; it trusts the calibration to a fraction of a pixel
+    rig, images : C cameras and one image of each
+    grid : of the first image
+    seeds : C - 1, from the first image to each other one; default: found along the first camera's rays, or from SIFT
+        features that agree with the cameras (`grow_between`)
+    window : odd side [px] of all windows, or of each grid point
+    least : least correlation, 0 to 1, of a match
+    constrained : finally match all images jointly along the first camera's rays (`match_along_rays`), which needs a
+        calibration right to a fraction of a pixel. Default: with three cameras or more
 
     Raises
     ------
     ObservationError, CalibrationError
-        As `check_images`; no texture, nothing in common; rays that are all but parallel.
+        As `check_images`, or there is no texture or no match, or the rays are nearly parallel.
     """
     check_images(rig, images)
     first = images[0]
-    halves_of(window, len(grid.points))
+    half_sides(window, len(grid.points))
     if seeds is not None and len(seeds) != len(rig) - 1:
         raise ObservationError(f"seeds of {len(seeds)} cameras", remedy=f"Give those of the other {len(rig) - 1}.")
     found = []
@@ -132,23 +133,23 @@ def measure(
             found.append(grow(first, image, grid, seeds[k], window=window, least=least))
         else:
             found.append(grow_between(first, image, (rig.cameras[0], camera), grid, window=window, least=least))
-        if found[-1].found.sum() < _FEWEST:
-            _refuse(first, camera.name)
+        if found[-1].found.sum() < _MIN_POINTS:
+            _raise_unmatched(first, camera.name)
         if seeds is None:
-            refuse_repeated(first, image, found[-1], f"camera {camera.name}")
+            reject_repeated_texture(first, image, found[-1], f"camera {camera.name}")
     surface = from_matches(rig, grid, None, found)
     if constrained if constrained is not None else len(rig) > 2:
         surface = match_rays(rig, images, surface, found, window=window, least=least)
     return surface
 
 
-def refuse_untextured(first: SplineImage, place: str) -> None:
-    """Say so where an image in which nothing was matched has no texture.
+def reject_untextured(first: SplineImage, place: str) -> None:
+    """Raise an error if an image without any match has no texture.
 
     Raises
     ------
     ObservationError
-        It has none beyond its noise; `place` is named.
+        The image has no texture beyond its noise; names `place`.
     """
     contrast = float(np.std(first.grey))
     if contrast < 3.0 * first.noise:
@@ -156,64 +157,69 @@ def refuse_untextured(first: SplineImage, place: str) -> None:
         raise ObservationError(problem, place=place, remedy="Put texture on the surface, or light it better.")
 
 
-def _refuse(first: SplineImage, camera: str) -> None:
-    """Say why nothing was matched."""
-    refuse_untextured(first, "first camera")
+def _raise_unmatched(first: SplineImage, camera: str) -> None:
+    """Raise ObservationError with the reason why nothing was matched."""
+    reject_untextured(first, "first camera")
     problem = "nothing of the first image is found in it"
-    remedy = "Give seeds by hand, a larger window, or a mask; texture that repeats is found nowhere for sure."
+    remedy = "Give seeds by hand, a larger window, or a mask; repeated texture has no unique match."
     raise ObservationError(problem, place=f"camera {camera}", remedy=remedy)
 
 
-def refuse_repeated(first: SplineImage, second: SplineImage, found: Matches, place: str) -> None:
-    """Refuse texture that looks the same again nearby, where nobody said which place is meant.
+def reject_repeated_texture(first: SplineImage, second: SplineImage, found: Matches, place: str) -> None:
+    """Raise an error if the texture repeats nearby, so that matches are ambiguous.
 
-    Windows of 31 px about 20 points are sought about their matches, two windows far. Texture repeats where most are
-    found as well elsewhere. Smaller windows would call a random pattern of coarse grains repeated.
+    Windows of 31 px around 20 points are searched within two windows of their matches. The texture repeats if most of
+    them have a second match. With smaller windows a random pattern of coarse grains would seem to repeat.
+
+    Raises
+    ------
+    ObservationError
+        The texture repeats; names `place`.
     """
     index = np.flatnonzero(found.found)
     index = index[np.linspace(0, len(index) - 1, min(len(index), 20)).astype(int)]
-    told = search_box(
-        first, second, found.points[index], found.uv[index], reach=2 * _REPEATED, window=_REPEATED
+    peaks = search_box(
+        first, second, found.points[index], found.uv[index], reach=2 * _REPEAT_WINDOW_PX, window=_REPEAT_WINDOW_PX
     )
-    seen = np.isfinite(told.best)
-    if seen.any() and np.mean(told.runner_up[seen] >= _ALIKE * told.best[seen]) > 0.5:
+    finite = np.isfinite(peaks.best)
+    if finite.any() and np.mean(peaks.runner_up[finite] >= _MIN_REPEAT_RATIO * peaks.best[finite]) > 0.5:
         problem = "texture that repeats: most points are found as well elsewhere, so where they are is not known"
         raise ObservationError(problem, place=place, remedy="Give seeds by hand: they say where; or another texture.")
 
 
 def from_matches(rig: Rig, grid: Grid, own: Matches | None, others: Sequence[Matches]) -> MeasuredSurface:
-    """Intersect matches of a grid; those whose parallax is far from the others' are left out.
+    """Intersect the matches of a grid and reject those with an outlying parallax.
 
     Parameters
     ----------
-    own : in the first camera, where the grid is another time's; None: the grid's places themselves
-    others : in each other camera
+    own : matches in the first camera if the grid is from another time; None: the grid points themselves
+    others : matches in each other camera
     """
     inside = grid.inside[:, None, None]
     place = np.where(grid.inside[:, None], grid.points, np.nan) if own is None else own.uv
-    exact = np.where(inside, _EXACT * np.eye(2), np.nan) if own is None else own.covariance
+    exact = np.where(inside, _EXACT_VARIANCE * np.eye(2), np.nan) if own is None else own.covariance
     uv = np.stack([place, *(m.uv for m in others)], axis=1)
     covariance = np.stack([exact, *(m.covariance for m in others)], axis=1)
-    told = intersect(rig, uv, covariance)
-    seen = [m.correlation for m in (*others, *([own] if own else []))]
-    correlation = np.min([np.where(np.isfinite(c), c, 1.0) for c in seen], axis=0)
-    gap = told.parallax
-    good = gap <= largest_parallax(gap)
+    points = intersect(rig, uv, covariance)
+    correlations = [m.correlation for m in (*others, *([own] if own else []))]
+    correlation = np.min([np.where(np.isfinite(c), c, 1.0) for c in correlations], axis=0)
+    gap = points.parallax
+    good = gap <= max_parallax(gap)
     keep = good[:, None, None]
     return MeasuredSurface(
-        grid, rig.names, np.where(keep[..., 0], told.x_world, np.nan), np.where(keep, told.covariance, np.nan),
+        grid, rig.names, np.where(keep[..., 0], points.x_world, np.nan), np.where(keep, points.covariance, np.nan),
         np.where(keep, uv, np.nan), np.where(good, correlation, np.nan), np.where(good, gap, np.nan),
         np.stack([m.deformation for m in others], axis=1),
     )  # fmt: skip
 
 
-def largest_parallax(gaps: NDArray) -> float:
-    """[px] by which rays may miss each other, by what most (N,) do: more is a wrong match, not the calibration."""
-    told = gaps[np.isfinite(gaps)]
-    if not len(told):
-        return _LEAST_PARALLAX
-    middle = np.median(told)
-    return max(_LEAST_PARALLAX, float(middle + _OUTLYING * 1.4826 * np.median(np.abs(told - middle))))
+def max_parallax(gaps: NDArray) -> float:
+    """Largest parallax [px] of a correct match: a robust bound on the parallaxes `gaps` (N,) [px]."""
+    finite = gaps[np.isfinite(gaps)]
+    if not len(finite):
+        return _MIN_OUTLIER_PARALLAX_PX
+    middle = np.median(finite)
+    return max(_MIN_OUTLIER_PARALLAX_PX, float(middle + _OUTLIER_SIGMAS * 1.4826 * np.median(np.abs(finite - middle))))
 
 
 def match_rays(
@@ -223,32 +229,35 @@ def match_rays(
     found: Sequence[Matches],
     *,
     window: int | ArrayLike = WINDOW,
-    least: float = LEAST_CORRELATION,
+    least: float = MIN_CORRELATION,
 ) -> MeasuredSurface:
-    """Match all images of a surface at once along the first camera's rays, from where it was measured.
+    """Match all images of a surface jointly along the first camera's rays, starting at the measured points.
 
     Parameters
     ----------
-    found : matches in the other cameras, whose deformations are the starts
+    found : matches in the other cameras, whose deformations (N, 2, 2) are the initial ones
+    window : odd side [px], of all or of each
+    least : least correlation, 0 to 1, of a match
     """
     at = surface.grid.points
     distance = np.linalg.norm(surface.x_world - rig.cameras[0].centre_world, axis=1)
     maps = np.stack([m.deformation for m in found], axis=1)
-    told = match_along_rays(rig, images, at, distance, maps, window=window)
-    good = told.found & (told.correlation >= least)
-    covariance = np.einsum("n,ni,nj->nij", told.variance, told.rays, told.rays)
-    across = _across(rig, told.rays, told.distance)
-    uv = np.stack([at, *(camera.project(told.x_world) for camera in rig.cameras[1:])], axis=1)
-    uv[:, 1:][~told.used] = np.nan
+    matches = match_along_rays(rig, images, at, distance, maps, window=window)
+    good = matches.found & (matches.correlation >= least)
+    covariance = np.einsum("n,ni,nj->nij", matches.variance, matches.rays, matches.rays)
+    across = _lateral_covariance(rig, matches.rays, matches.distance)
+    uv = np.stack([at, *(camera.project(matches.x_world) for camera in rig.cameras[1:])], axis=1)
+    uv[:, 1:][~matches.used] = np.nan
     keep = good[:, None]
     return MeasuredSurface(
-        surface.grid, rig.names, np.where(keep, told.x_world, np.nan),
+        surface.grid, rig.names, np.where(keep, matches.x_world, np.nan),
         np.where(keep[..., None], covariance + across, np.nan), np.where(keep[..., None], uv, np.nan),
-        np.where(good, told.correlation, np.nan), np.where(good, told.parallax, np.nan), surface.deformation,
+        np.where(good, matches.correlation, np.nan), np.where(good, matches.parallax, np.nan), surface.deformation,
     )  # fmt: skip
 
 
-def _across(rig: Rig, rays: NDArray, distance: NDArray) -> NDArray:
-    """(N, 3, 3) [m²] of the template's place across its ray, so that a covariance can be inverted."""
+def _lateral_covariance(rig: Rig, rays: NDArray, distance: NDArray) -> NDArray:
+    """(N, 3, 3) [m²] covariance across the ray due to the template's position, which keeps the total invertible."""
     focal = rig.cameras[0].matrix[0, 0]
-    return np.einsum("n,nij->nij", _EXACT * (distance / focal) ** 2, np.eye(3) - np.einsum("ni,nj->nij", rays, rays))
+    lateral = np.eye(3) - np.einsum("ni,nj->nij", rays, rays)
+    return np.einsum("n,nij->nij", _EXACT_VARIANCE * (distance / focal) ** 2, lateral)

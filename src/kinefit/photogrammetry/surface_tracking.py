@@ -1,10 +1,10 @@
-"""Points of a surface followed through videos: temporal matching in each view, spatial matching as the check.
+"""Track the points of a surface through videos: temporal matching in each view, spatial matching as a check.
 
 N. D'Apuzzo, R. Plänkers, P. Fua, A. Gruen and D. Thalmann, Modeling human bodies from video sequences (1999), section
-2.4: linear prediction, a search box scanned by cross-correlation, least-squares matching to the next image in every
-view, and between the views where the points ended up; a point is kept if both agree. Lost points are regenerated, and
-new ones made as they become visible, from the neighbours that are there. Where a body's motion is known, lost points
-are found again, with their names, as it brings them back into view (`returning`).
+2.4: linear prediction, cross-correlation in a search box, least-squares matching to the next image in every view, and
+then between the views; a point is kept if both agree. Lost points are regenerated, and new ones created as they become
+visible, from their neighbours. If a body's motion is known, lost points are re-identified when it brings them back into
+view (`returning`).
 """
 
 from __future__ import annotations
@@ -21,36 +21,36 @@ from kinefit.motion import Motion
 from kinefit.photogrammetry.intersection import intersect
 from kinefit.photogrammetry.least_squares_matching import WINDOW, match
 from kinefit.photogrammetry.matching.correlation import search_box
-from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid, Seeds
+from kinefit.photogrammetry.region_growing import MIN_CORRELATION, Grid, Seeds
 from kinefit.photogrammetry.returning import PointReturn, Vanished
 from kinefit.photogrammetry.spline_image import SplineImage
-from kinefit.photogrammetry.surface import check_images, largest_parallax, measure
+from kinefit.photogrammetry.surface import check_images, max_parallax, measure
 from kinefit.photogrammetry.trajectories import Trajectories
 
-_BEYOND = 3.0  # standard deviations by which temporal and spatial matches may differ beyond the stated agreement
-_BESIDE = 3.0  # steps of the grid from a point that was lost to one that was found, for it to be sought again
-_EXPECTED = 0.5  # of the box, within which a point that comes back is taken for itself
-_ROUNDS = 20  # of seeking again, in which a motion spreads from point to point
+_MAX_DISAGREEMENT_SIGMAS = 3.0  # by which temporal and spatial matches may differ beyond `agreement`
+_MAX_STEPS_APART = 3.0  # of the grid from a lost point to the tracked one whose motion it tries
+_MAX_RETURN_SHARE = 0.5  # of `reach`: distance of a re-identified point from its prediction
+_MAX_SEARCH_ROUNDS = 20  # in which a motion spreads from point to point
 
 
 @dataclass(frozen=True)
 class SurfaceTracking:
-    """How a surface is followed.
+    """Settings of `SurfaceTracker`.
 
     Parameters
     ----------
     window : odd side [px] of the windows
-    step : [px] of the grid on which points are made and made again
-    reach : [px] from where a point is predicted to the sides of its search box
-    least : correlation of a match
+    step : [px] of the grid on which points are created
+    reach : [px] half side of the search box around a predicted point
+    least : least correlation, 0 to 1, of a match
     agreement : [px] by which spatial and temporal match may differ
-    regenerate : whether places of the grid that lost their point get a new one
+    regenerate : whether free grid points get new surface points
     """
 
     window: int = WINDOW
     step: int = 8
     reach: int = 8
-    least: float = LEAST_CORRELATION
+    least: float = MIN_CORRELATION
     agreement: float = 0.5
     regenerate: bool = True
 
@@ -61,7 +61,7 @@ class SurfacePoints:
 
     Parameters
     ----------
-    ids : (M,) int; the same for the same point of the surface at all times
+    ids : (M,) int; a surface point keeps its id over time
     x_world : (M, 3) [m]
     covariance : (M, 3, 3) [m²]
     uv : (M, C, 2) [px]
@@ -78,23 +78,23 @@ class SurfacePoints:
         return len(self.ids)
 
     def only(self, keep: NDArray) -> SurfacePoints:
-        """Some of them, by index or mask."""
+        """Select points by index or mask."""
         return SurfacePoints(*(value[keep] for value in vars(self).values()))
 
 
 @dataclass(eq=False)
 class SurfaceTracker:
-    """Follows a surface through images of synchronised cameras; `update` once a frame, `trajectories` at the end.
+    """Tracks a surface through images of synchronised cameras: `update` once per frame, `trajectories` at the end.
 
     Parameters
     ----------
-    rig : two cameras or more; points are chosen in the first one's image
+    rig : two or more cameras; points are chosen in the first one's image
     rate : [Hz]
     settings : SurfaceTracking
-    mask : (H, W) bool, where in the first camera's first image the surface is; regenerated points need live neighbours,
-        and so stay with it
-    seeds : as of `measure`, for the first frame
-    motion : of a body whose surface it is, frame by frame; it says where points that were lost come back
+    mask : (H, W) bool, region of the surface in the first camera's first image. Later points need tracked neighbours
+        and so stay on the surface. Default: the whole image
+    seeds : for the first frame, as in `measure`
+    motion : of the body that has this surface, frame by frame; it predicts where lost points return. Default: none
     """
 
     rig: Rig
@@ -114,40 +114,46 @@ class SurfaceTracker:
             self._vanished = Vanished(self.rig, self.motion, self.settings.window)
 
     def update(self, images: Sequence[SplineImage]) -> SurfacePoints:
-        """Follow the surface into the next images, one of each camera.
+        """Track the surface into the next images, one of each camera.
 
         Raises
         ------
         ObservationError, CalibrationError
-            As `measure`, of the first images; images of other sizes.
+            As `measure` for the first images, or images of other sizes.
         TrackingError
             No point is left.
         """
         check_images(self.rig, images)
         if not self._frames:
-            now, velocity = self._started(images), None
+            points, velocity = self._measure_first(images), None
         else:
-            now, velocity = self._followed(images)
-        if len(now) == 0:
+            points, velocity = self._track(images)
+        if len(points) == 0:
             problem = f"no point of the surface is left in frame {len(self._frames)}"
             raise TrackingError(problem, remedy="A larger reach or window, more light, or a shorter exposure may help.")
-        self._velocity = np.zeros_like(now.uv) if velocity is None else velocity
+        self._velocity = np.zeros_like(points.uv) if velocity is None else velocity
         if velocity is not None and self._vanished is not None:
-            now = self._with(now, self._returned(images, now))
+            points = self._append(points, self._reidentify(images, points))
         if velocity is not None and self.settings.regenerate:
-            now = self._with(now, self._regenerated(images, now))
+            points = self._append(points, self._regenerate(images, points))
         self._images = images
-        self._frames.append(now)
-        return now
+        self._frames.append(points)
+        return points
 
-    def _with(self, now: SurfacePoints, more: SurfacePoints) -> SurfacePoints:
-        """Points and others, which move as their neighbours."""
-        shift = _of_nearest(now.uv[:, 0], self._velocity, more.uv[:, 0])
+    def _append(self, points: SurfacePoints, added: SurfacePoints) -> SurfacePoints:
+        """Append points, with the velocity of their nearest neighbours."""
+        shift = _values_of_nearest(points.uv[:, 0], self._velocity, added.uv[:, 0])
         self._velocity = np.concatenate([self._velocity, shift])
-        return SurfacePoints(*(np.concatenate([a, b]) for a, b in zip(vars(now).values(), vars(more).values())))
+        return SurfacePoints(*(np.concatenate([a, b]) for a, b in zip(vars(points).values(), vars(added).values())))
 
     def trajectories(self) -> Trajectories:
-        """All points over all frames so far."""
+        """Trajectories of all points over all frames so far.
+
+        Raises
+        ------
+        ObservationError
+            There is no frame yet.
+        """
         if not self._frames:
             raise ObservationError("no frame was given", remedy="Call `update` first.")
         shape = (len(self._frames), self._next)
@@ -159,10 +165,10 @@ class SurfaceTracker:
         return Trajectories(np.arange(len(self._frames)) / self.rate, x, std, uv)
 
     def returns(self) -> list[PointReturn]:
-        """When points that vanished are expected and were found again; none without the motion."""
+        """Frames in which lost points are expected and found again; empty without a motion."""
         return [] if self._vanished is None else list(self._vanished.returns)
 
-    def _started(self, images: Sequence[SplineImage]) -> SurfacePoints:
+    def _measure_first(self, images: Sequence[SplineImage]) -> SurfacePoints:
         settings = self.settings
         grid = Grid.of(images[0].size, settings.step, margin=settings.window // 2 + 2, mask=self.mask)
         surface = measure(
@@ -170,45 +176,45 @@ class SurfaceTracker:
         )
         index = np.flatnonzero(surface.measured)
         kept = (surface.x_world, surface.covariance, surface.uv, surface.deformation)
-        return SurfacePoints(self._new(len(index)), *(value[index] for value in kept))
+        return SurfacePoints(self._new_ids(len(index)), *(value[index] for value in kept))
 
-    def _new(self, count: int) -> NDArray[np.int64]:
-        """Names of new points."""
+    def _new_ids(self, count: int) -> NDArray[np.int64]:
+        """(count,) ids of new points."""
         self._next += count
         return np.arange(self._next - count, self._next)
 
-    def _followed(self, images: Sequence[SplineImage]) -> tuple[SurfacePoints, NDArray]:
+    def _track(self, images: Sequence[SplineImage]) -> tuple[SurfacePoints, NDArray]:
         """Points of the last frame that are found in this one, and their motion in the images (M, C, 2) [px].
 
-        Points that are not found where they are predicted are sought again where their neighbours went.
+        Points not found at their prediction are searched again with the motion of their neighbours.
         """
         last, settings = self._frames[-1], self.settings
         predicted = self._velocity.copy()
-        uv, own, velocity, maps, good = self._moved(images, last, predicted)
-        for _ in range(_ROUNDS):
-            lost, there = np.flatnonzero(~good), np.flatnonzero(good)
-            if not (len(lost) and len(there)):
+        uv, own, velocity, maps, good = self._match_temporally(images, last, predicted)
+        for _ in range(_MAX_SEARCH_ROUNDS):
+            lost, tracked = np.flatnonzero(~good), np.flatnonzero(good)
+            if not (len(lost) and len(tracked)):
                 break
-            beside = there[_nearest(last.uv[there, 0], last.uv[lost, 0])]
-            near = np.linalg.norm(last.uv[beside, 0] - last.uv[lost, 0], axis=1) <= _BESIDE * settings.step
-            other = np.linalg.norm(velocity[beside] - predicted[lost], axis=2).max(axis=1) > settings.reach / 2
-            again = near & other
-            if not again.any():
+            other = tracked[_nearest(last.uv[tracked, 0], last.uv[lost, 0])]
+            near = np.linalg.norm(last.uv[other, 0] - last.uv[lost, 0], axis=1) <= _MAX_STEPS_APART * settings.step
+            differs = np.linalg.norm(velocity[other] - predicted[lost], axis=2).max(axis=1) > settings.reach / 2
+            retried = near & differs
+            if not retried.any():
                 break
-            lost, shift = lost[again], velocity[beside[again]]
+            lost, shift = lost[retried], velocity[other[retried]]
             predicted[lost] = shift
-            told = self._moved(images, last.only(lost), shift)
-            for values, found in zip((uv, own, velocity, maps, good), told):
+            matches = self._match_temporally(images, last.only(lost), shift)
+            for values, found in zip((uv, own, velocity, maps, good), matches):
                 values[lost] = found
-        kept, uv, own, velocity, maps = last.only(good), uv[good], own[good], velocity[good], maps[good]
+        points, uv, own, velocity, maps = last.only(good), uv[good], own[good], velocity[good], maps[good]
         meet = intersect(self.rig, uv, own)
-        agree = meet.parallax <= largest_parallax(meet.parallax)
-        return SurfacePoints(kept.ids, meet.x_world, meet.covariance, uv, maps).only(agree), velocity[agree]
+        agree = meet.parallax <= max_parallax(meet.parallax)
+        return SurfacePoints(points.ids, meet.x_world, meet.covariance, uv, maps).only(agree), velocity[agree]
 
-    def _moved(
+    def _match_temporally(
         self, images: Sequence[SplineImage], last: SurfacePoints, predicted: NDArray
     ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray[np.bool_]]:
-        """Where points of the last frame are in this one, predicted to have moved by (M, C, 2) [px].
+        """Match points of the last frame in this one, starting from a predicted motion (M, C, 2) [px].
 
         Returns
         -------
@@ -216,7 +222,7 @@ class SurfaceTracker:
         covariance : (M, C, 2, 2) [px²]
         velocity : (M, C, 2) [px] by temporal matching alone
         deformation : (M, C - 1, 2, 2)
-        good : (M,) bool, found in every view, where spatial matching agrees
+        good : (M,) bool, found in every view, and spatial matching agrees
         """
         settings = self.settings
         uv, covariance = np.empty_like(last.uv), np.empty((*last.uv.shape, 2))
@@ -230,98 +236,98 @@ class SurfaceTracker:
             good &= found.found & (found.correlation >= settings.least)
         velocity, maps, index = uv - last.uv, last.deformation.copy(), np.flatnonzero(good)
         for c in range(1, len(images)):
-            good[index] &= self._agreeing(images, c, index, uv, covariance, maps)
+            good[index] &= self._match_spatially(images, c, index, uv, covariance, maps)
         return uv, covariance, velocity, maps, good
 
-    def _returned(self, images: Sequence[SplineImage], now: SurfacePoints) -> SurfacePoints:
-        """Points that were lost before, where the body's motion says that they are in view again.
+    def _reidentify(self, images: Sequence[SplineImage], points: SurfacePoints) -> SurfacePoints:
+        """Re-identify lost points that the body's motion brings back into view.
 
-        Each is matched in every view to what it looked like last, and between the views as the check.
+        Each is matched in every view with its last appearance, and then between the views as a check.
         """
         assert self._vanished is not None
         settings, frame, last = self.settings, len(self._frames), self._frames[-1]
-        lost = np.flatnonzero(~np.isin(last.ids, now.ids))
+        lost = np.flatnonzero(~np.isin(last.ids, points.ids))
         self._vanished.remember(frame - 1, last.ids[lost], last.x_world[lost], last.uv[lost], list(self._images))
         expected = self._vanished.expected(frame)
         if expected is None:
-            return now.only(np.zeros(0, int))
+            return points.only(np.zeros(0, int))
         window, good = settings.window, np.ones(len(expected.ids), bool)
         uv, covariance = expected.uv.copy(), np.empty((*expected.uv.shape, 2))
         for c, image in enumerate(images):
             mosaic, at = expected.mosaics[c], expected.at[:, c]
             box = search_box(mosaic, image, at, expected.uv[:, c], reach=settings.reach, window=window)
             start = np.where(np.isfinite(box.uv), box.uv, expected.uv[:, c])
-            told = match(mosaic, image, at, start, deformation=expected.maps[:, c], window=window)
-            good &= told.found & (told.correlation >= settings.least)
-            good &= np.linalg.norm(told.uv - expected.uv[:, c], axis=1) <= _EXPECTED * settings.reach
-            uv[:, c], covariance[:, c] = told.uv, told.covariance
+            found = match(mosaic, image, at, start, deformation=expected.maps[:, c], window=window)
+            good &= found.found & (found.correlation >= settings.least)
+            good &= np.linalg.norm(found.uv - expected.uv[:, c], axis=1) <= _MAX_RETURN_SHARE * settings.reach
+            uv[:, c], covariance[:, c] = found.uv, found.covariance
         maps, index = expected.between.copy(), np.flatnonzero(good)
         for c in range(1, len(images)):
-            good[index] &= self._agreeing(images, c, index, uv, covariance, maps)
+            good[index] &= self._match_spatially(images, c, index, uv, covariance, maps)
         index = np.flatnonzero(good)
-        meet = intersect(self.rig, uv[index], covariance[index])
-        agree = meet.parallax <= largest_parallax(meet.parallax)
-        self._vanished.found(frame, expected.index[index[agree]])
-        kept = (expected.ids[index], meet.x_world, meet.covariance, uv[index], maps[index])
-        return SurfacePoints(*(value[agree] for value in kept))
+        intersections = intersect(self.rig, uv[index], covariance[index])
+        consistent = intersections.parallax <= max_parallax(intersections.parallax)
+        self._vanished.mark_found(frame, expected.index[index[consistent]])
+        kept = (expected.ids[index], intersections.x_world, intersections.covariance, uv[index], maps[index])
+        return SurfacePoints(*(value[consistent] for value in kept))
 
-    def _agreeing(
+    def _match_spatially(
         self, images: Sequence[SplineImage], c: int, index: NDArray, uv: NDArray, covariance: NDArray, maps: NDArray
     ) -> NDArray[np.bool_]:
-        """(K,) whether matching from the first image to camera c's finds points where they are, some of all.
+        """(K,) whether matching the first image with that of camera c confirms the points `index` (K,).
 
-        Their places, covariances and maps are made those of that match.
+        Replaces their image points, covariances and maps by those of this match.
         """
         settings = self.settings
-        told = match(
+        found = match(
             images[0], images[c], uv[index, 0], uv[index, c], deformation=maps[index, c - 1], window=settings.window
         )
-        gap = np.linalg.norm(told.uv - uv[index, c], axis=1)
-        spread = np.sqrt(np.trace(told.covariance + covariance[index, c], axis1=1, axis2=2))
-        near = gap <= settings.agreement + _BEYOND * spread
-        uv[index, c], covariance[index, c] = told.uv, told.covariance
-        maps[index, c - 1] = told.deformation
-        return np.asarray(told.found & (told.correlation >= settings.least) & near)
+        gap = np.linalg.norm(found.uv - uv[index, c], axis=1)
+        spread = np.sqrt(np.trace(found.covariance + covariance[index, c], axis1=1, axis2=2))
+        near = gap <= settings.agreement + _MAX_DISAGREEMENT_SIGMAS * spread
+        uv[index, c], covariance[index, c] = found.uv, found.covariance
+        maps[index, c - 1] = found.deformation
+        return np.asarray(found.found & (found.correlation >= settings.least) & near)
 
-    def _regenerated(self, images: Sequence[SplineImage], now: SurfacePoints) -> SurfacePoints:
-        """New points where the grid has none, next to those that are there."""
+    def _regenerate(self, images: Sequence[SplineImage], points: SurfacePoints) -> SurfacePoints:
+        """New points at free grid points next to tracked ones."""
         grid = Grid.of(images[0].size, self.settings.step, margin=self.settings.window // 2 + 2)
-        cell = np.rint((now.uv[:, 0] - grid.points[0]) / grid.step).astype(int)
+        cell = np.rint((points.uv[:, 0] - grid.points[0]) / grid.step).astype(int)
         rows = len(grid.points) // grid.columns
         taken = np.zeros((rows + 2, grid.columns + 2), bool)
         taken[np.clip(cell[:, 1], -1, rows) + 1, np.clip(cell[:, 0], -1, grid.columns) + 1] = True
-        near = taken.copy()  # at most one cell from a live point: a surface grows by its step a frame
+        near = taken.copy()  # at most one cell from a tracked point: a surface grows by one step per frame
         for axis in (0, 1):
             near |= np.roll(near, 1, axis) | np.roll(near, -1, axis)
         free = (near & ~taken)[1:-1, 1:-1].ravel()
         if not free.any():
-            return now.only(np.zeros(0, int))
-        return self._beside(images, now, grid.points[free])
+            return points.only(np.zeros(0, int))
+        return self._match_new(images, points, grid.points[free])
 
-    def _beside(self, images: Sequence[SplineImage], now: SurfacePoints, at: NDArray) -> SurfacePoints:
-        """Points at places (K, 2) [px] of the first image, started from the maps of the nearest live ones."""
-        settings, near = self.settings, _nearest(now.uv[:, 0], at)
+    def _match_new(self, images: Sequence[SplineImage], points: SurfacePoints, at: NDArray) -> SurfacePoints:
+        """Match new points (K, 2) [px] of the first image, starting from the maps of the nearest tracked ones."""
+        settings, near = self.settings, _nearest(points.uv[:, 0], at)
         uv = np.repeat(at[:, None], len(images), axis=1)
         covariance = np.tile(1e-6 * np.eye(2), (len(at), len(images), 1, 1))
-        maps, good = now.deformation[near].copy(), np.ones(len(at), bool)
+        maps, good = points.deformation[near].copy(), np.ones(len(at), bool)
         for c in range(1, len(images)):
-            start = now.uv[near, c] + np.einsum("nij,nj->ni", maps[:, c - 1], at - now.uv[near, 0])
-            told = match(images[0], images[c], at, start, deformation=maps[:, c - 1], window=settings.window)
-            close = np.linalg.norm(told.uv - start, axis=1) <= settings.step / 2
-            good &= told.found & (told.correlation >= settings.least) & close
-            uv[:, c], covariance[:, c], maps[:, c - 1] = told.uv, told.covariance, told.deformation
-        meet = intersect(self.rig, uv, covariance)
-        good &= meet.parallax <= largest_parallax(meet.parallax[good])
+            start = points.uv[near, c] + np.einsum("nij,nj->ni", maps[:, c - 1], at - points.uv[near, 0])
+            found = match(images[0], images[c], at, start, deformation=maps[:, c - 1], window=settings.window)
+            close = np.linalg.norm(found.uv - start, axis=1) <= settings.step / 2
+            good &= found.found & (found.correlation >= settings.least) & close
+            uv[:, c], covariance[:, c], maps[:, c - 1] = found.uv, found.covariance, found.deformation
+        intersections = intersect(self.rig, uv, covariance)
+        good &= intersections.parallax <= max_parallax(intersections.parallax[good])
         index = np.flatnonzero(good)
-        kept = (meet.x_world, meet.covariance, uv, maps)
-        return SurfacePoints(self._new(len(index)), *(value[index] for value in kept))
+        kept = (intersections.x_world, intersections.covariance, uv, maps)
+        return SurfacePoints(self._new_ids(len(index)), *(value[index] for value in kept))
 
 
 def _nearest(points: NDArray, at: NDArray) -> NDArray[np.int64]:
-    """(K,) index of the nearest of points (M, 2) to each place (K, 2)."""
+    """(K,) index of the nearest of points (M, 2) to each of `at` (K, 2)."""
     return np.array([np.argmin(((points - place) ** 2).sum(axis=1)) for place in at], np.int64)
 
 
-def _of_nearest(points: NDArray, values: NDArray, at: NDArray) -> NDArray:
-    """Values of the nearest points (M, 2) to places (K, 2)."""
+def _values_of_nearest(points: NDArray, values: NDArray, at: NDArray) -> NDArray:
+    """Values (K, ...) of the nearest of points (M, 2) to each of `at` (K, 2)."""
     return values[_nearest(points, at)] if len(at) else values[:0]

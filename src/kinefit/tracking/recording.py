@@ -18,7 +18,7 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import UP_AXES, Motion
 from kinefit.multiview.association import choose_people, person_records
 from kinefit.multiview.followed import PersonKeypoints, follow
-from kinefit.multiview.one_camera import lifted_alone
+from kinefit.multiview.one_camera import only_lifted
 from kinefit.multiview.people import PersonTrack
 from kinefit.observations import (
     KEYPOINT_SIGMA,
@@ -178,7 +178,7 @@ class Recording:
     @property
     def alone(self) -> Camera | None:
         """The camera that is the only sensor, its landmarks lifted to space."""
-        lifted = lifted_alone(self.keypoints)
+        lifted = only_lifted(self.keypoints)
         others = self.markers or self.depth or self.sensors or self.backgrounds or len(self.rig) > 1
         return None if lifted is None or others else self.rig[lifted.camera]
 
@@ -257,7 +257,7 @@ def keypoint_frames(keypoints: Sequence[Keypoints], i: int, time: float) -> list
 
 def _seen_in(records: Sequence[Keypoints], times: NDArray, i: int) -> Sequence[Any]:
     """Frames of records of one person at a step, and of what a network lifted of it, where it is the only camera."""
-    time, one = float(times[i]), lifted_alone(records)
+    time, one = float(times[i]), only_lifted(records)
     seen: list[Any] = []
     if one is not None and one.lifted is not None and (one.confidence[i] > 0).any():
         seen.append(LiftedFrame(one.camera, time, one.names, one.lifted[i, 0], one.points[i, 0], one.keypoint_set))

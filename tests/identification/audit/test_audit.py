@@ -5,7 +5,7 @@ import pytest
 
 from kinefit.errors import ObservationError
 from kinefit.identification.audit.audit import audit_take
-from kinefit.identification.audit.swaps import crossings, pair_gain, swap_gains
+from kinefit.identification.audit.swaps import find_crossings, pair_gain, swap_gains
 from kinefit.identification.model.learn import learn_model
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
@@ -161,5 +161,5 @@ def test_crossings_are_where_two_go_on_as_the_other():
     a, b = np.hstack([t, t * 0, t * 0]), np.hstack([t, t * 0 + 0.2, t * 0])
     x = np.stack([a, b], 1)
     x[20:30] = x[20:30, ::-1]
-    found, broken = crossings(x)
+    found, broken = find_crossings(x)
     assert found == [(20, 0, 1), (30, 0, 1)] and broken[20].all() and not broken[10].any()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kinefit.identification.audit.audit import audit_take
-from kinefit.identification.audit.resting import resting
+from kinefit.identification.audit.resting import resting_markers
 
 FIRST = 60
 
@@ -18,7 +18,7 @@ def left_behind(take, label):
 
 
 def test_nothing_rests_in_a_clean_take(waving):
-    assert resting(waving) == []
+    assert resting_markers(waving) == []
 
 
 @pytest.mark.parametrize("label", ["LBWT", "RWRA"])
@@ -30,4 +30,4 @@ def test_a_marker_left_behind_is_named(waving, label):
 
 def test_a_take_of_less_than_a_window_says_nothing(waving):
     short = left_behind(waving, "LBWT")
-    assert resting(replace(short, positions=short.positions[FIRST : FIRST + 30])) == []
+    assert resting_markers(replace(short, positions=short.positions[FIRST : FIRST + 30])) == []

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kinefit.identification.frame.beliefs import LEAST, MOST, Beliefs, learn_beliefs
+from kinefit.identification.frame.beliefs import MAX_NOISE, MIN_NOISE, Beliefs, learn_beliefs
 from kinefit.identification.frame.identify import identify
 from kinefit.identification.frame.search import LabelSearch, UnlabelledFrame
 from kinefit.identification.frame.synthetic import random_pose, synthetic_body
@@ -42,7 +42,7 @@ def test_a_name_costs_what_its_absence_makes_it():
     gaps = np.linalg.norm(pose.points[:, None] - pose.points, axis=-1)
     told = [None, Beliefs(usual, noise), absent, Beliefs(usual, 2 * noise)]
     search = [LabelSearch(tables, UnlabelledFrame(pose.points, gaps, 10.0, 12.0, 4.5, beliefs=b), 1.0) for b in told]
-    cost = [one.alone(one.by_index[foot])[0] for one in search]
+    cost = [one.search_alone(one.by_index[foot])[0] for one in search]
     assert cost[1] == pytest.approx(cost[0]) and cost[3] > cost[0]
     assert cost[2] - cost[0] == pytest.approx(-absent.odds[toe], abs=1e-6)
 
@@ -59,4 +59,4 @@ def test_noise_is_found_for_each_segment_within_bounds():
             points[pose.truth[list(members)]] += sigma * rng.standard_normal((len(members), 3))
         noisy.append((points, identify(body, points)))
     noise = learn_beliefs(body, noisy).noise
-    assert noise[large] > 1.5 * np.median(noise) and LEAST <= noise.min() and noise.max() <= MOST
+    assert noise[large] > 1.5 * np.median(noise) and MIN_NOISE <= noise.min() and noise.max() <= MAX_NOISE

@@ -8,7 +8,7 @@ import pytest
 from kinefit.errors import ObservationError
 from kinefit.identification.frame.explain import at_level, explain, gain_of
 from kinefit.identification.frame.identify import identify
-from kinefit.identification.frame.polish import apart, cost_of, labels_of, polish, rivals, shared
+from kinefit.identification.frame.polish import cost_of, labels_of, polish, resolve_conflicts, rivals, shared_points
 from kinefit.identification.frame.search import LabelSearch, UnlabelledFrame
 from kinefit.identification.frame.synthetic import random_pose, synthetic_body
 from kinefit.identification.frame.tables import segment_tables
@@ -37,11 +37,11 @@ def begun(body, frame, root=0):
 def test_every_point_is_taken_once_and_nothing_gets_dearer(body, seed):
     _, frame = seen(body, seed, distortion=0.04, missing=0.2, extra=5)
     search, chosen = begun(body, frame)
-    once = apart(search, chosen)
+    once = resolve_conflicts(search, chosen)
     better = polish(search, once)
     for explanation in (once, better):
         taken = labels_of(explanation, len(body))
-        assert not shared(search, explanation).any()
+        assert not shared_points(search, explanation).any()
         assert len(set(taken[taken >= 0])) == (taken >= 0).sum()
     assert cost_of(search, better) <= cost_of(search, once) + 1e-9
 
@@ -50,9 +50,9 @@ def test_every_point_is_taken_once_and_nothing_gets_dearer(body, seed):
 def test_rivals_are_other_names_that_cost_little_more(body, seed):
     _, frame = seen(body, seed, distortion=0.06, missing=0.2)
     search, chosen = begun(body, frame)
-    best, near, _ = rivals(search, polish(search, apart(search, chosen)))
+    best, near, _ = rivals(search, polish(search, resolve_conflicts(search, chosen)))
     for dearer, rival in near:
-        assert not shared(search, rival).any()
+        assert not shared_points(search, rival).any()
         assert dearer == pytest.approx(cost_of(search, rival) - cost_of(search, best), abs=1e-6)
         assert (labels_of(rival, len(body)) != labels_of(best, len(body))).any()
 
@@ -62,7 +62,7 @@ def test_the_cost_does_not_depend_on_the_segment_begun_with(body):
     costs = []
     for root in (0, 1, 5):
         search, chosen = begun(body, frame, root)
-        costs.append(cost_of(search, polish(search, apart(search, chosen))))
+        costs.append(cost_of(search, polish(search, resolve_conflicts(search, chosen))))
     assert np.ptp(costs) < 0.5  # places of joints are known a little better from one side than from the other
 
 

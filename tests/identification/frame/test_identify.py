@@ -9,7 +9,7 @@ from kinefit.errors import ObservationError
 from kinefit.identification.frame._kernels_evidence import evidence, largest_quaternion, least_squares, rigid
 from kinefit.identification.frame.identify import IdentifySettings, identify
 from kinefit.identification.frame.synthetic import mean_length, random_pose, synthetic_body
-from kinefit.identification.frame.tables import deviations, segment_tables
+from kinefit.identification.frame.tables import marker_sigmas, segment_tables
 
 
 @pytest.fixture(scope="module")
@@ -185,4 +185,4 @@ def test_tables_hang_from_any_segment(body):
 
 def test_deviations_of_distances_are_split():
     s = np.array([0.002, 0.003, 0.004, 0.005])
-    assert np.allclose(deviations(np.sqrt(s[:, None] ** 2 + s**2)), s)
+    assert np.allclose(marker_sigmas(np.sqrt(s[:, None] ** 2 + s**2)), s)

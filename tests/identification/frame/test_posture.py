@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 
 from kinefit.geometry.se3 import exp_so3, log_so3
-from kinefit.identification.frame._kernels_posture import inverse, turn_costs, turn_of, turned_by
+from kinefit.identification.frame._kernels_posture import inverse, rotate_by, turn_costs, turn_of
 from kinefit.identification.frame.identify import identify, posture_of
 from kinefit.identification.frame.synthetic import synthetic_body
 from kinefit.identification.model.learn import learn_model
@@ -20,7 +20,7 @@ def test_turns_are_those_of_the_library(angle):
     np.testing.assert_allclose(exp_so3(out), R, atol=2e-6)
     assert np.linalg.norm(out) == pytest.approx(np.linalg.norm(log_so3(R)), abs=1e-6)
     start = exp_so3(np.array([0.3, 0.2, -0.1]))
-    turned_by(angle * axis, start, turned)
+    rotate_by(angle * axis, start, turned)
     np.testing.assert_allclose(turned, R @ start, atol=1e-9)
 
 

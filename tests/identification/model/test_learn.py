@@ -10,7 +10,7 @@ from kinefit.identification.model.files import load_model, save_model
 from kinefit.identification.model.from_frame import model_from_frame
 from kinefit.identification.model.gate import training_gate
 from kinefit.identification.model.learn import learn_model
-from kinefit.identification.model.rigid import meet_few, usual_turn
+from kinefit.identification.model.rigid import fit_joint_few, reference_turn
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
 
@@ -167,15 +167,15 @@ def test_a_hinge_is_learnt_with_its_axis_and_limits():
     Rp = exp_so3(rng.standard_normal((300, 3)))
     turns = rng.uniform(-0.8, 0.4, 300)[:, None] * [0.0, 1.0, 0.0] + 0.02 * rng.standard_normal((300, 3))
     usual = exp_so3(np.array([0.3, 0.0, 0.0]))
-    middle, give = usual_turn(Rp, Rp @ usual @ exp_so3(turns), np.ones(300, bool), full)
+    middle, give = reference_turn(Rp, Rp @ usual @ exp_so3(turns), np.ones(300, bool), full)
     np.testing.assert_allclose(middle, usual @ exp_so3(np.array([0.0, -0.2, 0.0])), atol=0.05)
     spread = np.sqrt(np.linalg.eigvalsh(give))
     assert abs(np.linalg.eigh(give)[1][:, 2] @ [0, 1, 0]) > 0.95  # the axis it turns about
     assert spread[2] < 0.8 and spread[1] < full / 3  # what else it may turn about is not known, but it bends one way
-    still, loose = usual_turn(Rp, Rp @ usual, np.ones(300, bool), full)
+    still, loose = reference_turn(Rp, Rp @ usual, np.ones(300, bool), full)
     np.testing.assert_allclose(still, usual, atol=1e-9)
     assert np.sqrt(np.linalg.eigvalsh(loose)[0]) > full  # held still: any turn may be
-    assert usual_turn(Rp, Rp, np.zeros(300, bool), full) == (None, None)
+    assert reference_turn(Rp, Rp, np.zeros(300, bool), full) == (None, None)
 
 
 def test_a_marker_on_its_joint_does_not_spoil_it():
@@ -183,7 +183,7 @@ def test_a_marker_on_its_joint_does_not_spoil_it():
     x = rng.uniform(-0.2, 0.2, (2, 3))
     Rp, tp = exp_so3(rng.standard_normal((30, 3))), rng.standard_normal((30, 3))
     y = np.einsum("fij,kj->fki", Rp, x) + tp[:, None]
-    a, b = meet_few(Rp, tp, x, y, x[0])
+    a, b = fit_joint_few(Rp, tp, x, y, x[0])
     assert np.isfinite(a).all() and np.isfinite(b).all()
 
 

@@ -10,7 +10,7 @@ from kinefit.bodies.fingers import of_fingers
 from kinefit.bodies.limbs import limbs
 from kinefit.bodies.surfaces import MeshSurface, body_mesh
 from kinefit.bodies.surfaces.triangles import triangles
-from kinefit.initialization.depth_score import OVERLAP, POSTURE, TOLERANCE, Score, spreads
+from kinefit.initialization.depth_score import MAX_DEPTH_ERROR, OVERLAP_COST, POSTURE_COST, Score, prior_sigmas
 from kinefit.rendering import Canvas, rasterise
 from kinefit.sensors.surfaces.depth_view import UNKNOWN, geodesic_ends, outside, splat, view_of
 
@@ -100,11 +100,11 @@ def twin(score, state):
     h, w = view.observed.shape
     z = rasterise(x, mesh.faces, view.lens, (w, h)).depth.astype(float)
     drawn, seen = np.isfinite(z), view.seen
-    gap = np.where(drawn & seen, z - view.observed, 0.0) / TOLERANCE
+    gap = np.where(drawn & seen, z - view.observed, 0.0) / MAX_DEPTH_ERROR
     explained = np.sum(np.clip(1 - np.abs(gap), 0, 1)[drawn & seen])
     against = np.sum(np.clip(-0.5 * gap, 0, 1)) + np.sum(view.trust[drawn & ~seen & (z < view.behind)])
-    odd = np.mean(((state.angles - tree.usual) / spreads(score.body)) ** 2)
-    return (explained - against) / seen.sum() - POSTURE * odd
+    odd = np.mean(((state.angles - tree.usual) / prior_sigmas(score.body)) ** 2)
+    return (explained - against) / seen.sum() - POSTURE_COST * odd
 
 
 def test_the_score_is_its_numpy_twin_and_truth_scores_best():
@@ -115,7 +115,7 @@ def test_the_score_is_its_numpy_twin_and_truth_scores_best():
     for _ in range(6):
         other = state.retract(0.05 * rng.normal(size=BODY.tree.n_dofs))
         within = twin(score, other) - score.of(other)
-        assert 0.0 <= within + 1e-4 and within < OVERLAP * 0.2  # what is left is parts within parts
+        assert 0.0 <= within + 1e-4 and within < OVERLAP_COST * 0.2  # what is left is parts within parts
         assert score.of(other) < score.of(state)
     assert score.of(state) > 0.85
 

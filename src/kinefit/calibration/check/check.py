@@ -76,7 +76,7 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
         return Check(take.name, ranked(missing), loaded.take, seen)
     rig, named = seen.rig, {entry.camera for entry in loaded.take.keypoints}
     with TakePictures(loaded.take, seen) as pictures:
-        one = follow(rig, seen.keypoints, take.person or _SHOWS_MOST, pictures=pictures)
+        one = follow(rig, seen.keypoints, take.person or _SHOWS_MOST, images=pictures)
     seen = replace(seen, keypoints=one.keypoints)
     begun = Check(take.name, (*loaded.findings, *_others(one, take.person is not None)), loaded.take, seen)
     check = check_keypoints(

@@ -29,7 +29,7 @@ from kinefit.observations.clocks import is_even
 from kinefit.photogrammetry.fields import field_camera, field_of
 from kinefit.photogrammetry.flat import measure_flat
 from kinefit.photogrammetry.least_squares_matching import windows_by_texture
-from kinefit.photogrammetry.region_growing import LEAST_CORRELATION, Grid
+from kinefit.photogrammetry.region_growing import MIN_CORRELATION, Grid
 from kinefit.photogrammetry.spline_image import SplineImage, grey
 from kinefit.photogrammetry.states import measure_states, rigid_motion, surface_strain
 from kinefit.photogrammetry.surface import MeasuredSurface
@@ -105,7 +105,7 @@ def measure_photographs(rig: Rig, views: StateImages, wanted: Wanted, progress: 
     window = wanted.side(first[0], first[1], grid)
     surfaces = measure_states(
         rig, states, grid, seeds=seeds, window=window, incremental=wanted.incremental, progress=progress,
-        least=LEAST_CORRELATION if wanted.least is None else wanted.least,
+        least=MIN_CORRELATION if wanted.least is None else wanted.least,
     )  # fmt: skip
     return _write_all(surfaces, views.photographs[0], wanted, int(np.max(window)))
 
@@ -127,7 +127,7 @@ def measure_one_camera(photographs: Sequence[Path], millimetres: float, wanted: 
     window = wanted.side(states[0], states[1], grid)
     surfaces = measure_flat(
         states, grid, millimetres / 1e3, window=window, incremental=wanted.incremental,
-        least=LEAST_CORRELATION if wanted.least is None else wanted.least,
+        least=MIN_CORRELATION if wanted.least is None else wanted.least,
     )  # fmt: skip
     return _write_all(surfaces, photographs, wanted, int(np.max(window)))
 
@@ -246,7 +246,7 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
         count = min(len(video) for video in videos)
         settings = SurfaceTracking(
             window=wanted.side_of_all(), step=wanted.step,
-            least=LEAST_CORRELATION if wanted.least is None else wanted.least,
+            least=MIN_CORRELATION if wanted.least is None else wanted.least,
         )  # fmt: skip
         seeds = None if wanted.seeds is None else read_seeds(wanted.seeds, len(rig))
         tracker = SurfaceTracker(rig, videos[0].rate, settings, mask_of(wanted.mask, wanted.field), seeds, motion)

@@ -1,4 +1,4 @@
-"""Whether labels sit, and move, where a marker set or another subject says: swaps that last all through a take."""
+"""Detect swaps that last a whole take, and markers worn elsewhere, by a marker set or another subject's model."""
 
 from __future__ import annotations
 
@@ -10,40 +10,45 @@ from numpy.typing import NDArray
 
 from kinefit.bodies.marker_sets import MarkerSet
 from kinefit.identification.model.from_frame import similarity
-from kinefit.identification.model.learn import distances
+from kinefit.identification.model.learn import distance_statistics
 from kinefit.identification.model.model import MarkerModel
 
-MISPLACED = 0.035
-"""[m] root mean square of a segment's markers off their places, below which nothing is said: laboratories and bodies
-differ by that much from the catalogue's average places."""
+MIN_PLACEMENT_RMS = 0.035
+"""[m] root mean square of a segment's placement errors below which nothing is reported: laboratories and bodies differ
+by that much from the catalogue's mean places."""
 
-BETTER = 0.5
-"""Of what was, an exchange must leave at most this: in distance off places, or in how much distances vary."""
+MAX_RATIO_AFTER_SWAP = 0.5
+"""A swap must lower the placement error, or the deviation of distances, to this share or less."""
 
-LOOSE = 0.02
-"""[m] deviation of a label's distances to its own segment, above which it may be another's; shoulders have 0.015."""
+MAX_OWN_DEVIATION = 0.02
+"""[m] deviation of a label's distances to its segment above which it may be another segment's; shoulders have 0.015."""
 
-Found = tuple[tuple[str, str], float, str]
+PairFinding = tuple[tuple[str, str], float, str]
 
 
-def swapped_throughout(positions: NDArray, model: MarkerModel, places: Sequence[NDArray]) -> list[Found]:
-    """Pairs of labels that are exchanged all through a take: the pair, [m] how far off it is, a sentence.
+def permanent_swaps(positions: NDArray, model: MarkerModel, places: Sequence[NDArray]) -> list[PairFinding]:
+    """Pairs of labels that are swapped in the whole take: the pair, [m] how far off it is, a sentence.
 
     Parameters
     ----------
     positions : (F, M, 3) [m] of the model's labels
     model : learnt from the take itself
-    places : for each segment of the model (k + j, 3) [m], where its markers and then the joints that it is part of
-        should be, of whatever size; NaN where not known. See `places_of_set`, `places_of_model`.
+    places : for each segment of the model (k + j, 3) [m], expected places of its k markers and then of its j joints, at
+        any scale; NaN where unknown. See `places_of_set`, `places_of_model`.
     """
-    found = list(_by_motion(positions, model))
+    found = list(_swaps_by_motion(positions, model))
     for s in range(len(places)):
-        found += _by_place(model, s, places)
+        found += _swaps_by_place(model, s, places)
     return found
 
 
 def places_of_set(model: MarkerModel, marker_set: MarkerSet) -> list[NDArray]:
-    """Places of a catalogue's set for a model's segments."""
+    """Expected places of a model's markers and joints by a marker set.
+
+    Returns
+    -------
+    for each segment (k + j, 3) [m]: its k markers, then its j joints; NaN where the set does not know them
+    """
     known = marker_set.match(model.labels)
     at = np.full((len(model), 3), np.nan)
     for i, name in enumerate(known):
@@ -54,7 +59,12 @@ def places_of_set(model: MarkerModel, marker_set: MarkerSet) -> list[NDArray]:
 
 
 def places_of_model(model: MarkerModel, other: MarkerModel) -> list[NDArray]:
-    """Another subject's places for a model's segments."""
+    """Expected places of a model's markers and joints by another subject's model.
+
+    Returns
+    -------
+    for each segment (k + j, 3) [m]: its k markers, then its j joints; NaN where `other` does not know them
+    """
     at = np.full((len(model), 3), np.nan)
     for i, label in enumerate(model.labels):
         if label in other.labels:
@@ -73,13 +83,13 @@ def places_of_model(model: MarkerModel, other: MarkerModel) -> list[NDArray]:
 
 
 def _joints(model: MarkerModel, s: int, joints: dict[str, NDArray]) -> list[NDArray]:
-    """(3,) each: the joints of a segment with its parent and children, in the order of the model's joints."""
-    nothing = np.full(3, np.nan)
-    return [joints.get(model.names[j.child], nothing) for j in model.joints if s in (j.parent, j.child)]
+    """(3,) each: joints of a segment with its parent and children, in the model's order; NaN where unknown."""
+    unknown = np.full(3, np.nan)
+    return [joints.get(model.names[j.child], unknown) for j in model.joints if s in (j.parent, j.child)]
 
 
-def _fits_elsewhere(model: MarkerModel, places: Sequence[NDArray], s: int, pair: tuple[int, int]) -> bool:
-    """Whether an exchange leaves the other segments that either label belongs to where they should be."""
+def _fits_other_segments(model: MarkerModel, places: Sequence[NDArray], s: int, pair: tuple[int, int]) -> bool:
+    """Whether the other segments of both labels still fit their places after a swap."""
     swapped = np.array(model.reference)
     swapped[list(pair)] = swapped[list(pair[::-1])]
     for t, members in enumerate(model.segments):
@@ -90,96 +100,101 @@ def _fits_elsewhere(model: MarkerModel, places: Sequence[NDArray], s: int, pair:
             continue
         misfit = []
         for reference in (model.reference, swapped):
-            have = np.vstack([reference[list(members)], *_joint_places(model, t)])
-            scale, R, shift = similarity(places[t][known], have[known], np.eye(3))
-            rest = have[known] - (scale * places[t][known] @ R.T + shift)
-            misfit.append(float(np.sqrt((rest**2).sum(1).mean()) / max(scale, 1e-6)))
-        if misfit[1] > max(misfit[0], MISPLACED):
+            actual = np.vstack([reference[list(members)], *_joint_places(model, t)])
+            scale, R, shift = similarity(places[t][known], actual[known], np.eye(3))
+            residuals = actual[known] - (scale * places[t][known] @ R.T + shift)
+            misfit.append(float(np.sqrt((residuals**2).sum(1).mean()) / max(scale, 1e-6)))
+        if misfit[1] > max(misfit[0], MIN_PLACEMENT_RMS):
             return False
     return True
 
 
-def _by_place(model: MarkerModel, s: int, places: Sequence[NDArray]) -> Iterator[Found]:
-    """Two labels of a segment that lie each where the other should."""
-    members, should = model.segments[s], places[s]
-    have = _own(model, s)
-    known = np.isfinite(should).all(1)
+def _swaps_by_place(model: MarkerModel, s: int, places: Sequence[NDArray]) -> Iterator[PairFinding]:
+    """Pairs of labels of a segment that lie at each other's expected place."""
+    members, expected = model.segments[s], places[s]
+    actual = _segment_points(model, s)
+    known = np.isfinite(expected).all(1)
     firm = np.flatnonzero(known[: len(members)])
     if known.sum() < 4:
         return
 
-    def off(order: NDArray) -> float:
-        scale, R, t = similarity(should[known], have[order][known], np.eye(3))
-        rest = have[order][known] - (scale * should[known] @ R.T + t)
-        return float(np.sqrt((rest**2).sum(1).mean()) / max(scale, 1e-6))
+    def rms_of(order: NDArray) -> float:
+        scale, R, t = similarity(expected[known], actual[order][known], np.eye(3))
+        residuals = actual[order][known] - (scale * expected[known] @ R.T + t)
+        return float(np.sqrt((residuals**2).sum(1).mean()) / max(scale, 1e-6))
 
-    start = np.arange(len(have))
-    now = off(start)
-    if now < MISPLACED:
+    identity = np.arange(len(actual))
+    rms = rms_of(identity)
+    if rms < MIN_PLACEMENT_RMS:
         return
     trials = []
     for a, b in combinations(firm.tolist(), 2):
-        order = start.copy()
+        order = identity.copy()
         order[[a, b]] = order[[b, a]]
-        trials.append((off(order), a, b))
-    left, a, b = min(trials, default=(np.inf, 0, 0))
-    if left < BETTER * now and _fits_elsewhere(model, places, s, (members[a], members[b])):
+        trials.append((rms_of(order), a, b))
+    rms_after, a, b = min(trials, default=(np.inf, 0, 0))
+    if rms_after < MAX_RATIO_AFTER_SWAP * rms and _fits_other_segments(model, places, s, (members[a], members[b])):
         pair = (model.labels[members[a]], model.labels[members[b]])
-        text = f"{pair[0]} and {pair[1]} are swapped throughout: {model.names[s]} is {100 * now:.0f} cm off its places"
-        yield pair, now, f"{text}, with them exchanged {100 * left:.0f} cm"
+        text = f"{pair[0]} and {pair[1]} are swapped throughout: {model.names[s]} is {100 * rms:.0f} cm off its places"
+        yield pair, rms, f"{text}, with them exchanged {100 * rms_after:.0f} cm"
 
 
-def elsewhere(model: MarkerModel, places: Sequence[NDArray]) -> list[tuple[str, float, str]]:
-    """Labels that move with their segment but sit elsewhere on it than the places say: label, [m] how far, a sentence.
+def moved_labels(model: MarkerModel, places: Sequence[NDArray]) -> list[tuple[str, float, str]]:
+    """Labels that move with their segment but sit elsewhere on it than expected: (label, [m] distance, sentence).
 
-    Not a wrong name: another placing, or a marker that was moved. Each is judged by a fit of all the others.
+    Their names are right: the marker was placed otherwise, or moved. Each label is compared with a fit of the others.
+
+    Parameters
+    ----------
+    places : for each segment (k + j, 3) [m], as in `permanent_swaps`
     """
     out: dict[str, tuple[float, str]] = {}
     for s, members in enumerate(model.segments):
-        should, have = places[s], _own(model, s)
-        known = np.isfinite(should).all(1)
+        expected, actual = places[s], _segment_points(model, s)
+        known = np.isfinite(expected).all(1)
         for k in np.flatnonzero(known[: len(members)]).tolist():
-            rest = known & (np.arange(len(have)) != k)
-            if rest.sum() < 3 or np.linalg.svd(should[rest] - should[rest].mean(0), compute_uv=False)[1] < MISPLACED:
+            others = known & (np.arange(len(actual)) != k)
+            x = expected[others]
+            if others.sum() < 3 or np.linalg.svd(x - x.mean(0), compute_uv=False)[1] < MIN_PLACEMENT_RMS:
                 continue
-            scale, R, t = similarity(should[rest], have[rest], np.eye(3))
-            off = float(np.linalg.norm(have[k] - (scale * R @ should[k] + t)))
-            fit = np.linalg.norm(have[rest] - (scale * should[rest] @ R.T + t), axis=1)
+            scale, R, t = similarity(x, actual[others], np.eye(3))
+            distance = float(np.linalg.norm(actual[k] - (scale * R @ expected[k] + t)))
+            residuals = np.linalg.norm(actual[others] - (scale * x @ R.T + t), axis=1)
             label = model.labels[members[k]]
-            if off > 2 * MISPLACED and off > 2 * fit.max() and off > out.get(label, (0.0, ""))[0]:
-                text = f"{label} sits {100 * off:.0f} cm elsewhere on {model.names[s]} and moves with it"
-                out[label] = (off, f"{text}: placed otherwise, not misnamed")
+            if distance > max(2 * MIN_PLACEMENT_RMS, 2 * residuals.max(), out.get(label, (0.0, ""))[0]):
+                text = f"{label} sits {100 * distance:.0f} cm elsewhere on {model.names[s]} and moves with it"
+                out[label] = (distance, f"{text}: placed otherwise, not misnamed")
     return [(label, size, text) for label, (size, text) in sorted(out.items(), key=lambda item: -item[1][0])]
 
 
-def _own(model: MarkerModel, s: int) -> NDArray:
-    """(k + j, 3) [m] a segment's markers and the joints that it is part of."""
+def _segment_points(model: MarkerModel, s: int) -> NDArray:
+    """(k + j, 3) [m] a segment's markers and its joints."""
     return np.vstack([model.reference[list(model.segments[s])], *_joint_places(model, s)])
 
 
 def _joint_places(model: MarkerModel, s: int) -> list[NDArray]:
-    """(3,) [m] each of the joints that a segment is part of."""
+    """(3,) [m] each: the joints of a segment, in its frame."""
     return [j.in_parent if s == j.parent else j.in_child for j in model.joints if s in (j.parent, j.child)]
 
 
-def _by_motion(positions: NDArray, model: MarkerModel) -> Iterator[Found]:
-    """Two labels each of which moves with the other's segment."""
-    varies = np.nan_to_num(distances(positions[:: max(1, len(positions) // 400)])[1])
-    segment: dict[int, list[int]] = {}
+def _swaps_by_motion(positions: NDArray, model: MarkerModel) -> Iterator[PairFinding]:
+    """Pairs of labels that each move with the other's segment."""
+    deviation = np.nan_to_num(distance_statistics(positions[:: max(1, len(positions) // 400)])[1])
+    mates_of: dict[int, list[int]] = {}
     for members in model.segments:
         for m in members:
-            segment.setdefault(m, []).extend(k for k in members if k != m)
-    loose = [m for m, mates in segment.items() if mates and np.median(varies[m, mates]) > LOOSE]
+            mates_of.setdefault(m, []).extend(k for k in members if k != m)
+    suspects = [m for m, mates in mates_of.items() if mates and np.median(deviation[m, mates]) > MAX_OWN_DEVIATION]
     best: dict[int, tuple[float, int, int, float]] = {}
-    for a, b in combinations(sorted(loose), 2):
-        mates, others = [k for k in segment[a] if k != b], [k for k in segment[b] if k != a]
-        if not mates or not others or a in others:
+    for a, b in combinations(sorted(suspects), 2):
+        mates, other_mates = [k for k in mates_of[a] if k != b], [k for k in mates_of[b] if k != a]
+        if not mates or not other_mates or a in other_mates:
             continue
-        now = float(np.median(varies[a, mates]) + np.median(varies[b, others]))
-        then = float(np.median(varies[b, mates]) + np.median(varies[a, others]))
-        if then < BETTER * now:
+        before = float(np.median(deviation[a, mates]) + np.median(deviation[b, other_mates]))
+        after = float(np.median(deviation[b, mates]) + np.median(deviation[a, other_mates]))
+        if after < MAX_RATIO_AFTER_SWAP * before:
             for m in (a, b):
-                best[m] = min(best.get(m, (np.inf, 0, 0, 0.0)), (then / now, a, b, now / 2))
+                best[m] = min(best.get(m, (np.inf, 0, 0, 0.0)), (after / before, a, b, before / 2))
     for a, b, size in sorted({(a, b, size) for m, (_, a, b, size) in best.items() if best[a][1:3] == best[b][1:3]}):
         pair = (model.labels[a], model.labels[b])
         text = f"{pair[0]} and {pair[1]} are swapped throughout: each moves with the other's segment"

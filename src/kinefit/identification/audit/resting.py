@@ -1,4 +1,4 @@
-"""Markers that rest in space while the person moves: fallen off, or glued to a chair."""
+"""Find markers that stay fixed in space while the person moves: fallen off, or glued to a chair."""
 
 from __future__ import annotations
 
@@ -8,33 +8,40 @@ from numpy.typing import NDArray
 from kinefit.findings import runs_of
 from kinefit.observations import Markers
 
-STILL, MOVES = 0.005, 0.05
-"""[m] from the mean of a window: within the first a marker rests; its neighbours go beyond the second."""
+MAX_RESTING_DISTANCE = 0.005
+"""[m] a resting marker stays this close to its mean position in a window."""
 
-WINDOW = 1.0
-"""[s] of a window: a foot stands, and a toe longer than the heel beside it, for less."""
+MIN_NEIGHBOUR_DISTANCE = 0.05
+"""[m] from its mean position that each neighbour of a resting marker moves."""
 
-NEIGHBOURS = 3
-"""That must all move: of a hand on a table or a foot on the floor others rest, too."""
+WINDOW_S = 1.0
+"""Length of a window: a foot stands for less, and so does a toe after the heel has lifted."""
 
-_TRIED = 50  # frames in which distances are compared
+MIN_NEIGHBOURS = 3
+"""Nearest markers that must all move: of a hand on a table or a foot on the floor several rest together."""
+
+_MAX_DISTANCE_FRAMES = 50  # frames in which distances are compared
 
 
-def resting(markers: Markers) -> list[tuple[str, tuple[int, int], float, str]]:
-    """Labels, first and last frames, how far the neighbours move [m], and sentences, of markers that rest.
+def resting_markers(markers: Markers) -> list[tuple[str, tuple[int, int], float, str]]:
+    """Find markers that rest in space while their neighbours move.
 
-    Most frames of a take may say so: a model that is learnt from it holds that for right.
+    They may rest in most frames of a take, where a model learnt from the same take would accept them.
+
+    Returns
+    -------
+    list of (label, (first frame, last frame), median movement of the neighbours [m], sentence)
     """
-    positions, length = markers.positions, max(2, round(WINDOW * markers.rate))
-    starts = np.arange(0, len(positions) - length + 1, max(1, length // 2))  # none in a shorter take
+    positions, length = markers.positions, max(2, round(WINDOW_S * markers.rate))
+    starts = np.arange(0, len(positions) - length + 1, max(1, length // 2))  # empty in a shorter take
     reach = np.array([_reach(positions[a : a + length]) for a in starts]).reshape(len(starts), positions.shape[1])
     out = []
-    for k in np.flatnonzero((reach < STILL).any(axis=0)).tolist():
+    for k in np.flatnonzero((reach < MAX_RESTING_DISTANCE).any(axis=0)).tolist():
         near, label = _nearest(positions, k), markers.names[k]
-        if len(near) < NEIGHBOURS:
+        if len(near) < MIN_NEIGHBOURS:
             continue
-        least = reach[:, near].min(axis=1)  # of unseen ones NaN, and so nothing is said
-        for a, b in runs_of((reach[:, k] < STILL) & (least > MOVES)):
+        least = reach[:, near].min(axis=1)  # NaN where one is not visible: no finding
+        for a, b in runs_of((reach[:, k] < MAX_RESTING_DISTANCE) & (least > MIN_NEIGHBOUR_DISTANCE)):
             span, moved = (int(starts[a]), int(starts[b - 1]) + length - 1), float(np.median(least[a:b]))
             text = f"{label} rests in frames {span[0]} to {span[1]} while its neighbours move by {100 * moved:.0f} cm"
             out.append((label, span, moved, f"{text}: it is on none of their segments"))
@@ -42,19 +49,19 @@ def resting(markers: Markers) -> list[tuple[str, tuple[int, int], float, str]]:
 
 
 def _reach(x: NDArray) -> NDArray:
-    """(K,) [m] the farthest from its mean that each gets; NaN where one is not seen in half of the frames."""
-    seen = np.isfinite(x[..., 0])
-    count = seen.sum(axis=0)
-    mean = np.where(seen[..., None], x, 0.0).sum(axis=0) / np.maximum(count, 1)[:, None]
-    far = np.where(seen, np.linalg.norm(x - mean, axis=2), 0.0).max(axis=0)
+    """(K,) [m] largest distance of each marker from its mean; NaN if it is visible in less than half of the frames."""
+    visible = np.isfinite(x[..., 0])
+    count = visible.sum(axis=0)
+    mean = np.where(visible[..., None], x, 0.0).sum(axis=0) / np.maximum(count, 1)[:, None]
+    far = np.where(visible, np.linalg.norm(x - mean, axis=2), 0.0).max(axis=0)
     return np.where(2 * count >= len(x), far, np.nan)
 
 
 def _nearest(positions: NDArray, k: int) -> NDArray:
-    """Indices of the markers that are nearest to one, by the median over the take."""
-    x = positions[:: max(1, len(positions) // _TRIED)]
-    apart = np.linalg.norm(x - x[:, k, None], axis=2)
-    seen = np.isfinite(apart).mean(axis=0) > 0.5
-    seen[k] = False
-    others = np.flatnonzero(seen)
-    return others[np.argsort(np.nanmedian(apart[:, others], axis=0))[:NEIGHBOURS]]
+    """Indices of the markers with the least median distance to marker k over the take."""
+    x = positions[:: max(1, len(positions) // _MAX_DISTANCE_FRAMES)]
+    gaps = np.linalg.norm(x - x[:, k, None], axis=2)
+    is_neighbour = np.isfinite(gaps).mean(axis=0) > 0.5
+    is_neighbour[k] = False
+    neighbours = np.flatnonzero(is_neighbour)
+    return neighbours[np.argsort(np.nanmedian(gaps[:, neighbours], axis=0))[:MIN_NEIGHBOURS]]

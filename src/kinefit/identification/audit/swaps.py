@@ -1,41 +1,41 @@
-"""Which labels of a take changed places, and when: by distances over time, and by jumps that an exchange undoes."""
+"""Detect swapped labels of a take from distances between markers and from jumps that a swap would undo."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-MOST = 5.0
-"""Deviations beyond which a distance says no more: it is wrong, by whatever."""
+MAX_SIGMAS = 5.0
+"""Errors of distances are truncated here: a larger one carries no more information."""
 
-TAIL = 1.5
-"""A distance strays this much more than its deviation tells: it is learnt from the middle of what was seen."""
+TAIL_FACTOR = 1.5
+"""Factor on the learnt standard deviations, which come from medians and are too small for the tails."""
 
-JOIN = 10
-"""Frames between two spans of one thing that are told as one span."""
+MAX_GAP = 10
+"""[frames] between two spans of the same kind that are reported as one."""
 
 
 def place_costs(positions: NDArray, mean: NDArray, deviation: NDArray) -> tuple[NDArray, NDArray]:
-    """What it costs to call a point by another's label.
+    """Cost of giving a point another point's label.
 
     Parameters
     ----------
-    positions : (F, K, 3) [m], labelled, NaN where not seen
-    mean, deviation : (K, K) [m] of distances; NaN where nothing is known
+    positions : (F, K, 3) [m], labelled; NaN where not visible
+    mean, deviation : (K, K) [m] of distances; NaN where unknown
 
     Returns
     -------
     (F, K, K), (F, K, K)
-        C[f, i, q]: sum over all k but i and q of min(((|x_q - x_k| - mean_ik) / deviation_ik)², MOST²), the points of k
-        being labelled as they are; t[f, i, j]: the term of i and j themselves. Zero where a point is not seen.
+        C[f, i, q]: sum over k, without i and q, of min(((|x_q - x_k| - mean_ik) / deviation_ik)², TRUNCATION_SIGMAS²),
+        where k keeps its label; t[f, i, j]: the term of i and j. Zero where a point is not visible.
     """
     frames, count = positions.shape[:2]
     d = np.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1).astype(np.float32)
     cost = np.zeros((frames, count, count), np.float32)
     own = np.zeros((frames, count, count), np.float32)
     for i in range(count):
-        z = (d - mean[i].astype(np.float32)) / (TAIL * deviation[i]).astype(np.float32)  # (F, q, k)
-        z = np.fmax(np.minimum(z * z, MOST**2), np.float32(0.0))  # 0 for what is not seen
+        z = (d - mean[i].astype(np.float32)) / (TAIL_FACTOR * deviation[i]).astype(np.float32)  # (F, q, k)
+        z = np.fmax(np.minimum(z * z, MAX_SIGMAS**2), np.float32(0.0))  # 0 for what is not seen
         z[:, :, i] = 0.0
         z[:, np.arange(count), np.arange(count)] = 0.0
         cost[:, i] = z.sum(-1)
@@ -44,26 +44,35 @@ def place_costs(positions: NDArray, mean: NDArray, deviation: NDArray) -> tuple[
 
 
 def swap_gains(positions: NDArray, mean: NDArray, deviation: NDArray) -> NDArray:
-    """(F, K, K) by how much the sum of squares falls when two labels are exchanged in a frame; symmetric."""
-    cost, own = place_costs(positions, mean, deviation)
-    here = np.einsum("fii->fi", cost)
-    return here[:, :, None] + here[:, None] - 2 * own - cost - cost.transpose(0, 2, 1)
+    """(F, K, K) by how much the sum of squares falls if two labels are swapped in a frame; symmetric.
+
+    Parameters
+    ----------
+    positions : (F, K, 3) [m], labelled; NaN where not visible
+    mean, deviation : (K, K) [m] of distances
+    """
+    cost, pair_terms = place_costs(positions, mean, deviation)
+    current = np.einsum("fii->fi", cost)
+    return current[:, :, None] + current[:, None] - 2 * pair_terms - cost - cost.transpose(0, 2, 1)
 
 
 def pair_gain(positions: NDArray, i: int, j: int, mean: NDArray, deviation: NDArray) -> NDArray:
-    """(F,) the same for one pair."""
+    """(F,) by how much the sum of squares falls if labels i and j are swapped; see `swap_gains`."""
     gain = np.zeros(len(positions))
     for a, b in ((i, j), (j, i)):
         d = np.linalg.norm(positions - positions[:, a, None], axis=-1)
         for label, sign in ((a, 1), (b, -1)):
-            z = np.nan_to_num(np.minimum(((d - mean[label]) / (TAIL * deviation[label])) ** 2, MOST**2))
+            z = np.nan_to_num(np.minimum(((d - mean[label]) / (TAIL_FACTOR * deviation[label])) ** 2, MAX_SIGMAS**2))
             z[:, [i, j]] = 0.0
             gain += sign * z.sum(1)
     return gain
 
 
 def best_run(gain: NDArray, least: float) -> tuple[int, int, float]:
-    """First, last and sum of the run of largest sum of gain - least; a frame counts at most ten times `least`."""
+    """First and last index, and sum, of the run of `gain` (F,) with the largest sum of gain - least.
+
+    A frame counts at most ten times `least`; both are numbers without unit, as `swap_gains` gives them.
+    """
     worth = np.clip(gain - least, -10 * least, 10 * least)
     total = np.concatenate([[0.0], np.cumsum(worth)])
     lowest = np.minimum.accumulate(total)
@@ -72,18 +81,23 @@ def best_run(gain: NDArray, least: float) -> tuple[int, int, float]:
     return first, last - 1, float(total[last] - total[first])
 
 
-def crossings(
+def find_crossings(
     positions: NDArray, least: float = 0.02, better: float = 0.35
 ) -> tuple[list[tuple[int, int, int]], NDArray]:
-    """Frames at which two markers go on where the other was: (frame, i, j), the exchange being between it and the last.
+    """Frames at which two trajectories continue where the other one was.
 
-    Each place is foretold from the last two, over up to ten frames not seen. Two that both miss theirs by more than
-    `least` [m], and would miss them by less than `better` of that if they were exchanged, have crossed.
+    Each position is predicted from the last two visible ones, over gaps of up to ten frames. Two markers cross if both
+    miss their predictions by more than `least` [m], and a swap lowers their total error below the share `better` of it.
+
+    Parameters
+    ----------
+    positions : (F, K, 3) [m], labelled; NaN where not visible
 
     Returns
     -------
     list, (F, K) bool
-        The crossings; whether a trajectory is broken at a frame: a jump, or it begins or ends there.
+        Crossings (frame, i, j), the swap lying between this frame and the last; whether a trajectory jumps, begins or
+        ends at a frame.
     """
     frames, count = positions.shape[:2]
     found = []
@@ -91,62 +105,77 @@ def crossings(
     at, speed = positions[0].copy(), np.zeros((count, 3))
     age = np.where(np.isfinite(at[:, 0]), 0, 99)
     for f in range(1, frames):
-        now = positions[f]
-        foretold = at + speed * (age[:, None] + 1)
-        off = np.linalg.norm(now - foretold, axis=-1)
+        current = positions[f]
+        predicted = at + speed * (age[:, None] + 1)
+        off = np.linalg.norm(current - predicted, axis=-1)
         jumped = np.flatnonzero((off > least) & (age <= 10))
         broken[f, jumped] = True
-        broken[f] |= np.isfinite(now[:, 0]) != (age == 0)
+        broken[f] |= np.isfinite(current[:, 0]) != (age == 0)
         if len(jumped) > 1:
-            across = np.linalg.norm(now[jumped] - foretold[jumped][:, None], axis=-1)
+            across = np.linalg.norm(current[jumped] - predicted[jumped][:, None], axis=-1)
             both = across + across.T
             np.fill_diagonal(both, np.inf)
             for a in range(len(jumped)):
                 b = int(np.argmin(both[a]))
                 if a < b and both[a, b] < better * (across[a, a] + across[b, b]):
                     found.append((f, int(jumped[a]), int(jumped[b])))
-        seen = np.isfinite(now[:, 0])
-        fresh = seen & (age == 0)
-        speed = np.where(fresh[:, None], now - at, np.where(seen[:, None], 0.0, speed))
+        visible = np.isfinite(current[:, 0])
+        fresh = visible & (age == 0)
+        speed = np.where(fresh[:, None], current - at, np.where(visible[:, None], 0.0, speed))
         for _, i, j in (c for c in found if c[0] == f):
             speed[[i, j]] = 0.0
-        at = np.where(seen[:, None], now, at)
-        age = np.where(seen, 0, age + 1)
+        at = np.where(visible[:, None], current, at)
+        age = np.where(visible, 0, age + 1)
     return found, broken
 
 
-def passing(positions: NDArray, length: int) -> tuple[NDArray, NDArray]:
-    """(n, length, K, 3) [m] where labels are in spans of so many frames, and where they pass from before to after."""
+def interpolate_spans(positions: NDArray, length: int) -> tuple[NDArray, NDArray]:
+    """Positions in all spans of `length` frames, measured and interpolated between the frames around each span.
+
+    Parameters
+    ----------
+    positions : (F, K, 3) [m]; NaN where not visible
+    length : number of frames
+
+    Returns
+    -------
+    (n, length, K, 3), (n, length, K, 3) [m]
+    """
     before, after = positions[: -length - 1], positions[length + 1 :]
-    usual = np.stack([before + (after - before) * (i + 1) / (length + 1) for i in range(length)], axis=1)
-    here = np.stack([positions[i + 1 : len(positions) - length + i] for i in range(length)], axis=1)
-    return here, usual
+    interpolated = np.stack([before + (after - before) * (i + 1) / (length + 1) for i in range(length)], axis=1)
+    measured = np.stack([positions[i + 1 : len(positions) - length + i] for i in range(length)], axis=1)
+    return measured, interpolated
 
 
-def glitches(
+def short_swaps(
     positions: NDArray, longest: int = 2, least: float = 0.02, better: float = 0.35
 ) -> list[tuple[int, int, int, int]]:
-    """Exchanges of a frame or two (a, b, first, last): one label is where the other passes; the other there, or hidden.
+    """Swaps of up to `longest` frames (a, b, first, last), found by interpolation from the frames around them.
 
-    Where each passes is told by the frames just before and after, in which both are seen; see `crossings` for `least`
-    and `better`.
+    One label is where the other one is expected, and the other label is at the first's place or not visible.
+
+    Parameters
+    ----------
+    positions : (F, K, 3) [m], labelled; NaN where not visible
+    least, better : [m] and share: see `find_crossings`
     """
     found: list[tuple[int, int, int, int]] = []
     taken = np.zeros(positions.shape[:2], bool)
     for length in range(1, longest + 1):
-        here, usual = passing(positions, length)
-        off = np.linalg.norm(here - usual, axis=-1).min(axis=1)  # (F, K), NaN where not seen throughout
+        measured, expected = interpolate_spans(positions, length)
+        off = np.linalg.norm(measured - expected, axis=-1).min(axis=1)  # (F, K), NaN where not seen throughout
         for f, a in np.argwhere(off > least).tolist():
-            across = np.linalg.norm(here[f][:, a, None] - usual[f], axis=-1).max(axis=0)
+            across = np.linalg.norm(measured[f][:, a, None] - expected[f], axis=-1).max(axis=0)
             across[a] = np.inf
             if not np.isfinite(across).any():
                 continue
             b = int(np.nanargmin(across))
-            hidden = not np.isfinite(here[f][:, b]).any()
-            back = np.linalg.norm(here[f][:, b] - usual[f][:, a], axis=-1).max()
-            own = np.linalg.norm(here[f][:, b] - usual[f][:, b], axis=-1).min()
+            missing = not np.isfinite(measured[f][:, b]).any()
+            back_error = np.linalg.norm(measured[f][:, b] - expected[f][:, a], axis=-1).max()
+            own_error = np.linalg.norm(measured[f][:, b] - expected[f][:, b], axis=-1).min()
             rows = slice(f + 1, f + 1 + length)
-            if across[b] < better * off[f, a] and (hidden or back < better * own) and not taken[rows][:, [a, b]].any():
+            fits = across[b] < better * off[f, a] and (missing or back_error < better * own_error)
+            if fits and not taken[rows][:, [a, b]].any():
                 taken[rows, a] = taken[rows, b] = True
                 found.append((min(a, b), max(a, b), f + 1, f + length))
     return found

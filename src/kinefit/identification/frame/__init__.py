@@ -1,1 +1,1 @@
-"""Who is who in one frame."""
+"""Label the markers of one frame."""

@@ -1,4 +1,4 @@
-"""Rigid fits of a few points, and how likely points are whatever their pose: numba."""
+"""Rigid fits of a few points, and the likelihood of points with the pose integrated out: numba."""
 
 import math
 
@@ -7,13 +7,13 @@ import numpy as np
 from kinefit._jit import jit
 
 _HALF_LOG = 1.5 * math.log(2 * math.pi)
-_TURNS = math.log(8 * math.pi**2) - 1.5 * math.log(2 * math.pi)
-_FLAT = 1 / (2 * math.pi)  # [1/rad²] curvature whose Gaussian has the width of a whole turn
+_LOG_ROTATIONS = math.log(8 * math.pi**2) - 1.5 * math.log(2 * math.pi)
+_MIN_CURVATURE = 1 / (2 * math.pi)  # [1/rad²] curvature whose Gaussian has the width of a whole turn
 
 
 @jit
 def largest_quaternion(N, q):
-    """q: unit eigenvector (w, x, y, z) of the largest eigenvalue of the symmetric 4 x 4 N (Jacobi; N is destroyed)."""
+    """Write to q (4,) the unit eigenvector (w, x, y, z) of the largest eigenvalue of N (4, 4) (Jacobi); destroys N."""
     V = np.eye(4)
     for _ in range(12):
         off = 0.0
@@ -49,9 +49,9 @@ def largest_quaternion(N, q):
 
 @jit
 def rigid(n, x, y, w, R, t, H):
-    """Weighted rigid motion of x[:n] onto y[:n] by proper rotations: Σ w |y - R x - t|².
+    """Weighted rigid fit of x[:n] (n, 3) to y[:n] (n, 3) [m], weights w (n,) [1/m²]: returns Σ w |y - R x - t|².
 
-    Fills R, t and H = Σ w (|x|² I - x xᵀ) about the weighted centroid, in the frame of x.
+    Writes R (3, 3), t (3,) and H = Σ w (|x|² I - x xᵀ) (3, 3) about the weighted centroid, in the frame of x.
     """
     total = 0.0
     a, b = np.zeros(3), np.zeros(3)
@@ -107,7 +107,7 @@ def rigid(n, x, y, w, R, t, H):
 
 @jit
 def least_squares(n, x, y, w, H):
-    """The least Σ w |y - R x - t|² over proper motions, alone; fills H as `rigid` does.
+    """The least Σ w |y - R x - t|² over rigid motions, without the motion; writes H like `rigid`.
 
     |x|² + |y|² - 2λ, λ the largest eigenvalue of Horn's matrix, by Newton's method from above on its characteristic
     polynomial (Theobald 2005); where two eigenvalues nearly agree, as for points on a line, by `rigid`.
@@ -173,7 +173,9 @@ def least_squares(n, x, y, w, H):
 
 @jit
 def evidence(n, x, y, sigma, work):
-    """-log of the density of n points of a rigid segment, its place and turn integrated out; and the weighted squares.
+    """-log density of n points of a rigid segment with its pose integrated out; and the weighted sum of squares.
+
+    x, y (n, 3) [m] in the segment and in space, sigma (n,) [m] per coordinate, work: scratch (8 + n // 3, 3).
 
     ∫∫ Π N(y; R x + t, σ²) dt dR = Π (2πσ²)^-3/2 (2π/W)^3/2 (2π)^3/2 det(H)^-1/2 / 8π² exp(-rss/2), W = Σ 1/σ².
     """
@@ -188,17 +190,17 @@ def evidence(n, x, y, sigma, work):
     rss = 0.0
     if n > 1:
         rss = least_squares(n, x, y, w, H)
-        a, b, c = H[0, 0] + _FLAT, H[1, 1] + _FLAT, H[2, 2] + _FLAT
+        a, b, c = H[0, 0] + _MIN_CURVATURE, H[1, 1] + _MIN_CURVATURE, H[2, 2] + _MIN_CURVATURE
         d, e, f = H[0, 1], H[0, 2], H[1, 2]
         det = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
-        turn = _TURNS + 0.5 * math.log(det if det > 1e-12 else 1e-12)
+        turn = _LOG_ROTATIONS + 0.5 * math.log(det if det > 1e-12 else 1e-12)
         cost += turn if turn > 0.0 else 0.0
     return 0.5 * rss + cost - _HALF_LOG + 1.5 * math.log(total), rss
 
 
 @jit
 def place_joint(n, x, y, sigma, joint, out):
-    """out: where a segment's fit puts a joint [m]; returns the variance of that per coordinate [m²], averaged."""
+    """Write to out (3,) [m] a segment's joint by a rigid fit; returns its mean variance per coordinate [m²]."""
     R, t, H, w = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(n)
     total = 0.0
     for i in range(n):
@@ -211,7 +213,8 @@ def place_joint(n, x, y, sigma, joint, out):
         r[k] = joint[k]
         for i in range(n):
             r[k] -= w[i] * x[i, k] / total
-    a, b, c, d, e, f = H[0, 0] + _FLAT, H[1, 1] + _FLAT, H[2, 2] + _FLAT, H[0, 1], H[0, 2], H[1, 2]
+    a, b, c = H[0, 0] + _MIN_CURVATURE, H[1, 1] + _MIN_CURVATURE, H[2, 2] + _MIN_CURVATURE
+    d, e, f = H[0, 1], H[0, 2], H[1, 2]
     det = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
     i00, i11, i22 = b * c - f * f, a * c - e * e, a * b - d * d
     i01, i02, i12 = e * f - d * c, d * f - b * e, d * e - a * f

@@ -1,4 +1,4 @@
-"""A segment's choices as the search keeps them, and what they cost beside a choice of the parent's: numba."""
+"""The choices of a segment as the search keeps them, and their costs given a choice of the parent: numba."""
 
 import math
 
@@ -33,11 +33,11 @@ def expand_segment(
     room,
     kept,
 ):
-    """Choices of a segment, the cheapest first, up to `kept` above the best; that of no point at all is always there.
+    """Choices of a segment in order of cost, up to `kept` above the best; always includes the empty choice (no point).
 
-    bits (N + 1, W) of each point, the last of none; taken (W,) those that nobody may take but as given; room: choices
-    at most; the rest as `enumerate_segment` has it. Returns index (C, k), cost (C,), squares (C,), the bits (C, W) of
-    points chosen here and of all, all of the first together (W,), and which is the choice of none.
+    bits (N + 1, W): one bit per point, the last row empty; taken (W,): points that may only be used as given; room:
+    most choices. Other arguments as in `enumerate_segment`. Returns index (C, k), cost (C,), squares (C,), the bits
+    (C, W) of points chosen here and of all points, the union (W,) of those chosen here, and the empty choice's index.
     """
     k, N, W = len(x), len(points), bits.shape[1]
     blocked = np.zeros(N, np.bool_)
@@ -53,18 +53,18 @@ def expand_segment(
         log_volume, gate, gain, slack, fewest, work_left, index, cost, squares,
     )  # fmt: skip
     order = np.argsort(cost[:count])
-    few = 0
-    seen = False
+    kept_count = 0
+    has_empty = False
     for c in range(count):
         if cost[order[c]] <= cost[order[0]] + kept:
-            seen = seen or order[c] == 0
-            few += 1
-    total = few if seen else few + 1
+            has_empty = has_empty or order[c] == 0
+            kept_count += 1
+    total = kept_count if has_empty else kept_count + 1
     out, costs, rss = np.empty((total, k), np.int64), np.empty(total), np.empty(total)
     new, every, union = np.zeros((total, W), np.uint64), np.zeros((total, W), np.uint64), np.zeros(W, np.uint64)
-    empty = few
+    empty = kept_count
     for c in range(total):
-        o = order[c] if c < few else 0
+        o = order[c] if c < kept_count else 0
         empty = c if o == 0 else empty
         costs[c], rss[c] = cost[o], squares[o]
         for i in range(k):
@@ -79,14 +79,14 @@ def expand_segment(
 
 
 @jit
-def cheapest_beside(points, theirs, index, low, high, width, tells, new, best, taken):
-    """Least cost (C,) `best` of a child's choices, with their ranges where those tell, that take none of `taken` (W,).
+def cheapest_compatible(points, parent_points, index, low, high, width, has_ranges, new, best, taken):
+    """Least cost, `best` (C,) plus range costs, of a child's choices that use no point of `taken` (W,).
 
-    theirs (k',) the points of the parent's choice, the rest as `range_cost` has it.
+    parent_points (k',) of the parent's choice; other arguments as in `range_cost`.
     """
     extra = np.zeros(len(best))
-    if tells:
-        range_cost(points, theirs, index, low, high, width, extra)
+    if has_ranges:
+        range_cost(points, parent_points, index, low, high, width, extra)
     least = math.inf
     for c in range(len(best)):
         free = True

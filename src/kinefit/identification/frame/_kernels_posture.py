@@ -1,4 +1,4 @@
-"""How usual the turns of a body's joints are under an explanation, from the root outwards: numba."""
+"""Cost of the joint rotations of an explanation under their learnt distribution, from the root outwards: numba."""
 
 import math
 
@@ -7,13 +7,13 @@ import numpy as np
 from kinefit._jit import jit
 from kinefit.identification.frame._kernels_evidence import rigid
 
-ROUNDS = 8
-_LOOSE = 10.0  # [rad²] variance of a turn of which nothing is known
+MAX_ITERATIONS = 8
+_UNKNOWN_TURN_VARIANCE = 10.0  # [rad²] prior variance of an unknown turn
 
 
 @jit
 def inverse(A, out):
-    """out: the inverse of a symmetric 3 x 3."""
+    """Write to out (3, 3) the inverse of a symmetric A (3, 3)."""
     a, b, c, d, e, f = A[0, 0], A[1, 1], A[2, 2], A[0, 1], A[0, 2], A[1, 2]
     det = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
     out[0, 0], out[1, 1], out[2, 2] = (b * c - f * f) / det, (a * c - e * e) / det, (a * b - d * d) / det
@@ -24,7 +24,7 @@ def inverse(A, out):
 
 @jit
 def turn_of(R, out):
-    """out: rotation vector (3,) [rad] of R (3, 3)."""
+    """Write to out (3,) [rad] the rotation vector of R (3, 3)."""
     cosine = 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1)
     x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
     sine = math.sqrt(x * x + y * y + z * z)
@@ -43,8 +43,8 @@ def turn_of(R, out):
 
 
 @jit
-def turned_by(v, R, out):
-    """out: exp(v) R."""
+def rotate_by(v, R, out):
+    """Write to out (3, 3) exp(v) R, v (3,) [rad]."""
     angle = math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
     a = math.sin(angle) / angle if angle > 1e-9 else 1.0
     b = (1 - math.cos(angle)) / angle**2 if angle > 1e-9 else 0.5
@@ -57,10 +57,10 @@ def turned_by(v, R, out):
 
 
 @jit
-def pulled(n, x, y, w, R0, G, R, H):
-    """R (3, 3), from where it is, to the least of f = Σ w |y - R x - t|² + vᵀ G v, v = log(R R0ᵀ); f at the end.
+def fit_rotation(n, x, y, w, R0, G, R, H):
+    """Minimise f = Σ w |y - R x|² + vᵀ G v, v = log(R R0ᵀ), over R (3, 3) in place by Gauss-Newton; returns f.
 
-    x, y (n, 3) about their weighted centroids, w (n,); Gauss-Newton; fills H (3, 3), the data's part of the curvature.
+    x, y (n, 3) [m] about their weighted centroids, w (n,) [1/m²]; writes H (3, 3), the data's part of the curvature.
     """
     v, g, step, A, inv, D = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     f, turn = 0.0, 0
@@ -93,7 +93,7 @@ def pulled(n, x, y, w, R0, G, R, H):
             f += v[a] * pull
             g[a] -= pull
         turn += 1
-        if turn > ROUNDS:
+        if turn > MAX_ITERATIONS:
             break
         for a in range(3):
             for b in range(3):
@@ -104,22 +104,22 @@ def pulled(n, x, y, w, R0, G, R, H):
         length = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
         for a in range(3):
             step[a] *= 1.0 if length < 1.0 else 1.0 / length
-        turned_by(step, R, D)
+        rotate_by(step, R, D)
         R[:] = D
         if length < 1e-3:
-            turn = ROUNDS
+            turn = MAX_ITERATIONS
     return f
 
 
 @jit
 def turn_costs(labels, points, starts, markers, x, sigma, parent, here, there, spread, middle, give, most, out):
-    """out (E,): what the turns of all joints cost, -log likelihood against that any turn is as likely.
+    """Write to out (E,) the cost of all joint rotations: -log likelihood ratio to uniform rotations.
 
     labels (E, M) the point of each label, -1 for none; points (N, 3); segments, parents first: `starts` (S + 1,) into
     markers (K,), x (K, 3), sigma (K,) [m]; parent (S,), -1 for the root; here, there (S, 3) the joint in the segment
-    and in its parent, spread (S,) [m]; middle (S, 3, 3) and give (S, 3, 3) [rad²] of the joint's turns, give[s, 0, 0]
-    < 0 where nothing is known; most: of one joint. Each segment is laid onto its points, its joint and its joint's
-    usual turns, as far as its parent's own turn is known; what that costs more than without the turns is counted.
+    and in its parent, spread (S,) [m]; middle (S, 3, 3) and give (S, 3, 3) [rad²]: mean and covariance of the joint's
+    turns, give[s, 0, 0] < 0 if unknown; most: largest cost of one joint. Each segment is fitted to its points and its
+    joint, with and without the prior on the turn if the parent's rotation is known; the difference is counted.
     """
     S = len(parent)
     size = 1
@@ -140,9 +140,9 @@ def turn_costs(labels, points, starts, markers, x, sigma, parent, here, there, s
                 if q >= 0:
                     xs[n], ys[n], ws[n] = x[i], points[q], 1 / sigma[i] ** 2
                     n += 1
-            own = n
-            above = p >= 0 and placed[p]
-            if above:
+            point_count = n
+            has_parent = p >= 0 and placed[p]
+            if has_parent:
                 square = 0.0
                 for k in range(3):
                     ys[n, k] = ts[p, k]
@@ -153,7 +153,7 @@ def turn_costs(labels, points, starts, markers, x, sigma, parent, here, there, s
                 trace = (Ps[p, 0, 0] + Ps[p, 1, 1] + Ps[p, 2, 2]) / 3
                 ws[n] = 1 / (spread[s] ** 2 + tv[p] + 2 / 3 * square * min(trace, 1.0))
                 n += 1
-            placed[s], known[s] = n >= 3 or (above and known[p] and give[s, 0, 0] >= 0), False
+            placed[s], known[s] = n >= 3 or (has_parent and known[p] and give[s, 0, 0] >= 0), False
             if not placed[s]:
                 continue
             a[:], b[:] = 0.0, 0.0
@@ -169,8 +169,8 @@ def turn_costs(labels, points, starts, markers, x, sigma, parent, here, there, s
                 for i in range(n):
                     xs[i, k] -= a[k]
                     ys[i, k] -= b[k]
-            free = rigid(n, xs, ys, ws, best, t, Hbest)
-            prior = above and known[p] and give[s, 0, 0] >= 0
+            free_cost = rigid(n, xs, ys, ws, best, t, Hbest)
+            prior = has_parent and known[p] and give[s, 0, 0] >= 0
             if prior:
                 for k in range(3):
                     for c in range(3):
@@ -184,24 +184,24 @@ def turn_costs(labels, points, starts, markers, x, sigma, parent, here, there, s
                                 P[k, c] += R0[k, u] * give[s, u, v] * R0[c, v]
                 inverse(P, G)
                 R[:] = best
-                cost = pulled(n, xs, ys, ws, R0, G, R, H)
+                cost = fit_rotation(n, xs, ys, ws, R0, G, R, H)
                 best[:] = R
                 Hbest[:] = H
                 R[:] = R0
-                other = pulled(n, xs, ys, ws, R0, G, R, H)
-                if other < cost:
-                    cost = other
+                other_cost = fit_rotation(n, xs, ys, ws, R0, G, R, H)
+                if other_cost < cost:
+                    cost = other_cost
                     best[:] = R
                     Hbest[:] = H
-                if own > 0:
-                    cost = 0.5 * (cost - free)
+                if point_count > 0:
+                    cost = 0.5 * (cost - free_cost)
                     total += cost if cost < most else most
             else:
                 G[:] = 0.0
                 for k in range(3):
-                    G[k, k] = 1 / _LOOSE
+                    G[k, k] = 1 / _UNKNOWN_TURN_VARIANCE
                 R[:] = best
-                pulled(n, xs, ys, ws, best.copy(), G, R, Hbest)  # for its curvature in the world
+                fit_rotation(n, xs, ys, ws, best.copy(), G, R, Hbest)  # for its curvature in the world
             Rs[s] = best
             for k in range(3):
                 ts[s, k] = b[k] - best[k, 0] * a[0] - best[k, 1] * a[1] - best[k, 2] * a[2]

@@ -1,4 +1,4 @@
-"""What frames of a take tell of the others: which labels it has, and how noisy each segment is (EM)."""
+"""Estimate from labelled frames of a take which labels it shows and how noisy each segment is (EM)."""
 
 from __future__ import annotations
 
@@ -16,22 +16,26 @@ from kinefit.identification.model.model import MarkerModel
 if TYPE_CHECKING:
     from kinefit.identification.frame.identify import Identification
 
-USUAL, FRAMES = 0.95, 1.0
-"""Share of frames that show a label, before any was looked at, and how many frames that counts for."""
+PRIOR_PRESENCE = 0.95
+"""Prior share of frames that show a label."""
 
-FIRM = 6.0
-"""Degrees of freedom that the model's own deviations count for."""
+PRIOR_FRAMES = 1.0
+"""Weight of this prior, in frames."""
 
-LEAST, MOST = 0.7, 2.5
-"""Of the noise of a segment, as a factor: frames of one take are too much alike to tell more."""
+PRIOR_DEGREES = 6.0
+"""Weight of the model's standard deviations, in degrees of freedom."""
 
-CERTAIN = 0.9
-"""Names that tell of noise; less certain ones are chosen for fitting well."""
+MIN_NOISE = 0.7
+MAX_NOISE = 2.5
+"""Limits of a segment's noise factor: the frames of one take are too alike for more."""
+
+MIN_CONFIDENCE = 0.9
+"""Only labels of this confidence count for the noise: less certain ones were selected by a good fit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Beliefs:
-    """What a take has shown of a model's labels so far.
+    """Presence of labels and noise of segments, estimated from frames of a take.
 
     Parameters
     ----------
@@ -44,33 +48,33 @@ class Beliefs:
 
     @property
     def odds(self) -> NDArray:
-        """(M,) what a label earns more than the usual one if it has a point, as log odds."""
+        """(M,) log odds of each label's presence relative to the median presence."""
         mean = float(np.median(self.presence))
         return np.log(self.presence / (1 - self.presence)) - np.log(mean / (1 - mean))
 
 
 def learn_beliefs(model: MarkerModel, frames: Sequence[tuple[NDArray, Identification]]) -> Beliefs:
-    """Presence and noise by what some frames were found to be: the M step; `identify` with them is the E step.
+    """Estimate presence and noise from labelled frames: the M step; `identify` with the result is the E step.
 
     Parameters
     ----------
-    frames : points (N, 3) [m] and their names, of each frame that was looked at
+    frames : points (N, 3) [m] and identification of each frame
     """
-    seen = np.zeros(len(model))
+    presence_sums = np.zeros(len(model))
     squares, freedom = np.zeros(len(model.segments)), np.zeros(len(model.segments))
     for points, found in frames:
         guess = found.assignment if found.guess is None else found.guess
-        seen += np.where(guess >= 0, found.confidence, 0.0)
-        sure = np.where(found.confidence >= CERTAIN, found.assignment, -1)
+        presence_sums += np.where(guess >= 0, found.confidence, 0.0)
+        certain_points = np.where(found.confidence >= MIN_CONFIDENCE, found.assignment, -1)
         for t in segment_tables(model, 0):
-            here = sure[t.markers] >= 0
-            n = int(here.sum())
+            visible = certain_points[t.markers] >= 0
+            n = int(visible.sum())
             if n > 3:
-                x, y = t.x[here], points[sure[t.markers[here]]]
-                squares[t.index] += least_squares(n, x, y, 1 / t.sigma[here] ** 2, np.empty((3, 3)))
+                x, y = t.x[visible], points[certain_points[t.markers[visible]]]
+                squares[t.index] += least_squares(n, x, y, 1 / t.sigma[visible] ** 2, np.empty((3, 3)))
                 freedom[t.index] += 3 * n - 6
-    presence = np.clip((seen + USUAL * FRAMES) / (len(frames) + FRAMES), 0.02, 0.98)
-    per_frame = freedom / max(len(frames), 1)  # one frame is like the next: all of them count as three
+    presence = np.clip((presence_sums + PRIOR_PRESENCE * PRIOR_FRAMES) / (len(frames) + PRIOR_FRAMES), 0.02, 0.98)
+    per_frame = freedom / max(len(frames), 1)  # frames are alike: together they count as three
     mean = np.where(freedom > 0, squares / np.maximum(freedom, 1), 1.0)
-    noise = np.sqrt((FIRM + 3 * per_frame * mean) / (FIRM + 3 * per_frame))
-    return Beliefs(presence, np.clip(noise, LEAST, MOST))
+    noise = np.sqrt((PRIOR_DEGREES + 3 * per_frame * mean) / (PRIOR_DEGREES + 3 * per_frame))
+    return Beliefs(presence, np.clip(noise, MIN_NOISE, MAX_NOISE))

@@ -1,7 +1,7 @@
-"""An explanation of a frame made better piece by piece, and what comes near it: branches of the tree searched anew.
+"""Improve an explanation of a frame branch by branch, and list the rivals whose cost is close to it.
 
-The search over the tree lets two limbs take the same point, as long as neither hangs on the other. Here every
-explanation that counts is one in which each point is taken once.
+The search over the tree lets limbs in different branches use the same point. Here every explanation uses each point
+once.
 """
 
 from __future__ import annotations
@@ -11,43 +11,43 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.identification.frame.search import WIDE, LabelSearch, Node
+from kinefit.identification.frame.search import MAX_BRANCH_EXCESS_COST, LabelSearch, Node
 
 Explanation = list[tuple[Node, int]]
-"""Nodes and what is chosen in each, parents first."""
+"""Nodes and the index of the choice in each, parents first."""
 
-NODES = 20
-"""For each segment of a branch that is searched anew; what is chosen elsewhere leaves it few points."""
+NODES_PER_SEGMENT = 20
+"""Node budget per segment when a branch is searched again; the rest of the body leaves it few points."""
 
-SWEEPS = 3
-"""Over all branches, or fewer if one changes nothing."""
+MAX_SWEEPS = 3
+"""Sweeps over all branches; fewer if one changes nothing."""
 
-GIVE_WAY = 3
-"""Segments of which one gives way, where several want a point."""
+MAX_TRIALS = 3
+"""Segments tried for another choice if several use the same point."""
 
-MOST = 6
-"""Other choices of one segment that are looked at."""
+MAX_ALTERNATIVES = 6
+"""Alternative choices tried per segment."""
 
-NEAR = 6.0
-"""Rivals dearer by more than this are 0.25 % as likely, and not looked at."""
+MAX_RIVAL_COST = 6.0
+"""Cost above the best beyond which rivals are ignored: 0.25 % of the likelihood."""
 
-RESTARTS = 4
-"""A rival that is cheaper becomes the explanation, so many times at most."""
+MAX_RESTARTS = 4
+"""Times that a cheaper rival may replace the explanation."""
 
 
 def cost_of(search: LabelSearch, chosen: Explanation) -> float:
-    """-log likelihood of an explanation; a point that two segments take counts for both."""
+    """-log likelihood of an explanation, a number; a point used by two segments counts twice."""
     at = {node.table.index: (node, c) for node, c in chosen}
     total = 0.0
     for node, c in chosen:
         total += float(node.cost[c])
         if node.table.parent in at:
-            total += float(search.between(*at[node.table.parent], node)[c])
+            total += float(search.range_costs(*at[node.table.parent], node)[c])
     return total
 
 
 def labels_of(chosen: Explanation, count: int) -> NDArray:
-    """(M,) int, point of each label, -1 for none."""
+    """(M,) int, point of each of `count` labels, -1 for none."""
     labels = np.full(count, -1)
     for node, c in chosen:
         fresh = node.table.shared < 0
@@ -55,104 +55,104 @@ def labels_of(chosen: Explanation, count: int) -> NDArray:
     return labels
 
 
-def shared(search: LabelSearch, chosen: Explanation) -> NDArray:
-    """(W,) bits of points that two segments take."""
-    twice, once = search.bits[-1].copy(), search.bits[-1].copy()
+def shared_points(search: LabelSearch, chosen: Explanation) -> NDArray:
+    """(W,) uint64 bits of the points that two segments use."""
+    used_twice, used = search.bits[-1].copy(), search.bits[-1].copy()
     for node, c in chosen:
-        twice |= once & node.new[c]
-        once |= node.new[c]
-    return twice
+        used_twice |= used & node.new[c]
+        used |= node.new[c]
+    return used_twice
 
 
-def apart(search: LabelSearch, chosen: Explanation) -> Explanation:
-    """The explanation with every point taken once."""
-    found = disentangle(search, chosen, branches(search), {chosen[0][0].table.index})
+def resolve_conflicts(search: LabelSearch, chosen: Explanation) -> Explanation:
+    """Change an explanation so that every point is used once."""
+    found = remove_conflicts(search, chosen, branches(search), {chosen[0][0].table.index})
     assert found is not None  # segments below the root can always choose none
     return found
 
 
 def polish(search: LabelSearch, found: Explanation) -> Explanation:
-    """The explanation, no dearer by the change of any one branch."""
+    """Improve an explanation until no change of a single branch lowers its cost."""
     below = branches(search)
     cost = cost_of(search, found)
-    largest = 0.6 * len(found)  # nearly all of a body, searched anew, is the search that it came from
+    largest = 0.6 * len(found)  # a branch of nearly the whole body would repeat the first search
     small = [node.table.index for node, _ in found[1:] if len(below[node.table.index]) < largest][::-1]
-    for _ in range(SWEEPS):
+    for _ in range(MAX_SWEEPS):
         before = cost
-        for s in () if search.idle else small:
-            trial = anew(search, found, below[s])
-            now = cost_of(search, trial)
-            if now < cost - 1e-6 and not shared(search, trial).any():
-                found, cost = trial, now
+        for s in () if search.is_exhausted else small:
+            trial = search_branch(search, found, below[s])
+            trial_cost = cost_of(search, trial)
+            if trial_cost < cost - 1e-6 and not shared_points(search, trial).any():
+                found, cost = trial, trial_cost
         if cost == before:
             break
     return found
 
 
-def carried(search: LabelSearch, chosen: Explanation) -> Explanation:
-    """An explanation as another search has it, at another noise level; points that it thinks too far off are left."""
+def transfer(search: LabelSearch, chosen: Explanation) -> Explanation:
+    """Transfer an explanation to a search at another noise level; points outside its gate are dropped."""
     every = np.bitwise_or.reduce(search.bits, 0)
     at: dict[int, tuple[Node, int]] = {}
     for node, c in chosen:
-        own = search.beside(every & ~node.all[c], WIDE)
-        here = own.seat(node.table, *at.get(node.table.parent, (None, -1)))
-        same = np.flatnonzero((here.index == node.index[c]).all(1))
-        at[node.table.index] = (here, int(same[0]) if len(same) else int(np.argmin(here.cost)))
+        local = search.without_points(every & ~node.all[c], MAX_BRANCH_EXCESS_COST)
+        new_node = local.make_node(node.table, *at.get(node.table.parent, (None, -1)))
+        matches = np.flatnonzero((new_node.index == node.index[c]).all(1))
+        at[node.table.index] = (new_node, int(matches[0]) if len(matches) else int(np.argmin(new_node.cost)))
     return list(at.values())
 
 
-def disentangle(
+def remove_conflicts(
     search: LabelSearch, chosen: Explanation, below: dict[int, list[int]], fixed: set[int], limit: float = np.inf
 ) -> Explanation | None:
-    """The explanation with every point taken once; of two segments that want one the cheaper gives way.
+    """Change an explanation so that every point is used once: of two segments one chooses again, whichever costs less.
 
-    None where both are `fixed`, or where that would cost more than `limit`.
+    None if both are `fixed`, or if the cost (a number) exceeds `limit`.
     """
     tries = 0
-    while (twice := shared(search, chosen)).any():
+    while (conflicts := shared_points(search, chosen)).any():
         tries += 1
-        users = {node.table.index for node, c in chosen if (node.new[c] & twice).any()} - fixed
-        if not users or cost_of(search, chosen) > limit:  # room for others only costs
+        users = {node.table.index for node, c in chosen if (node.new[c] & conflicts).any()} - fixed
+        if not users or cost_of(search, chosen) > limit:  # further changes only add cost
             return None
-        least = sorted(users, key=lambda s: (len(below[s]), s))
-        # branches that take points twice themselves: from the last segments on, it ends
-        trials = [anew(search, chosen, below[s]) for s in least[: 1 if tries > len(chosen) else GIVE_WAY]]
-        left = [int(np.unpackbits(shared(search, trial).view(np.uint8)).sum()) for trial in trials]
-        chosen = trials[min(range(len(trials)), key=lambda k: (left[k], cost_of(search, trials[k])))]
+        order = sorted(users, key=lambda s: (len(below[s]), s))
+        # with conflicts inside a branch: one at a time from the last segments on, so that it ends
+        trials = [search_branch(search, chosen, below[s]) for s in order[: 1 if tries > len(chosen) else MAX_TRIALS]]
+        conflict_counts = [int(np.unpackbits(shared_points(search, trial).view(np.uint8)).sum()) for trial in trials]
+        chosen = trials[min(range(len(trials)), key=lambda k: (conflict_counts[k], cost_of(search, trials[k])))]
     return chosen
 
 
 def branches(search: LabelSearch) -> dict[int, list[int]]:
-    """For each segment itself and all below it."""
+    """For each segment the indices of itself and its descendants."""
     found: dict[int, list[int]] = {}
     for t in reversed(search.tables):
         found[t.index] = [t.index] + [s for child in t.children for s in found[child]]
     return found
 
 
-def anew(search: LabelSearch, chosen: Explanation, branch: list[int]) -> Explanation:
-    """The explanation with a branch (a segment and all below it) searched again, without others' points."""
+def search_branch(search: LabelSearch, chosen: Explanation, branch: list[int]) -> Explanation:
+    """Search a branch (a segment and its descendants) of an explanation again, without the points of the rest."""
     kept = [(node, c) for node, c in chosen if node.table.index not in branch]
     table = search.by_index[branch[0]]
     above = next((node, c) for node, c in kept if node.table.index == table.parent)
     outside = search.bits[-1].copy()
     for node, c in kept:
         outside |= node.new[c]
-    local = search.beside(outside)
-    local.grant(NODES * len(branch))
+    local = search.without_points(outside)
+    local.set_node_budget(NODES_PER_SEGMENT * len(branch))
     return kept + local.decode(local.node(table, *above), above)
 
 
 def rivals(search: LabelSearch, chosen: Explanation) -> tuple[Explanation, list[tuple[float, Explanation]], set[int]]:
-    """The cheapest explanation near one, by how much others are dearer, up to NEAR, and segments that were looked at.
+    """The cheapest explanation near one, its rivals with their excess cost, and the indices of segments examined.
 
-    These are all, unless the frame's work was used up before.
+    All segments are examined unless the frame's work is used up. The excess cost is at most MAX_RIVAL_COST.
     """
-    search.allow(1.0)
-    for _ in range(RESTARTS):
+    search.set_work_share(1.0)
+    for _ in range(MAX_RESTARTS):
         cost, found = cost_of(search, chosen), []
-        seen: set[int] = set()
-        for trial in _others(search, chosen, seen):
+        examined: set[int] = set()
+        for trial in _alternatives(search, chosen, examined):
             found.append((cost_of(search, trial), trial))
             if found[-1][0] < cost - 1e-6:
                 break
@@ -160,33 +160,33 @@ def rivals(search: LabelSearch, chosen: Explanation) -> tuple[Explanation, list[
             break
         found[-1] = (cost, chosen)
         cost, chosen = cost_of(search, trial), trial
-    return chosen, [(now - cost, rival) for now, rival in found if now < cost + NEAR], seen
+    return chosen, [(total - cost, rival) for total, rival in found if total < cost + MAX_RIVAL_COST], examined
 
 
-def _others(search: LabelSearch, chosen: Explanation, seen: set[int]) -> Iterator[Explanation]:
-    """Explanations in which one segment chooses otherwise, and others make room for that; adds to `seen`."""
-    below, free = branches(search), search.beside(search.bits[-1], WIDE)
+def _alternatives(search: LabelSearch, chosen: Explanation, examined: set[int]) -> Iterator[Explanation]:
+    """Explanations in which one segment chooses differently and others adapt; adds its index to `examined`."""
+    below, free = branches(search), search.without_points(search.bits[-1], MAX_BRANCH_EXCESS_COST)
     at = {node.table.index: (node, c) for node, c in chosen}
-    limit = cost_of(search, chosen) + NEAR
+    limit = cost_of(search, chosen) + MAX_RIVAL_COST
     for node, c in chosen:
-        if search.frame.idle:
+        if search.frame.is_exhausted:
             return
         table, branch = node.table, below[node.table.index]
-        above = at.get(table.parent)
+        parent_choice = at.get(table.parent)
         kept = [pair for pair in chosen if pair[0].table.index not in branch]
-        free.grant(NODES * len(branch))
-        here = free.node(table, *above) if above else node
-        cost = free.beneath(here, above)
-        now = cost_of(search, [pair for pair in chosen if pair[0].table.index in branch])
-        if above is not None:
-            now += float(search.between(*above, node)[c])
+        free.set_node_budget(NODES_PER_SEGMENT * len(branch))
+        alternatives = free.node(table, *parent_choice) if parent_choice else node
+        cost = free.branch_costs(alternatives, parent_choice)
+        current_cost = cost_of(search, [pair for pair in chosen if pair[0].table.index in branch])
+        if parent_choice is not None:
+            current_cost += float(search.range_costs(*parent_choice, node)[c])
         fixed = {s for s in below if table.index in below[s]}
         order = np.argsort(cost)
-        likely = cost[order] <= now + NEAR
-        differs = (here.index[order] != node.index[c]).any(1)
-        for k in order[likely & differs][:MOST]:
-            trial = disentangle(search, kept + free.follow(here, int(k)), below, fixed, limit)
+        likely = cost[order] <= current_cost + MAX_RIVAL_COST
+        differs = (alternatives.index[order] != node.index[c]).any(1)
+        for k in order[likely & differs][:MAX_ALTERNATIVES]:
+            trial = remove_conflicts(search, kept + free.follow(alternatives, int(k)), below, fixed, limit)
             if trial is not None:
                 yield trial
-        if not search.frame.idle:
-            seen.add(table.index)
+        if not search.frame.is_exhausted:
+            examined.add(table.index)

@@ -1,7 +1,7 @@
 """The paper's synthetic test (P5 4.1): bodies of 13 segments/44 points and 15/49, posed at random, with exact truth.
 
-The paper shows its bodies only as a picture. These have its counts: up to six points a segment, the trunk having most
-of them, and a point at each joint that both segments share.
+The paper shows its bodies only in a figure. These have the same counts: up to six points per segment, most on the
+trunk, and at each joint a point that both segments share.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ TREE = (
     ("hand_r", "forearm_r", "r_wrist", ("r_wrist", "r_finger", "r_thumb")),
 )
 PLACING = 0.008
-"""[m] by how much a person's left and right markers differ from mirror images; joints' markers do not."""
+"""[m] standard deviation of left and right markers from mirror symmetry; markers at joints are symmetric."""
 
 
 @dataclass(frozen=True, eq=False)
 class SyntheticPose:
-    """A posed body as an unlabelled frame, with its truth.
+    """An unlabelled frame of a posed body with its true labels.
 
     Parameters
     ----------
-    points : (N, 3) [m], in no order
-    truth : (M,) int, the point of each of the model's labels; -1 where it is missing
+    points : (N, 3) [m], in random order
+    truth : (M,) int, the point of each label of the model; -1 if it is missing
     """
 
     points: NDArray
@@ -58,11 +58,12 @@ class SyntheticPose:
 
 
 def synthetic_body(points: int = 44, *, placing: float = PLACING, seed: int = 0) -> MarkerModel:
-    """The paper's body of 13 segments and 44 points, or (49) with hands of 15 segments and 49 points.
+    """The paper's body of 13 segments and 44 points, or of 15 segments (with hands) and 49 points.
 
     Parameters
     ----------
-    placing : [m] standard deviation by which markers between joints miss their mirror image
+    points : 44 or 49
+    placing : [m] standard deviation of left and right markers from mirror symmetry
     """
     tree = [row for row in TREE if points > 44 or not row[0].startswith("hand")]
     full: list[tuple[str, str, str, list[str]]] = []  # name, parent, joint (empty for the root), markers
@@ -102,23 +103,23 @@ def random_pose(
     missing: float = 0.0,
     extra: int = 0,
 ) -> SyntheticPose:
-    """A random pose of a body as P5 4.1 makes it.
+    """Draw a random pose of a body, like P5 4.1.
 
     Parameters
     ----------
     rotation : [rad]
-        Every segment turns about its joint (the root about its centre) by an angle uniform in [0, rotation] about a
-        random axis. Default: every rotation alike.
-    distortion : share of a segment's mean distance l
+        Largest angle: every segment turns about its joint (the root about its centre) by a uniform angle about a
+        random axis. Default: uniformly random rotations.
+    distortion : share of a segment's mean distance l, without unit
         Zero-mean Gaussian noise N(0, distortion l) / √6 is added to each coordinate of each point.
-    missing : probability of each point to be missing
-    extra : points at random in the box of the body, 0.2 m larger on each side
+    missing : probability that a point is missing
+    extra : number of random points in the body's bounding box, enlarged by 0.2 m on each side
     """
     places = np.array(model.reference)
     noise = np.zeros(len(model))
     Ts: list[tuple[NDArray, NDArray]] = []
     joint_of = {j.child: j for j in model.joints}
-    done: set[int] = set()
+    posed: set[int] = set()
     for s, markers in enumerate(model.segments):
         turn, x = _turn(rng, rotation), model.reference[list(markers)]
         if s in joint_of:
@@ -131,22 +132,22 @@ def random_pose(
         Ts.append((R, t))
         length = mean_length(x)
         for m in markers:
-            if m not in done:
+            if m not in posed:
                 places[m] = R @ model.reference[m] + t
                 noise[m] = distortion * length / np.sqrt(6.0)
-        done |= set(markers)
+        posed |= set(markers)
     places += noise[:, None] * rng.standard_normal(places.shape)
-    seen = rng.random(len(model)) >= missing
+    visible = rng.random(len(model)) >= missing
     low, high = places.min(0) - 0.2, places.max(0) + 0.2
-    points = np.vstack([places[seen], rng.uniform(low, high, (extra, 3))])
+    points = np.vstack([places[visible], rng.uniform(low, high, (extra, 3))])
     order = rng.permutation(len(points))
     truth = np.full(len(model), -1)
-    truth[seen] = np.argsort(order)[: seen.sum()]
+    truth[visible] = np.argsort(order)[: visible.sum()]
     return SyntheticPose(points[order], truth)
 
 
 def mean_length(x: NDArray) -> float:
-    """l of a segment [m]: the mean distance of its points (P5, below (3))."""
+    """Mean distance l [m] of a segment's points x (k, 3) (P5, below equation 3)."""
     i, j = np.triu_indices(len(x), 1)
     return float(np.linalg.norm(x[i] - x[j], axis=-1).mean())
 

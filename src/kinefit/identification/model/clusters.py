@@ -1,4 +1,4 @@
-"""Segments from motion alone: groups of near-constant distances, and the points that are constant in two of them."""
+"""Learn marker segments and their tree from motion alone: markers at near-constant distances form a segment."""
 
 from __future__ import annotations
 
@@ -12,58 +12,60 @@ from kinefit.identification.model.from_frame import Skeleton
 from kinefit.identification.model.rigid import joint_residual
 from kinefit.solvers.rigid_clusters import local, middle, rigid_frames, shape_of
 
-GIVE_WITHIN = 0.012
-"""[m] deviation of a distance up to which two markers are of one segment: twice what the catalogue's markers give by
-(0.004 m at each end), so that a soft part holds together; joints that turn move theirs by centimetres."""
+MAX_SEGMENT_SIGMA = 0.012
+"""[m] largest deviation of the distances within a segment: twice that of the catalogue's markers (0.004 m at each end).
+Distances across a moving joint vary by centimetres."""
 
-FIRMEST, LONGEST = 0.015, 0.6
-"""[m] deviation of a distance, and the distance, beyond which two markers are of no segment together: skin gives less,
-and of a body's parts only a tall man's trunk is longer. What was held still looks like one segment whatever it is."""
+MAX_PAIR_SIGMA = 0.015
+"""[m] two markers whose distance varies more are never of one segment: skin moves less."""
 
-NEARER = 0.002
-"""By which a distance, as if it were a deviation, counts against a group, so that of what was held still the near
-markers come together: 1 mm at 0.5 m."""
+MAX_PAIR_DISTANCE = 0.6
+"""[m] nor are two farther apart: only a tall man's trunk is longer. A joint without motion looks like one segment."""
 
-LOOSE = 1.5
-"""By how much more a distance may give to a marker of a neighbour that helps a group of one or two to a shape."""
+DISTANCE_PENALTY = 0.002
+"""[m deviation / m distance] penalty for long distances, so that nearby markers are grouped first in parts without
+motion: 1 mm at 0.5 m."""
 
-SHARED_GIVE = 0.010
-"""[m] a marker that strays less than this from a second segment may be that segment's too: it sits on their joint."""
+WIDENING_FACTOR = 1.5
+"""Factor on MAX_SEGMENT_SIGMA for markers of a neighbour that complete a group of one or two."""
 
-MOST_SHARED = 2
-"""Markers that two segments share at most: those on a hinge's axis."""
+MAX_SHARED_SIGMA = 0.010
+"""[m] a marker that varies less in the frame of a second segment may be shared with it: it sits on their joint."""
 
-MOST_FRAMES = 300
-"""Frames that are looked at here; every marker is fitted without itself."""
+MAX_SHARED_MARKERS = 2
+"""Most markers that two segments share: those on a hinge's axis."""
+
+MAX_FRAMES = 300
+"""Frames used here: every marker is fitted without itself, which is slow."""
 
 
 def learn_segments(positions: NDArray, labels: Sequence[str], mean: NDArray, deviation: NDArray) -> Skeleton:
-    """Segments and their tree, by what moves together.
+    """Learn segments and their tree from common motion.
 
-    Complete linkage over the deviations of distances gives groups; each marker then goes to the group from whose
-    rigid motion it strays least, and to a second one too if it hardly strays from that. Groups are joined into a tree
-    by the points that are most nearly constant in both frames. No two of a segment vary by more than FIRMEST, nor are
-    further apart than LONGEST.
+    Complete linkage over the deviations of distances gives groups. Each marker is then reassigned to the group in whose
+    frame it varies least, and shared with a second group if it hardly varies there. The tree joins the groups by the
+    points that are most nearly constant in both frames.
 
     Parameters
     ----------
-    positions : (F, M, 3) [m]
-    mean, deviation : (M, M) [m] of distances, NaN for two that are never seen together
+    positions : (F, M, 3) [m]; NaN where not visible
+    labels : M names
+    mean, deviation : (M, M) [m] of distances; NaN for pairs that are never visible together
     """
-    positions = positions[:: -(-len(positions) // MOST_FRAMES)]
-    firm = (deviation <= FIRMEST) & (mean <= LONGEST)
+    positions = positions[:: -(-len(positions) // MAX_FRAMES)]
+    firm = (deviation <= MAX_PAIR_SIGMA) & (mean <= MAX_PAIR_DISTANCE)
     np.fill_diagonal(firm, True)
-    apart = np.where(firm, deviation + NEARER * mean, np.inf)
-    groups = settle(positions, linkage(apart, GIVE_WITHIN), firm)
+    costs = np.where(firm, deviation + DISTANCE_PENALTY * mean, np.inf)
+    groups = reassign_markers(positions, linkage(costs, MAX_SEGMENT_SIGMA), firm)
     small = [g for g in groups if len(g) < 3]
-    index = sorted(set().union(*small))  # of these, two and two that are nearly of one segment
+    index = sorted(set().union(*small))  # of these, pairs that nearly form a segment are joined
     groups = [g for g in groups if len(g) >= 3]
-    groups += [{index[i] for i in g} for g in linkage(apart[np.ix_(index, index)], LOOSE * GIVE_WITHIN)]
+    groups += [{index[i] for i in g} for g in linkage(costs[np.ix_(index, index)], WIDENING_FACTOR * MAX_SEGMENT_SIGMA)]
     members = [tuple(sorted(g)) for g in groups]
-    wide = [widened(g, apart) for g in groups]
-    shared = share(positions, members, wide, firm)
+    widened = [widen_group(g, costs) for g in groups]
+    shared = share_markers(positions, members, widened, firm)
     cost = joint_costs(positions, shared, deviation)
-    order, parents = rooted(cost, [len(m) for m in members])
+    order, parents = root_tree(cost, [len(m) for m in members])
     place = {g: i for i, g in enumerate(order)}
     segments = []
     for g in order:
@@ -72,7 +74,7 @@ def learn_segments(positions: NDArray, labels: Sequence[str], mean: NDArray, dev
         for m in sorted(set().union(*(shared[g] & set(members[c]) for c in near)) - set(own)):
             own += [m] if firm[m, own].all() else []
         segments.append(tuple(sorted(own)))
-    names = tuple(named([labels[m] for m in members[g]]) for g in order)
+    names = tuple(group_name([labels[m] for m in members[g]]) for g in order)
     names = tuple(n if names.count(n) == 1 else f"{n}_{i}" for i, n in enumerate(names))
     unknown = np.full((len(labels), 3), np.nan)
     return Skeleton(
@@ -81,10 +83,16 @@ def learn_segments(positions: NDArray, labels: Sequence[str], mean: NDArray, dev
     )
 
 
-def linkage(apart: NDArray, most: float) -> list[set[int]]:
-    """Groups by complete linkage: the two groups whose farthest members are nearest are merged, up to `most`."""
-    groups = [{i} for i in range(len(apart))]
-    d = np.array(apart, float)
+def linkage(costs: NDArray, most: float) -> list[set[int]]:
+    """Complete linkage: merge the two groups with the least largest cost until it exceeds `most`.
+
+    Parameters
+    ----------
+    costs : (M, M) [m] cost of each pair
+    most : [m]
+    """
+    groups = [{i} for i in range(len(costs))]
+    d = np.array(costs, float)
     np.fill_diagonal(d, np.inf)
     while len(groups) > 1:
         i, j = np.unravel_index(np.argmin(d), d.shape)
@@ -98,28 +106,31 @@ def linkage(apart: NDArray, most: float) -> list[set[int]]:
     return groups
 
 
-def settle(positions: NDArray, groups: list[set[int]], firm: NDArray) -> list[set[int]]:
-    """Each marker in the group from which it strays least, of those to all of whose markers it is `firm` (M, M).
+def reassign_markers(positions: NDArray, groups: list[set[int]], firm: NDArray) -> list[set[int]]:
+    """Move each marker to the group in whose frame it varies least; groups of one or two stay.
 
-    Groups too small for a motion of their own stay.
+    Parameters
+    ----------
+    positions : (F, M, 3) [m]
+    firm : (M, M) bool, pairs that may be of one group
     """
     for _ in range(3):
-        whole = [g for g in groups if len(g) >= 3]
-        stray = np.stack([strays(positions, g) for g in whole]) if whole else np.empty((0, positions.shape[1]))
+        large = [g for g in groups if len(g) >= 3]
+        sigmas = np.stack([marker_sigmas(positions, g) for g in large]) if large else np.empty((0, positions.shape[1]))
         moved = False
-        for number, g in enumerate(whole):
+        for number, g in enumerate(large):
             for m in sorted(g):
-                best = _nearest(stray[:, m], whole, firm[m])
-                if best >= 0 and best != number and len(g) > 3 and stray[best, m] < 0.7 * stray[number, m]:
+                best = _best_group(sigmas[:, m], large, firm[m])
+                if best >= 0 and best != number and len(g) > 3 and sigmas[best, m] < 0.7 * sigmas[number, m]:
                     g.discard(m)
-                    whole[best].add(m)
+                    large[best].add(m)
                     moved = True
         for g in [g for g in groups if len(g) < 3]:
             for m in sorted(g):
-                best = _nearest(stray[:, m], whole, firm[m])
-                if best >= 0 and stray[best, m] < GIVE_WITHIN / 2:
+                best = _best_group(sigmas[:, m], large, firm[m])
+                if best >= 0 and sigmas[best, m] < MAX_SEGMENT_SIGMA / 2:
                     g.discard(m)
-                    whole[best].add(m)
+                    large[best].add(m)
                     moved = True
         groups = [g for g in groups if g]
         if not moved:
@@ -127,60 +138,82 @@ def settle(positions: NDArray, groups: list[set[int]], firm: NDArray) -> list[se
     return groups
 
 
-def _nearest(stray: NDArray, groups: list[set[int]], firm: NDArray) -> int:
-    """The group that a marker strays least from, of those to which it is firm; -1 for none."""
-    held = [i for i, g in enumerate(groups) if firm[sorted(g)].all()]
-    return min(held, key=lambda i: stray[i], default=-1)
+def _best_group(sigmas: NDArray, groups: list[set[int]], firm: NDArray) -> int:
+    """The group in which a marker varies least, of those with all of which it is `firm`; -1 for none."""
+    allowed = [i for i, g in enumerate(groups) if firm[sorted(g)].all()]
+    return min(allowed, key=lambda i: sigmas[i], default=-1)
 
 
-def strays(positions: NDArray, group: set[int]) -> NDArray:
-    """(M,) [m] how far each marker strays from its mean place in the frame of a group (without itself), on one axis."""
+def marker_sigmas(positions: NDArray, group: set[int]) -> NDArray:
+    """(M,) [m] standard deviation of each marker in the frame of a group, without itself, per axis; inf if unknown.
+
+    Parameters
+    ----------
+    positions : (F, M, 3) [m]; NaN where not visible
+    group : indices of markers
+    """
     out = np.full(positions.shape[1], np.inf)
     inside = sorted(group)
-    for leave in [None, *inside] if len(inside) > 3 else [None]:
-        used = [m for m in inside if m != leave]
+    for excluded in [None, *inside] if len(inside) > 3 else [None]:
+        used = [m for m in inside if m != excluded]
         R, t = rigid_frames(shape_of(positions[:, used]), positions[:, used])
-        who = [leave] if leave is not None else list(range(positions.shape[1]))
-        back = local(R, t, positions[:, who])
-        away = middle(((back - middle(back, axis=0)) ** 2).sum(-1), axis=0)
-        out[who] = np.where(np.isfinite(away), np.sqrt(away / 3), np.inf)
+        evaluated = [excluded] if excluded is not None else list(range(positions.shape[1]))
+        local_points = local(R, t, positions[:, evaluated])
+        variance = middle(((local_points - middle(local_points, axis=0)) ** 2).sum(-1), axis=0)
+        out[evaluated] = np.where(np.isfinite(variance), np.sqrt(variance / 3), np.inf)
     return out
 
 
-def widened(group: set[int], apart: NDArray) -> set[int]:
-    """A group of one or two with markers of others that hold their distances to it, the firmest first, up to four."""
+def widen_group(group: set[int], costs: NDArray) -> set[int]:
+    """Add to a group of one or two up to two markers of other groups, those with the least cost first.
+
+    Parameters
+    ----------
+    costs : (M, M) [m] of pairs
+    """
     out = set(group)
     while len(group) < 3 and len(out) < 4:
-        firm = apart[sorted(out)].max(0)
-        firm[sorted(out)] = np.inf
-        if firm.min() > LOOSE * GIVE_WITHIN:
+        worst = costs[sorted(out)].max(0)
+        worst[sorted(out)] = np.inf
+        if worst.min() > WIDENING_FACTOR * MAX_SEGMENT_SIGMA:
             break
-        out.add(int(np.argmin(firm)))
+        out.add(int(np.argmin(worst)))
     return out
 
 
-def share(
-    positions: NDArray, members: list[tuple[int, ...]], wide: list[set[int]], held: NDArray
+def share_markers(
+    positions: NDArray, members: list[tuple[int, ...]], wide: list[set[int]], is_firm: NDArray
 ) -> list[set[int]]:
-    """Each group with markers of others that hardly stray from it: of each other group the two that do least."""
+    """Add to each group the markers of others that hardly vary in its frame, at most two of each other group.
+
+    Parameters
+    ----------
+    positions : (F, M, 3) [m]
+    members, wide : the groups, and the same widened
+    is_firm : (M, M) bool, pairs that may be of one group
+    """
     out = []
-    for g, more in zip(members, wide):
-        found = set(more)
+    for g, extra in zip(members, wide):
+        found = set(extra)
         if len(g) >= 3:
-            stray = strays(positions, set(g))
-            for other in members:
-                if other is not g:
-                    near = (m for m in other if stray[m] < SHARED_GIVE and held[m, list(g)].all())
-                    firm = sorted(near, key=lambda m: stray[m])
-                    found |= set(firm[:MOST_SHARED])
+            sigmas = marker_sigmas(positions, set(g))
+            for neighbour in members:
+                if neighbour is not g:
+                    near = (m for m in neighbour if sigmas[m] < MAX_SHARED_SIGMA and is_firm[m, list(g)].all())
+                    ranked = sorted(near, key=lambda m: sigmas[m])
+                    found |= set(ranked[:MAX_SHARED_MARKERS])
         out.append(found)
     return out
 
 
 def joint_costs(positions: NDArray, groups: list[set[int]], deviation: NDArray) -> NDArray:
-    """(G, G) [m] how badly two groups meet in a point that is constant in both, with half of its way to their markers.
+    """(G, G) [m] residual of the best joint of each two groups, plus a tenth of the distance of their nearest markers.
 
-    The way counts since a point far from both is nearly constant for any two that turn little.
+    The distance counts because a far point is nearly constant for any two groups that turn little.
+
+    Parameters
+    ----------
+    positions : (F, M, 3) [m]; deviation : (M, M) [m] of distances
     """
     count = len(groups)
     cost = np.full((count, count), np.inf)
@@ -207,10 +240,12 @@ def joint_costs(positions: NDArray, groups: list[set[int]], deviation: NDArray) 
     return cost
 
 
-def rooted(cost: NDArray, sizes: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Order (parents first, depth first) and parents (-1 for the root) of the tree of least total cost.
+def root_tree(cost: NDArray, sizes: Sequence[int]) -> tuple[list[int], list[int]]:
+    """Minimum spanning tree over `cost` (G, G) [m]: order (parents first, depth first) and parents (-1 for the root).
 
-    The root has most markers times neighbours (P5 3.2: more points, and more segments linked to it, than most).
+    The root has the largest product of markers and neighbours.
+
+    Source: P5 3.2 (the segment with most points and most links).
     """
     count = len(cost)
     links: list[set[int]] = [set() for _ in range(count)]
@@ -233,7 +268,7 @@ def rooted(cost: NDArray, sizes: Sequence[int]) -> tuple[list[int], list[int]]:
     return order, parents
 
 
-def named(labels: Sequence[str]) -> str:
-    """A group's name: its first two labels, without the subject."""
+def group_name(labels: Sequence[str]) -> str:
+    """A group's name: its first two labels, without the subject's prefix."""
     plain = [bare(label) for label in labels]
     return "+".join(plain[:2]) + ("+" if len(plain) > 2 else "")

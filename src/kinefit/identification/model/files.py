@@ -50,12 +50,12 @@ class _ModelFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 def save_model(model: MarkerModel, path: str | PathLike[str]) -> None:
-    """Write a marker model; all of it or nothing.
+    """Write a marker model atomically.
 
     Raises
     ------
     ExportError
-        Where the system refuses.
+        The file cannot be written.
     """
     upper = np.triu_indices(len(model), 1)
     rows = np.split(np.arange(len(upper[0])), np.cumsum(np.arange(len(model) - 1, 1, -1)))
@@ -97,7 +97,7 @@ def load_model(path: str | PathLike[str]) -> MarkerModel:
     Raises
     ------
     FileError
-        Missing, not a marker model, or one that contradicts itself: with the place.
+        The file is missing, is no marker model, or contradicts itself; names the place in the file.
     """
     path = Path(path)
     remedy = "Make one with `kinefit markers learn`."
@@ -158,7 +158,7 @@ def _model(record: _ModelFile) -> MarkerModel:
 
 
 def _symmetric(upper: tuple[float, ...]) -> NDArray:
-    """(3, 3) from its upper half; positive definite, else a ValueError."""
+    """Symmetric (3, 3) from its upper half; raises ValueError if it is not positive definite."""
     out = np.zeros((3, 3))
     out[_UPPER] = upper
     out = out + np.triu(out, 1).T
@@ -168,5 +168,5 @@ def _symmetric(upper: tuple[float, ...]) -> NDArray:
 
 
 def _rounded(values: NDArray) -> list:
-    """To a thousandth of a millimetre: markers are measured to a tenth."""
+    """Rounded to a thousandth of a millimetre: markers are measured to a tenth."""
     return np.round(np.asarray(values, float), 6).tolist()

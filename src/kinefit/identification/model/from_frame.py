@@ -15,28 +15,28 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.se3 import nearest_rotation
 from kinefit.identification.model.model import MarkerJoint, MarkerModel
 
-NOISE = 0.001
-"""[m] of a measured distance."""
+DISTANCE_NOISE = 0.001
+"""[m] standard deviation of a measured distance."""
 
 JOINT_SPREAD = 0.02
-"""[m] guess of a virtual joint's spread: body proportions and skin."""
+"""[m] prior standard deviation of a virtual joint: body proportions and skin."""
 
 MARKER_SPREAD = 0.01
-"""[m] the same where both segments share a marker."""
+"""[m] prior standard deviation of a joint at a marker that both segments share."""
 
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """A marker set's segments for the labels that a take really has.
+    """A marker set's segments, reduced to the labels of a take.
 
     Parameters
     ----------
-    names, parents : of the segments; the root first, parent -1
-    members : each (k,) int into the take's labels
-    shared : for each segment, its markers that its parent has too
-    places : (M, 3) [m] of the set, NaN where not known; joints : (S, 3) [m] of the set, NaN where not known
-    unknown : labels that the set does not know, as indexes
-    give : [m] for each member of each segment; ranges : [rad] of each segment's joint; see SetSegment
+    names, parents : of the S segments; the root first, with parent -1
+    members : (k,) int each, indices into the take's M labels
+    places, joints : (M, 3), (S, 3) [m] in the set; NaN where unknown
+    unknown : indices of the labels that the set does not know
+    give : [m] standard deviation of each member of each segment
+    ranges : [rad] of each segment's joint; see SetSegment
     """
 
     names: tuple[str, ...]
@@ -49,12 +49,14 @@ class Skeleton:
     ranges: tuple[float, ...]
 
     def shared(self, s: int) -> tuple[int, ...]:
-        """Markers of a segment that its parent has too."""
+        """Markers that a segment shares with its parent."""
         return () if self.parents[s] < 0 else tuple(m for m in self.members[s] if m in self.members[self.parents[s]])
 
 
 def skeleton_of(labels: Sequence[str], marker_set: MarkerSet) -> Skeleton:
-    """Segments of a set that have a marker of their own among the labels; children of others go to the next ancestor.
+    """Reduce a marker set to the segments with a marker of their own among the labels; other segments are skipped.
+
+    Children of a skipped segment are linked to its nearest remaining ancestor.
 
     Raises
     ------
@@ -70,17 +72,17 @@ def skeleton_of(labels: Sequence[str], marker_set: MarkerSet) -> Skeleton:
             remedy=f"It has: {', '.join(marker_set.labels[:8])} ... Choose another set, or rename the markers.",
         )
     members = [tuple(number[m] for m in s.markers if m in number) for s in marker_set.segments]
-    elders: list[set[int]] = []
+    inherited: list[set[int]] = []
     for segment in marker_set.segments:
-        elders.append(set() if segment.parent < 0 else elders[segment.parent] | set(members[segment.parent]))
-    keep = [s for s in range(len(members)) if set(members[s]) - elders[s]]
+        inherited.append(set() if segment.parent < 0 else inherited[segment.parent] | set(members[segment.parent]))
+    keep = [s for s in range(len(members)) if set(members[s]) - inherited[s]]
     keep = [s for i, s in enumerate(keep) if i or len(members[s]) >= 3] or keep
     while keep and len(members[keep[0]]) < 3:
         keep = keep[1:]
     if not keep:
         raise ObservationError("no segment has three markers", remedy="A root needs three; add markers to the trunk.")
-    lost = {m for s in range(len(members)) if s not in keep for m in members[s]}
-    lost -= {m for s in keep for m in members[s]}
+    unassigned = {m for s in range(len(members)) if s not in keep for m in members[s]}
+    unassigned -= {m for s in keep for m in members[s]}
     parents = []
     for i, s in enumerate(keep):
         p = marker_set.segments[s].parent
@@ -94,7 +96,7 @@ def skeleton_of(labels: Sequence[str], marker_set: MarkerSet) -> Skeleton:
     for i, s in enumerate(keep):
         if marker_set.segments[s].joint is not None:
             joints[i] = marker_set.segments[s].joint
-    unknown = tuple(sorted({i for i, name in enumerate(known) if name is None} | lost))
+    unknown = tuple(sorted({i for i, name in enumerate(known) if name is None} | unassigned))
     give = []
     for segment in (marker_set.segments[s] for s in keep):
         each = segment.give or (GIVE,) * len(segment.markers)
@@ -105,12 +107,12 @@ def skeleton_of(labels: Sequence[str], marker_set: MarkerSet) -> Skeleton:
 
 
 def similarity(x: NDArray, y: NDArray, prior: NDArray) -> tuple[float, NDArray, NDArray]:
-    """Scale s, rotation R, translation t with s R x + t = y, least squares; what the points leave open as in `prior`.
+    """Least-squares scale s, rotation R, translation t with s R x + t = y.
 
     Parameters
     ----------
     x, y : (n, 3) [m], n >= 1
-    prior : (3, 3) rotation, weighed so little that it decides only what the points do not
+    prior : (3, 3) rotation that decides what the points leave undetermined; its weight is negligible otherwise
     """
     a, b = x - x.mean(0), y - y.mean(0)
     size = float((a * a).sum())
@@ -121,51 +123,60 @@ def similarity(x: NDArray, y: NDArray, prior: NDArray) -> tuple[float, NDArray, 
 
 
 def place_joints(positions: NDArray, skeleton: Skeleton) -> NDArray:
-    """(S, 3) [m] each segment's joint with its parent in one frame, from the set's places; NaN for the root.
+    """(S, 3) [m] each segment's joint with its parent in one frame; NaN for the root.
 
-    Every segment is laid onto its markers with its own size and turn (root first, each with the joint its parent
-    gives it); a joint lies in the middle of what parent and child say. Without places: amid the nearest markers.
+    Each segment of the set is fitted to its markers by a similarity, the root first. A joint is the mean of its places
+    by parent and child. Without places in the set it lies between the two nearest markers.
+
+    Parameters
+    ----------
+    positions : (M, 3) [m] of the skeleton's labels
     """
     count = len(skeleton.names)
     joints = np.full((count, 3), np.nan)
     fits: list[tuple[float, NDArray, NDArray]] = []
     for s in range(count):
         p = skeleton.parents[s]
-        here = [m for m in skeleton.members[s] if np.isfinite(skeleton.places[m]).all()]
-        x, y = skeleton.places[here], positions[here]
+        known = [m for m in skeleton.members[s] if np.isfinite(skeleton.places[m]).all()]
+        x, y = skeleton.places[known], positions[known]
         prior = fits[p] if p >= 0 else (1.0, np.eye(3), np.zeros(3))
         if p >= 0 and np.isfinite(skeleton.joints[s]).all():
             joints[s] = prior[0] * prior[1] @ skeleton.joints[s] + prior[2]
-            if len(here) >= 3:
+            if len(known) >= 3:
                 scale, R, t = similarity(x, y, prior[1])
-                flat = np.linalg.svd(x - x.mean(0), compute_uv=False)[1] > 0.03  # [m]; else turned about a line
+                is_planar = np.linalg.svd(x - x.mean(0), compute_uv=False)[1] > 0.03  # [m]; else turned about a line
                 own = scale * R @ skeleton.joints[s] + t
-                joints[s] = 0.5 * (joints[s] + own) if flat else joints[s]
+                joints[s] = 0.5 * (joints[s] + own) if is_planar else joints[s]
             x, y = np.vstack([x, skeleton.joints[s]]), np.vstack([y, joints[s]])
         fits.append(similarity(x, y, prior[1]) if len(x) > 1 else prior)
     for s in range(1, count):
         if not np.isfinite(joints[s]).all():
-            mine, theirs = positions[list(skeleton.members[s])], positions[list(skeleton.members[skeleton.parents[s]])]
-            gaps = np.linalg.norm(mine[:, None] - theirs, axis=-1)
+            own_points, parent_points = (positions[list(skeleton.members[k])] for k in (s, skeleton.parents[s]))
+            gaps = np.linalg.norm(own_points[:, None] - parent_points, axis=-1)
             i, j = np.unravel_index(np.argmin(gaps), gaps.shape)
-            joints[s] = 0.5 * (mine[i] + theirs[j])
+            joints[s] = 0.5 * (own_points[i] + parent_points[j])
     return joints
 
 
-def reach(
+def reachable_distances(
     reference: NDArray, members: Sequence[Sequence[int]], joints: Sequence[MarkerJoint]
 ) -> tuple[NDArray, NDArray]:
-    """(M, M) [m] each: least and largest distance of two markers that the tree of segments allows, whatever its pose.
+    """(M, M) [m] each: least and largest distance of two markers that the segment tree allows in any pose.
 
-    Within a segment both are the distance itself. Across joints: the largest is the way through the joints; the least
-    is what the longest piece of that way leaves when the others turn against it.
+    Within a segment both are the distance itself. Across joints the largest is the length of the chain of joints, and
+    the least what remains of its longest piece if the others fold against it.
+
+    Parameters
+    ----------
+    reference : (M, 3) [m]
+    members : indices of the markers of each segment
     """
     count, size = len(reference), len(members)
     low, high = np.zeros((count, count)), np.full((count, count), np.inf)
     mean = np.linalg.norm(reference[:, None] - reference, axis=-1)
     joint_of = {j.child: j for j in joints}
 
-    def way(s: int) -> list[int]:
+    def path_to_root(s: int) -> list[int]:
         path = [s]
         while path[-1] in joint_of:
             path.append(joint_of[path[-1]].parent)
@@ -173,7 +184,7 @@ def reach(
 
     for a in range(size):
         for b in range(a, size):
-            up, down = way(a), way(b)
+            up, down = path_to_root(a), path_to_root(b)
             if a == b:
                 i = np.ix_(list(members[a]), list(members[a]))
                 low[i], high[i] = mean[i], mean[i]
@@ -194,14 +205,19 @@ def reach(
     return low, np.maximum(high, low)
 
 
-def guess_deviation(mean: NDArray, skeleton: Skeleton, low: NDArray, high: NDArray) -> NDArray:
-    """(M, M) [m] how much distances give where no training tells: by skin within segments, else as the tree allows."""
+def prior_deviation(mean: NDArray, skeleton: Skeleton, low: NDArray, high: NDArray) -> NDArray:
+    """(M, M) [m] standard deviations of distances without training: from skin within segments, else from the tree.
+
+    Parameters
+    ----------
+    mean, low, high : (M, M) [m] mean, least and largest distances
+    """
     deviation = (high - low) / np.sqrt(12.0)
     within = np.full(mean.shape, np.inf)
     for m, give in zip(skeleton.members, skeleton.give):
         i, g = np.ix_(list(m), list(m)), np.asarray(give)
-        within[i] = np.minimum(within[i], np.sqrt(NOISE**2 + g[:, None] ** 2 + g**2))
-    deviation = np.where(np.isfinite(within), within, deviation + NOISE)
+        within[i] = np.minimum(within[i], np.sqrt(DISTANCE_NOISE**2 + g[:, None] ** 2 + g**2))
+    deviation = np.where(np.isfinite(within), within, deviation + DISTANCE_NOISE)
     np.fill_diagonal(deviation, 0.0)
     return deviation
 
@@ -210,53 +226,64 @@ def guess_deviation(mean: NDArray, skeleton: Skeleton, low: NDArray, high: NDArr
 def model_from_frame(
     positions: ArrayLike, labels: Sequence[str], marker_set: MarkerSet, *, name: str = "subject"
 ) -> MarkerModel:
-    """A subject's model from one labelled frame.
+    """Make a subject's marker model from one labelled frame.
 
     Parameters
     ----------
-    positions : (M, 3) [m], NaN where a marker is not seen: such a marker is left out, and named in the model's gaps
+    positions : (M, 3) [m]; a marker with NaN is excluded and listed in the model's gaps
     labels : (M,)
     marker_set : MarkerSet
-        A label that it does not know goes to the segment that is nearest; computed points are left out.
+        A label that it does not know goes to the nearest segment; computed points are excluded.
 
     Raises
     ------
     ObservationError
-        Shapes do not agree, a label is there twice, the set does not fit the labels, or the root has no three markers.
+        Shapes disagree, a label appears twice, the set does not fit the labels, or the root has too few markers.
     """
-    at = shaped(positions, (len(labels), 3), "positions")
-    real = [i for i, label in enumerate(labels) if not marker_set.is_computed(label) and not label.startswith("*")]
-    seen = [i for i in real if np.isfinite(at[i]).all()]
-    labels, at, gaps = [labels[i] for i in seen], at[seen], tuple(labels[i] for i in real if i not in seen)
+    points = shaped(positions, (len(labels), 3), "positions")
+    measured = [i for i, label in enumerate(labels) if not marker_set.is_computed(label) and not label.startswith("*")]
+    kept = [i for i in measured if np.isfinite(points[i]).all()]
+    labels, points, gaps = [labels[i] for i in kept], points[kept], tuple(labels[i] for i in measured if i not in kept)
     skeleton = skeleton_of(labels, marker_set)
-    skeleton = adopt(skeleton, np.linalg.norm(at[:, None] - at, axis=-1))
-    places = place_joints(at, skeleton)
+    skeleton = assign_unknown(skeleton, np.linalg.norm(points[:, None] - points, axis=-1))
+    places = place_joints(points, skeleton)
     joints = []
     for s in range(1, len(skeleton.names)):
-        marker = pivot(skeleton, s, places[s], at)
-        place = places[s] if marker is None else at[marker]
+        marker = shared_marker(skeleton, s, places[s], points)
+        place = places[s] if marker is None else points[marker]
         spread = JOINT_SPREAD if marker is None else MARKER_SPREAD
         joints.append(MarkerJoint(skeleton.parents[s], s, place, place, spread, marker))
-    mean = np.linalg.norm(at[:, None] - at, axis=-1)
-    low, high = reach(at, skeleton.members, joints)
-    deviation = guess_deviation(mean, skeleton, low, high)
+    mean = np.linalg.norm(points[:, None] - points, axis=-1)
+    low, high = reachable_distances(points, skeleton.members, joints)
+    deviation = prior_deviation(mean, skeleton, low, high)
     return MarkerModel(
-        name, tuple(labels), at, skeleton.members, skeleton.names, tuple(joints), mean, deviation, low, high, gaps
+        name, tuple(labels), points, skeleton.members, skeleton.names, tuple(joints), mean, deviation, low, high, gaps
     )
 
 
-def pivot(skeleton: Skeleton, s: int, place: NDArray, at: NDArray) -> int | None:
-    """The marker that a segment shares with its parent, the one nearest to their joint; None without one."""
+def shared_marker(skeleton: Skeleton, s: int, place: NDArray, reference: NDArray) -> int | None:
+    """Index of the marker that a segment shares with its parent, nearest to their joint; None without one.
+
+    Parameters
+    ----------
+    place : (3,) [m] the joint
+    reference : (M, 3) [m]
+    """
     shared = skeleton.shared(s)
-    return min(shared, key=lambda m: float(np.linalg.norm(at[m] - place))) if shared else None
+    return min(shared, key=lambda m: float(np.linalg.norm(reference[m] - place))) if shared else None
 
 
-def adopt(skeleton: Skeleton, cost: NDArray) -> Skeleton:
-    """Markers that the set does not know go to the segment of least mean `cost` (M, M) to two of its markers."""
+def assign_unknown(skeleton: Skeleton, cost: NDArray) -> Skeleton:
+    """Assign markers that the set does not know to the segment with the least mean cost to two of its markers.
+
+    Parameters
+    ----------
+    cost : (M, M) [m] distances, or their standard deviations
+    """
     members, give = [list(m) for m in skeleton.members], [list(g) for g in skeleton.give]
     for i in skeleton.unknown:
-        known = [np.sort(np.nan_to_num(cost[i, list(m)], nan=np.inf))[:2].mean() for m in skeleton.members]
-        best = int(np.argmin(known))
+        costs = [np.sort(np.nan_to_num(cost[i, list(m)], nan=np.inf))[:2].mean() for m in skeleton.members]
+        best = int(np.argmin(costs))
         members[best].append(i)
-        give[best].append(2 * GIVE)  # not known to be of this segment
+        give[best].append(2 * GIVE)  # the segment is a guess
     return replace(skeleton, members=tuple(map(tuple, members)), unknown=(), give=tuple(map(tuple, give)))

@@ -1,4 +1,4 @@
-"""The gate on training motion: which joints it did not exercise, and what to record."""
+"""Check a training take: report joints that it did not exercise and markers that it hardly shows."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import RANGE, MarkerSet, find_marker_set
 from kinefit.identification.model.model import MarkerJoint, MarkerModel
-from kinefit.identification.model.rigid import told
+from kinefit.identification.model.rigid import exercised_share
 from kinefit.observations import Markers
 
-ENOUGH = 0.35
-"""Share of a joint's range below which it counts as held still. In takes that trained models well, all joints but the
-wrists had more; walking leaves shoulders, wrists, waist and neck below, standing all."""
+MIN_EXERCISED_SHARE = 0.35
+"""Share of a joint's range below which it counts as still. In good training takes all joints but the wrists exceed it;
+walking leaves shoulders, wrists, waist and neck below, standing all."""
 
-ALIKE = 0.01
-"""[m] two segments whose distances agree this well cannot be told apart by themselves: two markers' give."""
+MAX_SHAPE_DIFFERENCE = 0.01
+"""[m] two segments whose distances agree this well are indistinguishable by shape: the skin motion of two markers."""
 
 _MOTIONS = {
     "head": "nod, tilt and turn the head as far as it goes",
@@ -33,7 +33,7 @@ _MOTIONS = {
 
 @dataclass(frozen=True)
 class TrainingFinding:
-    """One thing to know of a training take.
+    """One shortcoming of a training take.
 
     Parameters
     ----------
@@ -57,11 +57,11 @@ class TrainingFinding:
 def training_gate(
     markers: Markers, model: MarkerModel, *, marker_set: MarkerSet | None = None
 ) -> list[TrainingFinding]:
-    """What the training take leaves open, worst first; empty if nothing.
+    """List the shortcomings of a training take, worst first; empty if there are none.
 
     Parameters
     ----------
-    markers : the take from which `model` was learnt, or any other that is to be judged against its labels
+    markers : the take from which `model` was learnt, or another take with its labels
     marker_set : for the full range of each joint; default: the catalogue's set that knows the labels
     """
     marker_set = marker_set or find_marker_set(model.labels)
@@ -69,16 +69,16 @@ def training_gate(
     still = []
     for joint in model.joints:
         name = model.names[joint.child]
-        share = told(joint, full.get(name, RANGE))
-        if share < ENOUGH:
-            still.append((share, _still(model, joint, full.get(name, RANGE))))
+        share = exercised_share(joint, full.get(name, RANGE))
+        if share < MIN_EXERCISED_SHARE:
+            still.append((share, _still_finding(model, joint, full.get(name, RANGE))))
     out = [f for _, f in sorted(still, key=lambda pair: pair[0])]
     unknown = _unknown(model) if marker_set is None else []
-    return unknown + _twice(model) + out + _merged(model) + _seldom(markers, model) + _few(model) + _alike(model)
+    return unknown + _duplicates(model) + out + _merged(model) + _rare(markers, model) + _few(model) + _alike(model)
 
 
 def _unknown(model: MarkerModel) -> list[TrainingFinding]:
-    """Labels that no set knows: their segments are what held its distances in training, body parts or not."""
+    """Labels that no set knows: their segments come from motion alone and need not be body parts."""
     sizes = sorted(zip((len(s) for s in model.segments), model.names), reverse=True)
     text = f"no set of the catalogue knows the labels; {len(sizes)} segments are from motion alone, the largest with "
     text += f"{sizes[0][0]} markers ({sizes[0][1]})"
@@ -86,15 +86,15 @@ def _unknown(model: MarkerModel) -> list[TrainingFinding]:
     return [TrainingFinding("unknown", model.name, text, remedy)]
 
 
-def _twice(model: MarkerModel) -> list[TrainingFinding]:
-    """Labels that the file had twice: its reader told them apart by a suffix."""
+def _duplicates(model: MarkerModel) -> list[TrainingFinding]:
+    """Labels that appear twice in the file: the reader added a suffix to one of them."""
     parts = [(label, *label.rpartition("_")) for label in model.labels]
-    again = [(label, base) for label, base, _, n in parts if n.isdigit() and base in model.labels]
+    duplicates = [(label, base) for label, base, _, n in parts if n.isdigit() and base in model.labels]
     text, remedy = "the file has the label {} twice", "Delete one of the two in the recording"
-    return [TrainingFinding("twice", label, text.format(base), remedy) for label, base in again]
+    return [TrainingFinding("twice", label, text.format(base), remedy) for label, base in duplicates]
 
 
-def _still(model: MarkerModel, joint: MarkerJoint, full: float) -> TrainingFinding:
+def _still_finding(model: MarkerModel, joint: MarkerJoint, full: float) -> TrainingFinding:
     name, parent = model.names[joint.child], model.names[joint.parent]
     degrees = [f"{np.degrees(r):.0f}" for r in joint.ranges]
     motion = _MOTIONS.get(name.removesuffix("_r").removesuffix("_l").replace("_", ""), "turn it about all its axes")
@@ -106,7 +106,7 @@ def _still(model: MarkerModel, joint: MarkerJoint, full: float) -> TrainingFindi
 
 
 def _merged(model: MarkerModel) -> list[TrainingFinding]:
-    """Segments longer than a thigh or a trunk of anybody: several that were held together."""
+    """Segments longer than any trunk or thigh: probably several that did not move against each other."""
     out = []
     for name, members in zip(model.names, model.segments):
         length = float(model.mean[np.ix_(members, members)].max())
@@ -116,7 +116,7 @@ def _merged(model: MarkerModel) -> list[TrainingFinding]:
     return out
 
 
-def _seldom(markers: Markers, model: MarkerModel) -> list[TrainingFinding]:
+def _rare(markers: Markers, model: MarkerModel) -> list[TrainingFinding]:
     index = {name: i for i, name in enumerate(markers.names)}
     out = []
     for label in model.gaps:
@@ -127,21 +127,21 @@ def _seldom(markers: Markers, model: MarkerModel) -> list[TrainingFinding]:
 
 
 def _few(model: MarkerModel) -> list[TrainingFinding]:
-    """Segments whose pose three markers, or two and the joint, do not tell."""
+    """Segments with too few markers for a pose: fewer than three with the joint, or on one line."""
     out = []
     joints = {j.child: j.in_child for j in model.joints}
     for s, (name, members) in enumerate(zip(model.names, model.segments)):
         points = model.reference[list(members)]
         points = np.vstack([points, joints[s]]) if s in joints else points
         flat = np.linalg.svd(points - points.mean(0), compute_uv=False)
-        if len(points) < 3 or flat[1] < 0.02:  # [m] beside one line
+        if len(points) < 3 or flat[1] < 0.02:  # [m] off one line
             text = f"{len(members)} markers" + (", nearly on one line with its joint" if len(points) > 2 else "")
             out.append(TrainingFinding("few", name, text, "Add a marker off the line, or expect doubtful names there"))
     return out
 
 
 def _alike(model: MarkerModel) -> list[TrainingFinding]:
-    """Segments (left and right) with the same distances: only the body around them tells which is which."""
+    """Pairs of segments (left and right) with the same distances, which only their neighbours distinguish."""
     out = []
     for a in range(len(model.segments)):
         for b in range(a):
@@ -150,7 +150,7 @@ def _alike(model: MarkerModel) -> list[TrainingFinding]:
                 continue
             i, j = np.triu_indices(len(first), 1)
             d = model.mean[np.ix_(first, first)][i, j] - model.mean[np.ix_(second, second)][i, j]
-            if np.abs(d).max() < ALIKE:
+            if np.abs(d).max() < MAX_SHAPE_DIFFERENCE:
                 text = f"same shape as {model.names[b]} within {1e3 * np.abs(d).max():.0f} mm"
                 remedy = "Move one marker by 3 cm, or wear one more on a side"
                 out.append(TrainingFinding("alike", model.names[a], text, remedy))

@@ -1,4 +1,4 @@
-"""What is known of a subject's markers: which distances hold, how much each gives, where segments meet (P5 2)."""
+"""The marker model of a subject: segments, joints, and the distribution of distances (P5 2)."""
 
 from __future__ import annotations
 
@@ -12,24 +12,23 @@ from kinefit.errors import ObservationError
 
 @dataclass(frozen=True, eq=False)
 class MarkerJoint:
-    """Where two marker segments meet.
+    """The joint of two marker segments.
 
     Parameters
     ----------
-    parent, child : int, indexes of segments
+    parent, child : int, indices of segments
     in_parent, in_child : (3,) [m]
-        Its place in each segment's frame, that of the model's reference positions.
+        The joint in each segment's frame, which is that of the model's reference positions.
     spread : float [m]
-        Standard deviation between the two, as seen in training; skin and fitting.
+        Standard deviation of the difference of both in training: skin motion and fitting errors.
     marker : int or None
-        The marker that both segments share there, if one does (P5 2: "joint"); None for a virtual joint.
+        The marker that both segments share at the joint (P5 2: "joint"); None for a virtual joint.
     exercised : float [rad]
-        Range that the joint went through in training; 0 where the model comes from one frame.
+        Range of the joint in training; 0 for a model of one frame.
     ranges : 3 floats [rad]
-        The same about each of three axes at right angles, the most turned about first.
-    turn, give : (3, 3), (3, 3) [rad²], or None where no motion taught it
-        Middle of the child's turns in the parent's frame, and the covariance of its turns about that, in the child's
-        axes; a hinge's is small across its axis.
+        Ranges about three orthogonal axes, the largest first.
+    turn, give : (3, 3), (3, 3) [rad²], or None without training motion
+        Centre of the child's turns in the parent's frame, and their covariance about it in the child's axes.
     """
 
     parent: int
@@ -52,16 +51,21 @@ class MarkerModel:
     ----------
     name : str of the subject
     labels : (M,)
-    reference : (M, 3) [m] positions of one frame (or the mean shape of each segment, put together); all finite.
-    segments : each (k,) int, markers of a segment; a marker may be in two (a joint's). The first is the root.
+    reference : (M, 3) [m] positions in one frame, or each segment's mean shape fitted to one; all finite
+    segments : (k,) int each, markers of a segment, the root first; a marker at a joint may be in two
     names : of the segments
-    joints : MarkerJoint, one for each segment but the root; parents come before children.
+    joints : MarkerJoint, one for each segment but the root; parents come before children
     mean, deviation : (M, M) [m]
-        Distances of markers, and their standard deviations in training; a model of one frame has deviations guessed.
+        Distances and their standard deviations in training; prior deviations in a model of one frame.
     low, high : (M, M) [m]
-        Least and largest distance in training; across joints that were not exercised (all, in a model of one frame)
-        widened towards what the tree of segments allows. Equal to `mean` within segments of one frame.
-    gaps : labels of which training showed less than a tenth.
+        Least and largest distance in training. Across joints that training did not exercise (all, in a model of one
+        frame) widened towards what the segment tree allows. Equal to `mean` within segments of one frame.
+    gaps : labels visible in less than a tenth of the training frames
+
+    Raises
+    ------
+    ObservationError
+        A label appears twice, or shapes disagree.
     """
 
     name: str
@@ -78,9 +82,9 @@ class MarkerModel:
 
     def __post_init__(self) -> None:
         count = len(self.labels)
-        twice = sorted({n for n in self.labels if self.labels.count(n) > 1})
-        if twice:
-            raise ObservationError(f"labels appear twice: {', '.join(twice)}", remedy="Name every marker once.")
+        duplicates = sorted({n for n in self.labels if self.labels.count(n) > 1})
+        if duplicates:
+            raise ObservationError(f"labels appear twice: {', '.join(duplicates)}", remedy="Name every marker once.")
         if np.shape(self.reference) != (count, 3) or not np.isfinite(self.reference).all():
             raise ObservationError(
                 f"reference positions of shape {np.shape(self.reference)}, or not finite, for {count} labels",

@@ -1,4 +1,4 @@
-"""The points where two segments meet, with what a motion leaves open, and how far joints were turned."""
+"""Estimate the joints between two marker segments, their ranges, and the covariance of their turns."""
 
 from __future__ import annotations
 
@@ -9,52 +9,68 @@ from kinefit.geometry.se3 import exp_so3, log_so3, nearest_rotation
 from kinefit.identification.model.model import MarkerJoint
 from kinefit.solvers.rigid_clusters import local, middle
 
-SECOND_RANGE = 0.35
-"""Of a joint's range: about the axis it turns about second most, where all is known. A hip flexes through 130 degrees
-and spreads through 45; a hinge has no second axis, and its distances none that changes with it."""
+SECOND_AXIS_RATIO = 0.35
+"""Range of a ball joint about its second axis over that about its first: a hip flexes through 130 degrees and spreads
+through 45."""
 
-MORE, TURN = 1.3, 0.15
-"""Turns of a joint go beyond those of training by this factor, and this [rad]."""
+RANGE_FACTOR = 1.3
+"""Ratio of a joint's range in other motions to that in training."""
+
+MIN_TURN_SIGMA = 0.15
+"""[rad] standard deviation of turns about any axis that no training shows."""
 
 
-def meet(
+def fit_joint(
     Rp: NDArray, tp: NDArray, Rc: NDArray, tc: NDArray, x: NDArray, y: NDArray, guess: NDArray
 ) -> tuple[NDArray, NDArray]:
-    """The point that is constant in both frames: a in the parent's, b in the child's, from the reference place `guess`.
+    """Estimate the point that is constant in the frames of both segments: least squares over all frames.
 
-    Least squares of R_p a + t_p = R_c b + t_c over all frames; along directions that the motion does not tell (a
-    hinge's axis, or a joint held still) both stay at the guess, which counts as much as one centimetre in three.
+    Minimises |R_p a + t_p - R_c b - t_c|². Along directions that the motion does not determine (a hinge's axis, a joint
+    without motion) both points stay at the guess, which has the weight of one centimetre in three.
+
+    Parameters
+    ----------
+    Rp, tp, Rc, tc : (F, 3, 3), (F, 3) [m] of the parent and of the child; NaN where unknown
+    x, y : (k, 3), (F, k, 3) [m] reference and measured positions of the child's markers
+    guess : (3,) [m] the joint in the reference
+
+    Returns
+    -------
+    a, b : (3,), (3,) [m] the joint in the parent's and in the child's frame
     """
     if len(x) < 3:
-        return meet_few(Rp, tp, x, y, guess)
-    good = np.isfinite(tp).all(1) & np.isfinite(tc).all(1)
-    if not good.any():
+        return fit_joint_few(Rp, tp, x, y, guess)
+    valid = np.isfinite(tp).all(1) & np.isfinite(tc).all(1)
+    if not valid.any():
         return guess, guess
-    A = np.concatenate([Rp[good], -Rc[good]], axis=2)
-    r = tc[good] - tp[good] - (A @ np.concatenate([guess, guess]))
-    H = np.einsum("fij,fik->jk", A, A) / good.sum()
-    g = np.einsum("fij,fi->j", A, r) / good.sum()
+    A = np.concatenate([Rp[valid], -Rc[valid]], axis=2)
+    r = tc[valid] - tp[valid] - (A @ np.concatenate([guess, guess]))
+    H = np.einsum("fij,fik->jk", A, A) / valid.sum()
+    g = np.einsum("fij,fi->j", A, r) / valid.sum()
     step = np.linalg.solve(H + 0.02 * np.eye(6), g)
     return guess + step[:3], guess + step[3:]
 
 
-def meet_few(Rp: NDArray, tp: NDArray, x: NDArray, y: NDArray, guess: NDArray) -> tuple[NDArray, NDArray]:
-    """The same for a child of one or two markers: the point of the parent that keeps its distance to each."""
-    good = np.isfinite(tp).all(1)
+def fit_joint_few(Rp: NDArray, tp: NDArray, x: NDArray, y: NDArray, guess: NDArray) -> tuple[NDArray, NDArray]:
+    """Estimate the joint of a child with one or two markers: its distances to them are constant.
+
+    Parameters and results are those of `fit_joint`.
+    """
+    valid = np.isfinite(tp).all(1)
     a = guess.copy()
-    local = np.einsum("fji,fkj->fki", Rp[good], y[good] - tp[good][:, None])
+    local = np.einsum("fji,fkj->fki", Rp[valid], y[valid] - tp[valid][:, None])
     for _ in range(5):
         away = local - a
         length = np.linalg.norm(away, axis=-1)
         typical = middle(length, axis=0)
         J = -away / np.maximum(length, 1e-9)[..., None]
         r = typical - length
-        ok = np.isfinite(r)
-        if not ok.any():
+        finite = np.isfinite(r)
+        if not finite.any():
             return guess, guess
-        J, r = J[ok], r[ok]
+        J, r = J[finite], r[finite]
         a = a + np.linalg.solve(J.T @ J / len(r) + 0.02 * np.eye(3), J.T @ r / len(r) + 0.02 * (guess - a))
-    # in the child: at those distances from its markers, nearest to where the parent's lies in the reference
+    # in the child's frame: the point at these distances from its markers that is nearest to the parent's
     b = a.copy()
     typical = middle(np.linalg.norm(local - a, axis=-1), axis=0)
     for _ in range(10):
@@ -66,40 +82,40 @@ def meet_few(Rp: NDArray, tp: NDArray, x: NDArray, y: NDArray, guess: NDArray) -
 
 
 def joint_residual(parent: tuple[NDArray, ...], child: tuple[NDArray, ...] | None, y: NDArray) -> float:
-    """[m] how far the best joint of two segments strays: root mean square, median over frames.
+    """[m] root mean square residual of the best joint of two segments; median over the frames.
 
     Parameters
     ----------
-    parent, child : shape (k, 3), rotations (F, 3, 3), translations (F, 3); no child where it has fewer than 3 markers
+    parent, child : (k, 3) shape, (F, 3, 3) rotations, (F, 3) translations; child None with fewer than 3 markers
     y : (F, k, 3) [m] markers of the child
     """
     _, Rp, tp = parent
     frame = int(np.argmax(np.isfinite(y[..., 0]).sum(1) + np.isfinite(tp[:, 0])))
     if child is not None:
         _, Rc, tc = child
-        good = np.isfinite(tp).all(1) & np.isfinite(tc).all(1)
-        if good.sum() < 3:
+        valid = np.isfinite(tp).all(1) & np.isfinite(tc).all(1)
+        if valid.sum() < 3:
             return np.inf
-        A = np.concatenate([Rp[good], -Rc[good]], axis=2)
-        r = tc[good] - tp[good]
-        start = np.concatenate([local(Rp[good], tp[good], y[good]).mean((0, 1)), np.zeros(3)])
-        start[3:] = middle(local(Rc[good], tc[good], y[good]), axis=(0, 1))
+        A = np.concatenate([Rp[valid], -Rc[valid]], axis=2)
+        r = tc[valid] - tp[valid]
+        start = np.concatenate([local(Rp[valid], tp[valid], y[valid]).mean((0, 1)), np.zeros(3)])
+        start[3:] = middle(local(Rc[valid], tc[valid], y[valid]), axis=(0, 1))
         start = np.nan_to_num(start)
-        H = np.einsum("fij,fik->jk", A, A) / good.sum() + 1e-3 * np.eye(6)
-        g = np.einsum("fij,fi->j", A, r - A @ start) / good.sum()
-        left = r - A @ (start + np.linalg.solve(H, g))
-        return float(np.sqrt(np.median((left**2).sum(1))))
-    here = local(Rp, tp, y)
-    guess = here[frame].copy()
+        H = np.einsum("fij,fik->jk", A, A) / valid.sum() + 1e-3 * np.eye(6)
+        g = np.einsum("fij,fi->j", A, r - A @ start) / valid.sum()
+        residuals = r - A @ (start + np.linalg.solve(H, g))
+        return float(np.sqrt(np.median((residuals**2).sum(1))))
+    local_points = local(Rp, tp, y)
+    guess = local_points[frame].copy()
     if not np.isfinite(guess).any():
         return np.inf
-    a, _ = meet_few(Rp, tp, y[frame] if np.isfinite(y[frame]).all() else guess, y, np.nanmean(guess, axis=0))
-    length = np.linalg.norm(here - a, axis=-1)
+    a, _ = fit_joint_few(Rp, tp, y[frame] if np.isfinite(y[frame]).all() else guess, y, np.nanmean(guess, axis=0))
+    length = np.linalg.norm(local_points - a, axis=-1)
     return float(np.sqrt(np.nanmedian((length - middle(length, axis=0)) ** 2))) if len(length) else np.inf
 
 
 def _turns(Rp: NDArray, Rc: NDArray, good: NDArray) -> tuple[NDArray, NDArray, NDArray] | None:
-    """Mean turn (3, 3) of a child in its parent's frame, turns about it (F, 3) [rad] along their own axes (3, 3)."""
+    """Mean turn (3, 3) of a child in its parent's frame; turns about it (F, 3) [rad] in principal axes (3, 3)."""
     relative = np.einsum("fji,fjk->fik", Rp[good], Rc[good])
     relative = relative[np.isfinite(relative).all((1, 2))]
     if not len(relative):
@@ -110,8 +126,14 @@ def _turns(Rp: NDArray, Rc: NDArray, good: NDArray) -> tuple[NDArray, NDArray, N
     return mean, turns @ axes, axes
 
 
-def turned(Rp: NDArray, Rc: NDArray, good: NDArray) -> tuple[float, float, float]:
-    """[rad] range of a joint about three axes at right angles, largest first: what 90 % of the frames lie within."""
+def joint_ranges(Rp: NDArray, Rc: NDArray, good: NDArray) -> tuple[float, float, float]:
+    """(3,) [rad] range of a joint about three orthogonal axes, largest first: the 5 % to 95 % quantile.
+
+    Parameters
+    ----------
+    Rp, Rc : (F, 3, 3) of parent and child
+    good : (F,) bool, frames to use
+    """
     found = _turns(Rp, Rc, good)
     if found is None:
         return 0.0, 0.0, 0.0
@@ -120,14 +142,19 @@ def turned(Rp: NDArray, Rc: NDArray, good: NDArray) -> tuple[float, float, float
     return first, second, third
 
 
-def usual_turn(
+def reference_turn(
     Rp: NDArray, Rc: NDArray, good: NDArray, full: float
 ) -> tuple[NDArray | None, NDArray | None]:
-    """Middle of a joint's turns (3, 3) and their covariance (3, 3) [rad²], in the child's axes; None where not seen.
+    """Centre of a joint's turns (3, 3) and their covariance (3, 3) [rad²] in the child's axes; None if unobserved.
 
-    The covariance is that of turns spread evenly over what training showed, MORE of it, and of turns that it did not
-    show: TURN about any axis; of one that went through little of its range `full` [rad] the rest of that about all
-    axes; and, of what joints may turn about a second axis, half of what it did not.
+    The turns are taken as uniform over RANGE_FACTOR times the training range. To the variance is added MIN_TURN_SIGMA²,
+    the square of the range `full` that training did not show, and that of half of the missing range of a second axis.
+
+    Parameters
+    ----------
+    Rp, Rc : (F, 3, 3) of parent and child
+    good : (F,) bool, frames to use
+    full : [rad] range of such a joint about its first axis
     """
     found = _turns(Rp, Rc, good)
     if found is None:
@@ -135,14 +162,14 @@ def usual_turn(
     mean, turns, axes = found
     low, high = np.quantile(turns, [0.005, 0.995], axis=0)
     middle_turn = mean @ exp_so3(axes @ (0.5 * (low + high)))
-    seen = np.sort(high - low)[::-1]
-    open_first = max(full - seen[0], 0.0)
-    open_second = 0.5 * max(SECOND_RANGE * full - seen[1], 0.0)
-    square = (MORE * (high - low)) ** 2 / 12 + TURN**2 + open_first**2 + open_second**2
+    ranges = np.sort(high - low)[::-1]
+    open_first = max(full - ranges[0], 0.0)
+    open_second = 0.5 * max(SECOND_AXIS_RATIO * full - ranges[1], 0.0)
+    square = (RANGE_FACTOR * (high - low)) ** 2 / 12 + MIN_TURN_SIGMA**2 + open_first**2 + open_second**2
     return middle_turn, (axes * square) @ axes.T
 
 
-def told(joint: MarkerJoint, full: float) -> float:
-    """0..1: how much of its range `full` [rad] a joint went through; the axis it turns about second counts for half."""
+def exercised_share(joint: MarkerJoint, full: float) -> float:
+    """Share (0 to 1) of a joint's range `full` [rad] that training showed; the second axis counts for half."""
     first, second, _ = joint.ranges
-    return 0.5 * min(1.0, first / full) + 0.5 * min(1.0, second / (SECOND_RANGE * full))
+    return 0.5 * min(1.0, first / full) + 0.5 * min(1.0, second / (SECOND_AXIS_RATIO * full))

@@ -1,1 +1,1 @@
-"""Who is who in a whole take."""
+"""Label the markers of a whole take."""

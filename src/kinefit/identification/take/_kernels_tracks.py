@@ -1,4 +1,4 @@
-"""Points of one frame and the next that are the same marker, by where each was going."""
+"""Link points of consecutive frames into trajectories by constant-velocity prediction."""
 
 import math
 
@@ -9,32 +9,32 @@ from kinefit._jit import jit
 
 @jit
 def link_points(points, starts, column, start, still, steady, piece):
-    """Number the pieces of trajectories, in the order of their beginnings.
+    """Link points into pieces of trajectories, numbered in the order of their first frames.
 
     Parameters
     ----------
-    points : (T, 3) [m] all points that were seen, frame by frame
+    points : (T, 3) [m] all measured points, frame by frame
     starts : (F + 1,) int, the first point of each frame
     column : (T,) int, the file's column of each
-    start, still, steady : [m] how far a point may be from where it was expected: of a piece that begins where no motion
-        is known around it, that begins, that goes on
-    piece : (T,) int, written: the piece that each point belongs to
+    start, still, steady : [m] largest prediction error in the second frame of a piece, without and with moving
+        neighbours, and in later frames
+    piece : (T,) int, written: piece of each point
 
     Returns
     -------
-    int, number of pieces
+    number of pieces
     """
     count = 0
-    most = 0
+    max_points = 0
     for f in range(len(starts) - 1):
-        here = starts[f + 1] - starts[f]
-        most = here if here > most else most
-    error = np.empty((most, most))
+        n_here = starts[f + 1] - starts[f]
+        max_points = n_here if n_here > max_points else max_points
+    error = np.empty((max_points, max_points))
     velocity = np.zeros((len(points), 3))
     length = np.zeros(len(points), np.int64)
     tolerance = np.empty(len(points))
-    before = np.empty(most, np.int64)
-    after = np.empty(most, np.int64)
+    before = np.empty(max_points, np.int64)
+    after = np.empty(max_points, np.int64)
     for f in range(len(starts) - 1):
         a, b = starts[f], starts[f + 1]
         n = b - a
@@ -50,20 +50,20 @@ def link_points(points, starts, column, start, still, steady, piece):
             for j in range(n):
                 dx, dy, dz = points[a + j, 0] - x, points[a + j, 1] - y, points[a + j, 2] - z
                 error[i, j] = math.sqrt(dx * dx + dy * dy + dz * dz)
-        for i in range(m):  # what the file says, if the motion does not speak against it
+        for i in range(m):  # same column of the file, unless another point predicts it much better
             for j in range(n):
                 if column[a + j] == column[p + i] and error[i, j] <= tolerance[p + i]:
-                    fine = True
+                    is_best = True
                     for k in range(n):
                         if k != j and error[i, k] < 0.3 * error[i, j] - 0.002:
-                            fine = False
+                            is_best = False
                     for k in range(m):
                         if k != i and error[k, j] < 0.3 * error[i, j] - 0.002:
-                            fine = False
-                    if fine:
+                            is_best = False
+                    if is_best:
                         after[i] = j
                         before[j] = i
-        for i in range(m):  # what is nearest for both, and nothing else is near
+        for i in range(m):  # mutual nearest neighbours without a competitor
             if after[i] >= 0:
                 continue
             best, second = -1, math.inf
@@ -94,7 +94,7 @@ def link_points(points, starts, column, start, still, steady, piece):
                 length[a + j] = length[p + i] + 1
                 for c in range(3):
                     velocity[a + j, c] = points[a + j, c] - points[p + i, c]
-        for j in range(n):  # a beginning moves as those around it
+        for j in range(n):  # a new piece takes the mean velocity of its neighbours
             tolerance[a + j] = steady
             if length[a + j] > 1:
                 continue

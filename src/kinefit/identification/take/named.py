@@ -1,4 +1,4 @@
-"""Markers without names in a take: named by the subject's model before they are tracked (`[[markers]] model = ...`)."""
+"""Label the unlabelled markers of a take by the subject's model before tracking (`[[markers]] model = ...`)."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ def named_markers(
     markers: Markers, model: MarkerModel | str | PathLike[str], *, settings: TakeSettings | None = None,
     progress: Step | None = None,
 ) -> Markers:
-    """Markers with the labels of a subject's model, whatever their columns are called and wherever they break.
+    """Label markers by a subject's model, whatever the names of their columns and wherever trajectories break.
 
-    Only what was measured and is named for certain is kept: gaps are not filled, and ghosts are left out.
+    Only measured points with a certain label are kept: gaps are not filled, and unassigned points are excluded.
 
     Parameters
     ----------
-    model : of the subject, or a file of it: see `learn_model`, `kinefit markers learn`
-    settings : TakeSettings, of which `certain` is the least confidence of a name that counts
+    model : of the subject, or its file: see `learn_model`, `kinefit markers learn`
+    settings : TakeSettings; `certain` is the least confidence (0 to 1) of a label that is kept
     progress : (what, done, total) -> None
 
     Returns
     -------
-    Markers of the model's M labels, with rate, unit, events of those given; NaN where a label is not known.
+    Markers of the model's M labels with the rate, unit and events of `markers`; NaN where a label is unknown.
 
     Raises
     ------
     ObservationError
         No frame shows three points, or the model is of another subject.
     FileError
-        No file of a model.
+        The file is no marker model.
     """
     model = model if isinstance(model, MarkerModel) else load_model(model)
     settings = replace(settings or TakeSettings(), fill=0.0, fill_alone=0.0)
     found = identify_take(model, markers, settings=settings, progress=progress)
     out = found.markers(markers)
-    sure = found.confidence >= settings.certain
-    return replace(out, positions=np.where(sure[..., None], out.positions, np.nan))
+    is_certain = found.confidence >= settings.certain
+    return replace(out, positions=np.where(is_certain[..., None], out.positions, np.nan))
 
 
 def with_names(take: Take, seen: Observations, *, progress: Step | None = None) -> Observations:
-    """What a take's sensors saw, with names for the markers of every `[[markers]]` that has a `model`.
+    """Label the markers of every `[[markers]]` entry of a take that has a `model`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Several subjects in one take, and takes put one after the other."""
+"""Label several subjects in one take; concatenate takes."""
 
 from __future__ import annotations
 
@@ -20,37 +20,48 @@ def identify_people(
     models: Sequence[MarkerModel], markers: Markers, *, settings: TakeSettings | None = None,
     progress: Step | None = None,
 ) -> list[TakeIdentification]:
-    """Names for several subjects in one take: each among the points that those before did not take for certain.
+    """Label several subjects in one take, one after the other, the one with most markers first.
 
-    The subject with most markers comes first. Columns of a result are those of `markers`.
+    Each subject is searched among the points that are not certainly labelled yet. Columns refer to `markers`.
+
+    Parameters
+    ----------
+    models : of the subjects, with different names
+    markers : (F, N, 3) [m], unlabelled or wrongly labelled
+    settings : default: `TakeSettings()`
+    progress : (what, done, total) -> None
+
+    Returns
+    -------
+    one result per model, in the order of `models`
 
     Raises
     ------
     ObservationError
-        No model, two of one name, or a subject of whom nothing is found.
+        There is no model, two have the same name, or a subject is not found.
     """
     names = [m.name for m in models]
     if not models or len(set(names)) < len(names):
-        told = f"subjects called {', '.join(names)}" if names else "no subject"
-        raise ObservationError(told, remedy="Give every subject a name of its own: kinefit markers learn --name.")
+        problem = f"subjects called {', '.join(names)}" if names else "no subject"
+        raise ObservationError(problem, remedy="Give every subject a name of its own: kinefit markers learn --name.")
     settings = settings or TakeSettings()
-    rest = np.array(markers.positions)
+    remaining = np.array(markers.positions)
     out: dict[int, TakeIdentification] = {}
     for i in sorted(range(len(models)), key=lambda i: -len(models[i])):
-        out[i] = identify_take(models[i], replace(markers, positions=rest), settings=settings, progress=progress)
-        column, sure = out[i].column, out[i].confidence >= settings.certain
+        out[i] = identify_take(models[i], replace(markers, positions=remaining), settings=settings, progress=progress)
+        column, is_certain = out[i].column, out[i].confidence >= settings.certain
         rows = np.broadcast_to(np.arange(len(column))[:, None], column.shape)
-        rest[rows[sure], column[sure]] = np.nan
+        remaining[rows[is_certain], column[is_certain]] = np.nan
     return [out[i] for i in range(len(models))]
 
 
 def one_after_the_other(takes: Sequence[Markers]) -> Markers:
-    """Takes as one; labels that not all of them have are not seen in the others.
+    """Concatenate takes; a label is NaN in takes without it.
 
     Raises
     ------
     ObservationError
-        No take.
+        There is no take.
     """
     if not takes:
         raise ObservationError("no take", remedy="Name at least one.")

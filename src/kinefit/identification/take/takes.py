@@ -16,31 +16,35 @@ from kinefit.identification.frame.beliefs import Beliefs
 from kinefit.identification.frame.identify import Identification, IdentifySettings, identify
 from kinefit.identification.model.model import MarkerModel
 from kinefit.identification.take.consistency import fill_gaps
-from kinefit.identification.take.naming import FINE, STRAY, Naming, Step
+from kinefit.identification.take.naming import INLIER_SIGMAS, OUTLIER_SIGMAS, Naming, Step
 from kinefit.identification.take.pieces import find_pieces
 from kinefit.observations import Markers
 
-FIRST, TRIAL, FITS = 12, 4, 0.7
-"""Frames that are asked first, how many of them before all others, and the share of labels that must be found in half
-of them (in one of the trial): a model of another subject finds half at most, and takes long; the right one finds more
-than nine in ten."""
+FIRST_FRAMES = 12
+"""Frames that are identified first, to check the model."""
 
+TRIAL_FRAMES = 4
+"""The first of these; with a wrong model, which is slow, only these."""
 
-ANCHOR = IdentifySettings(searches=6, work=5e7)
-"""Of an anchor frame: one that needs more is no good anchor, and there are others."""
+MIN_LABEL_SHARE = 0.7
+"""Share of labels that one trial frame and half of the first frames must show. Another subject's model finds at most
+half of the labels, the right one more than 90 %."""
+
+ANCHOR_SETTINGS = IdentifySettings(searches=6, work=5e7)
+"""Limits for an anchor frame: one that needs more is replaced by others."""
 
 
 @dataclass(frozen=True)
 class TakeSettings:
-    """How `identify_take` goes about it.
+    """Settings of `identify_take`.
 
     Parameters
     ----------
-    every : [s] between anchor frames at first
-    most : share of the frames that may become anchors, where pieces stay unknown
-    rounds : of further anchors
-    fill, fill_alone : [s] longest gap that is filled with its segment; from itself. 0: none
-    certain : a label less confident is doubtful
+    every : [s] between the first anchor frames
+    most : largest share of the frames, 0 to 1, that become anchors if pieces stay unknown
+    rounds : number of rounds with further anchors
+    fill, fill_alone : [s] longest gap filled by its segment; by a cubic. 0: none
+    certain : least confidence, 0 to 1, of a label without doubt
     """
 
     every: float = 0.33
@@ -53,15 +57,15 @@ class TakeSettings:
 
 @dataclass(frozen=True)
 class Doubt:
-    """Frames that someone should look at.
+    """Frames with a doubtful label.
 
     Parameters
     ----------
-    first, last : numbers of the frames, counted from 0, both included
+    first, last : first and last frame, counted from 0
     label : of the marker
-    kind : "unsure" (name), "off" (its segment)
-    confidence : the least in these frames
-    text : the same as a sentence
+    kind : "unsure" (low probability) or "off" (its segment)
+    confidence : the least in these frames, 0 to 1
+    text : the doubt as a sentence
     """
 
     first: int
@@ -74,18 +78,18 @@ class Doubt:
 
 @dataclass(frozen=True, eq=False)
 class TakeIdentification:
-    """A take with names.
+    """A labelled take.
 
     Parameters
     ----------
     labels : (M,) of the model
-    positions : (F, M, 3) [m]; NaN where a label is not seen or not known
-    confidence : (F, M) probability of each name; 0 where there is none
-    filled : (F, M) bool, positions that were not measured
-    column : (F, M) int, which column of the take each is; -1 where none
-    doubts : worst first
-    anchors : frames that were identified one by one
-    ghosts : number of points that are unassigned
+    positions : (F, M, 3) [m]; NaN where a label is not visible or unknown
+    confidence : (F, M) probability of each label, 0 to 1; 0 without one
+    filled : (F, M) bool, interpolated positions
+    column : (F, M) int, column of the take; -1 for none
+    doubts : the worst first
+    anchors : frames that were identified separately
+    ghosts : number of unassigned points
     """
 
     labels: tuple[str, ...]
@@ -98,7 +102,7 @@ class TakeIdentification:
     ghosts: int
 
     def markers(self, like: Markers) -> Markers:
-        """As markers with labels, with rate, unit, events of the take that they were found in."""
+        """Labelled markers with the rate, unit and events of `like`, the take before labelling."""
         residual = None
         if like.residual is not None:
             rows = np.arange(len(self.column))[:, None]
@@ -107,8 +111,8 @@ class TakeIdentification:
 
 
 def identify_anchor(model: MarkerModel, points: NDArray, beliefs: Beliefs | None = None) -> Identification:
-    """An anchor frame, as `identify`, but not for long."""
-    return identify(model, points, beliefs=beliefs, settings=ANCHOR)
+    """Identify the points (N, 3) [m] of an anchor frame: `identify` with less work."""
+    return identify(model, points, beliefs=beliefs, settings=ANCHOR_SETTINGS)
 
 
 @checked
@@ -116,21 +120,21 @@ def identify_take(
     model: MarkerModel, markers: Markers, *, settings: TakeSettings | None = None, progress: Step | None = None,
     identify_frame: Callable[[MarkerModel, NDArray, Beliefs | None], Identification] = identify_anchor,
 ) -> TakeIdentification:
-    """Names for all points of a take, whatever its columns are called and wherever they break.
+    """Label all points of a take, whatever the names of its columns and wherever trajectories break.
 
-    Trajectories are followed as far as that is certain. Anchor frames, identified each on its own, vote on the pieces;
-    a piece whose votes change has swapped and is cut. Distances within the body then say of every piece whether its
-    name fits, and name those that no vote reached; what fits nowhere is a ghost.
+    Trajectories are split into pieces that certainly belong to one marker. Anchor frames are identified separately and
+    vote on the pieces; a piece is cut where its votes change. Distances within the body then confirm or reject each
+    label, and label pieces without votes. Points that fit no label are ghosts.
 
     Parameters
     ----------
     progress : (what, done, total) -> None
-    identify_frame : model, points (N, 3) [m], what frames have told so far -> Identification
+    identify_frame : (model, points (N, 3) [m], beliefs from the frames so far) -> Identification
 
     Raises
     ------
     ObservationError
-        No frame shows three points, or the model is of another subject.
+        No frame shows three points, or the take does not fit the model.
     """
     settings = settings or TakeSettings()
     step = progress or (lambda what, done, total: None)
@@ -140,44 +144,44 @@ def identify_take(
         raise ObservationError("no frame shows three markers", file=markers.source or None, remedy="Check the take.")
     work = Naming(model, pieces, markers.rate, step, identify_frame)
     anchors = _anchors(counts, max(1, round(settings.every * markers.rate)))
-    first = anchors[:: max(1, len(anchors) // FIRST)]
-    trial = first[:: max(1, len(first) // TRIAL)]
-    work.ask(trial)
-    share = max(work.named)
-    if share >= FITS:
-        work.ask(sorted(set(first) - set(trial)))
-        share = float(np.median(work.named))
-    if share < FITS:
+    first = anchors[:: max(1, len(anchors) // FIRST_FRAMES)]
+    trial = first[:: max(1, len(first) // TRIAL_FRAMES)]
+    work.identify_frames(trial)
+    share = max(work.label_shares)
+    if share >= MIN_LABEL_SHARE:
+        work.identify_frames(sorted(set(first) - set(trial)))
+        share = float(np.median(work.label_shares))
+    if share < MIN_LABEL_SHARE:
         raise ObservationError(
-            f"the take does not fit the model of {model.name}: {_refusal(work, share)}", file=markers.source or None,
-            remedy="Is it the same subject, with the same markers, and the right unit?" + _unknown_set(model),
+            f"the take does not fit the model of {model.name}: {_mismatch(work, share)}", file=markers.source or None,
+            remedy="Is it the same subject, with the same markers, and the right unit?" + _marker_set_advice(model),
         )
-    work.believe()
-    work.ask(sorted(set(anchors) - set(first)))
+    work.update_beliefs()
+    work.identify_frames(sorted(set(anchors) - set(first)))
     budget = max(20, int(settings.most * len(markers)))
     for _ in range(settings.rounds):
         work.cut_changes()
-        work.settle()
+        work.assign_labels()
         more = work.unknown_frames(min(budget - len(work.votes.asked), max(10, len(work.votes.asked))))
         if not more:
             break
-        work.ask(more)
+        work.identify_frames(more)
     work.cut_changes()
-    work.settle()
+    work.assign_labels()
     return _result(work, markers.rate, settings)
 
 
-def _refusal(work: Naming, share: float) -> str:
-    """What the frames that were asked found, and which segments they did not."""
+def _mismatch(work: Naming, share: float) -> str:
+    """Describe the share of labels found in the identified frames, and the segments that are missing."""
     votes = [label for label in work.votes.label if label < len(work.model)]
-    found = np.bincount(votes, minlength=len(work.model)) / max(len(work.named), 1)
+    found = np.bincount(votes, minlength=len(work.model)) / max(len(work.label_shares), 1)
     lacking = [n for n, s in zip(work.model.names, work.model.segments) if found[list(s)].mean() < 0.5]
-    text = f"in {len(work.named)} frames it finds {100 * share:.0f} % of the labels"
+    text = f"in {len(work.label_shares)} frames it finds {100 * share:.0f} % of the labels"
     return f"{text} at most, least of {', '.join(lacking[:6])}{' ...' if len(lacking) > 6 else ''}" if lacking else text
 
 
-def _unknown_set(model: MarkerModel) -> str:
-    """What to do where the segments come from motion alone."""
+def _marker_set_advice(model: MarkerModel) -> str:
+    """Advice for a model whose segments come from motion alone; empty for others."""
     if find_marker_set(model.labels) is not None:
         return ""
     return (
@@ -187,44 +191,50 @@ def _unknown_set(model: MarkerModel) -> str:
 
 
 def _anchors(counts: NDArray, every: int) -> list[int]:
-    """The frame that shows most points in each stretch."""
+    """The frame with most points of every `every` frames."""
     best = [a + int(np.argmax(counts[a : a + every])) for a in range(0, len(counts), every)]
     return [f for f in best if counts[f] > 2]
 
 
 def _result(work: Naming, rate: float, settings: TakeSettings) -> TakeIdentification:
-    """All of it, with gaps filled and doubts told."""
-    at, point = work.positions()
-    seen = point >= 0
-    off = work.agree.own(at)
-    known = work.sure[work.pieces.piece][point]
-    fits = np.exp(-0.5 * np.clip(np.nan_to_num(off) - FINE, 0.0, None) ** 2 / FINE**2)
-    confidence = np.where(seen, known * fits, 0.0)
-    doubts = list_doubts(work.model.labels, confidence, off, seen, settings.certain)
-    filled = np.zeros(seen.shape, bool)
+    """The result, with gaps filled and doubts listed."""
+    positions, point = work.positions()
+    visible = point >= 0
+    misfits = work.consistency.own(positions)
+    vote_confidence = work.confidence[work.pieces.piece][point]
+    fit_factor = np.exp(-0.5 * np.clip(np.nan_to_num(misfits) - INLIER_SIGMAS, 0.0, None) ** 2 / INLIER_SIGMAS**2)
+    confidence = np.where(visible, vote_confidence * fit_factor, 0.0)
+    doubts = list_doubts(work.model.labels, confidence, misfits, visible, settings.certain)
+    filled = np.zeros(visible.shape, bool)
     if settings.fill > 0:
-        at, filled = fill_gaps(work.model, at, rate, settings.fill, settings.fill_alone)
-    column = np.where(seen, work.pieces.column[point], -1)
+        positions, filled = fill_gaps(work.model, positions, rate, settings.fill, settings.fill_alone)
+    column = np.where(visible, work.pieces.column[point], -1)
     return TakeIdentification(
-        work.model.labels, at, confidence, filled, column, tuple(doubts), tuple(sorted(work.votes.asked)),
-        int(len(work.pieces.points) - seen.sum()),
+        work.model.labels, positions, confidence, filled, column, tuple(doubts), tuple(sorted(work.votes.asked)),
+        int(len(work.pieces.points) - visible.sum()),
     )
 
 
 def list_doubts(
     labels: tuple[str, ...], confidence: NDArray, off: NDArray, seen: NDArray, certain: float
 ) -> list[Doubt]:
-    """Spans of frames in which a name is not sure, worst first."""
+    """List spans of frames with a doubtful label, the worst first.
+
+    Parameters
+    ----------
+    confidence, off, seen : (F, M) probability 0 to 1, misfit in standard deviations, visibility (bool)
+    certain : least confidence without doubt, 0 to 1
+    """
     out = []
     for m, label in enumerate(labels):
         unsure = seen[:, m] & (confidence[:, m] < certain)
         for first, stop in runs_of(unsure, 10):
-            last, own = stop - 1, first + np.flatnonzero(unsure[first:stop])
-            least = float(confidence[own, m].min())
-            stray = float(np.nanmax(np.append(off[own, m], 0.0)))
-            kind = "off" if stray > STRAY else "unsure"
+            last, frames = stop - 1, first + np.flatnonzero(unsure[first:stop])
+            least = float(confidence[frames, m].min())
+            misfit = float(np.nanmax(np.append(off[frames, m], 0.0)))
+            kind = "off" if misfit > OUTLIER_SIGMAS else "unsure"
             text = f"{label} in frames {first} to {last}: " + (
-                f"off its segment by {stray:.0f} deviations" if kind == "off" else f"probability {least:.2f}"
+                f"off its segment by {misfit:.0f} deviations" if kind == "off" else f"probability {least:.2f}"
             )
             out.append(Doubt(first, last, label, kind, least, text))
     return sorted(out, key=lambda d: (d.confidence, d.first))

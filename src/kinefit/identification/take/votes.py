@@ -1,4 +1,4 @@
-"""What anchor frames say of pieces of trajectories, and who is who by that."""
+"""Collect the votes of anchor frames on the labels of trajectory pieces, and assign the labels."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from numpy.typing import NDArray
 from kinefit.identification.frame.identify import Identification
 from kinefit.identification.take.pieces import Pieces
 
-MOST = 4.0
-"""Weight of the surest vote, -log of its odds to be wrong: errors of one frame are not independent of the next's."""
+MAX_VOTE_WEIGHT = 4.0
+"""Largest weight of a vote, -log of its odds to be wrong: errors of consecutive frames are correlated."""
 
-NOTHING = 1.0
-"""Weight of a point that no label is for: it says less than a name, as a body may hide its own points' names."""
+NONE_WEIGHT = 1.0
+"""Weight of a vote for no label: it is weaker evidence, as true labels may be missed."""
 
-CHANGE = 6.0
-"""What a change of name within a piece must explain better, as weight: more than one vote, however sure."""
+MIN_CHANGE_WEIGHT = 6.0
+"""Least gain of a change of label within a piece, as weight: more than one vote can have."""
 
 
 @dataclass(eq=False)
 class Votes:
-    """Votes of anchor frames, on points.
+    """Votes of anchor frames on the labels of points.
 
     Parameters
     ----------
     labels : M
-    point, label, weight : of each vote; label M is "none"
-    asked : frames that were identified
+    point, label, weight : of each vote; label M means none
+    asked : identified frames
     """
 
     labels: int
@@ -38,43 +38,43 @@ class Votes:
     asked: set[int] = field(default_factory=set)
 
     def add(self, pieces: Pieces, frame: int, found: Identification) -> None:
-        """Take in what one frame says."""
+        """Add the votes of one frame."""
         first, last = pieces.starts[frame], pieces.starts[frame + 1]
         guess = found.assignment if found.guess is None else found.guess
         named = np.zeros(last - first, bool)
         for m in np.flatnonzero(guess >= 0):
             named[guess[m]] = True
-            sure = float(np.clip(found.confidence[m], 0.0, 1 - np.exp(-MOST)))
-            if sure > 0.5:
+            probability = float(np.clip(found.confidence[m], 0.0, 1 - np.exp(-MAX_VOTE_WEIGHT)))
+            if probability > 0.5:
                 self.point.append(int(first + guess[m]))
                 self.label.append(int(m))
-                self.weight.append(float(np.log(sure / (1 - sure))))
+                self.weight.append(float(np.log(probability / (1 - probability))))
         for i in np.flatnonzero(~named):
             self.point.append(int(first + i))
             self.label.append(self.labels)
-            self.weight.append(NOTHING)
+            self.weight.append(NONE_WEIGHT)
         self.asked.add(frame)
 
     def table(self, pieces: Pieces) -> NDArray:
-        """(P, M + 1) sums over each piece; no vote counts for more than votes of this take are right."""
+        """(P, M + 1) sums of weights per piece and label; limited by the share of correct votes in this take."""
         wrong = self.wrong(pieces)
-        most = float(np.clip(np.log((1 - wrong) / wrong), 0.2, MOST))
+        most = float(np.clip(np.log((1 - wrong) / wrong), 0.2, MAX_VOTE_WEIGHT))
         out = np.zeros((pieces.count, self.labels + 1))
         np.add.at(out, (pieces.piece[self.point], np.asarray(self.label)), np.minimum(self.weight, most))
         return out
 
     def wrong(self, pieces: Pieces) -> float:
-        """Share of votes that contradict most others of their piece, of pieces with three and more."""
+        """Share (0 to 1) of votes that contradict the majority of their piece, in pieces with three or more votes."""
         piece, label = pieces.piece[self.point], np.asarray(self.label)
         names = label < self.labels
-        many = names & (np.bincount(piece[names], minlength=pieces.count)[piece] >= 3)
+        counted = names & (np.bincount(piece[names], minlength=pieces.count)[piece] >= 3)
         out = np.zeros((pieces.count, self.labels))
-        np.add.at(out, (piece[many], label[many]), np.asarray(self.weight)[many])
-        against = label[many] != np.argmax(out[piece[many]], axis=1)
-        return float((against.sum() + 0.5) / (many.sum() + 1)) if many.sum() > 20 else 0.01
+        np.add.at(out, (piece[counted], label[counted]), np.asarray(self.weight)[counted])
+        against = label[counted] != np.argmax(out[piece[counted]], axis=1)
+        return float((against.sum() + 0.5) / (counted.sum() + 1)) if counted.sum() > 20 else 0.01
 
     def changes(self, pieces: Pieces) -> list[tuple[int, int, int]]:
-        """(piece, last point before, first point after) of each change of name within a piece, as votes tell it."""
+        """(piece, last point before, first point after) of each change of label within a piece."""
         piece, point = pieces.piece[self.point], np.asarray(self.point)
         label, weight = np.asarray(self.label), np.asarray(self.weight)
         order = np.lexsort((pieces.frame[point], piece))
@@ -88,7 +88,7 @@ class Votes:
             sums = np.cumsum(scores, axis=0)
             gain = sums[:-1].max(1) + (sums[-1] - sums[:-1]).max(1) - sums[-1].max()
             best = int(np.argmax(gain))
-            if gain[best] > CHANGE:
+            if gain[best] > MIN_CHANGE_WEIGHT:
                 out.append((int(piece[own[0]]), int(point[own[best]]), int(point[own[best + 1]])))
         return out
 
@@ -96,12 +96,14 @@ class Votes:
 def assign_pieces(
     table: NDArray, pieces: Pieces, rows: list[NDArray], share: float = 0.6, least: float = 1.0
 ) -> NDArray:
-    """(P,) label of each piece, -1 for none: the surest first, no label in two places at once.
+    """(P,) label of each piece, -1 for none: assigned in order of weight, each label once per frame.
 
     Parameters
     ----------
-    table : (P, M + 1) votes
-    share : of a piece's votes that a label must have; least : weight of them
+    table : (P, M + 1) sums of weights
+    rows : points of each piece
+    share : least share (0 to 1) of a piece's weight for its label
+    least : least weight of a label
     """
     labels = table.shape[1] - 1
     total = np.maximum(table.sum(1), 1e-9)

@@ -1,4 +1,4 @@
-"""Compiled normalised cross-correlation: where in a box a window looks most alike, to the pixel."""
+"""Compiled normalised cross-correlation of windows in search boxes, to the pixel."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from kinefit._jit import jit
 
 @jit
 def search_boxes(first, second, at, centres, half, reach, places, best, runner_up):
-    """Search windows about places (N, 2) of one image (H, W) float32 in boxes of the other about centres (N, 2) [px].
+    """Search windows at points (N, 2) of one image (H, W) float32 in boxes of another with centres (N, 2), all [px].
 
-    Fills the places (N, 2) of highest correlation, with the fraction of a pixel of the template; the correlation (N,);
-    and the highest one of places more than half a window away. NaN where window or box leaves the images.
+    Fills the positions (N, 2) of highest correlation, with the template's fraction of a pixel; the correlation (N,);
+    and the highest correlation more than half a window away (N,). NaN where window or box is outside of the images.
     """
     height, width = second.shape
     n = 2 * half + 1

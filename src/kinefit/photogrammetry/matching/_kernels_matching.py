@@ -1,4 +1,4 @@
-"""Compiled least-squares matching: a window of one image found in another, moved, deformed, brighter or darker.
+"""Compiled least-squares matching of a window in another image, with an affine map, a gain and an offset.
 
 The unknowns are those of Gruen (1985): an affine map of six parameters, and a gain and an offset of the grey values.
 The template f is fixed, so its normal matrix over [x f_x, y f_x, x f_y, y f_y, 1, f, f_x, f_y] is set up and factored
@@ -32,7 +32,7 @@ FOUND, FLAT, OUTSIDE, DIVERGED, NOT_TRIED = 0, 1, 2, 3, 4
 
 @jit
 def factor(m, n):
-    """Cholesky factor of a symmetric matrix (n, n) in place of its lower half; False where it is not positive."""
+    """Cholesky factor of a symmetric matrix (n, n), in its lower half; False if it is not positive definite."""
     for j in range(n):
         d = m[j, j]
         floor = 1e-10 * d
@@ -52,7 +52,7 @@ def factor(m, n):
 
 @jit
 def solve(m, b, n):
-    """Solve by the factor, in place of b (n,)."""
+    """Solve with the Cholesky factor m, in place in b (n,)."""
     for i in range(n):
         s = b[i]
         for k in range(i):
@@ -67,9 +67,9 @@ def solve(m, b, n):
 
 @jit
 def template(c, u, v, half, f, fx, fy, rows):
-    """Grey values (n, n) of a window about (u, v) and their derivatives, n = 2 half + 1; their mean; NaN if outside.
+    """Sample a window (n, n) at (u, v) [px] with its derivatives, n = 2 half + 1; returns the mean, NaN if outside.
 
-    rows : (2, n + 5) room to work in.
+    rows : (2, n + 5) scratch array.
     """
     height, width = c.shape
     n = 2 * half + 1
@@ -104,7 +104,7 @@ def template(c, u, v, half, f, fx, fy, rows):
 
 @jit
 def normal_matrix(f, fx, fy, half, mean, m):
-    """Lower half of the normal matrix (8, 8) of a window, places counted in half windows, f from its mean."""
+    """Lower half of the normal matrix (8, 8) of a window; positions in units of `half`, f relative to its mean."""
     n = 2 * half + 1
     for k in range(SIZE):
         for i in range(SIZE):
@@ -140,7 +140,7 @@ def normal_matrix(f, fx, fy, half, mean, m):
 
 @jit
 def fits(c, u, v, a, b, d, e, half):
-    """Whether the four corners of a deformed window lie on a spline's image."""
+    """Whether the four corners of a deformed window lie inside a spline's image."""
     height, width = c.shape
     du, dv = (abs(a) + abs(b)) * half, (abs(d) + abs(e)) * half
     return u - du >= 2.0 and v - dv >= 2.0 and u + du < width - 3.0 and v + dv < height - 3.0
@@ -148,7 +148,7 @@ def fits(c, u, v, a, b, d, e, half):
 
 @jit
 def right_side(c, f, fx, fy, half, mean, u, v, a, b, d, e, out):
-    """Right side (8,) of the normal equations at a map; mean and sum of squares about it of the sampled grey values."""
+    """Write to out (8,) the right side of the normal equations; returns offset and sum of squares of the samples."""
     n = 2 * half + 1
     r0 = r1 = r2 = r3 = r4 = r5 = h0 = h1 = hh = 0.0
     shift = value(c, u, v)
@@ -169,7 +169,7 @@ def right_side(c, f, fx, fy, half, mean, u, v, a, b, d, e, out):
 
 @jit
 def composed(a, b, d, e, x, scale):
-    """A 2x2 map after a step of the deformation (the first four of the unknowns x): whether it is one, and the map."""
+    """Compose a 2x2 map with a step (the first four unknowns x): whether it is invertible, and the new map."""
     d11, d12, d21, d22 = 1.0 + x[0] * scale, x[1] * scale, x[2] * scale, 1.0 + x[3] * scale
     det = d11 * d22 - d12 * d21
     ok = det > 0.1 and det < 10.0
@@ -182,8 +182,8 @@ def match_point(first, second, at_u, at_v, start, half, steps, tolerance, share,
     """Match the window about (at_u, at_v) of the first spline in the second, from `start`; fills a row of results.
 
     start : (6,) u, v [px] and the map (2, 2) row by row.
-    tolerance : [px] by which no part of the window moves any more.
-    kept : (8,) room for the right side.
+    tolerance : [px] largest motion of the window's corners at convergence.
+    kept : (8,) scratch array for the right side.
     """
     n = (2 * half + 1) ** 2
     for k in range(ROW):
@@ -216,7 +216,7 @@ def match_point(first, second, at_u, at_v, start, half, steps, tolerance, share,
             square -= b[k] * kept[k]
         gain = b[5]
         out[ITERATIONS] = step + 1.0
-        if not gain > 0.05:  # the template has nothing in common with what lies there
+        if not gain > 0.05:  # no correlation with the template
             break
         du, dv = b[6] / gain, b[7] / gain
         ok, n11, n12, n21, n22 = composed(a11, a12, a21, a22, b, 1.0 / (gain * half))
@@ -240,10 +240,10 @@ def match_point(first, second, at_u, at_v, start, half, steps, tolerance, share,
 
 @jit
 def covariance(m, at_u, at_v, half, gain, square, share, own, out):
-    """Fill in the noise and the covariance of the place found, from the factored normal matrix and the residuals.
+    """Fill in noise and covariance of a match, from the factored normal matrix and the residuals.
 
-    share : part of the variance of the noise that is the template's; the rest is the other image's.
-    own : variance of the template's noise, where it is less: residuals may also be what the model leaves over.
+    share : share of the template in the noise variance; the rest is the other image's.
+    own : variance of the template's noise, used if smaller, as residuals also contain model errors.
 
     The spline smooths the noise of the residuals, which is undone, and the noise of the template makes its own
     gradients steeper than they are: G of the 2x2 normal matrix S is noise, T = S - G is not. A shift moves residuals
@@ -262,7 +262,7 @@ def covariance(m, at_u, at_v, half, gain, square, share, own, out):
     t00 = s00 - feigned * slope_noise(tu) * value_noise(tv)
     t11 = s11 - feigned * slope_noise(tv) * value_noise(tu)
     det = t00 * t11 - s01 * s01
-    if not (t00 > 0.0 and t11 > 0.0 and det > 0.0):  # nothing but noise
+    if not (t00 > 0.0 and t11 > 0.0 and det > 0.0):  # only noise
         out[STATUS] = FLAT
         return
     i00, i01, i11 = t11 / det, -s01 / det, t00 / det
@@ -278,7 +278,7 @@ def covariance(m, at_u, at_v, half, gain, square, share, own, out):
 
 @jit
 def match_points(first, second, at, starts, halves, steps, tolerance, share, own, out):
-    """Match windows about places (N, 2), each of 2 half + 1 pixels, from starts (N, 6); fills out (N, 15)."""
+    """Match windows of 2 half + 1 pixels at points (N, 2) [px] from starts (N, 6); fills out (N, 15)."""
     f, fx, fy, rows, m, b, kept = room(halves)
     for k in range(at.shape[0]):
         match_point(
@@ -289,7 +289,7 @@ def match_points(first, second, at, starts, halves, steps, tolerance, share, own
 
 @jit
 def room(halves):
-    """Arrays to work in, for windows of up to the largest half."""
+    """Scratch arrays for windows of up to the largest half side."""
     n = 1
     for k in range(halves.shape[0]):
         n = 2 * halves[k] + 1 if 2 * halves[k] + 1 > n else n
@@ -299,10 +299,10 @@ def room(halves):
 
 @jit
 def predict(first, at, half, variance, share, out):
-    """Standard deviation (N,) [px], in its worst direction, that a match would have by the texture of its window alone.
+    """Predict the standard deviation (N,) [px] of a match in its worst direction from the texture of its window.
 
-    variance : of the noise of both images together; `share` of it is the first image's, whose gradients it feigns.
-    Infinite where there is no texture beyond noise, NaN where the window leaves the image.
+    variance : noise variance of both images together; `share` of it is the first image's and adds to its gradients.
+    Infinite without texture beyond noise, NaN where the window leaves the image.
     """
     n = 2 * half + 1
     f, fx, fy = np.empty((n, n), np.float32), np.empty((n, n), np.float32), np.empty((n, n), np.float32)

@@ -1,9 +1,8 @@
-"""Compiled multi-image matching: one window in several images at once, kept on the lines of sight of its cameras.
+"""Compiled multi-image matching: one window jointly in several images along its line of sight.
 
 The geometrically constrained form of Gruen and Baltsavias (1988), with one unknown place for all images: the distance
-along the template's ray. Each image contributes the shift that it would choose and its normal matrix, what the affine
-map and the grey values have to say eliminated; the distance follows from all, then maps and grey values at that
-distance.
+along the template's ray. Each image contributes its own shift and its normal matrix, reduced by the affine map and the
+grey values. The distance follows from all images, then maps and grey values at that distance.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ COLUMNS = 7
 
 @jit
 def conditional(m, y, b, gain, du, dv):
-    """Unknowns 0..5 where the last two, scaled by the gain, are given, from the forward-substituted right side y."""
+    """Solve for unknowns 0..5 given the last two (scaled by the gain), from the forward-substituted right side y."""
     b[6], b[7] = gain * du, gain * dv
     for i in range(5, -1, -1):
         s = y[i]
@@ -60,10 +59,10 @@ def conditional(m, y, b, gain, du, dv):
 def match_rays(
     first, images, sizes, cameras, at, origin, rays, starts, halves, steps, tolerance, share, own, out, each
 ):  # fmt: skip
-    """Match windows about places (N, 2) of a template in K images (K, H, W) of `sizes` (K, 2) and packed cameras.
+    """Match windows at points (N, 2) [px] of a template in K images (K, H, W) of `sizes` (K, 2) and packed cameras.
 
-    rays : (N, 3) unit directions of the places; origin (3,) [m] where they come from.
-    starts : (N, 1 + 4 K) distance [m], and the 2x2 map into each image; an image with a NaN is left out.
+    rays : (N, 3) unit directions of the points; origin (3,) [m] of the rays.
+    starts : (N, 1 + 4 K) distance [m], and the 2x2 map into each image; an image with NaN is excluded.
     Fills out (N, 7) and, for each image, each (N, K, 15).
     """
     count = images.shape[0]
@@ -193,18 +192,18 @@ def _match_ray(
     if not total > 0.0:
         out[STATE] = FLAT
         return
-    variance = mu = mv = 0.0  # the noise of the template moves all images' windows alike, so it may cancel
+    variance = mu = mv = 0.0  # the template's noise shifts all images' windows equally, so it may cancel
     for i in range(count):
         if used[i] and each[i, STATUS] == FOUND:
-            told, qu, qv = _information(each[i], moves[i, 4], moves[i, 5]), moves[i, 0], moves[i, 1]
-            variance += (1.0 - share) * told / (total * total)
-            root = math.sqrt(told / (s00 * qu * qu + 2.0 * s01 * qu * qv + s11 * qv * qv))  # 1 / sigma
+            information, qu, qv = _information(each[i], moves[i, 4], moves[i, 5]), moves[i, 0], moves[i, 1]
+            variance += (1.0 - share) * information / (total * total)
+            root = math.sqrt(information / (s00 * qu * qu + 2.0 * s01 * qu * qv + s11 * qv * qv))  # 1 / sigma
             mu, mv = mu + root * qu, mv + root * qv
     out[VARIANCE] = variance + share * (s00 * mu * mu + 2.0 * s01 * mu * mv + s11 * mv * mv) / (total * total)
 
 
 @jit
 def _information(row, pu, pv):
-    """How well an image tells the distance: p' C^-1 p for its shift p by distance and the covariance C of its match."""
+    """Information of an image about the distance: p' C^-1 p for its shift p per distance and covariance C."""
     a, b, d = row[VAR_U], row[COV], row[VAR_V]
     return (pu * pu * d - 2.0 * pu * pv * b + pv * pv * a) / (a * d - b * b)

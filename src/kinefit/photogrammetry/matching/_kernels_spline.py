@@ -135,20 +135,19 @@ def value(c, u, v):
 
 @jit
 def inside(c, u, v):
-    """Whether a spline has a value at (u, v)."""
+    """Whether a spline has a value at (u, v) [px]."""
     return u >= 2.0 and v >= 2.0 and u < c.shape[1] - 3.0 and v < c.shape[0] - 3.0
 
 
 @jit
 def values(c, uv, out):
-    """Values (N,) of a spline at places (N, 2) [px]; NaN where it has none."""
+    """Write to out (N,) the values of a spline at points (N, 2) [px]; NaN outside."""
     for n in range(uv.shape[0]):
         u, v = uv[n, 0], uv[n, 1]
         out[n] = value(c, u, v) if inside(c, u, v) else math.nan
 
 
-# How a spline passes on the variance of white noise of the pixels, by the place t between them: mean, cos 2 pi t, cos
-# 4 pi t.
+# Variance of an interpolated value per variance of white pixel noise, at t between pixels: mean, cos 2 pi t and 4 pi t.
 _VALUE = (0.91796918, 0.08175161, 0.00026418)
 _SLOPE = (2.67797400, -0.77729295, -0.00624300)
 

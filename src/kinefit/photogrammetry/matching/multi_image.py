@@ -1,4 +1,4 @@
-"""Matching in several images at once, kept on the cameras' rays: the geometrically constrained form.
+"""Joint matching in several images along the rays of the first camera (geometrically constrained).
 
 A. Gruen and E. Baltsavias, Geometrically constrained multiphoto matching (1988). The unknowns of a point are its
 distance along the template's ray, and an affine map, a gain and an offset for each other image.
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
-from kinefit.photogrammetry.least_squares_matching import STEPS, TOLERANCE, WINDOW, halves_of, places
+from kinefit.photogrammetry.least_squares_matching import MAX_STEPS, TOLERANCE, WINDOW, as_points, half_sides
 from kinefit.photogrammetry.matching import _kernels_matching as matching
 from kinefit.photogrammetry.matching import _kernels_multi_image as kernels
 from kinefit.photogrammetry.spline_image import SplineImage
@@ -22,7 +22,7 @@ from kinefit.photogrammetry.spline_image import SplineImage
 
 @dataclass(frozen=True, eq=False)
 class RayMatches:
-    """Windows of the first camera's image, found along their rays.
+    """Windows of the first camera's image matched along their rays.
 
     Parameters
     ----------
@@ -31,8 +31,8 @@ class RayMatches:
     distance : (N,) [m] along the ray, from the first camera's centre
     variance : (N,) [m²] of the distance
     correlation : (N,) mean over the images
-    parallax : (N,) [px] RMS by which the images alone would leave the rays
-    used : (N, C - 1) which images took part
+    parallax : (N,) [px] RMS shift away from the rays that the images alone would choose
+    used : (N, C - 1) bool, which images were used
     iterations, status : (N,) int, as in `Matches`
     """
 
@@ -48,7 +48,7 @@ class RayMatches:
 
     @property
     def found(self) -> NDArray[np.bool_]:
-        """(N,) which points were found."""
+        """(N,) bool, which points were found."""
         return self.status == matching.FOUND
 
 
@@ -61,23 +61,28 @@ def match_along_rays(
     *,
     window: int | ArrayLike = WINDOW,
 ) -> RayMatches:
-    """Find windows of the first camera's image in all others at once.
+    """Match windows of the first camera's image jointly in all others.
 
     Parameters
     ----------
-    rig, images : C cameras, and the image of each, in the size of its calibration
+    rig, images : C cameras, and one image of each in the calibrated size
     points : (N, 2) [px] centres of the windows in the first image
-    distance : (N,) [m] along their rays to start with, right to about two pixels; NaN leaves a point out
-    deformation : (N, C - 1, 2, 2) of the window into each other image, to start with; NaN leaves that image out
-    window : as in `match`, the side of all windows or of each
+    distance : (N,) [m] initial distance along the rays, right to about two pixels; NaN excludes a point
+    deformation : (N, C - 1, 2, 2) initial map of the window into each other image; NaN excludes that image
+    window : odd side [px], of all windows or of each
+
+    Raises
+    ------
+    ObservationError
+        Shapes disagree.
     """
-    at, start = places(points), np.array(distance, float)
+    at, start = as_points(points), np.array(distance, float)
     maps = np.array(deformation, float)
     count = len(rig) - 1
     if start.shape != (len(at),) or maps.shape != (len(at), count, 2, 2) or count < 1 or len(images) != count + 1:
         problem = f"{len(at)} points, distances {start.shape}, deformations {maps.shape}, {len(images)} images"
         raise ObservationError(problem, remedy="Give (N,), (N, C - 1, 2, 2) and C images.")
-    halves = halves_of(window, len(at))
+    halves = half_sides(window, len(at))
     height, width = (max(image.size[k] for image in images[1:]) for k in (1, 0))
     stack, sizes = np.zeros((count, height, width), np.float32), np.zeros((count, 2), np.int64)
     for k, image in enumerate(images[1:]):
@@ -85,18 +90,18 @@ def match_along_rays(
         stack[k, : sizes[k, 0], : sizes[k, 1]] = image.coefficients
     first = rig.cameras[0]
     rays, origin = np.ascontiguousarray(first.ray(at)), np.ascontiguousarray(first.centre_world)
-    out, each = np.empty((len(at), kernels.COLUMNS)), np.empty((len(at), count, matching.ROW))
+    out, image_rows = np.empty((len(at), kernels.COLUMNS)), np.empty((len(at), count, matching.ROW))
     starts = np.concatenate([start[:, None], maps.reshape(len(at), -1)], axis=1)
     noise = np.mean([image.noise**2 for image in images[1:]])
     kernels.match_rays(
-        images[0].coefficients, stack, sizes, rig.packed[1:].copy(), at, origin, rays, starts, halves, STEPS, TOLERANCE,
-        float(images[0].noise**2 / (images[0].noise**2 + noise)), float(images[0].noise**2), out, each,
+        images[0].coefficients, stack, sizes, rig.packed[1:].copy(), at, origin, rays, starts, halves, MAX_STEPS,
+        TOLERANCE, float(images[0].noise**2 / (images[0].noise**2 + noise)), float(images[0].noise**2), out, image_rows,
     )  # fmt: skip
     status = out[:, kernels.STATE].astype(np.int64)
     good = status == matching.FOUND
-    told = np.where(good[:, None], out, np.nan)
+    rows = np.where(good[:, None], out, np.nan)
     return RayMatches(
-        origin + told[:, :1] * rays, rays, told[:, kernels.DISTANCE], told[:, kernels.VARIANCE],
-        told[:, kernels.SIMILARITY], told[:, kernels.PARALLAX], each[:, :, matching.STATUS] == matching.FOUND,
+        origin + rows[:, :1] * rays, rays, rows[:, kernels.DISTANCE], rows[:, kernels.VARIANCE],
+        rows[:, kernels.SIMILARITY], rows[:, kernels.PARALLAX], image_rows[:, :, matching.STATUS] == matching.FOUND,
         np.nan_to_num(out[:, kernels.STEPS]).astype(np.int64), status,
     )  # fmt: skip

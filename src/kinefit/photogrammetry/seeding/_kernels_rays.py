@@ -11,13 +11,13 @@ from kinefit._jit import jit
 
 @jit
 def search_lines(first, second, at, lines, maps, half, least_variance, best_uv, best_map, best, runner_up):
-    """Search windows about places (S, 2) of one image (H, W) float32 along polylines in the other.
+    """Search windows around points (S, 2) [px] of one image (H, W) float32 along polylines in the other.
 
-    A line has K corners (S, K, 2) [px] and at each the map (S, K, 4) of an offset in the first image to the second; it
-    is walked in steps of a pixel, and the window's pixels are read where the map puts them, to the nearest pixel.
-    Corners with a NaN interrupt it. Windows whose variance is below the least are not sought. Fills the place (S, 2)
-    of highest correlation, its map (S, 4), the correlation (S,), and the highest one of places on the line that are
-    more than half a window away (S,). NaN where nothing was sought.
+    A line has K corners (S, K, 2) [px], each with a map (S, K, 4) of an offset in the first image to the second. It is
+    sampled in steps of one pixel, with the window's pixels at the nearest pixels of their mapped positions. Corners
+    with NaN interrupt it. Windows with less than the least variance are skipped. Fills the position (S, 2) of highest
+    correlation, its map (S, 4), the correlation (S,), and the highest correlation more than half a window away (S,).
+    NaN where nothing was searched.
     """
     height, width = second.shape
     n = 2 * half + 1

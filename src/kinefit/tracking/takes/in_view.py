@@ -126,7 +126,7 @@ def people_in_view(take: Take) -> InView | None:
         if seen.rig is None:
             return None
         with TakePictures(take, seen) as pictures:
-            return InView(seen, follow(seen.rig, seen.keypoints, pictures=pictures).people)
+            return InView(seen, follow(seen.rig, seen.keypoints, images=pictures).people)
     body = load_body(take.body)
     return people_in_depth(seen, recording_of(take, seen, body)[0], body)
 
