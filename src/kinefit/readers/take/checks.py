@@ -34,9 +34,9 @@ _ONLY: dict[str, dict[str, tuple[str, ...]]] = {
 }  # fmt: skip
 """Formats for which a key means something: with any other it is refused."""
 
-
 _MOST = 10**9  # steps of a take
 ONE_CAMERA = "keypoints of one camera do not tell how far a person is; two cameras do, or one beside depth or markers"
+_SETS = {"openpose": tuple(KEYPOINT_SETS), "skin": SKIN_SETS, "detect": (*MEDIAPIPE_SETS, FACE_SET)}
 
 
 def check_enough(take: Take) -> None:
@@ -112,8 +112,7 @@ def _values(take: Take) -> None:
             refuse(f"size {camera.size}, time offset {camera.time_offset} s", f"camera {camera.name}", "Give px and s.")
     for source in (*take.keypoints, *take.skin):
         place = f"keypoints of camera {source.camera}"
-        known = {"openpose": tuple(KEYPOINT_SETS), "skin": SKIN_SETS, "detect": (*MEDIAPIPE_SETS, FACE_SET)}
-        sets = known.get(source.format, MEDIAPIPE_SETS)
+        sets = _SETS.get(source.format, MEDIAPIPE_SETS)
         if source.set is not None and source.set not in sets:
             kind = "keypoint set" if source.format == "openpose" else f"keypoint set of {source.format}"
             refuse(choices(kind, source.set, sets), place, f'Use set = "{sets[0]}", or leave it out.')
