@@ -14,7 +14,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.bodies.marker_sets import find_placement
 from kinefit.errors import TrackingError
 from kinefit.findings import runs_of
-from kinefit.frame.results import BLIND
+from kinefit.frame.results import UNOBSERVED_STD_RATIO
 from kinefit.losses import Loss
 from kinefit.markers.poses import columns, sequence_both_ways
 from kinefit.markers.valleys import PointTake, profiled, settled_by_motion
@@ -121,7 +121,7 @@ def _bridged(
     """Poses whose untold angles follow from the frames around them; the others stay as measured."""
     tree, x = data.body.tree, data.x
     lost = ~((sure.dof_std[:, :3].max(axis=1) < _HELD) & (sure.dof_std[:, 3:6].max(axis=1) < _TOLD))
-    enough = np.minimum(np.where(tree.prismatic, _HELD, _TOLD), BLIND * tree.spread)
+    enough = np.minimum(np.where(tree.prismatic, _HELD, _TOLD), UNOBSERVED_STD_RATIO * tree.spread)
     told = (sure.dof_std[:, 6:] < enough) & ~lost[:, None]
     some = told.any(axis=0)
     if lost.all() or (told[:, some].all() and not lost.any()):
@@ -152,7 +152,7 @@ def _motion(
     """Quality as of every other track: the share of what shows a segment that agrees with it."""
     body, points, x = data.body, data.points, data.x
     dof_std = np.array(sure.dof_std)
-    dof_std[:, 6:][dof_std[:, 6:] > BLIND * body.tree.spread] = np.inf
+    dof_std[:, 6:][dof_std[:, 6:] > UNOBSERVED_STD_RATIO * body.tree.spread] = np.inf
     values = x - body.trajectories(roots, angles, points)
     squares = np.square(values / data.sigma[:, None]).sum(axis=2)
     quality = of_points(body, points, squares).segment_quality(body.tree)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
 from kinefit.findings import runs_of
-from kinefit.frame.results import BLIND
+from kinefit.frame.results import UNOBSERVED_STD_RATIO
 from kinefit.losses import Loss
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.unwrap import boxes
@@ -84,7 +84,7 @@ def profiled(
         for old, new in ((sure.dof_std, profiles.dof_std), (sure.joint_std, profiles.joint_std))
     )
     nearest = np.minimum(np.round(np.arange(F) / fine).astype(int), len(grid) - 1)
-    dof_std[:, 6:] = np.minimum(dof_std[:, 6:], np.maximum(sure.dof_std[:, 6:], BLIND * tree.spread))
+    dof_std[:, 6:] = np.minimum(dof_std[:, 6:], np.maximum(sure.dof_std[:, 6:], UNOBSERVED_STD_RATIO * tree.spread))
     wide = replace(sure, dof_std=dof_std, joint_std=joint_std)
     return profiles.roots, profiles.angles, sure, wide, flat[grid[nearest]]
 
@@ -120,7 +120,7 @@ class _Profiles:
     def asked(self) -> NDArray:
         """(F, D) bool: angles that a frame observes, but not well."""
         tree, std = self.take.body.tree, self.sure.dof_std[:, 6:]
-        return np.asarray((std > MIN_STD) & (std < BLIND * tree.spread) & ~tree.prismatic)
+        return np.asarray((std > MIN_STD) & (std < UNOBSERVED_STD_RATIO * tree.spread) & ~tree.prismatic)
 
     def _fit(
         self, frames: NDArray, roots: NDArray, angles: NDArray, locked: NDArray, iterations: int = 40

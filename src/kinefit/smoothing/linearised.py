@@ -17,7 +17,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure
 from kinefit.frame.fit import rows_of
 from kinefit.frame.results import evidence_of
-from kinefit.frame.trust import unseen
+from kinefit.frame.trust import segments_not_shown
 from kinefit.rows import AnyRows, DofRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.scene import Scene
@@ -136,7 +136,7 @@ class OtherSensors:
                 H[k], g[k], cost[k] = equations.matrix, equations.gradient, equations.cost
             if unsure is None or not any(m.shows_surface for m in matched):
                 continue
-            without = [unseen(m, e) for m, e in zip(matched, evidence_of(scene, matched))]
+            without = [segments_not_shown(m, e) for m, e in zip(matched, evidence_of(scene, matched))]
             if any(w is not None and w.any() for w in without):
                 sure = rows_of(scene, matched, self.settings, self.scale, points=int(self.points[f]), without=without)
                 unsure[k] = H[k] - normal_equations(body, scene.state, sure).matrix

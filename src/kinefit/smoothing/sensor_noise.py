@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure
-from kinefit.frame.fit import rows_of_points, takes_surfaces_for_exact
-from kinefit.frame.results import ANYWHERE
+from kinefit.frame.fit import ignores_surface_offsets, rows_of_points
+from kinefit.frame.results import ROOT_PRIOR_STD
 from kinefit.frame.skin import skin_of
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.base import Matched, rows_at
@@ -65,7 +65,7 @@ def covariance_alone(body: Body, state: BodyState, information: NDArray) -> NDAr
     if body.closures:
         information = information + normal_equations(body, state, every_closure(body, state)).matrix
     free = slice(0 if tree.root_free else 6, tree.n_dofs)
-    prior = block_diagonal(np.eye(6) / ANYWHERE**2, tree.posture_precision)
+    prior = block_diagonal(np.eye(6) / ROOT_PRIOR_STD**2, tree.posture_precision)
     out = np.zeros_like(information)
     out[free, free] = inverse((information + prior)[free, free])
     return out
@@ -125,7 +125,7 @@ def other_noise(
             settings = others.settings
             beside = max(settings.skin_shift, _EXACT), settings.skin_turn
             skin = skin_of(scene, surface, *(beside if body.tree.coordinates else _RIGID), matched[f])
-            exact = takes_surfaces_for_exact(scene, settings, int(others.points[f]) + rows_of_points(scene, matched[f]))
+            exact = ignores_surface_offsets(scene, settings, int(others.points[f]) + rows_of_points(scene, matched[f]))
             information[f] += (skin.exact_information if exact else skin.information)[upper]
             if surfaces:
                 pushed_by_skin = skin.exact_pushes if exact else skin.pushes

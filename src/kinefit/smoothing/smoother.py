@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from kinefit._mapped import release
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences.closures import hard_equations, looped
-from kinefit.frame.results import BLIND, FrameResult, judged
-from kinefit.frame.trust import adrift
+from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult, frame_result
+from kinefit.frame.trust import unknown_joints
 from kinefit.sensors.base import Matched, pixels_of
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.observability import moves_points, near
@@ -116,7 +116,7 @@ def smooth_results(
         covariance[packed] = covariance.T[packed] = covariances[f]
         if hard is not None:
             covariance = on_null_space(covariance, hard(state)[1])
-        frame = judged(scene, covariance, (*pixels, *more), result.iterations, observed=take.told[f])
+        frame = frame_result(scene, covariance, (*pixels, *more), result.iterations, observed=take.told[f])
         surfaces |= any(m.shows_surface for m in more)
         smoothed.append(replace(frame, matched=pixels, measurements=()))
     if surfaces:
@@ -135,9 +135,9 @@ def _closed(take: SmoothTake, hard: Constraint) -> SmoothTake:
 
 
 def _without_adrift(body: Body, results: Sequence[FrameResult], half: int) -> Spool[FrameResult]:
-    """Frames that state nothing of joints that are `adrift`, nor of their coordinates."""
+    """Frames that state nothing of joints that are `unknown_joints`, nor of their coordinates."""
     lost, hidden = map(np.stack, zip(*((r.lost, r.hidden) for r in results)))
-    gone = adrift(body.tree, lost, hidden, half)
+    gone = unknown_joints(body.tree, lost, hidden, half)
     of_dofs = np.concatenate([np.zeros((len(gone), 6), bool), gone[:, body.tree.owners]], axis=1)
     return Spool(
         replace(
@@ -198,7 +198,7 @@ def _observed(take: SmoothTake, channels: Channels, others: OtherSensors | None)
             found, rows[some] = [both + linear.H, linear.H], linear.rows
         for observed, matrices in zip(out, found):
             variance = np.array([variances(H + prior)[6:] for H in matrices])
-            observed[some] = variance <= np.square(BLIND * tree.spread)
+            observed[some] = variance <= np.square(UNOBSERVED_STD_RATIO * tree.spread)
     return out, rows
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import hard_equations
 from kinefit.errors import ObservationError
-from kinefit.frame.results import FrameResult, judged
+from kinefit.frame.results import FrameResult, frame_result
 from kinefit.observations.arrays import is_number
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.checks import of_kind
@@ -229,7 +229,7 @@ class FixedLag:
                 observed = self._told >= number - self._memory
                 matched = (*frame.points, *frame.surfaces)
                 scene, sure = self._costs.scene(self._frames, f), self._exact(frame.state, found[f])
-                out.append(judged(scene, sure, matched, self._last.iterations, observed=observed))
+                out.append(frame_result(scene, sure, matched, self._last.iterations, observed=observed))
         return out
 
     def _exact(self, state: BodyState, covariance: NDArray) -> NDArray:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure, looped
 from kinefit.frame.fit import rows_of, rows_of_points
-from kinefit.frame.results import BLIND, FrameResult
+from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched, Measurement, matched_by, pixels_of
 from kinefit.sensors.observability import moves_points
@@ -116,7 +116,7 @@ class FrameCosts:
         for several, far in ((others, False), (pixels, True)):
             if several:
                 H = H + normal_equations(self.body, scene.state, self._rows(several, scene, frame.points)).matrix
-                seen = np.sqrt(np.maximum(np.diag(inverse(H)), 0.0))[6:] <= BLIND * tree.spread
+                seen = np.sqrt(np.maximum(np.diag(inverse(H)), 0.0))[6:] <= UNOBSERVED_STD_RATIO * tree.spread
                 told |= seen & (self._far(pixels, scene) | looped(self.body)) if far else seen
         return told
 
