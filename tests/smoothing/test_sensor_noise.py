@@ -73,7 +73,7 @@ def test_information_and_lasting_errors_are_sums_over_rows_and_frames(tracked):
         for (channel, axis), values in stated.items():
             mean = sum((of.get((channel, axis), np.zeros(n)) for of in near), np.zeros(n)) / len(near)
             shared[axis] += components.shared[0][axis] * mean
-            lasting = components.lasting[channel] ** 2
+            lasting = components.systematic[channel] ** 2
             lasting += unseen * max(np.mean(values) - lasting, 0.0)
             expected += lasting * np.outer(mean, mean)
         expected += shared.T @ shared

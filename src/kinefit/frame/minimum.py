@@ -16,7 +16,7 @@ from kinefit.sensors.points.keypoints import packed
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.closed import Constraint, closed_fit
 from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.solvers.pixels import LIGHT, fit_pixels
+from kinefit.solvers.pixels import INITIAL_DAMPING, fit_pixels
 
 _MAX_CLOSURE_ERROR = 0.01  # [m, rad] of a start; above it a first fit closes chains with this standard deviation
 ROUGH_ITERATIONS = 10
@@ -55,7 +55,7 @@ def minimum(
     def at(state: BodyState) -> list[AnyRows]:
         return rows(scene.at(state))
 
-    body, start, damping, tried = scene.body, scene.state, None if held is None else LIGHT, 0
+    body, start, damping, tried = scene.body, scene.state, None if held is None else INITIAL_DAMPING, 0
     if hard is None:
         fit = levenberg_marquardt(body, start, at, max_iterations=most, tolerance=tolerance, damping=damping)
     else:

@@ -35,7 +35,7 @@ _INDEPENDENT = 1.0
 
 Marker errors last: skin slides with the posture, and a joint is not quite a ball or a hinge. So many frames say little
 more than their extremes do. Of 0.5, 1, 2, 4, 16 and 80 the joint centres of four laboratories' subjects are met best
-from 0.5 to 2 (15 to 16 mm, as they are; 20 mm by 16). Counted as `subject.lasting` counts errors, the left toe marker
+from 0.5 to 2 (15 to 16 mm, as they are; 20 mm by 16). Counted as `subject.excess` counts errors, the left toe marker
 of Plug-in-Gait's trial goes 13 cm off, and the ankle's angle 37 degrees. This and the constants above were chosen on
 trials that `benchmarks.markers_fit` reports on: its figures are no test on recordings that were held back.
 """

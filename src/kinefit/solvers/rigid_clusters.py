@@ -1,4 +1,4 @@
-"""Clusters of markers that move together: their mean shape, and its pose in every frame."""
+"""Rigid clusters of markers: their mean shape, and its pose in every frame."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kinefit.geometry.se3 import nearest_rotation
 
 
 def middle(values: NDArray, axis: int | tuple[int, ...]) -> NDArray:
-    """Median of what is not NaN along an axis; NaN, with no warning, where nothing is left."""
+    """Median along an axis, without NaN; NaN, with no warning, if all are NaN."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         median = np.nanmedian if np.isnan(values).any() else np.median  # the same, several times as fast
@@ -21,11 +21,14 @@ def middle(values: NDArray, axis: int | tuple[int, ...]) -> NDArray:
 def rigid_frames(
     x: NDArray, y: NDArray, prior: NDArray | None = None, weight: NDArray | None = None
 ) -> tuple[NDArray, NDArray]:
-    """Rotations (F, 3, 3), translations (F, 3) that lay x (k, 3) onto y (F, k, 3); NaN in y is not seen.
+    """Rotations (F, 3, 3) and translations (F, 3) that map x onto y by least squares; NaN in frames without points.
 
-    Points count by `weight` (k,), by default alike; x and weight may differ from frame to frame, (F, k, 3) and (F, k).
-    What they leave open (two of them, or one) follows `prior` (F, 3, 3), by default the identity. NaN where nothing is
-    seen.
+    Parameters
+    ----------
+    x : (k, 3) or (F, k, 3) [m] points of the cluster
+    y : (F, k, 3) [m] measured points, NaN for missing ones
+    prior : (F, 3, 3) rotations that decide what one or two points leave undetermined; default: the identity
+    weight : (k,) or (F, k) of the points; default: 1
     """
     prior = np.broadcast_to(np.eye(3), (len(y), 3, 3)) if prior is None else prior
     seen = np.isfinite(y[..., 0])
@@ -47,12 +50,12 @@ def rigid_frames(
 
 
 def local(R: NDArray, t: NDArray, y: NDArray) -> NDArray:
-    """(F, k, 3) [m] points y of the world in the frames of a segment."""
+    """(F, k, 3) [m] world points y in the frames of a segment with rotations (F, 3, 3) and origins (F, 3)."""
     return np.einsum("fji,fkj->fki", R, y - t[:, None])
 
 
 def shape_of(y: NDArray) -> NDArray:
-    """(k, 3) mean shape of markers that move together, y (F, k, 3), laid onto the frame that shows most of them."""
+    """(k, 3) [m] mean shape of a rigid cluster y (F, k, 3), in the pose of the frame with the most markers."""
     shape = y[int(np.argmax(np.isfinite(y[..., 0]).sum(1)))]
     shape = np.where(np.isfinite(shape), shape, np.nanmean(shape, axis=0))
     for _ in range(3):

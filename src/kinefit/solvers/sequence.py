@@ -1,4 +1,4 @@
-"""Fast fits of whole sequences: markers and tangent planes, frame after frame, in one compiled call."""
+"""Fit whole sequences fast: markers and tangent planes, frame after frame, in one compiled call."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Planes:
 
     Parameters
     ----------
-    points : PointSet of P points.
-    x_world : (F, P, 3) [m] a point of each plane; NaN for none.
-    normal : (F, P, 3) unit normals.
+    points : PointSet of P points
+    x_world : (F, P, 3) [m] a point of each plane; NaN for none
+    normal : (F, P, 3) unit normals
     sigma : float [m]
     """
 
@@ -66,28 +66,36 @@ def fit_sequence(
     max_iterations: int = 200,
     tolerance: float = 1e-6,
 ) -> SequenceFit:
-    """Minimise Σ ρ(w r²) in every frame, each from the solution of the one before (the first from `start`).
+    """Minimise Σ ρ(w r²) in every frame, each from the solution of the frame before.
 
-    With roots (F, 4, 4) and angles (F, D) as `start`, each frame begins at its own.
-
-    The same minimum as `levenberg_marquardt` with `point_rows` and `plane_rows`, without its calls from Python.
+    It finds the minimum of `levenberg_marquardt` with `point_rows` and `plane_rows`, without calls from Python.
 
     Parameters
     ----------
-    points : PointSet of K points on the body.
+    start : BodyState of the first frame, or roots (F, 4, 4) and angles (F, D) from which each frame starts
+    points : PointSet of K points on the body
     x_world : (F, K, 3) [m]
-        Where they were measured; NaN for one that was not.
+        Measured points; NaN for missing ones.
     sigma : scalar or (K,) [m]
     planes : Planes
-        Tangent planes for other points, as well or instead.
+        Tangent planes for other points, in addition or instead.
+    limits : bool
+        Whether coordinates stay within their limits.
+    locked : (n,) bool
+        Degrees of freedom that do not move.
     posture : float
-        Share of the body's posture prior, couplings included: it decides what the measurements leave open.
+        Share of the body's posture prior, couplings included. It determines what the measurements do not.
     usual : (F, D) or (D,) [rad or m]
-        The posture meant; default: the body's.
+        Mean of the posture prior; default: the body's.
     damping : float
         First λ as a share of H's mean diagonal.
     tolerance : float
         A frame ends when its next step is predicted to lower the cost by less than this share.
+
+    Raises
+    ------
+    ObservationError
+        Arrays of other shapes; a standard deviation that is not above 0.
     """
     tree = body.tree
     count = len(planes.x_world) if x_world is None and planes is not None else len(np.asarray(x_world))
@@ -125,13 +133,13 @@ def fit_sequence(
 
 @dataclass(frozen=True, eq=False)
 class Certainty:
-    """How sure fitted frames are.
+    """Standard deviations of fitted frames.
 
     Parameters
     ----------
-    dof_std : (F, n) [m, rad] one standard deviation of every degree of freedom.
-    joint_std : (F, S, 3) [m] one of every joint centre along the world's axes.
-    factors : (F, K) the points' robust factors in 0..1, 0 where unseen.
+    dof_std : (F, n) [m, rad] of every degree of freedom
+    joint_std : (F, S, 3) [m] of every joint centre along the world's axes
+    factors : (F, K) the points' robust factors in 0..1, 0 where missing
     """
 
     dof_std: NDArray
@@ -152,8 +160,15 @@ def certainty(
 ) -> Certainty:
     """Standard deviations of frames that `fit_sequence` fitted to points, from each frame's own covariance.
 
-    Infinite in a frame of which something is open; with a share `posture` that is no angle, and the prior's own spread
-    tells how open it is.
+    They are infinite in a frame whose measurements do not determine all degrees of freedom. With a share `posture` of
+    the prior all angles are determined, and the prior's standard deviation bounds theirs.
+
+    Parameters
+    ----------
+    Ts_world_root, angles : (F, 4, 4), (F, D) of the fit
+    x_world : (F, K, 3) [m] measured points; NaN for missing ones
+    sigma : scalar or (K,) [m]
+    posture : share of the body's posture prior
     """
     tree, x = body.tree, np.array(x_world, float, order="C")
     seen = np.isfinite(x).all(axis=2)
@@ -172,7 +187,13 @@ def certainty(
 def point_equations(
     body: Body, points: PointSet, x_world: NDArray, *, sigma: NDArray, loss: Loss = SQUARED
 ) -> MakeEquations:
-    """What `trajectory.smoothing.smooth` asks for, of points measured at x_world (F, K, 3) [m], NaN for none."""
+    """Equations of points for `trajectory.smoothing.smooth`.
+
+    Parameters
+    ----------
+    x_world : (F, K, 3) [m] measured points; NaN for missing ones
+    sigma : (K,) or (F, K) [m]
+    """
     tree, seen = body.tree, np.isfinite(x_world).all(axis=2)
     weight = np.where(seen, 1.0 / np.square(sigma), 0.0)
     x, rest = np.nan_to_num(x_world), body.points_rest(points)

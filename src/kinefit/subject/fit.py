@@ -20,7 +20,7 @@ from kinefit.sensors.base import Measurement
 from kinefit.solvers.bundle.border import Bordered, Prior, solve
 from kinefit.solvers.bundle.border_frames import POSTURE, SETTLING, Weighing
 from kinefit.solvers.equations import inverse
-from kinefit.subject.lasting import excess
+from kinefit.subject.excess import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import Parameters, World, stacked
 from kinefit.subject.subject import SubjectFit
@@ -68,7 +68,7 @@ def fit_subject(
     rounds : of match and solve, at most; fewer if correspondences no longer change
     looks : float, optional
         Number of frames with independent errors that all frames together count as; default: estimated for each sensor
-        from the bias of its residuals (see `lasting.excess`).
+        from the bias of its residuals (see `excess.excess`).
     loss : Loss of rows that have none of their own
     posture : share of the body's posture prior that constrains the poses
     coarse : iterations of a round whose correspondences still change, and steps of the poses alone in each. Few

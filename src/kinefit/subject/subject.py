@@ -54,7 +54,7 @@ class SubjectFit:
     information : (p, p) of the sensors without the prior, deflated by an excess above 1
     prior : Prior
     excess : {sensor: factor} by which the variance of all its frames together exceeds that of its rows, see
-        `lasting.excess`
+        `excess.excess`
     cost : float
     rounds : of match and solve
     parameters : kinds of parameters

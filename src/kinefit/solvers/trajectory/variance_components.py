@@ -54,7 +54,7 @@ class VarianceComponents:
     outlier: NDArray
 
     @property
-    def lasting(self) -> NDArray:
+    def systematic(self) -> NDArray:
         """(C,) standard deviation of what does not average out over neighbouring frames."""
         return np.asarray(np.sqrt(self.bias**2 + self.drift**2 + self.bias_error**2))
 
