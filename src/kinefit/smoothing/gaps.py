@@ -52,7 +52,7 @@ def _edge_of_gap(
     if not 0 <= f < len(roots):
         return None
     state, steps = BodyState(roots[f], angles[f]), 0
-    while steps < _VELOCITY_FRAMES and 0 <= f + towards * (steps + 1) < len(roots) and not lost[f + towards * (steps + 1)]:
+    while steps < _VELOCITY_FRAMES and 0 <= (k := f + towards * (steps + 1)) < len(roots) and not lost[k]:
         steps += 1
     if steps == 0:
         return state, np.zeros(6 + angles.shape[1])

@@ -19,7 +19,7 @@ from kinefit.solvers.equations import Equations, lock, normal_equations
 _MAX_TRIES = 30  # of more damping, for a matrix that is not positive definite
 
 LEAST_SCALED_DAMPING = 1e-9
-"""Least λ of solvers that scale each diagonal element of H by 1 + λ (bundle adjustment): it alone fixes a free gauge."""
+"""Least λ of solvers that scale each diagonal element of H by 1 + λ (bundle adjustment). Only it fixes a free gauge."""
 
 MakeRows = Callable[[BodyState], AnyRows | Iterable[AnyRows]]
 

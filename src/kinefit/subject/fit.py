@@ -18,7 +18,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.losses import SQUARED, Loss
 from kinefit.sensors.base import Measurement
 from kinefit.solvers.bundle.border import Bordered, Prior, solve
-from kinefit.solvers.bundle.border_frames import POSTURE, SETTLING, Weighing
+from kinefit.solvers.bundle.border_frames import MAX_POSE_STEPS, POSTURE_SHARE, Weighing
 from kinefit.solvers.equations import inverse
 from kinefit.subject.excess import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
@@ -28,7 +28,7 @@ from kinefit.subject.subject import SubjectFit
 REACH = (0.08, 0.05, 0.03)
 """[m] correspondence distance of each round, coarse to fine; the last for all further rounds."""
 
-COARSE_ITERATIONS = 4, SETTLING
+COARSE_ITERATIONS = 4, MAX_POSE_STEPS
 """Iterations of an early round, whose correspondences still change, and steps of the poses alone in each iteration."""
 
 _FINE_ITERATIONS = 15  # of the solver, in the last rounds
@@ -50,7 +50,7 @@ def fit_subject(
     rounds: int = 5,
     looks: float | None = None,
     loss: Loss = SQUARED,
-    posture: float = POSTURE,
+    posture: float = POSTURE_SHARE,
     coarse: tuple[int, int] = COARSE_ITERATIONS,
 ) -> SubjectFit:
     """Fit parameters and poses jointly to the measurements of K frames.
@@ -102,7 +102,7 @@ def fit_subject(
         early, before = anew or used < min(len(reach), rounds), theta
         solved = solve(
             frames, theta, states, prior, step, weighing=Weighing(shares, loss, posture),
-            iterations=coarse if early else (_FINE_ITERATIONS, SETTLING),
+            iterations=coarse if early else (_FINE_ITERATIONS, MAX_POSE_STEPS),
         )  # fmt: skip
         theta, states, moved = solved.theta, solved.states, solved.theta - before
         squared_change = moved @ (prior.information + solved.information) @ moved
@@ -112,7 +112,7 @@ def fit_subject(
         excess_of = excess(frames.rows_of_frames(theta, states), _effective_parameters(body, solved))
         shares = {sensor: 1.0 / max(excess_of.get(sensor, 1.0), 1.0) for sensor in sensors}
         if min(shares.values()) < 1.0:
-            weighing, fine = Weighing(shares, loss, posture), (_FINE_ITERATIONS, SETTLING)
+            weighing, fine = Weighing(shares, loss, posture), (_FINE_ITERATIONS, MAX_POSE_STEPS)
             solved = solve(frames, theta, states, prior, step, weighing=weighing, iterations=fine)
     world = worlds.at(solved.theta)
     return SubjectFit(

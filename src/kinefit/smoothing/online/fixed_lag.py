@@ -181,8 +181,8 @@ class FixedLag:
         made = [self._costs.quadratic(self._frames, f) for f in range(len(frames))]
         H, g, cost = (np.array(v) for v in zip(*made))
         roots, angles = self._states()
-        lower, upper, usual = boxes(tree, angles)
-        prior = replace(self._prior, usual=usual, liveliness=self._livelier)
+        lower, upper, mean = boxes(tree, angles)
+        prior = replace(self._prior, mean=mean, liveliness=self._livelier)
 
         def equations(new_roots: NDArray, new_angles: NDArray) -> Equations:
             delta = np.empty(g.shape)
@@ -201,11 +201,11 @@ class FixedLag:
     def _marginalise_oldest(self) -> None:
         """Remove the oldest frame from the window, and keep its cost of the next three frames."""
         roots, angles = self._states(4)
-        lower, upper, usual = boxes(self.body.tree, angles)
+        lower, upper, mean = boxes(self.body.tree, angles)
         H, g, _ = self._costs.quadratic(self._frames, 0)
         weight = self.body.tree.posture_precision
         H[6:, 6:] += weight
-        g[6:] += weight @ (usual[0] - angles[0])
+        g[6:] += weight @ (mean[0] - angles[0])
         at_limit = (angles[0] <= lower[0]) | (angles[0] >= upper[0])
         held = np.concatenate([np.full(6, not self.body.tree.root_free), at_limit])
         motion = replace(self._prior, liveliness=self._livelier).rows(3)
