@@ -50,7 +50,8 @@ def choices_options(command: Callable) -> Callable:
         click.option("--overlays/--no-overlays", default=True, show_default=True, help="Draw the fit on every video."),
         click.option(
             "--formats", default=",".join(results.DEFAULT_FORMATS), show_default=True, callback=chosen_formats,
-            metavar="LIST", help=f"What to write; {', '.join(sorted({*results.NAMES} - {*results.DEFAULT_FORMATS}))} are there too.",
+            metavar="LIST",
+            help=f"What to write; {', '.join(sorted({*results.NAMES} - {*results.DEFAULT_FORMATS}))} are there too.",
         ),
         click.option("--report/--no-report", default=True, show_default=True, help="Write report.html."),
         click.option(
