@@ -66,14 +66,14 @@ def wave_bar(
 @checked
 def see_bar(rig: Rig, ends: NDArray, *, noise: float = 0.1, seed: int = 0) -> dict[str, BarViews]:
     """Detections of a bar's ends (N, 2, 3) [m] in the cameras of a rig, in random order, with noise [px]."""
-    rng, seen = np.random.default_rng([seed, 1]), {}
+    rng, views = np.random.default_rng([seed, 1]), {}
     for camera in rig:
         uv = camera.project(ends) + rng.normal(0.0, noise, (*ends.shape[:2], 2))
         swapped = rng.random(len(ends)) < 0.5
         uv[swapped] = uv[swapped, ::-1]
         inside = (np.isfinite(uv) & (uv > 2.0) & (uv < np.array(camera.size) - 3.0)).all(axis=(1, 2))
-        seen[camera.name] = BarViews(camera.size, {int(f): uv[f] for f in np.flatnonzero(inside)}, len(ends))
-    return seen
+        views[camera.name] = BarViews(camera.size, {int(f): uv[f] for f in np.flatnonzero(inside)}, len(ends))
+    return views
 
 
 @checked

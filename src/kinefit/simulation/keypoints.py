@@ -160,7 +160,7 @@ def simulate_keypoints(
     names = keypoint_names(keypoint_set)
     random = np.random.default_rng(seed)
     people = [motion] if bystander is None else [motion, bystander]
-    seen = []
+    out = []
     for camera in rig:
         points = np.full((len(motion), len(people), len(names), 2), np.nan)
         confidence = np.zeros(points.shape[:3])
@@ -175,8 +175,8 @@ def simulate_keypoints(
             order = random.permuted(np.tile(np.arange(len(people)), (len(motion), 1)), axis=1)
             points = np.take_along_axis(points, order[:, :, None, None], axis=1)
             confidence = np.take_along_axis(confidence, order[:, :, None], axis=1)
-        seen.append(Keypoints(camera.name, keypoint_set, names, motion.rate, points, confidence, source="simulation"))
-    return seen
+        out.append(Keypoints(camera.name, keypoint_set, names, motion.rate, points, confidence, source="simulation"))
+    return out
 
 
 def _project(motion: Motion, camera: Camera, keypoint_set: str, names: tuple[str, ...]) -> NDArray:

@@ -214,10 +214,10 @@ def _write_video(job: _Job, name: str, sensor: ColourSensor, path: Path, *, grey
 
 def _write_keypoints(job: _Job, folder: Path) -> str:
     rig = Rig((job.rig["colour"],))
-    (seen,) = simulate_keypoints(
+    (detected,) = simulate_keypoints(
         job.scene.motion, rig, "MEDIAPIPE_33", noise_px=_KEYPOINT_NOISE_PX, outliers=0.02, missing=0.05, seed=job.seed
     )
-    points = np.concatenate([seen.points[:, 0], seen.confidence[:, 0, :, None]], axis=-1)
+    points = np.concatenate([detected.points[:, 0], detected.confidence[:, 0, :, None]], axis=-1)
     np.save(folder / "mediapipe_colour.npy", np.nan_to_num(points).astype(np.float32))
     return (
         f'[[keypoints]]\ncamera = "colour"\nfile = "mediapipe_colour.npy"\nformat = "mediapipe"\n'

@@ -45,12 +45,12 @@ def write_synthetic_take(folder: str | os.PathLike[str], seed: int = 0) -> Path:
     """
     folder, motion = Path(folder), squat_and_wave()
     rig = studio_rig(motion, size=_IMAGE_SIZE)
-    seen = simulate_keypoints(motion, rig, "MEDIAPIPE_33", noise_px=1.5, outliers=0.05, missing=0.05, seed=seed)
+    detections = simulate_keypoints(motion, rig, "MEDIAPIPE_33", noise_px=1.5, outliers=0.05, missing=0.05, seed=seed)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
             staging = Path(name)
-            for camera, keypoints in zip(rig, seen):
+            for camera, keypoints in zip(rig, detections):
                 _write_video(motion, camera, staging / f"{camera.name}.mp4")
                 np.save(staging / f"mediapipe_{camera.name}.npy", _landmarks(keypoints))
             write_calibration(rig, staging / "calibration.toml")

@@ -41,7 +41,7 @@ class Linearised:
     roots, angles : (T, 4, 4), (T, D) states at which the frames were linearised
     matched : T lists of matches; empty if they are not kept
     rows : (T,) number of rows that agree
-    unsure : (T, n, n) part of H without evidence, from segments that a surface sensor does not show, see
+    unsupported : (T, n, n) part of H without evidence, from segments that a surface sensor does not show, see
         `segments_not_shown`; None if it was not computed
     """
 
@@ -52,20 +52,22 @@ class Linearised:
     angles: NDArray
     matched: Sequence[tuple[Matched, ...]]
     rows: NDArray
-    unsure: NDArray | None = None
+    unsupported: NDArray | None = None
 
     def part(self, frames: slice) -> Linearised:
         """The costs of some frames."""
         names = ("H", "g", "cost", "roots", "angles", "matched", "rows")
-        unsure = None if self.unsure is None else self.unsure[frames]
-        return replace(self, **{name: getattr(self, name)[frames] for name in names}, unsure=unsure)
+        unsupported = None if self.unsupported is None else self.unsupported[frames]
+        return replace(self, **{name: getattr(self, name)[frames] for name in names}, unsupported=unsupported)
 
     def followed_by(self, later: Linearised) -> Linearised:
         """These costs and those of later frames, without matches."""
         names = ("H", "g", "cost", "roots", "angles", "rows")
         both = {name: np.concatenate([getattr(self, name), getattr(later, name)]) for name in names}
-        known = self.unsure is not None and later.unsure is not None
-        return replace(self, **both, matched=(), unsure=np.concatenate([self.unsure, later.unsure]) if known else None)
+        unsupported = None
+        if self.unsupported is not None and later.unsupported is not None:
+            unsupported = np.concatenate([self.unsupported, later.unsupported])
+        return replace(self, **both, matched=(), unsupported=unsupported)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,12 +122,12 @@ class OtherSensors:
         ----------
         frames : numbers of the frames; default: all
         keep : spool to which their matches are appended
-        judge : whether `Linearised.unsure` is computed
+        judge : whether `Linearised.unsupported` is computed
         """
         chosen = range(len(roots)) if frames is None else frames
         F, n = len(chosen), body.tree.n_dofs
         H, g, cost, rows = np.zeros((F, n, n)), np.zeros((F, n)), np.zeros(F), np.zeros(F)
-        unsure = np.zeros((F, n, n)) if judge else None
+        unsupported = np.zeros((F, n, n)) if judge else None
         for k, f in enumerate(chosen):
             scene = self.scene(f, roots, angles)
             matched = self.matched(scene)
@@ -139,14 +141,15 @@ class OtherSensors:
             if parts:
                 equations = normal_equations(body, scene.state, parts)
                 H[k], g[k], cost[k] = equations.matrix, equations.gradient, equations.cost
-            if unsure is None or not any(m.shows_surface for m in matched):
+            if unsupported is None or not any(m.shows_surface for m in matched):
                 continue
             without = [segments_not_shown(m, e) for m, e in zip(matched, evidence_of(scene, matched))]
             if any(w is not None and w.any() for w in without):
-                sure = rows_of(scene, matched, self.settings, self.scale, points=int(self.points[f]), without=without)
-                unsure[k] = H[k] - normal_equations(body, scene.state, sure).matrix
+                points = int(self.points[f])
+                supported = rows_of(scene, matched, self.settings, self.scale, points=points, without=without)
+                unsupported[k] = H[k] - normal_equations(body, scene.state, supported).matrix
         span = slice(chosen.start, chosen.stop)
-        return Linearised(H, g, cost, np.array(roots[span]), np.array(angles[span]), keep or (), rows, unsure)
+        return Linearised(H, g, cost, np.array(roots[span]), np.array(angles[span]), keep or (), rows, unsupported)
 
     def windows(
         self, body: Body, roots: NDArray, angles: NDArray, spans: Sequence[slice],

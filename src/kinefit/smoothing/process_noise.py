@@ -144,9 +144,9 @@ class SmoothTake:
     def fit(self, strength: Strength, *, tolerance: float = 1e-5) -> tuple[Smoothed, Posterior]:
         """Solve all frames jointly from the take's states, with covariances; `tolerance` is unitless."""
         fit = self.solved(strength, tolerance=tolerance)
-        if self.linear is None or self.linear.unsure is None:
+        if self.linear is None or self.linear.unsupported is None:
             return fit, posterior(self.body, fit)
-        measured = replace(fit.system, C=fit.system.C - self.linear.unsure)
+        measured = replace(fit.system, C=fit.system.C - self.linear.unsupported)
         return fit, posterior(self.body, replace(fit, system=measured))
 
     def solved(self, strength: Strength, *, tolerance: float = 1e-5) -> Smoothed:

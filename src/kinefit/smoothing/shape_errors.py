@@ -61,7 +61,7 @@ class ShapeErrors:
 
 
 def shape_errors(
-    found: SubjectFit, settings: TrackSettings, seen: Callable[[int], tuple[Scene, Sequence[Matched]]],
+    found: SubjectFit, settings: TrackSettings, frame_data: Callable[[int], tuple[Scene, Sequence[Matched]]],
     frames: Sequence[int], alone: Sequence[NDArray], scale: Mapping[str, float] | None = None,
 ) -> ShapeErrors:  # fmt: skip
     """Variances that the uncertainty of the shape adds to some frames.
@@ -70,7 +70,7 @@ def shape_errors(
     ----------
     found : subject fit with parameters and covariance
     settings : of the fit
-    seen : frame -> its scene and all its matches, keypoints with the weights of the covariances
+    frame_data : frame -> its scene and all its matches, keypoints with the weights of the covariances
     frames : K numbers of frames
     alone : K (n, n) covariances of each frame on its own, prior included
     scale : {sensor: factor} on the standard deviations of other sensors' rows in these covariances
@@ -83,7 +83,7 @@ def shape_errors(
     Sigma = found.covariance[np.ix_(used, used)]
     dofs, joints = [], []
     for frame, P in zip(frames, alone):
-        scene, matched = seen(frame)
+        scene, matched = frame_data(frame)
         matches = _FrameMatches(worlds, scene, matched, found.mean, used, np.flatnonzero(wide[used]), scale or {})
         gradients = matches.points(step) + matches.surfaces(step, settings)
         response = P @ gradients

@@ -126,14 +126,14 @@ def _pair_sums(left: NDArray, variance: NDArray) -> NDArray:
 
     left (T, M, 2), variance (T, M): see `shared_by`. Every frame counts alike, whatever its number of pairs.
     """
-    seen = np.isfinite(left).all(axis=2)
-    count = seen.sum(axis=1)
+    known = np.isfinite(left).all(axis=2)
+    count = known.sum(axis=1)
     some = count > 1
-    r, n = np.where(seen[..., None], left, 0.0)[some], count[some]
-    followed = np.where(seen, variance, 0.0)[some].sum(axis=1) / n
+    r, n = np.where(known[..., None], left, 0.0)[some], count[some]
+    absorbed = np.where(known, variance, 0.0)[some].sum(axis=1) / n
     squares = np.square(r).sum(axis=(1, 2))
     products = (np.square(r.sum(axis=1)).sum(axis=1) - squares) / (n * (n - 1))
-    return np.array([np.sum(products + followed), np.sum(squares / n + followed), len(n)])
+    return np.array([np.sum(products + absorbed), np.sum(squares / n + absorbed), len(n)])
 
 
 def _share(sums: NDArray, prior: float) -> float:

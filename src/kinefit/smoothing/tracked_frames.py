@@ -29,7 +29,7 @@ class TrackedFrames:
     leftovers : F tuples, the residuals of every sensor
     times : (F,) [s]
     rate : float [Hz]
-    scene_of, apart : of the tracker, see `lag_frame.Follows`
+    scene_of, apart : of the tracker, see `lag_frame.TrackerLike`
     """
 
     results: Sequence[FrameResult]
@@ -61,8 +61,8 @@ class TrackedFrames:
 def correct_swaps(channels: Channels, swapped: NDArray) -> tuple[NDArray, NDArray]:
     """Pixels (F, N, 2) and confidences (F, N), 0 where undetected, with the channels `swapped` (F, N) exchanged."""
     if len(swapped) == len(channels.uv) and not swapped.any():
-        unseen = ~np.isfinite(channels.uv).all(axis=2) & (channels.confidence != 0.0)
-        return channels.uv, np.where(unseen, 0.0, channels.confidence) if unseen.any() else channels.confidence
+        undetected = ~np.isfinite(channels.uv).all(axis=2) & (channels.confidence != 0.0)
+        return channels.uv, np.where(undetected, 0.0, channels.confidence) if undetected.any() else channels.confidence
     uv, confidence = room((*swapped.shape, 2)), room(swapped.shape)
     for some in stretches(len(swapped)):
         order = np.where(swapped[some], channels.partner, np.arange(swapped.shape[1]))

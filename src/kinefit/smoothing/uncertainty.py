@@ -38,7 +38,7 @@ from kinefit.solvers.trajectory.variance_components import VarianceComponents, v
 from kinefit.subject.closure_moves import ClosureMoves
 from kinefit.subject.matched_frames import closing_moves, point_moves
 from kinefit.subject.point_moves import PointMoves
-from kinefit.subject.sensor_parameters import CameraExtrinsics, alike
+from kinefit.subject.sensor_parameters import CameraExtrinsics, same_cameras
 from kinefit.subject.subject import Subject
 
 Answers = Callable[[Sequence[int], Sequence[NDArray]], ShapeErrors]
@@ -173,7 +173,7 @@ class KeypointPriors:
             cameras = subject.fit.cameras
             moves, covariance = point_moves(subject.fit), subject.covariance
             closing = closing_moves(subject.fit, subject.body)
-            if cameras is not None and alike(cameras.rig, channels.rig):
+            if cameras is not None and same_cameras(cameras.rig, channels.rig):
                 shift = np.zeros(len(covariance))  # the subject's fit moved the cameras, the motion's fit did not
                 shift[-len(cameras.names) :] = subject.fit.mean[-len(cameras.names) :]
                 return cls(moves, cameras, covariance + np.outer(shift, shift), closing)

@@ -51,7 +51,7 @@ def boxes(tree: KinematicTree, angles: NDArray) -> tuple[NDArray, NDArray, NDArr
     turns away.
     """
     shape = np.shape(angles)
-    lower, upper, usual = (np.array(np.broadcast_to(v, shape)) for v in (tree.lower, tree.upper, tree.usual))
+    lower, upper, mean = (np.array(np.broadcast_to(v, shape)) for v in (tree.lower, tree.upper, tree.usual))
     for d in tree.ball_joints:
         q = np.asarray(angles)[:, d]
         own = _nearest_turn(q, tree.lower[d], tree.upper[d])
@@ -61,8 +61,8 @@ def boxes(tree: KinematicTree, angles: NDArray) -> tuple[NDArray, NDArray, NDArr
         shift = q - sign * np.where(swap[:, None], other, own)  # q = sign · (its value within limits) + shift
         ends = sign * tree.lower[d] + shift, sign * tree.upper[d] + shift
         lower[:, d], upper[:, d] = np.minimum(*ends), np.maximum(*ends)
-        usual[:, d] = sign * tree.usual[d] + shift
-    return lower, upper, usual
+        mean[:, d] = sign * tree.usual[d] + shift
+    return lower, upper, mean
 
 
 def _ball(q: NDArray, low: NDArray, high: NDArray) -> NDArray:
@@ -74,12 +74,12 @@ def _ball(q: NDArray, low: NDArray, high: NDArray) -> NDArray:
         forms += _TURN * np.round((out[t - 1] - forms) / _TURN)
         nearer = int(np.argmin(np.abs(forms - out[t - 1]).sum(axis=1)))
         out[t:end] = forms[nearer] + (SIGNS if nearer else 1.0) * (q[t:end] - q[t])
-    whole = []
+    candidates = []
     for form in (out, np.pi + SIGNS * out):
         finite = np.isfinite(low) & np.isfinite(high)
         middle = np.where(finite, 0.5 * (np.where(finite, low, 0.0) + np.where(finite, high, 0.0)), 0.0)
-        whole.append(form - _TURN * np.round((np.median(form, axis=0) - middle) / _TURN))
-    return whole[int(np.argmin([_outside(form, low, high).sum() for form in whole]))]
+        candidates.append(form - _TURN * np.round((np.median(form, axis=0) - middle) / _TURN))
+    return candidates[int(np.argmin([_outside(form, low, high).sum() for form in candidates]))]
 
 
 def _nearest_turn(q: NDArray, low: NDArray, high: NDArray) -> NDArray:

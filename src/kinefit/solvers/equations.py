@@ -91,9 +91,10 @@ def normal_equations(
     factor, blocks = np.empty(len(rows)), np.empty((len(tree.segments), 27))
     C, g = np.empty(chain.shape), np.empty(n)
     given = [(p, share) for p, share in zip(parts, shares, strict=True) if isinstance(p, Rows)]
-    one = given[0][0].loss or loss if len(given) == 1 else loss
-    mixed = np.ndim(one.scale) > 0 or any(share != 1.0 or (p.loss or loss) is not one for p, share in given)
-    data, kind, scale, cost = rows.data, one.kind, one.scale, 0.0
+    common_loss = given[0][0].loss or loss if len(given) == 1 else loss
+    different = any(share != 1.0 or (p.loss or loss) is not common_loss for p, share in given)
+    mixed = np.ndim(common_loss.scale) > 0 or different
+    data, kind, scale, cost = rows.data, common_loss.kind, common_loss.scale, 0.0
     if mixed:  # the parts' own losses go into the weights, and the rest of their cost is added
         weighed = [((p.loss or loss).of_rows(p.data, p.group), share) for p, share in given]
         robust = np.concatenate([share * f for (f, _), share in weighed])

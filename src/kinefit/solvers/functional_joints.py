@@ -129,17 +129,17 @@ def sphere_centre(x: NDArray) -> tuple[NDArray, NDArray, float]:
     the algebraic fit of Gamage and Lasenby, J Biomech 35 (2002).
     """
     origin = np.nanmean(x, axis=(0, 1))
-    d, seen = x - origin, np.isfinite(x).all(axis=2)
+    d, known = x - origin, np.isfinite(x).all(axis=2)
     square = np.einsum("fki,fki->fk", d, d)
     A, b = 2.0 * (d - np.nanmean(d, axis=0)), square - np.nanmean(square, axis=0)
-    c = origin + np.linalg.lstsq(A[seen], b[seen], rcond=1e-9)[0]
+    c = origin + np.linalg.lstsq(A[known], b[known], rcond=1e-9)[0]
     for _ in range(50):
         away = x - c
         length = np.linalg.norm(away, axis=2)
         r = length - np.nanmean(length, axis=0)
         J = away / length[..., None]
         J = J - np.nanmean(J, axis=0)
-        step = np.linalg.lstsq(J[seen], r[seen], rcond=1e-9)[0]
+        step = np.linalg.lstsq(J[known], r[known], rcond=1e-9)[0]
         c = c + step
         if np.linalg.norm(step) < 1e-9:
             break
@@ -165,8 +165,8 @@ def _sphere(x: NDArray) -> tuple[NDArray, float, NDArray]:
         good = _inliers(off, good)
     directions = (x[good] - c) / radii[:, None]
     J = (directions - np.nanmean(directions, axis=0)).reshape(-1, 3)
-    seen = np.isfinite(J).all(axis=1)
-    turns = np.sqrt(np.linalg.eigvalsh(J[seen].T @ J[seen] / seen.sum()))[::-1]
+    known = np.isfinite(J).all(axis=1)
+    turns = np.sqrt(np.linalg.eigvalsh(J[known].T @ J[known] / known.sum()))[::-1]
     if turns[1] < MIN_TURN_STD:
         raise _held(turns, "about two axes", 1)
     return c, misfit, turns

@@ -38,7 +38,7 @@ class PixelFit(NamedTuple):
 
 
 def fit_pixels(
-    body: Body, state: BodyState, rig: Rig, seen: PixelPoints, held: tuple[BodyState, NDArray] | None, *,
+    body: Body, state: BodyState, rig: Rig, pixels: PixelPoints, held: tuple[BodyState, NDArray] | None, *,
     max_iterations: int, tolerance: float, posture: float = 1.0,
 ) -> PixelFit | None:  # fmt: skip
     """Minimise Σ ρ over pixels, the prediction and the posture prior, from a start state.
@@ -48,7 +48,7 @@ def fit_pixels(
     Parameters
     ----------
     state : to start from
-    seen : N pixels (N, 2) [px]
+    pixels : N points of the body, in images (N, 2) [px]
     held : predicted state and its information (n, n); None for no prediction
     max_iterations, tolerance : see `levenberg_marquardt`
     posture : share of the posture prior
@@ -65,8 +65,8 @@ def fit_pixels(
     H, g = np.empty((2, n, n)), np.empty((2, n))
     best, cost, tried = _kernels_pixels.minimum(
         tree.parents, tree.dof_start, tree.prismatic, tree.axes, tree.rest, tree.chain, tree.depth, *dense_pattern(n),
-        tree.lower, tree.upper, lock(body, None), seen.points.segments, body.points_rest(seen.points), rig.packed,
-        seen.camera, seen.uv, seen.weight, seen.loss.kind, float(seen.loss.scale), predicted.T_world_root,
+        tree.lower, tree.upper, lock(body, None), pixels.points.segments, body.points_rest(pixels.points), rig.packed,
+        pixels.camera, pixels.uv, pixels.weight, pixels.loss.kind, float(pixels.loss.scale), predicted.T_world_root,
         predicted.angles, information, posed, tree.usual,
         posture * (precision if precision.ndim == 2 else np.diag(precision)), roots, angles, H, g, max_iterations,
         tolerance, INITIAL_DAMPING, 0.0 if held else INITIAL_DAMPING,

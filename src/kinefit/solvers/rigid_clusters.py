@@ -31,21 +31,21 @@ def rigid_frames(
     weight : (k,) or (F, k) of the points; default: 1
     """
     prior = np.broadcast_to(np.eye(3), (len(y), 3, 3)) if prior is None else prior
-    seen = np.isfinite(y[..., 0])
-    share = np.where(seen, 1.0 if weight is None else weight / weight.max(), 0.0)[..., None]
+    measured = np.isfinite(y[..., 0])
+    share = np.where(measured, 1.0 if weight is None else weight / weight.max(), 0.0)[..., None]
     count = np.maximum(share.sum(1), 1e-300)
-    x_all = np.where(seen[..., None], x, 0.0)
-    y_all = np.where(seen[..., None], y, 0.0)
+    x_all = np.where(measured[..., None], x, 0.0)
+    y_all = np.where(measured[..., None], y, 0.0)
     x_mid, y_mid = (share * x_all).sum(1) / count, (share * y_all).sum(1) / count
-    a = np.where(seen[..., None], x - x_mid[:, None], 0.0)
-    b = np.where(seen[..., None], y_all - y_mid[:, None], 0.0)
+    a = np.where(measured[..., None], x - x_mid[:, None], 0.0)
+    b = np.where(measured[..., None], y_all - y_mid[:, None], 0.0)
     size = (share * a * a).sum((1, 2))[:, None, None]
     cross = np.einsum("fki,fkj->fij", share * b, a)
     cross += (1e-4 * size + 1e-12) * np.where(np.isfinite(prior), prior, np.eye(3))
     R = nearest_rotation(cross)
     t = y_mid - np.einsum("fij,fj->fi", R, x_mid)
-    nothing = ~seen.any(1)
-    R[nothing], t[nothing] = np.nan, np.nan
+    missing = ~measured.any(1)
+    R[missing], t[missing] = np.nan, np.nan
     return R, t
 
 

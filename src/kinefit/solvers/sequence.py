@@ -101,10 +101,10 @@ def fit_sequence(
     count = len(planes.x_world) if x_world is None and planes is not None else len(np.asarray(x_world))
     x = np.zeros((count, 0, 3)) if x_world is None else np.array(x_world, float, order="C")
     check_shape(x, (count, len(points), 3), "measured points")
-    seen = np.isfinite(x).all(axis=2)
+    measured = np.isfinite(x).all(axis=2)
     if not np.all(np.asarray(sigma, float) > 0) or (planes is not None and not planes.sigma > 0):
         raise ObservationError("the standard deviation of points and planes must be positive")
-    weight = np.where(seen, 1.0 / np.square(np.broadcast_to(np.asarray(sigma, float), seen.shape[1:])), 0.0)
+    weight = np.where(measured, 1.0 / np.square(np.broadcast_to(np.asarray(sigma, float), measured.shape[1:])), 0.0)
     order = np.argsort(points.segments, kind="stable")  # rows of one segment in one run
     p = planes or Planes(_NO_POINTS, np.zeros((count, 0, 3)), np.zeros((count, 0, 3)))
     for name, array in (("points", p.x_world), ("normals", p.normal)):
@@ -171,10 +171,10 @@ def certainty(
     posture : share of the body's posture prior
     """
     tree, x = body.tree, np.array(x_world, float, order="C")
-    seen = np.isfinite(x).all(axis=2)
-    weight = np.where(seen, 1.0 / np.square(np.broadcast_to(np.asarray(sigma, float), seen.shape[1:])), 0.0)
+    measured = np.isfinite(x).all(axis=2)
+    weight = np.where(measured, 1.0 / np.square(np.broadcast_to(np.asarray(sigma, float), measured.shape[1:])), 0.0)
     F, S, n = len(x), len(tree.segments), tree.n_dofs
-    dof_std, joint_std, factors = np.empty((F, n)), np.empty((F, S, 3)), np.empty(seen.shape)
+    dof_std, joint_std, factors = np.empty((F, n)), np.empty((F, S, 3)), np.empty(measured.shape)
     _certainties(
         tree.parents, tree.dof_start, tree.dof_parent, tree.last_dof, tree.chain, tree.depth, tree.prismatic, tree.axes,
         tree.rest, points.segments, body.points_rest(points), np.nan_to_num(x), weight, tree.usual, posture,
@@ -194,8 +194,8 @@ def point_equations(
     x_world : (F, K, 3) [m] measured points; NaN for missing ones
     sigma : (K,) or (F, K) [m]
     """
-    tree, seen = body.tree, np.isfinite(x_world).all(axis=2)
-    weight = np.where(seen, 1.0 / np.square(sigma), 0.0)
+    tree, measured = body.tree, np.isfinite(x_world).all(axis=2)
+    weight = np.where(measured, 1.0 / np.square(sigma), 0.0)
     x, rest = np.nan_to_num(x_world), body.points_rest(points)
 
     def make(roots: NDArray, angles: NDArray) -> Equations:

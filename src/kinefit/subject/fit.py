@@ -94,12 +94,12 @@ def fit_subject(
     theta = np.array(mean if start is None else start, float)
     check_shape(theta, mean.shape, f"a start for {', '.join(names)}")
     sensors = tuple({m.sensor: None for several in steps for m in several})
-    anew = not all(m.settled for several in steps for m in several)
+    rematched = not all(m.settled for several in steps for m in several)
     shares = {} if looks is None else dict.fromkeys(sensors, min(looks / len(steps), 1.0))
     excess_of = {sensor: 1.0 / share for sensor, share in shares.items()}
     for used in range(1, rounds + 1):
         frames = MatchedFrames(worlds, steps, times, velocities, theta, states, reach[min(used, len(reach)) - 1])
-        early, before = anew or used < min(len(reach), rounds), theta
+        early, before = rematched or used < min(len(reach), rounds), theta
         solved = solve(
             frames, theta, states, prior, step, weighing=Weighing(shares, loss, posture),
             iterations=coarse if early else (_FINE_ITERATIONS, MAX_POSE_STEPS),

@@ -134,14 +134,14 @@ def _fitted(
             PointOffsets(body, name, spread[(own < 1.0).astype(int)] * own) for name, own in zip(sets, shares)
         ]
         parameters: list[Parameters] = [lengths, *offsets]
-        before = sum(len(one.names) for one in parameters)
+        before = sum(len(kind.names) for kind in parameters)
         if k and gear.names:  # gear starts from poses of the first round
             parameters.append(gear)
-        of_body = sum(len(one.names) for one in parameters)
+        of_body = sum(len(kind.names) for kind in parameters)
         if cameras is not None:
             parameters.append(cameras.tighter(excess_of**-0.5))
         if start is None:
-            of_points = [one.mean for one in parameters[1:] if not isinstance(one, CameraExtrinsics)]
+            of_points = [kind.mean for kind in parameters[1:] if not isinstance(kind, CameraExtrinsics)]
             start = np.concatenate([np.log(scales), *of_points, np.zeros(0 if cameras is None else len(cameras.names))])
         elif of_body > before:
             start = np.concatenate([start[:before], gear.start(states), start[before:]])
@@ -158,7 +158,7 @@ def _fitted(
         excess_of = _excess(found, steps)
         covariance = inverse(prior + found.information / excess_of)
         moved, share = found.mean - found.prior.mean, np.full(len(prior), np.nan)
-        of_points = [one.values_of(own[:, None].repeat(3, axis=1)) for one, own in zip(offsets, shares)]
+        of_points = [kind.values_of(own[:, None].repeat(3, axis=1)) for kind, own in zip(offsets, shares)]
         share[len(lengths.names) : before] = np.concatenate(of_points)
         for short, of in enumerate((share == 1.0, share < 1.0)):
             open_to = np.flatnonzero(of & np.isclose(np.diag(prior) * share**2, spread[short] ** -2))

@@ -43,8 +43,8 @@ class Worlds:
 
     def __init__(self, world: World, parameters: Sequence[Parameters]) -> None:
         self._first = world
-        ends = np.cumsum([0, *(len(one.names) for one in parameters)])
-        self._parameters = [(one, slice(int(a), int(b))) for one, a, b in zip(parameters, ends, ends[1:])]
+        ends = np.cumsum([0, *(len(kind.names) for kind in parameters)])
+        self._parameters = [(kind, slice(int(a), int(b))) for kind, a, b in zip(parameters, ends, ends[1:])]
         # Cameras do not depend on bodies: applied first, they are not applied again for every body.
         self._applied = sorted(self._parameters, key=lambda each: not isinstance(each[0], CameraExtrinsics))
         self._cache: dict[tuple[int, bytes], tuple[World, World]] = {}
@@ -58,14 +58,14 @@ class Worlds:
     def _chain(self, theta: NDArray) -> list[World]:
         """The worlds after each kind of parameters has been applied in turn."""
         world, out = self._first, []
-        for one, own in self._applied:
+        for kind, own in self._applied:
             values = theta[own]
             key = id(world), values.tobytes()
             cached = self._cache.pop(key, None)
             if cached is None:
                 if len(self._cache) >= _MAX_CACHED_WORLDS:
                     self._cache.pop(next(iter(self._cache)))
-                cached = world, one.apply(world, values)
+                cached = world, kind.apply(world, values)
             self._cache[key] = cached  # the latest last
             world = cached[1]
             out.append(world)
@@ -75,20 +75,20 @@ class Worlds:
     def touches(self) -> tuple[frozenset[int] | None, ...]:
         """(p,) for each parameter the only segments whose rows depend on it; None for any."""
         out: list[frozenset[int] | None] = []
-        for one, own in self._parameters:
-            out += getattr(one, "touches", (None,) * (own.stop - own.start))
+        for kind, own in self._parameters:
+            out += getattr(kind, "touches", (None,) * (own.stop - own.start))
         return tuple(out)
 
     @property
     def of_points(self) -> NDArray:
         """(p,) bool: parameters that move nothing but points and joints of the body."""
-        flags = [np.full(own.stop - own.start, getattr(one, "of_points", False)) for one, own in self._parameters]
+        flags = [np.full(own.stop - own.start, getattr(kind, "of_points", False)) for kind, own in self._parameters]
         return np.concatenate(flags)
 
     @property
     def cameras(self) -> list[tuple[CameraExtrinsics, slice]]:
         """Parameters of cameras, and their slice of all parameters."""
-        return [(one, own) for one, own in self._parameters if isinstance(one, CameraExtrinsics)]
+        return [(kind, own) for kind, own in self._parameters if isinstance(kind, CameraExtrinsics)]
 
     def moves(self, theta: NDArray, steps: NDArray, some: NDArray) -> PointMoves:
         """Derivatives of points by parameters that move nothing else; by differences if a kind has no slopes.
@@ -100,19 +100,19 @@ class Worlds:
         """
         chain = self._chain(theta)
         moving = [
-            (one, own, after.body) for (one, own), before, after in zip(self._applied, [self._first, *chain], chain)
+            (kind, own, after.body) for (kind, own), before, after in zip(self._applied, [self._first, *chain], chain)
             if after.body is not before.body
         ]  # fmt: skip
-        slopes: list[Any] = [getattr(one, "slopes", None) for one, _, _ in moving]
+        slopes: list[Any] = [getattr(kind, "slopes", None) for kind, _, _ in moving]
         if all(slopes):
             made = [(add_slopes, theta[own], own, body) for add_slopes, (_, own, body) in zip(slopes, moving)]
             return PointMoves.from_slopes(chain[-1].body, made, some, len(theta))
         worlds = self
-        of_bodies = [one for one, _ in self._parameters if not isinstance(one, CameraExtrinsics)]
-        if all(getattr(one, "of_points", False) for one in of_bodies):  # saves scaling surfaces that are not used
+        of_bodies = [kind for kind, _ in self._parameters if not isinstance(kind, CameraExtrinsics)]
+        if all(getattr(kind, "of_points", False) for kind in of_bodies):  # saves scaling surfaces that are not used
             if self._bare is None:
                 bare = replace(self._first.body, surfaces=(), morphs=(), skin=None)
-                self._bare = Worlds(replace(self._first, body=bare), [one for one, _ in self._parameters])
+                self._bare = Worlds(replace(self._first, body=bare), [kind for kind, _ in self._parameters])
             worlds = self._bare
         pairs = []
         for together in apart(self.touches, some):
@@ -218,8 +218,8 @@ class MatchedFrames:
                     blocks.append(np.full((len(rows), len(theta)), np.nan))
                     if matched.cameras is not None and isinstance(rows, Rows):
                         seen_by = matched.cameras[rows.group] if len(matched.cameras) else matched.cameras
-                        for one, own in self._worlds.cameras:
-                            blocks[-1][:, own] = one.columns(rows, world.rig, seen_by)
+                        for kind, own in self._worlds.cameras:
+                            blocks[-1][:, own] = kind.columns(rows, world.rig, seen_by)
                     if moves is None or matched.places is None or not isinstance(rows, Rows) or scene.morphing:
                         continue
                     there = scene.at_time(matched.time)

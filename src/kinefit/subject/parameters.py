@@ -312,14 +312,14 @@ def stacked(parameters: Sequence[Parameters]) -> tuple[tuple[str, ...], NDArray,
     ObservationError
         No parameters, or two of one name.
     """
-    names = tuple(name for one in parameters for name in one.names)
+    names = tuple(name for kind in parameters for name in kind.names)
     twice = sorted({name for name in names if names.count(name) > 1})
     if not names or twice:
         problem = f"two parameters named '{twice[0]}'" if twice else "no parameters to fit"
         raise ObservationError(problem, remedy="Give every kind of parameter once, such as SegmentScales(body).")
     information, first = np.zeros((len(names), len(names))), 0
-    for one in parameters:
-        own = slice(first, first := first + len(one.names))
-        information[own, own] = one.information
-    mean, step = (np.concatenate([getattr(one, what) for one in parameters]) for what in ("mean", "step"))
+    for kind in parameters:
+        own = slice(first, first := first + len(kind.names))
+        information[own, own] = kind.information
+    mean, step = (np.concatenate([getattr(kind, name) for kind in parameters]) for name in ("mean", "step"))
     return names, mean, information, step

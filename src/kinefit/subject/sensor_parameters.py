@@ -193,7 +193,7 @@ class CameraExtrinsics:
         return out
 
 
-def alike(a: Rig, b: Rig) -> bool:
+def same_cameras(a: Rig, b: Rig) -> bool:
     """Whether two rigs have the same cameras with the same poses."""
     return a.names == b.names and all(np.array_equal(c.T_camera_world, d.T_camera_world) for c, d in zip(a, b))
 

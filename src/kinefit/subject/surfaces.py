@@ -163,7 +163,7 @@ class Girths:
         """The body with these logarithms of girths (2 G,)."""
         size = np.zeros((len(self.body.scale_groups), 6))
         size[list(self._groups), :4] = np.tile(np.reshape(values, (-1, 2)), 2)
-        sizes = [tuple(one) for one in size.tolist()]
+        sizes = [tuple(row) for row in size.tolist()]
         surfaces = tuple(
             _shaped(s, sizes[self.body.segment_scale[s.segment]]) if isinstance(s, TaperedCylinder) else s
             for s in world.body.surfaces

@@ -139,9 +139,9 @@ def _point_rows(take: SeenFrames, keys: dict[tuple[str, str], int]) -> _PointRow
     K, C, L = len(x), len(channels.rig), len(points)
     A, X, r = np.zeros((L, K, C, 2, 3 * TERMS)), np.zeros((L, K, C, 2, 3)), np.zeros((L, K, C, 2))
     names = [(name, points.names[k]) for name, span in channels.sets.items() for k in range(span.start, span.stop)]
-    left = np.array([_right_of(point) != point for _, point in names])
+    is_left = np.array([_right_of(point) != point for _, point in names])
     axes = frames[:, trunks(body.tree)[points.segments], :9].reshape(K, L, 3, 3) @ np.where(
-        left[:, None, None], _MIRROR, np.eye(3)
+        is_left[:, None, None], _MIRROR, np.eye(3)
     )
     for c, camera in enumerate(channels.rig):
         in_camera = np.flatnonzero(channels.camera == c)
@@ -171,5 +171,5 @@ def _point_rows(take: SeenFrames, keys: dict[tuple[str, str], int]) -> _PointRow
 def _right_of(point: str) -> str:
     """Name of the right point of a pair."""
     other = mirror_name(point)
-    left = (point[:1] == "L" and other[:1] == "R") or "left" in point
-    return other if left else point
+    is_left = (point[:1] == "L" and other[:1] == "R") or "left" in point
+    return other if is_left else point

@@ -182,11 +182,11 @@ def _pixels(view: RenderedView, n: int, height: int, width: int) -> tuple[NDArra
     blocks, cosines = (
         a.reshape(height, n, width, n).swapaxes(1, 2).reshape(height, width, n * n) for a in (z, view.cosine)
     )
-    seen = np.isfinite(blocks)
-    weight = np.where(seen, 1.0 / np.where(seen, blocks, 1.0) ** 2, 0.0)
+    hit = np.isfinite(blocks)
+    weight = np.where(hit, 1.0 / np.where(hit, blocks, 1.0) ** 2, 0.0)
     total = np.maximum(weight.sum(axis=-1), 1e-12)
-    mean = np.where(seen, weight * np.where(seen, blocks, 0.0), 0.0).sum(axis=-1) / total
-    return np.where(2 * seen.sum(axis=-1) > n * n, mean, np.inf), (weight * cosines).sum(axis=-1) / total
+    mean = np.where(hit, weight * np.where(hit, blocks, 0.0), 0.0).sum(axis=-1) / total
+    return np.where(2 * hit.sum(axis=-1) > n * n, mean, np.inf), (weight * cosines).sum(axis=-1) / total
 
 
 def _edges(z: NDArray) -> NDArray:

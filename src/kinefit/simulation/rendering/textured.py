@@ -45,10 +45,10 @@ def textured_picture(
         problem = f"a grain of {grain} m, noise of {noise}"
         raise ObservationError(problem, remedy="Give metres, and noise of zero or more.")
     view = scene.view(frame, scaled(camera, _SAMPLES))
-    seen, segment = view.raster.seen, view.raster.segment
-    fine = np.full(seen.shape, _BACKGROUND_GREY, np.float32)
-    x = view.x_rest[seen] / grain + 17.0 * segment[seen][:, None]  # another texture for every segment
-    fine[seen] = _MEAN_GREY + _GREY_STD * _lattice(x)
+    visible, segment = view.raster.seen, view.raster.segment
+    fine = np.full(visible.shape, _BACKGROUND_GREY, np.float32)
+    x = view.x_rest[visible] / grain + 17.0 * segment[visible][:, None]  # another texture for every segment
+    fine[visible] = _MEAN_GREY + _GREY_STD * _lattice(x)
     image = cv2.resize(fine, camera.size, interpolation=cv2.INTER_AREA)
     random = np.random.default_rng([seed, frame, *camera.name.encode()])
     return np.clip(np.rint(image + noise * random.standard_normal(image.shape)), 0, 255).astype(np.uint8)

@@ -21,7 +21,7 @@ from kinefit.observations.arrays import is_number
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.checks import of_kind
 from kinefit.smoothing.online.known_noise import KnownNoise
-from kinefit.smoothing.online.lag_frame import Follows, FrameCosts, LagFrame
+from kinefit.smoothing.online.lag_frame import FrameCosts, LagFrame, TrackerLike
 from kinefit.smoothing.unwrap import boxes, continued
 from kinefit.solvers.closed import on_null_space, onto
 from kinefit.solvers.equations import block_diagonal
@@ -54,7 +54,7 @@ class FixedLag:
         The lag is less than a frame; `tracker` is no tracker.
     """
 
-    def __init__(self, tracker: Follows, lag: float, *, noise: KnownNoise | None = None) -> None:
+    def __init__(self, tracker: TrackerLike, lag: float, *, noise: KnownNoise | None = None) -> None:
         if not (isinstance(getattr(tracker, "body", None), Body) and is_number(lag)):
             problem = f"a lag of type {type(lag).__name__} behind a {type(tracker).__name__}"
             raise ObservationError(problem, remedy="Give a Tracker and seconds: FixedLag(tracker, 0.1).")

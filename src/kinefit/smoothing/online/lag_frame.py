@@ -25,7 +25,7 @@ from kinefit.smoothing.process_noise import MIN_INLIER_FACTOR
 from kinefit.solvers.equations import inverse, normal_equations
 
 
-class Follows(Protocol):
+class TrackerLike(Protocol):
     """The attributes of a tracker that smoothing needs."""
 
     @property
@@ -81,11 +81,11 @@ class FrameCosts:
 
     Parameters
     ----------
-    tracker : see `Follows`
+    tracker : see `TrackerLike`
     noise : KnownNoise
     """
 
-    def __init__(self, tracker: Follows, noise: KnownNoise) -> None:
+    def __init__(self, tracker: TrackerLike, noise: KnownNoise) -> None:
         self.tracker, self.noise, self.body = tracker, noise, tracker.body
         self._sigma: dict[int, tuple[Any, NDArray]] = {}
 

@@ -128,26 +128,26 @@ def fit_body_and_cameras(
         S, b = np.zeros((p + size, p + size)), np.zeros(p + size)
         S[:p, :p], b[:p] = shape_prior, shape_prior @ (model.mean - at.theta)
         S[p:, p:], b[p:] = points.S, points.b
-        kept = np.empty((len(systems), p + size + 1, n))
+        solutions = np.empty((len(systems), p + size + 1, n))
         for f, (H, g) in enumerate(systems):
             S += H[n:, n:]
             b += g[n:]
-            if not _kernels_linear.eliminate(H, g, n, damping, chain, depth, S, b, kept[f]):
-                kept[f] = 0.0
-        return np.tril(S) + np.tril(S, -1).T, b, kept, points
+            if not _kernels_linear.eliminate(H, g, n, damping, chain, depth, S, b, solutions[f]):
+                solutions[f] = 0.0
+        return np.tril(S) + np.tril(S, -1).T, b, solutions, points
 
     now, cost, damping = start, cost_of(start), 1e-3
     for _ in range(max_iterations):
         systems, before = systems_of(now), cost
         while damping < 1e5:
-            S, b, kept, points = reduced(systems, now, damping)
+            S, b, solutions, points = reduced(systems, now, damping)
             S[range(p, p + size), range(p, p + size)] += precision
             b[p:] -= precision * prior.departure(now.rig, now.offsets)
             delta = np.linalg.solve(S + damping * np.diag(np.diag(S)), b)
             by_camera = delta[p:].reshape(-1, COLUMNS)
             theta = now.theta + delta[:p]
             theta[:groups] = np.clip(theta[:groups], 0.2, 5.0)
-            moves = kept[:, -1] - delta @ kept[:, :-1]
+            moves = solutions[:, -1] - delta @ solutions[:, :-1]
             new = BundleState(
                 moved_rig(now.rig, by_camera), now.offsets + by_camera[:, TIME], theta,
                 [s.retract(m, (tree.lower, tree.upper)) for s, m in zip(now.states, moves, strict=True)],
