@@ -3,7 +3,7 @@
 Balls: Ehrig, Taylor, Duda, Heller, A survey of formal methods for determining the centre of rotation of ball joints,
 J Biomech 39 (2006), the symmetrical centre (SCoRE) if both segments have three markers, the geometric sphere fit if
 one has fewer. Hinges: the axis of both segments of the same authors' survey of 2007 (SARA), by the singular vectors of
-the mean relative rotation. `tracking.marker_subject` calibrates all joints of a body jointly, with proportions and
+the mean relative rotation. `markers.subject` calibrates all joints of a body jointly, with proportions and
 landmarks; these functions use one joint's motion alone.
 """
 
