@@ -168,7 +168,7 @@ def pixel_variance(
     roots, angles, owner, rest, cameras, camera, covariance,
     parents, dof_start, prismatic, axes, rest_joints, dof_parent, last_dof, out,
 ):  # fmt: skip
-    """Variance out (T, K, 2) [px²] along u and v of where points are seen, from covariances (T, n, n); NaN unseen."""
+    """Variance out (T, K, 2) [px²] along u and v of projected points, from covariances (T, n, n); NaN if invisible."""
     frames, screws = np.empty((parents.size, 12)), np.empty((axes.shape[0], 6))
     n = covariance.shape[1]
     index, row = np.empty(n, np.int64), np.empty((2, n))
