@@ -112,7 +112,7 @@ def point_columns(data, segment, group, frames, joints, places, out):
 
 @jit
 def camera_columns(data, camera, poses, first, out):
-    """Add to out (N, p): whitened derivatives of rows by the twist of each row's camera (N,).
+    """Write into out (N, p) the whitened derivatives of rows by the twist of each row's camera (N,).
 
     poses (C, 4, 4) of the world in the cameras, first (C,) column of each, -1 for one that stays.
     """
