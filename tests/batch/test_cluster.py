@@ -56,7 +56,7 @@ def test_workers_with_another_kinefit_are_refused(cluster, monkeypatch):
 
 def test_no_scheduler_is_told(monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("kinefit.batch.cluster._PATIENCE", 0.3)
+    monkeypatch.setattr("kinefit.batch.cluster._CONNECT_TIMEOUT", 0.3)
     with pytest.raises(ExportError, match="no scheduler answers"):
         results(jobs.square, [1], "tcp://127.0.0.1:9")
     with pytest.raises(ExportError, match="no scheduler answers"):

@@ -10,7 +10,7 @@ import pytest
 from kinefit import load_body
 from kinefit.bodies import BodyState
 from kinefit.frame.fit import FrameFit
-from kinefit.frame.trust import forgotten, holding, left_out, moving, observed
+from kinefit.frame.trust import dofs_moving, dofs_of_joints, observed, reset_to_prior, without_segments
 from kinefit.observations import KeypointFrame
 from kinefit.rows import DofRows, PairRows, ParameterRows, Rows
 from kinefit.sensors.points.keypoints import KeypointSensor
@@ -140,10 +140,10 @@ def test_degrees_of_freedom_of_a_lost_segment():
     lost[TREE.segment("shank_r")] = True
     names = np.array(["root"] * 6 + list(TREE.coordinates))
     leg = {"hip_flexion_r", "hip_adduction_r", "hip_rotation_r", "knee_angle_r"}
-    assert set(names[moving(TREE, lost)]) == leg | {"root"}
-    assert set(names[holding(TREE, lost)]) == leg
-    gone = holding(TREE, lost)
-    covariance = forgotten(TREE, np.full((TREE.n_dofs,) * 2, 0.01), gone)
+    assert set(names[dofs_moving(TREE, lost)]) == leg | {"root"}
+    assert set(names[dofs_of_joints(TREE, lost)]) == leg
+    gone = dofs_of_joints(TREE, lost)
+    covariance = reset_to_prior(TREE, np.full((TREE.n_dofs,) * 2, 0.01), gone)
     assert not covariance[np.ix_(gone, ~gone)].any() and (covariance[np.ix_(~gone, ~gone)] == 0.01).all()
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)[gone]), TREE.posture_std[gone[6:]])
 
@@ -152,11 +152,11 @@ def test_rows_of_segments_that_are_left_out_weigh_nothing():
     lost, one = np.array([False, True]), np.ones(2)
     segment, x = np.array([0, 1]), np.eye(3)[:2]
     rows = Rows.of(segment, x, x, one, one)
-    assert left_out(rows, lost).weight.tolist() == [1.0, 0.0] and rows.weight.tolist() == [1.0, 1.0]
+    assert without_segments(rows, lost).weight.tolist() == [1.0, 0.0] and rows.weight.tolist() == [1.0, 1.0]
     pairs = PairRows(np.array([[0, 1], [0, 0]]), x, x, x, one, one)
-    assert left_out(pairs, lost).weight.tolist() == [0.0, 1.0]
+    assert without_segments(pairs, lost).weight.tolist() == [0.0, 1.0]
     dense = DofRows(np.ones((2, 8)), one, one, segment, segment=segment)
-    assert left_out(dense, lost).weight.tolist() == [1.0, 0.0]
-    assert left_out(DofRows(np.ones((2, 8)), one, one, segment), lost).weight.tolist() == [1.0, 1.0]
+    assert without_segments(dense, lost).weight.tolist() == [1.0, 0.0]
+    assert without_segments(DofRows(np.ones((2, 8)), one, one, segment), lost).weight.tolist() == [1.0, 1.0]
     parameters = ParameterRows(segment, one, one)
-    assert left_out(parameters, lost) is parameters
+    assert without_segments(parameters, lost) is parameters

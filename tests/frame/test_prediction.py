@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.frame.prediction import Prediction, belief, forgetting
+from kinefit.frame.prediction import Prediction, marginal_information, prediction_row
 from kinefit.rows import ParameterRows
 from kinefit.solvers.equations import normal_equations
 
@@ -52,7 +52,7 @@ def test_belief_pulls_all_degrees_of_freedom_together():
     A = rng.normal(size=(N, N))
     information = A @ A.T
     state, there = BODY.usual_state(), BODY.usual_state().retract(0.01 * rng.normal(size=N))
-    row = belief(state, there, information)
+    row = prediction_row(state, there, information)
     assert isinstance(row, ParameterRows)
     equations = normal_equations(BODY, state, row)
     np.testing.assert_allclose(equations.matrix, information, atol=1e-12)
@@ -163,14 +163,14 @@ def test_forgetting_is_marginalising():
     rng = np.random.default_rng(4)
     A = rng.normal(size=(N, N + 3))
     information, lost = A @ A.T, rng.random(N) < 0.4
-    out, kept = forgetting(information, lost), ~lost
+    out, kept = marginal_information(information, lost), ~lost
     schur = information[np.ix_(kept, kept)] - information[np.ix_(kept, lost)] @ np.linalg.solve(
         information[np.ix_(lost, lost)], information[np.ix_(lost, kept)]
     )
     np.testing.assert_allclose(out[np.ix_(kept, kept)], schur, rtol=1e-6, atol=1e-8)
     assert not out[lost].any() and not out[:, lost].any()
-    np.testing.assert_allclose(forgetting(information, np.zeros(N, bool)), information, rtol=1e-6, atol=1e-8)
-    assert not forgetting(information, np.ones(N, bool)).any()
+    np.testing.assert_allclose(marginal_information(information, np.zeros(N, bool)), information, rtol=1e-6, atol=1e-8)
+    assert not marginal_information(information, np.ones(N, bool)).any()
 
 
 def test_a_crank_goes_on_where_a_knee_fades():

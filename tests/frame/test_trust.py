@@ -3,7 +3,7 @@
 import numpy as np
 
 from kinefit.bodies import load_body
-from kinefit.frame.trust import adrift
+from kinefit.frame.trust import unknown_joints
 
 TREE = load_body("humanoid").tree
 HAND, FOREARM, UPPERARM = (TREE.segments.index(f"{n}_r") for n in ("hand", "forearm", "upperarm"))
@@ -21,17 +21,18 @@ def flags(**frames):
 
 def test_between_two_segments_that_are_unknown_near_a_contradiction_a_joint_is_adrift():
     told = flags(lost={FOREARM: [4]}, hidden={HAND: slice(None), FOREARM: [2, 3, 5, 6, 7]})
-    out = adrift(TREE, *told, 2)
+    out = unknown_joints(TREE, *told, 2)
     assert np.flatnonzero(out[:, HAND]).tolist() == [2, 3, 4, 5, 6]
     assert not np.delete(out, HAND, axis=1).any()  # the upper arm is where it is thought to be
 
 
 def test_what_is_hidden_or_contradicted_alone_is_not():
-    assert not adrift(TREE, *flags(hidden={HAND: slice(None), FOREARM: slice(None), UPPERARM: slice(None)}), 2).any()
-    assert not adrift(TREE, *flags(lost={FOREARM: slice(None)}), 2).any()
+    hidden = {HAND: slice(None), FOREARM: slice(None), UPPERARM: slice(None)}
+    assert not unknown_joints(TREE, *flags(hidden=hidden), 2).any()
+    assert not unknown_joints(TREE, *flags(lost={FOREARM: slice(None)}), 2).any()
 
 
 def test_a_root_has_no_joint_of_its_own_but_its_place():
     lost = np.zeros((3, len(TREE.segments)), bool)
     lost[1, 0] = True
-    np.testing.assert_array_equal(adrift(TREE, lost, np.zeros_like(lost), 1)[:, 0], [False, True, False])
+    np.testing.assert_array_equal(unknown_joints(TREE, lost, np.zeros_like(lost), 1)[:, 0], [False, True, False])

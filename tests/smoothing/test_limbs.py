@@ -1,14 +1,14 @@
 """Degrees of freedom that go together."""
 
 from kinefit.bodies import load_body
-from kinefit.smoothing.limbs import alike, limbs
+from kinefit.smoothing.limbs import limbs, noise_groups
 
 BODY = load_body("humanoid")
 TREE = BODY.tree
 
 
 def test_degrees_of_freedom_are_grouped_by_name_and_by_limb():
-    same = alike(BODY)
+    same = noise_groups(BODY)
     assert same[6 + TREE.coordinate("knee_angle_r")] == same[6 + TREE.coordinate("knee_angle_l")]
     assert len(set(same[:3])) == len(set(same[3:6])) == 1 and same[0] != same[3]
     limb = limbs(BODY)[6:]

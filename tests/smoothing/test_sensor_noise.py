@@ -9,7 +9,7 @@ import pytest
 from kinefit import MarkerFrame, Recording
 from kinefit.bodies.surfaces import body_mesh, segment_middles
 from kinefit.frame.fit import rows_of
-from kinefit.frame.results import ANYWHERE
+from kinefit.frame.results import ROOT_PRIOR_STD
 from kinefit.geometry.camera import Rig
 from kinefit.rows import Rows
 from kinefit.sensors.base import Matched, rows_at
@@ -55,7 +55,7 @@ def test_information_and_lasting_errors_are_sums_over_rows_and_frames(tracked):
             J, w = design(body, scene.state, rows), rows.weight * squares_of(rows)[1]
             information += J.T @ (w[:, None] * J)
             posterior = np.linalg.inv(
-                information + block_diagonal(np.eye(6) / ANYWHERE**2, body.tree.posture_precision)
+                information + block_diagonal(np.eye(6) / ROOT_PRIOR_STD**2, body.tree.posture_precision)
             )
             left = 1.0 - np.sum((np.eye(len(J)) - J @ posterior @ (w[:, None] * J).T) ** 2, axis=1)
             for i, group in enumerate(rows.group):
@@ -73,7 +73,7 @@ def test_information_and_lasting_errors_are_sums_over_rows_and_frames(tracked):
         for (channel, axis), values in stated.items():
             mean = sum((of.get((channel, axis), np.zeros(n)) for of in near), np.zeros(n)) / len(near)
             shared[axis] += components.shared[0][axis] * mean
-            lasting = components.lasting[channel] ** 2
+            lasting = components.systematic[channel] ** 2
             lasting += unseen * max(np.mean(values) - lasting, 0.0)
             expected += lasting * np.outer(mean, mean)
         expected += shared.T @ shared

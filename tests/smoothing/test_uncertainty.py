@@ -13,7 +13,7 @@ from kinefit.sensors.layout import Layout
 from kinefit.sensors.settings import CameraErrors
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.smoothing.shared_errors import SharedErrors
-from kinefit.smoothing.uncertainty import Known, lasting
+from kinefit.smoothing.uncertainty import KeypointPriors, systematic_errors
 from kinefit.solvers.least_squares import levenberg_marquardt
 from kinefit.solvers.trajectory.variance_components import VarianceComponents
 from kinefit.subject.keypoints import fit_subject
@@ -50,10 +50,10 @@ def fit(body, channels, uv, weight, start):
 
 def covariance(scene, noise, Sigma=None, cameras=None):
     subject, channels, weight, state = scene
-    known, layout = Known.of(subject, channels, cameras), Layout(channels, subject.body)
+    known, layout = KeypointPriors.of(subject, channels, cameras), Layout(channels, subject.body)
     known = replace(known, covariance=np.zeros_like(known.covariance) if Sigma is None else Sigma)
     none = np.zeros((subject.body.tree.n_dofs,) * 2)  # no other sensors
-    return lasting(known, layout, state, weight, noise, SharedErrors.none(len(weight)), none, none)
+    return systematic_errors(known, layout, state, weight, noise, SharedErrors.none(len(weight)), none, none)
 
 
 def noise_of(channels, drift=0.0, shift=None):
@@ -131,16 +131,16 @@ def test_a_subject_of_other_cameras_tells_its_shape_and_nothing_of_these(scene):
     _, channels, _, _ = scene
     body = load_body("humanoid")
     other = fit_subject(body, channels, cameras=CameraErrors(0.003, 0.002))
-    mine = Known.of(other, channels, CameraErrors(0.003, 0.002))
+    mine = KeypointPriors.of(other, channels, CameraErrors(0.003, 0.002))
     assert mine.cameras is other.fit.cameras and mine.covariance.shape == other.covariance.shape
     names = tuple(f"other {name}" for name in RIG.names)
     elsewhere = replace(channels, rig=Rig(tuple(replace(c, name=n) for c, n in zip(RIG, names))))
-    known = Known.of(other, elsewhere, CameraErrors(0.003, 0.002))
+    known = KeypointPriors.of(other, elsewhere, CameraErrors(0.003, 0.002))
     assert known.cameras.free == names
     count = len(other.fit.mean) - 6 * len(RIG)
     np.testing.assert_array_equal(known.covariance[:count, :count], other.covariance[:count, :count])
     np.testing.assert_allclose(known.covariance[count:, count:], np.linalg.inv(known.cameras.information))
-    assert Known.of(other, elsewhere, None).cameras is None
+    assert KeypointPriors.of(other, elsewhere, None).cameras is None
 
 
 def test_nothing_seen_leaves_finite_bars(scene):

@@ -9,11 +9,11 @@ from tests.oracle import posture
 from kinefit.bodies import load_body
 from kinefit.correspondences.parameters import prior_rows
 from kinefit.correspondences.pixels import pixel_rows
-from kinefit.frame.prediction import belief
+from kinefit.frame.prediction import prediction_row
 from kinefit.losses import SQUARED, geman_mcclure, huber
 from kinefit.simulation import squat_and_wave, studio_rig
 from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.solvers.pixels import LIGHT, PixelPoints, fit_pixels
+from kinefit.solvers.pixels import INITIAL_DAMPING, PixelPoints, fit_pixels
 
 BODY = load_body("humanoid")
 RIG = studio_rig(squat_and_wave())
@@ -52,9 +52,9 @@ def test_it_takes_the_steps_of_levenberg_marquardt(loss, wrong, most):
         def rows(at):
             measured = np.where((weight > 0)[:, None], uv, np.nan)  # noqa: B023
             pixels = replace(pixel_rows(BODY, at, points, RIG, camera, measured, sigma=SIGMA), loss=loss)  # noqa: B023
-            return [pixels, belief(at, state, information), prior_rows(BODY, at)]  # noqa: B023
+            return [pixels, prediction_row(at, state, information), prior_rows(BODY, at)]  # noqa: B023
 
-        fit = levenberg_marquardt(BODY, state, rows, damping=LIGHT, **given)
+        fit = levenberg_marquardt(BODY, state, rows, damping=INITIAL_DAMPING, **given)
         found, H, g, cost, tried = fit_pixels(
             BODY, state, RIG, PixelPoints(points, camera, uv, weight, loss), (state, information), **given
         )

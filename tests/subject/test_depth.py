@@ -10,7 +10,7 @@ from kinefit.bodies.surfaces import TaperedCylinder, nearest
 from kinefit.errors import BodyError, ObservationError
 from kinefit.sensors.surfaces.depth_view import view_of
 from kinefit.subject.depth import fit_surfaces
-from kinefit.subject.surfaces import GIRTH
+from kinefit.subject.surfaces import GIRTH_STD
 
 CAMERA = camera()
 POSES = (facing(**ARMS), facing(yaw=-0.4, arm_add_l=-80, elbow_flex_l=30, arm_flex_r=40, hip_flexion_r=20))
@@ -66,7 +66,7 @@ def test_the_right_body_stays_and_what_is_unseen_keeps_its_prior():
     fit = fit_surfaces(BODY, clouds, POSES)
     assert max(abs(fit.value(f"length {name}")[0]) for name in ("trunk", "upperarm", "forearm")) < 0.04
     shank, upper = (fit.value(f"girth {name} b")[1] for name in ("shank", "upperarm"))
-    assert 0.7 * GIRTH < shank < 1.05 * GIRTH
+    assert 0.7 * GIRTH_STD < shank < 1.05 * GIRTH_STD
     assert upper < shank
     assert away(fit.body, clouds, fit.states) <= away(BODY, clouds, POSES) + 1e-4
 

@@ -17,11 +17,11 @@ from kinefit.rows import ParameterRows, Rows
 from kinefit.sensors.base import RowsOf, Unknown
 from kinefit.sensors.points.markers import MarkerMeasurement, MarkerSensor
 from kinefit.solvers.bundle.border_frames import differences
-from kinefit.subject.lasting import Seen, excess
+from kinefit.subject.excess import FrameRows, excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import (
-    KNOWN_SIZE,
-    UNKNOWN_SIZE,
+    KNOWN_SIZE_STD,
+    UNKNOWN_SIZE_STD,
     PointOffsets,
     SegmentScales,
     World,
@@ -34,10 +34,10 @@ from kinefit.subject.sensor_parameters import CameraExtrinsics, OwnUnknowns
 def test_lengths_follow_the_size():
     loose, known = SegmentScales(HUMANOID), SegmentScales(HUMANOID, size=1.1)
     covariance = np.linalg.inv(loose.information)
-    assert np.allclose(np.diag(covariance), 0.05**2 + UNKNOWN_SIZE**2)
-    assert np.allclose(covariance[0, 1:], UNKNOWN_SIZE**2)
+    assert np.allclose(np.diag(covariance), 0.05**2 + UNKNOWN_SIZE_STD**2)
+    assert np.allclose(covariance[0, 1:], UNKNOWN_SIZE_STD**2)
     assert np.allclose(known.mean, np.log(1.1))
-    assert np.linalg.inv(known.information)[0, 1] == pytest.approx(KNOWN_SIZE**2)
+    assert np.linalg.inv(known.information)[0, 1] == pytest.approx(KNOWN_SIZE_STD**2)
     longer = known.apply(World(HUMANOID, RIG), known.mean).body
     assert np.allclose(longer.tree.offsets, 1.1 * HUMANOID.tree.offsets)
     with pytest.raises(BodyError, match="size"):
@@ -180,7 +180,7 @@ def seen(sensor, parts, surface=False, channels=None):
     matched = RowsOf(None, channels=channels)
     object.__setattr__(matched, "sensor", sensor)
     object.__setattr__(matched, "of_points", not surface)
-    return Seen(matched, parts)
+    return FrameRows(matched, parts)
 
 
 def test_errors_that_last_are_told_from_fresh_ones():

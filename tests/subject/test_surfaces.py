@@ -16,7 +16,7 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.subject.fit import fit_subject
 from kinefit.subject.parameters import SegmentScales, World
-from kinefit.subject.surfaces import GIRTH, CylinderShape, Girths
+from kinefit.subject.surfaces import GIRTH_STD, CylinderShape, Girths
 
 BODY = load_body("humanoid")
 SHAPE = CylinderShape(BODY)
@@ -60,8 +60,8 @@ def test_girths_go_with_the_lengths_that_they_are_of():
         touched = girths.touches[girths.names.index("girth thigh a")]
         assert (s.segment in touched) == thigh
     covariance = np.linalg.inv(girths.information)
-    assert np.allclose(np.diag(covariance), GIRTH**2)
-    assert covariance[0, 1] == pytest.approx(0.5 * GIRTH**2)
+    assert np.allclose(np.diag(covariance), GIRTH_STD**2)
+    assert covariance[0, 1] == pytest.approx(0.5 * GIRTH_STD**2)
     with pytest.raises(BodyError, match="no cylinders"):
         Girths(replace(BODY, surfaces=()))
 

@@ -1,1 +1,1 @@
-"""Takes to folders of results: one, many on one machine, many on a cluster; and what a whole study shows."""
+"""Track takes into folders of results: one, many on one machine or a cluster; and summarise a study."""

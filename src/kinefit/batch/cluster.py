@@ -1,4 +1,4 @@
-"""Jobs on the workers of a Dask cluster (extra `cluster`)."""
+"""Run jobs on the workers of a Dask cluster (extra `cluster`)."""
 
 from __future__ import annotations
 
@@ -13,28 +13,27 @@ from kinefit.tracking.checkpoints.checkpoint import code_digest
 T = TypeVar("T")
 R = TypeVar("R")
 
-_PATIENCE = 15.0  # [s] until a scheduler must have answered
+_CONNECT_TIMEOUT = 15.0  # [s] for the scheduler to answer
 
 
 def run_there(
     do: Callable[[T], R], jobs: Sequence[T], *, address: str, retries: int
 ) -> Iterator[tuple[int, R | Failure]]:
-    """Do jobs on a cluster; yields the number of each with its result, as they end.
+    """Run jobs on a cluster; yields the number and result of each as it ends.
 
     Parameters
     ----------
     do : function of a module, which workers import
-    jobs : anything that can be pickled
+    jobs : arguments of the function, which are pickled
     address : of the scheduler, such as "tcp://host:8786"
-    retries : int, how often a job is tried again that raised an error; of one whose worker died, the scheduler decides
-        (`distributed.scheduler.allowed-failures`, 3 unless configured). A scheduler blames a death on all jobs that
-        the worker had been given, so each that is blamed too often is tried once more with none of the others beside
-        it: what kills a worker then stands alone.
+    retries : int, number of further trials of a job that raised an error. Jobs whose worker died are retried by the
+        scheduler (`distributed.scheduler.allowed-failures`, 3 by default). It counts a death against all jobs of the
+        worker, so each job that it gives up is run once more without the others.
 
     Raises
     ------
     ExportError
-        The extra "cluster" is not installed, no scheduler answers, or a worker has another kinefit.
+        The extra "cluster" is not installed, no scheduler answers, or a worker has another version of kinefit.
     """
     try:
         from distributed import Client
@@ -42,7 +41,7 @@ def run_there(
         remedy = "Install it: pip install 'kinefit[cluster]'."
         raise ExportError("a cluster needs the package distributed", place="--cluster", remedy=remedy) from error
     try:
-        client = Client(address, timeout=_PATIENCE, set_as_default=False)
+        client = Client(address, timeout=_CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, ValueError) as error:  # TimeoutError is an OSError
         remedy = "Start one with `dask scheduler`, workers with `dask worker ADDRESS --nthreads 1`."
         raise ExportError(f"no scheduler answers at {address}", place="--cluster", remedy=remedy) from error
@@ -66,7 +65,7 @@ def run_there(
 
 
 def _check_workers(client: Any, address: str) -> None:
-    """Refuse workers that would compute something else."""
+    """Raise an error if a worker runs another version of kinefit."""
     try:
         codes = client.run(code_digest)
     except Exception as error:
@@ -79,7 +78,7 @@ def _check_workers(client: Any, address: str) -> None:
 
 
 def _ended(client: Any, futures: list[Any]) -> Iterator[tuple[Any, Any]]:
-    """Futures as they end, each with its result or error."""
+    """Iterate over futures as they end, each with its result or error."""
     from distributed import as_completed
 
     return as_completed(futures, loop=client.loop, with_results=True, raise_errors=False)  # type: ignore[no-any-return]

@@ -1,4 +1,4 @@
-"""Which takes patterns mean, and where the results of each go."""
+"""Find take files by patterns, and the folder of results of each."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from kinefit.errors import FileError, KinefitError, command
 from kinefit.readers.take.find import is_take, takes_in
 
 RECORD = "batch.json"
-"""File in every folder of results of a batch: what was made there, and of what."""
+"""File in every folder of results of a batch: the take, its key, the files and the summary rows."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """Takes that patterns mean.
+    """Takes found by patterns.
 
     Parameters
     ----------
-    base : Path, folder in which all of them lie
-    takes : absolute paths, each once, in the order of their names
-    left_out : TOML files that match as well and are no takes, such as calibrations
+    base : Path, folder that contains all of them
+    takes : absolute paths, each once, ordered by name
+    left_out : TOML files that match too but are no takes, such as calibrations
     """
 
     base: Path
@@ -32,20 +32,20 @@ class Found:
     left_out: tuple[Path, ...]
 
     def label(self, take: Path) -> str:
-        """A take's path from the base on: no two takes have the same."""
+        """A take's path relative to the base, unique for each take."""
         return take.relative_to(self.base).as_posix()
 
     def folder(self, take: Path, out: Path) -> Path:
-        """Where the results of a take go: each has a folder of its own."""
+        """Folder of a take's results, one for each take."""
         return out / take.relative_to(self.base).with_name(f"{take.stem}-kinefit")
 
 
 def find_takes(patterns: Sequence[str | os.PathLike[str]]) -> Found:
-    """The take files that patterns such as "sessions/**/take.toml" mean.
+    """Find the take files of patterns such as "sessions/**/take.toml".
 
-    A file means itself; a folder every take.toml in it and below; a folder that a pattern matches its own take file.
-    TOML files that are no takes are left out, those that cannot be read are not: they are to be told. What lies in
-    results of an earlier batch is never taken.
+    A file stands for itself, a folder for every take.toml in it and below, a folder matched by a wildcard for its own
+    take file. TOML files that are no takes are excluded. Unreadable ones are included, so that their error is reported.
+    Files in results of an earlier batch are ignored.
 
     Raises
     ------
@@ -54,24 +54,24 @@ def find_takes(patterns: Sequence[str | os.PathLike[str]]) -> Found:
     """
     bases: list[Path] = []
     files: dict[Path, Path] = {}
-    left: dict[Path, Path] = {}
+    excluded: dict[Path, Path] = {}
     for pattern in patterns:
         base, hits = _matched(os.fspath(pattern))
         takes = [take for hit in hits for take in _takes_at(hit) if not _is_result(take, base)]
         good = [take for take in takes if _may_be_take(take)]
         if not good:
-            told = f"no take file among the {len(hits)} files and folders that match" if hits else "nothing matches"
+            problem = f"no take file among the {len(hits)} files and folders that match" if hits else "nothing matches"
             remedy = f"Name take files, such as 'sessions/**/take.toml'; one is written by {command('init')} FOLDER."
-            raise FileError(told, file=pattern, remedy=remedy)
+            raise FileError(problem, file=pattern, remedy=remedy)
         bases.append(base)
         files |= {take.resolve(): take for take in good}
-        left |= {take.resolve(): take for take in takes if take not in good}
+        excluded |= {take.resolve(): take for take in takes if take not in good}
     base = Path(os.path.commonpath(bases))
-    return Found(base, tuple(sorted(files.values())), tuple(sorted(left.values())))
+    return Found(base, tuple(sorted(files.values())), tuple(sorted(excluded.values())))
 
 
 def _matched(pattern: str) -> tuple[Path, list[Path]]:
-    """The folder before the first wildcard, and what matches, absolute."""
+    """The folder before the first wildcard, and the matching paths, all absolute."""
     path = Path(os.path.abspath(os.path.expanduser(pattern)))
     if path.is_dir():
         return path, sorted(path.glob("**/take.toml"))
@@ -91,7 +91,7 @@ def _takes_at(hit: Path) -> Iterable[Path]:
 
 
 def _is_result(take: Path, base: Path) -> bool:
-    """Whether it lies in the results of a batch, below the base."""
+    """Whether a file is in the results of a batch, below the base."""
     above = [folder for folder in take.parents if folder.is_relative_to(base)]
     return any((folder / RECORD).is_file() for folder in above)
 

@@ -1,4 +1,4 @@
-"""Many takes: each tracked into a folder of its own, and one summary of all."""
+"""Track many takes, each into its own folder of results, and write one summary."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from kinefit.batch.summary import write_summary
 from kinefit.batch.work import TakeJob, work
 from kinefit.errors import ExportError
 
-Told = Callable[[int, int, tuple[Row, ...]], None]
-"""Called with how many takes are done, how many there are, and the rows of the one that ended."""
+TakesProgress = Callable[[int, int, tuple[Row, ...]], None]
+"""Called with the number of takes that ended, the number of all takes, and the rows of the last one."""
 
 
 @checked
 def track_takes(
     patterns: str | PathLike[str] | Found | Sequence[str | PathLike[str]], out: str | PathLike[str], *,
     choices: Choices | None = None, workers: int = 1, cluster: str | None = None, retries: int = 2,
-    progress: Told | None = None,
+    progress: TakesProgress | None = None,
 ) -> tuple[Row, ...]:  # fmt: skip
-    """Track takes that are independent of each other, in processes of this machine or on a cluster.
+    """Track independent takes, in processes of this machine or on a cluster.
 
-    A take that fails stops no other: its error stands in its row. One that an earlier run has done, of the same files
-    and with the same choices, is not done again; one that was stopped goes on. How takes are split over workers
-    changes no bit of the results. In a script, call it below `if __name__ == "__main__":`, as workers import it.
+    A take that fails does not stop the others: its error is in its row. Takes that an earlier run finished, with the
+    same files and choices, are not tracked again; interrupted ones continue. Results do not depend on the number of
+    workers. In a script, call it below `if __name__ == "__main__":`, since workers import the script.
 
     Parameters
     ----------
-    patterns : such as "sessions/**/take.toml", see `find_takes`; or what that found
+    patterns : such as "sessions/**/take.toml", see `find_takes`; or the result of that function
     out : folder of all results and of the summary
-    choices : Choices, what is made of each take
-    workers : int, processes of this machine; each has one thread for linear algebra
+    choices : Choices of results for each take
+    workers : int, number of processes on this machine; each uses one thread for linear algebra
     cluster : address of a Dask scheduler instead, such as "tcp://host:8786"; takes and `out` must be on a file system
         that its workers share, under the same paths
-    retries : int, how often a take is tried again whose worker died or met a fault that is not the take's
+    retries : int, number of further trials of a take whose worker died or raised an unexpected error
     progress : called as takes end
 
     Returns
@@ -52,7 +52,7 @@ def track_takes(
     FileError
         Nothing matches.
     ExportError
-        No workers, or a cluster that cannot be used; the summary cannot be written.
+        `workers` is below 1 or `retries` below 0; the cluster cannot be used; the summary cannot be written.
     """
     if workers < 1 or retries < 0:
         problem = f"{workers} workers, {retries} retries"

@@ -1,4 +1,4 @@
-"""One take into a folder of results: what is made of it, who is in it, and each of them tracked and written."""
+"""Track one take into a folder of results: find its people, track each, and write the results."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kinefit.batch.results import USUAL, Step, write_overlays, write_results
+from kinefit.batch.results import DEFAULT_FORMATS, Step, write_overlays, write_results
 from kinefit.errors import KinefitError, TakeError
 
 if TYPE_CHECKING:
@@ -19,23 +19,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Choices:
-    """What is made of a take.
+    """Choices of results for a take.
 
     Parameters
     ----------
     formats : of `results.NAMES`
-    overlays : bool, whether the fit is drawn on every video
+    overlays : bool, whether overlay videos are written
     report : bool, whether report.html is written
-    pictures : what report and overlays show of the videos: "full" or "none"
-    smooth : bool, whether each frame knows the whole take
-    contacts : bool, whether soles that rest on a level floor are held still
+    pictures : images in report and overlays: "full" or "none"
+    smooth : bool, whether the whole take is smoothed
+    contacts : bool, whether soles on a level floor are constrained to rest
     lag : float [s], see `track`
-    person : who is followed; None: whom the take names, else everybody in view
-    restart : bool, whether what an earlier run left is forgotten
-    hide_faces : bool, whether everybody's face is hidden in what is shown of the videos, as the take may say, too
+    person : target person; None: the one that the take names, else every person in view
+    restart : bool, whether an unfinished earlier run is discarded
+    hide_faces : bool, whether all faces are hidden in images; a take may set it too
     """
 
-    formats: tuple[str, ...] = USUAL
+    formats: tuple[str, ...] = DEFAULT_FORMATS
     overlays: bool = True
     report: bool = True
     pictures: str = "full"
@@ -54,13 +54,13 @@ class Choices:
 
 @dataclass(frozen=True, eq=False)
 class TrackedPerson:
-    """What came of one person of a take.
+    """The tracked motion of one person of a take.
 
     Parameters
     ----------
     motion : Motion
-    notes : sentences that the user should read
-    total : int, how many frames there are where Ctrl-C left some of them out; else 0
+    notes : sentences for the user
+    total : int, number of frames of the take if Ctrl-C stopped the run before the last; else 0
     """
 
     motion: Motion
@@ -69,12 +69,12 @@ class TrackedPerson:
 
 
 def asked_take(path: Path, choices: Choices) -> Take:
-    """A take file with the person that the choices name.
+    """Read a take file, with the choices' person and hidden faces.
 
     Raises
     ------
     KinefitError
-        What is wrong with the take, or with the person named.
+        The take or the named person is invalid.
     """
     from kinefit.readers.take.checks import check_enough, check_take
     from kinefit.readers.take.file import read_take
@@ -85,27 +85,28 @@ def asked_take(path: Path, choices: Choices) -> Take:
         take = replace(take, person=choices.person)
         try:
             check_take(take)
-        except KinefitError as error:  # of this option: the take alone is right
+        except KinefitError as error:  # the option's fault: the take alone is valid
             raise type(error)(error.problem, place="--person", remedy=error.remedy) from None
     check_enough(take)
     return take
 
 
 def check_drawable(take: Take) -> None:
-    """Refuse overlays of a take that has nothing to draw on.
+    """Check that a take has images for overlays.
 
     Raises
     ------
     TakeError
+        It has neither videos nor depth.
     """
     if not (take.depth or any(camera.video for camera in take.cameras)):
         raise TakeError("overlays, but no video or depth to draw on", file=take.path, remedy="Leave --overlays out.")
 
 
 def people_of(take: Take, out: Path, step: Step, tell: Tell) -> tuple[InView | None, list[tuple[Take, Path]]]:
-    """Who is to be tracked: what the cameras saw, and a take and a folder of results for each person.
+    """Find the people to track: the people in view (None if the take names one), and a take and a folder for each.
 
-    Keypoints are detected, cameras found and bodies fetched first, where the take needs them.
+    If the take needs it, keypoints are detected, cameras calibrated and bodies downloaded first.
     """
     from kinefit.calibration.people.of_take import find_cameras
     from kinefit.preparing.take import prepared
@@ -124,14 +125,14 @@ def people_of(take: Take, out: Path, step: Step, tell: Tell) -> tuple[InView | N
 def track_person(
     take: Take, out: Path, choices: Choices, *, view: InView | None, step: Step, tell: Tell, files: dict[str, Path],
 ) -> TrackedPerson:  # fmt: skip
-    """Track one person of a take and write what comes of it; enter into `files` what is there, one after the other.
+    """Track one person of a take and write the results; written files are added to `files`.
 
-    A run that was stopped is gone on with (`out/unfinished`), unless the choices say to restart.
+    An interrupted run (`out/unfinished`) is continued, unless the choices restart it.
 
     Raises
     ------
     KinefitError
-        What tracking and writing raise.
+        Tracking or writing fails.
     """
     from kinefit.batch.report import provenance, write_track_report
     from kinefit.findings import CLOCKS, STATURE

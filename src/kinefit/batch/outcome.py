@@ -1,4 +1,4 @@
-"""The outcome of each person of each take, as the summary's tables list it."""
+"""Records of the summary's tables: one row for each person of each take, with ranges of motion."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ DONE, FAILED = "done", "failed"
 
 
 class Range(msgspec.Struct, frozen=True):
-    """How far one angle moved [deg], as the report tells it.
+    """Range of motion of one angle [deg], as in the report.
 
     Parameters
     ----------
     coordinate : name without its side
-    side : "left", "right" or "" for the body's middle
-    lowest, highest, span : float; None where it was observed in no two frames
-    twice : float, two standard deviations of the span
-    share : of the frames in which it was observed
+    side : "left", "right" or "" for a midline angle
+    lowest, highest, span : float [deg]; None if the angle is observed in fewer than two frames
+    twice : float [deg], two standard deviations of the span
+    share : of the frames in which it is observed
     """
 
     coordinate: str
@@ -35,15 +35,15 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
 
     Parameters
     ----------
-    take : path of the take file from the folder of all takes on
-    person : int, which of several; 0 where the take was not parted by people
-    subject, visit, date, movement : as `[session]` states them
-    folder : of the results, from the summary on; "" where there are none
+    take : path of the take file relative to the folder of all takes
+    person : int, number of the person; 0 if the take has one
+    subject, visit, date, movement : from the take's `[session]`
+    folder : of the results, relative to the summary; "" if there are none
     frames : int
-    seconds, quality, lost : float; mean quality, and the share of segments and frames that are lost; None if failed
+    seconds, quality, lost : float [s], mean quality, and share of lost segments over all frames; None if failed
     status : "done" or "failed"
-    error : what went wrong
-    notes : what the command says besides
+    error : message of the error
+    notes : sentences for the user
     findings : faults of the inputs
     ranges : tuple of Range
     """
@@ -67,5 +67,5 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def failed(row: Row, error: str) -> Row:
-    """A row of what went wrong."""
+    """The row with the status "failed" and an error."""
     return msgspec.structs.replace(row, status=FAILED, error=error)

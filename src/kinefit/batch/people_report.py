@@ -1,4 +1,4 @@
-"""One page over all people of a take: who they are, how far to trust each, and the way to each one's report."""
+"""Report page of a take with several people: outcome of each, with a link to each one's report."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ if TYPE_CHECKING:
 
 
 def write_people_report(rows: Sequence[Row], folder: Path, *, pictures: bool) -> Path:
-    """Write report.html into the folder of a take of several people; their results lie in `person-K` beside it.
+    """Write report.html into the folder of a take with several people, whose results are in its folders `person-K`.
 
     Parameters
     ----------
-    rows : one a person, those who failed too
+    rows : one for each person, failed ones included
     folder : of the take's results
-    pictures : bool, whether each one's montage, which this run drew, is shown
+    pictures : bool, whether each person's montage is shown
 
     Raises
     ------
     ExportError
-        It cannot be written.
+        The page cannot be written.
     """
     from kinefit.exporters.atomic import write_text
     from kinefit.exporters.report import page as p
 
     done = [row for row in rows if row.status == DONE]
-    told = f"{len(done)} of {len(rows)} people in view were tracked; each has results and a report of their own."
+    text = f"{len(done)} of {len(rows)} people in view were tracked; each has results and a report of their own."
     parts: list[p.Section | str] = [
-        *fault_boxes(rows), p.callout("good" if len(done) == len(rows) else "warning" if done else "bad", told),
+        *fault_boxes(rows), p.callout("good" if len(done) == len(rows) else "warning" if done else "bad", text),
         _people(rows, folder),
     ]  # fmt: skip
     parts += [p.section(f"Person {row.person}", *_person(row, folder, pictures)) for row in rows]
@@ -51,13 +51,13 @@ def _people(rows: Sequence[Row], folder: Path) -> Html:
 
 
 def _person(row: Row, folder: Path, pictures: bool) -> list[str]:
-    """The picture of all cameras, and what the command says."""
+    """The montage of all cameras, the error and the notes of one person, and a link to the report."""
     from kinefit._pictures import read_picture
     from kinefit.exporters.report import page as p
 
     montage = folder / row.folder / "montage.png"
-    there = pictures and row.folder and montage.is_file()
-    parts: list[str] = [p.picture(read_picture(montage), width=1400)] if there else []
+    has_montage = pictures and row.folder and montage.is_file()
+    parts: list[str] = [p.picture(read_picture(montage), width=1400)] if has_montage else []
     if row.error:
         parts.append(p.callout("bad", row.error))
     if row.notes:

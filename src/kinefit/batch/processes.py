@@ -1,4 +1,4 @@
-"""Jobs on the processes of one machine: one that dies is replaced, and its job tried again."""
+"""Run jobs in processes of one machine; a process that dies is replaced, and its job is retried."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-"""One of each in every worker, unless the user set another number: workers share the cores."""
+"""Set to 1 in every worker, unless the user set another number: workers share the cores."""
 
 
 class Failure(str):
-    """Why a job has no result: what went wrong in its last trial."""
+    """Error message of a job's last trial, in place of its result."""
 
 
 def run_here(
     do: Callable[[T], R], jobs: Sequence[T], *, workers: int, retries: int
 ) -> Iterator[tuple[int, R | Failure]]:
-    """Do jobs in so many processes; yields the number of each with its result, as they end.
+    """Run jobs in worker processes; yields the number and result of each as it ends.
 
     Parameters
     ----------
     do : function of a module, which workers import
-    jobs : anything that can be pickled
-    workers : int, processes, each of which does one job at a time
-    retries : int, how often a job is tried again that raised an error or whose process died
+    jobs : arguments of the function, which are pickled
+    workers : int, number of processes, each with one job at a time
+    retries : int, number of further trials of a job that raised an error or whose process died
     """
     waiting, tries = deque(range(len(jobs))), [0] * len(jobs)
     idle: list[_Worker] = []
@@ -71,11 +71,11 @@ class _Worker:
     def give(self, job: Any) -> None:
         try:
             self.pipe.send(job)
-        except OSError:  # it has died: `result` finds that out
+        except OSError:  # the process died; `result` reports it
             pass
 
     def result(self) -> tuple[Any, bool]:
-        """What came of its job, and whether it can do another."""
+        """Result of the worker's job, and whether the worker is alive."""
         try:
             return self.pipe.recv(), True
         except (EOFError, OSError):
@@ -92,7 +92,7 @@ class _Worker:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """An environment for a process that starts, of which numerical libraries read the number of threads."""
+    """Set the number of threads of numerical libraries in the environment of a new process."""
     added = [name for name in _THREADS if name not in os.environ]
     os.environ.update(dict.fromkeys(added, "1"))
     try:
@@ -103,8 +103,8 @@ def _one_thread() -> Iterator[None]:
 
 
 def _serve(pipe: Connection, do: Callable[[Any], Any]) -> None:
-    """Do jobs until there are no more; end at once where the process that gives them has died."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is theirs to stop
+    """Run jobs until there are no more; exits at once if the parent process dies."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     threading.Thread(target=_end_with_parent, daemon=True).start()
     while True:
         try:

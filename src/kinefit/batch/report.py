@@ -1,4 +1,4 @@
-"""The report of a track: its pictures from the videos, what was done, report.html."""
+"""Write report.html of a tracked take: images from the videos, and provenance."""
 
 from __future__ import annotations
 
@@ -26,18 +26,21 @@ def write_track_report(
     motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path],
     pictures: str = "full", notes: Iterable[str] = (),
 ) -> None:  # fmt: skip
-    """Write report.html into a folder of results, with links to what lies there already; enter it into `files`.
+    """Write report.html into a folder of results, with links to `files`; it is added to them.
 
-    `pictures` are "full" or "none"; `notes` are what the command says, too.
+    Parameters
+    ----------
+    pictures : "full" or "none"
+    notes : sentences for the user
     """
-    from kinefit.batch.results import ABOUT
+    from kinefit.batch.results import DESCRIPTIONS
     from kinefit.exporters.report.norms import read_norms
     from kinefit.exporters.report.report import write_report
 
     norms = read_norms(take.session.norms) if take.session.norms else None
     shown = {} if pictures == "none" else take_pictures(motion, take, seen, step)
     step("report", 0, 1)
-    links = {path.relative_to(folder).as_posix(): ABOUT.get(name, name) for name, path in files.items()}
+    links = {path.relative_to(folder).as_posix(): DESCRIPTIONS.get(name, name) for name, path in files.items()}
     files["report"] = write_report(
         motion, folder / "report.html", rig=seen.rig, pictures=shown, files=links, norms=norms,
         findings=[("warning", f"{note}.", "") for note in notes],
@@ -48,9 +51,9 @@ def write_track_report(
 def take_pictures(
     motion: Motion, take: Take, seen: Observations, step: Step
 ) -> dict[str, dict[int, NDArray[np.uint8]]]:
-    """{camera: {frame: picture of the person with the fit drawn on it}} of the frames that a report shows.
+    """{camera: {frame: image (H, W, 3) of the person with the fit drawn on it}} of the frames that a report shows.
 
-    Frames that a video does not reach are left out.
+    Frames outside a camera's video are omitted.
     """
     from kinefit.batch.results import _residuals
     from kinefit.exporters.report.pictures import close_up, report_frames
@@ -75,9 +78,9 @@ def take_pictures(
 
 
 def provenance(take: Take, **more: Any) -> dict[str, Any]:
-    """What a track of a take was made from, as `Motion.provenance` holds it: files, standard deviations, versions.
+    """Provenance of a tracked take, for `Motion.provenance`: files, standard deviations, versions.
 
-    `more` is what else is to be reported, such as smoothing={...} or tracking={...}.
+    `more` are further entries, such as smoothing={...} or tracking={...}.
     """
     out: dict[str, Any] = {
         "kinefit": metadata.version("kinefit"),

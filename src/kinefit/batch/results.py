@@ -1,4 +1,4 @@
-"""Results of one motion into a folder: every format, overlay videos, a picture of all cameras."""
+"""Write the results of one motion into a folder: formats, overlay videos, a montage of all cameras."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ if TYPE_CHECKING:
     from kinefit.readers.take.load import Observations
 
 Step = Callable[[str, int, int], None]
-"""Called with what is done, how much of it is done, and how much there is (0: unknown)."""
+"""Called with the name of the work, the number of steps done, and the number of all steps (0: unknown)."""
 
 NAMES = {
     "motion": "motion.npz", "csv": "tables", "bvh": "motion.bvh", "glb": "motion.glb", "trc": "motion.trc",
     "mot": "motion.mot", "osim": "body.osim", "parquet": "tables", "c3d": "motion.c3d", "usd": "motion.usdc",
     "x3d": "motion.x3d", "nwb": "motion.nwb", "mcap": "motion.mcap", "rrd": "motion.rrd", "jsonl": "motion.jsonl",
 }  # fmt: skip
-"""What each format is called in a folder of results."""
+"""File or folder of each format in a folder of results."""
 
-USUAL = ("motion", "csv", "bvh", "glb", "trc", "mot", "osim")
-"""Formats that are written where none are named."""
+DEFAULT_FORMATS = ("motion", "csv", "bvh", "glb", "trc", "mot", "osim")
+"""Formats that are written by default."""
 
-ABOUT = {
+DESCRIPTIONS = {
     "motion": "everything, for kinefit export and kinefit.read_motion",
     "csv": "tables of angles, joint centres, landmarks, quality, residuals",
     "parquet": "the same tables as Parquet",
@@ -44,11 +44,11 @@ ABOUT = {
     "montage": "one picture of all cameras",
     "report": "what came out and how far to trust it, on one page for a browser",
 }
-"""What each is for."""
+"""Use of each kind of result."""
 
 
 def write_format(motion: Motion, format: str, path: Path, **options: Any) -> None:
-    """Write a motion in one of the formats of `NAMES`; options are those of its exporter."""
+    """Write a motion in one of the formats of `NAMES`, with options of its exporter."""
     from kinefit import exporters
 
     writers: dict[str, Callable[..., Any]] = {
@@ -63,7 +63,7 @@ def write_format(motion: Motion, format: str, path: Path, **options: Any) -> Non
 
 
 def write_results(motion: Motion, folder: Path, formats: Iterable[str], step: Step, files: dict[str, Path]) -> None:
-    """Write a motion in several formats; enter into `files` what is there, one after the other."""
+    """Write a motion in several formats; written files are added to `files`."""
     from kinefit._mapped import release
 
     formats = tuple(formats)
@@ -79,7 +79,7 @@ def write_results(motion: Motion, folder: Path, formats: Iterable[str], step: St
 def write_overlays(
     motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path]
 ) -> None:  # fmt: skip
-    """Write overlay videos of all cameras and depth sensors, and one picture; enter what is there into `files`."""
+    """Write overlay videos of all cameras and depth sensors, and a montage; written files are added to `files`."""
     import numpy as np
 
     from kinefit.exporters import depth_picture, draw_overlay, write_depth_overlay, write_montage, write_overlay
@@ -119,6 +119,6 @@ def write_overlays(
 
 
 def _residuals(motion: Motion, camera: str) -> Residuals | None:
-    """Of a camera; of the first of its detectors where it has several."""
+    """Residuals of a camera's first detector; None if it has none."""
     labels = [label for label in motion.residuals if label == camera or label.startswith(f"{camera} ")]
     return motion.residuals[labels[0]] if labels else None

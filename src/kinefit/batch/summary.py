@@ -1,4 +1,4 @@
-"""What a whole study shows: tables of takes and of ranges of motion, and one page over subjects and sessions."""
+"""Summary of a study: tables of takes and of ranges of motion, and one page over subjects and sessions."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ if TYPE_CHECKING:
     from kinefit.batch.outcome import Range
     from kinefit.exporters.report.page import Html
 
-_WHO = ("take", "person", "subject", "visit", "date", "movement")
-_ROW = (*_WHO, "frames", "seconds", "quality", "lost share", "status", "error", "faults", "folder")
-_RANGE = (
-    *_WHO, "coordinate", "side", "lowest [deg]", "highest [deg]", "range [deg]", "range 2 std [deg]", "observed share",
+_ID_COLUMNS = ("take", "person", "subject", "visit", "date", "movement")
+_TAKE_COLUMNS = (*_ID_COLUMNS, "frames", "seconds", "quality", "lost share", "status", "error", "faults", "folder")
+_RANGE_COLUMNS = (
+    *_ID_COLUMNS, "coordinate", "side", "lowest [deg]", "highest [deg]", "range [deg]", "range 2 std [deg]",
+    "observed share",
 )  # fmt: skip
 
 
@@ -36,32 +37,32 @@ def write_summary(rows: Sequence[Row], folder: Path) -> None:
 
     if not rows:
         raise ExportError("no take to summarise", file=folder, remedy="Name takes by a pattern that matches some.")
-    table = [(*_who(row), row.frames or "", *map(_number, (row.seconds, row.quality, row.lost)), row.status, row.error,
+    table = [(*_ids(row), row.frames or "", *map(_number, (row.seconds, row.quality, row.lost)), row.status, row.error,
               " ".join(found.text for found in row.findings), row.folder) for row in rows]  # fmt: skip
     ranges = [
-        (*_who(row), one.coordinate, one.side, *map(_number, (one.lowest, one.highest, one.span, one.twice, one.share)))
-        for row in rows for one in row.ranges
+        (*_ids(row), r.coordinate, r.side, *map(_number, (r.lowest, r.highest, r.span, r.twice, r.share)))
+        for row in rows for r in row.ranges
     ]  # fmt: skip
-    write_text(folder / "summary.csv", _csv(_ROW, table))
-    write_text(folder / "ranges.csv", _csv(_RANGE, ranges))
+    write_text(folder / "summary.csv", _csv(_TAKE_COLUMNS, table))
+    write_text(folder / "ranges.csv", _csv(_RANGE_COLUMNS, ranges))
     write_text(folder / "summary.html", summary_page(rows, folder))
 
 
 def summary_page(rows: Sequence[Row], folder: Path) -> str:
-    """The text of summary.html, whose links lead to the reports below `folder`."""
+    """HTML of summary.html, with links to the reports below `folder`."""
     from kinefit.exporters.report import page as p
 
     done = [row for row in rows if row.status == DONE]
     takes, bad = len({row.take for row in rows}), len({row.take for row in rows if row.status != DONE})
     named = len({row.subject for row in rows if row.subject})
-    told = f"{takes - bad} of {takes} takes are done; {named} subjects are named."
+    text = f"{takes - bad} of {takes} takes are done; {named} subjects are named."
     parts: list[p.Section | str] = [
         *fault_boxes(rows),
-        p.callout("bad" if not done else "warning" if bad else "good", told),
+        p.callout("bad" if not done else "warning" if bad else "good", text),
         p.section("Takes", _takes(rows, folder)),
     ]
     if done:
-        parts += [p.section("Range of motion", p.paragraph(_ABOUT, small=True), by_joint(done))]
+        parts += [p.section("Range of motion", p.paragraph(_RANGES_NOTE, small=True), by_joint(done))]
     notes = [(row.take, _person(row), note) for row in rows for note in row.notes]
     if notes:
         parts.append(p.section("Notes", p.table(("take", "person", "note"), notes, first_left=3)))
@@ -69,7 +70,7 @@ def summary_page(rows: Sequence[Row], folder: Path) -> str:
 
 
 def fault_boxes(rows: Iterable[Row]) -> list[Html]:
-    """A box for each fault of the inputs, with the take and the person that it is about."""
+    """A callout for each fault of the inputs, with its take and person."""
     from kinefit.exporters.report.findings import finding_callout
 
     return [
@@ -78,7 +79,7 @@ def fault_boxes(rows: Iterable[Row]) -> list[Html]:
     ]  # fmt: skip
 
 
-_ABOUT = (
+_RANGES_NOTE = (
     "Degrees, as the report of each take has them: highest less lowest angle, ± two standard deviations. Subjects and "
     "sessions: mean over takes, and the standard deviation between them (of the takes, not of the measurement) where "
     "there are two or more. * marks takes in which the angle was not observed all the time."
@@ -96,7 +97,7 @@ def _takes(rows: Sequence[Row], folder: Path) -> Html:
         report = f"{row.folder}/report.html"
         linked = p.file_link(report, row.take) if row.folder and (folder / report).is_file() else row.take
         cells.append((linked, _person(row), row.subject, row.visit, row.date, row.movement, *outcome(row), row.error))
-    columns = ("take", "person", *_WHO[2:], *OUTCOME, "error")
+    columns = ("take", "person", *_ID_COLUMNS[2:], *OUTCOME, "error")
     return p.table(columns, cells, first_left=7)
 
 
@@ -104,7 +105,7 @@ OUTCOME = "status", "frames", "seconds", "quality", "lost"
 
 
 def outcome(row: Row) -> tuple[str, ...]:
-    """The cells of `OUTCOME`, empty where a row failed."""
+    """The cells of the columns `OUTCOME`; apart from the status empty for a failed row."""
     from kinefit.exporters.report import page as p
 
     quality = "" if row.quality is None else p.shaded(f"{row.quality:.2f}", 1.0 - row.quality)
@@ -113,18 +114,18 @@ def outcome(row: Row) -> tuple[str, ...]:
 
 
 def by_joint(rows: Sequence[Row]) -> Html:
-    """A menu of coordinates: each over takes, and over subjects and sessions."""
+    """A menu of coordinates, each with tables of ranges by take, and by subject and session."""
     from kinefit.exporters.report import page as p
     from kinefit.exporters.report.names import spoken
 
-    names = list(dict.fromkeys(one.coordinate for row in rows for one in row.ranges))
+    names = list(dict.fromkeys(r.coordinate for row in rows for r in row.ranges))
     pages = {}
     for name in names:
-        of = [(row, {one.side: one for one in row.ranges if one.coordinate == name}) for row in rows]
-        sides = ("",) if any("" in found for _, found in of) else ("left", "right")
+        by_row = [(row, {r.side: r for r in row.ranges if r.coordinate == name}) for row in rows]
+        sides = ("",) if any("" in ranges for _, ranges in by_row) else ("left", "right")
         head = ["range"] if sides == ("",) else ["left range", "right range", "left less right"]
-        takes = [(row.take, _person(row), row.subject, row.visit, *_cells(found, sides)) for row, found in of]
-        groups = _groups(of, sides)
+        takes = [(row.take, _person(row), row.subject, row.visit, *_cells(ranges, sides)) for row, ranges in by_row]
+        groups = _groups(by_row, sides)
         pages[spoken(name).capitalize()] = p.joined(
             p.table(("take", "person", "subject", "visit", *head), takes, first_left=4),
             p.table(("subject", "visit", "date", "takes", *head), groups, first_left=3, caption=_GROUPED),
@@ -132,40 +133,40 @@ def by_joint(rows: Sequence[Row]) -> Html:
     return p.chooser("Angle", pages)
 
 
-def _cells(found: dict[str, Range], sides: Sequence[str]) -> list[str]:
+def _cells(ranges: dict[str, Range], sides: Sequence[str]) -> list[str]:
     """Range of each side, and their difference."""
-    from kinefit.exporters.report.ranges import told
+    from kinefit.exporters.report import ranges as report_ranges
 
-    def cell(one: Range | None) -> str:
-        if one is None or one.span is None or one.twice is None:
+    def cell(r: Range | None) -> str:
+        if r is None or r.span is None or r.twice is None:
             return "not observed"
-        return told(one.span, one.twice) + ("" if one.share > 0.995 else "*")
+        return report_ranges.told(r.span, r.twice) + ("" if r.share > 0.995 else "*")
 
-    out = [cell(found.get(side)) for side in sides]
+    out = [cell(ranges.get(side)) for side in sides]
     if len(sides) == 2:
-        less = _difference(found)
-        out.append("–" if less is None else told(*less))
+        difference = _difference(ranges)
+        out.append("–" if difference is None else report_ranges.told(*difference))
     return out
 
 
-def _difference(found: dict[str, Range]) -> tuple[float, float] | None:
-    """Left less right, with two standard deviations; None where one was not observed."""
-    left, right = found.get("left"), found.get("right")
+def _difference(ranges: dict[str, Range]) -> tuple[float, float] | None:
+    """Left less right, with two standard deviations; None if a side was not observed."""
+    left, right = ranges.get("left"), ranges.get("right")
     if left is None or right is None or left.span is None or right.span is None:
         return None
     return left.span - right.span, math.hypot(left.twice or 0.0, right.twice or 0.0)
 
 
-def _groups(of: Iterable[tuple[Row, dict[str, Range]]], sides: Sequence[str]) -> list[tuple[str, ...]]:
-    """A row for each subject and session."""
+def _groups(by_row: Iterable[tuple[Row, dict[str, Range]]], sides: Sequence[str]) -> list[tuple[str, ...]]:
+    """A table row for each subject and session."""
     groups: dict[tuple[str, str, str], list[dict[str, Range]]] = {}
-    for row, found in of:
-        groups.setdefault((row.subject, row.visit, row.date), []).append(found)
+    for row, ranges in by_row:
+        groups.setdefault((row.subject, row.visit, row.date), []).append(ranges)
     out = []
     for (subject, visit, date), members in sorted(groups.items()):
-        spans = [[one.span for found in members if (one := found.get(side)) and one.span is not None] for side in sides]
+        spans = [[r.span for ranges in members if (r := ranges.get(side)) and r.span is not None] for side in sides]
         if len(sides) == 2:
-            spans.append([less[0] for found in members if (less := _difference(found))])
+            spans.append([difference[0] for ranges in members if (difference := _difference(ranges))])
         out.append((subject or "–", visit or "–", date or "–", str(len(members)), *map(_average, spans)))
     return out
 
@@ -176,7 +177,7 @@ def _average(values: Sequence[float]) -> str:
     return f"{mean(values):.0f}".replace("-", "−") + (f" ± {stdev(values):.0f}" if len(values) > 1 else "")
 
 
-def _who(row: Row) -> tuple[str, ...]:
+def _ids(row: Row) -> tuple[str, ...]:
     return row.take, _person(row), row.subject, row.visit, row.date, row.movement
 
 

@@ -1,4 +1,4 @@
-"""What a worker does with one take: track it into its folder, unless that is done already; rows of the summary."""
+"""The job of a worker: track one take into its folder, unless it is done already; returns rows of the summary."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class TakeJob:
     Parameters
     ----------
     take : Path, absolute
-    label : what the summary calls it
+    label : name in the summary
     out : Path, folder of its results
-    folder : the same, from the summary on
+    folder : the same, relative to the summary
     choices : Choices
     """
 
@@ -50,9 +50,9 @@ class TakeJob:
 
 
 def work(job: TakeJob) -> tuple[Row, ...]:
-    """Track a take and everybody in it, or take over what an earlier run made of the same; a row for each person.
+    """Track a take with all its people, or reuse an earlier run's results; returns a row for each person.
 
-    What is wrong with the take stands in its rows. Other errors are raised, as they may not come again.
+    Faults of the take are in its rows. Other errors are raised, since they may not occur again.
     """
     from kinefit.tracking.checkpoints.checkpoint import key_of
 
@@ -66,8 +66,8 @@ def work(job: TakeJob) -> tuple[Row, ...]:
         return (failed(start, str(error)),)
     known = None if job.choices.restart else _read(job.out / RECORD)
     if known is not None and known.take != str(job.take):
-        told = f"the results of another take lie in {job.folder} ({known.take})"
-        return (failed(start, f"{told}. Name another folder by --out, or write over them by --restart."),)
+        problem = f"the results of another take lie in {job.folder} ({known.take})"
+        return (failed(start, f"{problem}. Name another folder by --out, or write over them by --restart."),)
     if known is not None and known.key == key and all((job.out / name).exists() for name in known.files):
         return known.rows
     rows, made = _tracked(job, take, start, said)
@@ -78,17 +78,17 @@ def work(job: TakeJob) -> tuple[Row, ...]:
 
 @contextmanager
 def _warnings_in(said: list[str]) -> Iterator[None]:
-    """Enter what is warned of in between: old keys of a take."""
+    """Collect warnings about old keys of a take into `said`."""
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always", FutureWarning)
         try:
             yield
         finally:
-            said += [str(one.message) for one in warned if issubclass(one.category, FutureWarning)]
+            said += [str(w.message) for w in warned if issubclass(w.category, FutureWarning)]
 
 
 def _tracked(job: TakeJob, take: Take, start: Row, said: list[str]) -> tuple[tuple[Row, ...], list[str]]:
-    """A row for each person, and the files that were made, from the folder of results on."""
+    """Track all people of a take; returns a row for each, and the written files relative to the folder of results."""
     try:
         view, people = people_of(take, job.out, _silent, said.append)
     except KinefitError as error:
@@ -104,28 +104,29 @@ def _tracked(job: TakeJob, take: Take, start: Row, said: list[str]) -> tuple[tup
         files: dict[str, Path] = {}
         try:
             done = track_person(person, folder, job.choices, view=view, step=_silent, tell=_silent, files=files)
-        except KinefitError as error:  # of one person: the others are tracked all the same
+        except KinefitError as error:  # the other people are tracked nevertheless
             rows.append(failed(msgspec.structs.replace(row, folder=""), str(error)))
             continue
         made += [path.relative_to(job.out).as_posix() for path in files.values()]
         rows.append(of_motion(row, done.motion, (*said, *done.notes)))
     if len(rows) > 1 and job.choices.report:
-        own = [msgspec.structs.replace(r, take=take.name, folder=r.folder and f"person-{r.person}") for r in rows]
-        made.append(write_people_report(own, job.out, pictures=job.choices.draws).name)
+        page_rows = [msgspec.structs.replace(r, take=take.name, folder=r.folder and f"person-{r.person}") for r in rows]
+        made.append(write_people_report(page_rows, job.out, pictures=job.choices.draws).name)
     return tuple(rows), made
 
 
-def _silent(*told: object) -> None:
+def _silent(*arguments: object) -> None:
     pass
 
 
 def _of_session(row: Row, take: Take) -> Row:
-    told = take.session.told
-    return msgspec.structs.replace(row, **{key: told.get(key, "") for key in ("subject", "visit", "date", "movement")})
+    entries = take.session.told
+    keys = ("subject", "visit", "date", "movement")
+    return msgspec.structs.replace(row, **{key: entries.get(key, "") for key in keys})
 
 
 def of_motion(row: Row, motion: Motion, notes: tuple[str, ...]) -> Row:
-    """A row with what a motion shows."""
+    """The row with a motion's length, quality, ranges of motion and findings."""
     from kinefit.exporters.report.ranges import ranges_of
 
     ranges = []
@@ -143,7 +144,7 @@ def of_motion(row: Row, motion: Motion, notes: tuple[str, ...]) -> Row:
 
 
 def _read(path: Path) -> _TakeRecord | None:
-    """What an earlier run noted; None where there is nothing that can be read."""
+    """The record of an earlier run; None if there is none that can be read."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=_TakeRecord)
     except (OSError, msgspec.MsgspecError):

@@ -1,1 +1,1 @@
-"""One time: what the sensors saw becomes measurements, is fitted, and judged."""
+"""Fit one frame: route sensor data to measurements, fit the pose, and assess the result."""

@@ -1,4 +1,4 @@
-"""The minimum under one match: of any rows, of closed chains, and in one compiled piece of keypoints alone."""
+"""Minimise one frame's cost under fixed correspondences: for any rows, closed chains, or compiled for keypoints."""
 
 from __future__ import annotations
 
@@ -16,16 +16,18 @@ from kinefit.sensors.points.keypoints import packed
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.closed import Constraint, closed_fit
 from kinefit.solvers.least_squares import levenberg_marquardt
-from kinefit.solvers.pixels import LIGHT, fit_pixels
+from kinefit.solvers.pixels import INITIAL_DAMPING, fit_pixels
 
-_OPEN = 0.01  # [m, rad] by which a start may be off what closes it, and the first fit's standard deviation of that
-ROUGH = 10, 1e-2
-"""Iterations and tolerance of a round whose loss is still wide: the next one begins there."""
+_MAX_CLOSURE_ERROR = 0.01  # [m, rad] of a start; above it a first fit closes chains with this standard deviation
+ROUGH_ITERATIONS = 10
+"""At most, of a round that another round refines."""
+ROUGH_TOLERANCE = 1e-2
+"""Of such a round, see `levenberg_marquardt`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where it is, the normal matrix (n, n) there, the cost, and the steps tried."""
+    """A minimum: the scene, the normal matrix (n, n), the cost, and the number of steps tried."""
 
     scene: Scene
     H: NDArray
@@ -37,14 +39,15 @@ def minimum(
     scene: Scene, held: tuple[BodyState, NDArray] | None, matched: Sequence[Matched],
     rows: Callable[[Scene], list[AnyRows]], hard: Constraint | None, most: int, tolerance: float,
 ) -> Minimum:  # fmt: skip
-    """From a scene's state on.
+    """Minimise the cost of a match from a scene's state.
 
     Parameters
     ----------
-    held : a state, and the information (n, n) of it
-    rows : scene -> rows of the matches, of what was held, of the posture prior
-    hard : what closes chains
-    most, tolerance : of iterations, see `levenberg_marquardt`
+    held : predicted state and its information (n, n)
+    rows : scene -> rows of the matches, of the prediction, of the posture prior
+    hard : equations of hard closures, None for none
+    most : int, iterations at most
+    tolerance : float, unitless, see `levenberg_marquardt`
     """
     if held is not None and hard is None and (found := _of_keypoints(scene, held, matched, most, tolerance)):
         return found
@@ -52,14 +55,14 @@ def minimum(
     def at(state: BodyState) -> list[AnyRows]:
         return rows(scene.at(state))
 
-    body, start, damping, tried = scene.body, scene.state, None if held is None else LIGHT, 0
+    body, start, damping, tried = scene.body, scene.state, None if held is None else INITIAL_DAMPING, 0
     if hard is None:
         fit = levenberg_marquardt(body, start, at, max_iterations=most, tolerance=tolerance, damping=damping)
     else:
-        if np.abs(hard(start)[0]).max() > _OPEN:  # the nearest closed pose may be far from what is seen
+        if np.abs(hard(start)[0]).max() > _MAX_CLOSURE_ERROR:  # the nearest closed pose may be far from the data
             near = levenberg_marquardt(
-                body, start, lambda state: [*at(state), closed_at(body, state).rows(_OPEN)],
-                max_iterations=ROUGH[0], tolerance=ROUGH[1], damping=damping,
+                body, start, lambda state: [*at(state), closed_at(body, state).rows(_MAX_CLOSURE_ERROR)],
+                max_iterations=ROUGH_ITERATIONS, tolerance=ROUGH_TOLERANCE, damping=damping,
             )  # fmt: skip
             start, tried = near.state, near.iterations
         fit = closed_fit(body, start, at, hard, max_iterations=most, tolerance=tolerance, damping=damping)
@@ -69,11 +72,11 @@ def minimum(
 def _of_keypoints(
     scene: Scene, held: tuple[BodyState, NDArray], matched: Sequence[Matched], most: int, tolerance: float
 ) -> Minimum | None:
-    """Without rows in between, where keypoints alone were measured of a body whose joints stay where they are."""
-    seen = packed(matched, scene)
-    if seen is None:
+    """The minimum by the compiled solver; None unless keypoints alone were measured, of a body without morphs."""
+    pixels = packed(matched, scene)
+    if pixels is None:
         return None
     fit = fit_pixels(
-        scene.body, scene.state, scene.rig, seen, held, max_iterations=most, tolerance=tolerance
+        scene.body, scene.state, scene.rig, pixels, held, max_iterations=most, tolerance=tolerance
     )
     return None if fit is None else Minimum(scene.at(fit.state), fit.H, fit.cost, fit.iterations)

@@ -1,4 +1,4 @@
-"""What earlier frames predict of the next one: a Kalman filter with constant velocity over all degrees of freedom."""
+"""Predict the next frame's pose: a Kalman filter with constant velocity over all degrees of freedom."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from kinefit.correspondences.closures import looped
 from kinefit.rows import ParameterRows
 from kinefit.solvers.equations import inverse
 
-_FIXED = 1e-4  # [m, rad] standard deviation of a root that stays where it is put
+_FIXED_ROOT_STD = 1e-4  # [m, rad] of a root that does not move
 
 
 class Prediction:
-    """Pose, velocity and their joint covariance, carried from frame to frame.
+    """Pose, velocity and their joint covariance, predicted from frame to frame.
 
-    Positions and velocities (per frame) of the n degrees of freedom make a state of 2n. Its prediction enters the next
-    frame's fit as one row on all degrees of freedom together, so that what one frame left open is filled from those
-    before it, and what it saw well is hardly touched.
+    The filter's state has 2n entries: position and velocity (per frame) of the n degrees of freedom. The prediction
+    enters the next frame's fit as one row on all degrees of freedom. It fills in degrees of freedom that the frame does
+    not observe, and hardly changes those that it observes well.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class Prediction:
     angle_acceleration, root_acceleration : float [rad/s²], [m/s²]
         One standard deviation of the random acceleration that drives the motion.
     memory : float [s]
-        How long a velocity lasts that nothing confirms; of gear in a closed chain it lasts.
+        Time constant with which an unobserved velocity decays. Velocities of gear in a closed chain do not decay.
     """
 
     state_attributes = ("state", "_velocity", "_xx", "_vx", "_vv")  # see `save_state`
@@ -45,12 +45,12 @@ class Prediction:
         self._noise = [np.diag(jolt**2 * share) for share in (0.25, 0.5, 1.0)]
         self._first_velocity = np.diag(np.concatenate([np.full(3, 1.0), np.full(n - 3, 5.0)]) * dt) ** 2
         self._first_velocity *= self._moves
-        self._wide = np.where(self._moves, np.concatenate([np.full(3, 0.5), np.full(n - 3, 1.0)]), _FIXED)
+        self._wide = np.where(self._moves, np.concatenate([np.full(3, 0.5), np.full(n - 3, 1.0)]), _FIXED_ROOT_STD)
         self.state: BodyState | None = None
         self._velocity, self._halted = np.zeros(n), False
 
     def start(self, state: BodyState, std: NDArray | None = None) -> None:
-        """Begin at a state whose velocity is unknown; std (n,) [m, rad], inf where nothing is known."""
+        """Start at a state with unknown velocity; std (n,) [m, rad] of the state, inf where it is unknown."""
         self.state, self._velocity = state, np.zeros_like(self._velocity)
         spread = self._wide if std is None else np.minimum(std, self._wide)
         self._xx, self._vv = np.diag(spread**2), self._first_velocity.copy()
@@ -58,7 +58,7 @@ class Prediction:
 
     @property
     def velocity(self) -> NDArray:
-        """(n,) [m, rad] a frame."""
+        """(n,) [m, rad] per frame."""
         return self._velocity
 
     @property
@@ -67,12 +67,12 @@ class Prediction:
         return np.sqrt(np.diag(self._xx))
 
     def go_on(self, state: BodyState, std: NDArray, velocity: NDArray) -> None:
-        """Begin with what is known already; velocity (n,) [m, rad] a frame."""
+        """Start with a known velocity; std (n,) [m, rad] of the state, velocity (n,) [m, rad] per frame."""
         self.start(state, std)
         self._velocity = velocity * self._moves
 
     def change_chart(self, angles: NDArray, signs: NDArray) -> None:
-        """Go on in other charts of some ball joints: their angles (D,), and the signs (D,) of how they change."""
+        """Express the filter's state in other charts of ball joints: angles (D,), and signs (D,) of their changes."""
         assert self.state is not None
         turned = np.concatenate([np.ones(6), signs])
         self.state = BodyState(self.state.T_world_root, angles)
@@ -81,17 +81,20 @@ class Prediction:
         self._xx, self._vx, self._vv = both * self._xx, both * self._vx, both * self._vv
 
     def halt(self) -> None:
-        """Stay where the body was last seen: for a frame in which nothing is.
+        """Hold the body at its last pose, for a frame without measurements.
 
-        That it stays is no knowledge: it may as well go on as it went, and its velocity does not fade.
+        The square of the dropped velocity is added to its variance, because the body may as well have moved on.
+        The velocity does not decay in this frame.
         """
         self._vv = self._vv + np.outer(self._velocity, self._velocity)
         self._velocity, self._halted = np.zeros_like(self._velocity), True
 
     def ahead(self, steps: float = 1.0) -> tuple[BodyState, NDArray]:
-        """The state some frames on, and the information (n, n) of it.
+        """Predict the state some frames ahead, with its information (n, n).
 
-        More than one where frames were dropped, less where sensors take turns.
+        Parameters
+        ----------
+        steps : number of frames; above 1 after dropped frames, below 1 where sensors alternate
         """
         assert self.state is not None
         self._ahead = self.state
@@ -108,7 +111,7 @@ class Prediction:
         return self._ahead, self._information
 
     def correct(self, state: BodyState, posterior: NDArray) -> None:
-        """Take the fitted state, with the covariance (n, n) that its normal matrix gives, prediction included."""
+        """Update the filter with the fitted state and its covariance (n, n), prediction included."""
         gain = self._vx @ self._information
         self._velocity = (self._velocity + gain @ self._ahead.difference(state)) * self._moves
         vv = self._vv - gain @ (self._xx - posterior) @ gain.T
@@ -118,19 +121,19 @@ class Prediction:
         self.state = state
 
 
-def belief(state: BodyState, predicted: BodyState, information: NDArray) -> ParameterRows:
-    """The prediction as one row on all degrees of freedom: r = predicted − state, weighed by an (n, n) information."""
+def prediction_row(state: BodyState, predicted: BodyState, information: NDArray) -> ParameterRows:
+    """The prediction as one row on all degrees of freedom: r = predicted − state, weighted by information (n, n)."""
     return ParameterRows(np.arange(len(information)), state.difference(predicted), information)
 
 
-def forgetting(information: NDArray, lost: NDArray) -> NDArray:
-    """Information (n, n) without some degrees of freedom (n,) bool; of the others what it was."""
-    kept = np.flatnonzero(~lost)
+def marginal_information(information: NDArray, lost: NDArray) -> NDArray:
+    """Information (n, n) with the degrees of freedom `lost` (n,) bool marginalised: their rows and columns are 0."""
+    kept_dofs = np.flatnonzero(~lost)
     out = np.zeros_like(information)
-    out[np.ix_(kept, kept)] = inverse(inverse(information)[np.ix_(kept, kept)])
+    out[np.ix_(kept_dofs, kept_dofs)] = inverse(inverse(information)[np.ix_(kept_dofs, kept_dofs)])
     return out
 
 
-def released_from(held: tuple[BodyState, NDArray] | None, free: NDArray | None) -> tuple[BodyState, NDArray] | None:
-    """What is held, a state and its information (n, n), without some degrees of freedom (n,) bool, None for none."""
-    return held if held is None or free is None else (held[0], forgetting(held[1], free))
+def release_dofs(held: tuple[BodyState, NDArray] | None, free: NDArray | None) -> tuple[BodyState, NDArray] | None:
+    """A predicted state and its information (n, n), without some degrees of freedom (n,) bool; None for none."""
+    return held if held is None or free is None else (held[0], marginal_information(held[1], free))

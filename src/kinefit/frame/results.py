@@ -1,4 +1,4 @@
-"""One tracked frame, and how sure it is."""
+"""One tracked frame with its standard deviations and quality."""
 
 from __future__ import annotations
 
@@ -14,9 +14,12 @@ from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import joint_moves
 
-BLIND = 0.95  # of a prior's standard deviation: the data explain less than a tenth of the variance
-ANYWHERE = 1.0  # [m, rad] prior standard deviation of a root that nothing holds
-_LEAST = 1e-3  # [m] by which an unobserved coordinate must move a joint centre to leave it unknown
+UNOBSERVED_STD_RATIO = 0.95
+"""Posterior over prior standard deviation above which a coordinate counts as unobserved: the data explain less than a
+tenth of the prior's variance."""
+ROOT_PRIOR_STD = 1.0
+"""[m, rad] prior standard deviation of an unobserved root."""
+_MIN_JOINT_SHIFT = 1e-3  # [m] by which an unobserved coordinate must move a joint centre to leave it unknown
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,21 +31,21 @@ class FrameResult:
     time : float [s]
     state : BodyState
     dof_std : (6 + D,) [m, rad]
-        Posterior standard deviation; inf where only the prior speaks.
+        Posterior standard deviation; inf where the measurements do not observe a degree of freedom.
     joint_std : (S, 3) [m]
-        Of every joint centre along the world's axes; inf likewise.
+        Standard deviation of every joint centre along the world's axes; inf where it is unobserved.
     segment_quality : (S,) in 0..1
-        Share of what the sensors can see of a segment that agrees with them; 0 where they see nothing of it, nor of its
-        neighbours on both sides.
+        Share of a segment's evidence that agrees; 0 where no sensor observes the segment, nor its neighbours on both
+        sides.
     lost : (S,) bool
-        Segments that what was measured speaks against.
+        Segments that the measurements contradict.
     hidden : (S,) bool
-        Segments that no sensor sees: held by the prediction and the prior alone.
+        Segments that no sensor observes; prediction and prior alone constrain them.
     support : float in 0..1
         Share of all evidence that agrees.
     iterations : int
-    matched : of every measurement, with the correspondences of the fit
-    measurements : the measurements themselves
+    matched : every measurement with the correspondences of the fit
+    measurements : the measurements of this frame
     """
 
     time: float
@@ -59,7 +62,7 @@ class FrameResult:
 
     @property
     def quality(self) -> float:
-        """Mean quality of all segments, in 0..1."""
+        """Mean quality of all segments, a share of 0 to 1."""
         return float(np.mean(self.segment_quality))
 
 
@@ -68,19 +71,19 @@ def deviations(
 ) -> tuple[NDArray, NDArray]:
     """Standard deviations of the degrees of freedom (n,) [m, rad] and of the joint centres (S, 3) [m].
 
-    Infinite where the data explain less than a tenth of the prior's variance: for a joint centre, where its variance is
-    as much as the coordinates that are so would give it by the prior alone.
+    They are infinite where the data explain less than a tenth of the prior's variance. A joint centre's is infinite
+    where it reaches what the unobserved coordinates give it by the prior alone.
 
     Parameters
     ----------
-    covariance : (n, n) posterior, the prior counted once
+    covariance : (n, n) posterior, the prior included once
     observed : (D,) bool, optional
-        Coordinates that the data observe at all; others are unknown however small their variance is.
+        Coordinates that the data observe; others count as unknown whatever their variance.
     """
     tree = body.tree
-    prior = np.concatenate([np.full(6, ANYWHERE), tree.posture_std])
+    prior = np.concatenate([np.full(6, ROOT_PRIOR_STD), tree.posture_std])
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    blind = std > BLIND * prior
+    blind = std > UNOBSERVED_STD_RATIO * prior
     if observed is not None:
         blind[6:] |= ~observed
         covariance = np.array(covariance)
@@ -92,37 +95,38 @@ def deviations(
     if blind.any():
         alone = np.square(np.where(blind, np.minimum(prior, 1e3), 0.0))
         unknown = np.sqrt(np.square(moves) @ alone)
-        joints = np.where((unknown > _LEAST) & (joints > BLIND * unknown), np.inf, joints)
+        joints = np.where((unknown > _MIN_JOINT_SHIFT) & (joints > UNOBSERVED_STD_RATIO * unknown), np.inf, joints)
     return np.where(blind, np.inf, std), joints
 
 
 def evidence_of(scene: Scene, matched: Sequence[Matched]) -> list[Evidence]:
-    """What each match says of each segment at a scene's state."""
+    """Evidence of each match for and against every segment at a scene's state."""
     return [m.evidence(scene.at_time(m.time)) for m in matched]
 
 
-def together(scene: Scene, told: Iterable[Evidence]) -> Evidence:
-    """What several say, all in all."""
-    return sum(told, Evidence.none(len(scene.body.tree.segments)))
+def sum_evidence(scene: Scene, parts: Iterable[Evidence]) -> Evidence:
+    """Sum of the evidence of several measurements."""
+    return sum(parts, Evidence.none(len(scene.body.tree.segments)))
 
 
-def judged(
+def frame_result(
     scene: Scene, covariance: NDArray, matched: Sequence[Matched], iterations: int, *, observed: NDArray | None = None,
-    told: Evidence | None = None,
+    evidence: Evidence | None = None,
 ) -> FrameResult:  # fmt: skip
-    """A fitted frame with its deviations and its quality.
+    """A fitted frame with its standard deviations and quality.
 
     Parameters
     ----------
     scene : at the fitted state
-    covariance, observed : see `deviations`
-    told : what the matches say at the fitted state, where that is known already
+    covariance : (n, n) posterior, the prior included once
+    observed : (D,) bool, optional, see `deviations`
+    evidence : sum over all matches at the fitted state; default: computed here
     """
-    told = together(scene, evidence_of(scene, matched)) if told is None else told
-    total = float(told.agreeing.sum() + told.contrary.sum())
-    support = float(told.agreeing.sum()) / total if total > 0.0 else 0.0
+    evidence = sum_evidence(scene, evidence_of(scene, matched)) if evidence is None else evidence
+    total = float(evidence.agreeing.sum() + evidence.contrary.sum())
+    support = float(evidence.agreeing.sum()) / total if total > 0.0 else 0.0
     std = deviations(scene.body, scene.state, covariance, observed)
     return FrameResult(
-        scene.time, scene.state, *std, told.segment_quality(scene.body.tree), told.lost, told.hidden, support,
-        iterations, tuple(matched), scene.measurements,
+        scene.time, scene.state, *std, evidence.segment_quality(scene.body.tree), evidence.lost, evidence.hidden,
+        support, iterations, tuple(matched), scene.measurements,
     )  # fmt: skip

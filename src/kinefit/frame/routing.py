@@ -1,4 +1,4 @@
-"""From what sensors hand over to measurements: which sensor each frame is of, and what it stands for."""
+"""Route frames to their sensors, and turn them into measurements."""
 
 from __future__ import annotations
 
@@ -40,12 +40,14 @@ from kinefit.sensors.surfaces.background import Background
 from kinefit.sensors.surfaces.depth_image import DepthImageSensor
 from kinefit.sensors.surfaces.point_cloud import PointCloudSensor
 
-MIN_SIGMA, MAX_SIGMA = 1e-5, 1e4
-"""[m] or [px] of a sensor: finer than any marker system, and wider than any image. A weight is 1 / sigma²."""
+MIN_SIGMA = 1e-5
+"""[m] or [px] of a sensor: finer than any marker system. A weight is 1 / sigma²."""
+MAX_SIGMA = 1e4
+"""[m] or [px] of a sensor: wider than any image."""
 
 
 class Sensors:
-    """All sensors of a take by name: the built-in kinds as their first frame asks for them, and those of one's own.
+    """All sensors of a take by name: the user's own, and built-in ones, each made for its first frame.
 
     Parameters
     ----------
@@ -55,20 +57,20 @@ class Sensors:
         [m] of depth, clouds and markers, of one marker as "SENSOR MARKER"; [px] of keypoints, of silhouettes as
         "silhouette CAMERA", of regions as "region CAMERA".
     settings : TrackSettings
-    own : sensors of one's own
-    on_body : depth cameras whose images show nothing but the body: no background is learnt
+    own : the user's own sensors
+    on_body : depth cameras whose images show nothing but the body; no background is learnt for them
 
     Raises
     ------
     ObservationError
-        Two sensors of one name, or one without; a standard deviation that is not positive.
+        Two sensors have one name, or one has none; a standard deviation is not positive.
     CalibrationError
-        A camera of `on_body` that the rig does not have.
+        The rig lacks a camera of `on_body`.
 
     Attributes
     ----------
-    stated : {depth camera: (H, W) [m]} of the empty scene, as `know_background` was told
-    view_bias : of the keypoints' detectors, see `KeypointSensor`; None for none
+    stated : {depth camera: (H, W) [m]} depth of the empty scene, as given to `know_background`
+    view_bias : of the keypoint detectors, see `KeypointSensor`; None for none
     """
 
     def __init__(
@@ -92,7 +94,7 @@ class Sensors:
         self._backgrounds: dict[str, Background | None] = {rig[name].name: None for name in on_body}
         self.stated: dict[str, NDArray] = {}
         self.view_bias: ViewBias | None = None
-        self._made_of: dict[str, tuple[str, str]] = {}  # of built-in sensors the kind and the name of their frames
+        self._made_of: dict[str, tuple[str, str]] = {}  # {built-in sensor: kind and sensor name of its frames}
         self._channels = ChannelNames()
         self._makers: dict[type, Callable[[str], Sensor]] = {
             KeypointFrame: self._keypoints, MarkerFrame: self._markers, DepthFrame: self._depth,
@@ -104,21 +106,32 @@ class Sensors:
         return iter(self._sensors.values())
 
     def of(self, name: str) -> Sensor | None:
-        """The sensor of a measurement; None for a measurement that came without one."""
+        """The sensor of this name; None if there is none, as for a measurement given directly."""
         return self._sensors.get(name)
 
     def measurements(self, frames: Sequence[Any], scene: Scene, *, points: bool = False) -> list[Measurement]:
-        """What the sensors saw at one time, ready to be matched; `points`: of those alone that place named points."""
-        out, several = [], dict[str, list[Any]]()
-        seen = [(None if isinstance(f, Measurement) else self._of_frame(f), f) for f in frames]
-        for sensor, frame in seen:
-            several.setdefault("" if sensor is None else sensor.name, []).append(frame)
-        for sensor, frame in seen:
+        """Measurements of one time from the frames of all sensors.
+
+        Parameters
+        ----------
+        frames : of one time; a `Measurement` passes as it is
+        points : only of sensors that measure named points
+
+        Raises
+        ------
+        ObservationError
+            A sensor's `prepare` returns no measurement, or one without its name or without a time.
+        """
+        out, frames_of = [], dict[str, list[Any]]()
+        routed = [(None if isinstance(f, Measurement) else self._of_frame(f), f) for f in frames]
+        for sensor, frame in routed:
+            frames_of.setdefault("" if sensor is None else sensor.name, []).append(frame)
+        for sensor, frame in routed:
             with named(frame.sensor):
                 if sensor is None:
                     out.append(_checked(frame, frame.sensor))
                 elif sensor.places_points or not points:
-                    same = several[sensor.name]
+                    same = frames_of[sensor.name]
                     if not sensor.together:
                         out.append(_checked(sensor.prepare(frame, scene), sensor.name))
                     elif frame is same[0]:
@@ -126,7 +139,13 @@ class Sensors:
         return out
 
     def check_channels(self, matched: Sequence[Matched], scene: Scene) -> None:
-        """ObservationError where sensors of one's own do not keep to their channels, or two use one name."""
+        """Check that the user's own sensors keep to their channels, and that no two use one name.
+
+        Raises
+        ------
+        ObservationError
+            They do not.
+        """
         self._channels.check_step(matched)
         for m in matched:
             if m.of_points and (m.sensor in self._own or m.sensor not in self._sensors):
@@ -134,16 +153,16 @@ class Sensors:
 
     @property
     def own(self) -> tuple[Sensor, ...]:
-        """Those of one's own, in the order of their names."""
+        """The user's own sensors, ordered by name."""
         return tuple(self._sensors[name] for name in sorted(self._own))
 
     def set_sigma(self, name: str, sigma: float) -> None:
-        """Another standard deviation from the next frame on: [px] of a camera's keypoints, [m] of depth and markers.
+        """Set a standard deviation from the next frame on: [px] of a camera's keypoints, [m] of depth and markers.
 
         Raises
         ------
         ObservationError
-            No number from `MIN_SIGMA` to `MAX_SIGMA`; a sensor of one's own, which has its own.
+            `sigma` is no number from `MIN_SIGMA` to `MAX_SIGMA`; the sensor is the user's own and sets its own.
         """
         if not is_number(sigma) or not MIN_SIGMA <= sigma <= MAX_SIGMA or isinstance(sigma, bool):
             remedy = f"Give a number from {MIN_SIGMA:g} to {MAX_SIGMA:g}, in metres or pixels."
@@ -151,26 +170,26 @@ class Sensors:
         if name in self._own:
             raise ObservationError(f"'{name}' is a sensor of one's own", remedy="Change it where it was made.")
         self.sigma[name] = float(sigma)
-        for made in (KEYPOINTS, name):  # is made anew; what a camera learnt of its background stays
-            self._sensors.pop(made, None)
+        for sensor in (KEYPOINTS, name):  # made again for its next frame; a camera's learnt background stays
+            self._sensors.pop(sensor, None)
 
     def learnt(self) -> list[dict[str, Any]]:
-        """What sensors of one's own have learnt so far; see `unlearn`."""
+        """State of the user's own sensors, for `unlearn`."""
         return [dict(vars(sensor)) for sensor in self.own]
 
     def unlearn(self, before: Sequence[Mapping[str, Any]]) -> None:
-        """Set sensors of one's own back to what they had learnt."""
+        """Set the user's own sensors back to an earlier state, from `learnt`."""
         for sensor, known in zip(self.own, before, strict=True):
             vars(sensor).clear()
             vars(sensor).update(known)
 
     @property
     def keypoints(self) -> KeypointSensor:
-        """The detectors of all cameras."""
+        """The sensor of the keypoint detectors of all cameras."""
         return cast(KeypointSensor, self._made(KEYPOINTS, KeypointFrame, KEYPOINTS))
 
     def background(self, camera: Camera) -> Background | None:
-        """What stands still before a depth camera; None where nothing is to be learnt."""
+        """Background of a depth camera; None where none is to be learnt."""
         if camera.name not in self._backgrounds:
             sigma = self.sigma.get(camera.name, self.settings.depth)
             wait = self.settings.background * self.rate
@@ -179,7 +198,15 @@ class Sensors:
         return self._backgrounds[camera.name]
 
     def know_background(self, sensor: str, depth: NDArray) -> None:
-        """State what a depth camera sees when nobody is there: (H, W) [m], 0 where that is not known."""
+        """Set the depth (H, W) [m] of a camera's empty scene, 0 where it is unknown.
+
+        Raises
+        ------
+        ObservationError
+            The image has another size than the camera.
+        CalibrationError
+            The rig has no such camera.
+        """
         camera = self.rig[sensor]
         if np.shape(depth) != camera.size[::-1]:
             problem = f"a background of shape {np.shape(depth)}, camera {sensor} has {camera.size}"
@@ -190,20 +217,20 @@ class Sensors:
             self.stated[camera.name] = np.asarray(depth)
 
     def anew(self) -> Sensors:
-        """The same sensors for another run over the take, which know the same backgrounds and layouts of keypoints."""
+        """Sensors for another run over the take, with the same backgrounds and keypoint layouts."""
         out = Sensors(self.rig, self.rate, self.sigma, self.settings, self.own)
         out._backgrounds, out.stated, out.view_bias = self._backgrounds, self.stated, self.view_bias
         out._sensors[KEYPOINTS] = self.keypoints
         return out
 
     def save_state(self) -> dict[str, Any]:
-        """What all of them have learnt, for `restore_state`."""
+        """State of all sensors and backgrounds, for `restore_state`."""
         sensors = {name: (self._made_of.get(name), save_state(one)) for name, one in self._sensors.items()}
         backgrounds = {name: save_state(one) for name, one in self._backgrounds.items() if one is not None}
         return {"sensors": sensors, "backgrounds": backgrounds}
 
     def restore_state(self, state: Mapping[str, Any]) -> None:
-        """Have the built-in sensors that others like these had, and know what those had learnt."""
+        """Restore a state from `save_state`; built-in sensors that it names are made first."""
         makers = {kind.__name__: make for kind, make in self._makers.items()}
         for name, learnt in state["backgrounds"].items():
             restore_state(self.background(self.rig[name]), learnt)
@@ -218,7 +245,7 @@ class Sensors:
         return own or self._made(sensor_of(frame), type(frame), frame.sensor)
 
     def _made(self, name: str, kind: type, of: str) -> Sensor:
-        """The sensor of a name, made when it is first asked for."""
+        """The built-in sensor of a name, made on first use."""
         if name not in self._sensors:
             self._sensors[name] = self._makers[kind](of)
             self._made_of[name] = kind.__name__, of

@@ -1,13 +1,11 @@
-"""How far surfaces determine where bones are: the body's surface lies only about where it is on the person's skeleton.
+"""Eliminate surface offsets: the error of the body's surface relative to the bone is a nuisance parameter.
 
-What a surface of simple shapes is off by on a person, and soft tissue, moves every row of a segment alike, in all
-sensors that see surfaces and for as long as the take lasts. However many rows there are, they give a segment's pose no
-better than that. With the segment's surface shifted and turned by an unknown e ~ N(0, Σ), the normal equations
-(H, g) of a segment's rows become
+The error of a model's surface and soft tissue displaces all rows of a segment alike, in every sensor that measures
+surfaces and over the whole take. It bounds how well surfaces determine a segment's pose, whatever the number of rows.
+Let the segment's surface be shifted and turned by an unknown e ~ N(0, Σ). Eliminating e turns the normal equations
+(H, g) of the segment's rows into
 
     H' = H − H (H + Σ⁻¹)⁻¹ H,        g' = Σ⁻¹ (H + Σ⁻¹)⁻¹ g
-
-which is what remains once e is eliminated.
 """
 
 from __future__ import annotations
@@ -26,20 +24,20 @@ from kinefit.sensors.base import Matched
 from kinefit.sensors.scene import Scene
 from kinefit.solvers import _kernels
 
-_TINY = 1e-9  # of a segment's largest eigenvalue: below it a direction is not observed
+_MIN_EIGENVALUE_RATIO = 1e-9  # to the segment's largest: a direction below it is not observed
 
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """Normal equations of S segments' surfaces, each about its middle, with the surface's own error eliminated.
+    """Normal equations of S segments' surfaces, each about its middle, with the surface offset eliminated.
 
     Parameters
     ----------
     H, g : (S, 6, 6), (S, 6) of twists (v at the middle, ω)
     jacobian : (S, 6, n) of those twists by the degrees of freedom
-    sigma : (6,) [m, rad] standard deviations of the surface's error
-    exact : (S, 6, 6) H of surfaces that are taken for exact, nothing eliminated
-    turned : (S, 6) twist by which what tracked points were anchored to is off besides, one standard deviation
+    sigma : (6,) [m, rad] standard deviations of the surface offset
+    exact : (S, 6, 6) H of surfaces that count as exact, nothing eliminated
+    turned : (S, 6) one standard deviation of the additional twist of the anchors of tracked surface points
     """
 
     H: NDArray
@@ -50,10 +48,9 @@ class Skin:
     turned: NDArray
 
     def rows(self) -> DofRows:
-        """The same as six rows a segment, of directions that are observed."""
+        """The normal equations as rows: one for each observed direction of a segment, six at most."""
         values, vectors = np.linalg.eigh(self.H)
-        told = values > _TINY * np.maximum(values[:, -1:], 1e-12)
-        s, k = np.nonzero(told)
+        s, k = np.nonzero(values > _MIN_EIGENVALUE_RATIO * np.maximum(values[:, -1:], 1e-12))
         v, w = vectors[s, :, k], values[s, k]
         residual = np.einsum("ri,ri->r", v, self.g[s]) / w
         J = np.einsum("ri,rin->rn", v, self.jacobian[s])
@@ -61,22 +58,22 @@ class Skin:
 
     @property
     def information(self) -> NDArray:
-        """(n, n) Jᵀ H' J."""
+        """Information (n, n) of the degrees of freedom, Jᵀ H' J."""
         return self.jacobian.reshape(-1, self.n).T @ (self.H @ self.jacobian).reshape(-1, self.n)
 
     @property
     def exact_information(self) -> NDArray:
-        """(n, n) Jᵀ H J where surfaces are taken for exact."""
+        """Information (n, n) where surfaces count as exact, Jᵀ H J."""
         return self.jacobian.reshape(-1, self.n).T @ (self.exact @ self.jacobian).reshape(-1, self.n)
 
     @property
     def pushes(self) -> NDArray:
-        """(7 S, n) how each standard deviation of the surface's error pushes the degrees of freedom."""
+        """(7 S, n) gradient of the degrees of freedom by one standard deviation of each surface offset."""
         return self._pushes(self.H)
 
     @property
     def exact_pushes(self) -> NDArray:
-        """(7 S, n) the same where surfaces are taken for exact."""
+        """(7 S, n) the same where surfaces count as exact."""
         return self._pushes(self.exact)
 
     def _pushes(self, H: NDArray) -> NDArray:
@@ -93,13 +90,13 @@ class Skin:
 def skin_of(
     scene: Scene, parts: Sequence[Rows], shift: float, turn: float, matched: Sequence[Matched] = ()
 ) -> Skin:
-    """Surface rows of all sensors at a scene's state, with the surface's error eliminated.
+    """Normal equations of the surface rows of all sensors at a scene's state, surface offsets eliminated.
 
     Parameters
     ----------
-    parts : with their losses
-    shift, turn : [m], [rad] standard deviations of a segment's surface about its bone
-    matched : matches, whose `turns` last besides
+    parts : surface rows with their losses
+    shift, turn : [m], [rad] standard deviations of a segment's surface offset
+    matched : matches, whose `turns` are additional constant offsets
     """
     body, tree = scene.body, scene.body.tree
     S = len(tree.segments)
@@ -121,14 +118,14 @@ def skin_of(
     g = blocks[:, 21:]
     sigma = np.array([shift] * 3 + [turn] * 3)
     inverse = np.diag(sigma**-2.0)
-    kept = np.linalg.solve(H + inverse, np.concatenate([H, g[..., None]], axis=2))
-    left = H - H @ kept[..., :6]
-    g = inverse @ kept[..., 6:]
+    offset = np.linalg.solve(H + inverse, np.concatenate([H, g[..., None]], axis=2))
+    reduced = H - H @ offset[..., :6]
+    g = inverse @ offset[..., 6:]
     turned = np.zeros((S, 6))
     for s, by in (pair for m in matched for pair in m.turns.items()):
         if by @ by > turned[s] @ turned[s]:
             turned[s, 3:] = R[s] @ by
-    return Skin(0.5 * (left + left.swapaxes(1, 2)), g[..., 0], _jacobians(scene, middle), sigma, H, turned)
+    return Skin(0.5 * (reduced + reduced.swapaxes(1, 2)), g[..., 0], _jacobians(scene, middle), sigma, H, turned)
 
 
 def _factor(rows: Rows) -> NDArray:
@@ -136,7 +133,7 @@ def _factor(rows: Rows) -> NDArray:
 
 
 def _jacobians(scene: Scene, middle: NDArray) -> NDArray:
-    """(S, 6, n) velocity of each segment's middle and its turn by every degree of freedom."""
+    """(S, 6, n) derivative of each segment's twist (v at its middle, ω) by every degree of freedom."""
     body, state = scene.body, scene.state
     if scene.morphing is not None:
         pose = scene.morphing.pose(state)
@@ -152,6 +149,6 @@ def _jacobians(scene: Scene, middle: NDArray) -> NDArray:
 
 @lru_cache(maxsize=8)
 def _middles(body: Body) -> NDArray:
-    """(S, 3) [m] middle of each segment's surface, in the root frame at rest."""
+    """(S, 3) [m] middle of each segment's surface, in the root frame in the rest pose."""
     mesh = body_mesh(body)
     return segment_middles(mesh.vertices, mesh.segment, len(body.tree.segments))

@@ -1,4 +1,4 @@
-"""What a time's measurements observe, and what they only contradict."""
+"""Which degrees of freedom a frame's measurements observe, and which segments they contradict."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
 from kinefit.bodies.tree import KinematicTree
-from kinefit.frame.results import ANYWHERE, BLIND
+from kinefit.frame.results import ROOT_PRIOR_STD, UNOBSERVED_STD_RATIO
 from kinefit.rows import AnyRows, PairRows, ParameterRows, Rows
 from kinefit.sensors.base import Matched
 from kinefit.sensors.evidence import AGREES, Evidence
@@ -19,22 +19,22 @@ from kinefit.sensors.points.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import variances
 
-_LEAP = 4.0  # deviations of a prediction, beyond which a start is not held by it
-_MOST = 1e3  # [m, rad] standard deviation of a coordinate that is forgotten and has no prior
+_MAX_START_SIGMAS = 4.0  # of the prediction: a start farther off discards the prediction
+_MAX_PRIOR_STD = 1e3  # [m, rad] standard deviation of a coordinate that is reset and has no prior
 
 
 def observed(tree: KinematicTree, information: NDArray) -> NDArray:
-    """(n,) bool: degrees of freedom that an information (n, n), with the prior, tells of; see `BLIND`.
+    """(n,) bool: degrees of freedom that an information (n, n), prior included, observes; see `UNOBSERVED_STD_RATIO`.
 
-    By itself, not through what the prior couples with them.
+    Couplings of the prior are removed first: they would let one observed coordinate make another count as observed.
     """
-    prior, alone = np.concatenate([np.full(6, ANYWHERE), tree.spread]), np.array(information)
+    prior, alone = np.concatenate([np.full(6, ROOT_PRIOR_STD), tree.spread]), np.array(information)
     alone[6:, 6:] -= tree.couplings.T @ tree.couplings
-    return np.asarray(np.sqrt(np.maximum(variances(alone), 0.0)) <= BLIND * prior)
+    return np.asarray(np.sqrt(np.maximum(variances(alone), 0.0)) <= UNOBSERVED_STD_RATIO * prior)
 
 
-def levered(scene: Scene, pixels: Iterable[KeypointMatched]) -> NDArray:
-    """(D,) bool: coordinates that move a keypoint that is seen where it should be."""
+def moves_keypoints(scene: Scene, pixels: Iterable[KeypointMatched]) -> NDArray:
+    """(D,) bool: coordinates that move a keypoint whose detection agrees with the fit."""
     out, state = np.zeros(len(scene.body.tree.coordinates), bool), scene.state
     for m in pixels:
         inside = (m.weight > 0) & (m.squares(scene.at_time(m.time)) < AGREES**2)
@@ -43,8 +43,8 @@ def levered(scene: Scene, pixels: Iterable[KeypointMatched]) -> NDArray:
     return out
 
 
-def moving(tree: KinematicTree, segments: NDArray) -> NDArray:
-    """(n,) bool: degrees of freedom that move some segment of (S,) bool."""
+def dofs_moving(tree: KinematicTree, segments: NDArray) -> NDArray:
+    """(n,) bool: degrees of freedom that move any of some segments (S,) bool."""
     out = np.zeros(tree.n_dofs, bool)
     for s in np.flatnonzero(segments):
         last = int(tree.last_dof[s])
@@ -53,16 +53,15 @@ def moving(tree: KinematicTree, segments: NDArray) -> NDArray:
     return out
 
 
-def adrift(tree: KinematicTree, lost: NDArray, hidden: NDArray, half: int) -> NDArray:
-    """(F, S) bool: joints of which frames in a row know nothing, whatever their fit says of them.
+def unknown_joints(tree: KinematicTree, lost: NDArray, hidden: NDArray, half: int) -> NDArray:
+    """(F, S) bool: joints whose angles are unknown in a frame, whatever the fit's covariance.
 
-    Neither of the two segments that a joint (each named by the segment that hangs on it) connects is where it is
-    thought to be, or seen at all, and within so many frames one of them is where it cannot be: what is unseen went
-    somewhere else, and no motion prior tells where.
+    A joint, named by its child segment, is unknown if both segments that it connects are lost or hidden, and one of
+    them is lost within `half` frames: it moved away unobserved, and a motion prior cannot follow it.
 
     Parameters
     ----------
-    lost, hidden : (F, S) bool, as evidence has them
+    lost, hidden : (F, S) bool, as in `Evidence`
     half : int, frames to either side
     """
     parents = np.where(tree.parents >= 0, tree.parents, np.arange(len(tree.parents)))
@@ -70,41 +69,46 @@ def adrift(tree: KinematicTree, lost: NDArray, hidden: NDArray, half: int) -> ND
     return np.asarray(unknown & unknown[:, parents] & near(contradicted, half))
 
 
-def unseen(matched: Matched, told: Evidence) -> NDArray | None:
-    """(S,) bool: segments that a surface, as its evidence says, does not show, or speaks against; None for points.
+def segments_not_shown(matched: Matched, evidence: Evidence) -> NDArray | None:
+    """(S,) bool: segments that a surface sensor does not show, or contradicts; None for points.
 
-    What it has near one of these is another segment's, or no segment's: it may pull that one along, and tells nothing
-    of where it is. No more does it that parts of the body keep apart.
+    Surface points matched to such a segment belong to another one, or to none. They may pull the segment, but they are
+    no measurement of its place. The same holds for rows against collisions.
     """
-    return np.asarray(told.hidden | told.lost) if matched.shows_surface else None
+    return np.asarray(evidence.hidden | evidence.lost) if matched.shows_surface else None
 
 
-def holding(tree: KinematicTree, segments: NDArray) -> NDArray:
-    """(n,) bool: coordinates of the joints of some segments (S,) bool, and of those that they hang on."""
-    away = np.array(segments)
+def dofs_of_joints(tree: KinematicTree, segments: NDArray) -> NDArray:
+    """(n,) bool: coordinates of the joints of some segments (S,) bool, and of their parents' joints."""
+    near_segments = np.array(segments)
     parents = tree.parents[segments]
-    away[parents[parents >= 0]] = True
-    return np.concatenate([np.zeros(6, bool), away[tree.owners]])
+    near_segments[parents[parents >= 0]] = True
+    return np.concatenate([np.zeros(6, bool), near_segments[tree.owners]])
 
 
-def forgotten(tree: KinematicTree, covariance: NDArray, gone: NDArray) -> NDArray:
-    """A covariance (n, n) that knows of some degrees of freedom (n,) bool no more than the prior does."""
-    prior = np.concatenate([np.full(6, ANYWHERE), np.minimum(tree.posture_std, _MOST)])
+def reset_to_prior(tree: KinematicTree, covariance: NDArray, gone: NDArray) -> NDArray:
+    """Covariance (n, n) with the degrees of freedom `gone` (n,) bool reset to the prior, uncorrelated."""
+    prior = np.concatenate([np.full(6, ROOT_PRIOR_STD), np.minimum(tree.posture_std, _MAX_PRIOR_STD)])
     out = np.where(gone[:, None] | gone[None, :], 0.0, covariance)
     out[gone, gone] = prior[gone] ** 2
     return out
 
 
-def leapt(predicted: BodyState, information: NDArray, state: BodyState) -> NDArray | None:
-    """(n,) bool: angles that a start has changed by more than the prediction allows; None where there are none."""
+def angles_off_prediction(predicted: BodyState, information: NDArray, state: BodyState) -> NDArray | None:
+    """(n,) bool: angles of a start that are more than `_MAX_START_SIGMAS` off the prediction; None for none.
+
+    Parameters
+    ----------
+    information : (n, n) of the prediction
+    """
     off, std = predicted.difference(state), np.sqrt(variances(information))
-    out = np.abs(off) > _LEAP * std
+    out = np.abs(off) > _MAX_START_SIGMAS * std
     out[:6] = False
     return out if out.any() else None
 
 
-def left_out(rows: AnyRows, segments: NDArray) -> AnyRows:
-    """The same rows; those on some segments (S,) bool weigh nothing."""
+def without_segments(rows: AnyRows, segments: NDArray) -> AnyRows:
+    """The same rows, with weight 0 for those on some segments (S,) bool."""
     if isinstance(rows, ParameterRows):
         return rows
     of = rows.segments if isinstance(rows, PairRows) else rows.segment

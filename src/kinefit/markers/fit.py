@@ -14,7 +14,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.bodies.marker_sets import find_placement
 from kinefit.errors import TrackingError
 from kinefit.findings import runs_of
-from kinefit.frame.results import BLIND
+from kinefit.frame.results import UNOBSERVED_STD_RATIO
 from kinefit.losses import Loss
 from kinefit.markers.poses import columns, sequence_both_ways
 from kinefit.markers.valleys import PointTake, profile_frames, resolve_by_motion
@@ -124,7 +124,7 @@ def _interpolate_unobserved(
     tree, x = data.body.tree, data.x
     std = certainty.dof_std
     lost = ~((std[:, :3].max(axis=1) < _MAX_ROOT_STD) & (std[:, 3:6].max(axis=1) < _MAX_ANGLE_STD))
-    max_std = np.minimum(np.where(tree.prismatic, _MAX_ROOT_STD, _MAX_ANGLE_STD), BLIND * tree.spread)
+    max_std = np.minimum(np.where(tree.prismatic, _MAX_ROOT_STD, _MAX_ANGLE_STD), UNOBSERVED_STD_RATIO * tree.spread)
     observed = (std[:, 6:] < max_std) & ~lost[:, None]
     ever_observed = observed.any(axis=0)
     if lost.all() or (observed[:, ever_observed].all() and not lost.any()):
@@ -155,7 +155,7 @@ def _motion(
     """Assemble the motion; its quality is the share of a segment's evidence that agrees."""
     body, points, x = data.body, data.points, data.x
     dof_std = np.array(certainty.dof_std)
-    dof_std[:, 6:][dof_std[:, 6:] > BLIND * body.tree.spread] = np.inf
+    dof_std[:, 6:][dof_std[:, 6:] > UNOBSERVED_STD_RATIO * body.tree.spread] = np.inf
     values = x - body.trajectories(roots, angles, points)
     squares = np.square(values / data.sigma[:, None]).sum(axis=2)
     quality = of_points(body, points, squares).segment_quality(body.tree)

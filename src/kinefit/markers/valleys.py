@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
 from kinefit.findings import runs_of
-from kinefit.frame.results import BLIND
+from kinefit.frame.results import UNOBSERVED_STD_RATIO
 from kinefit.losses import Loss
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.unwrap import boxes
@@ -82,7 +82,8 @@ def profile_frames(
         for old, new in ((local_certainty.dof_std, profiles.dof_std), (local_certainty.joint_std, profiles.joint_std))
     )
     nearest = np.minimum(np.round(np.arange(F) / fine).astype(int), len(grid) - 1)
-    dof_std[:, 6:] = np.minimum(dof_std[:, 6:], np.maximum(local_certainty.dof_std[:, 6:], BLIND * tree.spread))
+    most = np.maximum(local_certainty.dof_std[:, 6:], UNOBSERVED_STD_RATIO * tree.spread)
+    dof_std[:, 6:] = np.minimum(dof_std[:, 6:], most)
     widened = replace(local_certainty, dof_std=dof_std, joint_std=joint_std)
     return profiles.roots, profiles.angles, local_certainty, widened, flat[grid[nearest]]
 
@@ -118,7 +119,7 @@ class _Profiles:
     def weakly_observed(self) -> NDArray:
         """(F, D) bool: angles that a frame observes weakly."""
         tree, std = self.take.body.tree, self.local_certainty.dof_std[:, 6:]
-        return np.asarray((std > MIN_SIGMA) & (std < BLIND * tree.spread) & ~tree.prismatic)
+        return np.asarray((std > MIN_SIGMA) & (std < UNOBSERVED_STD_RATIO * tree.spread) & ~tree.prismatic)
 
     def _fit(
         self, frames: NDArray, roots: NDArray, angles: NDArray, locked: NDArray, iterations: int = 40

@@ -1,7 +1,7 @@
-"""What sensors saw: frozen records, in metres, radians, seconds and pixels.
+"""Records of sensor data: frozen, in metres, radians, seconds and pixels.
 
-Readers make them, correspondences use them; nothing here opens a file or knows a body. `recordings` are whole takes of
-one sensor, `frames` what it saw at one time.
+Readers make them, correspondences use them. Nothing here opens a file or depends on a body. `frames` are records of one
+time, `recordings` of a whole take of one sensor.
 """
 
 from kinefit.observations.body_trackers import BodyTrackerFrame, BodyTrackerVideo

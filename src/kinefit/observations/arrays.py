@@ -1,4 +1,4 @@
-"""What records of observations hold, in the types that they say: arrays of numbers, names, a sensor and a time."""
+"""Checks and conversions of the fields of records: arrays of numbers, names, sensor and time."""
 
 from __future__ import annotations
 
@@ -13,11 +13,17 @@ from numpy.typing import NDArray
 from kinefit._arguments import check_shape
 from kinefit.errors import ObservationError
 
-_SHARE = 0.5  # of an array, of which a part keeps the whole in memory; less is copied
+_MIN_VIEW_SHARE = 0.5  # of the array that a view keeps in memory; a smaller view is copied
 
 
 def numbers(values: Any, dtype: type | None = float, what: str = "an observation") -> NDArray:
-    """A copy of one type (None: their own); ObservationError where the values are no numbers."""
+    """Copy of values as an array of numbers of any shape, of one type; None: their own type.
+
+    Raises
+    ------
+    ObservationError
+        The values are no array of numbers.
+    """
     try:
         return np.array(values, dtype=dtype)
     except (TypeError, ValueError, OverflowError) as error:
@@ -29,9 +35,16 @@ def frozen(
     values: Any, dtype: type = float, what: str = "an observation", shape: Sequence[int | str] | None = None,
     file: str | None = None,
 ) -> NDArray:  # fmt: skip
-    """Numbers that nobody can write: a copy, or the array itself where its owner is read-only already (`sealed`).
+    """Read-only array of numbers: a copy, or the array itself if its owner is already read-only (`sealed`).
 
-    ObservationError where they are no numbers, or of another shape than is asked for: see `check_shape`.
+    Parameters
+    ----------
+    shape : expected shape, see `check_shape`; None: any
+
+    Raises
+    ------
+    ObservationError
+        The values are no array of numbers, or of another shape.
     """
     out = _read_only(values, dtype, what)
     if shape is not None:
@@ -40,7 +53,7 @@ def frozen(
 
 
 def freeze(record: object, **values: Any) -> None:
-    """Set fields of a frozen record that is being made."""
+    """Set fields of a frozen record, in its `__post_init__`."""
     for name, value in values.items():
         object.__setattr__(record, name, value)
 
@@ -49,13 +62,13 @@ def _read_only(values: Any, dtype: type, what: str) -> NDArray:
     if isinstance(values, np.ndarray) and values.dtype == dtype and not values.flags.writeable:
         owner = values.base if type(values.base) is np.ndarray else values
         alone = type(owner) is np.ndarray and (owner.base is None or isinstance(owner.base, mmap))
-        if alone and not owner.flags.writeable and values.nbytes > _SHARE * owner.nbytes:
+        if alone and not owner.flags.writeable and values.nbytes > _MIN_VIEW_SHARE * owner.nbytes:
             return values
     return sealed(numbers(values, dtype, what))
 
 
 def sealed(array: NDArray) -> NDArray:
-    """An array of one's own, made read-only: records take it as it is."""
+    """The array (any shape) itself, made read-only: records then do not copy it."""
     array.flags.writeable = False
     return array
 
@@ -66,7 +79,13 @@ def is_number(value: object) -> bool:
 
 
 def check_seen(sensor: Any, time: Any, names: Any = ()) -> None:
-    """ObservationError where a sensor's name is no text, a time no number, or names are no sequence of texts."""
+    """Check the types of a record's sensor, time and names.
+
+    Raises
+    ------
+    ObservationError
+        The sensor is no text, the time no number, or the names are no sequence of texts.
+    """
     if not isinstance(sensor, str):
         raise ObservationError(f"a sensor called {type(sensor).__name__}", remedy="Give its name, a text.")
     if not is_number(time):
@@ -77,8 +96,8 @@ def check_seen(sensor: Any, time: Any, names: Any = ()) -> None:
 
 
 def typical_depth(depth: NDArray) -> float:
-    """Median [m] of what was measured in some 300 pixels of an image, 0 where that is nothing."""
-    few = depth[:: depth.shape[0] // 16 + 1, :: depth.shape[1] // 20 + 1].flatten()
-    few.sort()
-    first = int(few.searchsorted(0.0, "right"))
-    return float(few[(first + len(few)) // 2]) if first < len(few) else 0.0
+    """Median depth [m] of some 300 pixels of a depth image (H, W) [m], 0 if none of them has a depth."""
+    sample = depth[:: depth.shape[0] // 16 + 1, :: depth.shape[1] // 20 + 1].flatten()
+    sample.sort()
+    first = int(sample.searchsorted(0.0, "right"))
+    return float(sample[(first + len(sample)) // 2]) if first < len(sample) else 0.0

@@ -1,4 +1,4 @@
-"""Trackers fixed on the body, such as magnetic ones: of one time, and of a whole recording (P2 2.3)."""
+"""Trackers fixed on the body, such as magnetic ones: one frame, and a whole recording (P2 2.3)."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ class BodyTrackerFrame:
     ----------
     sensor, time : name of the system, and [s]
     names : (K,) of the trackers
-    x_world : (K, 3) [m] place of each; NaN where it was not measured
-    Rs_world_tracker : (K, 3, 3) rotation of each, its columns are the tracker's axes in the world; NaN where it was not
-        measured. Default: none was.
+    x_world : (K, 3) [m] place of each; NaN if missing
+    Rs_world_tracker : (K, 3, 3) rotations, whose columns are the tracker's axes in the world; NaN if missing; default:
+        all missing
 
     Raises
     ------
     ObservationError
-        Shapes that do not fit.
+        Arrays of other shapes.
     """
 
     sensor: str
@@ -53,14 +53,14 @@ class BodyTrackerVideo(_Recording):
     rate : float [Hz]
     times : (F,) [s] in the take; strictly increasing
     names : (K,) of the trackers
-    x_world : (F, K, 3) [m]; NaN where not measured
-    Rs_world_tracker : (F, K, 3, 3); NaN where not measured
+    x_world : (F, K, 3) [m]; NaN if missing
+    Rs_world_tracker : (F, K, 3, 3); NaN if missing
     source : file, for messages
 
     Raises
     ------
     ObservationError
-        Times that do not increase; shapes that do not fit.
+        Times that do not increase; arrays of other shapes.
     """
 
     names: tuple[str, ...]
@@ -76,7 +76,7 @@ class BodyTrackerVideo(_Recording):
         freeze(self, times=times, x_world=x, Rs_world_tracker=R)
 
     def frame(self, i: int) -> BodyTrackerFrame:
-        """Frame number `i`, negative ones from the end."""
+        """Frame number `i`; a negative number counts from the end."""
         i = range(len(self))[i]
         R = self.Rs_world_tracker[i]
         return BodyTrackerFrame(self.sensor, float(self.times[i]), self.names, self.x_world[i], R)

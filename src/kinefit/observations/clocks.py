@@ -1,4 +1,4 @@
-"""When the frames of a recording were taken: even or not, and keypoints put onto the even steps of a take."""
+"""Times of a recording's frames: even or uneven, nominal rate, and keypoints interpolated at a take's even steps."""
 
 from __future__ import annotations
 
@@ -9,63 +9,65 @@ from numpy.typing import NDArray
 
 from kinefit.observations.recordings import Keypoints
 
-_MAX_JITTER = 0.15  # of a step: milliseconds, to which some containers round, are 0.12 steps of 240 Hz
-_MAX_SAME = 0.02  # of a step, by which a frame may be off and still counts at it as it is
-_MAX_OFF, _MAX_STEPS = 0.4, 3  # medians, that a distance is off a whole number, up to this one; 5 ms are 1.25 of 4
-_MAX_GAP = 2.1  # usual distances of frames over which is interpolated: one frame is lacking
-_MAX_MOVE = 0.5  # of a person's extent, mean distance of its points in two frames next to each other
-_MIN_MOVE_PX = 20.0  # that distance is always allowed: of some persons a point or two are seen
+_MAX_JITTER_STEPS = 0.15  # some containers round to milliseconds, 0.12 steps of 240 Hz
+_MAX_SAME_STEPS = 0.02  # between a frame and a step at which it counts without interpolation
+_MAX_ROUNDING = 0.4  # of a distance in medians to a whole number; 5 ms are 1.25 of 4 ms
+_MAX_MEDIANS = 3  # of a distance that is used for the rate
+_MAX_GAP_MEDIANS = 2.1  # of a gap that is interpolated: one frame is missing
+_MAX_MOVE_SHARE = 0.5  # of a person's extent: mean distance of its points in two consecutive frames
+_MIN_MOVE_PX = 20.0  # [px] of that distance is always allowed: some people have a point or two
 
 
 def is_even(times: NDArray, rate: float) -> bool:
     """Whether frames at `times` (N,) [s] follow each other at `rate` [Hz], each within 0.15 of a step."""
     off = (times - times[0]) * rate - np.arange(len(times))
-    return bool(np.all(np.abs(off) <= _MAX_JITTER))
+    return bool(np.all(np.abs(off) <= _MAX_JITTER_STEPS))
 
 
 def nominal_rate(times: NDArray) -> float:
-    """Rate [Hz] of two or more frames at `times` (N,) [s]: by distances near to one to three times their median."""
+    """Rate [Hz] of two or more frames at `times` (N,) [s], from distances close to one to three times their median."""
     distances = np.diff(times)
     ratios = distances / np.sort(distances)[len(distances) // 2]  # the median, or the distance above it
     steps = np.rint(ratios)
-    near = (np.abs(ratios - steps) < _MAX_OFF) & (steps >= 1) & (steps <= _MAX_STEPS)
+    near = (np.abs(ratios - steps) < _MAX_ROUNDING) & (steps >= 1) & (steps <= _MAX_MEDIANS)
     return float(steps[near].sum() / distances[near].sum())
 
 
 def frame_times(count: int, rate: float, clock: NDArray | None = None) -> NDArray:
-    """(count,) [s] from the first frame: those of a video (`clock`) that has as many frames, else even ones."""
+    """(N,) [s] from the first of `count` frames: those of a video's `clock` (N,) if it has as many, else even ones."""
     return clock if clock is not None and len(clock) == count else np.arange(count) / rate
 
 
 def unevenness(times: NDArray, rate: float) -> str:
-    """How times (N,) [s] of a video's frames differ from even ones at its nominal rate [Hz]; "" where they do not."""
+    """Describe how times (N,) [s] of a video's frames differ from even ones at its nominal rate [Hz]; "" if even."""
     if is_even(times, rate):
         return ""
     lacking = np.maximum(np.rint(np.diff(times) * rate).astype(int) - 1, 0)
     at = np.flatnonzero(lacking)
-    told = f"variable frame rate, {rate:.4g} Hz nominal"
+    text = f"variable frame rate, {rate:.4g} Hz nominal"
     if len(at):
-        told += f", {lacking.sum()} frames lacking between {times[at[0]]:.3g} and {times[at[-1] + 1]:.3g} s"
-    return told
+        text += f", {lacking.sum()} frames lacking between {times[at[0]]:.3g} and {times[at[-1] + 1]:.3g} s"
+    return text
 
 
 def steps_of(times: NDArray, rate: float) -> tuple[int, int]:
-    """Steps (start, stop) of a take, t = step / rate, that frames at `times` (N,) [s] reach."""
+    """Steps (start, stop) of a take, t = step / rate [Hz], within the frames at `times` (N,) [s]."""
     if is_even(times, rate):
         start = round(float(times[0]) * rate)
         return start, start + len(times)
-    return int(np.ceil(times[0] * rate - _MAX_JITTER)), int(np.floor(times[-1] * rate + _MAX_JITTER)) + 1
+    start, last = np.ceil(times[0] * rate - _MAX_JITTER_STEPS), np.floor(times[-1] * rate + _MAX_JITTER_STEPS)
+    return int(start), int(last) + 1
 
 
 def on_steps(keypoints: Keypoints, times: NDArray, rate: float, frames: tuple[int, int]) -> Keypoints:
-    """Keypoints at the even steps of a take, interpolated between the two frames about each.
+    """Interpolate keypoints at the even steps of a take.
 
-    A point is seen at a step if both frames saw it and no more than one frame is lacking between them. A person of one
-    frame is the person of the next one whose points are nearest.
+    A point is known at a step if it is detected in the frames before and after, with at most one frame missing between
+    them. A person of one frame is matched to the person of the next frame with the nearest points.
 
     Parameters
     ----------
-    times : (F,) [s] of its frames in the take, increasing
+    times : (F,) [s] of the keypoints' frames in the take, increasing
     rate : float [Hz] of the take
     frames : (start, stop), steps of the take, t = step / rate
     """
@@ -75,9 +77,9 @@ def on_steps(keypoints: Keypoints, times: NDArray, rate: float, frames: tuple[in
     gap = times[after] - times[before]
     share = np.divide(at - times[before], gap, out=np.zeros(len(at)), where=gap > 0)
     nearest = np.where(share > 0.5, after, before)
-    same = np.abs(at - times[nearest]) * rate <= _MAX_SAME
-    usual = np.median(np.diff(times)) if len(times) > 1 else 0.0
-    between = ~same & (share > 0) & (share < 1) & (gap <= _MAX_GAP * usual)
+    same = np.abs(at - times[nearest]) * rate <= _MAX_SAME_STEPS
+    median = np.median(np.diff(times)) if len(times) > 1 else 0.0
+    between = ~same & (share > 0) & (share < 1) & (gap <= _MAX_GAP_MEDIANS * median)
     names = ("points", "confidence", *(() if keypoints.lifted is None else ("lifted",)))
     arrays = {name: getattr(keypoints, name)[nearest] for name in names}
     for array in arrays.values():
@@ -95,14 +97,14 @@ def on_steps(keypoints: Keypoints, times: NDArray, rate: float, frames: tuple[in
 
 
 def _next_people(points: NDArray, next_points: NDArray) -> NDArray:
-    """(P,) int: which person of the next frame (P, K, 2) [px] each person of a frame is; -1 where nobody is near."""
+    """(P,) int: the person of the next frame (P, K, 2) [px] that matches each person of a frame; -1 for none near."""
     distance = np.linalg.norm(points[:, None] - next_points[None], axis=-1)
     both = np.isfinite(distance)
     count = both.sum(axis=-1)
     mean = np.where(count > 0, np.where(both, distance, 0.0).sum(axis=-1) / np.maximum(count, 1), np.inf)
-    seen = np.isfinite(points)
-    extent = np.where(seen, points, -np.inf).max(axis=1) - np.where(seen, points, np.inf).min(axis=1)
+    known = np.isfinite(points)
+    extent = np.where(known, points, -np.inf).max(axis=1) - np.where(known, points, np.inf).min(axis=1)
     best, back = mean.argmin(axis=1), mean.argmin(axis=0)
-    limit = np.maximum(_MAX_MOVE * np.linalg.norm(extent, axis=-1), _MIN_MOVE_PX)
+    limit = np.maximum(_MAX_MOVE_SHARE * np.linalg.norm(extent, axis=-1), _MIN_MOVE_PX)
     near = mean[np.arange(len(mean)), best] <= limit
     return np.where(near & (back[best] == np.arange(len(mean))), best, -1)

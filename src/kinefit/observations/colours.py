@@ -1,4 +1,4 @@
-"""Recordings of colour images: the video of one camera, read when its frames are asked for."""
+"""Colour recordings: the video of one camera, read on demand."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class ColourVideo(_ImageRecording):
         Name of the camera in the rig.
     rate : float [Hz]
     times : (F,) [s] in the take; strictly increasing.
-    size : (width, height) [px] of the calibration's image.
+    size : (width, height) [px] of the calibration's image
     image : callable
-        Frame number -> (H, W, 3) uint8 RGB in that image's frame.
+        Frame number -> (H, W, 3) uint8 RGB in the calibration's image frame.
     source : str
         File or folder, for messages.
 
@@ -31,5 +31,5 @@ class ColourVideo(_ImageRecording):
     """
 
     def frame(self, i: int) -> ColourFrame:
-        """Frame number `i`, negative ones from the end; read now."""
+        """Frame number `i`, read now; a negative number counts from the end."""
         return ColourFrame(self.sensor, *self._image(i))

@@ -1,4 +1,4 @@
-"""Recordings of depth: the frames of one sensor, read when they are asked for."""
+"""Depth recordings of one sensor, whose frames are read on demand."""
 
 from __future__ import annotations
 
@@ -12,24 +12,30 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.observations.frames import DepthFrame, PointCloud
 
-_GAP = 1.5  # usual steps of time: half a frame late is jitter, more is a frame that is missing
-_LATEST = 1e11  # [s] of a time: clocks count from 1970 or from when they began
+_MIN_GAP_STEPS = 1.5  # of time between frames: half a step late is jitter, more is a missing frame
+_MAX_TIME = 1e11  # [s]: clocks count from 1970 or from their start
 
 
 def checked_times(times: NDArray, sensor: str, source: str = "") -> NDArray:
-    """Read-only (F,) [s]; a typed error where one is no time, or not later than the one before it."""
+    """Read-only times (F,) [s] of a sensor's frames.
+
+    Raises
+    ------
+    ObservationError
+        No times; a time that is not finite, too large, or not later than the one before it.
+    """
     times = np.array(times, dtype=float).ravel()
     back = np.flatnonzero(~(np.diff(times) > 0.0)) + 1
     bad = np.flatnonzero(~np.isfinite(times))
     if not len(times) or len(bad) or len(back):
         frame = int(bad[0] if len(bad) else back[0] if len(back) else 0)
-        told = ", ".join(f"{t:.6g} s" for t in times[max(frame - 1, 0) : frame + 1])
+        both = ", ".join(f"{t:.6g} s" for t in times[max(frame - 1, 0) : frame + 1])
         raise ObservationError(
-            f"times of the frames of {sensor} do not increase ({told})" if len(times) else f"{sensor} has no frames",
+            f"times of the frames of {sensor} do not increase ({both})" if len(times) else f"{sensor} has no frames",
             file=source or None, place=f"frame {frame}" if len(times) else None,
             remedy="Sort the frames by time and leave out doubled ones; a clock that was set back needs two takes.",
         )  # fmt: skip
-    if max(-times[0], times[-1]) > _LATEST:
+    if max(-times[0], times[-1]) > _MAX_TIME:
         problem = f"times of the frames of {sensor} from {times[0]:.6g} to {times[-1]:.6g} s"
         raise ObservationError(problem, file=source or None, remedy="Give seconds; time_unit = \"us\" says otherwise.")
     times.flags.writeable = False
@@ -38,7 +44,7 @@ def checked_times(times: NDArray, sensor: str, source: str = "") -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class _Recording:
-    """What recordings of depth images and of clouds have in common."""
+    """Base of recordings of one sensor with a time for each frame."""
 
     sensor: str
     rate: float
@@ -49,18 +55,22 @@ class _Recording:
 
     @property
     def gaps(self) -> NDArray:
-        """(G,) frames that come more than half a step too late: some before them are missing, or the clock jumped."""
-        return np.flatnonzero(np.diff(self.times) > _GAP / self.rate) + 1
+        """(G,) int: frames after a gap of more than 1.5 steps: frames are missing, or the clock jumped."""
+        return np.flatnonzero(np.diff(self.times) > _MIN_GAP_STEPS / self.rate) + 1
 
     def nearest(self, time: float) -> int:
-        """The frame nearest to a time [s] of the take."""
+        """Number of the frame nearest to a time [s] of the take."""
         i = int(np.searchsorted(self.times, time))
         return min((k for k in (i - 1, i) if 0 <= k < len(self)), key=lambda k: abs(self.times[k] - time))
 
     def at_step(self, step: int, rate: float) -> int | None:
-        """The frame that counts at a step of a take's common time, t = step / rate: the nearest, within half a step.
+        """Number of the frame nearest to a step of a take, t = step / rate; None if it is half a step or more away.
 
-        Every frame counts at one step alone: a slow sensor leaves steps without, of a fast one frames are left out.
+        Every frame has one step. A slow sensor has steps without a frame, a fast one frames that no step uses.
+
+        Parameters
+        ----------
+        rate : [Hz] of the take
         """
         i = self.nearest(step / rate)
         return i if -0.5 <= round(self.times[i] * rate - step, 6) < 0.5 else None
@@ -68,7 +78,7 @@ class _Recording:
 
 @dataclass(frozen=True, eq=False)
 class _ImageRecording(_Recording):
-    """What recordings of one camera's images have in common."""
+    """Base of recordings of one camera's images."""
 
     size: tuple[int, int]
     image: Callable[[int], NDArray]
@@ -78,7 +88,7 @@ class _ImageRecording(_Recording):
         object.__setattr__(self, "times", checked_times(self.times, self.sensor, self.source))
 
     def _image(self, i: int) -> tuple[float, NDArray]:
-        """Time and image of a frame, negative ones from the end; read now."""
+        """Time [s] and image of a frame, read now; a negative number counts from the end."""
         i = range(len(self))[i]
         image = np.asarray(self.image(i))
         if image.shape[1::-1] != self.size:
@@ -101,22 +111,22 @@ class DepthVideo(_Recording):
     times : (F,) [s] in the take; strictly increasing.
     size : (width, height) [px]
     image : callable
-        Frame number -> (H, W) [m] along the optical axis; what is not positive and finite counts as not measured.
+        Frame number -> (H, W) [m] along the optical axis; values that are not positive and finite count as missing.
     near, far : float [m]
-        Range gate: nothing measured outside of it is handed out.
+        Range: depths outside are set to 0.
     camera : Camera or None
-        What the recording itself states of its sensor.
+        The sensor's calibration, if the recording contains it.
     background : DepthVideo or None
-        The same sensor, standing where it stands, before the empty scene.
+        The empty scene, recorded by the same sensor at the same place.
     on_body : bool
-        Whether everything but the body was taken out already.
+        Whether everything but the body is already removed.
     source : str
         File or folder, for messages.
 
     Raises
     ------
     ObservationError
-        Times that do not increase, a rate or a range that cannot be.
+        Times that do not increase; an impossible rate or range; a background of another size.
     """
 
     size: tuple[int, int]
@@ -142,7 +152,13 @@ class DepthVideo(_Recording):
             )  # fmt: skip
 
     def frame(self, i: int) -> DepthFrame:
-        """Frame number `i`, negative ones from the end; read now."""
+        """Frame number `i`, read now; a negative number counts from the end.
+
+        Raises
+        ------
+        ObservationError
+            The image has another size than the recording.
+        """
         i = range(len(self))[i]
         depth = np.array(self.image(i), np.float32)
         if depth.shape != self.size[::-1]:
@@ -154,14 +170,14 @@ class DepthVideo(_Recording):
         return DepthFrame(self.sensor, float(self.times[i]), depth)
 
     def without(self, frames: NDArray) -> DepthVideo:
-        """The same without some frames (N,), but not without all."""
-        kept = np.setdiff1d(np.arange(len(self)), frames)
-        return replace(self, times=self.times[kept], image=lambda i: self.image(int(kept[i])))
+        """The recording without some frames (N,) int; some must remain."""
+        remaining = np.setdiff1d(np.arange(len(self)), frames)
+        return replace(self, times=self.times[remaining], image=lambda i: self.image(int(remaining[i])))
 
 
 @dataclass(frozen=True, eq=False)
 class CloudVideo(_Recording):
-    """Clouds of points of one sensor, without the order of an image.
+    """Unordered point clouds of one sensor.
 
     Parameters
     ----------
@@ -170,14 +186,21 @@ class CloudVideo(_Recording):
     times : (F,) [s] in the take; strictly increasing.
     points : callable
         Frame number -> (N, 3) [m] in the sensor's frame.
-    T_world_sensor : (4, 4) [m]
+    T_world_sensor : (4, 4) [m]; default: the identity
     viewpoint : bool
-        Whether the sensor stood at the origin of its frame: only surfaces that face it can have been seen.
+        Whether the sensor is at the origin of its frame: only surfaces that face it are matched.
+    near, far : float [m]
+        Range: points nearer or farther from the origin of the sensor's frame are dropped.
     on_body : bool
-        Whether everything but the body was taken out already.
+        Whether everything but the body is already removed.
     segment : str or None
-        The one segment of the body that all points are on, where that is known.
+        The body segment of all points, if known.
     source : str
+
+    Raises
+    ------
+    ObservationError
+        Times that do not increase.
     """
 
     points: Callable[[int], NDArray]
@@ -196,13 +219,13 @@ class CloudVideo(_Recording):
         object.__setattr__(self, "T_world_sensor", T)
 
     def frame(self, i: int) -> PointCloud:
-        """Frame number `i`, negative ones from the end; read now."""
+        """Frame number `i`, read now; a negative number counts from the end."""
         i, T = range(len(self))[i], self.T_world_sensor
         assert T is not None
         x = np.asarray(self.points(i), float).reshape(-1, 3)
         x = x[np.isfinite(x).all(axis=1)]
-        away = np.linalg.norm(x, axis=1)
-        x = x[(away > 0.0) & (away >= self.near) & (away <= self.far)]
+        distance = np.linalg.norm(x, axis=1)
+        x = x[(distance > 0.0) & (distance >= self.near) & (distance <= self.far)]
         viewpoint = T[:3, 3] if self.viewpoint else None
         x = x @ T[:3, :3].T + T[:3, 3]
         return PointCloud(self.sensor, float(self.times[i]), x, viewpoint, self.on_body, self.segment)

@@ -1,4 +1,4 @@
-"""What kinefit's own detector saw in one video."""
+"""Detections of kinefit's own detector in one video: landmarks, masks and hands of people."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MEDIAPIPE_33 = (
     *_FACE.split(), "mouth_left", "mouth_right",
     *(f"{side}_{part}" for part in _PAIRS.split() for side in ("left", "right")),
 )  # fmt: skip
-"""Names of the landmarks of MediaPipe's pose network, in its order; kinefit's own detector gives the same."""
+"""Names of the landmarks of MediaPipe's pose network, in its order; kinefit's own detector has the same."""
 
 _FINGERS = ("index", "middle", "ring", "pinky")
 MEDIAPIPE_HAND_21 = (
@@ -34,7 +34,7 @@ MEDIAPIPE_HAND_21 = (
 MEDIAPIPE_75 = (*MEDIAPIPE_33, *(f"{side}_{name}" for side in ("left", "right") for name in MEDIAPIPE_HAND_21))
 """Names of the landmarks of a person with both hands: of the pose network, then of the left and the right hand."""
 
-_MESH = {  # points that bodies know
+_MESH = {  # points that are landmarks of bodies
     10: "forehead_top", 151: "forehead", 9: "glabella", 168: "nose_bridge", 6: "nose_bone", 195: "nose_ridge",
     4: "nose_point", 2: "nose_base", 17: "lower_lip", 18: "chin_groove", 200: "chin_upper", 199: "chin_front",
     152: "chin",
@@ -53,37 +53,42 @@ MEDIAPIPE_478 = tuple(_MESH_NAMES.get(k, f"face_{k}") for k in range(478))
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """What kinefit's own detector saw in one video: people, each the same in one column, with their outlines.
+    """Detections of kinefit's own detector in one video: people, each in one column, with their masks.
 
     Parameters
     ----------
     camera : str
     rate : float [Hz]
-    size : (width, height) [px] of the video's image.
+    size : (width, height) [px] of the video's image
     points : (F, P, 33, 2) [px]
-        Landmarks of MEDIAPIPE_33 in the video's image; NaN where a person is not seen. P may be 0.
+        Landmarks of MEDIAPIPE_33 in the video's image; NaN in frames without the person. P may be 0.
     confidence : (F, P, 33)
-        Probability that a landmark is in the image and not hidden; 0 where a person is not seen.
+        Probability that a landmark is in the image and not occluded; 0 in frames without the person.
     mask_runs : (N,)
-        Lengths of the runs of all masks, one mask after the other by frame, then person: down the columns of the
-        image, beginning outside of the person (COCO's uncompressed run-length code).
+        Run lengths of all masks, ordered by frame, then person: down the columns of the image, starting with pixels
+        outside the mask (COCO's uncompressed run-length encoding).
     mask_starts : (F * P + 1,)
-        Where each mask begins in `mask_runs`; a mask without runs was not made.
+        Start of each mask in `mask_runs`; a cell without runs has no mask.
     source : str
     lifted : (F, P, 33, 3) [m], optional
-        The landmarks in space from the middle of the hips, along the image's u and v and away from the camera, of a
-        person of the network's idea of size; NaN where a person is not seen.
+        3D landmarks relative to the middle of the hips, along the image's u and v and away from the camera, at the
+        network's own scale; NaN in frames without the person.
     hands : (F, P, 2, 21, 2) [px], optional
-        Landmarks of MEDIAPIPE_HAND_21 of the left and the right hand; NaN where a hand is not seen. Of hands in an
-        image that shows nobody, the person is not seen.
+        Landmarks of MEDIAPIPE_HAND_21 of the left and the right hand; NaN for undetected hands. Hands may be detected
+        without the person's body.
     hand_confidence : (F, P, 2, 21), with `hands`
-        Probability that a landmark is of this hand and in the image; 0 where a hand is not seen.
+        Probability that a landmark is of this hand and in the image; 0 for undetected hands.
     face : (F, P, 478, 2) [px], optional
-        Points of MEDIAPIPE_478; NaN where a face is not seen.
+        Points of MEDIAPIPE_478; NaN for undetected faces.
     face_confidence : (F, P, 478), with `face`
         Probability that there is a face, 0 for points outside of the image and where no face is seen.
     times : (F,) [s], optional
-        When each frame is shown, from the first frame on, increasing; None: at the rate.
+        Time of each frame from the first, increasing; None: at the rate.
+
+    Raises
+    ------
+    ObservationError
+        Arrays of other shapes; masks of another size than the image; times that do not increase.
     """
 
     camera: str
@@ -139,7 +144,12 @@ class Detections:
         freeze(self, times=times)
 
     def within(self, first: int, frames: int) -> Detections:
-        """The same as frames from `first` on of a video of so many, without times; nobody is seen in the others."""
+        """The detections padded to a longer video, as its frames from `first` on, without times; no one in the others.
+
+        Parameters
+        ----------
+        first, frames : number of the first frame in that video, and its number of frames
+        """
         after, people = frames - first - len(self), self.points.shape[1]
 
         def padded(array: NDArray, value: float) -> NDArray:
@@ -157,9 +167,9 @@ class Detections:
 
     @property
     def seen(self) -> NDArray:
-        """(F, P) bool, whether a person, or a hand alone, is seen in a frame."""
-        seen = np.isfinite(self.points).all(axis=(2, 3))
-        return seen if self.hands is None else seen | np.isfinite(self.hands).all(axis=(3, 4)).any(axis=2)
+        """(F, P) bool: whether a person, or a hand alone, is detected in a frame."""
+        detected = np.isfinite(self.points).all(axis=(2, 3))
+        return detected if self.hands is None else detected | np.isfinite(self.hands).all(axis=(3, 4)).any(axis=2)
 
     @property
     def has_faces(self) -> bool:
@@ -167,7 +177,7 @@ class Detections:
         return self.face_confidence is not None and bool(self.face_confidence.any())
 
     def mask(self, frame: int, person: int) -> NDArray | None:
-        """(height, width) bool, the pixels of a person; None where there is no mask."""
+        """Mask (H, W) bool of a person in a frame; None if there is none."""
         cell = range(len(self))[frame] * self.points.shape[1] + range(self.points.shape[1])[person]
         runs = self.mask_runs[self.mask_starts[cell] : self.mask_starts[cell + 1]]
         if not len(runs):
@@ -184,9 +194,9 @@ class Detections:
         Parameters
         ----------
         camera : str, optional
-            Its name in the rig; default: the video's.
+            Name of the camera in the rig; default: the video's.
         image_frame : ImageFrame, optional
-            The video's image frame, where it is not the calibration's.
+            The video's image frame, if it is not the calibration's.
         time_offset : float [s]
         face : bool
             The faces alone, MEDIAPIPE_478, in place of these.
@@ -232,7 +242,7 @@ class Detections:
 def in_calibration(
     points: NDArray, lifted: NDArray | None, image_frame: ImageFrame
 ) -> tuple[NDArray, NDArray | None]:
-    """Landmarks (..., 2) [px] and those lifted (..., 3) [m] of a video's image, in the calibration's image frame."""
+    """Convert landmarks (..., 2) [px] and 3D landmarks (..., 3) [m] to the calibration's image frame."""
     if lifted is not None:
         axes = image_frame.to_calibration(np.eye(2)) - image_frame.to_calibration(np.zeros((1, 2)))
         axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Recordings of named features: points of the body or lines of known objects in an image, markers in space."""
+"""Recordings of named features: keypoints, image lines of known objects, and markers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kinefit.observations.recordings import Markers
 
 @dataclass(frozen=True, eq=False)
 class KeypointVideo(_Recording):
-    """Keypoints of one person in one camera, found when they are asked for.
+    """Keypoints of one person in one camera, detected on demand.
 
     Parameters
     ----------
@@ -26,9 +26,10 @@ class KeypointVideo(_Recording):
     times : (F,) [s] in the take; strictly increasing.
     names : (K,) of the keypoints
     points : callable
-        Frame number -> (K, 2) [px] in the calibration's image frame, NaN where unseen, and (K,) confidence in 0..1.
+        Frame number -> (K, 2) [px] in the calibration's image frame, NaN for undetected keypoints, and (K,) confidence
+        in 0..1.
     keypoint_set : str
-        The body's keypoint set that the names belong to; "" for names of the body's landmarks.
+        The body's keypoint set that has the names; "" for names of the body's landmarks.
     source : str
         File, for messages.
 
@@ -47,13 +48,13 @@ class KeypointVideo(_Recording):
         object.__setattr__(self, "times", checked_times(self.times, self.sensor, self.source))
 
     def frame(self, i: int) -> KeypointFrame:
-        """Frame number `i`, negative ones from the end; found now."""
+        """Frame number `i`, detected now; a negative number counts from the end."""
         i = range(len(self))[i]
         uv, confidence = self.points(i)
         return KeypointFrame(self.sensor, float(self.times[i]), self.names, uv, confidence, self.keypoint_set)
 
     def unseen(self, time: float) -> KeypointFrame:
-        """A frame at a time [s] without a frame of its own: no point is seen, and all frames have the same names."""
+        """A frame without detections at a time [s], with the recording's names."""
         uv, confidence = np.full((len(self.names), 2), np.nan), np.zeros(len(self.names))
         return KeypointFrame(self.sensor, time, self.names, uv, confidence, self.keypoint_set)
 
@@ -72,7 +73,7 @@ class LineVideo(_Recording):
     landmarks : (L,) of one or two names each
         The body's landmarks that lie on a line: the two ends of an edge, or a single point.
     ends : (F, L, 2, 2) [px]
-        Two points of every line in the calibration's image frame; NaN for one that was not seen.
+        Two points of every line in the calibration's image frame; NaN for an undetected line.
     source : str
         File, for messages.
 
@@ -100,22 +101,22 @@ class LineVideo(_Recording):
         object.__setattr__(self, "ends", ends)
 
     def frame(self, i: int) -> LineFrame:
-        """Frame number `i`, negative ones from the end."""
+        """Frame number `i`; a negative number counts from the end."""
         i = range(len(self))[i]
         return LineFrame(self.sensor, float(self.times[i]), self.names, self.landmarks, self.ends[i])
 
 
 @dataclass(frozen=True, eq=False)
 class NamedMarkers:
-    """A marker recording with the names that a body's marker set has for its labels.
+    """A marker recording whose labels are names of a body's marker set.
 
     Parameters
     ----------
     sensor : name of the sensor
-    markers : Markers, with those names
+    markers : Markers, with these names
     marker_set : of the body, "" for its landmarks
     time_offset : float [s]
-    std : (K,) [m] by which the set's markers may sit elsewhere on this person; None where the body has their places
+    std : (K,) [m] standard deviation of the set's marker places on this person; None if the body has their places
     """
 
     sensor: str
@@ -125,7 +126,7 @@ class NamedMarkers:
     std: NDArray | None = None
 
     def at(self, time: float) -> MarkerFrame | None:
-        """The frame nearest to a time [s], None where there is none within half a frame."""
+        """The frame nearest to a time [s]; None if there is none within half a frame."""
         k = round((time - self.time_offset) * self.markers.rate)
         if not 0 <= k < len(self.markers):
             return None

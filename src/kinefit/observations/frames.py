@@ -1,4 +1,4 @@
-"""What one sensor saw at one time: what a live source hands to the tracker, and what a recording is made of."""
+"""Frames: the data of one sensor at one time, from a live source or a recording."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from kinefit.errors import ObservationError
 from kinefit.observations.arrays import check_seen, freeze, frozen, numbers, sealed, typical_depth
 from kinefit.observations.recordings import Keypoints
 
-_FARTHEST = 100.0  # [m] that any depth camera measures; a tenth of a metre in millimetres
+_MAX_DEPTH = 100.0  # [m] of any depth camera; a larger number is in millimetres
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,12 +28,12 @@ class DepthFrame:
         Name of its camera in the rig.
     time : float [s]
     depth : (H, W) float32 [m]
-        Along the optical axis; 0 where nothing was measured.
+        Along the optical axis; 0 for pixels without a measurement.
 
     Raises
     ------
     ObservationError
-        No image, or one whose numbers are too large for metres.
+        The array is no image, or its values are too large for metres.
     """
 
     sensor: str
@@ -50,7 +50,7 @@ class DepthFrame:
         if not (depth.min() >= 0.0 and depth.max() < np.inf):
             depth[~((depth > 0.0) & (depth < np.inf))] = 0.0
         typical = typical_depth(depth)
-        if typical > _FARTHEST:
+        if typical > _MAX_DEPTH:
             problem = f"millimetres taken for metres? A depth image of {self.sensor} shows things {typical:.0f} m away"
             raise ObservationError(problem, remedy="Give metres: 0.001 times an image in millimetres.")
         depth.flags.writeable = False
@@ -64,19 +64,24 @@ class DepthFrame:
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """3D points that lie on some surface (P2 2.3): anywhere, on the body, or on one segment of it.
+    """3D points on a surface (P2 2.3): of anything, of the body, or of one segment.
 
     Parameters
     ----------
     sensor : str
     time : float [s]
-    points : (N, 3) [m] in the world
+    points : (N, 3) [m] in the world; points that are not finite are dropped
     viewpoint : (3,) [m] or None
-        Where the sensor stood, in the world: only a side that faces it can have been seen.
+        Place of the sensor in the world: only surfaces that face it are matched. None: all are.
     on_body : bool
-        Whether all points are known to be the body's.
+        Whether all points are known to be on the body.
     segment : str or None
-        The one segment that they are on, where that is known.
+        The segment of all points, if known.
+
+    Raises
+    ------
+    ObservationError
+        Arrays of other shapes; a viewpoint that is not finite.
     """
 
     sensor: str
@@ -109,10 +114,15 @@ class KeypointFrame:
         Name of the camera in the rig.
     time : float [s]
     names : (K,) of the keypoints
-    uv : (K, 2) [px] in the calibration's image frame; NaN where unseen
-    confidence : (K,) in 0..1, 0 where unseen
+    uv : (K, 2) [px] in the calibration's image frame; NaN for undetected keypoints
+    confidence : (K,) in 0..1, 0 for undetected keypoints
     keypoint_set : str
-        The body's keypoint set that the names belong to; "" for names of the body's landmarks.
+        The body's keypoint set that has the names; "" for names of the body's landmarks.
+
+    Raises
+    ------
+    ObservationError
+        Arrays of other shapes.
     """
 
     sensor: str
@@ -124,14 +134,14 @@ class KeypointFrame:
 
     @classmethod
     def of_record(cls, record: Keypoints, frame: int, time: float) -> KeypointFrame:
-        """The person of a record of one, at a frame and a time [s]; not checked again, as the record was."""
-        made = object.__new__(cls)
-        uv, sure = (sealed(values[frame, 0].copy()) for values in (record.points, record.confidence))
+        """One frame of a record of one person, at a time [s]; the record's arrays are not checked again."""
+        out = object.__new__(cls)
+        uv, confidence = (sealed(values[frame, 0].copy()) for values in (record.points, record.confidence))
         freeze(
-            made, sensor=record.camera, time=time, names=record.names, uv=uv, confidence=sure,
+            out, sensor=record.camera, time=time, names=record.names, uv=uv, confidence=confidence,
             keypoint_set=record.keypoint_set,
         )  # fmt: skip
-        return made
+        return out
 
     def __post_init__(self) -> None:
         check_seen(self.sensor, self.time, self.names)
@@ -142,16 +152,16 @@ class KeypointFrame:
 
 @dataclass(frozen=True, eq=False)
 class MarkerFrame:
-    """3D positions of labelled markers: point to point.
+    """3D positions of labelled markers.
 
     Parameters
     ----------
     sensor : str
     time : float [s]
-    names : (M,)
-    positions : (M, 3) [m] in the world; NaN where unseen
+    names : (M,) labels
+    positions : (M, 3) [m] in the world; NaN for missing markers
     marker_set : str
-        The body's marker set that the names belong to; "" for names of the body's landmarks.
+        The body's marker set that has the names; "" for names of the body's landmarks.
     """
 
     sensor: str
@@ -167,7 +177,7 @@ class MarkerFrame:
 
 @dataclass(frozen=True, eq=False)
 class SilhouetteFrame:
-    """Which pixels of one image show the body.
+    """A mask of the body in one image.
 
     Parameters
     ----------
@@ -175,13 +185,13 @@ class SilhouetteFrame:
         Name of its camera in the rig.
     time : float [s]
     mask : (H, W) uint8 or bool
-        In the calibration's image frame: 255 (or True) where the body is, 0 where it is not, between for an edge that
-        lies within the pixel.
+        In the calibration's image frame: 255 (or True) for pixels of the body, 0 for others, between for pixels that
+        its contour crosses.
 
     Raises
     ------
     ObservationError
-        No image, or one that is not of 8 bits.
+        The array is no image, or not of 8 bits.
     """
 
     sensor: str
@@ -205,7 +215,7 @@ class SilhouetteFrame:
 
 @dataclass(frozen=True, eq=False)
 class LineFrame:
-    """Lines in one image that points or edges of the body lie on (P1 2.3).
+    """Lines in one image through points or edges of the body (P1 2.3).
 
     Parameters
     ----------
@@ -216,12 +226,12 @@ class LineFrame:
     landmarks : (L,) of one or two names each
         The body's landmarks that lie on a line: the two ends of an edge, or a single point.
     ends : (L, 2, 2) [px]
-        Two points of every line in the calibration's image frame, in any order; NaN for one that was not seen.
+        Two points of every line in the calibration's image frame, in any order; NaN for an undetected line.
 
     Raises
     ------
     ObservationError
-        Shapes that do not agree; a line through one or two equal points, or of no or more than two landmarks.
+        Shapes do not agree; the two points of a line are less than a pixel apart; a line has not one or two landmarks.
     """
 
     sensor: str
@@ -263,7 +273,7 @@ class ColourFrame:
     Raises
     ------
     ObservationError
-        No image, or one that is not of three channels of 8 bits.
+        The array is no image of three channels of 8 bits.
     """
 
     sensor: str
@@ -282,7 +292,7 @@ class ColourFrame:
 
 @dataclass(frozen=True, eq=False)
 class LiftedFrame:
-    """Landmarks of one person that a network lifted from one camera's image to space.
+    """3D landmarks of one person that a network estimated from one camera's image.
 
     Parameters
     ----------
@@ -291,11 +301,11 @@ class LiftedFrame:
     time : float [s]
     names : (K,) of the landmarks, the hips among them
     x : (K, 3) [m]
-        From the middle of the hips, along the calibrated image's u and v and away from the camera, of a person of the
-        network's idea of size; NaN where unseen.
-    uv : (K, 2) [px] the same landmarks in the calibration's image frame; NaN where unseen
+        Relative to the middle of the hips, along the calibrated image's u and v and away from the camera, at the
+        network's own scale; NaN for undetected landmarks.
+    uv : (K, 2) [px] the same landmarks in the calibration's image frame; NaN for undetected ones
     keypoint_set : str
-        The body's keypoint set that the names belong to.
+        The body's keypoint set that has the names.
     """
 
     sensor: str
@@ -316,7 +326,7 @@ Frame = DepthFrame | PointCloud | KeypointFrame | MarkerFrame | SilhouetteFrame 
 
 
 KEYPOINTS = "keypoints"
-"""Name of the sensor that the keypoint detectors of all cameras are together."""
+"""Name of the one sensor of the keypoint detectors of all cameras."""
 
 _NAMES = {
     KeypointFrame: KEYPOINTS, SilhouetteFrame: "silhouette {}", LineFrame: "lines {}", ColourFrame: "region {}",
@@ -325,12 +335,12 @@ _NAMES = {
 
 
 def sensor_of(frame: object) -> str:
-    """Name of the sensor that a frame is of: where several see with one camera, with what is seen there."""
+    """Name of a frame's sensor: its `sensor`, with a prefix for kinds that may share a camera."""
     return _NAMES.get(type(frame), "{}").format(getattr(frame, "sensor", ""))
 
 
 def by_record(frames: Iterable[Any]) -> Mapping[type, list[Any]]:
-    """Frames of one time, sorted by their record: `by_record(frames)[DepthFrame]`, empty where there is none."""
+    """Frames of one time by class: `by_record(frames)[DepthFrame]`; an empty list for a class without frames."""
     out = defaultdict[type, list[Any]](list)
     for frame in frames:
         out[type(frame)].append(frame)

@@ -1,4 +1,4 @@
-"""Which of several people: how a take, an argument or an option names one."""
+"""Select the target person among several: the forms that a take, an argument or an option may use."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 from kinefit.errors import ObservationError
 
 FORMS = '"first", "moving", "largest", "nearest X Y Z" [m], or a number from 1'
-"""What may be written."""
+"""Allowed forms, for messages."""
 
 
 @dataclass(frozen=True, eq=False)
 class PersonChoice:
-    """One of several people.
+    """Criterion that selects the target person among several.
 
     Parameters
     ----------
-    way : "first" (of whom most is seen), "moving" (whose points move most), "largest" (in the pictures), "nearest" or
-        "number"
-    number : int, from 1, of the people as `kinefit track` lists them
-    place : (3,) [m] in the world, that "nearest" is about
+    way : "first" (most detections), "moving" (largest motion of the points), "largest" (in the images), "nearest" (to
+        `place`) or "number"
+    number : int, from 1, in the list of `kinefit track`
+    place : (3,) [m] in the world, for "nearest"
     """
 
     way: str = "first"
@@ -31,12 +31,12 @@ class PersonChoice:
 
     @classmethod
     def of(cls, person: int | str | None) -> PersonChoice:
-        """What somebody wrote; None is "first".
+        """Parse a user's choice; None is "first".
 
         Raises
         ------
         ObservationError
-            Anything else than `FORMS`.
+            The choice is none of `FORMS`.
         """
         if person is None:
             return cls()

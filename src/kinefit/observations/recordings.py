@@ -1,4 +1,4 @@
-"""Whole recordings of one sensor: frozen records, in metres, radians, seconds and pixels."""
+"""Recordings: the data of one sensor over a whole take, as frozen records in metres, radians, seconds and pixels."""
 
 from __future__ import annotations
 
@@ -10,33 +10,38 @@ from numpy.typing import NDArray
 from kinefit.observations.arrays import check_seen, freeze, frozen
 
 KEYPOINT_SIGMA = 8.0
-"""[px] Standard deviation of a keypoint of confidence 1 where none is given: what detectors err by in images of
-1,000 to 2,000 px in which a person fills half of the height."""
+"""[px] default standard deviation of a keypoint of confidence 1: typical of detectors in images of 1,000 to 2,000 px in
+which a person fills half of the height."""
 
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """2D keypoints of all people that a detector saw in one camera.
+    """2D keypoints of all people that a detector found in one camera.
 
     Parameters
     ----------
     camera : str
         Name of the camera in the rig.
     keypoint_set : str
-        Name of the set ("BODY_25B", "COCO_17", "HALPE_26", "MEDIAPIPE_33"); says which names the columns have.
-    names : (K,) names of the keypoints.
+        Name of the set ("BODY_25B", "COCO_17", "HALPE_26", "MEDIAPIPE_33"), which defines the names.
+    names : (K,) names of the keypoints
     rate : float [Hz]
     points : (F, P, K, 2) [px]
-        In the image frame of the camera's calibration (not of a scaled or letterboxed video). NaN where unseen.
-        P is the largest number of people in any frame; their order means nothing.
+        In the image frame of the camera's calibration (not of a scaled or letterboxed video). NaN for undetected
+        keypoints. P is the largest number of people in any frame; their order has no meaning.
     confidence : (F, P, K)
-        The detector's own confidence in 0..1; 0 where unseen.
+        The detector's own confidence in 0..1; 0 for undetected keypoints.
     time_offset : float [s]
         Added to frame / rate to get the time of the take.
     source : str
-        File or folder it came from, for messages.
+        File or folder, for messages.
     lifted : (F, P, K, 3) [m], optional
-        The points in space as a network lifted them, see `LiftedFrame`; NaN where unseen.
+        3D landmarks of a network, see `LiftedFrame`; NaN for undetected ones.
+
+    Raises
+    ------
+    ObservationError
+        Arrays of other shapes.
     """
 
     camera: str
@@ -63,13 +68,13 @@ class Keypoints:
         return len(self.points)
 
     def rows(self, frames: slice, time_offset: float) -> Keypoints:
-        """Some of its frames, with the time of the first."""
+        """The keypoints of some frames; `time_offset` [s] is the time of the first."""
         lifted = None if self.lifted is None else self.lifted[frames]
         points, confidence = self.points[frames], self.confidence[frames]
         return replace(self, points=points, confidence=confidence, lifted=lifted, time_offset=time_offset)
 
     def first_points(self, keypoint_set: str, names: tuple[str, ...]) -> Keypoints:
-        """Its first points alone, as those of another set with these names."""
+        """The first points alone, as another keypoint set with these names."""
         lifted = None if self.lifted is None else self.lifted[:, :, : len(names)]
         points, confidence = self.points[:, :, : len(names)], self.confidence[:, :, : len(names)]
         return replace(
@@ -77,16 +82,16 @@ class Keypoints:
         )
 
     def of_one(self, chosen: NDArray) -> Keypoints:
-        """One person's; chosen (F,) is who it is in each frame, -1 for nobody."""
+        """The keypoints of one person; chosen (F,) int is the person's number in each frame, -1 for none."""
         if self.points.shape[1] == 0:
             shape = len(self), 1, len(self.names)
             return replace(self, points=np.full((*shape, 2), np.nan), confidence=np.zeros(shape), lifted=None)
-        frames, one, there = np.arange(len(self)), np.maximum(chosen, 0), (chosen >= 0)[:, None]
-        points = np.where(there[..., None], self.points[frames, one], np.nan)
-        confidence = np.where(there, self.confidence[frames, one], 0.0)
+        frames, person, present = np.arange(len(self)), np.maximum(chosen, 0), (chosen >= 0)[:, None]
+        points = np.where(present[..., None], self.points[frames, person], np.nan)
+        confidence = np.where(present, self.confidence[frames, person], 0.0)
         lifted = None
         if self.lifted is not None:
-            lifted = np.where(there[..., None], self.lifted[frames, one], np.nan)[:, None]
+            lifted = np.where(present[..., None], self.lifted[frames, person], np.nan)[:, None]
         return replace(self, points=points[:, None], confidence=confidence[:, None], lifted=lifted)
 
     @property
@@ -97,12 +102,12 @@ class Keypoints:
 
 @dataclass(frozen=True)
 class MarkerEvent:
-    """Something marked in a recording.
+    """An event marked in a recording.
 
     Parameters
     ----------
-    label : str, such as "Foot Strike".
-    time : float [s] on the recording's own clock, which begins with frame 1.
+    label : str, such as "Foot Strike"
+    time : float [s] on the recording's own clock, which starts with frame 1
     context : str, such as "Left"; subject : str
     """
 
@@ -114,23 +119,28 @@ class MarkerEvent:
 
 @dataclass(frozen=True, eq=False)
 class Markers:
-    """3D positions of markers over time, labelled (names) or not (names such as "*1").
+    """3D positions of markers over time, labelled or unlabelled (names such as "*1").
 
     Parameters
     ----------
     names : (M,)
     rate : float [Hz]
     positions : (F, M, 3) [m]
-        World frame of the file; NaN where a marker was not seen.
+        In the file's world frame; NaN for missing markers.
     residual : (F, M) [m] or None
         The system's own reconstruction residual.
     up : "x", "y", "z" or None
-        Vertical axis of the world, where the file says so.
+        Vertical axis of the world; None if the file does not state it.
     first_frame : int
-        Number that the file gives its first frame.
+        The file's number of its first frame.
     source : str
-    unit : str, of the file that it came from: "mm", "m" ...; positions are in metres whatever it says.
-    events : what was marked in the recording.
+    unit : str, of the source file ("mm", "m" ...); positions are always in metres
+    events : marked in the recording
+
+    Raises
+    ------
+    ObservationError
+        Positions of another shape.
     """
 
     names: tuple[str, ...]
@@ -197,7 +207,7 @@ class SkeletonMotion:
 
     @property
     def rest(self) -> NDArray:
-        """(J, 3) [m] joint positions at rest, the roots' offsets included, in the axes of the file's world."""
+        """(J, 3) [m] joint positions in the rest pose, root offsets included, in the axes of the file's world."""
         rest = np.array(self.offsets)
         for joint, parent in enumerate(self.parents):
             rest[joint] += rest[parent] if parent >= 0 else 0.0

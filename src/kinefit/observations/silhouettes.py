@@ -1,4 +1,4 @@
-"""Recordings of silhouettes: the masks of one camera, read when they are asked for."""
+"""Silhouette recordings: the masks of one camera, read on demand."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class SilhouetteVideo(_ImageRecording):
         Name of the camera in the rig.
     rate : float [Hz]
     times : (F,) [s] in the take; strictly increasing.
-    size : (width, height) [px] of the calibration's image.
+    size : (width, height) [px] of the calibration's image
     image : callable
-        Frame number -> (H, W) uint8 in that image's frame, 255 where the body is.
+        Frame number -> (H, W) uint8 in the calibration's image frame, 255 for pixels of the body.
     source : str
         File or folder, for messages.
 
@@ -31,5 +31,5 @@ class SilhouetteVideo(_ImageRecording):
     """
 
     def frame(self, i: int) -> SilhouetteFrame:
-        """Frame number `i`, negative ones from the end; read now."""
+        """Frame number `i`, read now; a negative number counts from the end."""
         return SilhouetteFrame(self.sensor, *self._image(i))

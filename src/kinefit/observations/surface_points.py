@@ -1,4 +1,4 @@
-"""Tracked points of a surface: of one time, and of a whole recording."""
+"""Tracked points of a surface: one frame, and a whole recording."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from kinefit.observations.depth import _Recording, checked_times
 
 @dataclass(frozen=True, eq=False)
 class SurfacePointFrame:
-    """Points of a surface at one time, as `photogrammetry.surface_tracking.SurfaceTracker.update` gives them.
+    """Tracked points of a surface at one time, from `photogrammetry.surface_tracking.SurfaceTracker.update`.
 
     Parameters
     ----------
     sensor, time : name of the sensor, and [s]
     ids : (N,) int, the same for the same point at all times
-    x_world : (N, 3) [m]; NaN where not seen
+    x_world : (N, 3) [m]; NaN for missing points, which are dropped
     covariance : (N, 3, 3) [m²]
 
     Raises
     ------
     ObservationError
-        Shapes that do not fit, or a point twice.
+        Arrays of other shapes, or a point twice.
     """
 
     sensor: str
@@ -43,8 +43,8 @@ class SurfacePointFrame:
             raise ObservationError(problem, remedy="Give whole numbers (N,), (N, 3) and (N, 3, 3).")
         if len(np.unique(ids)) < len(ids):
             raise ObservationError(f"a point of {self.sensor} twice", remedy="Give every point its own number.")
-        seen = np.isfinite(x).all(axis=1) & np.isfinite(c).all(axis=(1, 2))
-        for name, value in (("ids", ids[seen]), ("x_world", x[seen]), ("covariance", c[seen])):
+        known = np.isfinite(x).all(axis=1) & np.isfinite(c).all(axis=(1, 2))
+        for name, value in (("ids", ids[known]), ("x_world", x[known]), ("covariance", c[known])):
             object.__setattr__(self, name, value)
 
 
@@ -58,7 +58,7 @@ class SurfacePointVideo(_Recording):
     rate : float [Hz]
     times : (F,) [s] in the take; strictly increasing.
     first : (F + 1,) int
-        Where in the columns below each frame begins; the last is their length.
+        Start of each frame in the columns below, and their length.
     ids : (N,) int, the same for the same point at all times
     x_world : (N, 3) [m]
     std : (N, 3) [m] standard deviations along the world's axes
@@ -86,7 +86,7 @@ class SurfacePointVideo(_Recording):
             raise ObservationError(problem, file=self.source or None, remedy=remedy)
 
     def frame(self, i: int) -> SurfacePointFrame:
-        """Frame number `i`, negative ones from the end."""
+        """Frame number `i`; a negative number counts from the end."""
         i = range(len(self))[i]
         part = slice(int(self.first[i]), int(self.first[i + 1]))
         covariance = self.std[part, :, None] ** 2 * np.eye(3)

@@ -1,4 +1,4 @@
-"""A known motion, and what sensors would have seen of it."""
+"""Simulate known motions, and the data that sensors would record of them."""
 
 from kinefit.simulation.exercise import squat_and_wave
 from kinefit.simulation.figures import draw_figure

@@ -1,4 +1,4 @@
-"""What the joints do in ten movements, as functions of the share of the time that has passed."""
+"""Joint angles of ten movements, as functions of the times u (F,) in 0..1 of the movement's duration."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 @dataclass(frozen=True, eq=False)
 class PostureSequence:
-    """Joint angles and the trunk's turn over time.
+    """Joint angles and the trunk's rotation over time.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class PostureSequence:
 
 
 def _ease(u: NDArray, start: float, end: float) -> NDArray:
-    """0 before the start, 1 after the end, without a jerk between (quintic)."""
+    """0 before `start`, 1 after `end`, with a smooth transition (quintic)."""
     v = np.clip((u - start) / (end - start), 0.0, 1.0)
     return v * v * v * (v * (6.0 * v - 15.0) + 10.0)
 
@@ -42,7 +42,7 @@ def _swings(u: NDArray, count: float) -> NDArray:
 
 
 def _standing(**changed: ArrayLike) -> dict[str, ArrayLike]:
-    """Arms hanging a little away from the trunk, with what is changed."""
+    """Joint angles [deg] of a standing person with hanging arms, with some changed."""
     out: dict[str, ArrayLike] = {"neck_extension": 0.0}
     for side in "lr":
         out |= {f"arm_add_{side}": -9.0, f"elbow_flex_{side}": 14.0, f"pro_sup_{side}": 80.0}
@@ -51,7 +51,7 @@ def _standing(**changed: ArrayLike) -> dict[str, ArrayLike]:
 
 
 def point(u: NDArray) -> PostureSequence:
-    """The right arm points ahead, then sweeps outward and back."""
+    """The right arm points ahead, then sweeps outward and back; u (F,) in 0..1."""
     b, sweep = _held(u), _ease(u, 0.35, 0.5) * (1.0 - _ease(u, 0.5, 0.68))
     return PostureSequence(
         _standing(
@@ -63,7 +63,7 @@ def point(u: NDArray) -> PostureSequence:
 
 
 def walk(u: NDArray) -> PostureSequence:
-    """Two and a half strides towards where the person looks."""
+    """Two and a half strides forwards; u (F,) in 0..1."""
     go = _ease(u, 0.0, 0.15) * (1.0 - _ease(u, 0.85, 1.0))
     phase = 2.0 * np.pi * 2.5 * u
     degrees = _standing(arm_flex_r=-20 * go * np.sin(phase), arm_flex_l=20 * go * np.sin(phase))
@@ -77,7 +77,7 @@ def walk(u: NDArray) -> PostureSequence:
 
 
 def wave(u: NDArray) -> PostureSequence:
-    """The right hand, raised beside the head, waves four times."""
+    """The right hand, raised next to the head, waves four times; u (F,) in 0..1."""
     b = _held(u, 0.25, 0.75)
     swing = b * _swings(u - 0.25, 8.0) * _ease(u, 0.2, 0.3) * (1.0 - _ease(u, 0.7, 0.8))
     return PostureSequence(
@@ -89,7 +89,7 @@ def wave(u: NDArray) -> PostureSequence:
 
 
 def shake_hands(u: NDArray) -> PostureSequence:
-    """The right hand is held out and shaken up and down three times."""
+    """The right hand is held out and shaken up and down three times; u (F,) in 0..1."""
     b = _held(u)
     shake = _swings(u - 0.3, 7.5) * _ease(u, 0.28, 0.38) * (1.0 - _ease(u, 0.62, 0.72))
     return PostureSequence(
@@ -99,14 +99,14 @@ def shake_hands(u: NDArray) -> PostureSequence:
 
 
 def bow(u: NDArray) -> PostureSequence:
-    """A deep bow from the hips."""
+    """A deep bow from the hips; u (F,) in 0..1."""
     b = _held(u, 0.42, 0.58)
     arms = {f"arm_flex_{side}": 18 * b for side in "lr"} | {f"hip_flexion_{side}": 55 * b for side in "lr"}
     return PostureSequence(_standing(neck_extension=-10 * b, lumbar_extension=-8 * b, **arms), lean=55 * b)
 
 
 def clap(u: NDArray) -> PostureSequence:
-    """Both hands clap five times before the chest."""
+    """Both hands clap five times in front of the chest; u (F,) in 0..1."""
     b = _held(u, 0.25, 0.75)
     apart = 0.5 - 0.5 * np.cos(2.0 * np.pi * 10.0 * (u - 0.25) * (u > 0.25) * (u < 0.75))
     arms: dict[str, ArrayLike] = {}
@@ -119,7 +119,7 @@ def clap(u: NDArray) -> PostureSequence:
 
 
 def sit_down(u: NDArray) -> PostureSequence:
-    """Down onto a seat that is not there, and up again."""
+    """Sitting down onto an imaginary seat, and getting up; u (F,) in 0..1."""
     b = _held(u, 0.42, 0.62)
     bent = 4.0 * b * (1.0 - b)
     legs = {f"hip_flexion_{side}": 86 * b + 25 * bent for side in "lr"}
@@ -129,7 +129,7 @@ def sit_down(u: NDArray) -> PostureSequence:
 
 
 def kick(u: NDArray) -> PostureSequence:
-    """The right leg swings back and kicks ahead."""
+    """The right leg swings back and kicks ahead; u (F,) in 0..1."""
     back, kicked = _ease(u, 0.05, 0.35) * (1 - _ease(u, 0.38, 0.5)), _ease(u, 0.38, 0.55) * (1 - _ease(u, 0.6, 0.95))
     return PostureSequence(
         _standing(
@@ -144,7 +144,7 @@ def kick(u: NDArray) -> PostureSequence:
 
 
 def squat(u: NDArray) -> PostureSequence:
-    """A squat with the arms held ahead."""
+    """A squat with the arms held ahead; u (F,) in 0..1."""
     b = _held(u, 0.45, 0.55)
     legs = {f"hip_flexion_{side}": 92 * b for side in "lr"} | {f"knee_angle_{side}": 96 * b for side in "lr"}
     legs |= {f"hip_adduction_{side}": -3 - 9 * b for side in "lr"} | {f"ankle_angle_{side}": 28 * b for side in "lr"}
@@ -153,7 +153,7 @@ def squat(u: NDArray) -> PostureSequence:
 
 
 def arms_at_sensor(u: NDArray) -> PostureSequence:
-    """Both arms are stretched straight ahead, at whoever stands there, and held."""
+    """Both arms are stretched straight ahead, towards the sensor, and held; u (F,) in 0..1."""
     b, sway = _held(u, 0.3, 0.75), _swings(u, 3.0)
     arms = {
         f"{name}_{side}": value

@@ -1,4 +1,4 @@
-"""A bar with two targets, waved through a volume: where its ends are, and what cameras see of them."""
+"""Simulate a calibration bar with two targets: places of its ends, and detections in cameras."""
 
 from __future__ import annotations
 
@@ -14,14 +14,17 @@ from kinefit.geometry.se3 import exp_so3, transform
 
 @checked
 def bar_rig(count: int = 3, size: tuple[int, int] = (1920, 1080), *, seed: int | None = None) -> Rig:
-    """Cameras 3.8 m round the middle of a room, z up, each with another lens; places and lenses drawn from a seed."""
+    """Rig of cameras 3.8 m around the middle of a room, z up, each with another lens.
+
+    With a `seed` places and lenses vary at random.
+    """
     rng = np.random.default_rng(seed)
     drawn = rng.uniform(-1.0, 1.0, (count, 12)) * (seed is not None)
     cameras = []
     for i, d in enumerate(drawn):
         azimuth = np.radians(20.0 + max(70.0, 300.0 / count) * i + 10.0 * d[0])
-        away = 3.8 + 0.4 * d[1]
-        centre = np.array([away * np.cos(azimuth), away * np.sin(azimuth), 1.2 + 0.4 * (i % 4) + 0.3 * d[2]])
+        distance = 3.8 + 0.4 * d[1]
+        centre = np.array([distance * np.cos(azimuth), distance * np.sin(azimuth), 1.2 + 0.4 * (i % 4) + 0.3 * d[2]])
         forward = np.array([0.1 * d[3], 0.1 * d[4], 1.0]) - centre
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -39,36 +42,53 @@ def bar_rig(count: int = 3, size: tuple[int, int] = (1920, 1080), *, seed: int |
 def wave_bar(
     length: float, count: int, *, low: ArrayLike = (-1.0, -1.0, 0.3), high: ArrayLike = (1.0, 1.0, 2.0), seed: int = 0
 ) -> NDArray:
-    """(count, 2, 3) [m] ends of a bar: its middle anywhere in a box, its direction anywhere."""
+    """Ends (N, 2, 3) [m] of a bar at `count` random places in a box, in random directions.
+
+    Parameters
+    ----------
+    length : [m] of the bar
+    low, high : (3,) [m] corners of the box
+
+    Raises
+    ------
+    ObservationError
+        `length` or `count` is not positive.
+    """
     if not (length > 0 and count > 0):
         raise ObservationError(f"a bar of {length} m at {count} places", remedy="Give positive numbers.")
     rng = np.random.default_rng(seed)
     middle = rng.uniform(np.asarray(low, float), np.asarray(high, float), (count, 3))
-    way = rng.normal(size=(count, 3))
-    half = 0.5 * length * way / np.linalg.norm(way, axis=1, keepdims=True)
+    direction = rng.normal(size=(count, 3))
+    half = 0.5 * length * direction / np.linalg.norm(direction, axis=1, keepdims=True)
     return np.stack([middle - half, middle + half], axis=1)
 
 
 @checked
 def see_bar(rig: Rig, ends: NDArray, *, noise: float = 0.1, seed: int = 0) -> dict[str, BarViews]:
-    """What the cameras of a rig see of the ends (N, 2, 3) [m], in random order, with noise [px] on each coordinate."""
-    rng, seen = np.random.default_rng([seed, 1]), {}
+    """Detections of a bar's ends (N, 2, 3) [m] in the cameras of a rig, in random order, with noise [px]."""
+    rng, views = np.random.default_rng([seed, 1]), {}
     for camera in rig:
         uv = camera.project(ends) + rng.normal(0.0, noise, (*ends.shape[:2], 2))
         swapped = rng.random(len(ends)) < 0.5
         uv[swapped] = uv[swapped, ::-1]
         inside = (np.isfinite(uv) & (uv > 2.0) & (uv < np.array(camera.size) - 3.0)).all(axis=(1, 2))
-        seen[camera.name] = BarViews(camera.size, {int(f): uv[f] for f in np.flatnonzero(inside)}, len(ends))
-    return seen
+        views[camera.name] = BarViews(camera.size, {int(f): uv[f] for f in np.flatnonzero(inside)}, len(ends))
+    return views
 
 
 @checked
 def draw_bar(
     camera: Camera, ends: ArrayLike, *, radius: float = 0.02, lamps: ArrayLike = (), noise: float = 3.0, seed: int = 0
 ) -> NDArray:
-    """(H, W) uint8: shining balls of a radius [m] at the ends (2, 3), and lamps (K, 3) [m] that shine as bright.
+    """Grey image (H, W) uint8 of a bar with bright balls at its ends (2, 3) [m].
 
-    Each pixel is the mean of 4 x 4 rays, on a dark ground with noise.
+    Each pixel is the mean of 4 x 4 rays, on a dark background with noise.
+
+    Parameters
+    ----------
+    radius : [m] of the balls
+    lamps : (K, 3) [m] other lights, as bright as the balls
+    noise : standard deviation of a grey value
     """
     rng, (width, height) = np.random.default_rng(seed), camera.size
     image = np.full((height, width), 18.0)
@@ -85,8 +105,8 @@ def draw_bar(
         if not (len(us) and len(vs)):
             continue
         fine = np.stack(np.meshgrid((us[:, None] + grid).ravel(), (vs[:, None] + grid).ravel()), axis=-1)
-        away = np.linalg.norm(np.cross(camera.ray(fine), x - camera.centre_world), axis=-1)
-        share = (away < radius).reshape(len(vs), 4, len(us), 4).mean(axis=(1, 3))
+        from_ray = np.linalg.norm(np.cross(camera.ray(fine), x - camera.centre_world), axis=-1)
+        share = (from_ray < radius).reshape(len(vs), 4, len(us), 4).mean(axis=(1, 3))
         patch = image[vs[0] : vs[-1] + 1, us[0] : us[-1] + 1]
         np.maximum(patch, 18.0 + 220.0 * share, out=patch)
     return np.clip(np.rint(image + rng.normal(0.0, noise, image.shape)), 0, 255).astype(np.uint8)

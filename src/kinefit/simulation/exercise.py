@@ -1,4 +1,4 @@
-"""A motion made of formulas: a squat while one hand waves; needs no recording."""
+"""A synthetic motion without a recording: a squat while one hand waves."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kinefit.simulation.retarget import known_motion
 
 
 def squat_and_wave(body: Body | None = None, *, rate: float = 30.0, duration: float = 2.0, up: str = "z") -> Motion:
-    """A person squats once with flat feet, waves with the right hand and looks around.
+    """Motion of a person who squats once with flat feet, waves with the right hand and looks around.
 
     Parameters
     ----------
@@ -20,7 +20,7 @@ def squat_and_wave(body: Body | None = None, *, rate: float = 30.0, duration: fl
     rate : float [Hz]
     duration : float [s]
     up : str
-        Vertical axis of the result's world; the floor is at height zero.
+        Vertical axis of the world; the floor is at height zero.
     """
     body = load_body("humanoid") if body is None else body
     t = np.arange(round(rate * duration)) / rate

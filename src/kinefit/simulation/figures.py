@@ -1,4 +1,4 @@
-"""A figure of tapered limbs, drawn as a camera would see it."""
+"""Draw a body as a figure of tapered limbs in a camera's image."""
 
 from __future__ import annotations
 
@@ -16,54 +16,54 @@ from kinefit.solvers.mobility import closed_poses
 
 _GREY = (128, 128, 128)
 _COLOURS = {"_l": (196, 120, 60), "_r": (60, 110, 200), "": (150, 175, 110)}  # BGR: left, right, middle
-_RIM = 32  # corners of a round end
-_FINE = 4  # binary digits after the point of a pixel
+_END_CORNERS = 32  # of the polygon of a round end
+_SUBPIXEL_BITS = 4  # of corners in drawing functions
 
 
 def draw_figure(motion: Motion, frame: int, camera: Camera, image: NDArray | None = None) -> NDArray:
-    """Picture (H, W, 3) of the body's surfaces, BGR 8 bit: the far ones first, the near ones over them.
+    """Image (H, W, 3) of the body's surfaces, BGR 8 bit, drawn from far to near.
 
     Parameters
     ----------
     frame : int
-    camera : Camera in the motion's world.
+    camera : Camera in the motion's world
     image : (H, W, 3), optional
-        Drawn upon, of the camera's size; default: plain grey.
+        Background of the camera's size; default: plain grey.
     """
     image = np.full((camera.size[1], camera.size[0], 3), _GREY, np.uint8) if image is None else image.copy()
     R_camera_world, far = camera.T_camera_world[:3, :3], []
     frames, _ = motion.body.tree.forward(motion.state(frame).T_world_root, motion.state(frame).angles)
     for limb in motion.body.surfaces:
         R, t = frames[limb.segment, :9].reshape(3, 3), frames[limb.segment, 9:]
-        x = _rim(limb, R_camera_world @ R) @ R.T + R @ motion.body.tree.rest[limb.segment] + t
+        x = _contour_points(limb, R_camera_world @ R) @ R.T + R @ motion.body.tree.rest[limb.segment] + t
         far.append((float((x @ R_camera_world[2]).mean() + camera.T_camera_world[2, 3]), x, limb.segment))
     nearest, farthest = min(item[0] for item in far), max(item[0] for item in far)
     for depth, x, segment in sorted(far, key=lambda item: -item[0]):
-        outline = camera.project(x)
-        if not np.isfinite(outline).all():
+        contour = camera.project(x)
+        if not np.isfinite(contour).all():
             continue
-        hull = cv2.convexHull(outline.astype(np.float32))[:, 0]
-        corners = np.round(hull * 2**_FINE).astype(np.int32)
+        hull = cv2.convexHull(contour.astype(np.float32))[:, 0]
+        corners = np.round(hull * 2**_SUBPIXEL_BITS).astype(np.int32)
         name = motion.body.tree.segments[segment]
         colour = np.array(_COLOURS[name[-2:] if name[-2:] in _COLOURS else ""])
         shade = 1.0 - 0.35 * (depth - nearest) / max(farthest - nearest, 1e-9)
-        cv2.fillPoly(image, [corners], (colour * shade).tolist(), cv2.LINE_AA, _FINE)
-        cv2.polylines(image, [corners], True, (colour * shade * 0.6).tolist(), 1, cv2.LINE_AA, _FINE)
+        cv2.fillPoly(image, [corners], (colour * shade).tolist(), cv2.LINE_AA, _SUBPIXEL_BITS)
+        cv2.polylines(image, [corners], True, (colour * shade * 0.6).tolist(), 1, cv2.LINE_AA, _SUBPIXEL_BITS)
     return image
 
 
 def portrait(body: Body, azimuth: float = 40.0, size: tuple[int, int] = (900, 900)) -> NDArray:
-    """Picture (H, W, 3) of a body in the closed pose nearest to its usual one, BGR 8 bit.
+    """Image (H, W, 3) of a body in its default pose, BGR 8 bit; with closures in a closed pose near it.
 
     Parameters
     ----------
-    azimuth : [deg] of the camera about the upright, 0 in front of the body.
+    azimuth : [deg] of the camera about the vertical, 0 in front of the body
     size : (width, height) [px]
 
     Raises
     ------
     BodyError
-        Closures that contradict each other; a body without surfaces.
+        Closures contradict each other; the body has no surfaces.
     """
     if not body.surfaces:
         raise BodyError(f"body '{body.name}' has no surfaces to draw", remedy="Give its segments some.")
@@ -74,30 +74,30 @@ def portrait(body: Body, azimuth: float = 40.0, size: tuple[int, int] = (900, 90
         np.zeros((1, count, 3)), np.ones(1), np.ones((1, count)),
     )  # fmt: skip
     frames, _ = body.tree.forward(state.T_world_root, state.angles)
-    all_of = [
+    points_of_limbs = [
         limb.vertices if isinstance(limb, MeshSurface) else np.array([limb.start, limb.end]) for limb in body.surfaces
     ]
     x = np.concatenate([
         (points + body.tree.rest[limb.segment]) @ frames[limb.segment, :9].reshape(3, 3).T + frames[limb.segment, 9:]
-        for points, limb in zip(all_of, body.surfaces)
+        for points, limb in zip(points_of_limbs, body.surfaces)
     ])  # fmt: skip
-    centre, far = 0.5 * (x.min(axis=0) + x.max(axis=0)), float(np.linalg.norm(np.ptp(x, axis=0)))
-    a, distance = np.radians(azimuth), 2.2 * far
+    centre, extent = 0.5 * (x.min(axis=0) + x.max(axis=0)), float(np.linalg.norm(np.ptp(x, axis=0)))
+    a, distance = np.radians(azimuth), 2.2 * extent
     eye = centre + distance * np.array([np.cos(a) * 0.97, 0.25, np.sin(a) * 0.97])
     T = look_at(eye, centre, np.array([0.0, 1.0, 0.0]))
-    focal = 0.85 * min(size) * distance / far
+    focal = 0.85 * min(size) * distance / extent
     matrix = np.array([[focal, 0.0, 0.5 * size[0]], [0.0, focal, 0.5 * size[1]], [0.0, 0.0, 1.0]])
     return draw_figure(motion, 0, Camera("portrait", size, matrix, np.zeros(0), "radtan", T))
 
 
-def _rim(limb: Surface, R_camera_segment: NDArray) -> NDArray:
-    """(K, 3) [m] points in the segment's frame about which the limb's outline runs: of its two rounded ends."""
+def _contour_points(limb: Surface, R_camera_segment: NDArray) -> NDArray:
+    """(K, 3) [m] points in the segment's frame whose convex hull in the image is the limb: of its two round ends."""
     if isinstance(limb, MeshSurface):
         return limb.vertices
-    angle = np.linspace(0, 2 * np.pi, _RIM, endpoint=False)
+    angle = np.linspace(0, 2 * np.pi, _END_CORNERS, endpoint=False)
     outward = np.outer(np.cos(angle), R_camera_segment[0]) + np.outer(np.sin(angle), R_camera_segment[1])
-    rims = []
+    ends = []
     for end, (a, b) in zip((limb.start, limb.end), limb.radii):
         M = limb.axes.T @ np.diag([a, b, np.sqrt(a * b)]) ** 2 @ limb.axes  # ellipsoid; its farthest point outward
-        rims.append(end + (outward @ M) / np.sqrt(np.sum(outward @ M * outward, axis=1))[:, None])
-    return np.concatenate(rims)
+        ends.append(end + (outward @ M) / np.sqrt(np.sum(outward @ M * outward, axis=1))[:, None])
+    return np.concatenate(ends)

@@ -1,4 +1,4 @@
-"""What 2D keypoint detectors would have seen of a known motion, with their errors."""
+"""Simulate 2D keypoints of a known motion, with the errors of a detector."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from kinefit.observations import Keypoints
 from kinefit.readers.keypoint_sets import keypoint_names
 from kinefit.sensors.channels import mirror_name
 
-_MARGIN = 0.04  # of the image, that stays free around the person
-_NEAREST = 3.0  # [m]
-_BURST = 8  # frames that a confusion of left and right lasts, on average
-_VOLUME = np.array([[-0.8, 0.0, -0.8], [0.8, 2.0, 0.8]])  # [m] where nothing else is asked for, y up
+_MARGIN_SHARE = 0.04  # of the image, free around the person
+_MIN_DISTANCE = 3.0  # [m]
+_MEAN_SWAP_FRAMES = 8  # length of a left-right swap
+_DEFAULT_VOLUME = np.array([[-0.8, 0.0, -0.8], [0.8, 2.0, 0.8]])  # [m], y up
 
 
 def studio_rig(
@@ -26,31 +26,36 @@ def studio_rig(
     size: tuple[int, int] = (1088, 1920),
     focal: float | None = None,
 ) -> Rig:
-    """Cameras around a motion, as near as they can stand and have all of it in view.
+    """Rig of cameras around a motion, each at the shortest distance from which all of it is in view.
 
     Parameters
     ----------
     motion : Motion, optional
         Default: a volume of 1.6 x 1.6 m and 2 m height at the origin.
     cameras : int
-        One or more; at the heights of tripods, around the motion but no two opposite each other.
+        One or more; at heights of tripods, around the motion, no two opposite each other.
     up : str, optional
         Vertical axis of the world; default: the motion's, or "y".
     size : (width, height) [px]
     focal : float [px], optional
-        Default: 1675 px for images 1920 px high, and in proportion.
+        Default: 1675 px for images 1920 px high, in proportion for others.
 
     Returns
     -------
     Rig
         Cameras cam01, cam02, ... with a mild lens distortion.
+
+    Raises
+    ------
+    ObservationError
+        `cameras` is below 1.
     """
     if cameras < 1:
         raise ObservationError(f"a rig of {cameras} cameras", remedy="Give one or more.")
     up = up or (motion.up if motion is not None else "y")
     R_world = rotation_between_up("y", up)  # built y up, then turned
     if motion is None:
-        corners = np.array(np.meshgrid(*_VOLUME.T)).reshape(3, -1).T
+        corners = np.array(np.meshgrid(*_DEFAULT_VOLUME.T)).reshape(3, -1).T
     else:
         corners = motion.positions().reshape(-1, 3) @ rotation_between_up(motion.up, "y").T
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -60,7 +65,7 @@ def studio_rig(
     for k in range(cameras):
         azimuth = 2 * np.pi * (k + 0.5) / cameras + (0.22 if k % 2 else -0.12)
         height = low[1] + (1.3, 1.9, 1.5, 2.2)[k % 4]
-        for distance in np.arange(_NEAREST, 60.0, 0.1):
+        for distance in np.arange(_MIN_DISTANCE, 60.0, 0.1):
             place = centre + distance * np.array([np.cos(azimuth), 0.0, np.sin(azimuth)])
             place[1] = height
             camera = _camera(f"cam{k + 1:02d}", size, focal, place, centre)
@@ -77,7 +82,7 @@ def _turn(R: NDArray) -> NDArray:
 
 
 def _camera(name: str, size: tuple[int, int], focal: float, place: NDArray, aim: NDArray) -> Camera:
-    """A camera at a place that looks at another; y up."""
+    """A camera at `place` (3,) [m] that looks at `aim` (3,) [m]; y up."""
     z = (aim - place) / np.linalg.norm(aim - place)
     x = np.cross(z, [0.0, 1.0, 0.0])
     x /= np.linalg.norm(x)
@@ -90,7 +95,7 @@ def _camera(name: str, size: tuple[int, int], focal: float, place: NDArray, aim:
 
 def _sees(camera: Camera, x_world: NDArray) -> bool:
     uv = camera.project(x_world) / camera.size
-    return bool(np.all((uv > _MARGIN) & (uv < 1 - _MARGIN)))  # NaN is not seen
+    return bool(np.all((uv > _MARGIN_SHARE) & (uv < 1 - _MARGIN_SHARE)))  # False for NaN
 
 
 def simulate_keypoints(
@@ -107,41 +112,41 @@ def simulate_keypoints(
     bystander: Motion | None = None,
     seed: int = 0,
 ) -> list[Keypoints]:
-    """Keypoints of a motion in every camera of a rig, as a detector would give them.
+    """Simulate a detector's keypoints of a motion in every camera of a rig.
 
     Parameters
     ----------
     motion : Motion
         In the rig's world.
     keypoint_set : str
-        Points that the body lacks are never seen.
+        Points that the body lacks are never detected.
     noise_px : float [px]
-        Standard deviation of a point along u and v.
-    outliers : share of the points seen
-        One half lies anywhere in the person's box, the other 20 to 200 px away from where it should.
+        Standard deviation of the jitter along u and v.
+    outliers : share of the detected points
+        One half is anywhere in the person's box, the other 20 to 200 px off.
     missing : share of the points
-        NaN with confidence 0, as are points outside the image.
+        NaN with confidence 0, like points outside the image.
     swaps : share of each camera's frames
-        In bursts of about eight frames, left is taken for right in the whole person.
+        Left and right of the whole person are swapped, for about eight frames each time.
     drift_px : float [px]
-        Standard deviation of a second error along u and v that changes slowly: what a detector misses in one frame it
-        misses in the next.
+        Standard deviation of the drift along u and v, an error correlated in time.
     drift_time : float [s]
-        In which that error forgets itself by 1/e.
+        Time constant of the drift.
     bystander : Motion, optional
-        A second person, seen in as many frames as it has, with the same errors.
+        A second person, in as many frames as its motion has, with the same errors.
     seed : int
         The same seed gives the same keypoints.
 
     Returns
     -------
     list of Keypoints, one for each camera
-        Confidences of outliers are lower on average, but not always.
+        Confidences of outliers are lower on average only.
 
     Raises
     ------
     ObservationError
-        Shares that are not in 0..1, an unknown keypoint set.
+        A share is not in 0..1; a standard deviation is negative; `drift_time` is not positive; the keypoint set is
+        unknown.
     """
     for name, share in (("outliers", outliers), ("missing", missing), ("swaps", swaps)):
         if not 0.0 <= share <= 1.0:
@@ -155,7 +160,7 @@ def simulate_keypoints(
     names = keypoint_names(keypoint_set)
     random = np.random.default_rng(seed)
     people = [motion] if bystander is None else [motion, bystander]
-    seen = []
+    out = []
     for camera in rig:
         points = np.full((len(motion), len(people), len(names), 2), np.nan)
         confidence = np.zeros(points.shape[:3])
@@ -166,16 +171,16 @@ def simulate_keypoints(
                 uv = uv + drift_px * drift(uv.shape, keep, random)
             found = _detect(uv, camera, names, random, noise_px, outliers, missing, swaps)
             points[:frames, p], confidence[:frames, p] = found
-        if len(people) > 1:  # the order of people means nothing
+        if len(people) > 1:  # a detector's order of people is arbitrary
             order = random.permuted(np.tile(np.arange(len(people)), (len(motion), 1)), axis=1)
             points = np.take_along_axis(points, order[:, :, None, None], axis=1)
             confidence = np.take_along_axis(confidence, order[:, :, None], axis=1)
-        seen.append(Keypoints(camera.name, keypoint_set, names, motion.rate, points, confidence, source="simulation"))
-    return seen
+        out.append(Keypoints(camera.name, keypoint_set, names, motion.rate, points, confidence, source="simulation"))
+    return out
 
 
 def _project(motion: Motion, camera: Camera, keypoint_set: str, names: tuple[str, ...]) -> NDArray:
-    """(F, K, 2) [px], NaN for points that the body lacks and outside the image."""
+    """(F, K, 2) [px] projections, NaN for points that the body lacks and points outside the image."""
     points = motion.body.keypoints(keypoint_set)
     columns = [names.index(name) for name in points.names]
     uv = np.full((len(motion), len(names), 2), np.nan)
@@ -186,7 +191,12 @@ def _project(motion: Motion, camera: Camera, keypoint_set: str, names: tuple[str
 
 
 def drift(shape: tuple[int, ...], keep: float, random: np.random.Generator) -> NDArray:
-    """Values (F, ...) of unit variance, each the share `keep` of the last frame's and something new."""
+    """Random values (F, ...) of unit variance, correlated by `keep` (a number in 0..1) from frame to frame.
+
+    Parameters
+    ----------
+    shape : (F, K, 2) or any other
+    """
     out = random.standard_normal(shape)
     for f in range(1, len(out)):
         out[f] = keep * out[f - 1] + np.sqrt(1.0 - keep**2) * out[f]
@@ -197,7 +207,7 @@ def _detect(
     uv: NDArray, camera: Camera, names: tuple[str, ...], random: np.random.Generator,
     noise_px: float, outliers: float, missing: float, swaps: float,
 ) -> tuple[NDArray, NDArray]:
-    """Points (F, K, 2) with the errors of a detector, and its confidence (F, K)."""
+    """Points (F, K, 2) [px] with a detector's errors, and confidences (F, K)."""
     frames, count = uv.shape[:2]
     found = uv + noise_px * random.standard_normal(uv.shape)
     wrong = random.random((frames, count)) < outliers
@@ -218,9 +228,9 @@ def _detect(
 
 
 def _bursts(frames: int, share: float, random: np.random.Generator) -> NDArray:
-    """(F,) bool, true in bursts that make up about a share of all frames."""
+    """(F,) bool: random bursts of frames that make up a share of all frames."""
     out = np.zeros(frames, bool)
     while out.sum() < round(share * frames):
-        start, length = random.integers(frames), 1 + random.poisson(_BURST - 1)
+        start, length = random.integers(frames), 1 + random.poisson(_MEAN_SWAP_FRAMES - 1)
         out[start : min(start + length, start + round(share * frames) - int(out.sum()))] = True
     return out

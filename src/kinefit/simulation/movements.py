@@ -1,4 +1,4 @@
-"""Ten movements made of formulas, and the people who do them: the sequences of P2's experiment (P2 5)."""
+"""Ten synthetic movements, and people who perform them: the sequences of P2's experiment (P2 5)."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from kinefit.simulation._postures import MOVEMENTS
 from kinefit.simulation.retarget import known_motion
 
 DURATION = 4.0  # [s] at speed 1
-_SOLE = 0.02  # [m] over which feet share the support: that of a foot being lifted
-_FOOT = 0.04  # of the stature: no ankle lies as low
-_THICK = 0.015  # [m] of a foot below the axis of its toes
+_SUPPORT_HEIGHT = 0.02  # [m] of a foot being lifted, over which its share of the support decays
+_MAX_FOOT_HEIGHT = 0.04  # of the stature: ankles are higher
+_SOLE_THICKNESS = 0.015  # [m] of a foot below the axis of its toes
 
 
 @dataclass(frozen=True, eq=False)
 class Performer:
-    """Who moves, and how fast.
+    """A person, the speed of the movement, and the direction of the sensor.
 
     Parameters
     ----------
     body : Body
-    speed : float, 1 for the movement's usual duration of four seconds.
+    speed : float, 1 for the default duration of four seconds
     azimuth : float [rad]
-        Where a sensor stands, seen from above, counter-clockwise from straight ahead.
+        Of the sensor, counter-clockwise seen from above, from the person's forward direction.
     """
 
     body: Body
@@ -52,7 +52,7 @@ def movement(name: str, body: Body | None = None, *, rate: float = 30.0, speed: 
     Returns
     -------
     Motion
-        World y up, the person looks along x at the start, the floor at height zero; known exactly.
+        World y up, the person faces x at the start, the floor is at height zero; standard deviations zero.
 
     Raises
     ------
@@ -84,10 +84,10 @@ def movement(name: str, body: Body | None = None, *, rate: float = 30.0, speed: 
 
 
 def people(body: Body | None = None, *, count: int = 10, seed: int = 0) -> tuple[Performer, ...]:
-    """People of 1.50 to 2.00 m, thin and stout, slow and fast (speeds 0.6 to 1.6), seen from the front and half beside.
+    """People of 1.50 to 2.00 m stature with different girths, speeds (0.6 to 1.6) and sensor azimuths (± 20 degrees).
 
-    Every property runs evenly over its range; who has which is drawn by the seed. Limbs are up to 4 % longer or
-    shorter than a body of that stature has them, girths 0.85 to 1.2 times as large.
+    The values of every property are evenly spaced over its range, and combined at random. Limb lengths vary by ± 4 %
+    about those of the stature, girths are 0.85 to 1.2 times as large.
     """
     body = load_body("humanoid10") if body is None else body
     random = np.random.default_rng(seed)
@@ -105,7 +105,7 @@ def people(body: Body | None = None, *, count: int = 10, seed: int = 0) -> tuple
 
 
 def _stouter(body: Body, girth: float) -> Body:
-    """The body with the half axes of all cylinders multiplied."""
+    """The body with the half axes of all cylinders multiplied by `girth`."""
     surfaces = []
     for s in body.surfaces:
         if isinstance(s, TaperedCylinder):
@@ -116,13 +116,13 @@ def _stouter(body: Body, girth: float) -> Body:
 
 
 def _planted(body: Body, R_world_root: NDArray, angles: NDArray) -> NDArray:
-    """T_world_root (F, 4, 4) such that the lowest foot stands on the floor and does not slip."""
+    """T_world_root (F, 4, 4) for which the lowest foot is on the floor and does not slip."""
     Ts = se3.transform(R_world_root, np.zeros((len(angles), 3)))
     poses = body.tree.segment_poses(Ts, angles)
     feet = [np.mean([se3.apply(poses[:, k], point) for k, point in foot], axis=0) for foot in _feet(body)]
     x = np.stack(feet, axis=1)  # (F, feet, 3)
     height = x[..., 1]
-    share = np.exp(-(height - height.min(axis=1, keepdims=True)) / _SOLE)
+    share = np.exp(-(height - height.min(axis=1, keepdims=True)) / _SUPPORT_HEIGHT)
     share /= share.sum(axis=1, keepdims=True)
     place = np.zeros((len(angles), 3))
     carried = 0.5 * (share[1:] + share[:-1])[..., None] * np.diff(x, axis=0)
@@ -133,20 +133,21 @@ def _planted(body: Body, R_world_root: NDArray, angles: NDArray) -> NDArray:
 
 
 def _feet(body: Body) -> list[list[tuple[int, NDArray]]]:
-    """Points of both feet, left and right, with their segments: ends of the cylinders that are lowest at rest."""
+    """Points of the left and the right foot, with their segments: the lowest cylinder ends of the rest pose."""
     tips = _tips(body)
     if not tips:
         return [[(s, np.zeros(3)) for s in range(len(body.tree.segments))]]
     x = np.array([body.tree.rest[s] + p for s, p in tips])
-    low = x[:, 1] < x[:, 1].min() + _FOOT * max(body.stature, 1e-3)
+    low = x[:, 1] < x[:, 1].min() + _MAX_FOOT_HEIGHT * max(body.stature, 1e-3)
     sides = [low & (x[:, 2] < 0.0), low & (x[:, 2] >= 0.0)]
     return [[tip for tip, here in zip(tips, side) if here] for side in sides if side.any()]
 
 
 def _standing_height(body: Body) -> float:
-    """[m] of the middle of the feet above the floor when the body stands at rest."""
+    """Height [m] of the middle of the feet above the floor in the rest pose."""
     low = min((body.tree.rest[s, 1] + p[1] for s, p in _tips(body)), default=0.0)
-    return float(np.mean([body.tree.rest[s, 1] + p[1] for foot in _feet(body) for s, p in foot]) - low + _THICK)
+    feet = np.mean([body.tree.rest[s, 1] + p[1] for foot in _feet(body) for s, p in foot])
+    return float(feet - low + _SOLE_THICKNESS)
 
 
 def _tips(body: Body) -> list[tuple[int, NDArray]]:

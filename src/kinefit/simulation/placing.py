@@ -1,4 +1,4 @@
-"""Where a sensor stands: in front of a person, as near as it can see all of the motion."""
+"""Place a sensor in front of a person, at the shortest distance from which all of the motion is in view."""
 
 from __future__ import annotations
 
@@ -9,35 +9,36 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.motion import UP_AXES, Motion
 
-_MARGIN = 0.04  # of the image, that stays free around the landmarks
-_NEAREST, _FARTHEST = 1.0, 20.0  # [m]
-_SKIN = 0.1  # [m] by which the body's surface comes nearer than its landmarks
+_MARGIN_SHARE = 0.04  # of the image, free around the landmarks
+_MIN_DISTANCE = 1.0  # [m]
+_MAX_DISTANCE = 20.0  # [m]
+_SURFACE_MARGIN = 0.1  # [m] between landmarks and the body's surface
 
 
 def in_front(
     motion: Motion, camera: Camera, *, distance: float | None = None, azimuth: float = 0.0, height: float = 1.2,
     near: float = 0.0, far: float = np.inf,
 ) -> Camera:
-    """The camera placed so that it looks at the middle of a motion.
+    """The camera placed in front of a person, looking at the middle of the motion.
 
     Parameters
     ----------
     motion : Motion
     camera : Camera
-        Its lens counts, its pose does not.
+        Its intrinsics are kept, its pose is replaced.
     distance : float [m], optional
-        From the middle of the motion, along the floor; default: the nearest from which all landmarks are in the image
+        From the middle of the motion, along the floor; default: the shortest from which all landmarks are in the image
         and within the range.
     azimuth : float [rad]
-        Seen from above, counter-clockwise from straight ahead of the person (mean of the root's x axis).
-    height : float [m] above the lowest landmark.
+        Counter-clockwise seen from above, from the person's forward direction (mean of the root's x axis).
+    height : float [m] above the lowest landmark
     near, far : float [m]
-        What the sensor measures.
+        Range of the sensor.
 
     Raises
     ------
     ObservationError
-        No distance shows all of the motion within the range.
+        There is no distance from which all of the motion is in view and within the range.
     """
     up = np.array(UP_AXES[motion.up])
     points = places(motion)
@@ -45,13 +46,13 @@ def in_front(
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     forward = motion.Ts_world_root[:, :3, 0].mean(axis=0)
     forward -= (forward @ up) * up
-    if np.linalg.norm(forward) < 0.1:  # turns round and round, or its x axis points up
+    if np.linalg.norm(forward) < 0.1:  # all directions occur, or the x axis is vertical
         forward = np.roll(up, 1)
     forward /= np.linalg.norm(forward)
     ahead = np.cos(azimuth) * forward + np.sin(azimuth) * np.cross(up, forward)
     eye = middle + (along.min() + height - middle @ up) * up
-    for away in (distance,) if distance is not None else np.arange(_NEAREST, _FARTHEST, 0.05):
-        placed = camera.with_pose(look_at(eye + away * ahead, middle, up))
+    for trial in (distance,) if distance is not None else np.arange(_MIN_DISTANCE, _MAX_DISTANCE, 0.05):
+        placed = camera.with_pose(look_at(eye + trial * ahead, middle, up))
         if distance is not None or _sees(placed, points, near, far):
             return placed
     depth = float(np.ptp(points @ ahead))
@@ -62,14 +63,14 @@ def in_front(
 
 
 def places(motion: Motion) -> NDArray:
-    """(N, 3) [m] all landmarks in all frames, in the world; the joints of a body without landmarks."""
+    """(N, 3) [m] all landmarks in all frames, in the world; joint centres for a body without landmarks."""
     if len(motion.body.landmarks):
         return motion.positions().reshape(-1, 3)
     return motion.segment_poses()[..., :3, 3].reshape(-1, 3)
 
 
 def look_at(eye: NDArray, target: NDArray, up: NDArray) -> NDArray:
-    """T_camera_world (4, 4) of a camera at `eye` that has `target` in its middle and `up` upright."""
+    """T_camera_world (4, 4) of a camera at `eye` (3,) [m] that looks at `target` (3,) [m], with `up` (3,) upwards."""
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, up)
     x /= np.linalg.norm(x)
@@ -89,5 +90,5 @@ def beside(camera: Camera, name: str, baseline: float) -> Camera:
 def _sees(camera: Camera, x_world: NDArray, near: float, far: float) -> bool:
     uv = camera.project(x_world) / camera.size
     z = x_world @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
-    inside = np.all((uv > _MARGIN) & (uv < 1 - _MARGIN), axis=1)  # NaN is not seen
-    return bool(inside.all() and z.min() > near + _SKIN and z.max() < far)
+    inside = np.all((uv > _MARGIN_SHARE) & (uv < 1 - _MARGIN_SHARE), axis=1)  # False for NaN
+    return bool(inside.all() and z.min() > near + _SURFACE_MARGIN and z.max() < far)

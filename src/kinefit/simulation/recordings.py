@@ -1,4 +1,4 @@
-"""A whole recording of a known motion by depth, stereo and colour cameras: files, calibration and take file."""
+"""Write a simulated recording of a known motion by depth, stereo and colour cameras, as a take."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from kinefit.simulation.rendering.scenes import SimulatedScene
 from kinefit.simulation.rendering.sensors import DEPTH_SENSORS, DepthSensor, simulate_depth
 
 SENSORS = (*DEPTH_SENSORS, "stereo", "colour", "keypoints")
-"""What `write_recording` simulates."""
+"""Sensors that `write_recording` can simulate."""
 
-_UNIT = 0.001  # [m] of one count of a depth image
-_KEYPOINT_NOISE = 1.5  # [px]
-_KEYPOINT_ACCURACY = 2.0  # [px] in the take: what the noise and the small outliers come to
-_DISPARITY_ACCURACY = 0.5  # [px]
-_PREVIEW = 240  # [px] height
-_FRAME = re.compile(r"\d{6}\.png")
+_DEPTH_UNIT = 0.001  # [m] of one count of a depth image
+_KEYPOINT_NOISE_PX = 1.5  # [px]
+_KEYPOINT_SIGMA = 2.0  # [px] in the take file: noise and small outliers
+_DISPARITY_SIGMA = 0.5  # [px] in the take file
+_PREVIEW_HEIGHT = 240  # [px]
+_FRAME_FILE = re.compile(r"\d{6}\.png")
 
 Step = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """What there is to write: the scene, one camera for every name, and where to say how far it has come."""
+    """A recording to write: scene, cameras by name, seed of the errors, and a progress function."""
 
     scene: SimulatedScene
     rig: Rig
@@ -72,29 +72,28 @@ def write_recording(
     beside: Callable[[Path], None] | None = None,
     body: str | os.PathLike[str] | None = None,
 ) -> Path:
-    """Write what sensors in front of a person would have seen of a motion, as a take.
+    """Write a take that sensors in front of a person would have recorded of a motion.
 
     Parameters
     ----------
     motion : Motion
-        One frame of it is one frame of every sensor.
+        Each of its frames is a frame of every sensor.
     folder : path
-        Made where it does not exist; files of the same names in it are replaced.
+        Created if it does not exist; files of the same names in it are replaced.
     sensors : of `SENSORS`
-        "tof", "kinect": 16-bit PNG in millimetres; "stereo": two grey videos without loss; "colour": a video;
-        "keypoints": a detector's points in the colour camera.
+        "tof", "kinect": 16-bit PNG in millimetres; "stereo": two lossless grey videos; "colour": a video;
+        "keypoints": a detector's keypoints in the colour camera.
     distance, azimuth, height : [m], [rad], [m]
-        Where they stand, see `in_front`; by default each as near as it can see all of the motion.
+        Place of the sensors, see `in_front`; default: each at the shortest distance with all of the motion in view.
     room : bool
-        Floor, walls and a table around the body.
+        Whether floor, walls and a table are around the body.
     seed : int
         Of all errors.
     step : callable(what, done, total), optional
     beside : callable(folder), optional
-        Writes more files to stand beside the take (the truth); they appear with the rest or not at all.
-
+        Writes further files next to the take (such as the truth); they appear with the rest or not at all.
     body : path, optional
-        Body file that the take shall name; default: the name of the motion's body, as the catalogue has it.
+        Body file for the take to name; default: the name of the motion's body in the catalogue.
 
     Returns
     -------
@@ -104,9 +103,9 @@ def write_recording(
     Raises
     ------
     ObservationError
-        A sensor that does not exist, or that cannot see all of the motion within its range.
+        A sensor is unknown, or cannot have all of the motion in view and within its range.
     ExportError
-        The folder cannot be written; then no take file is there.
+        The folder cannot be written. It then contains no take file.
     """
     folder, chosen = Path(folder), list(dict.fromkeys(sensors))
     for name in chosen:
@@ -132,7 +131,7 @@ def write_recording(
             if beside is not None:
                 beside(staging)
             _move(staging, folder)
-    except OSError as error:  # PyAV's errors of files are of this kind too
+    except OSError as error:  # PyAV's file errors are OSErrors too
         raise ExportError(
             f"the recording cannot be written ({error.strerror or error})", file=folder,
             remedy="Name a folder that can be written, on a disk with free space.",
@@ -162,7 +161,7 @@ def _cameras(
 
 
 def _write_sensor(job: _Job, sensor: str, chosen: Sequence[str], folder: Path) -> list[str]:
-    """Write the files of one sensor; its entries in the take file."""
+    """Write the files of one sensor; returns its entries of the take file."""
     if sensor in DEPTH_SENSORS:
         return _write_depth(job, DEPTH_SENSORS[sensor], folder)
     if sensor == "stereo":
@@ -170,7 +169,7 @@ def _write_sensor(job: _Job, sensor: str, chosen: Sequence[str], folder: Path) -
         for name in names:
             _write_video(job, name, STEREO, folder / f"{name}.mkv", grey=True)
         entries = [f'[[camera]]\nname = "{name}"\nvideo = "{name}.mkv"\n' for name in names]
-        pair = f'[[stereo]]\nleft = "{names[0]}"\nright = "{names[1]}"\nsigma = {_DISPARITY_ACCURACY}  # px\n'
+        pair = f'[[stereo]]\nleft = "{names[0]}"\nright = "{names[1]}"\nsigma = {_DISPARITY_SIGMA}  # px\n'
         return [*entries, pair]
     if sensor == "colour":
         _write_video(job, "colour", COLOUR, folder / "colour.mp4", grey=False)
@@ -184,12 +183,13 @@ def _write_depth(job: _Job, sensor: DepthSensor, folder: Path) -> list[str]:
     video = simulate_depth(motion, camera, sensor, seed=job.seed, scene=job.scene)
     (folder / sensor.name).mkdir()
     for frame in job.frames(sensor.name):
-        counts = np.round(video.frame(frame).depth / _UNIT).astype(np.uint16)
+        counts = np.round(video.frame(frame).depth / _DEPTH_UNIT).astype(np.uint16)
         _save(folder / sensor.name / f"{frame:06d}.png", counts)
-    away = float(np.linalg.norm(places(motion).mean(axis=0) - camera.centre_world))
+    distance = float(np.linalg.norm(places(motion).mean(axis=0) - camera.centre_world))
     return [
-        f'[[depth]]\nname = "{sensor.name}"\nfile = "{sensor.name}"\nunit = {_UNIT}\nrate = {float(motion.rate)}\n'
-        f"range = [{sensor.near}, {sensor.far}]\nsigma = {float(sensor.sigma(away)):.4f}\n"
+        f'[[depth]]\nname = "{sensor.name}"\nfile = "{sensor.name}"\n'
+        f"unit = {_DEPTH_UNIT}\nrate = {float(motion.rate)}\n"
+        f"range = [{sensor.near}, {sensor.far}]\nsigma = {float(sensor.sigma(distance)):.4f}\n"
     ]
 
 
@@ -214,24 +214,24 @@ def _write_video(job: _Job, name: str, sensor: ColourSensor, path: Path, *, grey
 
 def _write_keypoints(job: _Job, folder: Path) -> str:
     rig = Rig((job.rig["colour"],))
-    (seen,) = simulate_keypoints(
-        job.scene.motion, rig, "MEDIAPIPE_33", noise_px=_KEYPOINT_NOISE, outliers=0.02, missing=0.05, seed=job.seed
+    (detected,) = simulate_keypoints(
+        job.scene.motion, rig, "MEDIAPIPE_33", noise_px=_KEYPOINT_NOISE_PX, outliers=0.02, missing=0.05, seed=job.seed
     )
-    points = np.concatenate([seen.points[:, 0], seen.confidence[:, 0, :, None]], axis=-1)
+    points = np.concatenate([detected.points[:, 0], detected.confidence[:, 0, :, None]], axis=-1)
     np.save(folder / "mediapipe_colour.npy", np.nan_to_num(points).astype(np.float32))
     return (
         f'[[keypoints]]\ncamera = "colour"\nfile = "mediapipe_colour.npy"\nformat = "mediapipe"\n'
-        f"sigma = {_KEYPOINT_ACCURACY}\n"
+        f"sigma = {_KEYPOINT_SIGMA}\n"
     )
 
 
 def preview(scene: SimulatedScene, rig: Rig, *, frame: int | None = None, seed: int = 0) -> NDArray:
-    """Picture (240, W, 3) BGR of what the sensors of a recording see in one frame, by default the middle one.
+    """Image (240, W, 3) BGR of one frame of all sensors of a recording, side by side; default: the middle frame.
 
-    Depth as colours: near red, far blue, black where nothing was measured.
+    Depth is shown as colours: near red, far blue, black for pixels without depth.
     """
     frame = len(scene.motion) // 2 if frame is None else frame
-    points, shown = places(scene.motion).reshape(len(scene.motion), -1, 3)[frame], []
+    points, images = places(scene.motion).reshape(len(scene.motion), -1, 3)[frame], []
     for camera in rig:
         if camera.name in DEPTH_SENSORS:
             video = simulate_depth(scene.motion, camera, DEPTH_SENSORS[camera.name], seed=seed, scene=scene)
@@ -241,10 +241,10 @@ def preview(scene: SimulatedScene, rig: Rig, *, frame: int | None = None, seed: 
             grey = camera.name != "colour"
             image = picture(scene, frame, camera, STEREO if grey else COLOUR, grey=grey, seed=seed)
             image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if grey else image
-        size = (round(_PREVIEW * camera.size[0] / camera.size[1]), _PREVIEW)
-        few = camera.size[1] < _PREVIEW
-        shown.append(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST if few else cv2.INTER_AREA))
-    return np.hstack(shown)
+        size = (round(_PREVIEW_HEIGHT * camera.size[0] / camera.size[1]), _PREVIEW_HEIGHT)
+        is_enlarged = camera.size[1] < _PREVIEW_HEIGHT
+        images.append(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST if is_enlarged else cv2.INTER_AREA))
+    return np.hstack(images)
 
 
 def _take(motion: Motion, entries: Sequence[str], body: str) -> str:
@@ -258,13 +258,13 @@ def _take(motion: Motion, entries: Sequence[str], body: str) -> str:
 
 
 def _move(staging: Path, folder: Path) -> None:
-    """Let the new files take the place of old ones; the take file goes first and comes last."""
+    """Move the new files into the folder; the old take file is removed first, the new one moved last."""
     (folder / "take.toml").unlink(missing_ok=True)
     for path in sorted(staging.iterdir(), key=lambda path: path.name == "take.toml"):
         target = folder / path.name
         if path.is_dir() and target.is_dir():
-            for old in target.iterdir():  # frames of a longer recording; nothing else is touched
-                if _FRAME.fullmatch(old.name):
+            for old in target.iterdir():  # frames of a longer recording; other files stay
+                if _FRAME_FILE.fullmatch(old.name):
                     old.unlink()
             for new in path.iterdir():
                 new.replace(target / new.name)

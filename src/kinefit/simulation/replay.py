@@ -1,4 +1,4 @@
-"""A motion seen anew: on a slope, carried along, by a camera that was not there (P3 4, fig. 13)."""
+"""Replay a motion on a slope, moved along it, and film it with a virtual camera (P3 4, fig. 13)."""
 
 from __future__ import annotations
 
@@ -19,26 +19,29 @@ from kinefit.motion import UP_AXES, Motion
 from kinefit.simulation.figures import draw_figure
 from kinefit.simulation.placing import look_at, places
 
-_SNOW, _TRACKS, _SKY = (240, 232, 226), (214, 202, 192), (225, 190, 150)  # BGR: the slope, its grid, the sky
-_GRID, _FAR = 1.0, 30  # [m] between the lines of a slope, and how many of them to either side
-_BEHIND = 0.3  # [m] before a camera, nearer than which no line is drawn
+_SLOPE_COLOUR = (240, 232, 226)  # BGR
+_GRID_COLOUR = (214, 202, 192)  # BGR
+_SKY_COLOUR = (225, 190, 150)  # BGR
+_GRID_SPACING = 1.0  # [m]
+_GRID_LINES = 30  # to either side
+_MIN_LINE_DEPTH = 0.3  # [m] in front of a camera
 
 
 def replayed(
     motion: Motion, *, slope: float = 30.0, heading: float = 0.0, speed: float = 0.0, gain: float = 0.0
 ) -> Motion:
-    """The motion on an inclined floor, carried down it by s(t) = v t + a t² / 2 along the fall line.
+    """Put a motion on an inclined floor, moving down the fall line by s(t) = v t + a t² / 2.
 
     Parameters
     ----------
-    slope : [deg] of the floor, below 90.
-    heading : [deg] of the fall line about the vertical axis.
-    speed, gain : v [m/s] and a [m/s²].
+    slope : [deg] of the floor, below 90
+    heading : [deg] of the fall line about the vertical axis
+    speed, gain : v [m/s] and a [m/s²]
 
     Raises
     ------
     ObservationError
-        Numbers that are not finite, a slope of 90 degrees and more.
+        A number is not finite; the slope is 90 degrees or more.
     """
     if not np.isfinite([slope, heading, speed, gain]).all() or abs(slope) >= 90.0:
         problem = f"a slope of {slope:g} deg with {speed:g} m/s and {gain:g} m/s²"
@@ -55,7 +58,7 @@ def replayed(
 
 
 def _ground(motion: Motion, slope: float, heading: float) -> tuple[NDArray, NDArray]:
-    """Fall line (3,), and T (4, 4) from a level floor to the inclined one, about where the person first stands."""
+    """Fall line (3,), and T (4, 4) from a level floor to the inclined one, about the person's first place."""
     up, down, R = _inclined(motion, slope, heading)
     x = places(motion).reshape(len(motion), -1, 3)
     foot = x[0].mean(axis=0)
@@ -64,7 +67,7 @@ def _ground(motion: Motion, slope: float, heading: float) -> tuple[NDArray, NDAr
 
 
 def _inclined(motion: Motion, slope: float, heading: float) -> tuple[NDArray, NDArray, NDArray]:
-    """Upwards (3,), the fall line (3,), and R (3, 3) that inclines the floor."""
+    """Vertical (3,), fall line (3,), and R (3, 3) that inclines the floor."""
     up = np.array(UP_AXES[motion.up])
     level = se3.exp_so3(np.radians(heading) * up) @ np.roll(up, 1)
     R = se3.exp_so3(np.radians(slope) * np.cross(level, -up))
@@ -72,7 +75,7 @@ def _inclined(motion: Motion, slope: float, heading: float) -> tuple[NDArray, ND
 
 
 def _turned(std: NDArray, R: NDArray) -> NDArray:
-    """(F, S, 3) standard deviations along axes that were turned, as if errors along them were independent."""
+    """(F, S, 3) standard deviations along rotated axes, for independent errors along the old ones."""
     known = np.isfinite(std).all(axis=-1, keepdims=True)
     return np.where(known, np.sqrt(np.square(np.where(known, std, 0.0)) @ np.square(R).T), np.inf)
 
@@ -81,18 +84,18 @@ def film(
     motion: Motion, path: str | os.PathLike[str], *, slope: float = 30.0, heading: float = 0.0, azimuth: float = 100.0,
     size: tuple[int, int] = (960, 720),
 ) -> None:  # fmt: skip
-    """Write a video (.mp4) of a motion that `replayed` gave, on its slope, by a camera that pans with it.
+    """Write a video (.mp4) of a motion from `replayed` on its slope, with a panning camera.
 
     Parameters
     ----------
-    slope, heading : as of `replayed`
-    azimuth : [deg] of the camera about the vertical axis, from the fall line.
+    slope, heading : [deg], see `replayed`
+    azimuth : [deg] of the camera about the vertical axis, from the fall line
     size : (width, height) [px], even
 
     Raises
     ------
     ExportError
-        Another suffix, or a file that cannot be written.
+        The suffix is not .mp4; the file cannot be written.
     """
     target = Path(path)
     if target.suffix.lower() != ".mp4":
@@ -113,12 +116,12 @@ def film(
 
 
 def _cameras(motion: Motion, heading: float, azimuth: float, size: tuple[int, int]) -> list[Camera]:
-    """Of every frame the camera, which stands beside the middle of the way and turns with the person."""
+    """The camera of every frame: it stays beside the middle of the path, and pans and zooms with the person."""
     up = np.array(UP_AXES[motion.up])
     x = places(motion).reshape(len(motion), -1, 3).mean(axis=1)
     side = se3.exp_so3(np.radians(heading + azimuth) * up) @ np.roll(up, 1)
-    way = float(np.linalg.norm(x[-1] - x[0]))
-    eye = x[len(x) // 2] + (4.0 + 0.6 * way) * side + (1.0 + 0.1 * way) * up
+    length = float(np.linalg.norm(x[-1] - x[0]))
+    eye = x[len(x) // 2] + (4.0 + 0.6 * length) * side + (1.0 + 0.1 * length) * up
     out = []
     for middle in x:
         focal = 0.32 * size[1] * float(np.linalg.norm(middle - eye))
@@ -128,34 +131,35 @@ def _cameras(motion: Motion, heading: float, azimuth: float, size: tuple[int, in
 
 
 def _lines(motion: Motion, slope: float, heading: float) -> NDArray:
-    """(L, 2, 3) [m] lines of a grid on the slope, below the person's way."""
+    """(L, 2, 3) [m] lines of a grid on the slope, below the person's path."""
     up, down, R = _inclined(motion, slope, heading)
     across, normal = np.cross(R @ up, down), R @ up
     x = places(motion)
     at = x[: len(x) // len(motion)].mean(axis=0)
     at = at + (float((x @ normal).min()) - at @ normal) * normal
-    way = max(float(((x - at) @ down).max()), 0.0)
-    steps = np.arange(-_FAR, _FAR + 1) * _GRID
-    along = [(at + s * across - 10.0 * down, at + s * across + (way + 20.0) * down) for s in steps]
-    rungs = np.arange(-10.0, way + 20.0, _GRID)
-    return np.array([*along, *((at + r * down - _FAR * across, at + r * down + _FAR * across) for r in rungs)])
+    length = max(float(((x - at) @ down).max()), 0.0)
+    steps = np.arange(-_GRID_LINES, _GRID_LINES + 1) * _GRID_SPACING
+    along = [(at + s * across - 10.0 * down, at + s * across + (length + 20.0) * down) for s in steps]
+    rungs = np.arange(-10.0, length + 20.0, _GRID_SPACING)
+    half = _GRID_LINES * across
+    return np.array([*along, *((at + r * down - half, at + r * down + half) for r in rungs)])
 
 
 def _backdrop(camera: Camera, lines: NDArray, normal: NDArray) -> NDArray:
-    """The slope, upwards of which its normal (3,) points, with its grid before the sky."""
+    """Image (H, W, 3) of the slope with its upward normal (3,), its grid and the sky."""
     horizon = np.linalg.inv(camera.matrix).T @ camera.T_camera_world[:3, :3] @ normal  # rays below it meet the slope
     u, v = np.meshgrid(np.arange(camera.size[0]), np.arange(camera.size[1]))
-    image = np.full((camera.size[1], camera.size[0], 3), _SNOW, np.uint8)
+    image = np.full((camera.size[1], camera.size[0], 3), _SLOPE_COLOUR, np.uint8)
     ends = lines @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
     for a, b in ends:
-        if min(a[2], b[2]) < _BEHIND:
-            if max(a[2], b[2]) < _BEHIND:
+        if min(a[2], b[2]) < _MIN_LINE_DEPTH:
+            if max(a[2], b[2]) < _MIN_LINE_DEPTH:
                 continue
             far, near = (a, b) if a[2] > b[2] else (b, a)
-            near = near + (far - near) * (_BEHIND - near[2]) / (far[2] - near[2])
+            near = near + (far - near) * (_MIN_LINE_DEPTH - near[2]) / (far[2] - near[2])
             a, b = far, near
         p, q = (camera.matrix @ v for v in (a, b))
         start, end = (np.clip(np.round(v[:2] / v[2]), -20000, 20000).astype(int).tolist() for v in (p, q))
-        cv2.line(image, start, end, _TRACKS, 1, cv2.LINE_AA)
-    image[horizon[0] * u + horizon[1] * v + horizon[2] >= 0.0] = _SKY
+        cv2.line(image, start, end, _GRID_COLOUR, 1, cv2.LINE_AA)
+    image[horizon[0] * u + horizon[1] * v + horizon[2] >= 0.0] = _SKY_COLOUR
     return image

@@ -1,4 +1,4 @@
-"""A recorded motion of any known skeleton, put onto the humanoid by the directions of its bones."""
+"""Retarget a recorded motion of any known skeleton to the humanoid by the directions of its bones."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from kinefit.observations import SkeletonMotion
 from kinefit.simulation.skeletons import BoneDirections, bone_directions, steps
 from kinefit.solvers.least_squares import Fit, levenberg_marquardt
 
-_ACCURACY = 0.001  # [m] of the target points; small beside a bone, so that the priors only fill in what is free
-_POSTURE = 0.5  # [rad] spread of the angles about the usual posture: decides the turn of a straight arm
-_CHANGE = 0.2  # [rad] spread of their change from frame to frame
-_LOOSE = 0.004  # [m] the same of hands and feet, which recordings often have bent further than a joint goes
-_POOR = 1000.0  # cost of a frame that is not fitted well
+_TARGET_STD = 0.001  # [m]; small relative to a bone, so that priors determine only what targets do not
+_POSTURE_STD = 0.5  # [rad] of the angles about the default posture: determines the rotation of a straight arm
+_CHANGE_STD = 0.2  # [rad] of the angles from frame to frame
+_EXTREMITY_STD = 0.004  # [m] of targets of hands and feet, which recordings often bend beyond joint limits
+_MAX_GOOD_COST = 1000.0  # of a frame that is fitted well
 _QUALITIES = ("dof_std", "joint_std", "quality", "segment_quality")
-_ANCHORS = 5  # frames tried to begin with
-_STARTS = ((-1.2, 1.3), (0.0, 1.3), (1.2, 1.3))  # [rad] turn of the upper arm, pronation
+_ANCHOR_CANDIDATES = 5  # frames tried as the first one
+_ARM_STARTS = ((-1.2, 1.3), (0.0, 1.3), (1.2, 1.3))  # [rad] rotation of the upper arm, pronation
 _CHAIN = (("thigh", "shank"), ("shank", "foot"), ("foot", "toes"), ("upperarm", "forearm"), ("forearm", "hand"))
 _POINTS = ("skull_vertex", "l_tragion", "r_tragion") + tuple(
     f"{side}_{name}" for side in "lr" for name in ("digit_2", *(f"metacarpal_phalanx_{k}" for k in (2, 3, 5)))
@@ -39,21 +39,21 @@ def retarget(
     skeleton: SkeletonMotion, body: Body | None = None, *, rate: float | None = None,
     names: Mapping[str, str] | None = None,
 ) -> Motion:
-    """Motion of a body whose bones point where those of a recorded skeleton do; it keeps its own lengths.
+    """Retarget a recorded skeleton to a body: same bone directions, the body's own lengths.
 
-    Target points are found by walking from joint to joint with the body's lengths along the recorded directions, and
-    the body is fitted to them within its joint limits. The root's way is scaled by the length of the legs.
+    Target points follow from joint to joint, with the body's lengths along the recorded directions. The body is fitted
+    to them within its joint limits. The root's path is scaled by the length of the legs.
 
     Parameters
     ----------
     skeleton : SkeletonMotion
-        Of a family of `bodies.joint_names.FAMILIES`, or of names that `names` tells.
+        Of a family of `bodies.joint_names.FAMILIES`, or with joints given by `names`.
     body : Body, optional
-        The catalogue's "humanoid" (default), or one of the same segments and landmarks.
+        The catalogue's "humanoid" (default), or a body with the same segments and landmarks.
     rate : float [Hz], optional
         Of the result; default: the recorded one.
     names : segment -> name of its joint, optional
-        As of `bodies.joint_names.recorded_joints`.
+        See `bodies.joint_names.recorded_joints`.
 
     Returns
     -------
@@ -63,9 +63,9 @@ def retarget(
     Raises
     ------
     ObservationError
-        The skeleton is of no known family; the message tells which joints lack.
+        The skeleton is of no known family; the message lists the missing joints.
     BodyError
-        The body is not made like the humanoid.
+        The body lacks segments or landmarks of the humanoid.
     """
     body = load_body("humanoid") if body is None else body
     bones = bone_directions(skeleton, names)
@@ -78,9 +78,10 @@ def retarget(
     def follow(frames: Iterable[int], state: BodyState) -> None:
         for frame in frames:
             start = BodyState(Ts_world_root[frame], state.angles)
-            fit = _fit(body, start, points, targets[frame], change=_CHANGE)
-            if fit.equations.cost > _POOR:  # a joint ran into its limit: is there another way to get there?
-                fits = [_fit(body, s, points, targets[frame], change=np.inf) for s in _other_ways(body, start)]
+            fit = _fit(body, start, points, targets[frame], change=_CHANGE_STD)
+            if fit.equations.cost > _MAX_GOOD_COST:  # a joint is at its limit: try other angles of the same rotation
+                starts = _equivalent_shoulders(body, start)
+                fits = [_fit(body, s, points, targets[frame], change=np.inf) for s in starts]
                 other = min(fits, key=lambda f: f.equations.cost)
                 fit = other if other.equations.cost < 0.5 * fit.equations.cost else fit
             state = fit.state
@@ -96,7 +97,7 @@ def retarget(
 def known_motion(
     body: Body, rate: float, Ts_world_root: NDArray, angles: NDArray, *, up: str = "y", name: str = "motion"
 ) -> Motion:
-    """Motion that is known exactly: roots (F, 4, 4) [m], angles (F, D) [rad]; deviations zero, qualities one."""
+    """Motion from roots (F, 4, 4) [m] and angles (F, D) [rad], with standard deviations zero and qualities one."""
     frames, segments = len(angles), len(body.tree.segments)
     return Motion(
         body=body, rate=rate, times=np.arange(frames) / rate, Ts_world_root=Ts_world_root, angles=angles,
@@ -106,32 +107,35 @@ def known_motion(
 
 
 def _fit(body: Body, start: BodyState, points: PointSet, target: NDArray, *, change: float) -> Fit:
-    accuracy = np.where([name in _EXTREMITIES for name in points.names], _LOOSE, _ACCURACY)
-    return fit_to_points(body, start, points, target, sigma=accuracy, change=change)
+    sigma = np.where([name in _EXTREMITIES for name in points.names], _EXTREMITY_STD, _TARGET_STD)
+    return fit_to_points(body, start, points, target, sigma=sigma, change=change)
 
 
 def fit_to_points(
     body: Body, start: BodyState, points: PointSet, target: NDArray, *, sigma: ArrayLike, change: float
 ) -> Fit:
-    """The state that brings points of a body to targets (K, 3) [m] with `sigma` [m], and leaves the rest as it was.
+    """Fit a state to targets (K, 3) [m] of points of a body, with priors on the posture and on changes from the start.
 
-    `change` : float [rad] spread of the angles about those of the start.
+    Parameters
+    ----------
+    sigma : scalar or (K,) [m] of the targets
+    change : float [rad], standard deviation of the angles about those of the start
     """
     of_change = np.concatenate([np.full(6, np.inf), np.full(len(start.angles), change)])
 
     def make_rows(state: BodyState) -> tuple:
         return (
             point_rows(body, state, points, target, sigma=sigma),
-            prior_rows(body, state, sigma=_POSTURE),
+            prior_rows(body, state, sigma=_POSTURE_STD),
             prediction_rows(body, state, start, sigma=of_change),
         )
 
     return levenberg_marquardt(body, start, make_rows, tolerance=1e-6)
 
 
-def _other_ways(body: Body, state: BodyState) -> list[BodyState]:
-    """The same turns of the shoulders by other angles: (a, b, c) about z, x, y is (a ± π, π - b, c ± π)."""
-    ways = []
+def _equivalent_shoulders(body: Body, state: BodyState) -> list[BodyState]:
+    """States with the same shoulder rotations by other angles: (a, b, c) about z, x, y is (a ± π, π - b, c ± π)."""
+    states = []
     for sides in ("l", "r", "lr"):
         angles = np.array(state.angles)
         for side in sides:
@@ -139,18 +143,18 @@ def _other_ways(body: Body, state: BodyState) -> list[BodyState]:
             turned = np.array([np.pi, np.pi, np.pi]) + angles[d] * (1.0, -1.0, 1.0)
             middle = 0.5 * (body.tree.lower[d] + body.tree.upper[d])
             angles[d] = turned - 2 * np.pi * np.round((turned - middle) / (2 * np.pi))
-        ways.append(BodyState(state.T_world_root, angles))
-    return ways
+        states.append(BodyState(state.T_world_root, angles))
+    return states
 
 
 def _anchor(body: Body, points: PointSet, targets: NDArray, Ts_world_root: NDArray) -> tuple[int, BodyState]:
-    """The frame, among a few, that is fitted best from some start, and its state.
+    """The best fitted of a few frames, each from several starts, and its state.
 
-    Arms have solutions with elbow and shoulder turned the wrong way; many starts find the right one.
+    Arms have false solutions with elbow and shoulder turned the wrong way; several starts find the right one.
     """
     best, where, least = body.rest_state(Ts_world_root[0]), 0, np.inf
-    for frame in np.unique(np.linspace(0, len(targets) - 1, _ANCHORS).astype(int)):
-        for turns in product(_STARTS, repeat=2):
+    for frame in np.unique(np.linspace(0, len(targets) - 1, _ANCHOR_CANDIDATES).astype(int)):
+        for turns in product(_ARM_STARTS, repeat=2):
             start = np.array(body.rest_state().angles)
             for side, (rotation, pronation) in zip("lr", turns):
                 bent = {"arm_rot": rotation, "pro_sup": pronation, "elbow_flex": 0.8, "knee_angle": 0.3}
@@ -163,7 +167,7 @@ def _anchor(body: Body, points: PointSet, targets: NDArray, Ts_world_root: NDArr
 
 
 def _targets(body: Body, bones: BoneDirections) -> tuple[PointSet, NDArray, NDArray]:
-    """Points (K) of the body, where they should be (F, K, 3) [m], and the root's pose (F, 4, 4)."""
+    """K points of the body, their targets (F, K, 3) [m], and the root's pose (F, 4, 4)."""
     tree = body.tree
     lacking = [name for name in _POINTS if name not in body.landmarks.names]
     joints = [f"{name}_{side}" for pair in _CHAIN for name in pair for side in "lr"]
@@ -192,7 +196,7 @@ def _targets(body: Body, bones: BoneDirections) -> tuple[PointSet, NDArray, NDAr
     for name in ("head", "clavicle_l", "clavicle_r"):
         place[name] = place["thorax"] + R @ offset[name]
     for side in "lr":
-        turn = R @ _turn_from_usual(bones.bones[f"clavicle_{side}"], R)
+        turn = R @ _turn_from_median(bones.bones[f"clavicle_{side}"], R)
         place[f"upperarm_{side}"] = place[f"clavicle_{side}"] + turn @ offset[f"upperarm_{side}"]
     R = _frames(bones.bones["head"], bones.across["head"], bones.upright["head"])
     for name in ("skull_vertex", "l_tragion", "r_tragion"):
@@ -219,31 +223,31 @@ def _targets(body: Body, bones: BoneDirections) -> tuple[PointSet, NDArray, NDAr
 def _frames(bone: NDArray, across: NDArray, rest: NDArray, *, keep_across: bool = False) -> NDArray:
     """Rotations (F, 3, 3) that take z to `across` and (rest, 0) to `bone`, both (F, 3).
 
-    Where those are not at right angles, the bone is kept and the other turned; or the other way round.
+    If these are not orthogonal, the bone is kept and `across` made orthogonal to it; with `keep_across` vice versa.
     """
     first, second = (across, bone) if keep_across else (bone, across)
     first = first / np.linalg.norm(first, axis=1, keepdims=True)
     second = second - np.sum(first * second, axis=1, keepdims=True) * first
     second = second / np.linalg.norm(second, axis=1, keepdims=True)
     z, along = (first, second) if keep_across else (second, first)
-    beside = np.cross(z, along)
+    third = np.cross(z, along)
     forward, up = rest
-    return np.stack([forward * along - up * beside, up * along + forward * beside, z], axis=-1)
+    return np.stack([forward * along - up * third, up * along + forward * third, z], axis=-1)
 
 
-def _turn_from_usual(directions: NDArray, R: NDArray) -> NDArray:
-    """Smallest rotations (F, 3, 3) in the frames R (F, 3, 3) from the usual (median) direction to each (F, 3)."""
+def _turn_from_median(directions: NDArray, R: NDArray) -> NDArray:
+    """Smallest rotations (F, 3, 3) in the frames R (F, 3, 3) from the median direction to each (F, 3)."""
     local = (directions[:, None] @ R)[:, 0]
     return se3.shortest_turn(np.median(local, axis=0), local)
 
 
 def cut(motion: Motion, start: int, stop: int | None = None) -> Motion:
-    """Frames [start, stop) of a motion, as of a Python slice; its time begins at zero.
+    """Cut frames [start, stop) out of a motion, like a Python slice; its time starts at zero.
 
     Raises
     ------
     ObservationError
-        No frames are left.
+        No frames remain.
     """
     rows = slice(start, stop)
     if not len(motion.times[rows]):
@@ -263,9 +267,9 @@ def cut(motion: Motion, start: int, stop: int | None = None) -> Motion:
 
 
 def resampled(motion: Motion, rate: float) -> Motion:
-    """A motion at another rate [Hz]: angles and the root's place linearly, its turn along the shortest way.
+    """Resample a motion at another rate [Hz]: angles and root position linearly, root rotation along the shortest arc.
 
-    Deviations and qualities are those of the worse neighbour; residuals are left out.
+    Standard deviations and qualities are those of the worse neighbour; residuals are dropped.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Recorded skeletons of several families, told as the same few joints and directions."""
+"""Convert recorded skeletons of several families to common joints and bone directions."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from kinefit.errors import ObservationError
 from kinefit.motion import rotation_between_up
 from kinefit.observations import SkeletonMotion
 
-_LEAST_BONE = 0.005  # [m] a shorter bone has no direction
+_MIN_BONE_LENGTH = 0.005  # [m]: a shorter bone has no direction
 
 
 @dataclass(frozen=True, eq=False)
 class BoneDirections:
-    """A recorded motion without its lengths, y up; all arrays (F, 3), directions of unit length or NaN.
+    """Bone directions of a recorded motion, y up; all arrays (F, 3), unit vectors or NaN.
 
     Parameters
     ----------
     rate : float [Hz]
     hip_centre : (F, 3) [m]
-    leg_length : float [m] of thigh and shank.
+    leg_length : float [m] of thigh and shank
     bones : name -> direction
         "pelvis" (hip centre to sacrum), "abdomen", "thorax", "head" (from the root of the neck to the top of the head,
         or between the eyes), and with _l and _r "thigh", "shank", "foot", "toes", "clavicle" (from the root of the neck
@@ -32,8 +32,8 @@ class BoneDirections:
     across : name -> direction
         From left to right across "pelvis", "thorax" and "head"; towards the thumb across "hand_l" and "hand_r".
     upright : name -> (2,) forward and up, unit
-        Directions of "pelvis", "abdomen", "thorax" and "head" when the person stands upright: skeletons differ in where
-        they put the joints of the spine.
+        Directions of "pelvis", "abdomen", "thorax" and "head" of an upright person: skeletons differ in the places of
+        the spine's joints.
     """
 
     rate: float
@@ -47,7 +47,7 @@ class BoneDirections:
         return len(self.hip_centre)
 
     def resampled(self, rate: float) -> BoneDirections:
-        """The same at another rate [Hz], linearly between frames."""
+        """The bone directions at another rate [Hz], interpolated linearly."""
         at = steps(len(self), self.rate, rate)
         low = np.minimum(at.astype(int), len(self) - 1)
         high, share = np.minimum(low + 1, len(self) - 1), (at - low)[:, None]
@@ -63,7 +63,7 @@ class BoneDirections:
 
 
 def steps(frames: int, rate: float, new_rate: float) -> NDArray:
-    """Where the frames at a new rate [Hz] lie among the old ones (0 .. frames - 1).
+    """(N,) positions of the frames at a new rate [Hz] among the old ones (0 .. frames - 1) at `rate` [Hz].
 
     Raises
     ------
@@ -82,22 +82,22 @@ def bone_directions(skeleton: SkeletonMotion, names: Mapping[str, str] | None = 
     ----------
     skeleton : SkeletonMotion
     names : segment -> name of a joint, optional
-        As of `bodies.joint_names.recorded_joints`; else the names tell the family.
+        See `bodies.joint_names.recorded_joints`; default: the skeleton's family is found by its joint names.
 
     Raises
     ------
     ObservationError
-        Of no known family, or a bone of the trunk, the arms or the legs has no length.
+        The skeleton is of no known family; a bone of the trunk, the arms or the legs has no length.
     """
     found = recorded_joints(skeleton.names, names, source=skeleton.source)
     joints, R_up = found.joints, rotation_between_up(skeleton.up, "y")
     positions = skeleton.positions @ R_up.T
     rest, right, forward = _rest(skeleton, found, R_up)
 
-    def turned(role: str, direction: NDArray) -> NDArray:  # with the joint, from the rest pose
+    def turned(role: str, direction: NDArray) -> NDArray:  # direction in the rest pose -> (F, 3) with the joint
         return (R_up @ skeleton.Ts_world_joint[:, joints[role], :3, :3] @ R_up.T) @ direction
 
-    def end(role: str, of: str) -> NDArray:  # where no name tells it, the first child
+    def end(role: str, of: str) -> NDArray:  # the first child of `of` if there is no joint of this name
         return positions[:, joints.get(role, _child(skeleton, joints[of]))]
 
     joint = {role: positions[:, index] for role, index in joints.items()}
@@ -126,7 +126,7 @@ def bone_directions(skeleton: SkeletonMotion, names: Mapping[str, str] | None = 
         across[f"hand_{s}"] = turned(palm, forward) if thumb is None else thumb - joint[palm]
     legs = [np.linalg.norm(bones[f"{bone}_{side}"], axis=1).mean() for bone in ("thigh", "shank") for side in SIDES]
     for name, vector in bones.items():
-        if not name.startswith(("hand", "toes")) and np.any(np.linalg.norm(vector, axis=1) < _LEAST_BONE):
+        if not name.startswith(("hand", "toes")) and np.any(np.linalg.norm(vector, axis=1) < _MIN_BONE_LENGTH):
             raise ObservationError(f"the bone '{name}' has no length", file=skeleton.source or None)
     return BoneDirections(
         skeleton.rate, hip_centre, float(sum(legs) / 2),
@@ -136,7 +136,7 @@ def bone_directions(skeleton: SkeletonMotion, names: Mapping[str, str] | None = 
 
 
 def _child(skeleton: SkeletonMotion, joint: int) -> int:
-    """The first child of a joint; the joint itself where it has none, so that the bone has no direction."""
+    """The first child of a joint; the joint itself if it has none, so that the bone has no direction."""
     children = np.flatnonzero(skeleton.parents == joint)
     return int(children[0]) if len(children) else joint
 
@@ -161,4 +161,4 @@ def _upright(skeleton: SkeletonMotion, found: Recorded, rest: NDArray, forward: 
 
 def _unit(vectors: NDArray) -> NDArray:
     norms = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.where(norms >= _LEAST_BONE, vectors / np.where(norms > 0, norms, 1.0), np.nan)
+    return np.where(norms >= _MIN_BONE_LENGTH, vectors / np.where(norms > 0, norms, 1.0), np.nan)

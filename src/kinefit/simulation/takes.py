@@ -1,4 +1,4 @@
-"""A whole recording of a known motion: videos, keypoints, calibration and take file."""
+"""Write a synthetic take of a known motion: videos, keypoints, calibration and take file."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from kinefit.simulation.exercise import squat_and_wave
 from kinefit.simulation.figures import draw_figure
 from kinefit.simulation.keypoints import simulate_keypoints, studio_rig
 
-_SIZE = (544, 960)  # px
-_ACCURACY = 2.0  # px
+_IMAGE_SIZE = (544, 960)  # [px]
+_KEYPOINT_SIGMA = 2.0  # [px] in the take file
 
 
 def write_synthetic_take(folder: str | os.PathLike[str], seed: int = 0) -> Path:
@@ -31,7 +31,7 @@ def write_synthetic_take(folder: str | os.PathLike[str], seed: int = 0) -> Path:
     folder : path
         Made where it does not exist; files of the same names in it are replaced.
     seed : int
-        Of the keypoints' errors: 1.5 px noise, 5 % outliers, 5 % missing.
+        Of the keypoints' errors: 1.5 px noise, 5 % outliers, 5 % undetected.
 
     Returns
     -------
@@ -41,23 +41,23 @@ def write_synthetic_take(folder: str | os.PathLike[str], seed: int = 0) -> Path:
     Raises
     ------
     ExportError
-        The folder cannot be written; then no take file is there.
+        The folder cannot be written. It then contains no take file.
     """
     folder, motion = Path(folder), squat_and_wave()
-    rig = studio_rig(motion, size=_SIZE)
-    seen = simulate_keypoints(motion, rig, "MEDIAPIPE_33", noise_px=1.5, outliers=0.05, missing=0.05, seed=seed)
+    rig = studio_rig(motion, size=_IMAGE_SIZE)
+    detections = simulate_keypoints(motion, rig, "MEDIAPIPE_33", noise_px=1.5, outliers=0.05, missing=0.05, seed=seed)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
             staging = Path(name)
-            for camera, keypoints in zip(rig, seen):
+            for camera, keypoints in zip(rig, detections):
                 _write_video(motion, camera, staging / f"{camera.name}.mp4")
                 np.save(staging / f"mediapipe_{camera.name}.npy", _landmarks(keypoints))
             write_calibration(rig, staging / "calibration.toml")
             (staging / "take.toml").write_text(_take(motion, rig), encoding="utf-8")
             for path in sorted(staging.iterdir(), key=lambda path: path.name == "take.toml"):
                 path.replace(folder / path.name)
-    except OSError as error:  # PyAV's errors of files are of this kind too
+    except OSError as error:  # PyAV's file errors are OSErrors too
         raise ExportError(
             f"the synthetic take cannot be written ({error.strerror or error})", file=folder,
             remedy="Name a folder that can be written and has 10 MB free.",
@@ -78,7 +78,7 @@ def _write_video(motion: Motion, camera: Camera, path: Path) -> None:
 
 
 def _landmarks(keypoints: Keypoints) -> np.ndarray:
-    """(F, 33, 3) as MediaPipe gives them: x, y [px] and visibility, zero where unseen."""
+    """(F, 33, 3) landmarks in MediaPipe's format: x, y [px] and visibility, zero for undetected ones."""
     array = np.concatenate([keypoints.points[:, 0], keypoints.confidence[:, 0, :, None]], axis=-1)
     return np.nan_to_num(array).astype(np.float32)
 
@@ -92,7 +92,7 @@ def _take(motion: Motion, rig: Rig) -> str:
     parts += [f'[[camera]]\nname = "{name}"\nvideo = "{name}.mp4"\n' for name in rig.names]
     parts += [
         f'[[keypoints]]\ncamera = "{name}"\nfile = "mediapipe_{name}.npy"\nformat = "mediapipe"\n'
-        f"sigma = {_ACCURACY}\n"
+        f"sigma = {_KEYPOINT_SIGMA}\n"
         for name in rig.names
     ]
     return "\n".join(parts)

@@ -1,4 +1,4 @@
-"""A motion of one body, done by another."""
+"""Transfer a motion from one body to another by common landmarks."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from kinefit.geometry import se3
 from kinefit.motion import Motion
 from kinefit.simulation.retarget import fit_to_points, known_motion
 
-_ACCURACY = 0.01  # [m] bodies differ by more than this; small beside a limb, so that the priors only fill in
-_CHANGE = 0.2  # [rad] from frame to frame
-_FEWEST = 6  # landmarks that both must have: fewer leave limbs open
+_LANDMARK_STD = 0.01  # [m]; small relative to a limb, so that priors determine only what landmarks do not
+_CHANGE_STD = 0.2  # [rad] of an angle from frame to frame
+_MIN_LANDMARKS = 6  # in common: fewer do not determine all limbs
 
 
 def on_body(motion: Motion, body: Body) -> Motion:
-    """The motion with another body put through the same landmarks, as the two have names in common.
+    """Fit another body to the landmarks of a motion that both bodies have by name.
 
-    Where the statures differ, places are scaled with them about the world's origin, so the floor stays the floor.
+    If the statures differ, places are scaled about the world's origin by their ratio, so the floor stays at height
+    zero.
 
     Parameters
     ----------
@@ -37,10 +38,10 @@ def on_body(motion: Motion, body: Body) -> Motion:
         Fewer than six landmarks of the same names.
     """
     names = tuple(name for name in body.landmarks.names if name in motion.body.landmarks.names)
-    if len(names) < _FEWEST:
+    if len(names) < _MIN_LANDMARKS:
         raise BodyError(
             f"the bodies '{motion.body.name}' and '{body.name}' have {len(names)} landmarks in common",
-            remedy=f"Take a body with {_FEWEST} or more of: {', '.join(motion.body.landmarks.names)}.",
+            remedy=f"Take a body with {_MIN_LANDMARKS} or more of: {', '.join(motion.body.landmarks.names)}.",
         )
     points, scale = body.landmarks.select(names), 1.0
     if body.stature > 0 and motion.body.stature > 0:
@@ -49,13 +50,13 @@ def on_body(motion: Motion, body: Body) -> Motion:
     state, roots, angles = body.usual_state(), [], []
     for frame, target in enumerate(targets):
         start = BodyState(_aligned(body, state, points, target), state.angles)
-        change = _CHANGE if frame else np.inf
-        state = fit_to_points(body, start, points, target, sigma=_ACCURACY, change=change).state
+        change = _CHANGE_STD if frame else np.inf
+        state = fit_to_points(body, start, points, target, sigma=_LANDMARK_STD, change=change).state
         roots.append(state.T_world_root)
         angles.append(state.angles)
     return known_motion(body, motion.rate, np.array(roots), np.array(angles), up=motion.up, name=motion.name)
 
 
 def _aligned(body: Body, state: BodyState, points: PointSet, target: NDArray) -> NDArray:
-    """T_world_root (4, 4) that brings the points of a state nearest to their targets (Kabsch)."""
+    """T_world_root (4, 4) that aligns the points of a state with their targets (Kabsch)."""
     return se3.aligned(body.positions(state, points), target) @ state.T_world_root

@@ -1,4 +1,4 @@
-"""Kernels used once on a tiny simulated take: compiled, or loaded, before a person moves in front of cameras."""
+"""Warm up compiled kernels with a tiny simulated take, before live tracking starts."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from kinefit.tracking.video import track
 
 
 def warm_keypoints() -> None:
-    """Keypoints of cameras: the fit of the person, tracking, smoothing."""
+    """Run the fit of the person, tracking and smoothing once on keypoints."""
     motion = cut(squat_and_wave(), 0, 4)
     rig = studio_rig(motion)
     track(Recording.of_keypoints(rig, simulate_keypoints(motion, rig, "BODY_25B"), up=motion.up), motion.body)
 
 
 def warm_depth() -> None:
-    """A depth camera, with no pose given, so that the search for the start is among it."""
+    """Run depth tracking once, without a start pose, so the search for it is included."""
     motion = cut(squat_and_wave(), 0, 3)
     camera = in_front(motion, KINECT.camera(name="kinect"), near=KINECT.near, far=KINECT.far)
     video = simulate_depth(motion, camera, KINECT)

@@ -1,1 +1,1 @@
-"""A whole take at once: smoother, process noise, gaps, contacts, uncertainty."""
+"""Smooth a whole take: motion prior, process noise, gaps, foot contacts, uncertainty."""

@@ -1,4 +1,4 @@
-"""Feet on the floor: points of the soles that stay low and hardly move, where they rest, and when they leave."""
+"""Find foot contacts: points of the soles that are low and slow, their places, and when contact starts and ends."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from kinefit.findings import runs_of
 from kinefit.geometry import se3
 from kinefit.motion import UP_AXES
 
-_SOLE = 0.04  # [m] above the lowest landmark of the body at rest, up to which one counts as of a sole
-_SLOW = 0.15  # [m/s]: a foot that swings reaches several m/s; one that stands seems to move by its noise
-_LETS_GO = 0.30  # [m/s] at which a point that rested leaves: of 1 to 6 times `_SLOW`, in simulated jumps,
-# all from 1.5 on end a foot's flicker, and none holds it in flight (seeds 0 to 2, `benchmarks.closures_contacts`)
-_LOW = 0.04  # [m] above where the point rests: a foot that is lifted to step clears more within few frames
-_LEAST = 0.1  # [s] that a contact lasts at least; the shortest stance of a sprinter
-_GIVES = 0.01  # [m] that a resting point still moves, one standard deviation: soles and skin give
+_SOLE_HEIGHT = 0.04  # [m] above the lowest landmark of the rest pose, below which a landmark belongs to a sole
+_MAX_CONTACT_SPEED = 0.15  # [m/s]: a swinging foot reaches several m/s; a standing one seems to move by its noise
+_MIN_RELEASE_SPEED = 0.30  # [m/s] that ends a contact: of 1 to 6 times `_MAX_CONTACT_SPEED`, in simulated jumps, all
+# from 1.5 on end flicker, and none extends contact into flight (seeds 0 to 2, `benchmarks.closures_contacts`)
+_MAX_CONTACT_HEIGHT = 0.04  # [m] above the point's contact height: a foot lifted to step exceeds it within few frames
+_MIN_CONTACT_S = 0.1  # [s]: the shortest stance of a sprinter
+_CONTACT_STD = 0.01  # [m] of a point in contact: soles and skin deform
 _MIN_SWING_S = 0.15  # that a foot is in the air between two stances; where points are less sure than with calibration
 _MAX_OFF_PLANE_M = 0.10  # of a sole before one camera, whose depth is that unsure: beyond, it rests on something else
 _STANCE_SIGMA_M = 0.02  # of the height of a foot that stands, all its points together
@@ -54,14 +54,14 @@ class FloorPlane:
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Points of the body that rest at times.
+    """Contacts of points of the body with the floor.
 
     Parameters
     ----------
-    points : PointSet of P points.
-    places : (F, P, 3) [m] where they rest.
-    weight : (F, P) [1/m²], 0 where they do not.
-    floor : FloorPlane that was found from them; None where it was known, or they do not rest
+    points : PointSet of P points
+    places : (F, P, 3) [m] of the contacts, in the world
+    weight : (F, P) [1/m²], 0 without contact
+    floor : FloorPlane estimated from them; None for a known floor, or without contacts
     """
 
     points: PointSet
@@ -70,15 +70,15 @@ class Contacts:
     floor: FloorPlane | None = None
 
     def part(self, frames: slice) -> Contacts:
-        """Those of a stretch of frames."""
+        """The contacts of some frames."""
         return replace(self, places=self.places[frames], weight=self.weight[frames])
 
 
 def soles(body: Body) -> PointSet:
-    """Landmarks of the body that are lowest when it stands at rest (y up)."""
+    """Landmarks of the soles: the lowest ones of the rest pose (y up)."""
     points = body.landmarks
     height = body.points_rest(points)[:, 1]
-    low = np.flatnonzero(height < height.min(initial=np.inf) + _SOLE)
+    low = np.flatnonzero(height < height.min(initial=np.inf) + _SOLE_HEIGHT)
     return points.select(tuple(points.names[i] for i in low))
 
 
@@ -86,22 +86,22 @@ def find_contacts(
     body: Body, roots: NDArray, angles: NDArray, rate: float, up: str, eye: NDArray | None = None, *,
     level: bool = True,
 ) -> Contacts:  # fmt: skip
-    """Contacts of the soles with one floor in a smoothed motion.
+    """Find contacts of the soles with one floor in a smoothed motion.
 
-    Contacts switch with hysteresis: a point must be slow for a while to rest, and twice as fast to leave.
+    Contacts have hysteresis: a point must be slow for a while to start one, and twice as fast to end it.
 
-    A level floor's height is taken for each point on its own, since its place on the sole is not known to the
-    centimetre: the median of those of its slow frames that are near the lowest. Where the vertical is not measured the
-    floor is the plane through all points that rest. One camera alone tells neither height nor speed towards it: what
-    counts there is that a point hardly moves across its ray, and it rests where its ray meets the plane.
+    The height of a level floor is estimated for each point, since its place on the sole is not known to the centimetre:
+    the median over its slow frames near the lowest one. If the vertical is not measured, the floor is the plane through
+    all contacts. One camera alone observes neither height nor depth speed: there a point is in contact if it hardly
+    moves across its ray, and its place is where its ray meets the plane.
 
     Parameters
     ----------
     roots, angles : (F, 4, 4) [m], (F, D) [rad]
     rate : float [Hz]
-    up : vertical axis of the world.
-    eye : (3,) [m] of a camera that is the only sensor
-    level : whether `up` is measured, so that the floor is level
+    up : vertical axis of the world
+    eye : (3,) [m] centre of the camera, if it is the only sensor
+    level : bool, `up` is measured, so that the floor is level
     """
     points, axis = soles(body), np.array(UP_AXES[up])
     x = body.trajectories(roots, angles, points)
@@ -110,21 +110,22 @@ def find_contacts(
     places, weight = np.zeros(x.shape), np.zeros(x.shape[:2])
     rests: list[tuple[int, slice]] = []
     for p in range(len(points)):
-        slow, near = speed[:, p] < _SLOW, np.ones(len(x), bool)
-        if slow.sum() < _LEAST * rate:
+        slow, near = speed[:, p] < _MAX_CONTACT_SPEED, np.ones(len(x), bool)
+        if slow.sum() < _MIN_CONTACT_S * rate:
             continue
         ground = None
         if level and eye is None:
             lowest = np.quantile(height[slow, p], 0.1)
-            ground = float(np.median(height[slow & (height[:, p] < lowest + _LOW), p]))
-            near = np.abs(height[:, p] - ground) < _LOW
-        for start, stop in runs_of((speed[:, p] < _LETS_GO) & near, 1 if level else round(_MIN_SWING_S * rate)):
+            ground = float(np.median(height[slow & (height[:, p] < lowest + _MAX_CONTACT_HEIGHT), p]))
+            near = np.abs(height[:, p] - ground) < _MAX_CONTACT_HEIGHT
+        gap = 1 if level else round(_MIN_SWING_S * rate)
+        for start, stop in runs_of((speed[:, p] < _MIN_RELEASE_SPEED) & near, gap):
             run = slice(start, stop)
-            if np.count_nonzero(slow[run]) < _LEAST * rate:
+            if np.count_nonzero(slow[run]) < _MIN_CONTACT_S * rate:
                 continue
             middle = np.median(x[run, p], axis=0)
             places[run, p] = middle if ground is None else middle + (ground - middle @ axis) * axis
-            weight[run, p] = _GIVES**-2
+            weight[run, p] = _CONTACT_STD**-2
             rests.append((p, run))
     if level or not rests:
         return Contacts(points, places, weight)
@@ -132,7 +133,7 @@ def find_contacts(
     floor = fit_floor(body, roots, angles, middles, above[[p for p, _ in rests]], up, eye)
     for (p, run), middle in zip(rests, middles, strict=True):
         off = float(floor.height(middle)) - above[p]
-        if abs(off) < (_LOW if eye is None else _MAX_OFF_PLANE_M):
+        if abs(off) < (_MAX_CONTACT_HEIGHT if eye is None else _MAX_OFF_PLANE_M):
             along = floor.normal if eye is None else (middle - eye) / ((middle - eye) @ floor.normal)
             places[run, p] = middle - off * along
         elif eye is None:
@@ -214,7 +215,7 @@ def upward(x: NDArray, rest_height: NDArray) -> NDArray:
 
 
 def _speeds(x: NDArray, rate: float, eye: NDArray | None) -> NDArray:
-    """(F, P) [m/s] of points x (F, P, 3); across their rays from an eye (3,), where there is one."""
+    """(F, P) [m/s] speed of points x (F, P, 3); across their rays if an eye (3,) is given."""
     if len(x) < 2:
         return np.full(x.shape[:2], np.inf)
     moved = np.gradient(x, axis=0)

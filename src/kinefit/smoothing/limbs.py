@@ -1,4 +1,4 @@
-"""Degrees of freedom that go together: of one limb, and of both sides."""
+"""Groups of degrees of freedom: of one limb, and of left and right."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from kinefit.bodies import Body
 
 
 def limbs(body: Body) -> NDArray:
-    """(n,) int: degrees of freedom between two forks of the tree: trunk, head, each arm, each leg."""
+    """(n,) int: number of the limb of each degree of freedom: trunk, head, each arm, each leg (between two forks)."""
     tree = body.tree
     children = np.bincount(np.maximum(tree.parents, 0), minlength=len(tree.segments))
     children[0] -= 1  # the root is no child of its own
@@ -20,9 +20,9 @@ def limbs(body: Body) -> NDArray:
     return np.concatenate([np.zeros(6, int), out[tree.owners]])
 
 
-def alike(body: Body) -> NDArray:
-    """(n,) int: degrees of freedom that are as lively as each other: the root's shift, its turn, both sides."""
-    known: dict[str, int] = {}
+def noise_groups(body: Body) -> NDArray:
+    """(n,) int: number of the group that shares a process noise: the root's shift, its turn, left and right joints."""
+    groups: dict[str, int] = {}
     names = ["shift"] * 3 + ["turn"] * 3
     names += [c[:-2] if c.endswith(("_l", "_r")) else c for c in body.tree.coordinates]
-    return np.array([known.setdefault(name, len(known)) for name in names])
+    return np.array([groups.setdefault(name, len(groups)) for name in names])

@@ -1,8 +1,8 @@
-"""Any sensors over a whole take: matched anew in every round, and between rounds as quadratic costs of the poses.
+"""Linearise any sensors over a whole take: matched once a round, and a quadratic cost of the poses within the round.
 
-About the states where a frame's rows were made, the cost of its measurements is c − 2 gᵀδ + δᵀHδ. That is all that the
-solver asks of them while it moves by little, so a round costs one match and one linearisation a frame, whatever the
-sensors are; the motion prior and the pixels of keypoints are taken exactly at every step.
+Near the states where a frame's rows were made, the cost of its measurements is c − 2 gᵀδ + δᵀHδ. So a round costs one
+match and one linearisation of each frame, whatever the sensors. The motion prior and the keypoints are not
+approximated: the solver evaluates them at every step.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure
 from kinefit.frame.fit import rows_of
 from kinefit.frame.results import evidence_of
-from kinefit.frame.trust import unseen
+from kinefit.frame.trust import segments_not_shown
 from kinefit.rows import AnyRows, DofRows, Rows
 from kinefit.sensors.base import Matched, Measurement, matched_by
 from kinefit.sensors.scene import Scene
@@ -38,10 +38,11 @@ class Linearised:
     Parameters
     ----------
     H, g, cost : (T, n, n), (T, n), (T,)
-    roots, angles : (T, 4, 4), (T, D) about which
-    matched : T lists, by which correspondences; empty where these are not kept
-    rows : (T,) how many rows agree
-    unsure : (T, n, n) the part of H that makes nothing more certain, see `unseen`; None where that is not asked for
+    roots, angles : (T, 4, 4), (T, D) states at which the frames were linearised
+    matched : T lists of matches; empty if they are not kept
+    rows : (T,) number of rows that agree
+    unsupported : (T, n, n) part of H without evidence, from segments that a surface sensor does not show, see
+        `segments_not_shown`; None if it was not computed
     """
 
     H: NDArray
@@ -51,35 +52,37 @@ class Linearised:
     angles: NDArray
     matched: Sequence[tuple[Matched, ...]]
     rows: NDArray
-    unsure: NDArray | None = None
+    unsupported: NDArray | None = None
 
     def part(self, frames: slice) -> Linearised:
-        """A stretch of it."""
+        """The costs of some frames."""
         names = ("H", "g", "cost", "roots", "angles", "matched", "rows")
-        unsure = None if self.unsure is None else self.unsure[frames]
-        return replace(self, **{name: getattr(self, name)[frames] for name in names}, unsure=unsure)
+        unsupported = None if self.unsupported is None else self.unsupported[frames]
+        return replace(self, **{name: getattr(self, name)[frames] for name in names}, unsupported=unsupported)
 
     def followed_by(self, later: Linearised) -> Linearised:
-        """With the frames after it; matches are left out."""
+        """These costs and those of later frames, without matches."""
         names = ("H", "g", "cost", "roots", "angles", "rows")
         both = {name: np.concatenate([getattr(self, name), getattr(later, name)]) for name in names}
-        told = self.unsure is not None and later.unsure is not None
-        return replace(self, **both, matched=(), unsure=np.concatenate([self.unsure, later.unsure]) if told else None)
+        unsupported = None
+        if self.unsupported is not None and later.unsupported is not None:
+            unsupported = np.concatenate([self.unsupported, later.unsupported])
+        return replace(self, **both, matched=(), unsupported=unsupported)
 
 
 @dataclass(frozen=True, eq=False)
 class OtherSensors:
-    """What all sensors but the keypoints saw in T frames.
+    """Measurements of all sensors but the keypoints in T frames.
 
     Parameters
     ----------
     times : (T,) [s]
     measurements : T lists
     scene_of : (state, time) -> scene
-    apart : scene -> rows that keep parts of the body from running into each other
+    apart : scene -> rows against collisions of the body with itself
     settings : TrackSettings
-    scale : {sensor: factor on its standard deviation}, as the take shows it; 1 where none is given
-    points : (T,) int, rows of keypoints in every frame
+    scale : {sensor: factor on its standard deviation}, estimated from the take; 1 for other sensors
+    points : (T,) int, number of rows of keypoints in every frame
     """
 
     times: NDArray
@@ -91,12 +94,12 @@ class OtherSensors:
     points: NDArray
 
     def part(self, frames: slice) -> OtherSensors:
-        """A stretch of it."""
+        """The measurements of some frames."""
         names = ("times", "measurements", "points")
         return replace(self, **{name: getattr(self, name)[frames] for name in names})
 
     def scene(self, f: int, roots: NDArray, angles: NDArray) -> Scene:
-        """Of one frame of states (T, 4, 4), (T, D), with the velocity that they have there."""
+        """The scene of one frame at states (T, 4, 4), (T, D), with their velocity there."""
         state, (a, b) = BodyState(roots[f], angles[f]), (max(f - 1, 0), min(f + 1, len(roots) - 1))
         velocity = None
         if b > a:
@@ -113,14 +116,18 @@ class OtherSensors:
         self, body: Body, roots: NDArray, angles: NDArray, *, frames: range | None = None,
         keep: Spool[tuple[Matched, ...]] | None = None, judge: bool = False,
     ) -> Linearised:  # fmt: skip
-        """Frames matched and linearised about states (T, 4, 4), (T, D), all or some of them.
+        """Match and linearise frames at states (T, 4, 4), (T, D).
 
-        `keep` is where their matches go; `judge`: what of it makes nothing more certain is told as well.
+        Parameters
+        ----------
+        frames : numbers of the frames; default: all
+        keep : spool to which their matches are appended
+        judge : whether `Linearised.unsupported` is computed
         """
         chosen = range(len(roots)) if frames is None else frames
         F, n = len(chosen), body.tree.n_dofs
         H, g, cost, rows = np.zeros((F, n, n)), np.zeros((F, n)), np.zeros(F), np.zeros(F)
-        unsure = np.zeros((F, n, n)) if judge else None
+        unsupported = np.zeros((F, n, n)) if judge else None
         for k, f in enumerate(chosen):
             scene = self.scene(f, roots, angles)
             matched = self.matched(scene)
@@ -134,22 +141,28 @@ class OtherSensors:
             if parts:
                 equations = normal_equations(body, scene.state, parts)
                 H[k], g[k], cost[k] = equations.matrix, equations.gradient, equations.cost
-            if unsure is None or not any(m.shows_surface for m in matched):
+            if unsupported is None or not any(m.shows_surface for m in matched):
                 continue
-            without = [unseen(m, e) for m, e in zip(matched, evidence_of(scene, matched))]
+            without = [segments_not_shown(m, e) for m, e in zip(matched, evidence_of(scene, matched))]
             if any(w is not None and w.any() for w in without):
-                sure = rows_of(scene, matched, self.settings, self.scale, points=int(self.points[f]), without=without)
-                unsure[k] = H[k] - normal_equations(body, scene.state, sure).matrix
+                points = int(self.points[f])
+                supported = rows_of(scene, matched, self.settings, self.scale, points=points, without=without)
+                unsupported[k] = H[k] - normal_equations(body, scene.state, supported).matrix
         span = slice(chosen.start, chosen.stop)
-        return Linearised(H, g, cost, np.array(roots[span]), np.array(angles[span]), keep or (), rows, unsure)
+        return Linearised(H, g, cost, np.array(roots[span]), np.array(angles[span]), keep or (), rows, unsupported)
 
     def windows(
         self, body: Body, roots: NDArray, angles: NDArray, spans: Sequence[slice],
         keep: Spool[tuple[Matched, ...]] | None = None, *, judge: bool = False,
     ) -> Iterator[Linearised]:  # fmt: skip
-        """Stretches of a take that overlap, one after the other; what two of them share is linearised once.
+        """Linearise overlapping windows one after the other; frames that two of them share are linearised once.
 
-        `keep` is where the matches of all frames go, each once; `judge` as of `linearised`.
+        Parameters
+        ----------
+        roots, angles : (T, 4, 4), (T, D)
+        spans : slices of the windows
+        keep : spool to which the matches of all frames are appended, each once
+        judge : see `linearised`
         """
         last, first, done = None, 0, 0
         for span in spans:
@@ -160,7 +173,7 @@ class OtherSensors:
 
 
 def with_quadratic(body: Body, make: MakeEquations, more: Linearised) -> MakeEquations:
-    """Equations of keypoints, packed as the tree has them, made dense, with quadratic costs added."""
+    """Equations of keypoints with the quadratic costs of other sensors added: packed along the tree -> dense."""
     chain, depth = body.tree.chain, body.tree.depth
 
     def both(roots: NDArray, angles: NDArray) -> Equations:
@@ -178,7 +191,7 @@ def with_quadratic(body: Body, make: MakeEquations, more: Linearised) -> MakeEqu
 
 
 def squares_of(rows: AnyRows) -> tuple[NDArray, NDArray]:
-    """Squared residual of each row, in variances, and its robust factor; nothing of rows that are no measurement."""
+    """Squared residuals (R,) of rows, in variances, and robust factors (R,); both empty for other kinds of rows."""
     if not isinstance(rows, Rows | DofRows):
         return np.zeros(0), np.zeros(0)
     square = rows.weight * rows.residual**2

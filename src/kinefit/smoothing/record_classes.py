@@ -1,4 +1,4 @@
-"""The classes of records that are kept while a take is tracked and smoothed; no other is read from a file."""
+"""Classes of the records that tracking and smoothing store; files with other classes are not read."""
 
 from __future__ import annotations
 
@@ -36,4 +36,4 @@ CODEC = Codec([
     SilhouetteMatched, SilhouetteMeasurement, FreePairs, SurfacePairs, SurfacePointMatched, SurfacePointMeasurement,
     BodyTrackerMatched, BodyTrackerMeasurement,
 ])  # fmt: skip
-"""Writes and reads records of tracked frames. What belongs to all frames (bodies, sensors, cameras) is none of them."""
+"""Writes and reads records of tracked frames, without what all frames share (bodies, sensors, cameras)."""

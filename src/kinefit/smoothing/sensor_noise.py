@@ -1,4 +1,4 @@
-"""Errors of all sensors but the keypoints: their variance components, and how what lasts of them pushes the pose."""
+"""Errors of all sensors but the keypoints: variance components, and the effect of systematic errors on the pose."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure
-from kinefit.frame.fit import rows_of_points, takes_surfaces_for_exact
-from kinefit.frame.results import ANYWHERE
+from kinefit.frame.fit import ignores_surface_offsets, rows_of_points
+from kinefit.frame.results import ROOT_PRIOR_STD
 from kinefit.frame.skin import skin_of
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.base import Matched, rows_at
@@ -24,88 +24,93 @@ from kinefit.solvers.bundle.border_frames import gram
 from kinefit.solvers.equations import block_diagonal, design, inverse, normal_equations, product
 from kinefit.solvers.trajectory.variance_components import VarianceComponents, variance_components
 
-_RIGID = 1e-6, 1e-6  # [m], [rad] of a body without joints: it is its surface, and no bone lies below
-_EXACT = 1e-4  # [m] as good as 0
+_RIGID_SURFACE_STDS = 1e-6, 1e-6  # [m], [rad] of surface offsets of a body without joints: it is its surface
+_MIN_SURFACE_STD = 1e-4  # [m] of a surface offset, in place of 0
 _LEVERAGE_FRAMES = 40  # of a take, in which the leverage of each channel is computed
-_STATED_LOOKS = 5.0  # channels along one axis, nothing of which is followed, that a stated lasting error counts for
+_STATED_CHANNELS = 5.0  # channels along one axis, without leverage, that a stated systematic error counts as
 
 
 _Push = tuple[str, NDArray, NDArray, NDArray]
-"""Of rows of one sensor in one frame: its name; channels and axes (2, R), Σ w J (R, n) and Σ w (R,) of each."""
+"""Rows of one sensor in one frame: its name; channels and axes (2, R), Σ w J (R, n) and Σ w (R,) of each."""
 
 
 @dataclass(frozen=True, eq=False)
 class OtherNoise:
-    """What lasts of the errors of all sensors but the keypoints.
+    """Information and systematic errors of all sensors but the keypoints.
 
     Parameters
     ----------
     information : (T, n (n + 1) / 2) of every frame's rows, the upper triangle of each
-    lasting : the same of Σ s sᵀ of the pushes s = Jᵀ W e of every lasting error e, with s the mean over the frames
-        that motion ties to each frame
+    systematic : (T, n (n + 1) / 2) Σ s sᵀ of the gradients s = Jᵀ W e of every systematic error e, with s averaged over
+        the frames within the correlation time of the motion
     components : {sensor: VarianceComponents [m]}
     """
 
     information: NDArray
-    lasting: NDArray
+    systematic: NDArray
     components: dict[str, VarianceComponents]
 
     def pooled(self, f: int, half: int) -> tuple[NDArray, NDArray]:
-        """(n, n) information, the mean over so many frames to either side, and lasting."""
-        return _square(self.information[max(f - half, 0) : f + half + 1].mean(axis=0)), _square(self.lasting[f])
+        """(n, n) information, averaged over `half` (int) frames to either side, and `systematic` (n, n) of a frame."""
+        return _square(self.information[max(f - half, 0) : f + half + 1].mean(axis=0)), _square(self.systematic[f])
 
-    def as_told(self) -> dict[str, Any]:
-        """The same in a few numbers, by sensor."""
+    def summary(self) -> dict[str, Any]:
+        """The variance components in a few numbers, by sensor."""
         return {name: found.summary("m", 4) for name, found in self.components.items()}
 
 
 def covariance_alone(body: Body, state: BodyState, information: NDArray) -> NDArray:
-    """(n, n) covariance of one frame on its own, closures and prior included; zero for a root that is fixed."""
+    """(n, n) covariance of one frame on its own, closures and prior included; 0 for a fixed root.
+
+    Parameters
+    ----------
+    information : (n, n) of the frame's measurements
+    """
     tree = body.tree
     if body.closures:
         information = information + normal_equations(body, state, every_closure(body, state)).matrix
     free = slice(0 if tree.root_free else 6, tree.n_dofs)
-    prior = block_diagonal(np.eye(6) / ANYWHERE**2, tree.posture_precision)
+    prior = block_diagonal(np.eye(6) / ROOT_PRIOR_STD**2, tree.posture_precision)
     out = np.zeros_like(information)
     out[free, free] = inverse((information + prior)[free, free])
     return out
 
 
 def leverages(J: NDArray, pushed: NDArray, alone: NDArray) -> NDArray:
-    """(R,) share of the variance of each row's error that a fit takes from its residual.
+    """(R,) leverages: share of the variance of each row's error that the fit absorbs.
 
-    Of errors e of equal variance the fit leaves r = (I − J P Jᵀ W) e; what others' errors add is negative.
+    Errors e of equal variance leave residuals r = (I − J P Jᵀ W) e. The errors of other rows add a negative share.
 
     Parameters
     ----------
     J, pushed : (R, n) derivatives by the pose, and W J
     alone : (n, n) covariance P of the frame on its own
     """
-    left = np.eye(len(J)) - product(product(J, alone), pushed.T)
-    return np.asarray(1.0 - np.sum(left**2, axis=1))
+    residual = np.eye(len(J)) - product(product(J, alone), pushed.T)
+    return np.asarray(1.0 - np.sum(residual**2, axis=1))
 
 
 def other_noise(
     body: Body, others: OtherSensors, matched: Sequence[tuple[Matched, ...]], roots: NDArray, angles: NDArray,
     pixels: Callable[[int], NDArray], *, half: int = 0, surfaces: bool = True,
 ) -> OtherNoise:  # fmt: skip
-    """Noise of all sensors but the keypoints, from their residuals at fitted states.
+    """Estimate the noise of all sensors but the keypoints from their residuals at fitted states.
 
     Parameters
     ----------
     matched : T lists of matches
     roots, angles : (T, 4, 4), (T, D) fitted
     pixels : frame -> (n, n) information of its keypoints
-    half : frames to either side that motion ties to a frame
-    surfaces : whether errors of surfaces as wholes count
+    half : frames to either side within the correlation time of the motion
+    surfaces : whether surface offsets count as systematic errors
     """
     T = len(roots)
     upper = np.triu_indices(body.tree.n_dofs)
-    information, skins, lasting = np.zeros((3, T, len(upper[0])))
+    information, skins, systematic = np.zeros((3, T, len(upper[0])))
     residuals, pushes = ChannelResiduals(), Spool[list[_Push]]()
-    hidden, stated = defaultdict[str, list[NDArray]](list), defaultdict[str, list[NDArray]](list)
+    absorbed, stated = defaultdict[str, list[NDArray]](list), defaultdict[str, list[NDArray]](list)
     independent = set[str]()
-    looked_at = set(np.linspace(0, T - 1, min(_LEVERAGE_FRAMES, T)).astype(int).tolist())
+    leverage_frames = set(np.linspace(0, T - 1, min(_LEVERAGE_FRAMES, T)).astype(int).tolist())
     for f in range(T):
         scene, surface, pushed = others.scene(f, roots, angles), list[Rows](), list[_Push]()
         for m in matched[f]:
@@ -115,57 +120,58 @@ def other_noise(
             surface += [r.weaker(scale) for r in made if isinstance(r, Rows) and not m.of_points]
             weights = [r.weight * squares_of(r)[1] / scale**2 for r in points]
             for rows, w, at in zip(points, weights, residuals.add(f, m, points, [r.residual for r in points], weights)):
-                felt = w > 0.0
-                J, w, at = design(body, scene.state, rows)[felt], w[felt], at[:, felt]
+                used = w > 0.0
+                J, w, at = design(body, scene.state, rows)[used], w[used], at[:, used]
                 information[f] += gram(J, w[:, None] * J)[upper]
                 pushed.append((m.sensor, *_summed(at, w[:, None] * J, w)))
-                stated[m.sensor].append(np.vstack([at, m.lasts / rows.weight[felt]]))
+                stated[m.sensor].append(np.vstack([at, m.lasts / rows.weight[used]]))
                 independent |= {m.sensor} if m.independent else set()
         if surface:
             settings = others.settings
-            beside = max(settings.skin_shift, _EXACT), settings.skin_turn
-            skin = skin_of(scene, surface, *(beside if body.tree.coordinates else _RIGID), matched[f])
-            exact = takes_surfaces_for_exact(scene, settings, int(others.points[f]) + rows_of_points(scene, matched[f]))
+            offset_stds = max(settings.skin_shift, _MIN_SURFACE_STD), settings.skin_turn
+            skin = skin_of(scene, surface, *(offset_stds if body.tree.coordinates else _RIGID_SURFACE_STDS), matched[f])
+            exact = ignores_surface_offsets(scene, settings, int(others.points[f]) + rows_of_points(scene, matched[f]))
             information[f] += (skin.exact_information if exact else skin.information)[upper]
             if surfaces:
                 pushed_by_skin = skin.exact_pushes if exact else skin.pushes
                 skins[f] += gram(pushed_by_skin, pushed_by_skin)[upper]
-        if f in looked_at:
+        if f in leverage_frames:
             alone = covariance_alone(body, scene.state, _square(information[f]) + pixels(f))
             for sensor, at, push, weight in pushed:
-                hidden[sensor].append(np.vstack([at, leverages(push / weight[:, None], push, alone)]))
+                absorbed[sensor].append(np.vstack([at, leverages(push / weight[:, None], push, alone)]))
         pushes.append(pushed)
     found, variance = {}, {}
     for sensor, (values, _) in residuals.arrays(T).items():
-        leverage = _means(hidden[sensor], values.shape[1:]).mean(axis=1)
-        one = variance_components(values, others.times, leverage=leverage, jitter_leverage=leverage / (2 * half + 1))
-        found[sensor] = one
-        variance[sensor] = _lasting(one, leverage, _means(stated[sensor], values.shape[1:]), sensor in independent)
+        leverage = _means(absorbed[sensor], values.shape[1:]).mean(axis=1)
+        noise = variance_components(values, others.times, leverage=leverage, jitter_leverage=leverage / (2 * half + 1))
+        found[sensor] = noise
+        stated_means = _means(stated[sensor], values.shape[1:])
+        variance[sensor] = _systematic(noise, leverage, stated_means, sensor in independent)
     for f, (near, sums) in enumerate(_window_means(pushes, half, variance, body.tree.n_dofs)):
         pushed_by = [skins[near].mean(axis=0)]
         for sensor, mean in sums.items():
             shared = found[sensor].shared[0][:, None] * mean.sum(axis=0)
             both = np.concatenate([(np.sqrt(variance[sensor])[..., None] * mean).reshape(-1, mean.shape[2]), shared])
             pushed_by.append(gram(both, both)[upper])
-        lasting[f] = np.sum(pushed_by, axis=0)
-    return OtherNoise(information, lasting, found)
+        systematic[f] = np.sum(pushed_by, axis=0)
+    return OtherNoise(information, systematic, found)
 
 
-def _lasting(found: VarianceComponents, leverage: NDArray, stated: NDArray, independent: bool) -> NDArray:
-    """(C, A) variance of what lasts: as estimated, and what is stated beyond it as far as residuals do not show it.
+def _systematic(found: VarianceComponents, leverage: NDArray, stated: NDArray, independent: bool) -> NDArray:
+    """(C, A) variance of systematic errors: the estimate, plus a share of what `stated` (C, A) exceeds it by.
 
-    Residuals of independent channels, of which a fit follows the shares `leverage` (C,), say as much as so many
-    channels of which it follows nothing; what is stated counts for `_STATED_LOOKS` of them. What channels have in
-    common a fit follows: there all that is stated counts.
+    The share falls with the number of independent channels, each counted by 1 − leverage (C,): their residuals would
+    show a larger error. `stated` itself counts as `_STATED_CHANNELS` channels. If channels are not independent, the fit
+    absorbs their common error, and the share is 1.
     """
-    estimated = found.lasting[:, None] ** 2
-    looks = stated.shape[1] * float(np.sum(np.clip(1.0 - leverage, 0.0, 1.0))) if independent else 0.0
-    unseen = _STATED_LOOKS / (_STATED_LOOKS + looks)
-    return np.asarray(estimated + unseen * np.maximum(stated - estimated, 0.0))
+    estimated = found.systematic[:, None] ** 2
+    channels = stated.shape[1] * float(np.sum(np.clip(1.0 - leverage, 0.0, 1.0))) if independent else 0.0
+    share = _STATED_CHANNELS / (_STATED_CHANNELS + channels)
+    return np.asarray(estimated + share * np.maximum(stated - estimated, 0.0))
 
 
 def _summed(at: NDArray, push: NDArray, weight: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Each channel and axis (2, R) of N rows once, with the sums of the rows' pushes (R, n) and weights (R,)."""
+    """Unique channels and axes (2, R) of N rows, with the sums of the rows' w J (R, n) and weights (R,)."""
     at, index = np.unique(at, axis=1, return_inverse=True)
     index, out = index.ravel(), np.zeros((at.shape[1], push.shape[1]))
     np.add.at(out, index, push)
@@ -173,7 +179,7 @@ def _summed(at: NDArray, push: NDArray, weight: NDArray) -> tuple[NDArray, NDArr
 
 
 def _means(entries: Sequence[NDArray], shape: tuple[int, ...]) -> NDArray:
-    """(C, A) means of entries (3, R), channel, axis and value; the mean of all where there are none."""
+    """(C, A) means of entries (3, R) (channel, axis, value); the overall mean where there are no entries."""
     channel, axis, value = np.concatenate([np.zeros((3, 0)), *entries], axis=1)
     count, total = np.zeros(shape), np.zeros(shape)
     at = channel.astype(np.int64), axis.astype(np.int64)
@@ -185,8 +191,8 @@ def _means(entries: Sequence[NDArray], shape: tuple[int, ...]) -> NDArray:
 def _window_means(
     pushes: Spool[list[_Push]], half: int, channels: Mapping[str, NDArray], n: int
 ) -> Iterator[tuple[slice, dict[str, NDArray]]]:
-    """Of every frame those so near that motion ties them to it, and each sensor's mean pushes (C, A, n) over them."""
-    T, sums = len(pushes), {sensor: np.zeros((*of.shape, n)) for sensor, of in channels.items()}
+    """For every frame the window of `half` frames to either side, and each sensor's mean w J (C, A, n) over it."""
+    T, sums = len(pushes), {sensor: np.zeros((*variance.shape, n)) for sensor, variance in channels.items()}
     for last in range(T + half):
         for f, sign in ((last, 1.0), (last - 2 * half - 1, -1.0)):
             for sensor, at, push, _ in pushes[f] if 0 <= f < T else ():
@@ -197,7 +203,7 @@ def _window_means(
 
 
 def _square(packed: NDArray) -> NDArray:
-    """(n, n) of its upper triangle."""
+    """Symmetric (n, n) from its upper triangle (n (n + 1) / 2,)."""
     out = np.empty((int(np.sqrt(2.0 * len(packed))),) * 2)
     upper = np.triu_indices(len(out))
     out[upper] = out.T[upper] = packed

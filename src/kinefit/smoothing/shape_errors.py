@@ -1,9 +1,9 @@
-"""What an uncertain shape does to poses: D Σ Dᵀ, where D is how a pose, fitted anew, answers to the shape.
+"""Propagate the uncertainty of a shape to poses: D Σ Dᵀ, with D the response of the fitted pose to the shape.
 
-Any sensors, any parameters: at the fitted pose the gradient g = Jᵀ W r vanishes; where the shape is θ + δ it does not,
-and the pose answers by P ∂g/∂θ δ. Derivatives by θ are differences between worlds, as in the fit that found them.
+This holds for any sensors and parameters. At the fitted pose the gradient g = Jᵀ W r vanishes. If the shape is θ + δ,
+it does not, and the pose responds by P ∂g/∂θ δ. Derivatives by θ are differences between worlds, as in the subject fit.
 
-Parameters that touch surfaces alone (girths) are left out: what a surface is off by stands in `frame.skin`.
+Parameters of surfaces alone (girths) are excluded: `frame.skin` accounts for surface offsets.
 """
 
 from __future__ import annotations
@@ -28,14 +28,15 @@ from kinefit.subject.parameters import PointOffsets, stacked
 from kinefit.subject.subject import SubjectFit
 from kinefit.subject.surfaces import CylinderShape, Girths
 
-SAMPLED = 16
-"""Frames in which answers are found; between them variances are interpolated. On three simulated takes of 60 frames the
-mean standard deviation of joint centres differs by less than 1 % from answers in every frame, single ones by 60 %."""
+SAMPLED_FRAMES = 16
+"""Frames in which responses are computed; variances are interpolated between them. On three simulated takes of 60
+frames the mean standard deviation of joint centres differs by less than 1 % from that with responses in every frame,
+single ones by 60 %."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeErrors:
-    """Variances that the shape adds to some frames.
+    """Variances that the uncertainty of the shape adds to some frames.
 
     Parameters
     ----------
@@ -49,7 +50,7 @@ class ShapeErrors:
     joints: NDArray
 
     def at(self, frame: int) -> tuple[NDArray, NDArray]:
-        """(n,) and (S, 3) of any frame."""
+        """(n,) [m², rad²] and (S, 3) [m²] variances of any frame, interpolated."""
         after = int(np.clip(np.searchsorted(self.frames, frame), 1, max(len(self.frames) - 1, 1)))
         if len(self.frames) == 1:
             return self.dofs[0], self.joints[0]
@@ -60,65 +61,70 @@ class ShapeErrors:
 
 
 def shape_errors(
-    found: SubjectFit, settings: TrackSettings, seen: Callable[[int], tuple[Scene, Sequence[Matched]]],
+    found: SubjectFit, settings: TrackSettings, frame_data: Callable[[int], tuple[Scene, Sequence[Matched]]],
     frames: Sequence[int], alone: Sequence[NDArray], scale: Mapping[str, float] | None = None,
 ) -> ShapeErrors:  # fmt: skip
-    """Of some frames.
+    """Variances that the uncertainty of the shape adds to some frames.
 
     Parameters
     ----------
-    found : with its parameters and their covariance
-    settings : those of the fit
-    seen : of a frame its scene and all that was matched in it, keypoints with the weights that the covariances have
+    found : subject fit with parameters and covariance
+    settings : of the fit
+    frame_data : frame -> its scene and all its matches, keypoints with the weights of the covariances
     frames : K numbers of frames
     alone : K (n, n) covariances of each frame on its own, prior included
     scale : {sensor: factor} on the standard deviations of other sensors' rows in these covariances
     """
-    kept = np.concatenate([
+    used = np.concatenate([
         np.full(len(p.names), not isinstance(p, CylinderShape | Girths)) for p in found.parameters
     ])  # fmt: skip
     wide = np.concatenate([np.full(len(p.names), not isinstance(p, PointOffsets)) for p in found.parameters])
     step, worlds = stacked(found.parameters)[3], Worlds(found.prior_world, found.parameters)
-    Sigma = found.covariance[np.ix_(kept, kept)]
+    Sigma = found.covariance[np.ix_(used, used)]
     dofs, joints = [], []
     for frame, P in zip(frames, alone):
-        scene, matched = seen(frame)
-        one = _FrameMatches(worlds, scene, matched, found.mean, kept, np.flatnonzero(wide[kept]), scale or {})
-        pushed = one.points(step) + one.surfaces(step, settings)
-        answer = P @ pushed
+        scene, matched = frame_data(frame)
+        matches = _FrameMatches(worlds, scene, matched, found.mean, used, np.flatnonzero(wide[used]), scale or {})
+        gradients = matches.points(step) + matches.surfaces(step, settings)
+        response = P @ gradients
         moves = joint_moves(scene.body, scene.state)
-        whole = moves @ answer + one.stretch(step)
-        dofs.append(np.einsum("ip,pq,iq->i", answer, Sigma, answer))
+        whole = moves @ response + matches.stretch(step)
+        dofs.append(np.einsum("ip,pq,iq->i", response, Sigma, response))
         joints.append(np.einsum("sap,pq,saq->sa", whole, Sigma, whole, optimize=True))
     return ShapeErrors(np.asarray(frames), np.maximum(dofs, 0.0), np.maximum(joints, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
 class _FrameMatches:
-    """One frame's matches in the worlds of parameters (p,), of which q are kept: a problem of one frame.
+    """One frame's matches as a function of q of p parameters: a `BorderedProblem` of one frame.
 
-    `wide` are those of the q that move more than places of points.
+    Parameters
+    ----------
+    theta : (p,) parameters
+    used : (p,) bool, the q parameters
+    wide : int, numbers among the q of those that move more than landmark offsets
+    scale : {sensor: factor} on standard deviations
     """
 
     worlds: Worlds
     scene: Scene
     matched: Sequence[Matched]
     theta: NDArray
-    kept: NDArray
+    used: NDArray
     wide: NDArray
     scale: Mapping[str, float]
 
     @property
     def touches(self) -> tuple[frozenset[int] | None, ...]:
-        """Of each kept parameter the segments on which alone rows can feel it."""
-        return tuple(t for t, kept in zip(self.worlds.touches, self.kept) if kept)
+        """(q,) for each parameter the only segments whose rows depend on it; None for any."""
+        return tuple(t for t, used in zip(self.worlds.touches, self.used) if used)
 
     def body(self, values: NDArray) -> Body:
-        """The body with kept parameters (q,)."""
+        """The body with parameters (q,)."""
         return self.worlds.at(self._all(values)).body
 
     def parts(self, values: NDArray, frame: int, state: BodyState) -> list[Part]:
-        """Rows of points, and of what closes chains."""
+        """Rows of points and of closures, with parameters (q,)."""
         scene = self._scene(values)
         points = [
             (m.sensor, weaker(rows, self.scale.get(m.sensor, 1.0)))
@@ -127,46 +133,46 @@ class _FrameMatches:
         return [*points, *((CLOSURES, rows) for rows in every_closure(scene.body, scene.state))]
 
     def points(self, step: NDArray) -> NDArray:
-        """(n, q) ∂g/∂θ of all points."""
-        mean, state = self.theta[self.kept], self.scene.state
+        """(n, q) ∂g/∂θ of all points; step (p,) of finite differences."""
+        mean, state = self.theta[self.used], self.scene.state
         frame = frame_at(self, mean, 0, state, Weighing())
-        moved = differences(self, mean, step[self.kept], [state])[0]
+        moved = differences(self, mean, step[self.used], [state])[0]
         return -gram(frame.J, frame.factor[:, None] * moved)
 
     def surfaces(self, step: NDArray, settings: TrackSettings) -> NDArray:
-        """(n, q) ∂g/∂θ of all surfaces, by parameters that reach beyond points."""
-        n, mean = self.scene.body.tree.n_dofs, self.theta[self.kept]
+        """(n, q) ∂g/∂θ of all surfaces, by the `wide` parameters; step (p,) of finite differences."""
+        n, mean = self.scene.body.tree.n_dofs, self.theta[self.used]
         out = np.zeros((n, len(mean)))
-        shown = [m for m in self.matched if not m.of_points]
-        if not shown or not len(self.wide):
+        surfaces = [m for m in self.matched if not m.of_points]
+        if not surfaces or not len(self.wide):
             return out
-        beside = rows_of_points(self.scene, self.matched)
+        point_rows = rows_of_points(self.scene, self.matched)
 
         def gradient(values: NDArray) -> NDArray:
             scene = self._scene(values)
-            rows = [r for r in rows_of(scene, shown, settings, self.scale, points=beside) if len(r)]
+            rows = [r for r in rows_of(scene, surfaces, settings, self.scale, points=point_rows) if len(r)]
             return normal_equations(scene.body, scene.state, rows).gradient if rows else np.zeros(n)
 
         for k in self.wide:
             change = np.zeros(len(mean))
-            change[k] = step[self.kept][k]
+            change[k] = step[self.used][k]
             out[:, k] = (gradient(mean + change) - gradient(mean - change)) / (2.0 * change[k])
         return out
 
     def stretch(self, step: NDArray) -> NDArray:
-        """(S, 3, q) how joint centres move with the parameters, the pose as it is."""
-        mean, state = self.theta[self.kept], self.scene.state
+        """(S, 3, q) derivatives of joint centres for a fixed pose; step (p,) of finite differences."""
+        mean, state = self.theta[self.used], self.scene.state
         out = np.zeros((len(self.scene.body.tree.segments), 3, len(mean)))
         for k in self.wide:
             change = np.zeros(len(mean))
-            change[k] = step[self.kept][k]
+            change[k] = step[self.used][k]
             a, b = (_centres(self.body(mean + sign * change), state) for sign in (1.0, -1.0))
             out[:, :, k] = (a - b) / (2.0 * change[k])
         return out
 
     def _all(self, values: NDArray) -> NDArray:
         theta = self.theta.copy()
-        theta[self.kept] = values
+        theta[self.used] = values
         return theta
 
     def _scene(self, values: NDArray) -> Scene:
@@ -177,7 +183,7 @@ class _FrameMatches:
 
 
 def _moved(rig: Rig, known: Rig) -> Rig:
-    """A scene's cameras, in their order, where a world has those that it knows: a fit to points alone knows none."""
+    """A scene's cameras with the poses of `known`, for those that it contains; a fit to points alone contains none."""
     if known.names == rig.names:
         return known
     return Rig(tuple(known[c.name] if c.name in known else c for c in rig.cameras))

@@ -1,8 +1,8 @@
-"""Errors that the points of one segment share: a head that is seen 7 px too far left has all of its points there.
+"""Estimate errors that the points of one segment share: a head detected 7 px too far left has all its points there.
 
-Eleven points of a face then tell little more of where the head is than one does, and far less than eleven points of
-joints would. What is shared is found from the take: of two points of one segment in one view the products of what a
-fit leaves over.
+Eleven points of a face then determine the head's place little better than one point, and far worse than eleven points
+of joints. The shared part is estimated from the take, from products of residuals of two points of one segment in one
+view.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from kinefit.sensors.channels import Channels
 
-_SAMPLES = 30.0  # looks at pairs of points that count as much as knowing nothing of what they share
-_MOST = 0.8  # of a point's variance that may be shared
+_PRIOR_MEASUREMENTS = 30.0  # independent measurements of pairs that the prior value of a share counts as
+_MAX_SHARE = 0.8  # of a point's variance that may be shared
 
 
 def members(channels: Channels) -> NDArray:
-    """(N,) int: number of the group of points of one source and segment that a channel is of; -1 where it is alone."""
+    """(N,) int: number of each channel's group, the points of one source and segment; -1 for a single point."""
     segment = channels.points.segments[channels.column] if len(channels.column) else channels.column
     out = np.full(len(segment), -1)
     keys = channels.source * (segment.max(initial=0) + 1) + segment
@@ -33,12 +33,12 @@ def members(channels: Channels) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class SharedErrors:
-    """What channels of one group have in common: a shift [px] along u and along v, new in every frame.
+    """Errors that channels of one group share: a shift [px] along u and along v, independent in every frame.
 
     Parameters
     ----------
     member : (N,) int, group of each channel, -1 for none
-    share : (N,) of its variance that a channel has in common with its group
+    share : (N,) of a channel's variance that its group shares
     variance : (G,) [px²] of each group's shift
     """
 
@@ -48,7 +48,7 @@ class SharedErrors:
 
     @classmethod
     def of(cls, channels: Channels, share: NDArray, sigma: NDArray) -> SharedErrors:
-        """Of shares (N,) of what channels err by, sigma (N,) [px] at full confidence."""
+        """Shared errors from shares (N,) of the channels' variances, with sigma (N,) [px] at full confidence."""
         grouped = members(channels)
         share = np.where(grouped >= 0, share, 0.0)
         used, index = np.unique(grouped[share > 0], return_inverse=True)
@@ -59,14 +59,14 @@ class SharedErrors:
 
     @classmethod
     def none(cls, count: int) -> SharedErrors:
-        """Of so many channels that each err for themselves."""
+        """No shared errors, for a number of channels."""
         return cls(np.full(count, -1), np.zeros(count), np.zeros(0))
 
     def whitened(self, columns: NDArray, weight: NDArray, channel: NDArray) -> NDArray:
-        """Rows (R, k), u and v of each channel (R,) in turn, whitened by all of their errors.
+        """Rows (R, k) whitened by own and shared errors; u and v of each channel (R,) alternate.
 
-        They come whitened by weights (N,) [1/px²] of own errors alone: by the square root of a diagonal D, in place of
-        that of D - D 1 (1/U + 1ᵀ D 1)⁻¹ 1ᵀ D of each group.
+        The given rows are whitened by the weights (N,) [1/px²] of own errors alone, the square root of a diagonal D.
+        The result is whitened by the square root of D - D 1 (1/U + 1ᵀ D 1)⁻¹ 1ᵀ D of each group.
         """
         grouped = self.member[channel] >= 0
         if not grouped.any():
@@ -76,13 +76,13 @@ class SharedErrors:
         total = np.bincount(key, root**2, 2 * len(self.variance))
         sums = np.zeros((len(total), columns.shape[1]))
         np.add.at(sums, key, root[:, None] * columns[grouped])
-        less = (1.0 - 1.0 / np.sqrt(1.0 + np.repeat(self.variance, 2) * total)) / np.maximum(total, 1e-30)
+        removed = (1.0 - 1.0 / np.sqrt(1.0 + np.repeat(self.variance, 2) * total)) / np.maximum(total, 1e-30)
         out = np.array(columns)
-        out[grouped] -= (less[key] * root)[:, None] * sums[key]
+        out[grouped] -= (removed[key] * root)[:, None] * sums[key]
         return out
 
     def sums(self, rows: NDArray, channel: NDArray) -> NDArray:
-        """(2 G, k) sums of rows (R, k) of each group along u and v."""
+        """(2 G, k) sums of rows (R, k) over each group, along u and v, with the rows' channels (R,)."""
         grouped = self.member[channel] >= 0
         key = 2 * self.member[channel] + np.arange(len(channel)) % 2
         out = np.zeros((2 * len(self.variance), rows.shape[1]))
@@ -91,54 +91,54 @@ class SharedErrors:
 
 
 def shared_by(channels: Channels, left: NDArray, variance: NDArray, looks: float) -> NDArray:
-    """(N,) share of each channel's variance that all points of its group have in common, 0 where it is alone.
+    """Estimate the share (N,) of each channel's variance that all points of its group share, 0 without a group.
 
-    Segments of a keypoint set are judged over all views, left and right as one; where they are seen rarely, they share
-    as much as the others of their set do.
+    A segment of a keypoint set has one share for all views, and for left and right. Rarely detected segments get the
+    share of their set.
 
     Parameters
     ----------
-    left : (T, N, 2) [px] measured minus fitted, NaN for outliers and where unseen.
-    variance : (T, N) [px²] of where the fit sees the points, u and v together: what it follows of the errors.
-    looks : independent looks that one frame amounts to.
+    left : (T, N, 2) [px] measured minus fitted, NaN for outliers and undetected points
+    variance : (T, N) [px²] of the fitted points, u plus v: the part of the errors that the fit absorbs
+    looks : number of independent measurements that one frame counts as, 1 at most
     """
     member, out = members(channels), np.zeros(len(channels.column))
     lowest = np.minimum(channels.column, channels.column[channels.partner])
     sums: dict[int, dict[tuple[int, ...], NDArray]] = {}
     groups: dict[tuple[int, ...], list[int]] = {}
     for g in range(int(member.max(initial=-1)) + 1):
-        mine = member == g
-        points = tuple(np.unique(lowest[mine]).tolist())
+        in_group = member == g
+        points = tuple(np.unique(lowest[in_group]).tolist())
         first = next(i for i, span in enumerate(channels.sets.values()) if span.start <= points[0] < span.stop)
-        told = _in_common(left[:, mine], variance[:, mine]) * (1.0, 1.0, looks)
+        group_sums = _pair_sums(left[:, in_group], variance[:, in_group]) * (1.0, 1.0, looks)
         of_set = sums.setdefault(first, {})
-        of_set[points] = of_set.get(points, 0.0) + told
+        of_set[points] = of_set.get(points, 0.0) + group_sums
         groups.setdefault(points, []).append(g)
     for of_set in sums.values():
-        whole = _share(np.sum(list(of_set.values()), axis=0), 0.0)
-        for points, told in of_set.items():
-            out[np.isin(member, groups[points])] = _share(told, whole)
+        set_share = _share(np.sum(list(of_set.values()), axis=0), 0.0)
+        for points, group_sums in of_set.items():
+            out[np.isin(member, groups[points])] = _share(group_sums, set_share)
     return out
 
 
-def _in_common(left: NDArray, variance: NDArray) -> NDArray:
-    """Sums over frames of what pairs of a group's points have in common, and of their whole variance [px²]; frames.
+def _pair_sums(left: NDArray, variance: NDArray) -> NDArray:
+    """(3,) sums over frames of the shared and of the whole variance [px²] of a group's points; number of frames.
 
-    left (T, M, 2), variance (T, M) as of `shared_by`; every frame counts alike, however many pairs it has.
+    left (T, M, 2), variance (T, M): see `shared_by`. Every frame counts alike, whatever its number of pairs.
     """
-    seen = np.isfinite(left).all(axis=2)
-    count = seen.sum(axis=1)
+    known = np.isfinite(left).all(axis=2)
+    count = known.sum(axis=1)
     some = count > 1
-    r, n = np.where(seen[..., None], left, 0.0)[some], count[some]
-    followed = np.where(seen, variance, 0.0)[some].sum(axis=1) / n
+    r, n = np.where(known[..., None], left, 0.0)[some], count[some]
+    absorbed = np.where(known, variance, 0.0)[some].sum(axis=1) / n
     squares = np.square(r).sum(axis=(1, 2))
     products = (np.square(r.sum(axis=1)).sum(axis=1) - squares) / (n * (n - 1))
-    return np.array([np.sum(products + followed), np.sum(squares / n + followed), len(n)])
+    return np.array([np.sum(products + absorbed), np.sum(squares / n + absorbed), len(n)])
 
 
-def _share(told: NDArray, usual: float) -> float:
-    """Of sums as of `_in_common`, the frames as looks; as `usual` where these are few."""
-    common, whole, looks = told
-    known = looks / (looks + _SAMPLES)
-    own = common / whole if whole > 0 else usual
-    return float(np.clip(known * own + (1.0 - known) * usual, 0.0, _MOST))
+def _share(sums: NDArray, prior: float) -> float:
+    """Shared share of the variance from `_pair_sums`, shrunk towards `prior` if there are few measurements."""
+    shared, whole, measurements = sums
+    weight = measurements / (measurements + _PRIOR_MEASUREMENTS)
+    own = shared / whole if whole > 0 else prior
+    return float(np.clip(weight * own + (1.0 - weight) * prior, 0.0, _MAX_SHARE))

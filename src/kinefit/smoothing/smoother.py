@@ -1,4 +1,4 @@
-"""A whole take at once: all frames fitted together with a motion prior whose process noise the take determines."""
+"""Smooth a whole take: fit all frames jointly, with a motion prior whose process noise is estimated from the take."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from kinefit._mapped import release
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences.closures import hard_equations, looped
-from kinefit.frame.results import BLIND, FrameResult, judged
-from kinefit.frame.trust import adrift
+from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult, frame_result
+from kinefit.frame.trust import unknown_joints
 from kinefit.sensors.base import Matched, pixels_of
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.observability import moves_points, near
@@ -22,35 +22,35 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.foot_contacts import find_contacts
 from kinefit.smoothing.gaps import bridged
 from kinefit.smoothing.linearised import OtherSensors
-from kinefit.smoothing.process_noise import INLIER, SmoothTake, Strength, enliven, estimate
+from kinefit.smoothing.process_noise import MIN_INLIER_FACTOR, SmoothTake, Strength, estimate, estimate_liveliness
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import Spool, stretches
-from kinefit.smoothing.tracked_frames import TrackedFrames, exchanged, without_bias
+from kinefit.smoothing.tracked_frames import TrackedFrames, correct_swaps, without_bias
 from kinefit.smoothing.unwrap import unwrap
-from kinefit.smoothing.windows import parts, solved, solved_surely
+from kinefit.smoothing.windows import parts, solved, solved_with_covariances
 from kinefit.solvers.closed import Constraint, on_null_space, onto
 from kinefit.solvers.equations import variances
 from kinefit.solvers.trajectory import _kernels_smoothing
 
-_MATRIX_FRAMES = 100  # whose matrices over all degrees of freedom are made at once: some 2 MB of each
-_PARTS = 6  # of a long take, from which its process noise is estimated
-_ENOUGH = 6  # pixels that hold a root, or points in space of half as many rows; with fewer a frame is lost
-_LOOKS = 2  # at where the soles rest, the second with them held
-_ADRIFT = 0.13  # [s] about a contradicted segment: of 0, 0.13 and 0.27, the first misses the ends of a gap
+_MATRIX_FRAMES = 100  # whose (n, n) matrices are made at a time: some 2 MB of each
+_NOISE_PARTS = 6  # of a long take, from which its process noise is estimated
+_MIN_PIXELS = 6  # of a frame, with half the rows of other points; a frame with fewer is lost
+_CONTACT_ROUNDS = 2  # of finding foot contacts, the second with the contacts of the first
+_UNKNOWN_TIME = 0.13  # [s] about a contradicted segment: of 0, 0.13 and 0.27, the first misses the ends of a gap
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothedTake:
-    """A take, smoothed.
+    """A smoothed take.
 
     Parameters
     ----------
     results : F frames, with the matches of keypoints alone; read on demand
-    take : SmoothTake as it was solved last
-    matched : F lists, the matches of all other sensors; None where there are none
-    weight : (F, N) [1/px²] with which every channel took part, robust factor included
-    provenance : what was estimated, as `Motion.provenance` has it
-    shared : what keypoints of one segment err by together, as it was taken
+    take : SmoothTake at the solution
+    matched : F lists, the matches of all other sensors; None if there are none
+    weight : (F, N) [1/px²] of every channel in the fit, robust factor included
+    provenance : estimated noise, for `Motion.provenance`
+    shared : errors that keypoints of one segment share, as the fit assumed them
     """
 
     results: Sequence[FrameResult]
@@ -65,41 +65,41 @@ def smooth_results(
     body: Body, frames: TrackedFrames, settings: TrackSettings, *, contacts: bool = False, up: str = "z",
     eye: NDArray | None = None, level: bool = True, window: int = 300, overlap: int = 60,
 ) -> SmoothedTake:  # fmt: skip
-    """Tracked frames of any sensors, smoothed together.
+    """Smooth tracked frames of any sensors jointly.
 
-    Outliers and exchanged sides are those of the track, judged anew once; correspondences of other sensors than
-    keypoints are found anew in every round.
+    Outliers and left-right swaps are those of the track, decided again once. Correspondences of sensors other than
+    keypoints are matched again in every round.
 
     Parameters
     ----------
     contacts : bool
-        Hold the soles still where they rest on a level floor; `up` is the world's vertical axis.
-    eye : (3,) [m] of the camera that is the only sensor, for the contacts, see `find_contacts`; its pixels then stay
-        no surer than they are stated, since no other view shows what they are off by
-    level : whether `up` is measured, so that the floor is level
-    window, overlap : frames of a part that is solved at once, and how many it shares with the next.
+        Constrain the soles to rest while they touch a level floor; `up` is the world's vertical axis.
+    eye : (3,) [m] centre of the camera, if it is the only sensor, see `find_contacts`. The noise of its keypoints is
+        then never estimated below the stated one, since no other view shows their systematic errors.
+    level : bool, `up` is measured, so that the floor is level
+    window, overlap : number of frames that are solved at a time, and that two neighbouring windows share
     """
     take = replace(_take(as_tracked(body, frames, settings), settings), one_view=eye is not None)
     channels, swapped, others = take.channels, take.swapped, take.others
     strength, take, rounds = _estimate(take, settings, window, overlap)
-    take, covariances, others_matched = solved_surely(take, strength, window, overlap)
-    again = _swaps(take)
-    if not np.array_equal(again, swapped):
-        uv, confidence = exchanged(channels, again)
+    take, covariances, others_matched = solved_with_covariances(take, strength, window, overlap)
+    new_swaps = _swaps(take)
+    if not np.array_equal(new_swaps, swapped):
+        uv, confidence = correct_swaps(channels, new_swaps)
         uv = without_bias(body, channels, uv, take.roots, take.angles)
-        take, swapped = replace(take, uv=uv, confidence=confidence, swapped=again), again
-        take, covariances, others_matched = solved_surely(take, strength, window, overlap)
-    for _ in range(_LOOKS if contacts else 0):  # error bars stay those without: that a sole rests is no measurement
+        take, swapped = replace(take, uv=uv, confidence=confidence, swapped=new_swaps), new_swaps
+        take, covariances, others_matched = solved_with_covariances(take, strength, window, overlap)
+    for _ in range(_CONTACT_ROUNDS if contacts else 0):  # covariances stay those without: a contact is no measurement
         found = find_contacts(body, take.roots, take.angles, frames.rate, up, eye, level=level)
         take, others_matched = solved(replace(take, contacts=found), strength, window, overlap)
     take = replace(take, angles=unwrap(body.tree, take.angles))
     hard = hard_equations(body)
     take = take if hard is None else _closed(take, hard)
-    # Outliers and quality are judged by the stated standard deviations, as for a frame: they compare between takes.
-    took_part = take.agreeing(strength.sigma)
-    for some in stretches(len(took_part)):
-        took_part[some] *= take.confidence[some] / np.square(strength.sigma)
-    release(took_part, take.confidence)
+    # Outliers and quality use the stated standard deviations, as in tracking: they compare between takes.
+    fit_weight = take.factors_at_states(strength.sigma)
+    for some in stretches(len(fit_weight)):
+        fit_weight[some] *= take.confidence[some] / np.square(strength.sigma)
+    release(fit_weight, take.confidence)
     surfaces = False
     smoothed, packed = Spool[FrameResult](), np.triu_indices(body.tree.n_dofs)
     covariance = np.empty((body.tree.n_dofs,) * 2)
@@ -117,17 +117,17 @@ def smooth_results(
         covariance[packed] = covariance.T[packed] = covariances[f]
         if hard is not None:
             covariance = on_null_space(covariance, hard(state)[1])
-        frame = judged(scene, covariance, (*pixels, *more), result.iterations, observed=take.told[f])
+        frame = frame_result(scene, covariance, (*pixels, *more), result.iterations, observed=take.observed[f])
         surfaces |= any(m.shows_surface for m in more)
         smoothed.append(replace(frame, matched=pixels, measurements=()))
     if surfaces:
-        smoothed = _without_adrift(body, smoothed, round(_ADRIFT * frames.rate))
+        smoothed = _with_unknown_joints(body, smoothed, round(_UNKNOWN_TIME * frames.rate))
     shared = SharedErrors.of(channels, strength.shared, strength.sigma)
-    return SmoothedTake(smoothed, take, others_matched, took_part, _told(take, strength, rounds), shared)
+    return SmoothedTake(smoothed, take, others_matched, fit_weight, _provenance(take, strength, rounds), shared)
 
 
 def _closed(take: SmoothTake, hard: Constraint) -> SmoothTake:
-    """With closures that hold exactly: the solution has them as rows of a tenth of a millimetre."""
+    """The take with closures closed exactly; the solution has them as rows with a sigma of a tenth of a millimetre."""
     roots, angles = np.array(take.roots), np.array(take.angles)
     for f in range(len(roots)):
         state, _ = onto(take.body, BodyState(roots[f], angles[f]), hard, limits=False)
@@ -135,27 +135,27 @@ def _closed(take: SmoothTake, hard: Constraint) -> SmoothTake:
     return replace(take, roots=roots, angles=angles)
 
 
-def _without_adrift(body: Body, results: Sequence[FrameResult], half: int) -> Spool[FrameResult]:
-    """Frames that state nothing of joints that are `adrift`, nor of their coordinates."""
+def _with_unknown_joints(body: Body, results: Sequence[FrameResult], half: int) -> Spool[FrameResult]:
+    """Frames with infinite standard deviations of `unknown_joints` and their coordinates."""
     lost, hidden = map(np.stack, zip(*((r.lost, r.hidden) for r in results)))
-    gone = adrift(body.tree, lost, hidden, half)
-    of_dofs = np.concatenate([np.zeros((len(gone), 6), bool), gone[:, body.tree.owners]], axis=1)
+    unknown = unknown_joints(body.tree, lost, hidden, half)
+    of_dofs = np.concatenate([np.zeros((len(unknown), 6), bool), unknown[:, body.tree.owners]], axis=1)
     return Spool(
         replace(
             r, joint_std=np.where(joints[:, None], np.inf, r.joint_std), dof_std=np.where(dofs, np.inf, r.dof_std)
         )
-        for r, joints, dofs in zip(results, gone, of_dofs)
+        for r, joints, dofs in zip(results, unknown, of_dofs)
     )  # fmt: skip
 
 
 def as_tracked(body: Body, frames: TrackedFrames, settings: TrackSettings) -> SmoothTake:
-    """What all sensors measured in tracked frames as it was used, with the tracker's states, not smoothed."""
+    """Measurements of tracked frames with the tracker's swaps and states, not smoothed."""
     (channels, swapped), results = frames.pixels(), frames.results
     roots, angles = map(np.stack, zip(*((r.state.T_world_root, r.state.angles) for r in results)))
     names = tuple(channels.points.names[c] for c in channels.column)
     points = PointSet(names, channels.points.segments[channels.column], channels.points.points[channels.column])
-    everything = np.ones((len(roots), len(body.tree.coordinates)), bool)
-    uv, confidence = exchanged(channels, swapped)
+    all_observed = np.ones((len(roots), len(body.tree.coordinates)), bool)
+    uv, confidence = correct_swaps(channels, swapped)
     sensors, others = dict.fromkeys((m.sensor for several in frames.measurements for m in several), 1.0), None
     if sensors or body.closures:
         rows = 2 * np.count_nonzero(channels.weight, axis=1)
@@ -164,22 +164,22 @@ def as_tracked(body: Body, frames: TrackedFrames, settings: TrackSettings) -> Sm
         )  # fmt: skip
     return SmoothTake(
         body, channels, points, without_bias(body, channels, uv, roots, angles), confidence, swapped, roots, angles,
-        everything, np.ones((len(roots), body.tree.n_dofs)), 1.0 / frames.rate, settings.loss,
+        all_observed, np.ones((len(roots), body.tree.n_dofs)), 1.0 / frames.rate, settings.loss,
         (settings.acceleration_memory, settings.smooth_memory), others=others,
     )  # fmt: skip
 
 
 def _take(take: SmoothTake, settings: TrackSettings) -> SmoothTake:
-    """What was tracked, in angles without jumps."""
+    """The take with continuous angles, lost frames filled, and its observed coordinates."""
     body, channels, others, rate = take.body, take.channels, take.others, 1.0 / take.dt
-    inliers = take.agreeing(channels.sigma) > INLIER
+    inliers = take.factors_at_states(channels.sigma) > MIN_INLIER_FACTOR
     alone, rows = _observed(take, channels, others)
-    far = moves_points(body, take.points, inliers, take.roots, take.angles)
-    told = alone[0] & (far | looped(body)) | alone[1]
-    lost = inliers.sum(axis=1) + 0.5 * rows < _ENOUGH
+    moves_keypoint = moves_points(body, take.points, inliers, take.roots, take.angles)
+    observed = alone[0] & (moves_keypoint | looped(body)) | alone[1]
+    lost = inliers.sum(axis=1) + 0.5 * rows < _MIN_PIXELS
     roots, angles = bridged(take.roots, unwrap(body.tree, take.angles), lost, settings.smooth_memory * rate)
-    told = near(told, round(settings.smooth_memory * rate))
-    return replace(take, roots=roots, angles=angles, told=told)
+    observed = near(observed, round(settings.smooth_memory * rate))
+    return replace(take, roots=roots, angles=angles, observed=observed)
 
 
 def _observed(take: SmoothTake, channels: Channels, others: OtherSensors | None) -> tuple[list[NDArray], NDArray]:
@@ -189,7 +189,7 @@ def _observed(take: SmoothTake, channels: Channels, others: OtherSensors | None)
     out, rows = [np.zeros((T, D), bool), np.zeros((T, D), bool)], np.zeros(T)
     for some in stretches(T, _MATRIX_FRAMES):
         part = take.part(some)
-        packed, _, _ = part.seen(channels.sigma).equations(take.body)(part.roots, part.angles)
+        packed, _, _ = part.solver_points(channels.sigma).equations(take.body)(part.roots, part.angles)
         both = np.zeros((len(part.roots), *prior.shape))
         _kernels_smoothing.add_packed(packed, tree.chain, tree.depth, both)
         both += np.tril(both, -1).transpose(0, 2, 1)
@@ -199,16 +199,16 @@ def _observed(take: SmoothTake, channels: Channels, others: OtherSensors | None)
             found, rows[some] = [both + linear.H, linear.H], linear.rows
         for observed, matrices in zip(out, found):
             variance = np.array([variances(H + prior)[6:] for H in matrices])
-            observed[some] = variance <= np.square(BLIND * tree.spread)
+            observed[some] = variance <= np.square(UNOBSERVED_STD_RATIO * tree.spread)
     return out, rows
 
 
 def _estimate(
     take: SmoothTake, settings: TrackSettings, window: int, overlap: int
 ) -> tuple[Strength, SmoothTake, int]:
-    """Strength of a few parts of the take, and the take with the liveliness of all."""
+    """Estimate the strength from a few parts of the take; returns it, the take with its liveliness, and the rounds."""
     windows = [whole for whole, _ in parts(len(take.roots), window, overlap)]
-    chosen = np.unique(np.linspace(0, len(windows) - 1, _PARTS).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(windows) - 1, _NOISE_PARTS).round().astype(int))
     start = settings.root_acceleration, settings.angle_acceleration
     strength, pieces, rounds = estimate([take.part(windows[i]) for i in chosen], start, settings.smooth_rounds)
     done = dict(zip(chosen.tolist(), pieces, strict=True))
@@ -216,7 +216,7 @@ def _estimate(
         take = replace(take, others=replace(take.others, scale=pieces[0].others.scale))
     roots, angles, live = np.array(take.roots), np.array(take.angles), np.array(take.live)
     for i, (whole, kept) in enumerate(parts(len(take.roots), window, overlap)):
-        piece = done[i] if i in done else enliven(take.part(whole), strength)
+        piece = done[i] if i in done else estimate_liveliness(take.part(whole), strength)
         release(take.uv, take.confidence)
         inside = slice(kept.start - whole.start, kept.stop - whole.start)
         roots[kept], angles[kept], live[kept] = piece.roots[inside], piece.angles[inside], piece.live[inside]
@@ -224,21 +224,21 @@ def _estimate(
 
 
 def _swaps(take: SmoothTake) -> NDArray:
-    """(F, N) bool, channels to exchange with their partner, judged by the smoothed motion."""
+    """(F, N) bool: channels to exchange with their left-right partner, by the smoothed motion."""
     channels, groups = take.channels, limb_groups(take.body, take.channels)
     if not len(channels.column):
         return np.zeros((len(take.roots), 0), bool)
     out = np.empty(take.confidence.shape, bool)
     for some in stretches(len(out)):
         fitted, given = take.fitted(take.roots[some], take.angles[some]), channels.part(range(*some.indices(len(out))))
-        uv, confidence = exchanged(given, np.zeros(fitted.shape[:2], bool))
+        uv, confidence = correct_swaps(given, np.zeros(fitted.shape[:2], bool))
         uv = without_bias(take.body, channels, uv, take.roots[some], take.angles[some])
         weight = confidence / np.square(channels.sigma)
         out[some] = [find_swaps(channels, groups, *of_frame) for of_frame in zip(uv, weight, fitted)]
     return out
 
 
-def _told(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, Any]:
+def _provenance(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, Any]:
     coordinates = ("root_shift", "root_turn", *take.body.tree.coordinates)
     values = [strength.acceleration[0], *strength.acceleration[5:]]
     sigma = {

@@ -1,4 +1,4 @@
-"""What is kept of every frame of a long take: in memory while it is little, beyond that in a temporary file."""
+"""Store records of every frame of a long take: small ones in memory, large ones in a temporary file."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ IN_MEMORY = 16 * 2**20
 """Bytes of each kind that stay in memory: depth and silhouettes of some seconds, keypoints of a minute."""
 
 STRETCH = 2000
-"""Frames of which arrays over all channels are made at once."""
+"""Frames for which arrays over all channels are made at a time."""
 
 
 def stretches(frames: int, length: int | None = None) -> list[slice]:
-    """Of a take, each of `length` frames at most; default: what is computed of all channels in one stays small."""
+    """Slices of a take, each of `length` frames at most; default: `STRETCH`, which keeps arrays of channels small."""
     length = length or STRETCH
     return [slice(start, min(start + length, frames)) for start in range(0, max(frames, 1), length)]
 
 
 class Store:
-    """A file of records, and the objects that they refer to.
+    """A file of records, and the objects to which they refer.
 
-    Records hold arrays and the classes of `record_classes`. All other objects (bodies, sensors, cameras, measurements
-    of a sensor of one's own) stay in memory as they are.
+    Records contain arrays and the classes of `record_classes`. All other objects (bodies, sensors, cameras,
+    measurements of the user's own sensors) stay in memory.
 
     Parameters
     ----------
@@ -47,12 +47,12 @@ class Store:
         self._records, self._shared, self._numbers = records, list[Any](), dict[int, int]()
 
     def write(self, thing: Any, tag: int = 0, number: int = 0) -> int:
-        """The byte at which an object is written; tag and number as of `RecordFile.append`.
+        """Write an object; returns the byte at which it starts. Tag and number: see `RecordFile.append`.
 
         Raises
         ------
         ExportError
-            No room for it.
+            The disk is full.
         """
         try:
             return self._records.append(CODEC.encode(thing, self._refer), tag, number)
@@ -60,12 +60,12 @@ class Store:
             raise self._full(error) from error
 
     def read(self, at: int) -> Any:
-        """What was written at a byte: a copy.
+        """A copy of the object written at a byte.
 
         Raises
         ------
         FileError
-            It is damaged.
+            The record is damaged.
         """
         return CODEC.decode(self._records.read(at), self._resolve, name=self._records.name)
 
@@ -85,18 +85,18 @@ class Store:
 
 
 class Spool(Sequence[T], Generic[T]):
-    """Records of many frames, read back one by one; what is read is a copy.
+    """A sequence of records of many frames, in memory or in a temporary file; each read returns a copy.
 
-    The file lies in the system's temporary folder (`TMPDIR`), without a name where the system allows it, and is gone
-    with the spool or the process.
+    The file is in the system's temporary folder (`TMPDIR`), without a name if the system allows it. It is deleted with
+    the spool or the process.
 
     Parameters
     ----------
-    things : to begin with
+    things : first records
     in_memory : see `Store`
-    store : that records go to, of several spools; default: one of its own
-    tag : of its records there
-    places : bytes at which records begin that are in the store already
+    store : shared by several spools; default: a new one
+    tag : of this spool's records in the store
+    places : bytes at which records start that the store has already
     """
 
     def __init__(
@@ -129,15 +129,15 @@ class Spool(Sequence[T], Generic[T]):
         self._places[which] = self._store.write(thing, self._tag)
 
     def append(self, thing: T, number: int = 0) -> None:
-        """Add one at the end, with a number of its own for whoever scans the file.
+        """Append a record; `number` is stored with it, for a scan of the file.
 
         Raises
         ------
         ExportError
-            No room in the temporary folder.
+            The temporary folder is full.
         """
         self._places.append(self._store.write(thing, self._tag, number))
 
     def chosen(self, which: Iterable[int]) -> Spool[T]:
-        """Some of them, in this order, in the same file."""
+        """A spool of some of the records, in this order, in the same store."""
         return Spool(store=self._store, tag=self._tag, places=[self._places[i] for i in which])

@@ -1,4 +1,4 @@
-"""Frames of a take as a tracker left them, and their pixels as they are fitted: what smoothing begins with."""
+"""The input of smoothing: tracked frames of a take, and their keypoints."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from kinefit.smoothing.spool import STRETCH, stretches
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrames:
-    """F consecutive frames as a tracker left them.
+    """F consecutive tracked frames.
 
     Parameters
     ----------
-    results : F frames, with those matches alone that offer packed `pixels`, all in one layout
-    measurements : of each of them what all other sensors measured, without whole images
-    leftovers : of each of them what the fit leaves over of every sensor
+    results : F frames, with only those matches that have packed `pixels`, all in one layout
+    measurements : F tuples, the measurements of all other sensors, without whole images
+    leftovers : F tuples, the residuals of every sensor
     times : (F,) [s]
     rate : float [Hz]
-    scene_of, apart : those of the tracker
+    scene_of, apart : of the tracker, see `lag_frame.TrackerLike`
     """
 
     results: Sequence[FrameResult]
@@ -41,7 +41,7 @@ class TrackedFrames:
     apart: ApartRows
 
     def pixels(self) -> tuple[Channels, NDArray]:
-        """The points in images of all frames as they were measured, and (F, N) bool: which changed sides."""
+        """Keypoints of all frames as measured, and (F, N) bool: channels whose left and right the tracker swapped."""
         F, layout, swapped = len(self.results), None, np.zeros((len(self.results), 0), bool)
         uv, confidence = room((F, 0, 2)), room((F, 0))
         for f, result in enumerate(self.results):
@@ -58,23 +58,23 @@ class TrackedFrames:
         return replace(layout.channels, uv=uv, confidence=confidence), swapped
 
 
-def exchanged(channels: Channels, swapped: NDArray) -> tuple[NDArray, NDArray]:
-    """Pixels (F, N, 2) and confidences (F, N) with sides put right, 0 where unseen."""
+def correct_swaps(channels: Channels, swapped: NDArray) -> tuple[NDArray, NDArray]:
+    """Pixels (F, N, 2) and confidences (F, N), 0 where undetected, with the channels `swapped` (F, N) exchanged."""
     if len(swapped) == len(channels.uv) and not swapped.any():
-        unseen = ~np.isfinite(channels.uv).all(axis=2) & (channels.confidence != 0.0)
-        return channels.uv, np.where(unseen, 0.0, channels.confidence) if unseen.any() else channels.confidence
+        undetected = ~np.isfinite(channels.uv).all(axis=2) & (channels.confidence != 0.0)
+        return channels.uv, np.where(undetected, 0.0, channels.confidence) if undetected.any() else channels.confidence
     uv, confidence = room((*swapped.shape, 2)), room(swapped.shape)
     for some in stretches(len(swapped)):
         order = np.where(swapped[some], channels.partner, np.arange(swapped.shape[1]))
         uv[some] = np.take_along_axis(channels.uv[some], order[:, :, None], axis=1)
-        sure = np.take_along_axis(channels.confidence[some], order, axis=1)
-        confidence[some] = np.where(np.isfinite(uv[some]).all(axis=2), sure, 0.0)
+        ordered = np.take_along_axis(channels.confidence[some], order, axis=1)
+        confidence[some] = np.where(np.isfinite(uv[some]).all(axis=2), ordered, 0.0)
     release(uv, confidence)
     return uv, confidence
 
 
 def without_bias(body: Body, channels: Channels, uv: NDArray, roots: NDArray, angles: NDArray) -> NDArray:
-    """Pixels (T, N, 2) without the bias by view that keypoints have at states; the same where none is known."""
+    """Pixels (T, N, 2) minus the detectors' bias by view at states (T, 4, 4), (T, D); unchanged if no bias is known."""
     if channels.view_bias is None:
         return uv
     points = channels.points

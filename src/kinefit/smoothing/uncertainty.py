@@ -1,13 +1,13 @@
-"""Error bars that are true: jitter as the fit's own covariance has it, errors that do not average out, and the shape.
+"""Compute honest error bars: the fit's covariance, plus systematic errors and the uncertainty of the shape.
 
-A fit takes every error for new in every frame. An error e that lasts goes through to the pose whole, by δ = P Jᵀ W e
-with P the covariance of one frame on its own, however many frames are smoothed together. With δ also the answer to a
-change of the shape θ (bone lengths, places of points), the pose being fitted anew,
+A fit assumes independent errors in every frame. A systematic error e displaces the pose by δ = P Jᵀ W e, with P the
+covariance of one frame on its own, however many frames are smoothed jointly. The pose also responds to a change of the
+shape θ (bone lengths, landmark offsets). So
 
     Cov = C + P (Jᵀ W Σ W J + Σ_c s_c s_cᵀ) P + D Σ_θ Dᵀ,        D = −P H_qθ
 
-where C is the smoothed fit's covariance, Σ the variance of every channel's drift and s_c = Jᵀ W 1_c · shift that of a
-camera, or of another sensor, as a whole.
+where C is the smoothed fit's covariance, Σ the variance of every channel's bias and drift, and s_c = Jᵀ W 1_c · shift
+the shared bias of a camera or another sensor.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from kinefit.sensors.layout import Layout
 from kinefit.sensors.settings import CameraErrors
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import OtherNoise, covariance_alone, leverages
-from kinefit.smoothing.shape_errors import SAMPLED, ShapeErrors
+from kinefit.smoothing.shape_errors import SAMPLED_FRAMES, ShapeErrors
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import stretches
 from kinefit.solvers.bundle.border_frames import gram
@@ -38,28 +38,28 @@ from kinefit.solvers.trajectory.variance_components import VarianceComponents, v
 from kinefit.subject.closure_moves import ClosureMoves
 from kinefit.subject.matched_frames import closing_moves, point_moves
 from kinefit.subject.point_moves import PointMoves
-from kinefit.subject.sensor_parameters import CameraExtrinsics, alike
+from kinefit.subject.sensor_parameters import CameraExtrinsics, same_cameras
 from kinefit.subject.subject import Subject
 
 Answers = Callable[[Sequence[int], Sequence[NDArray]], ShapeErrors]
-"""(frames, covariance of each on its own) -> what an uncertain shape adds to them."""
+"""(frames, covariance of each on its own) -> variances that the uncertainty of the shape adds to them."""
 
-TIED = 0.1
-"""[s] within which motion ties a frame to another: an acceleration lasts about twice that."""
+MOTION_CORRELATION_TIME = 0.1
+"""[s] within which the motion correlates frames: an acceleration lasts about twice that."""
 
-_STRETCHES = 6  # of a long take, from which the detectors' noise is estimated: 12,000 frames tell it
-_APART = 800  # frames: more than residuals are followed over, at up to 400 Hz
+_NOISE_STRETCHES = 6  # of a long take, from which the detectors' noise is estimated: 12,000 frames are enough
+_SEPARATING_FRAMES = 800  # without detections between two stretches: more than the longest lag, at up to 400 Hz
 
 
 @dataclass(frozen=True, eq=False)
-class Lasting:
-    """What no smoothing takes away, of one frame.
+class SystematicErrors:
+    """Covariance from systematic errors and the shape, of one frame: smoothing does not reduce it.
 
     Parameters
     ----------
-    dofs : (n, n) [m, rad] covariance of the degrees of freedom.
-    joints : (S, 3) [m²] variance of the joint centres along the world's axes.
-    alone : (n, n) covariance of the frame on its own, prior included.
+    dofs : (n, n) covariance of the degrees of freedom [m, rad]
+    joints : (S, 3) [m²] variance of the joint centres along the world's axes
+    alone : (n, n) covariance of the frame on its own, prior included
     """
 
     dofs: NDArray
@@ -67,97 +67,98 @@ class Lasting:
     alone: NDArray
 
 
-def with_lasting_errors(
+def with_systematic_errors(
     results: Sequence[FrameResult], subject: Subject, take: SmoothTake, weight: NDArray,
     others: OtherNoise | None = None, answers: Sequence[Answers] = (), *,
     cameras: CameraErrors | None = None, shared: SharedErrors | None = None,
 ) -> tuple[Iterator[FrameResult], VarianceComponents]:  # fmt: skip
-    """The same results, one by one, with the deviations that lasting errors and the shape add; the detectors' noise.
+    """Add systematic errors and the uncertainty of the shape to standard deviations; also returns the detectors' noise.
 
     Parameters
     ----------
-    results : F neighbouring frames, with the standard deviations of a fit that takes errors for new each time.
-    subject : with the shape that was estimated from the take; without one it is taken for exact.
-    take : the pixels as they were used, and the states
-    weight : (F, N) [1/px²] with which every channel took part, robust factor included
+    results : F consecutive frames, with the standard deviations of a fit that assumes independent errors
+    subject : person whose shape was estimated from the take; without a fit it counts as exact
+    take : keypoints and states of the fit
+    weight : (F, N) [1/px²] of every channel in the fit, robust factor included
     others : noise of all other sensors
-    answers : what shapes add that were found from several kinds of sensors together
-    cameras : errors of the cameras' poses, where neither the subject nor the answers know; None for exact ones
-    shared : what points of one segment err by together, as the fit took it; None: each for itself
+    answers : uncertainty of shapes that were fitted to several kinds of sensors
+    cameras : standard deviations of the cameras' poses, if neither the subject nor the answers contain them; None for
+        exact ones
+    shared : errors that points of one segment share, as the fit assumed them; None for none
     """
     body, channels, rate = subject.body, take.channels, 1.0 / take.dt
     shared = shared or SharedErrors.none(len(channels.column))
     layout = Layout(channels.with_points(body), body)
-    half, n = round(TIED * rate), body.tree.n_dofs
-    sampled = np.unique(np.linspace(0, len(results) - 1, min(SAMPLED, len(results))).astype(int))
-    hidden, seen = np.zeros((2, len(channels.column)))
+    half, n = round(MOTION_CORRELATION_TIME * rate), body.tree.n_dofs
+    sampled = np.unique(np.linspace(0, len(results) - 1, min(SAMPLED_FRAMES, len(results))).astype(int))
+    absorbed, count = np.zeros((2, len(channels.column)))
     for f in sampled:
         rows, J, pushed = pixel_columns(layout, results[f].state, weight[f], shared)
         whole = gram(J, pushed) + (0.0 if others is None else others.pooled(f, half)[0])
-        felt = rows.weight > 0.0
-        followed = leverages(J[felt], pushed[felt], covariance_alone(body, results[f].state, whole))
-        hidden += np.bincount(rows.group[felt], followed, len(hidden))
-        seen += np.bincount(rows.group[felt], minlength=len(seen))
-    hidden = np.where(seen > 0, hidden / np.maximum(seen, 1), hidden.sum() / max(seen.sum(), 1))
+        used = rows.weight > 0.0
+        leverage = leverages(J[used], pushed[used], covariance_alone(body, results[f].state, whole))
+        absorbed += np.bincount(rows.group[used], leverage, len(absorbed))
+        count += np.bincount(rows.group[used], minlength=len(count))
+    absorbed = np.where(count > 0, absorbed / np.maximum(count, 1), absorbed.sum() / max(count.sum(), 1))
     if channels.view_followed is not None:
-        hidden = 1.0 - (1.0 - hidden) * (1.0 - channels.view_followed)
-    values = _left_over(take)
+        absorbed = 1.0 - (1.0 - absorbed) * (1.0 - channels.view_followed)
+    values = _residuals(take)
     noise = variance_components(
-        values, np.arange(len(values)) / rate, leverage=hidden, jitter_leverage=hidden / (2 * half + 1),
+        values, np.arange(len(values)) / rate, leverage=absorbed, jitter_leverage=absorbed / (2 * half + 1),
         pool=np.minimum(channels.column, channels.column[channels.partner]), group=channels.source,
     )  # fmt: skip
     del values
-    known = Known.of(subject, channels, cameras)
-    nothing = np.zeros((n, n)), np.zeros((n, n))
+    priors = KeypointPriors.of(subject, channels, cameras)
+    zero = np.zeros((n, n)), np.zeros((n, n))
 
-    def lasts(f: int) -> Lasting:
-        more = nothing if others is None else others.pooled(f, half)
+    def errors_at(f: int) -> SystematicErrors:
+        other_sensors = zero if others is None else others.pooled(f, half)
         near = weight[max(f - half, 0) : f + half + 1]
-        return lasting(known, layout, results[f].state, near.mean(axis=0), noise, shared, *more)
+        return systematic_errors(priors, layout, results[f].state, near.mean(axis=0), noise, shared, *other_sensors)
 
     shapes = []
     if answers:
-        alone = [lasts(int(f)).alone for f in sampled]
-        shapes = [one([int(f) for f in sampled], alone) for one in answers]
+        alone = [errors_at(int(f)).alone for f in sampled]
+        shapes = [answer([int(f) for f in sampled], alone) for answer in answers]
 
-    def surer_no_more() -> Iterator[FrameResult]:
+    def inflated() -> Iterator[FrameResult]:
         for f, result in enumerate(results):
-            one = lasts(f)
-            dofs, joints = np.maximum(np.diag(one.dofs), 0.0), one.joints
+            errors = errors_at(f)
+            dofs, joints = np.maximum(np.diag(errors.dofs), 0.0), errors.joints
             for shape in shapes:
-                dofs, joints = (mine + of_shape for mine, of_shape in zip((dofs, joints), shape.at(f)))
+                dofs, joints = (variance + added for variance, added in zip((dofs, joints), shape.at(f)))
             yield replace(
                 result, dof_std=np.sqrt(np.square(result.dof_std) + dofs),
                 joint_std=np.sqrt(np.square(result.joint_std) + joints),
             )  # fmt: skip
 
-    return surer_no_more(), noise
+    return inflated(), noise
 
 
-def _left_over(take: SmoothTake) -> NDArray:
-    """Residuals (F, N, 2) [px], NaN where unseen; of long takes in stretches, with unseen frames between."""
+def _residuals(take: SmoothTake) -> NDArray:
+    """Residuals (F, N, 2) [px], NaN where undetected; of a long take some stretches, separated by NaN frames."""
     parts = stretches(len(take.roots))
-    chosen = [parts[i] for i in np.unique(np.linspace(0, len(parts) - 1, _STRETCHES).astype(int))]
+    chosen = [parts[i] for i in np.unique(np.linspace(0, len(parts) - 1, _NOISE_STRETCHES).astype(int))]
     values = []
     for some in chosen:
         part = take.part(some)
-        seen = part.confidence > 0
-        values.append(np.where(seen[..., None], part.uv - part.fitted(part.roots, part.angles), np.nan))
-        if len(parts) > _STRETCHES:  # as many frames as residuals are followed over
-            values.append(np.full((_APART, *values[0].shape[1:]), np.nan))
+        detected = part.confidence > 0
+        values.append(np.where(detected[..., None], part.uv - part.fitted(part.roots, part.angles), np.nan))
+        if len(parts) > _NOISE_STRETCHES:
+            values.append(np.full((_SEPARATING_FRAMES, *values[0].shape[1:]), np.nan))
     return np.concatenate(values)
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """What keypoints rest on, and how sure it is.
+class KeypointPriors:
+    """Shape and cameras with their covariance, on which the poses from keypoints depend.
 
     Parameters
     ----------
-    moves : how points move with the shape; None for one that is exact.
-    cameras : parameters of cameras' poses, which come last; None for exact ones.
-    covariance : (p, p) of both
-    closing : how the body's closures move with the first of them; their own deviations last.
+    moves : derivatives of points by the shape; None for an exact shape
+    cameras : parameters of cameras' poses, the last ones; None for exact cameras
+    covariance : (p, p) of shape and cameras
+    closing : derivatives of the body's closures by the shape; errors of closures themselves are systematic
     """
 
     moves: PointMoves | None
@@ -166,17 +167,17 @@ class Known:
     closing: ClosureMoves | None = None
 
     @classmethod
-    def of(cls, subject: Subject, channels: Channels, errors: CameraErrors | None) -> Known:
-        """Of a subject; cameras that its fit did not seek err as their calibration; None for exact."""
+    def of(cls, subject: Subject, channels: Channels, errors: CameraErrors | None) -> KeypointPriors:
+        """Priors of a subject; cameras that its fit did not contain have the calibration's `errors`, None for exact."""
         if subject.fit is not None and subject.covariance is not None:
             cameras = subject.fit.cameras
             moves, covariance = point_moves(subject.fit), subject.covariance
             closing = closing_moves(subject.fit, subject.body)
-            if cameras is not None and alike(cameras.rig, channels.rig):
-                stay = np.zeros(len(covariance))  # where they were found, and the motion was not
-                stay[-len(cameras.names) :] = subject.fit.mean[-len(cameras.names) :]
-                return cls(moves, cameras, covariance + np.outer(stay, stay), closing)
-            if cameras is not None:  # those of another take tell nothing of these
+            if cameras is not None and same_cameras(cameras.rig, channels.rig):
+                shift = np.zeros(len(covariance))  # the subject's fit moved the cameras, the motion's fit did not
+                shift[-len(cameras.names) :] = subject.fit.mean[-len(cameras.names) :]
+                return cls(moves, cameras, covariance + np.outer(shift, shift), closing)
+            if cameras is not None:  # cameras of another take
                 covariance = covariance[: -len(cameras.names), : -len(cameras.names)]
         else:
             moves, covariance, closing = None, np.zeros((0, 0)), None
@@ -188,28 +189,28 @@ class Known:
         return cls(moves, cameras, whole, closing)
 
     def columns(self, layout: Layout, rows: Rows, tree: KinematicTree, frames: NDArray) -> tuple[NDArray, NDArray]:
-        """(N, p) how far points of rows move along their directions, whitened, and (S, 3, p) how joints do."""
+        """(N, p) whitened derivatives of rows, and (S, 3, p) of joint centres; frames (S, 12) of the segments."""
         by, joints = np.zeros((len(rows), len(self.covariance))), np.zeros((len(frames), 3, len(self.covariance)))
         if self.moves is not None:
-            moved, told = self.moves.joints(tree, frames), self.moves.columns(layout.places, rows, tree, frames)
-            joints[:, :, : moved.shape[2]] = moved
-            if told is not None:
-                by[:, : told.shape[1]] = told
+            of_joints, of_rows = self.moves.joints(tree, frames), self.moves.columns(layout.places, rows, tree, frames)
+            joints[:, :, : of_joints.shape[2]] = of_joints
+            if of_rows is not None:
+                by[:, : of_rows.shape[1]] = of_rows
         if self.cameras is not None:
             channels = layout.channels
-            seen = self.cameras.columns(rows, channels.rig, channels.camera[rows.group])
-            by[:, by.shape[1] - seen.shape[1] :] = seen
+            by_cameras = self.cameras.columns(rows, channels.rig, channels.camera[rows.group])
+            by[:, by.shape[1] - by_cameras.shape[1] :] = by_cameras
         return by, joints
 
 
 def pixel_columns(
     layout: Layout, state: BodyState, weight: NDArray, shared: SharedErrors
 ) -> tuple[Rows, NDArray, NDArray]:
-    """Keypoints of one frame with weights (N,) [1/px²], two rows each.
+    """Rows of the keypoints of one frame with weights (N,) [1/px²], two each, and their derivatives.
 
     Returns
     -------
-    rows, J (2 N, n) [px] how they move with the pose, and W J (2 N, n) [1/px] how an error of each pushes the pose
+    rows, J (2 N, n) [px] derivatives by the pose, and W J (2 N, n) [1/px] gradient of the pose by an error of each row
     """
     own = weight / (1.0 - shared.share)
     rows = targets.fill(
@@ -223,7 +224,7 @@ def pixel_columns(
 
 
 def pixel_information(take: SmoothTake, weight: NDArray, shared: SharedErrors | None) -> Callable[[int], NDArray]:
-    """Function of a frame: the information (n, n) of its keypoints with weights (F, N) [1/px²]."""
+    """Function: frame -> information (n, n) of its keypoints, with weights (F, N) [1/px²]."""
     layout = Layout(take.channels.with_points(take.body), take.body)
     shared = shared or SharedErrors.none(weight.shape[1])
 
@@ -234,46 +235,47 @@ def pixel_information(take: SmoothTake, weight: NDArray, shared: SharedErrors | 
     return information
 
 
-def lasting(
-    known: Known, layout: Layout, state: BodyState, weight: NDArray,
-    noise: VarianceComponents, shared: SharedErrors, other_information: NDArray, other_lasting: NDArray,
-) -> Lasting:  # fmt: skip
-    """Covariance of one frame's pose from drift, shifts of sensors and shape.
+def systematic_errors(
+    priors: KeypointPriors, layout: Layout, state: BodyState, weight: NDArray,
+    noise: VarianceComponents, shared: SharedErrors, other_information: NDArray, other_systematic: NDArray,
+) -> SystematicErrors:  # fmt: skip
+    """Covariance of one frame's pose from bias, drift, shared biases of sensors and shape.
 
     Parameters
     ----------
-    known : what the keypoints rest on
-    weight : (N,) [1/px²] with which each channel took part, robust factor included; 0 where unseen.
-    shared : part of a channel's errors, of jitter and of drift alike, that is the same in all of its group
-    other_information, other_lasting : (n, n) of all sensors but the keypoints, see `OtherNoise`
+    priors : shape and cameras with their covariance
+    weight : (N,) [1/px²] of every channel in the fit, robust factor included; 0 where undetected
+    noise : of the detectors
+    shared : share of a channel's errors, of jitter and drift alike, that its group shares
+    other_information, other_systematic : (n, n) of all sensors but the keypoints, see `OtherNoise`
     """
     body, channels, tree = layout.body, layout.channels, layout.body.tree
     rows, J, pushed = pixel_columns(layout, state, weight, shared)
     frames, _ = tree.forward(state.T_world_root, state.angles)
-    by_shape, stretch = known.columns(layout, rows, tree, frames)
-    Sigma = known.covariance
+    by_shape, stretch = priors.columns(layout, rows, tree, frames)
+    Sigma = priors.covariance
     if body.closures:
         closed = closed_at(body, state)
         w = closed.rows().weight
         soft = (w * ~closed.hard)[:, None] * closed.jacobian
-        other_lasting = other_lasting + soft.T @ closed.jacobian
+        other_systematic = other_systematic + soft.T @ closed.jacobian
     alone = covariance_alone(body, state, gram(J, pushed) + other_information)
     of_axis = 2 * channels.source[rows.group] + np.arange(len(rows)) % 2
     push = np.ravel(noise.shared)[:, None] * gram(np.eye(2 * len(noise.shared))[of_axis], pushed)
-    last, share = (v[rows.group][:, None] * pushed for v in (noise.lasting * np.sqrt(1.0 - shared.share),
-                                                            noise.lasting * np.sqrt(shared.share)))
-    together = shared.sums(share, rows.group)
-    drift = gram(last, last) + gram(together, together)
-    meat = drift + product(push.T, push) + other_lasting
+    own_error, share = (v[rows.group][:, None] * pushed for v in (noise.systematic * np.sqrt(1.0 - shared.share),
+                                                                 noise.systematic * np.sqrt(shared.share)))
+    group_error = shared.sums(share, rows.group)
+    drift = gram(own_error, own_error) + gram(group_error, group_error)
+    meat = drift + product(push.T, push) + other_systematic
     own = (weight / (1.0 - shared.share))[rows.group]
     pushed_by_shape = gram(pushed, by_shape / np.sqrt(np.where(own > 0.0, own, 1.0))[:, None])
-    if known.closing is not None:
-        moved_by = known.closing.at(state)
+    if priors.closing is not None:
+        moved_by = priors.closing.at(state)
         pushed_by_shape[:, : moved_by.shape[1]] += closed.jacobian.T @ (w[:, None] * moved_by)
-    answer = -product(alone, pushed_by_shape)
+    response = -product(alone, pushed_by_shape)
     dofs = product(product(alone, meat), alone)
     moved = joint_moves(body, state)
-    whole = product(moved, answer) + stretch
+    whole = product(moved, response) + stretch
     joints = np.sum(product(moved, dofs) * moved, axis=-1) + np.sum(product(whole, Sigma) * whole, axis=-1)
-    shape = product(product(answer, Sigma), answer.T)
-    return Lasting(dofs + shape, np.maximum(joints, 0.0), alone)
+    shape = product(product(response, Sigma), response.T)
+    return SystematicErrors(dofs + shape, np.maximum(joints, 0.0), alone)

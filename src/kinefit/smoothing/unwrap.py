@@ -1,4 +1,4 @@
-"""Angles without jumps: one chart a ball joint for a whole take, and whole turns counted on."""
+"""Remove jumps from angles: one chart of each ball joint for the whole take, and angles beyond a whole turn."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from kinefit.bodies.charts import SIGNS, twin
 from kinefit.bodies.tree import KinematicTree
 
 _TURN = 2.0 * np.pi
-_SMALL = 1.5  # [rad] a step smaller than that, all three angles together, leads to no other form: that is 2 π away
+_MAX_STEP = 1.5  # [rad] sum over the three angles: a smaller step stays in its form, since the next is 2 π away
 
 
 def unwrap(tree: KinematicTree, angles: NDArray) -> NDArray:
-    """The same poses with angles (T, D) that are continuous wherever the pose is.
+    """Angles (T, D) of the same poses, continuous wherever the pose is.
 
-    A ball joint keeps the chart in which most of the take lies within its limits, and may leave them where only the
-    other chart holds the turn (an arm that swings overhead): the number goes on instead of jumping.
+    A ball joint keeps the chart in which most of the take is within its limits. Its angles may exceed the limits where
+    only the other chart contains the rotation (an arm that swings overhead), so that they do not jump.
     """
     out = np.array(angles, float)
     turning = ~tree.prismatic
@@ -24,13 +24,13 @@ def unwrap(tree: KinematicTree, angles: NDArray) -> NDArray:
     for d in tree.ball_joints:
         ball[d] = True
         out[:, d] = _ball(out[:, d], tree.lower[d], tree.upper[d])
-    free = turning & ~ball & (tree.upper - tree.lower > _TURN)  # others cannot come round within their limits
+    free = turning & ~ball & (tree.upper - tree.lower > _TURN)  # others cannot make a turn within their limits
     out[:, free] = np.unwrap(out[:, free], axis=0)
     return out
 
 
 def continued(tree: KinematicTree, before: NDArray, angles: NDArray) -> NDArray:
-    """The same pose with angles (D,) in the form that is nearest to those of the frame before it (D,)."""
+    """Angles (D,) of the same pose, in the form nearest to those of the frame before (D,)."""
     out = np.array(angles, float)
     ball = np.zeros(len(out), bool)
     for d in tree.ball_joints:
@@ -45,12 +45,13 @@ def continued(tree: KinematicTree, before: NDArray, angles: NDArray) -> NDArray:
 
 
 def boxes(tree: KinematicTree, angles: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Lower and upper ends and prior mean (T, D) in the charts of angles (T, D).
+    """Lower limits, upper limits and prior mean (T, D) in the charts of angles (T, D).
 
-    Limits hold in one chart of a ball joint; where its angles stand in the other, or some turns on, so do these.
+    A ball joint's limits are given in one chart. They are converted where its angles are in the other chart, or some
+    turns away.
     """
     shape = np.shape(angles)
-    lower, upper, usual = (np.array(np.broadcast_to(v, shape)) for v in (tree.lower, tree.upper, tree.usual))
+    lower, upper, mean = (np.array(np.broadcast_to(v, shape)) for v in (tree.lower, tree.upper, tree.usual))
     for d in tree.ball_joints:
         q = np.asarray(angles)[:, d]
         own = _nearest_turn(q, tree.lower[d], tree.upper[d])
@@ -60,36 +61,36 @@ def boxes(tree: KinematicTree, angles: NDArray) -> tuple[NDArray, NDArray, NDArr
         shift = q - sign * np.where(swap[:, None], other, own)  # q = sign · (its value within limits) + shift
         ends = sign * tree.lower[d] + shift, sign * tree.upper[d] + shift
         lower[:, d], upper[:, d] = np.minimum(*ends), np.maximum(*ends)
-        usual[:, d] = sign * tree.usual[d] + shift
-    return lower, upper, usual
+        mean[:, d] = sign * tree.usual[d] + shift
+    return lower, upper, mean
 
 
 def _ball(q: NDArray, low: NDArray, high: NDArray) -> NDArray:
-    """Angles (T, 3) of a ball joint, each in the form nearest to the one before, all within limits as far as can be."""
+    """Angles (T, 3) of a ball joint, each in the form nearest to the one before, in the chart nearest to the limits."""
     out = np.array(q)
-    jumps = np.flatnonzero(np.abs(np.diff(q, axis=0)).sum(axis=1) > _SMALL) + 1
+    jumps = np.flatnonzero(np.abs(np.diff(q, axis=0)).sum(axis=1) > _MAX_STEP) + 1
     for t, end in zip(jumps, np.append(jumps[1:], len(q)), strict=False):
         forms = np.stack([q[t], twin(q[t])])
         forms += _TURN * np.round((out[t - 1] - forms) / _TURN)
         nearer = int(np.argmin(np.abs(forms - out[t - 1]).sum(axis=1)))
         out[t:end] = forms[nearer] + (SIGNS if nearer else 1.0) * (q[t:end] - q[t])
-    whole = []
+    candidates = []
     for form in (out, np.pi + SIGNS * out):
         finite = np.isfinite(low) & np.isfinite(high)
         middle = np.where(finite, 0.5 * (np.where(finite, low, 0.0) + np.where(finite, high, 0.0)), 0.0)
-        whole.append(form - _TURN * np.round((np.median(form, axis=0) - middle) / _TURN))
-    return whole[int(np.argmin([_outside(form, low, high).sum() for form in whole]))]
+        candidates.append(form - _TURN * np.round((np.median(form, axis=0) - middle) / _TURN))
+    return candidates[int(np.argmin([_outside(form, low, high).sum() for form in candidates]))]
 
 
 def _nearest_turn(q: NDArray, low: NDArray, high: NDArray) -> NDArray:
-    """Angles moved by whole turns so that they lie within their limits, or as near as can be."""
+    """Angles moved by whole turns into their limits, or as near to them as possible."""
     below, above = np.ceil((low - q) / _TURN), np.floor((high - q) / _TURN)
     turns = np.clip(np.zeros_like(q), np.minimum(below, above), np.maximum(below, above))
-    alone = below > above  # between the ends of two turns: the nearer one
+    outside = below > above  # between the limits of two turns: take the nearer one
     nearer = np.where(low - (q + _TURN * above) <= (q + _TURN * below) - high, above, below)
-    return q + _TURN * np.where(alone, nearer, turns)
+    return q + _TURN * np.where(outside, nearer, turns)
 
 
 def _outside(q: NDArray, low: NDArray, high: NDArray) -> NDArray:
-    """(T,) how far angles (T, 3) lie beyond their limits."""
+    """(T,) sum of how far angles (T, 3) exceed their limits."""
     return np.asarray((np.maximum(low - q, 0.0) + np.maximum(q - high, 0.0)).sum(axis=1))

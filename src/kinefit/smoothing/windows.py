@@ -1,4 +1,4 @@
-"""A long take, solved in windows that overlap, of each of which the middle is kept."""
+"""Solve a long take in overlapping windows, and keep the middle of each."""
 
 from __future__ import annotations
 
@@ -16,11 +16,16 @@ from kinefit.smoothing.process_noise import SmoothTake, Strength
 from kinefit.smoothing.spool import Spool
 from kinefit.solvers.trajectory.smoothing import Posterior
 
-_TOLERANCES = 1e-3, 1e-5  # of two passes of matching all other sensors anew and solving, at known process noise
+_PASS_TOLERANCES = 1e-3, 1e-5  # of two passes, each of matching all other sensors and solving, at known process noise
 
 
 def parts(frames: int, window: int, overlap: int) -> list[tuple[slice, slice]]:
-    """Overlapping windows of equal length: what is solved, and what of the take is kept from it."""
+    """Overlapping windows of equal length: for each the frames to solve, and the frames to keep of them.
+
+    Parameters
+    ----------
+    frames, window, overlap : numbers of frames
+    """
     if frames <= window:
         return [(slice(0, frames), slice(0, frames))]
     count = int(np.ceil((frames - overlap) / (window - overlap)))
@@ -31,9 +36,16 @@ def parts(frames: int, window: int, overlap: int) -> list[tuple[slice, slice]]:
 
 
 def solved(
-    take: SmoothTake, strength: Strength, window: int, overlap: int, tolerances: Sequence[float] = _TOLERANCES
+    take: SmoothTake, strength: Strength, window: int, overlap: int, tolerances: Sequence[float] = _PASS_TOLERANCES
 ) -> tuple[SmoothTake, Spool[tuple[Matched, ...]] | None]:
-    """The take at its minimum, and other sensors' matches, after a pass to each tolerance; without them to the last."""
+    """Solve a take in windows; returns it at its minimum, and the matches of all sensors but the keypoints.
+
+    Parameters
+    ----------
+    strength : process noise and noise of keypoints
+    window, overlap : numbers of frames
+    tolerances : unitless, of each pass of matching and solving; without other sensors the last one alone is used
+    """
     matched, windows = None, parts(len(take.roots), window, overlap)
     for tolerance in tolerances[-1:] if take.others is None else tolerances:
         fit = partial(SmoothTake.solved, strength=strength, tolerance=tolerance)
@@ -48,12 +60,15 @@ def solved(
     return take, matched
 
 
-def solved_surely(
+def solved_with_covariances(
     take: SmoothTake, strength: Strength, window: int, overlap: int
 ) -> tuple[SmoothTake, Spool[NDArray], Spool[tuple[Matched, ...]] | None]:
-    """The same with covariances of all frames, the upper triangle of each, and how sure speeds are."""
+    """As `solved`, with covariances: the upper triangle (n (n + 1) / 2,) of each frame's (n, n).
+
+    The returned take also has the standard deviations of speeds.
+    """
     if take.others is not None:
-        take, _ = solved(take, strength, window, overlap, _TOLERANCES[:-1])
+        take, _ = solved(take, strength, window, overlap, _PASS_TOLERANCES[:-1])
     packed, windows = np.triu_indices(take.body.tree.n_dofs), parts(len(take.roots), window, overlap)
     roots, angles = np.array(take.roots), np.array(take.angles)
     covariances, speeds = Spool[NDArray](), []
@@ -77,7 +92,7 @@ def _linear_parts(
     take: SmoothTake, windows: Sequence[tuple[slice, slice]], matched: Spool[tuple[Matched, ...]] | None, *,
     judge: bool = False,
 ) -> Iterator[SmoothTake]:  # fmt: skip
-    """Windows of a take, with other sensors matched and linearised about its states; `matched` takes the matches."""
+    """Windows of a take, with other sensors matched and linearised at its states; matches are added to `matched`."""
     spans, linear = [whole for whole, _ in windows], None
     if take.others is not None:
         linear = take.others.windows(take.body, take.roots, take.angles, spans, matched, judge=judge)
@@ -87,6 +102,6 @@ def _linear_parts(
 
 
 def _speed_std(post: Posterior, dt: float) -> NDArray:
-    """(T - 1, n) [m/s, rad/s] standard deviation of each change to the next frame; errors that last are in none."""
+    """(T - 1, n) [m/s, rad/s] standard deviation of each change to the next frame, without systematic errors."""
     own = np.einsum("tii->ti", post.frames)
     return np.sqrt(np.maximum(own[1:] + own[:-1] - 2.0 * np.einsum("tii->ti", post.following), 0.0)) / dt

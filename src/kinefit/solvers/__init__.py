@@ -1,1 +1,1 @@
-"""Rows to a state."""
+"""Solve for states from rows: normal equations, least squares, constraints, sequences, assignment."""

@@ -1,4 +1,4 @@
-"""Small dense sums and solutions, one after another: libraries that start threads for each are many times slower."""
+"""Small dense products and solutions: libraries that start threads for each are many times slower."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def solve(A, right):
 
 @jit
 def along(data, segment, centre, screws, dof_parent, last_dof, J):
-    """J (N, n): how far the points of rows, data (6 or more, N), move along their directions."""
+    """J (N, n): derivatives of the points of rows, data (6 or more, N), along their directions."""
     J[:] = 0.0
     for i in range(segment.size):
         x, y, z = data[0, i] - centre[0], data[1, i] - centre[1], data[2, i] - centre[2]
@@ -82,7 +82,7 @@ def along(data, segment, centre, screws, dof_parent, last_dof, J):
 
 @jit
 def joint_columns(parents, frames, offsets, out):
-    """out (S, 3, q): how joint centres move in the world, as their places in their parents do, offsets (S, 3, q)."""
+    """out (S, 3, q): derivatives of joint centres in the world, from those of their offsets in parents (S, 3, q)."""
     for s in range(parents.size):
         p = parents[s]
         if p < 0:
@@ -97,7 +97,7 @@ def joint_columns(parents, frames, offsets, out):
 
 @jit
 def point_columns(data, segment, group, frames, joints, places, out):
-    """out (N, q): how far points of rows move, whitened: with joints (S, 3, q), and in their segments (M, 3, q)."""
+    """out (N, q): whitened derivatives of rows, from those of joints (S, 3, q) and of places in segments (M, 3, q)."""
     for i in range(segment.size):
         f, joint, place, row = frames[segment[i]], joints[segment[i]], places[group[i]], out[i]
         w = math.sqrt(data[7, i])
@@ -112,7 +112,7 @@ def point_columns(data, segment, group, frames, joints, places, out):
 
 @jit
 def camera_columns(data, camera, poses, first, out):
-    """Into out (N, p): how far points of rows move, whitened, by the twist of the camera (N,) that sees each.
+    """Write into out (N, p) the whitened derivatives of rows by the twist of each row's camera (N,).
 
     poses (C, 4, 4) of the world in the cameras, first (C,) column of each, -1 for one that stays.
     """

@@ -1,10 +1,10 @@
 """Linear algebra of a tree: packing, factors, damped steps, elimination.
 
-The tree makes H sparse: two degrees of freedom meet only when one is above the other. Row k of the packed matrix C
-holds H[k, chain[k, t]] for t = 0..depth[k], from the root down to k itself, where `chain` (n, m) lists what stands
-above each degree of freedom. The factorisation H = Lᵀ L keeps that pattern (Featherstone 2005), and since the chain
-of an ancestor is the start of one's own, every inner loop runs over neighbours in memory. Chains 0..k make the same
-code dense.
+The tree makes H sparse: two degrees of freedom are coupled only if one is an ancestor of the other. Row k of the packed
+matrix C contains H[k, chain[k, t]] for t = 0..depth[k], from the root down to k itself, where `chain` (n, m) lists the
+ancestors of each degree of freedom. The factorisation H = Lᵀ L keeps that pattern (Featherstone 2005). The chain of an
+ancestor is the start of its descendants' chains, so every inner loop runs over neighbours in memory. With chains 0..k
+the same code handles dense matrices.
 """
 
 from __future__ import annotations
@@ -16,15 +16,16 @@ import numpy as np
 from kinefit._jit import jit
 
 LEAST_DAMPING = 1e-12
-"""Least λ, as a share of H's mean diagonal: without it λ falls to 0 and never grows again. 1e-15 to 1e-6 do as well."""
+"""Least λ, as a share of H's mean diagonal: without it λ falls to 0 and cannot grow again. 1e-15 to 1e-6 work equally
+well."""
 
-_MAX_STOPS = 4  # rounds of stopping coordinates at limits; 8 save no step, 1 needs 14 % more where limits are active
-_ROUNDING = 1e-15  # share of angle and limit by which the way to a limit is longer; `retract` ends at the limit itself
+_MAX_STOPS = 4  # rounds of stopping coordinates at limits; 8 save no step, 1 needs 14 % more if limits are active
+_ROUNDING = 1e-15  # share of angle and limit that is added to a step to a limit; `retract` ends at the limit itself
 
 
 @jit
 def pack(H, chain, depth, C):
-    """Lower triangle of H (n, n) into C (n, m)."""
+    """Pack the lower triangle of H (n, n) into C (n, m)."""
     for k in range(depth.size):
         for t in range(depth[k] + 1):
             C[k, t] = H[k, chain[k, t]]
@@ -32,7 +33,7 @@ def pack(H, chain, depth, C):
 
 @jit
 def unpack(C, chain, depth, H):
-    """C (n, m) into H (n, n), both triangles; H must be zero where nothing meets."""
+    """Unpack C (n, m) into both triangles of H (n, n); H must be zero for uncoupled degrees of freedom."""
     for k in range(depth.size):
         for t in range(depth[k] + 1):
             H[k, chain[k, t]] = C[k, t]
@@ -41,7 +42,7 @@ def unpack(C, chain, depth, H):
 
 @jit
 def factor_tree(C, chain, depth):
-    """H = Lᵀ L in place; the diagonal is left inverted. False if H is not positive."""
+    """Factor H = Lᵀ L in place, with the inverse of L's diagonal. False if H is not positive definite."""
     for k in range(depth.size - 1, -1, -1):
         row, d = C[k], depth[k]
         if not row[d] > 0.0:
@@ -77,7 +78,7 @@ def solve_tree(L, chain, depth, x):
 
 @jit
 def hold(held, chain, depth, C, g):
-    """Take degrees of freedom `held` (n,) out of a step: their rows and columns of C become the identity's, g zero."""
+    """Exclude degrees of freedom `held` (n,) from a step: rows and columns of C become the identity's, g zero."""
     n = g.size
     for k in range(n):
         if held[k]:
@@ -93,10 +94,10 @@ def hold(held, chain, depth, C, g):
 
 @jit
 def damped_step(C, g, damping, chain, depth, angles, lower, upper, locked, L, delta):
-    """δ of (H + λ) δ = g within limits; returns the predicted fall of the cost, negative if that failed.
+    """Solve (H + λ) δ = g within limits; returns the predicted fall of the cost, negative if H is not positive.
 
-    Coordinates that are locked, or at a limit that the gradient pushes out of, stay. Coordinates that the step would
-    take beyond a limit end at it, and the step of the others is solved anew: clipping alone makes most such steps bad.
+    Locked coordinates, and coordinates at a limit with an outward gradient, do not move. Coordinates that would exceed
+    a limit stop at it, and the step of the others is solved again, because clipping alone gives poor steps.
     """
     n = g.size
     held, way, stops = np.empty(n, np.bool_), np.zeros(n), 0
@@ -161,9 +162,9 @@ def subtract_product(C, chain, depth, x, out):
 
 @jit
 def adapt(damping, growth, fall, predicted, least):
-    """Damping and its next growth after a step with true and predicted fall of the cost (Nielsen's rule).
+    """Adapt damping and growth factor after a step, from the true and the predicted fall of the cost (Nielsen's rule).
 
-    The damping never falls below `least` > 0: `LEAST_DAMPING` of H's mean diagonal.
+    The damping does not fall below `least` > 0: `LEAST_DAMPING` times H's mean diagonal.
     """
     if not fall > 0.0:
         return damping * growth, 2.0 * growth
@@ -174,7 +175,7 @@ def adapt(damping, growth, fall, predicted, least):
 
 @jit
 def invert_factor(C, chain, depth):
-    """H (packed) = Lᵀ L, and L⁻¹ into its place; False where some degree of freedom has no information of its own."""
+    """Replace H (packed) = Lᵀ L by L⁻¹; False if a degree of freedom has no information of its own."""
     n = depth.size
     own, x = np.empty(n), np.empty(chain.shape[1])
     for k in range(n):
@@ -200,7 +201,7 @@ def invert_factor(C, chain, depth):
 
 @jit
 def invert(C, chain, depth, out):
-    """Inverse (n, n) of H (packed, destroyed); False where some degree of freedom has no information of its own."""
+    """Inverse (n, n) of H (packed, destroyed); False if a degree of freedom has no information of its own."""
     if not invert_factor(C, chain, depth):
         return False
     for k in range(depth.size):
@@ -217,7 +218,7 @@ def invert(C, chain, depth, out):
 
 @jit
 def invert_diagonal(C, chain, depth, out):
-    """Diagonal (n,) of the inverse of H (packed, destroyed); False as of `invert`."""
+    """Diagonal (n,) of the inverse of H (packed, destroyed); False as in `invert`."""
     if not invert_factor(C, chain, depth):
         return False
     for k in range(depth.size):
@@ -230,9 +231,9 @@ def invert_diagonal(C, chain, depth, out):
 
 @jit
 def eliminate(H, g, n, damping, chain, depth, S, b, both):
-    """Take n poses out of a joint system H (m, m; lower), g (m,): S −= Bᵀ A⁻¹ B, b −= Bᵀ A⁻¹ g (Schur complement).
+    """Eliminate n pose unknowns from a system H (m, m; lower), g (m,): S −= Bᵀ A⁻¹ B, b −= Bᵀ A⁻¹ g (Schur complement).
 
-    Leaves both (p + 1, n) = A⁻¹ [B, g] for the way back. A is damped by its own diagonal. False if not positive.
+    Fills both (p + 1, n) = A⁻¹ [B, g] for back substitution. A is damped by its own diagonal. False if not positive.
     """
     p = H.shape[0] - n
     A = np.empty(chain.shape)
@@ -263,7 +264,7 @@ def eliminate(H, g, n, damping, chain, depth, S, b, both):
 
 @jit
 def multiply(A, B, out):
-    """out = A B; zeros of A cost nothing."""
+    """out = A B; zeros of A are skipped."""
     for i in range(A.shape[0]):
         line = out[i]
         line[:] = 0.0

@@ -1,4 +1,4 @@
-"""A fit to pixels in one kernel: what `least_squares.levenberg_marquardt` does with rows of pixels and a prediction."""
+"""Fit a pose to pixels in one kernel: `least_squares.levenberg_marquardt` with rows of pixels and a prediction."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from kinefit.solvers._kernels_linear import LEAST_DAMPING, adapt, damped_step
 
 @jit
 def add_joint(first, index, gap, precision, H, g):
-    """Add rows on degrees of freedom `first` + index (K,), weighed together by (K, K), to H (lower) and g; their cost.
+    """Add rows on degrees of freedom `first` + index (K,), with a joint weight (K, K), to H (lower) and g; their cost.
 
-    The indices rise.
+    The indices increase.
     """
     cost = 0.0
     for i in range(index.size):
@@ -33,7 +33,7 @@ def add_joint(first, index, gap, precision, H, g):
 
 @jit
 def mirror(H):
-    """The upper triangle of H (n, n) from the lower."""
+    """Copy the lower triangle of H (n, n) to the upper."""
     for i in range(H.shape[0]):
         for j in range(i):
             H[j, i] = H[i, j]
@@ -49,11 +49,11 @@ def minimum(
     """Levenberg-Marquardt over pixels (as `pixel_rows`, with one robust loss), a predicted pose and a prior posture.
 
     Parameters: the tree; every (n, n) and all_before (n,) the dense pattern; owner, place, cameras, camera, uv, weight
-    as of `pixel_rows`; predicted pose with its information (n, n); coordinates held (P,) towards usual (D,) with a
-    precision (P, P). Two of each, roots (2, 4, 4), angles (2, D), H (2, n, n), g (2, n): the first state is the start.
-    The first damping is at least a share of H's mean diagonal.
-    Returns which of the two is the minimum (-1 where something is not finite), its cost, and the steps tried. Of H the
-    lower triangle is made.
+    as in `pixel_rows`; predicted pose with its information (n, n); a prior on coordinates held (P,) with mean usual
+    (D,) and precision (P, P). Two of each, roots (2, 4, 4), angles (2, D), H (2, n, n), g (2, n): the first state is
+    the start. The first damping is at least a share of H's mean diagonal.
+    Returns which of the two is the minimum (-1 if a number is not finite), its cost, and the number of steps tried.
+    Only the lower triangle of H is filled.
     """
     n, D, S, N = depth.size, axes.shape[0], parents.size, 2 * owner.size
     frames, screws, centre = np.empty((S, 12)), np.empty((D, 6)), np.empty(3)

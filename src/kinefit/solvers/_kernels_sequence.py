@@ -1,4 +1,4 @@
-"""A whole sequence of frames in one call: points and planes on a body, Levenberg-Marquardt frame after frame."""
+"""Fit a whole sequence of frames in one call: points and planes on a body, Levenberg-Marquardt frame after frame."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from kinefit.correspondences._kernels import plane_rows, point_rows
 from kinefit.solvers._kernels import assemble, joint_moves
 from kinefit.solvers._kernels_linear import LEAST_DAMPING, adapt, damped_step, invert
 
-_TRIES = 60  # of more damping, for a matrix that is not positive
+_MAX_TRIES = 60  # of more damping, for a matrix that is not positive definite
 
 
 @jit
 def gather(order, x, n, weight, target, normal, weights):
-    """One frame's planes (P, 3) as lines (3, P) in another order; weight 0 and zeros where not finite."""
+    """Copy one frame's planes (P, 3) to (3, P) in another order; weight 0 and zeros for planes that are not finite."""
     for i in range(order.size):
         k = order[i]
         total = x[k, 0] + x[k, 1] + x[k, 2] + n[k, 0] + n[k, 1] + n[k, 2]
@@ -30,7 +30,7 @@ def gather(order, x, n, weight, target, normal, weights):
 
 @jit
 def widen(C, depth, place, wide_depth, H):
-    """H in the pattern of `C` into a wider one, where C[k, t] stands at H[k, place[k, t]]."""
+    """Copy C into a wider pattern H, with C[k, t] at H[k, place[k, t]]."""
     for k in range(depth.size):
         for t in range(wide_depth[k] + 1):
             H[k, t] = 0.0
@@ -42,7 +42,7 @@ def widen(C, depth, place, wide_depth, H):
 def add_posture(share, pair, precision, usual, angles, H, g):
     """Add a share of a Gaussian about `usual` (D,) to H and g; returns its cost.
 
-    pair (E, 3): two angles, the second no later, and where they meet in H's row of the first; precision (E,).
+    pair (E, 3): two angles, the second not after the first, and their entry in H's row of the first; precision (E,).
     """
     cost = 0.0
     for e in range(precision.size):
@@ -64,17 +64,17 @@ def fit_sequence(
     usual, posture, prior_pairs, prior, wide, wide_depth, place, kind, scale, max_iterations, tolerance, damping_share,
     each, roots, angles, costs, iterations,
 ):  # fmt: skip
-    """Fit all frames, each from the last one's solution; roots[0], angles[0] hold the start and are overwritten.
+    """Fit all frames, each from the last one's solution; roots[0], angles[0] contain the start and are overwritten.
 
-    With `each`, all roots and angles hold starts, and every frame begins at its own.
+    With `each`, all roots and angles contain starts, and every frame starts from its own.
 
     owner (K,), rest (K, 3), target (F, K, 3) [m], weight (F, K) [1/m²]; planes sorted by segment: plane_owner (P,),
-    plane_rest (3, P); not sorted, NaN where not measured: plane_x, plane_n (F, P, 3); plane_order (P,) sorts them.
-    The angles are drawn towards usual (F, D) by the share `posture` of a prior, see `add_posture`; with it the pattern
-    of H is wide, wide_depth, see `widen`.
+    plane_rest (3, P); not sorted, NaN for missing ones: plane_x, plane_n (F, P, 3); plane_order (P,) sorts them.
+    usual (F, D) is the mean of the posture prior with the share `posture`, see `add_posture`; with it the pattern of H
+    is wide, wide_depth, see `widen`.
     roots (F, 4, 4), angles (F, D), costs (F,), iterations (F,) are filled. Damping starts at `damping_share` of the
-    mean diagonal of H in the first frame and is carried on. An iteration that is predicted to win less than
-    `tolerance` of the cost ends a frame.
+    mean diagonal of H in the first frame, and continues from frame to frame. A frame ends when the predicted fall of
+    the cost is below the share `tolerance` of it.
     """
     n_segments, n_angles = parents.size, axes.shape[0]
     n = n_angles + 6
@@ -120,7 +120,7 @@ def fit_sequence(
                 for i in range(n):
                     mean += H[i, wide_depth[i]] / n
                 least, most = LEAST_DAMPING * mean, damping_share * mean
-                if not 0.0 <= damping <= most:  # a frame that fitted exactly leaves it high
+                if not 0.0 <= damping <= most:  # it is high after a frame with an exact fit
                     damping = most
                 damping = max(damping, least)
                 growth = 2.0
@@ -134,14 +134,14 @@ def fit_sequence(
             if attempt == max_iterations:
                 break
             predicted = damped_step(H, g, damping, wide, wide_depth, q, lower, upper, locked, L, delta)
-            for _ in range(_TRIES):
+            for _ in range(_MAX_TRIES):
                 if predicted >= 0.0:
                     break
                 damping = 10.0 * damping
                 predicted = damped_step(H, g, damping, wide, wide_depth, q, lower, upper, locked, L, delta)
             retract(root, q, delta, lower, upper, new_root, new_q)
             if predicted <= tolerance * cost + 1e-30:
-                break  # not worth another look: the model holds this close, so the step is taken as it is
+                break  # the quadratic model is accurate for such a small step, which is taken without evaluating it
         if predicted <= tolerance * cost + 1e-30 and predicted > 0.0:
             root, new_root, q, new_q = new_root, root, new_q, q
             cost -= predicted
@@ -181,9 +181,9 @@ def certainties(
     owner, rest, target, weight, usual, posture, prior_pairs, prior, wide, wide_depth, place, kind, scale,
     roots, angles, dof_std, joint_std, factors,
 ):  # fmt: skip
-    """How sure fitted frames are: dof_std (F, n), joint_std (F, S, 3), and robust factors (F, K), 0 where unseen.
+    """Standard deviations of fitted frames: dof_std (F, n), joint_std (F, S, 3); robust factors (F, K), 0 if missing.
 
-    Points, prior and patterns as in `fit_sequence`. A frame that cannot be inverted is infinite.
+    Points, prior and patterns as in `fit_sequence`. A frame with a singular matrix has infinite standard deviations.
     """
     n_segments, n_angles, points = parents.size, axes.shape[0], owner.size
     n = n_angles + 6

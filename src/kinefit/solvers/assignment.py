@@ -1,4 +1,4 @@
-"""Who goes with whom: the pairs of least total cost."""
+"""Linear assignment: the pairs of rows and columns with the least total cost."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from kinefit.errors import ObservationError
 
 
 def assign(cost: ArrayLike, most: float = np.inf) -> list[tuple[int, int]]:
-    """Pairs (row, column) whose costs, each below `most`, fall short of `most` by the greatest total.
+    """Assign rows to columns: pairs (row, column) that maximise Σ (most − cost), each with a cost below `most`.
 
-    Every row and every column is in one pair at most. Shortest augmenting paths (Jonker and Volgenant 1987), in
-    O(n³); with `most` infinite, as many pairs as finite costs allow.
+    Every row and every column is in one pair at most. With `most` infinite, there are as many pairs as finite costs
+    allow. Shortest augmenting paths (Jonker and Volgenant 1987), in O(n³).
 
     Parameters
     ----------
-    cost : (R, C), infinite where a pair is impossible.
+    cost : (R, C), infinite where a pair is impossible
+    most : cost of leaving a row and a column unassigned, in the unit of `cost`
 
     Raises
     ------
@@ -30,30 +31,30 @@ def assign(cost: ArrayLike, most: float = np.inf) -> list[tuple[int, int]]:
     allowed = np.isfinite(cost) & (cost < most)
     if not allowed.any():
         return []
-    if 1 in cost.shape:  # one to choose for
+    if 1 in cost.shape:
         best = int(np.argmin(np.where(allowed, cost, np.inf)))
         return [divmod(best, cost.shape[1])]
     rows = np.flatnonzero(allowed.any(axis=1))
     nearest = np.where(allowed, cost, np.inf)[rows].argmin(axis=1)
-    if len(set(nearest.tolist())) == len(rows):  # all have what is best for them: no total is better
+    if len(set(nearest.tolist())) == len(rows):  # the best columns of all rows differ: no total is smaller
         return list(zip(rows.tolist(), nearest.tolist()))
     spread = float(np.ptp(cost[allowed])) + 1.0
-    alone = most if np.isfinite(most) else float(cost[allowed].max()) + (min(cost.shape) + 1) * spread
-    n = sum(cost.shape)  # everybody may stay alone, at the price of `most` a pair
-    square = np.full((n, n), alone)
-    square[: cost.shape[0], : cost.shape[1]] = np.where(allowed, cost, 3.0 * abs(alone) + 3.0 * spread)
+    unassigned = most if np.isfinite(most) else float(cost[allowed].max()) + (min(cost.shape) + 1) * spread
+    n = sum(cost.shape)  # every row and column may stay unassigned, at half of `most` each
+    square = np.full((n, n), unassigned)
+    square[: cost.shape[0], : cost.shape[1]] = np.where(allowed, cost, 3.0 * abs(unassigned) + 3.0 * spread)
     square[cost.shape[0] :, cost.shape[1] :] = 0.0
     square[: cost.shape[0], cost.shape[1] :] *= 0.5
     square[cost.shape[0] :, : cost.shape[1]] *= 0.5
-    chosen = _least(square)[: cost.shape[0]]
+    chosen = _assign_square(square)[: cost.shape[0]]
     return [(r, int(c)) for r, c in enumerate(chosen) if c < cost.shape[1] and allowed[r, c]]
 
 
-def _least(cost: NDArray) -> NDArray:
-    """(n,) column of each row of a square matrix (n, n), with the least total."""
+def _assign_square(cost: NDArray) -> NDArray:
+    """(n,) column assigned to each row of a square matrix (n, n), with the least total."""
     n = len(cost)
     u, v = np.zeros(n + 1), np.zeros(n + 1)
-    owner = np.full(n + 1, -1)  # row of each column; the last column begins every path
+    owner = np.full(n + 1, -1)  # row of each column; every path starts at the last column
     for row in range(n):
         owner[n], column = row, n
         least, before, used = np.full(n, np.inf), np.full(n, n), np.zeros(n + 1, bool)

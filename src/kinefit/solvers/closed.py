@@ -1,12 +1,13 @@
-"""Fits under equations that hold exactly: hard closures of a body (P3 3.2, as an equality-constrained step).
+"""Fit a body under equality constraints: hard closures (P3 3.2, as an equality-constrained step).
 
-With H the normal matrix, g the gradient, A the Jacobian of the equations c = 0, and Z what A leaves free, a step is
+With H the normal matrix, g the gradient, A the Jacobian of the constraints c = 0, and Z a basis of its null space, a
+step is
 
     δ = −A⁺ c + Z (Zᵀ (H + λ) Z)⁻¹ Zᵀ (g + (H + λ) A⁺ c)
 
-which solves the Karush-Kuhn-Tucker system without its multipliers, whatever equations follow from others. Every trial
-state is brought back onto c = 0 before its cost is compared, so that a fit never trades one for the other. Covariances
-are those on the null space of A. The multipliers of c = 0 are forces where the gradient is one: `closure_forces`.
+It solves the Karush-Kuhn-Tucker system without multipliers, for redundant constraints too. Every trial state is
+projected onto c = 0 before its cost is compared. Covariances are restricted to the null space of A. If the gradient is
+a force, the multipliers of c = 0 are the forces in the closures: `closure_forces`.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from kinefit.solvers.equations import lock, normal_equations
 from kinefit.solvers.least_squares import Fit, MakeRows, Step, bounds_of
 
 CLOSED = 1e-9
-"""[m, rad] by which an equation may be off and still hold."""
+"""[m, rad] largest residual of an equation that counts as satisfied."""
 
-_EXACT = 1e-13  # [m, rad] at which no further step is taken; far from the world's origin rounding ends it before
-_RANK = 1e-7  # of the largest singular value of A, below which an equation follows from the others
-_BACK = 30  # Newton steps back onto the equations
-_ACTIVE = 6  # rounds of holding coordinates at the limits that a step would leave
+_MIN_RESIDUAL = 1e-13  # [m, rad] below which no further step is taken; far from the world's origin rounding is larger
+_MIN_SINGULAR_RATIO = 1e-7  # to the largest singular value of A: below it an equation is redundant
+_MAX_PROJECTION_STEPS = 30  # Newton steps onto the equations
+_MAX_LIMIT_ROUNDS = 6  # of stopping coordinates at limits that a step would exceed
 
 Constraint = Callable[[BodyState], tuple[NDArray, NDArray]]
 """State -> c (m,) and its Jacobian A (m, n)."""
@@ -39,12 +40,12 @@ Constraint = Callable[[BodyState], tuple[NDArray, NDArray]]
 
 @dataclass(frozen=True, eq=False)
 class Null:
-    """What equations leave free of some degrees of freedom.
+    """Null space of equations, and the step onto them.
 
     Parameters
     ----------
-    free : (n, n − r) Z, orthonormal directions that the equations do not see; zero for what is held.
-    back : (n,) −A⁺ c, the shortest step onto them.
+    free : (n, n − r) Z, orthonormal directions along which the equations do not change; zero for held coordinates
+    back : (n,) −A⁺ c, the shortest step onto the equations
     """
 
     free: NDArray
@@ -52,10 +53,10 @@ class Null:
 
 
 def null_space(A: NDArray, c: NDArray, held: NDArray) -> Null:
-    """Of equations with Jacobian A (m, n) and values c (m,), where some degrees of freedom (n,) bool stay."""
+    """Null space of equations with Jacobian A (m, n) and values c (m,); degrees of freedom `held` (n,) bool stay."""
     open_to = np.flatnonzero(~held)
     U, s, Vt = np.linalg.svd(A[:, open_to])
-    rank = int(np.sum(s > _RANK * max(float(s.max(initial=0.0)), 1e-12)))
+    rank = int(np.sum(s > _MIN_SINGULAR_RATIO * max(float(s.max(initial=0.0)), 1e-12)))
     free, back = np.zeros((A.shape[1], len(open_to) - rank)), np.zeros(A.shape[1])
     free[open_to] = Vt[rank:].T
     back[open_to] = -Vt[:rank].T @ ((U[:, :rank].T @ c) / s[:rank])
@@ -64,24 +65,31 @@ def null_space(A: NDArray, c: NDArray, held: NDArray) -> Null:
 
 def onto(
     body: Body, state: BodyState, constraint: Constraint, *, limits: bool = True, locked: NDArray | None = None,
-    steps: int = _BACK,
+    steps: int = _MAX_PROJECTION_STEPS,
 ) -> tuple[BodyState, float]:  # fmt: skip
-    """The state nearest to one at which the equations hold, and by how much the worst of them is off still."""
+    """Project a state onto equations; returns the nearest state found and its largest residual [m, rad].
+
+    Parameters
+    ----------
+    limits : whether coordinates stay within their limits
+    locked : (n,) bool, degrees of freedom that do not move
+    steps : Newton steps at most
+    """
     bounds, fixed = bounds_of(body, limits), lock(body, locked)
     c, A = constraint(state)
     worst, best = float(np.abs(c).max(initial=0.0)), float(c @ c)
     for _ in range(steps):
-        if worst <= _EXACT:
+        if worst <= _MIN_RESIDUAL:
             break
         share, stops = 1.0, np.zeros(len(fixed), bool)
-        for _ in range(_ACTIVE):
+        for _ in range(_MAX_LIMIT_ROUNDS):
             delta = null_space(*_stopped(A, c, state, stops, bounds), fixed).back
             out = _beyond(state, delta, bounds) & ~stops & ~fixed
             if not out.any():
                 break
             stops |= out
         moved = None
-        while share > 1e-3:  # a step that leads away from the equations was too long
+        while share > 1e-3:  # shorten a step that increases the residuals
             trial = state.retract(share * delta, bounds)
             new_c, new_A = constraint(trial)
             if float(new_c @ new_c) < best:
@@ -96,7 +104,7 @@ def onto(
 
 
 def _beyond(state: BodyState, delta: NDArray, bounds: tuple[NDArray, NDArray]) -> NDArray:
-    """(n,) bool, coordinates that a step takes beyond their limits."""
+    """(n,) bool: coordinates that exceed their limits after a step."""
     angles = state.angles + delta[6:]
     out = np.zeros(len(delta), bool)
     out[6:] = (angles < bounds[0] - 1e-12) | (angles > bounds[1] + 1e-12)
@@ -106,7 +114,7 @@ def _beyond(state: BodyState, delta: NDArray, bounds: tuple[NDArray, NDArray]) -
 def _stopped(
     A: NDArray, c: NDArray, state: BodyState, stops: NDArray, bounds: tuple[NDArray, NDArray]
 ) -> tuple[NDArray, NDArray]:
-    """Equations by which some coordinates, too, go to the nearer of their limits and no farther."""
+    """The equations, and further ones that move the coordinates `stops` (n,) bool to the nearer of their limits."""
     at = np.flatnonzero(stops)
     if not len(at):
         return A, c
@@ -120,12 +128,12 @@ def _step(
     H: NDArray, g: NDArray, damping: float, A: NDArray, c: NDArray, state: BodyState,
     bounds: tuple[NDArray, NDArray], locked: NDArray,
 ) -> tuple[NDArray, float]:  # fmt: skip
-    """δ (n,) of the constrained step from a state at which c = 0, and the fall of the cost that it predicts."""
+    """δ (n,) of the constrained step from a state with c = 0, and the fall of the cost that it predicts."""
     damped = H + damping * np.eye(len(H))
     at_limit = np.zeros(len(g), bool)
     at_limit[6:] = ((state.angles <= bounds[0]) & (g[6:] < 0.0)) | ((state.angles >= bounds[1]) & (g[6:] > 0.0))
     held, stops, delta = locked | at_limit, np.zeros(len(g), bool), np.zeros(len(g))
-    for _ in range(_ACTIVE):
+    for _ in range(_MAX_LIMIT_ROUNDS):
         null = null_space(*_stopped(A, c, state, stops, bounds), held)
         Z = null.free
         push = Z.T @ (g - damped @ null.back)
@@ -141,9 +149,14 @@ def closed_fit(
     body: Body, state: BodyState, make_rows: MakeRows, constraint: Constraint, *, damping: float | None = None,
     max_iterations: int = 50, tolerance: float = 1e-9,
 ) -> Fit:  # fmt: skip
-    """Minimise Σ ρ(w r²) under equations and limits of joints, by `levenberg_marquardt`, whose arguments these are.
+    """Minimise Σ ρ(w r²) under equations and joint limits (Levenberg-Marquardt).
 
-    Where the equations cannot be met from the start, the fit ends at once, at the state that comes nearest.
+    If the equations cannot be satisfied from the start, the fit ends at the nearest state found.
+
+    Parameters
+    ----------
+    make_rows, damping, max_iterations, tolerance : see `levenberg_marquardt`; tolerance is a share of the cost
+    constraint : state -> values c (m,) and Jacobian A (m, n) of the equations
     """
     bounds, held = bounds_of(body, True), lock(body, None)
     state, off = onto(body, state.retract(np.zeros(body.tree.n_dofs), bounds), constraint)
@@ -176,7 +189,7 @@ def closed_fit(
 def closed_step(
     body: Body, state: BodyState, rows: AnyRows | Iterable[AnyRows], constraint: Constraint
 ) -> Step:
-    """One constrained Gauss-Newton step for rows linearised at `state`; for loops that renew their rows (ICP)."""
+    """One constrained Gauss-Newton step for rows linearised at `state`, for loops with new rows at every step (ICP)."""
     bounds, held = bounds_of(body, True), lock(body, None)
     eq = normal_equations(body, state, rows)
     damping = _kernels_linear.LEAST_DAMPING * float(eq.diagonal.mean()) + 1e-300
@@ -187,31 +200,30 @@ def closed_step(
 
 
 def on_null_space(covariance: NDArray, A: NDArray) -> NDArray:
-    """Covariance (n, n) of what equations of Jacobian A (m, n) leave free: P − P Aᵀ (A P Aᵀ)⁺ A P."""
+    """Restrict a covariance P (n, n) to the null space of A (m, n): P − P Aᵀ (A P Aᵀ)⁺ A P."""
     if not len(A):
         return covariance
     across = A @ covariance
     S = across @ A.T
     scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
     inner = np.linalg.pinv(S * scale[:, None] * scale[None, :], rcond=1e-12, hermitian=True)
-    left = across * scale[:, None]
-    out = covariance - left.T @ inner @ left
+    scaled = across * scale[:, None]
+    out = covariance - scaled.T @ inner @ scaled
     return 0.5 * (out + out.T)
 
 
 @dataclass(frozen=True, eq=False)
 class ClosureForces:
-    """What closures of a body that stands still carry.
+    """Forces in the closures of a body in static equilibrium.
 
     Parameters
     ----------
     names : (m,) of the equations: closure and direction
-    force : (m,) [N], of turns [N m]: on each closure's `point`, in the frame of its `to` (or of the world); the other
-        side gets the opposite
-    determined : (m,) bool, whether the equilibrium alone says it: false where gear is clamped against itself
-    torque : (n,) [N m, N] of the active coordinates that hold the pose; 0 for passive ones
-    unbalanced : (n,) [N, N m] of the root and the passive coordinates that no force of a closure balances; zero in
-        equilibrium
+    force : (m,) [N], of rotations [N m]: on each closure's `point`, in the frame of its `to` (or of the world); the
+        opposite force acts on the other side
+    determined : (m,) bool, whether the equilibrium determines the force; False for gear clamped against itself
+    torque : (n,) [N m, N] of the active coordinates; 0 for passive ones
+    unbalanced : (n,) [N, N m] load on the root and the passive coordinates that no closure balances; 0 in equilibrium
     """
 
     names: tuple[str, ...]
@@ -222,7 +234,7 @@ class ClosureForces:
 
 
 def load_of(body: Body, state: BodyState, points: PointSet, forces: ArrayLike) -> NDArray:
-    """(n,) [N, N m] generalised forces Σ Jₖᵀ fₖ of forces (K, 3) [N] in the world on points (K,) of a body."""
+    """Generalised forces (n,) [N, N m]: Σ Jₖᵀ fₖ of forces (K, 3) [N] in the world on K points of a body."""
     screws = body.tree.forward(state.T_world_root, state.angles)[1]
     x, f = body.positions(state, points) - state.T_world_root[:3, 3], np.asarray(forces, float)
     out = np.zeros(body.tree.n_dofs)
@@ -234,21 +246,21 @@ def load_of(body: Body, state: BodyState, points: PointSet, forces: ArrayLike) -
 def closure_forces(
     body: Body, state: BodyState, load: NDArray, *, active: Collection[str] | None = None
 ) -> ClosureForces:
-    """Forces in the closures of a body at rest: the multipliers λ of c = 0 in load + u + Aᵀ λ = 0.
+    """Forces in the closures of a body in static equilibrium: the multipliers λ of c = 0 in load + u + Aᵀ λ = 0.
 
-    A is the Jacobian of all closures, u the torques of coordinates that muscles or motors hold. It is statics: masses
-    that accelerate need their inertial forces in the load, which no part of kinefit computes. The paper (P3) has no
-    equation for forces.
+    A is the Jacobian of all closures, u the torques of active coordinates (muscles, motors). Inertial forces of
+    accelerated masses must be part of the load; kinefit does not compute them. The paper (P3) has no equation for
+    forces.
 
     Parameters
     ----------
-    load : (n,) [N, N m] on the degrees of freedom, as of `load_of`; a torque of a joint by its own entry
-    active : coordinates whose torque is whatever the pose needs; default: all of the person's, none of the gear's
+    load : (n,) [N, N m] on the degrees of freedom, such as from `load_of`; a joint's torque is its own entry
+    active : names of the active coordinates; default: all of the person's, none of the gear's
 
     Raises
     ------
     BodyError
-        A body without closures; an active coordinate that it does not have.
+        The body has no closures, or lacks an active coordinate.
     """
     if not body.closures:
         raise BodyError(f"body '{body.name}' has no closures", remedy="Add [[closure]] to its file.")
@@ -264,11 +276,11 @@ def closure_forces(
     held[:6] = not tree.root_free
     A = closed_at(body, state).jacobian
     U, s, Vt = np.linalg.svd(A[:, ~held].T)
-    rank = int(np.sum(s > _RANK * max(float(s.max(initial=0.0)), 1e-12)))
+    rank = int(np.sum(s > _MIN_SINGULAR_RATIO * max(float(s.max(initial=0.0)), 1e-12)))
     force = -Vt[:rank].T @ ((U[:, :rank].T @ load[~held]) / s[:rank])
     balance = load + A.T @ force
     names = tuple(f"{c.name} {row}" for c in body.closures for row in c.row_names)
     return ClosureForces(
-        names, force, np.abs(Vt[rank:]).max(axis=0, initial=0.0) < _RANK, np.where(held, -balance, 0.0),
+        names, force, np.abs(Vt[rank:]).max(axis=0, initial=0.0) < _MIN_SINGULAR_RATIO, np.where(held, -balance, 0.0),
         np.where(held, 0.0, balance),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Normal equations: rows of a body at a state -> H, g and the cost; damped steps; covariance."""
+"""Normal equations of a body's rows at a state, and covariances from them."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from kinefit.losses import SQUARED, Loss
 from kinefit.rows import AnyRows, DofRows, Rows, sort_out
 from kinefit.solvers import _kernels, _kernels_border, _kernels_linear
 
-_ROUNDING = 1e-14  # share of the most informed degree of freedom's information that is none
-_LOOSE = 1e-5  # share of a free direction from which a degree of freedom takes part in it
+_MIN_INFORMATION_RATIO = 1e-14  # to the most informed degree of freedom: information below it is rounding
+_MIN_FREE_COMPONENT = 1e-5  # of a free direction, above which a degree of freedom counts as free
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,13 +27,13 @@ class Equations:
 
     Parameters
     ----------
-    body, state : what they are about.
-    rows : Rows that went in.
-    factor : (N,) robust factor of each row in 0..1.
-    packed : (n, m) H in the pattern of chain and depth, see `_kernels_linear`.
-    gradient : (n,) g = Σ Jᵀ W r.
-    cost : float, Σ ρ(w r²) over all rows.
-    chain, depth : (n, m), (n,) int: what stands above each degree of freedom; all before it where rows couple them.
+    body, state : at which the rows are linearised
+    rows : N rows of segments
+    factor : (N,) robust factor of each row in 0..1
+    packed : (n, m) H in the pattern of chain and depth, see `_kernels_linear`
+    gradient : (n,) g = Σ Jᵀ W r
+    cost : float, Σ ρ(w r²) over all rows
+    chain, depth : (n, m), (n,) int: ancestors of each degree of freedom; all earlier ones if rows couple them
     """
 
     body: Body
@@ -48,14 +48,14 @@ class Equations:
 
     @property
     def matrix(self) -> NDArray:
-        """(n, n) H in full."""
+        """H as a full (n, n) matrix."""
         H = np.zeros((len(self.depth), len(self.depth)))
         _kernels_linear.unpack(self.packed, self.chain, self.depth, H)
         return H
 
     @property
     def diagonal(self) -> NDArray:
-        """(n,) of H."""
+        """(n,) diagonal of H."""
         return self.packed[np.arange(len(self.depth)), self.depth]
 
 
@@ -63,12 +63,17 @@ def normal_equations(
     body: Body, state: BodyState, parts: AnyRows | Iterable[AnyRows], *, loss: Loss = SQUARED,
     shares: Sequence[float] | None = None,
 ) -> Equations:  # fmt: skip
-    """Gather rows of any kinds at a state into H and g.
+    """Normal equations of rows of any kinds at a state.
 
     Parameters
     ----------
     loss : of rows without their own
-    shares : how much each of several parts counts, beyond its loss; default: in full
+    shares : factor on the cost of each part; default: 1
+
+    Raises
+    ------
+    ObservationError
+        Rows on segments or degrees of freedom that the body lacks.
     """
     parts = [parts] if isinstance(parts, AnyRows) else list(parts)
     if shares is None:
@@ -86,10 +91,11 @@ def normal_equations(
     factor, blocks = np.empty(len(rows)), np.empty((len(tree.segments), 27))
     C, g = np.empty(chain.shape), np.empty(n)
     given = [(p, share) for p, share in zip(parts, shares, strict=True) if isinstance(p, Rows)]
-    one = given[0][0].loss or loss if len(given) == 1 else loss
-    mixed = np.ndim(one.scale) > 0 or any(share != 1.0 or (p.loss or loss) is not one for p, share in given)
-    data, kind, scale, cost = rows.data, one.kind, one.scale, 0.0
-    if mixed:  # each part by its own loss: in the weights already, with what that leaves of the cost
+    common_loss = given[0][0].loss or loss if len(given) == 1 else loss
+    different = any(share != 1.0 or (p.loss or loss) is not common_loss for p, share in given)
+    mixed = np.ndim(common_loss.scale) > 0 or different
+    data, kind, scale, cost = rows.data, common_loss.kind, common_loss.scale, 0.0
+    if mixed:  # the parts' own losses go into the weights, and the rest of their cost is added
         weighed = [((p.loss or loss).of_rows(p.data, p.group), share) for p, share in given]
         robust = np.concatenate([share * f for (f, _), share in weighed])
         data, kind, scale = np.array(rows.data), SQUARED.kind, 1.0
@@ -130,12 +136,12 @@ def normal_equations(
 
 
 def _counting(rows: AnyRows, share: float) -> AnyRows:
-    """Rows without a loss, counting by a share; those with one as they are."""
+    """Rows without a loss, their weight multiplied by a share; rows with a loss unchanged."""
     return rows if share == 1.0 or isinstance(rows, Rows | DofRows) else replace(rows, weight=share * rows.weight)
 
 
 def _add_dense(rows: DofRows, share: float, body: Body, loss: Loss, H: NDArray, g: NDArray) -> float:
-    """Add a share of rows on all degrees of freedom; their cost."""
+    """Add rows on all degrees of freedom to H and g, multiplied by a share; returns their cost."""
     if rows.jacobian.shape[1] != len(g):
         problem = f"rows on {rows.jacobian.shape[1]} degrees of freedom, but body '{body.name}' has {len(g)}"
         raise ObservationError(problem, remedy="Make the rows with the body that is fitted.")
@@ -150,14 +156,14 @@ def _add_dense(rows: DofRows, share: float, body: Body, loss: Loss, H: NDArray, 
 
 @lru_cache(maxsize=8)
 def dense_pattern(n: int) -> tuple[NDArray, NDArray]:
-    """Chain and depth of a matrix in which all degrees of freedom meet."""
+    """Chain (n, n) and depth (n,) of a dense matrix, in which all degrees of freedom are coupled."""
     chain, depth = np.tile(np.arange(n), (n, 1)), np.arange(n)
     chain.flags.writeable = depth.flags.writeable = False
     return chain, depth
 
 
 def block_diagonal(first: NDArray, second: NDArray) -> NDArray:
-    """Two square matrices as the blocks of a larger one, zeros elsewhere."""
+    """Block-diagonal matrix (n + m, n + m) of two square matrices (n, n), (m, m)."""
     n = len(first)
     out = np.zeros((n + len(second),) * 2)
     out[:n, :n], out[n:, n:] = first, second
@@ -165,19 +171,19 @@ def block_diagonal(first: NDArray, second: NDArray) -> NDArray:
 
 
 def inverse(matrix: NDArray) -> NDArray:
-    """Inverse of a symmetric positive matrix, small enough that threads would only get in each other's way."""
+    """Inverse of a small symmetric positive matrix (n, n), without threads."""
     out = np.empty_like(matrix)
     if _kernels_linear.invert(np.array(matrix), *dense_pattern(len(matrix)), out):
         return out
     try:
         out = np.linalg.inv(matrix)
-    except np.linalg.LinAlgError:  # numbers so far apart that some count for nothing beside others
+    except np.linalg.LinAlgError:  # singular by rounding: entries of too different size
         out = np.linalg.pinv(matrix, hermitian=True)
     return 0.5 * (out + out.T)
 
 
 def variances(matrix: NDArray) -> NDArray:
-    """(n,) diagonal of the inverse of a symmetric positive matrix (n, n), without the rest of it."""
+    """(n,) diagonal of the inverse of a symmetric positive matrix (n, n), without computing the rest."""
     out = np.empty(len(matrix))
     if not _kernels_linear.invert_diagonal(np.array(matrix), *dense_pattern(len(matrix)), out):
         return np.diag(inverse(matrix))
@@ -185,7 +191,7 @@ def variances(matrix: NDArray) -> NDArray:
 
 
 def product(A: NDArray, B: NDArray) -> NDArray:
-    """A B of small matrices (..., k), (k, m), without threads that would only get in each other's way."""
+    """A B (..., m) of small matrices (..., k), (k, m), without threads."""
     lines = np.ascontiguousarray(A, float).reshape(math.prod(A.shape[:-1]), A.shape[-1])
     out = np.empty((len(lines), B.shape[1]))
     _kernels_linear.multiply(lines, np.ascontiguousarray(B, float), out)
@@ -193,7 +199,7 @@ def product(A: NDArray, B: NDArray) -> NDArray:
 
 
 def design(body: Body, state: BodyState, rows: Rows | DofRows) -> NDArray:
-    """(N, n) how far each row's point moves along its direction with every degree of freedom."""
+    """(N, n) derivatives of rows by every degree of freedom: how far each point moves along its direction."""
     if isinstance(rows, DofRows):
         return rows.jacobian
     tree, out = body.tree, np.empty((len(rows), body.tree.n_dofs))
@@ -204,7 +210,7 @@ def design(body: Body, state: BodyState, rows: Rows | DofRows) -> NDArray:
 
 
 def _within(what: str, count: int, body: Body, *indices: NDArray) -> None:
-    """Kernels look nowhere else: an index of another body must not reach them."""
+    """Check indices before kernels use them: kernels check no bounds."""
     for index in indices:
         if index.size and not 0 <= index.min() <= index.max() < count:
             raise ObservationError(
@@ -214,7 +220,7 @@ def _within(what: str, count: int, body: Body, *indices: NDArray) -> None:
 
 
 def lock(body: Body, locked: NDArray | None) -> NDArray:
-    """(6 + D,) bool, degrees of freedom that may not move: those given, and the root of a body that is fixed."""
+    """(6 + D,) bool, degrees of freedom that do not move: those given (6 + D,), and the root of a fixed body."""
     out = np.zeros(body.tree.n_dofs, bool) if locked is None else np.array(locked, bool)
     out[:6] |= not body.tree.root_free
     return out
@@ -222,14 +228,14 @@ def lock(body: Body, locked: NDArray | None) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Uncertainty of a state.
+    """Covariance of a state, with unobserved directions.
 
     Parameters
     ----------
     observed : (n, n)
-        Covariance of what was observed: zero along free directions and for known degrees of freedom.
+        Covariance of the observed directions: zero along free ones and for known degrees of freedom.
     free : (n, k)
-        Directions in which nothing holds the state.
+        Directions that no row observes.
     """
 
     observed: NDArray
@@ -237,43 +243,43 @@ class Covariance:
 
     @property
     def matrix(self) -> NDArray:
-        """(n, n) covariance, infinite on the diagonal (and zero beside it) where a free direction takes part."""
-        lost = np.abs(self.free).max(axis=1, initial=0.0) > _LOOSE
-        out = np.where(lost[:, None] | lost[None, :], 0.0, self.observed)
-        out[lost, lost] = np.inf
+        """Covariance as an (n, n) matrix; free degrees of freedom have inf on the diagonal and 0 off it."""
+        is_free = np.abs(self.free).max(axis=1, initial=0.0) > _MIN_FREE_COMPONENT
+        out = np.where(is_free[:, None] | is_free[None, :], 0.0, self.observed)
+        out[is_free, is_free] = np.inf
         return out
 
     @property
     def std(self) -> NDArray:
-        """(n,) [m, rad] standard deviation of every degree of freedom, inf where it is free."""
+        """(n,) [m, rad] standard deviation of every degree of freedom, inf for free ones."""
         return np.sqrt(np.diag(self.matrix))
 
     def of(self, moves: NDArray) -> NDArray:
-        """Standard deviation (...) of quantities with derivatives `moves` (..., n); inf where they are free."""
+        """Standard deviations (...,) of quantities with derivatives `moves` (..., n); inf for free ones."""
         variance = np.einsum("...i,...i->...", moves @ self.observed, moves)
-        blind = np.abs(moves @ self.free).max(axis=-1, initial=0.0) > _LOOSE
-        return np.where(blind, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+        is_free = np.abs(moves @ self.free).max(axis=-1, initial=0.0) > _MIN_FREE_COMPONENT
+        return np.where(is_free, np.inf, np.sqrt(np.maximum(variance, 0.0)))
 
 
 @checked
 def covariance(equations: Equations, *, locked: NDArray | None = None) -> Covariance:
-    """Inverse of the undamped normal matrix.
+    """Covariance of a state: the inverse of the undamped normal matrix.
 
-    A direction is free where its information is below 1e-10 of what its degrees of freedom have each on their own.
+    A direction is free if its information is below 1e-10 of that of its degrees of freedom on their own.
 
     Parameters
     ----------
-    locked : (n,) bool, degrees of freedom that are known: their variance is zero. A fixed root always is.
+    locked : (n,) bool, known degrees of freedom: their variance is zero. A fixed root is always known.
     """
     n = len(equations.depth)
     known, out = lock(equations.body, locked), np.empty((n, n))
     C = np.array(equations.packed)
-    whole = not known.any() and equations.diagonal.min() > _ROUNDING * equations.diagonal.max()
+    whole = not known.any() and equations.diagonal.min() > _MIN_INFORMATION_RATIO * equations.diagonal.max()
     if whole and _kernels_linear.invert(C, equations.chain, equations.depth, out):
         return Covariance(out, np.empty((n, 0)))
     H = equations.matrix
     own = np.where(known, 0.0, np.diag(H))
-    some = own > _ROUNDING * own.max()
+    some = own > _MIN_INFORMATION_RATIO * own.max()
     scale = 1.0 / np.sqrt(own[some])
     values, vectors = np.linalg.eigh(H[np.ix_(some, some)] * scale[:, None] * scale[None, :])
     weak = values < 1e-10
@@ -286,12 +292,12 @@ def covariance(equations: Equations, *, locked: NDArray | None = None) -> Covari
 
 @checked
 def joint_std(body: Body, state: BodyState, cov: Covariance) -> NDArray:
-    """(S, 3) [m] standard deviation of every joint centre along the world's axes; inf where that is free."""
+    """(S, 3) [m] standard deviation of every joint centre along the world's axes; inf if it is free."""
     return cov.of(joint_moves(body, state))
 
 
 def joint_moves(body: Body, state: BodyState) -> NDArray:
-    """(S, 3, n) how far every joint centre moves along the world's axes with every degree of freedom."""
+    """(S, 3, n) derivatives of every joint centre, along the world's axes, by every degree of freedom."""
     tree = body.tree
     frames, screws = tree.forward(state.T_world_root, state.angles)
     moves = np.empty((len(tree.segments), 3, tree.n_dofs))

@@ -16,25 +16,25 @@ from kinefit.rows import AnyRows
 from kinefit.solvers import _kernels_linear
 from kinefit.solvers.equations import Equations, lock, normal_equations
 
-_TRIES = 30  # of more damping, for a matrix that is not positive
+_MAX_TRIES = 30  # of more damping, for a matrix that is not positive definite
 
 LEAST_SCALED_DAMPING = 1e-9
-"""Least λ of solvers that scale each diagonal element of H by 1 + λ, as bundles do: it alone holds a free gauge."""
+"""Least λ of solvers that scale each diagonal element of H by 1 + λ (bundle adjustment). Only it fixes a free gauge."""
 
 MakeRows = Callable[[BodyState], AnyRows | Iterable[AnyRows]]
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Where a fit ended.
+    """The result of a fit.
 
     Parameters
     ----------
     state : BodyState
-    equations : Equations, undamped, at that state.
-    iterations : int, steps tried.
-    converged : bool, False when the iterations were used up.
-    damping : float, last λ: a good start for the next frame.
+    equations : Equations, undamped, at that state
+    iterations : int, number of steps tried
+    converged : bool, False if the iterations were used up
+    damping : float, last λ: a good start for the next frame
     """
 
     state: BodyState
@@ -55,12 +55,12 @@ class Step:
 
     @property
     def cost(self) -> float:
-        """Of the state before the step."""
+        """Cost of the state before the step, in squared standard deviations (no unit)."""
         return self.equations.cost
 
 
 def relax(damping: float) -> float:
-    """Reduce the λ that scales the diagonal of H, after a step that lowered the cost."""
+    """Reduce the λ (unitless) that scales the diagonal of H, after a step that lowered the cost."""
     return max(0.1 * damping, LEAST_SCALED_DAMPING)
 
 
@@ -71,21 +71,21 @@ def descend(
     state: State, cost_of: Callable[[State], float], step: Callable[[State, float], State | None], *, iterations: int,
     tolerance: float, damping: float = 1e-4, most: float = 1e8,
 ) -> tuple[State, float]:  # fmt: skip
-    """Where a cost is least, and that cost, by steps whose damping grows until they lower it.
+    """Minimise a cost by steps whose damping grows until they lower it; returns the state and its cost.
 
     Parameters
     ----------
-    step : (state, λ) -> the state after a step with λ times the diagonal of H added to it; None where there is none
-    tolerance : stop when a step lowers the cost by less than this share of it.
-    damping, most : first λ, and the one at which nothing is left to be gained.
+    step : (state, λ) -> state after a step with λ times the diagonal of H added to H; None if H is singular
+    tolerance : stop when a step lowers the cost by less than this share of it
+    damping, most : first λ, and the λ at which the search ends; unitless
     """
     cost = cost_of(state)
     for _ in range(iterations):
         before = cost
         while damping < most:
-            there = step(state, damping)
-            if there is not None and (new := cost_of(there)) < cost:
-                state, cost, damping = there, new, relax(damping)
+            trial = step(state, damping)
+            if trial is not None and (new := cost_of(trial)) < cost:
+                state, cost, damping = trial, new, relax(damping)
                 break
             damping *= 10.0
         if not before - cost > tolerance * cost:
@@ -103,7 +103,7 @@ def _step(eq: Equations, damping: float, bounds: tuple[NDArray, NDArray], locked
 
 
 def bounds_of(body: Body, limits: bool) -> tuple[NDArray, NDArray]:
-    """(D,) lower and upper ends of every coordinate; infinite without limits."""
+    """(D,) lower and upper limits of every coordinate; infinite if `limits` is False."""
     if limits:
         return body.tree.lower, body.tree.upper
     free = np.full(len(body.tree.coordinates), np.inf)
@@ -121,18 +121,22 @@ def gauss_newton(
     damping: float = 0.0,
     locked: NDArray | None = None,
 ) -> Step:
-    """One step of (H + λ) δ = g for rows linearised at `state`; for loops that renew their rows (ICP).
+    """One step of (H + λ) δ = g for rows linearised at `state`, for loops that make new rows at every step (ICP).
 
     Parameters
     ----------
+    limits : bool
+        Whether coordinates stay within their limits.
     damping : float
-        λ, added to the diagonal as it is; `LEAST_DAMPING` of H's mean diagonal is the least.
+        λ, added to the diagonal; at least `LEAST_DAMPING` times H's mean diagonal.
+    locked : (n,) bool
+        Degrees of freedom that do not move.
     """
     eq = normal_equations(body, state, rows, loss=loss)
     bounds, held = bounds_of(body, limits), lock(body, locked)
     damping = max(damping, _kernels_linear.LEAST_DAMPING * float(eq.diagonal.mean()) + 1e-300)
     delta, fall = _step(eq, damping, bounds, held)
-    for _ in range(_TRIES):
+    for _ in range(_MAX_TRIES):
         if fall >= 0:
             break
         damping *= 100.0
@@ -158,15 +162,15 @@ def levenberg_marquardt(
     Parameters
     ----------
     make_rows : state -> rows
-        Called anew at every state tried, so that rows are exact there.
+        Called at every state tried, so rows are exact there.
     limits : bool
-        Joint limits hold: no coordinate leaves its range.
+        Whether coordinates stay within their limits.
     locked : (6 + D,) bool
-        Degrees of freedom that stay.
+        Degrees of freedom that do not move.
     damping : float
         First λ, absolute (in the units of H); default: a tenth of H's mean diagonal.
     tolerance : float
-        Stop when the predicted fall of the cost is below this share of it (or nothing is left of the first cost).
+        Stop when the predicted fall of the cost is below this share of it, or below 1e-16 of the first cost.
     """
     bounds, held = bounds_of(body, limits), lock(body, locked)
     state = state.retract(np.zeros(body.tree.n_dofs), bounds)

@@ -1,4 +1,4 @@
-"""Absolute orientation in closed form, of many limbs at once (Horn, JOSA A 4, 1987; P2 4.2.7)."""
+"""Absolute orientation of many limbs in closed form (Horn, JOSA A 4, 1987; P2 4.2.7)."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from kinefit.geometry import se3
 def absolute_orientation(
     source: NDArray, target: NDArray, weight: NDArray, limb: NDArray, count: int, *, stay: float = 0.0
 ) -> tuple[NDArray, NDArray]:
-    """The motion x -> R x + t of each limb that minimises Σ w |R source + t − target|² over its own pairs.
+    """The rigid motion x -> R x + t of each limb that minimises Σ w |R source + t − target|² over its pairs.
 
     Horn's unit quaternion: the eigenvector of the largest eigenvalue of the 4 x 4 matrix N made of Σ w a bᵀ, where a
-    and b are source and target about their weighted means. Pairs that leave a turn open (one pair, or all on a line)
-    have several largest eigenvalues; `stay` is added to N's first element, which prefers the quaternion of no turn.
+    and b are source and target about their weighted means. Pairs that do not determine the rotation (one pair, or all
+    on a line) have several largest eigenvalues. `stay`, added to N's first element, prefers the identity.
 
     Parameters
     ----------
-    source, target : (N, 3) [m] pairs of points.
-    weight : (N,) not negative.
+    source, target : (N, 3) [m] pairs of points
+    weight : (N,) not negative
     limb : (N,) int in 0 .. count - 1
-    count : int, number of limbs.
+    count : int, number of limbs
     stay : float [m² times the unit of the weights]
-        Preference of small turns: as much as pairs at rest with a quarter of this as their second moment.
+        Preference for small rotations, equal to that of unmoved pairs with a quarter of this as second moment.
 
     Returns
     -------
-    R (count, 3, 3), t (count, 3) [m]; no motion for limbs without pairs.
+    R (count, 3, 3), t (count, 3) [m]; the identity for limbs without pairs
 
     Raises
     ------
@@ -50,16 +50,16 @@ def absolute_orientation(
     )
     a, b = source - mean_source[limb], (target - mean_target[limb]) * weight[:, None]
     S = np.stack([np.bincount(limb, a[:, i] * b[:, j], count) for i in range(3) for j in range(3)], axis=1)
-    R = se3.rotation_from_quaternion(_largest(S.reshape(-1, 3, 3), stay))
+    R = se3.rotation_from_quaternion(_best_quaternions(S.reshape(-1, 3, 3), stay))
     t = mean_target - (R @ mean_source[:, :, None])[..., 0]
     return R, t
 
 
-def _largest(S: NDArray, stay: float) -> NDArray:
+def _best_quaternions(S: NDArray, stay: float) -> NDArray:
     """(L, 4) unit quaternions (w, x, y, z) that maximise qᵀ N q."""
     N = np.empty((len(S), 4, 4))
     trace = np.trace(S, axis1=1, axis2=2)
-    N[:, 0, 0] = trace + stay + 1e-12  # no turn where nothing is measured
+    N[:, 0, 0] = trace + stay + 1e-12  # the identity for limbs without pairs
     N[:, 1:, 1:] = S + S.swapaxes(1, 2) - trace[:, None, None] * np.eye(3)
     N[:, 0, 1:] = N[:, 1:, 0] = np.stack(
         [S[:, 1, 2] - S[:, 2, 1], S[:, 2, 0] - S[:, 0, 2], S[:, 0, 1] - S[:, 1, 0]], axis=1

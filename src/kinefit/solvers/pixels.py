@@ -1,4 +1,4 @@
-"""A fit to pixels, a predicted pose and the prior posture: `levenberg_marquardt` in one compiled piece."""
+"""Fit a pose to pixels, a predicted pose and the posture prior: `levenberg_marquardt` in one compiled kernel."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from kinefit.losses import Loss
 from kinefit.solvers import _kernels_pixels
 from kinefit.solvers.equations import dense_pattern, lock
 
-LIGHT = 1e-3
-"""First damping where a prediction holds every degree of freedom already; without one, times H's mean diagonal."""
+INITIAL_DAMPING = 1e-3
+"""First damping with a prediction of every degree of freedom; without one, it is multiplied by H's mean diagonal."""
 
 
 class PixelPoints(NamedTuple):
@@ -28,7 +28,7 @@ class PixelPoints(NamedTuple):
 
 
 class PixelFit(NamedTuple):
-    """Where it ended: the state, `H` (n, n) and `g` (n,) of its normal equations, the cost, and the steps tried."""
+    """The end of a fit: state, `H` (n, n) and `g` (n,) of its normal equations, cost, and number of steps tried."""
 
     state: BodyState
     H: NDArray
@@ -38,23 +38,24 @@ class PixelFit(NamedTuple):
 
 
 def fit_pixels(
-    body: Body, state: BodyState, rig: Rig, seen: PixelPoints, held: tuple[BodyState, NDArray] | None, *,
+    body: Body, state: BodyState, rig: Rig, pixels: PixelPoints, held: tuple[BodyState, NDArray] | None, *,
     max_iterations: int, tolerance: float, posture: float = 1.0,
 ) -> PixelFit | None:  # fmt: skip
-    """The minimum of Σ ρ over pixels, of what a prediction says and of the prior posture, from a state on.
+    """Minimise Σ ρ over pixels, the prediction and the posture prior, from a start state.
 
-    The same steps as those of `levenberg_marquardt` with rows of these, but for rounding, in a fifth of the time: no
-    rows are handed over.
+    The steps are those of `levenberg_marquardt`, up to rounding, in a fifth of the time, since no rows are made.
 
     Parameters
     ----------
-    held : a predicted state, and the information (n, n) of it; None for no prediction
-    max_iterations, tolerance : as of `levenberg_marquardt`
-    posture : how much the prior posture counts
+    state : to start from
+    pixels : N points of the body, in images (N, 2) [px]
+    held : predicted state and its information (n, n); None for no prediction
+    max_iterations, tolerance : see `levenberg_marquardt`
+    posture : share of the posture prior
 
     Returns
     -------
-    None where something is not finite.
+    None if an input is not finite
     """
     tree, n = body.tree, body.tree.n_dofs
     predicted, information = held or (state, np.zeros((n, n)))
@@ -64,11 +65,11 @@ def fit_pixels(
     H, g = np.empty((2, n, n)), np.empty((2, n))
     best, cost, tried = _kernels_pixels.minimum(
         tree.parents, tree.dof_start, tree.prismatic, tree.axes, tree.rest, tree.chain, tree.depth, *dense_pattern(n),
-        tree.lower, tree.upper, lock(body, None), seen.points.segments, body.points_rest(seen.points), rig.packed,
-        seen.camera, seen.uv, seen.weight, seen.loss.kind, float(seen.loss.scale), predicted.T_world_root,
+        tree.lower, tree.upper, lock(body, None), pixels.points.segments, body.points_rest(pixels.points), rig.packed,
+        pixels.camera, pixels.uv, pixels.weight, pixels.loss.kind, float(pixels.loss.scale), predicted.T_world_root,
         predicted.angles, information, posed, tree.usual,
         posture * (precision if precision.ndim == 2 else np.diag(precision)), roots, angles, H, g, max_iterations,
-        tolerance, LIGHT, 0.0 if held else LIGHT,
+        tolerance, INITIAL_DAMPING, 0.0 if held else INITIAL_DAMPING,
     )  # fmt: skip
     if best < 0:
         return None

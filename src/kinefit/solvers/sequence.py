@@ -1,4 +1,4 @@
-"""Fast fits of whole sequences: markers and tangent planes, frame after frame, in one compiled call."""
+"""Fit whole sequences fast: markers and tangent planes, frame after frame, in one compiled call."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Planes:
 
     Parameters
     ----------
-    points : PointSet of P points.
-    x_world : (F, P, 3) [m] a point of each plane; NaN for none.
-    normal : (F, P, 3) unit normals.
+    points : PointSet of P points
+    x_world : (F, P, 3) [m] a point of each plane; NaN for none
+    normal : (F, P, 3) unit normals
     sigma : float [m]
     """
 
@@ -66,37 +66,45 @@ def fit_sequence(
     max_iterations: int = 200,
     tolerance: float = 1e-6,
 ) -> SequenceFit:
-    """Minimise Σ ρ(w r²) in every frame, each from the solution of the one before (the first from `start`).
+    """Minimise Σ ρ(w r²) in every frame, each from the solution of the frame before.
 
-    With roots (F, 4, 4) and angles (F, D) as `start`, each frame begins at its own.
-
-    The same minimum as `levenberg_marquardt` with `point_rows` and `plane_rows`, without its calls from Python.
+    It finds the minimum of `levenberg_marquardt` with `point_rows` and `plane_rows`, without calls from Python.
 
     Parameters
     ----------
-    points : PointSet of K points on the body.
+    start : BodyState of the first frame, or roots (F, 4, 4) and angles (F, D) from which each frame starts
+    points : PointSet of K points on the body
     x_world : (F, K, 3) [m]
-        Where they were measured; NaN for one that was not.
+        Measured points; NaN for missing ones.
     sigma : scalar or (K,) [m]
     planes : Planes
-        Tangent planes for other points, as well or instead.
+        Tangent planes for other points, in addition or instead.
+    limits : bool
+        Whether coordinates stay within their limits.
+    locked : (n,) bool
+        Degrees of freedom that do not move.
     posture : float
-        Share of the body's posture prior, couplings included: it decides what the measurements leave open.
+        Share of the body's posture prior, couplings included. It determines what the measurements do not.
     usual : (F, D) or (D,) [rad or m]
-        The posture meant; default: the body's.
+        Mean of the posture prior; default: the body's.
     damping : float
         First λ as a share of H's mean diagonal.
     tolerance : float
         A frame ends when its next step is predicted to lower the cost by less than this share.
+
+    Raises
+    ------
+    ObservationError
+        Arrays of other shapes; a standard deviation that is not above 0.
     """
     tree = body.tree
     count = len(planes.x_world) if x_world is None and planes is not None else len(np.asarray(x_world))
     x = np.zeros((count, 0, 3)) if x_world is None else np.array(x_world, float, order="C")
     check_shape(x, (count, len(points), 3), "measured points")
-    seen = np.isfinite(x).all(axis=2)
+    measured = np.isfinite(x).all(axis=2)
     if not np.all(np.asarray(sigma, float) > 0) or (planes is not None and not planes.sigma > 0):
         raise ObservationError("the standard deviation of points and planes must be positive")
-    weight = np.where(seen, 1.0 / np.square(np.broadcast_to(np.asarray(sigma, float), seen.shape[1:])), 0.0)
+    weight = np.where(measured, 1.0 / np.square(np.broadcast_to(np.asarray(sigma, float), measured.shape[1:])), 0.0)
     order = np.argsort(points.segments, kind="stable")  # rows of one segment in one run
     p = planes or Planes(_NO_POINTS, np.zeros((count, 0, 3)), np.zeros((count, 0, 3)))
     for name, array in (("points", p.x_world), ("normals", p.normal)):
@@ -125,13 +133,13 @@ def fit_sequence(
 
 @dataclass(frozen=True, eq=False)
 class Certainty:
-    """How sure fitted frames are.
+    """Standard deviations of fitted frames.
 
     Parameters
     ----------
-    dof_std : (F, n) [m, rad] one standard deviation of every degree of freedom.
-    joint_std : (F, S, 3) [m] one of every joint centre along the world's axes.
-    factors : (F, K) the points' robust factors in 0..1, 0 where unseen.
+    dof_std : (F, n) [m, rad] of every degree of freedom
+    joint_std : (F, S, 3) [m] of every joint centre along the world's axes
+    factors : (F, K) the points' robust factors in 0..1, 0 where missing
     """
 
     dof_std: NDArray
@@ -152,14 +160,21 @@ def certainty(
 ) -> Certainty:
     """Standard deviations of frames that `fit_sequence` fitted to points, from each frame's own covariance.
 
-    Infinite in a frame of which something is open; with a share `posture` that is no angle, and the prior's own spread
-    tells how open it is.
+    They are infinite in a frame whose measurements do not determine all degrees of freedom. With a share `posture` of
+    the prior all angles are determined, and the prior's standard deviation bounds theirs.
+
+    Parameters
+    ----------
+    Ts_world_root, angles : (F, 4, 4), (F, D) of the fit
+    x_world : (F, K, 3) [m] measured points; NaN for missing ones
+    sigma : scalar or (K,) [m]
+    posture : share of the body's posture prior
     """
     tree, x = body.tree, np.array(x_world, float, order="C")
-    seen = np.isfinite(x).all(axis=2)
-    weight = np.where(seen, 1.0 / np.square(np.broadcast_to(np.asarray(sigma, float), seen.shape[1:])), 0.0)
+    measured = np.isfinite(x).all(axis=2)
+    weight = np.where(measured, 1.0 / np.square(np.broadcast_to(np.asarray(sigma, float), measured.shape[1:])), 0.0)
     F, S, n = len(x), len(tree.segments), tree.n_dofs
-    dof_std, joint_std, factors = np.empty((F, n)), np.empty((F, S, 3)), np.empty(seen.shape)
+    dof_std, joint_std, factors = np.empty((F, n)), np.empty((F, S, 3)), np.empty(measured.shape)
     _certainties(
         tree.parents, tree.dof_start, tree.dof_parent, tree.last_dof, tree.chain, tree.depth, tree.prismatic, tree.axes,
         tree.rest, points.segments, body.points_rest(points), np.nan_to_num(x), weight, tree.usual, posture,
@@ -172,9 +187,15 @@ def certainty(
 def point_equations(
     body: Body, points: PointSet, x_world: NDArray, *, sigma: NDArray, loss: Loss = SQUARED
 ) -> MakeEquations:
-    """What `trajectory.smoothing.smooth` asks for, of points measured at x_world (F, K, 3) [m], NaN for none."""
-    tree, seen = body.tree, np.isfinite(x_world).all(axis=2)
-    weight = np.where(seen, 1.0 / np.square(sigma), 0.0)
+    """Equations of points for `trajectory.smoothing.smooth`.
+
+    Parameters
+    ----------
+    x_world : (F, K, 3) [m] measured points; NaN for missing ones
+    sigma : (K,) or (F, K) [m]
+    """
+    tree, measured = body.tree, np.isfinite(x_world).all(axis=2)
+    weight = np.where(measured, 1.0 / np.square(sigma), 0.0)
     x, rest = np.nan_to_num(x_world), body.points_rest(points)
 
     def make(roots: NDArray, angles: NDArray) -> Equations:

@@ -1,1 +1,1 @@
-"""Who is seen: size and shape of a person."""
+"""Fit the size and shape of a person."""

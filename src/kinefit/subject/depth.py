@@ -1,7 +1,7 @@
-"""The person's own size from the first depth frames: lengths of the limbs and girths of the surfaces.
+"""Fit limb lengths and girths to the first depth frames.
 
-Measured points should lie on the surface nearest to them, and no contour of the body should stand out where the sensor
-saw past it; `fit_subject` finds the poses of a few frames, lengths and girths together.
+Measured points should lie on the nearest surface, and the body's contour should not cover pixels that the sensor saw as
+background. `fit_subject` finds poses of a few frames, lengths and girths jointly.
 """
 
 from __future__ import annotations
@@ -29,14 +29,16 @@ from kinefit.subject.parameters import Parameters, SegmentScales
 from kinefit.subject.subject import SubjectFit
 from kinefit.subject.surfaces import Girths
 
-# Chosen on ten simulated people in three postures each, off by 5° and 3 cm; the figure `size_lengths` has four of them.
-_STATURES = (-0.1, 0.0, 0.1)  # logarithms to start from: closest points slide along limbs, lengths are slow to change
-_TRIED, _ROUNDS = 5, 12  # rounds with each, and with the best of them
-_COARSE = 1, 2  # as of `fit_subject`
-_LOOKS = 0.3  # of a frame, independent: neighbours share folds of cloth and the model's form
-_POSTURE = 0.1  # share of the posture prior: lengths that poses are bent for are worse (3 of ten people by 0.5 %)
-_CONTOUR = 2.5  # times a point's standard deviation: of 0.6, 1, 1.6, 2.5 lengths are off by 2.5, 2.0, 2.0, 1.8 %
-_ACROSS = 0.5  # cosine of normal and line of sight; elsewhere a surface that recedes does not help
+# Chosen on ten simulated people in three postures each, with pose errors of 5° and 3 cm; the figure `size_lengths` has
+# four of them.
+_START_LOG_STATURES = (-0.1, 0.0, 0.1)  # closest points slide along limbs, so lengths change slowly
+_ROUNDS_PER_START = 5
+_ROUNDS_OF_BEST = 12
+_COARSE_ITERATIONS = 1, 2  # see `fit_subject`
+_INDEPENDENT_SHARE = 0.3  # of a frame's errors: neighbours share folds of cloth and the model's form
+_POSTURE_PRIOR_SHARE = 0.1  # with less, poses bend to fit wrong lengths (3 of ten people, 0.5 % worse)
+_CONTOUR_SIGMA_RATIO = 2.5  # to a point's: with 0.6, 1, 1.6, 2.5 lengths err by 2.5, 2.0, 2.0, 1.8 %
+_MAX_CONTOUR_COSINE = 0.5  # of normal and line of sight; elsewhere moving the surface inwards does not help
 
 
 def fit_surfaces(
@@ -50,25 +52,24 @@ def fit_surfaces(
     points: int = 500,
     start: NDArray | None = None,
 ) -> SubjectFit:
-    """Lengths and girths of a body from clouds of the person in poses that are about known.
+    """Fit lengths and girths of a body to point clouds of the person, with poses known approximately.
 
     Parameters
     ----------
-    body : Body with surfaces; of one without cylinders the lengths alone are found.
+    body : Body with surfaces; without cylinders the lengths alone are fitted
     clouds : K x (N, 3) [m] points on the person, in the world
     states : K poses
-    camera : Camera of the sensor, one for all: surfaces that face away from it attract nothing, and what its image
-        shows empty about the person holds the girths from growing
-    views : K, the same from whole depth images, instead of a camera
-    sigma : float [m], of a point: noise, cloth
-    points : int of each cloud that take part
+    camera : Camera of the sensor, the same for all clouds: surfaces that face away from it get no points, and empty
+        pixels around the person limit the girths
+    views : K views of whole depth images, instead of a camera
+    sigma : float [m], standard deviation of a point: noise, cloth
+    points : int, number of points used of each cloud
     start : (p,) parameters to start from, of an earlier fit; default: three statures are tried
 
     Returns
     -------
-    Subject
-        Its parameters are those of `SegmentScales` and `Girths`; their standard deviations are as wide as the prior's
-        where nothing was seen.
+    SubjectFit
+        Its parameters are those of `SegmentScales` and `Girths`. Unobserved ones keep the prior's standard deviation.
 
     Raises
     ------
@@ -98,26 +99,26 @@ def fit_surfaces(
 
     def fitted(states: Sequence[BodyState], start: NDArray, rounds: int, reach: Sequence[float]) -> SubjectFit:
         return joint.fit_subject(
-            body, rig, steps, states, parameters, start=start, reach=reach, rounds=rounds, looks=_LOOKS * len(steps),
-            posture=_POSTURE, coarse=_COARSE,
+            body, rig, steps, states, parameters, start=start, reach=reach, rounds=rounds,
+            looks=_INDEPENDENT_SHARE * len(steps), posture=_POSTURE_PRIOR_SHARE, coarse=_COARSE_ITERATIONS,
         )  # fmt: skip
 
     if start is not None:
-        return fitted(states, start, _TRIED, joint.REACH[-1:])
-    tried = [fitted(states, stature * groups, _TRIED, joint.REACH) for stature in _STATURES]
+        return fitted(states, start, _ROUNDS_PER_START, joint.REACH[-1:])
+    tried = [fitted(states, size * groups, _ROUNDS_PER_START, joint.REACH) for size in _START_LOG_STATURES]
     best = min(tried, key=lambda found: _misfit(found, steps))
-    return fitted(best.states, best.mean, _ROUNDS, joint.REACH[-1:])
+    return fitted(best.states, best.mean, _ROUNDS_OF_BEST, joint.REACH[-1:])
 
 
 def _misfit(found: SubjectFit, steps: Sequence[Sequence[Measurement]]) -> float:
-    """What stands out, less the points that the body explains; alike for fits with other correspondences."""
-    total, soft = 0.0, joint.REACH[-1]
-    for state, several in zip(found.states, steps):
+    """Weight of contour samples off their place, minus that of explained points; comparable between fits."""
+    total, scale = 0.0, joint.REACH[-1]
+    for state, measurements in zip(found.states, steps):
         scene = Scene(found.body, state, found.rig)
-        for one in several:
-            for rows in rows_at(matched_by(one, scene, joint.REACH[0]), scene):
-                explained = 1.0 / (1.0 + np.square(rows.residual / soft))
-                total += float(rows.weight @ (float(isinstance(one, _Contour)) - explained))
+        for m in measurements:
+            for rows in rows_at(matched_by(m, scene, joint.REACH[0]), scene):
+                explained = 1.0 / (1.0 + np.square(rows.residual / scale))
+                total += float(rows.weight @ (float(isinstance(m, _Contour)) - explained))
     return total
 
 
@@ -127,7 +128,7 @@ def _view(cloud: NDArray, camera: Camera) -> DepthView:
 
 
 class _Contour(Measurement):
-    """What a view shows empty: the body's occluding contour should recede to the person's outline in it."""
+    """Empty pixels of a view: the body's occluding contour should lie within the person's contour in the image."""
 
     settled = False
 
@@ -135,30 +136,30 @@ class _Contour(Measurement):
         self.sensor, self.time, self._view, self._of = "contour", 0.0, view, of
 
     def match(self, scene: Scene, reach: float) -> Matched:
-        """Samples of the surface beside the outline, each with the place at it that lies along its normal."""
+        """Match surface samples outside the person's contour to the place on it along their normals."""
         samples, f = scene.surface.samples, scene.frames[scene.surface.samples.segment]
         R = f[:, :9].reshape(-1, 3, 3)
         x = np.einsum("nij,jn->ni", R, samples.point) + f[:, 9:]
         n = np.einsum("nij,jn->ni", R, samples.normal)
         out, trust = outside(self._view, x)
         sight = x - self._view.viewpoint
-        across = np.abs(np.einsum("ni,ni->n", n, sight)) < _ACROSS * np.linalg.norm(sight, axis=1)
-        use = (out > 0.0) & (out < 2.0 * reach) & (trust > 0.0) & across & ~scene.surface.fingers
+        is_contour = np.abs(np.einsum("ni,ni->n", n, sight)) < _MAX_CONTOUR_COSINE * np.linalg.norm(sight, axis=1)
+        use = (out > 0.0) & (out < 2.0 * reach) & (trust > 0.0) & is_contour & ~scene.surface.fingers
         place, normal = (np.ascontiguousarray(a[:, use].T) for a in (samples.point, samples.normal))
         anchors = SurfaceAnchors(scene.body, samples.segment[use], place, normal)
         patches = float(scene.surface.areas.sum()) / (self._of.settings.patch**2 * len(samples))
-        weight = trust[use] * min(patches, 1.0) / (_CONTOUR * self._of.sigma) ** 2
+        weight = trust[use] * min(patches, 1.0) / (_CONTOUR_SIGMA_RATIO * self._of.sigma) ** 2
         return _Receding(SurfacePairs(anchors, x[use] - out[use, None] * n[use], weight, reach, True))
 
 
 @dataclass(frozen=True, eq=False)
 class _Receding(Matched):
-    """Samples of the surface that stand out, and where they should be."""
+    """Surface samples outside the person's contour, paired with places on it."""
 
     pairs: SurfacePairs
     of_points = False
     shows_surface = True
 
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
-        """One row a sample."""
+        """One row for each sample."""
         return [self.pairs.rows(scene)]

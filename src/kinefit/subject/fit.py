@@ -1,7 +1,7 @@
-"""Whatever is unknown of a person, cameras and sensors, from all sensors of a take together.
+"""Fit a person, cameras and sensors jointly to all sensors of a take.
 
-Some frames, the same in every sensor, and their poses; parameters of any kinds (`kinefit.subject.parameters`). Frames
-are matched, poses and parameters solved together, and matched again where the solution now is.
+The unknowns are the poses of some frames and parameters of any kinds (`kinefit.subject.parameters`). Each round
+matches the frames at the current solution, then solves for poses and parameters jointly.
 """
 
 from __future__ import annotations
@@ -18,22 +18,21 @@ from kinefit.geometry.camera import Rig
 from kinefit.losses import SQUARED, Loss
 from kinefit.sensors.base import Measurement
 from kinefit.solvers.bundle.border import Bordered, Prior, solve
-from kinefit.solvers.bundle.border_frames import POSTURE, SETTLING, Weighing
+from kinefit.solvers.bundle.border_frames import MAX_POSE_STEPS, POSTURE_SHARE, Weighing
 from kinefit.solvers.equations import inverse
-from kinefit.subject.lasting import excess
+from kinefit.subject.excess import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import Parameters, World, stacked
 from kinefit.subject.subject import SubjectFit
 
 REACH = (0.08, 0.05, 0.03)
-"""[m] of correspondences that are sought anew, coarse to fine; the last for all further rounds."""
+"""[m] correspondence distance of each round, coarse to fine; the last for all further rounds."""
 
-COARSE = 4, SETTLING
-"""Iterations of a round where correspondences are sought anew, or reach farther than in the end; and how many steps
-poses take by themselves in each."""
+COARSE_ITERATIONS = 4, MAX_POSE_STEPS
+"""Iterations of an early round, whose correspondences still change, and steps of the poses alone in each iteration."""
 
-_ITERATIONS = 15  # of the solver, in the last rounds
-_DONE = 0.01  # posterior standard deviations of a change between rounds that is none
+_FINE_ITERATIONS = 15  # of the solver, in the last rounds
+_MAX_CHANGE_SIGMAS = 0.01  # posterior standard deviations of a change between rounds that counts as converged
 
 
 @checked
@@ -51,29 +50,29 @@ def fit_subject(
     rounds: int = 5,
     looks: float | None = None,
     loss: Loss = SQUARED,
-    posture: float = POSTURE,
-    coarse: tuple[int, int] = COARSE,
+    posture: float = POSTURE_SHARE,
+    coarse: tuple[int, int] = COARSE_ITERATIONS,
 ) -> SubjectFit:
-    """Parameters and poses that explain what all sensors saw in K frames.
+    """Fit parameters and poses jointly to the measurements of K frames.
 
     Parameters
     ----------
-    body, rig : as the parameters' priors have them.
-    steps : K lists, what each sensor measured in a frame.
-    states : K poses near the truth.
-    parameters : kinds of them, applied in this order.
-    times : (K,) [s] of the states, default that of the first measurement of each frame.
-    velocities : K of (6 + D,) [m/s, rad/s], optional; for measurements of other times than their state's.
-    start : (p,) to start from, default the priors' means.
-    reach : [m] of correspondences, round by round; the last for all further rounds.
-    rounds : of match and solve, at most; correspondences that settle end it earlier.
+    body, rig : at the means of the parameters' priors
+    steps : K lists of measurements, one list for each frame
+    states : K poses near the truth
+    parameters : kinds of parameters, applied in this order
+    times : (K,) [s] of the states; default: time of the first measurement of each frame
+    velocities : K of (6 + D,) [m/s, rad/s], optional; for measurements at other times than their state's
+    start : (p,) parameters to start from; default: the priors' means
+    reach : [m] correspondence distance of each round; the last for all further rounds
+    rounds : of match and solve, at most; fewer if correspondences no longer change
     looks : float, optional
-        How many frames of independent errors all frames together count as; default: estimated, sensor by sensor, from
-        how much residuals last (see `lasting.excess`).
-    loss : Loss of rows that have none of their own.
-    posture : share of the body's posture prior that holds the poses.
-    coarse : iterations of a round where correspondences are sought anew, and steps of poses by themselves in each: few,
-        where the nearest points of a surface would let poses follow lengths that are wrong.
+        Number of frames with independent errors that all frames together count as; default: estimated for each sensor
+        from the bias of its residuals (see `excess.excess`).
+    loss : Loss of rows that have none of their own
+    posture : share of the body's posture prior that constrains the poses
+    coarse : iterations of a round whose correspondences still change, and steps of the poses alone in each. Few
+        iterations keep poses from following wrong lengths along the nearest points of a surface.
 
     Raises
     ------
@@ -95,34 +94,35 @@ def fit_subject(
     theta = np.array(mean if start is None else start, float)
     check_shape(theta, mean.shape, f"a start for {', '.join(names)}")
     sensors = tuple({m.sensor: None for several in steps for m in several})
-    anew = not all(m.settled for several in steps for m in several)
+    rematched = not all(m.settled for several in steps for m in several)
     shares = {} if looks is None else dict.fromkeys(sensors, min(looks / len(steps), 1.0))
-    told = {sensor: 1.0 / share for sensor, share in shares.items()}
+    excess_of = {sensor: 1.0 / share for sensor, share in shares.items()}
     for used in range(1, rounds + 1):
         frames = MatchedFrames(worlds, steps, times, velocities, theta, states, reach[min(used, len(reach)) - 1])
-        early, before = anew or used < min(len(reach), rounds), theta
+        early, before = rematched or used < min(len(reach), rounds), theta
         solved = solve(
             frames, theta, states, prior, step, weighing=Weighing(shares, loss, posture),
-            iterations=coarse if early else (_ITERATIONS, SETTLING),
+            iterations=coarse if early else (_FINE_ITERATIONS, MAX_POSE_STEPS),
         )  # fmt: skip
         theta, states, moved = solved.theta, solved.states, solved.theta - before
-        if not early and solved.converged and moved @ (prior.information + solved.information) @ moved < _DONE**2:
+        squared_change = moved @ (prior.information + solved.information) @ moved
+        if not early and solved.converged and squared_change < _MAX_CHANGE_SIGMAS**2:
             break
     if looks is None:
-        told = excess(frames.seen(theta, states), _followed(body, solved))
-        shares = {sensor: 1.0 / max(told.get(sensor, 1.0), 1.0) for sensor in sensors}
+        excess_of = excess(frames.rows_of_frames(theta, states), _effective_parameters(body, solved))
+        shares = {sensor: 1.0 / max(excess_of.get(sensor, 1.0), 1.0) for sensor in sensors}
         if min(shares.values()) < 1.0:
-            weighing = Weighing(shares, loss, posture)
-            solved = solve(frames, theta, states, prior, step, weighing=weighing, iterations=(_ITERATIONS, SETTLING))
+            weighing, fine = Weighing(shares, loss, posture), (_FINE_ITERATIONS, MAX_POSE_STEPS)
+            solved = solve(frames, theta, states, prior, step, weighing=weighing, iterations=fine)
     world = worlds.at(solved.theta)
     return SubjectFit(
         world.body, world.rig, world.values, names, solved.theta, inverse(prior.information + solved.information),
-        solved.states, solved.information, prior, told, solved.cost, used,
+        solved.states, solved.information, prior, excess_of, solved.cost, used,
         tuple(parameters), World(body, rig),
     )  # fmt: skip
 
 
-def _followed(body: Body, solved: Bordered) -> float:
-    """How many mean residuals a fit can make zero."""
+def _effective_parameters(body: Body, solved: Bordered) -> float:
+    """Number of mean residuals that a fit can make zero: degrees of freedom, and parameters that data determine."""
     posterior = inverse(solved.prior.information + solved.information)
     return body.tree.n_dofs + len(solved.theta) - float(np.sum(solved.prior.information * posterior))

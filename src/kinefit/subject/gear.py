@@ -1,4 +1,4 @@
-"""What is not known of gear, as parameters of a subject fit: dimensions, and places in the world (P3 5)."""
+"""Unknowns of gear as parameters of a subject fit: dimensions, and places in the world (P3 5)."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from kinefit.bodies.closures import Closure, Dimension, known_gear, with_dimensi
 from kinefit.geometry import se3
 from kinefit.subject.parameters import World
 
-_STEP = 1e-4  # [m, rad] from which derivatives are taken
+_STEP = 1e-4  # [m, rad] of finite differences
 _WHERE = ("x", "y", "z", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True, eq=False)
 class Gear:
-    """Dimensions of a body's gear and places of closures in the world that a body file says to estimate.
+    """Dimensions of a body's gear and places of closures in the world, of those that the body file marks as unknown.
 
-    A place is a shift [m] and, of a rigid closure, a rotation vector [rad], both from the world's origin. Closures that
-    wait for these values are as soft as those are unsure; here they have their own deviation.
+    A place is a translation [m] and, for a rigid closure, a rotation vector [rad], both from the world's origin.
+    Outside a subject fit, closures with an unknown place are as soft as the place is uncertain. In the fit they have
+    their own standard deviation.
 
     Parameters
     ----------
@@ -35,7 +36,7 @@ class Gear:
 
     @cached_property
     def dimensions(self) -> tuple[Dimension, ...]:
-        """Those to estimate."""
+        """Dimensions to estimate."""
         return tuple(d for d in self.body.dimensions if d.std > 0.0)
 
     @cached_property
@@ -45,30 +46,30 @@ class Gear:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(p,)."""
+        """(p,) names of dimensions, then of each place's axes."""
         out = [f"gear {d.name}" for d in self.dimensions]
         return (*out, *(f"{c.name} {axis}" for c in self.places for axis in _WHERE[: _count(c)]))
 
     @property
     def mean(self) -> NDArray:
-        """(p,) [m] or [rad]."""
+        """(p,) [m, rad] prior mean."""
         values = [d.value for d in self.dimensions]
         return np.array(values + [v for c in self.places for v in (*c.place, *c.turn)[: _count(c)]])
 
     @property
     def information(self) -> NDArray:
-        """(p, p)."""
+        """(p, p) [1/m², 1/rad²] prior information."""
         std = [d.std for d in self.dimensions]
         std += [s for c in self.places for s in (*[c.place_std] * 3, *[c.turn_std] * 3)[: _count(c)]]
         return np.diag(np.array(std) ** -2.0)
 
     @property
     def step(self) -> NDArray:
-        """(p,)."""
+        """(p,) [m, rad] steps of finite differences."""
         return np.full(len(self.names), _STEP)
 
     def apply(self, world: World, values: NDArray) -> World:
-        """The world with gear of these values, which count as known."""
+        """The world with gear of these values (p,) [m, rad], which count as known."""
         count = len(self.dimensions)
         wanted = dict(zip((d.name for d in self.dimensions), np.asarray(values, float)[:count].tolist()))
         body, rest = with_dimensions(world.body, wanted), np.asarray(values, float)[count:]
@@ -79,7 +80,7 @@ class Gear:
         return replace(world, body=known_gear(with_places(body, places)))
 
     def start(self, states: Sequence[BodyState]) -> NDArray:
-        """(p,) the prior means of dimensions, and places as some tracked poses have them: their median."""
+        """(p,) [m, rad] values to start from: prior means of dimensions, and medians of places over tracked poses."""
         out, at = self.mean, len(self.dimensions)
         if not len(states):
             return out
@@ -103,6 +104,6 @@ def _count(c: Closure) -> int:
 
 
 def _middle(R: NDArray) -> NDArray:
-    """(3, 3) of rotations (K, 3, 3): the one that is nearest to all others."""
+    """(3, 3) median of rotations (K, 3, 3): the one with the smallest sum of angles to all others."""
     angle = np.arccos(np.clip((np.einsum("aij,bij->ab", R, R) - 1.0) / 2.0, -1.0, 1.0))
     return np.asarray(R[int(np.argmin(angle.sum(axis=1)))])

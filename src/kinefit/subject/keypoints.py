@@ -1,4 +1,4 @@
-"""Who is seen: bone lengths, and where on the body the detectors' points sit, from frames spread over a take."""
+"""Fit bone lengths and landmark offsets of keypoints to frames spread over a take."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import CameraErrors
 from kinefit.solvers.equations import inverse
 from kinefit.subject import fit as joint
+from kinefit.subject.excess import excess
 from kinefit.subject.gear import Gear
-from kinefit.subject.lasting import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales, World, place_spread
 from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.subject.subject import Progress, Subject, SubjectFit
 from kinefit.subject.view_bias import SeenFrames, learn_view_bias
 
-_SHIFT = 0.01, 0.005  # [m] how far detectors' points are off on long and on short segments, before a take is seen
-_POSTURE = 0.1  # share of the posture prior: frames of a take are a few independent postures at the most
-_UNTOLD = 1.2  # variance of shapes found, over what they state: limits, weights and priors are taken for known there.
+_OFFSET_PRIOR_STDS = 0.01, 0.005  # [m] of landmark offsets on long and on short segments, before a take is fitted
+_POSTURE_PRIOR_SHARE = 0.1  # frames of a take are a few independent postures at most
+_SHAPE_VARIANCE_FACTOR = 1.2  # of fitted shapes: their covariance takes limits, weights and priors as known.
 # With 1.0, 1.2 and 1.6 intervals of 95 % hold 95.5, 96.5 and 97.7 % of the joints of twenty known people with BODY_25B
 # (`benchmarks.error_bars`); the worst group of angles 88, 89 and 91 %. MEDIAPIPE_33 is the check.
 _ROUNDS = 2  # of fits with a better prior standard deviation; it changes by less than a tenth from then on
-_PLAUSIBLE = 0.15  # [m] median distance from triangulated points beyond which a pose is not one
+_MAX_POINT_DISTANCE = 0.15  # [m] median distance from triangulated points of a plausible pose
 
 
 def fit_subject(
@@ -52,17 +52,19 @@ def fit_subject(
     view_bias: bool = False,
     progress: Progress | None = None,
 ) -> Subject:
-    """Bone lengths and the places of the detectors' points on a body, with no pose given.
+    """Fit bone lengths and landmark offsets of keypoints, with no pose given.
 
     Parameters
     ----------
-    body : Body, generic.
-    frames : int, how many frames spread over the take are used.
-    height : float [m] of the person: lengths that no two points measure follow it.
-    trial : what another trial of the same person gave: lengths start from there, and stay as near as it was sure.
-    cameras : how far cameras may be off, which are then found along; default: the calibration is exact.
-    moved : what an earlier fit found of these cameras, which stand now where it found them.
-    view_bias : whether the detectors' bias by direction of view is found along, of points that three cameras show.
+    body : Body, generic
+    channels : keypoints of all cameras
+    frames : int, number of frames used, spread over the take
+    height : float [m] of the person: lengths that no two points measure scale with it
+    trial : subject of another trial of the same person: its lengths and their covariance are the prior
+    cameras : standard deviations of the calibration: cameras are fitted too; default: the calibration is exact
+    moved : camera parameters of an earlier fit, if the rig already has the poses that it found
+    view_bias : whether the detectors' bias by direction of view is estimated, of points that three cameras detect
+    progress : called with the name of the work, the steps done and all steps
 
     Raises
     ------
@@ -112,19 +114,18 @@ def _fitted(
     lengths: SegmentScales, scales: NDArray, errors: CameraErrors | None,
     known: CameraExtrinsics | None, by_view: bool,
 ) -> tuple[SubjectFit, NDArray, ViewBias]:  # fmt: skip
-    """Lengths, points, gear and cameras, with as much freedom for points as this take asks for; and their covariance.
+    """Fit lengths, points, gear and cameras; returns the fit, its covariance, and the detectors' bias by view.
 
-    And the detectors' bias by view, which the first round tells and the others do without.
-
-    How far points stand from where the body has them is found from the take (`place_spread`), beginning with
-    `_SHIFT`; on short segments (fingers) apart. What a detector errs by lasts, and would move cameras: their
-    calibration counts for more by the excess of the round before.
+    The standard deviation of landmark offsets is estimated from the take (`place_spread`), starting from
+    `_OFFSET_PRIOR_STDS`, separately for short segments (fingers). The bias by view is estimated in the first round, and
+    removed in later ones. Detector bias would move cameras: the weight of their calibration is raised by the excess of
+    the round before.
     """
-    spread, excess_of, start, gear, bias = np.array(_SHIFT), 1.0, None, Gear(body), ViewBias()
+    spread, excess_of, start, gear, bias = np.array(_OFFSET_PRIOR_STDS), 1.0, None, Gear(body), ViewBias()
     sets = [name for name in channels.sets if name]
     shares = [body.offset_shares[body.keypoints(name).segments] for name in sets]
     cameras: CameraExtrinsics | None = None
-    bare = body if body.morphs else replace(body, surfaces=(), skin=None)  # surfaces would be stretched for nothing
+    bare = body if body.morphs else replace(body, surfaces=(), skin=None)  # saves scaling surfaces
     used = tuple(channels.rig.names[c] for c in np.unique(channels.camera))
     if errors is not None:
         cameras = replace(known or CameraExtrinsics.of(errors, channels.rig, used), rig=channels.rig)
@@ -133,20 +134,21 @@ def _fitted(
             PointOffsets(body, name, spread[(own < 1.0).astype(int)] * own) for name, own in zip(sets, shares)
         ]
         parameters: list[Parameters] = [lengths, *offsets]
-        before = sum(len(one.names) for one in parameters)
-        if k and gear.names:  # which poses of the first round have brought into place
+        before = sum(len(kind.names) for kind in parameters)
+        if k and gear.names:  # gear starts from poses of the first round
             parameters.append(gear)
-        of_body = sum(len(one.names) for one in parameters)
+        of_body = sum(len(kind.names) for kind in parameters)
         if cameras is not None:
             parameters.append(cameras.tighter(excess_of**-0.5))
         if start is None:
-            of_points = [one.mean for one in parameters[1:] if not isinstance(one, CameraExtrinsics)]
+            of_points = [kind.mean for kind in parameters[1:] if not isinstance(kind, CameraExtrinsics)]
             start = np.concatenate([np.log(scales), *of_points, np.zeros(0 if cameras is None else len(cameras.names))])
         elif of_body > before:
             start = np.concatenate([start[:before], gear.start(states), start[before:]])
         found = joint.fit_subject(
-            bare, channels.rig, steps, states, parameters, start=start, rounds=1, looks=len(steps), posture=_POSTURE
-        )
+            bare, channels.rig, steps, states, parameters, start=start, rounds=1, looks=len(steps),
+            posture=_POSTURE_PRIOR_SHARE,
+        )  # fmt: skip
         start, states, prior = found.mean, found.states, found.prior.information.copy()
         prior[of_body:, of_body:] /= excess_of
         if k == 0 and by_view:
@@ -156,12 +158,12 @@ def _fitted(
         excess_of = _excess(found, steps)
         covariance = inverse(prior + found.information / excess_of)
         moved, share = found.mean - found.prior.mean, np.full(len(prior), np.nan)
-        of_points = [one.values_of(own[:, None].repeat(3, axis=1)) for one, own in zip(offsets, shares)]
+        of_points = [kind.values_of(own[:, None].repeat(3, axis=1)) for kind, own in zip(offsets, shares)]
         share[len(lengths.names) : before] = np.concatenate(of_points)
         for short, of in enumerate((share == 1.0, share < 1.0)):
             open_to = np.flatnonzero(of & np.isclose(np.diag(prior) * share**2, spread[short] ** -2))
-            apart, variance = moved[open_to] / share[open_to], np.diag(covariance)[open_to] / share[open_to] ** 2
-            spread[short] = place_spread(apart, variance, spread[short], _SHIFT[short])
+            offset, variance = moved[open_to] / share[open_to], np.diag(covariance)[open_to] / share[open_to] ** 2
+            spread[short] = place_spread(offset, variance, spread[short], _OFFSET_PRIOR_STDS[short])
         if cameras is not None:
             measured, own = found.information / excess_of, slice(of_body, len(moved))
             cameras = cameras.with_errors_of(own, moved, measured, found.prior.information / excess_of)
@@ -172,17 +174,17 @@ def _fitted(
     found = replace(found, body=Worlds(prior_world, parameters).at(found.mean).body, prior_world=prior_world)
     if cameras is not None:
         found = replace(found, parameters=(*parameters[:-1], cameras))
-    wider = np.sqrt(np.where(np.arange(len(covariance)) < of_body, _UNTOLD, 1.0))
+    wider = np.sqrt(np.where(np.arange(len(covariance)) < of_body, _SHAPE_VARIANCE_FACTOR, 1.0))
     return found, wider[:, None] * covariance * wider, bias
 
 
 def _without_bias(
     body: Body, channels: Channels, found: SubjectFit, steps: Sequence[Sequence[KeypointMeasurement]]
 ) -> tuple[ViewBias, list[Sequence[KeypointMeasurement]]]:
-    """The detectors' bias by view in frames whose poses a fit found, and the same frames with it known."""
+    """Estimate the detectors' bias by view from fitted frames; returns it, and the frames with it removed."""
     sized = Worlds(found.prior_world, found.parameters).at(found.mean).body
-    seen = [m.match(Scene(sized, state, channels.rig), joint.REACH[-1]) for (m,), state in zip(steps, found.states)]
-    uv, weight = (np.stack([getattr(one, what) for one in seen]) for what in ("uv", "weight"))
+    matched = [m.match(Scene(sized, state, channels.rig), joint.REACH[-1]) for (m,), state in zip(steps, found.states)]
+    uv, weight = (np.stack([getattr(m, name) for m in matched]) for name in ("uv", "weight"))
     frames = SeenFrames(sized, channels, found.states, uv, weight * np.square(channels.sigma))
     bias = learn_view_bias([frames])
     layout = Layout(bias.known_to(channels), body)
@@ -192,49 +194,50 @@ def _without_bias(
 def _by_detector(
     channels: Channels, found: SubjectFit, steps: Sequence[Sequence[KeypointMeasurement]]
 ) -> list[Sequence[KeypointMeasurement]]:
-    """Frames in which keypoints of each set count as sure as they prove beside the surest one's, by what is left over.
+    """Frames whose confidences are scaled by the residuals of each keypoint set, relative to the best set.
 
-    Detectors are stated alike, and the worse of two would else have as much to say of lengths.
+    All detectors have one standard deviation by default. Without this the worse of two would weigh as much on lengths.
     """
     sized = Worlds(found.prior_world, found.parameters).at(found.mean).body
     matched = [m.match(Scene(sized, state, channels.rig), joint.REACH[-1]) for (m,), state in zip(steps, found.states)]
     squares = np.stack([m.squares(Scene(sized, state, channels.rig)) for m, state in zip(matched, found.states)])
     used = np.stack([m.weight > 0 for m in matched])
     spans = [(channels.column >= s.start) & (channels.column < s.stop) for s in channels.sets.values()]
-    middle = np.array([np.median(squares[:, mine][used[:, mine]]) if used[:, mine].any() else np.inf for mine in spans])
-    sure = np.zeros(len(channels.column))
-    for mine, own in zip(spans, middle, strict=True):
-        sure[mine] = middle.min() / own if own > 0 else 1.0
+    medians = np.array([np.median(squares[:, s][used[:, s]]) if used[:, s].any() else np.inf for s in spans])
+    factor = np.zeros(len(channels.column))
+    for span, median in zip(spans, medians, strict=True):
+        factor[span] = medians.min() / median if median > 0 else 1.0
     return [
-        [KeypointMeasurement(m.of, m.layout, m.uv, m.confidence * sure, m.time) for m in several] for several in steps
+        [KeypointMeasurement(m.of, m.layout, m.uv, m.confidence * factor, m.time) for m in several] for several in steps
     ]
 
 
 def _excess(found: SubjectFit, steps: Sequence[Sequence[KeypointMeasurement]]) -> float:
-    """How many times larger than assumed a channel's variance is once all frames are averaged; 1 where too few tell.
+    """Factor by which a channel's variance over all frames exceeds the assumed one; 1 with too few residuals.
 
-    It scales what data say of themselves, not the fit: less weight would leave the lengths to the prior.
+    It scales the reported covariance, not the fit: less weight would leave the lengths to the prior.
     """
     worlds, prior = Worlds(found.prior_world, found.parameters), found.prior.information
     frames = MatchedFrames(worlds, steps, None, None, found.mean, found.states, joint.REACH[0])
     known = len(found.mean) - float(np.sum(prior * inverse(prior + found.information)))
-    return excess(frames.seen(found.mean, found.states), found.body.tree.n_dofs + known).get(KEYPOINTS, 1.0)
+    rows = frames.rows_of_frames(found.mean, found.states)
+    return excess(rows, found.body.tree.n_dofs + known).get(KEYPOINTS, 1.0)
 
 
 def _pose(body: Body, channels: Channels, x_world: NDArray, near: BodyState | None) -> BodyState | None:
-    """State from triangulated points: from a neighbouring frame's if that leads there, else from nowhere."""
+    """State fitted to triangulated points, started from a neighbouring frame's, else without; None if implausible."""
     for start in (near, None) if near else (None,):
         try:
-            state, left = pose_from_points(body, channels.points, x_world, near=start)
+            state, distance = pose_from_points(body, channels.points, x_world, near=start)
         except TrackingError:
             return None
-        if left < (0.5 * _PLAUSIBLE if start else _PLAUSIBLE):
+        if distance < (0.5 * _MAX_POINT_DISTANCE if start else _MAX_POINT_DISTANCE):
             return state
     return None
 
 
 def _weights(body: Body, channels: Channels, states: dict[int, BodyState]) -> NDArray:
-    """(F, N) weights without the channels whose left and right look exchanged."""
+    """(F, N) weights of the channels, 0 for limbs whose left and right seem swapped."""
     groups = limb_groups(body, channels)
     weight = channels.weight[list(states)]
     for row, (f, state) in zip(weight, states.items(), strict=True):

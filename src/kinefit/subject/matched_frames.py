@@ -1,4 +1,4 @@
-"""Frames with their correspondences, in worlds that parameters make: the problem that a subject fit solves."""
+"""Frames with fixed correspondences, as a function of parameters: the problem that a subject fit solves."""
 
 from __future__ import annotations
 
@@ -18,30 +18,36 @@ from kinefit.sensors.scene import Scene
 from kinefit.solvers.bundle.border_frames import Part, apart
 from kinefit.solvers.pixels import PixelPoints
 from kinefit.subject.closure_moves import ClosureMoves, closing_rows
-from kinefit.subject.lasting import Seen
+from kinefit.subject.excess import FrameRows
 from kinefit.subject.parameters import Parameters, World, stacked
 from kinefit.subject.point_moves import PointMoves
 from kinefit.subject.sensor_parameters import CameraExtrinsics
 from kinefit.subject.subject import SubjectFit
 
 CLOSURES = "closures"
-"""Under which name what closes a body's chains stands among the sensors."""
+"""Name of a body's closures among the sensors."""
 
-_KEPT = 64  # worlds that are remembered
-_CLOSING = ("tree", "landmarks", "closures")  # of a body, what its closures depend on
-_SURFACE = ("tree", "surfaces", "skin", "morphs")  # of a body, what a surface's rows depend on
+_MAX_CACHED_WORLDS = 64
+_CLOSURE_ATTRIBUTES = ("tree", "landmarks", "closures")  # of a body, on which its closures depend
+_SURFACE_ATTRIBUTES = ("tree", "surfaces", "skin", "morphs")  # of a body, on which a surface's rows depend
 
 
 class Worlds:
-    """The worlds of parameters' values; those asked for lately are kept, so that what did not change is the same."""
+    """Makes worlds from values of parameters, and caches the latest: unchanged parts are the same objects.
+
+    Parameters
+    ----------
+    world : to which the parameters apply
+    parameters : kinds of parameters, p in all
+    """
 
     def __init__(self, world: World, parameters: Sequence[Parameters]) -> None:
         self._first = world
-        ends = np.cumsum([0, *(len(one.names) for one in parameters)])
-        self._parameters = [(one, slice(int(a), int(b))) for one, a, b in zip(parameters, ends, ends[1:])]
-        # Cameras know nothing of bodies: moved first, they are not moved again for every body.
+        ends = np.cumsum([0, *(len(kind.names) for kind in parameters)])
+        self._parameters = [(kind, slice(int(a), int(b))) for kind, a, b in zip(parameters, ends, ends[1:])]
+        # Cameras do not depend on bodies: applied first, they are not applied again for every body.
         self._applied = sorted(self._parameters, key=lambda each: not isinstance(each[0], CameraExtrinsics))
-        self._kept: dict[tuple[int, bytes], tuple[World, World]] = {}
+        self._cache: dict[tuple[int, bytes], tuple[World, World]] = {}
         self._bare: Worlds | None = None
         self._scenes: dict[int, tuple[Body, Scene]] = {}
 
@@ -50,67 +56,78 @@ class Worlds:
         return self._chain(theta)[-1] if self._applied else self._first
 
     def _chain(self, theta: NDArray) -> list[World]:
-        """The worlds that each kind of parameters makes of the one before."""
+        """The worlds after each kind of parameters has been applied in turn."""
         world, out = self._first, []
-        for one, own in self._applied:
+        for kind, own in self._applied:
             values = theta[own]
             key = id(world), values.tobytes()
-            kept = self._kept.pop(key, None)
-            if kept is None:
-                if len(self._kept) >= _KEPT:
-                    self._kept.pop(next(iter(self._kept)))
-                kept = world, one.apply(world, values)
-            self._kept[key] = kept  # the latest last
-            world = kept[1]
+            cached = self._cache.pop(key, None)
+            if cached is None:
+                if len(self._cache) >= _MAX_CACHED_WORLDS:
+                    self._cache.pop(next(iter(self._cache)))
+                cached = world, kind.apply(world, values)
+            self._cache[key] = cached  # the latest last
+            world = cached[1]
             out.append(world)
         return out
 
     @property
     def touches(self) -> tuple[frozenset[int] | None, ...]:
-        """Of each parameter the segments on which alone rows can feel it; None for anywhere."""
+        """(p,) for each parameter the only segments whose rows depend on it; None for any."""
         out: list[frozenset[int] | None] = []
-        for one, own in self._parameters:
-            out += getattr(one, "touches", (None,) * (own.stop - own.start))
+        for kind, own in self._parameters:
+            out += getattr(kind, "touches", (None,) * (own.stop - own.start))
         return tuple(out)
 
     @property
     def of_points(self) -> NDArray:
-        """(p,) bool, parameters that move nothing but points and joints of the body."""
-        told = [np.full(own.stop - own.start, getattr(one, "of_points", False)) for one, own in self._parameters]
-        return np.concatenate(told)
+        """(p,) bool: parameters that move nothing but points and joints of the body."""
+        flags = [np.full(own.stop - own.start, getattr(kind, "of_points", False)) for kind, own in self._parameters]
+        return np.concatenate(flags)
 
     @property
     def cameras(self) -> list[tuple[CameraExtrinsics, slice]]:
-        """Parameters of cameras, and where they stand among all."""
-        return [(one, own) for one, own in self._parameters if isinstance(one, CameraExtrinsics)]
+        """Parameters of cameras, and their slice of all parameters."""
+        return [(kind, own) for kind, own in self._parameters if isinstance(kind, CameraExtrinsics)]
 
     def moves(self, theta: NDArray, steps: NDArray, some: NDArray) -> PointMoves:
-        """How points move with some parameters, all of which move nothing else; by differences where not told."""
+        """Derivatives of points by parameters that move nothing else; by differences if a kind has no slopes.
+
+        Parameters
+        ----------
+        theta, steps : (p,) values and steps of finite differences
+        some : (q,) int, the parameters to derive by
+        """
         chain = self._chain(theta)
         moving = [
-            (one, own, after.body) for (one, own), before, after in zip(self._applied, [self._first, *chain], chain)
+            (kind, own, after.body) for (kind, own), before, after in zip(self._applied, [self._first, *chain], chain)
             if after.body is not before.body
         ]  # fmt: skip
-        slopes: list[Any] = [getattr(one, "slopes", None) for one, _, _ in moving]
+        slopes: list[Any] = [getattr(kind, "slopes", None) for kind, _, _ in moving]
         if all(slopes):
-            made = [(tell, theta[own], own, body) for tell, (_, own, body) in zip(slopes, moving)]
-            return PointMoves.told(chain[-1].body, made, some, len(theta))
+            made = [(add_slopes, theta[own], own, body) for add_slopes, (_, own, body) in zip(slopes, moving)]
+            return PointMoves.from_slopes(chain[-1].body, made, some, len(theta))
         worlds = self
-        others = [one for one, _ in self._parameters if not isinstance(one, CameraExtrinsics)]
-        if all(getattr(one, "of_points", False) for one in others):  # surfaces would be stretched for nothing
+        of_bodies = [kind for kind, _ in self._parameters if not isinstance(kind, CameraExtrinsics)]
+        if all(getattr(kind, "of_points", False) for kind in of_bodies):  # saves scaling surfaces that are not used
             if self._bare is None:
                 bare = replace(self._first.body, surfaces=(), morphs=(), skin=None)
-                self._bare = Worlds(replace(self._first, body=bare), [one for one, _ in self._parameters])
+                self._bare = Worlds(replace(self._first, body=bare), [kind for kind, _ in self._parameters])
             worlds = self._bare
         pairs = []
         for together in apart(self.touches, some):
             change = np.zeros(len(theta))
             change[together] = steps[together]
             pairs.append((together, worlds.at(theta - change).body, worlds.at(theta + change).body))
-        return PointMoves.between(pairs, some, steps, self.touches)
+        return PointMoves.from_differences(pairs, some, steps, self.touches)
 
     def closing(self, theta: NDArray, steps: NDArray) -> ClosureMoves | None:
-        """How closures of the body move with the parameters; None for a body without."""
+        """Derivatives of the body's closures by the parameters; None for a body without closures.
+
+        Parameters
+        ----------
+        theta, steps : (p,) values and steps of finite differences
+        """
         if not self._first.body.closures:
             return None
         pairs, body = [], self.at(theta).body
@@ -120,12 +137,12 @@ class Worlds:
                 change = np.zeros(len(theta))
                 change[k] = sign * step
                 ends.append(self.at(theta + change).body)
-            same = all(getattr(ends[0], part) is getattr(body, part) for part in _CLOSING)
+            same = all(getattr(ends[0], part) is getattr(body, part) for part in _CLOSURE_ATTRIBUTES)
             pairs.append(None if same else (ends[0], ends[1]))
         return ClosureMoves(body, pairs, steps)
 
     def scene(self, world: World, state: BodyState) -> Scene:
-        """A scene of a world; those of one body share what was made for it."""
+        """A scene of a world; scenes of one body share its cached geometry."""
         key = id(world.body)
         if key not in self._scenes:
             if len(self._scenes) >= 4:
@@ -135,7 +152,18 @@ class Worlds:
 
 
 class MatchedFrames:
-    """Frames with their correspondences: the problem that the solver sees."""
+    """Frames with fixed correspondences: a `BorderedProblem`.
+
+    Parameters
+    ----------
+    worlds : Worlds
+    steps : F lists of measurements, one list for each frame
+    times : (F,) [s] of the states; default: time of the first measurement of each frame
+    velocities : F of (6 + D,) [m/s, rad/s], optional
+    theta : (p,) parameters at which the measurements are matched
+    states : F poses at which they are matched
+    reach : [m] correspondence distance
+    """
 
     def __init__(
         self, worlds: Worlds, steps: Sequence[Sequence[Measurement]], times: Sequence[float] | None,
@@ -151,7 +179,7 @@ class MatchedFrames:
 
     @property
     def touches(self) -> tuple[frozenset[int] | None, ...]:
-        """Of each parameter the segments on which alone rows can feel it; None for anywhere."""
+        """(p,) for each parameter the only segments whose rows depend on it; None for any."""
         return self._worlds.touches
 
     def body(self, theta: NDArray) -> Body:
@@ -159,7 +187,7 @@ class MatchedFrames:
         return self._worlds.at(theta).body
 
     def parts(self, theta: NDArray, frame: int, state: BodyState) -> list[Part]:
-        """Rows of one frame's sensors."""
+        """Rows of one frame's sensors and closures, with parameters (p,)."""
         world = self._worlds.at(theta)
         scene = self._scene(world, frame, state)
         out: list[Part] = []
@@ -169,13 +197,16 @@ class MatchedFrames:
         return [*out, *((CLOSURES, rows) for rows in closing_rows(world.body, state))]
 
     def packed(self, theta: NDArray, frame: int, state: BodyState) -> tuple[Rig, PixelPoints] | None:
-        """A frame's cameras and points, where keypoints are all that it has; else None."""
+        """A frame's cameras and keypoints, with parameters (p,); None if it has other measurements."""
         scene = self._scene(self._worlds.at(theta), frame, state)
-        seen = packed(self._matched[frame], scene)
-        return None if seen is None else (scene.rig, seen)
+        pixels = packed(self._matched[frame], scene)
+        return None if pixels is None else (scene.rig, pixels)
 
     def columns(self, theta: NDArray, steps: NDArray, states: Sequence[BodyState]) -> list[NDArray]:
-        """(N, p) of every frame, as `border_frames.differences`: of points and of cameras, else NaN."""
+        """(N, p) derivatives of every frame's rows by points and cameras, NaN elsewhere.
+
+        See `border_frames.differences`; `theta` and `steps` (p,) are values and steps of finite differences.
+        """
         world, moving = self._worlds.at(theta), np.flatnonzero(self._worlds.of_points)
         some = len(moving) and any(m.places is not None for several in self._matched for m in several)
         moves = self._worlds.moves(theta, steps, moving) if some else None
@@ -187,25 +218,25 @@ class MatchedFrames:
                     blocks.append(np.full((len(rows), len(theta)), np.nan))
                     if matched.cameras is not None and isinstance(rows, Rows):
                         seen_by = matched.cameras[rows.group] if len(matched.cameras) else matched.cameras
-                        for one, own in self._worlds.cameras:
-                            blocks[-1][:, own] = one.columns(rows, world.rig, seen_by)
+                        for kind, own in self._worlds.cameras:
+                            blocks[-1][:, own] = kind.columns(rows, world.rig, seen_by)
                     if moves is None or matched.places is None or not isinstance(rows, Rows) or scene.morphing:
                         continue
                     there = scene.at_time(matched.time)
-                    told = moves.columns(matched.places, rows, there.body.tree, there.frames)
-                    if told is not None:
-                        blocks[-1][:, moving] = told
+                    by_points = moves.columns(matched.places, rows, there.body.tree, there.frames)
+                    if by_points is not None:
+                        blocks[-1][:, moving] = by_points
             if closing is not None:
                 blocks.append(closing.whitened(state))
             out.append(np.concatenate(blocks))
         return out
 
-    def seen(self, theta: NDArray, states: Sequence[BodyState]) -> list[list[Seen]]:
-        """What every frame's sensors saw."""
+    def rows_of_frames(self, theta: NDArray, states: Sequence[BodyState]) -> list[list[FrameRows]]:
+        """Rows of every frame's measurements, with parameters (p,)."""
         world = self._worlds.at(theta)
         return [
             [
-                Seen(matched, self._rows((f, i), matched.sensor, matched, self._scene(world, f, state), world))
+                FrameRows(matched, self._rows((f, i), matched.sensor, matched, self._scene(world, f, state), world))
                 for i, matched in enumerate(self._matched[f])
             ]
             for f, state in enumerate(states)
@@ -214,34 +245,34 @@ class MatchedFrames:
     def _rows(
         self, key: tuple[int, int], sensor: str, matched: Matched, scene: Scene, world: World
     ) -> list[AnyRows]:
-        """Rows of one measurement; those of a world that differs in nothing that it can know of are not made again."""
-        kept = self._latest.get(key)
-        same = kept is not None and kept[0] is scene.state
-        if same and kept is not None and _alike(kept[1], world, sensor, matched.shows_surface):
-            return kept[2]
+        """Rows of one measurement; cached rows if the world differs only in parts on which they do not depend."""
+        cached = self._latest.get(key)
+        same = cached is not None and cached[0] is scene.state
+        if same and cached is not None and _same_for(cached[1], world, sensor, matched.shows_surface):
+            return cached[2]
         rows = rows_at(matched, scene)
         if not same:
             self._latest[key] = scene.state, world, rows
         return rows
 
     def _scene(self, world: World, frame: int, state: BodyState) -> Scene:
-        several = self._steps[frame]
+        measurements = self._steps[frame]
         velocity = None if self._velocities is None else self._velocities[frame]
-        time = several[0].time if self._times is None else self._times[frame]
+        time = measurements[0].time if self._times is None else self._times[frame]
         scene = self._worlds.scene(world, state)
-        return scene.at(state, time=time, velocity=velocity, measurements=several)
+        return scene.at(state, time=time, velocity=velocity, measurements=measurements)
 
 
 def point_moves(found: SubjectFit) -> PointMoves:
-    """How points and joints move with those parameters of a fit that move nothing else."""
+    """Derivatives of points and joints by those parameters of a fit that move nothing else."""
     worlds, step = Worlds(found.prior_world, found.parameters), stacked(found.parameters)[3]
     return worlds.moves(found.mean, step, np.flatnonzero(worlds.of_points))
 
 
 def closing_moves(found: SubjectFit, body: Body) -> ClosureMoves | None:
-    """How closures of a body move with the parameters of a fit, which may have known less of the body's gear.
+    """Derivatives of a body's closures by the parameters of a fit; None for a body without closures.
 
-    None for a body without closures.
+    The fitted body may have had fewer closures.
     """
     if not body.closures:
         return None
@@ -249,7 +280,9 @@ def closing_moves(found: SubjectFit, body: Body) -> ClosureMoves | None:
     return Worlds(world, found.parameters).closing(found.mean, stacked(found.parameters)[3])
 
 
-def _alike(a: World, b: World, sensor: str, of_surface: bool) -> bool:
-    """Whether a sensor's rows are the same in two worlds; those of a surface do not know of a body's points."""
-    same = a.body is b.body or (of_surface and all(getattr(a.body, p) is getattr(b.body, p) for p in _SURFACE))
+def _same_for(a: World, b: World, sensor: str, of_surface: bool) -> bool:
+    """Whether a sensor's rows are the same in two worlds; rows of a surface do not depend on the body's points."""
+    same = a.body is b.body or (
+        of_surface and all(getattr(a.body, name) is getattr(b.body, name) for name in _SURFACE_ATTRIBUTES)
+    )
     return same and a.rig is b.rig and a.values.get(sensor) == b.values.get(sensor)

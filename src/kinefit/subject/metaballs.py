@@ -1,4 +1,4 @@
-"""Radii and weights of metaballs: as parameters of a subject fit, and from points on one limb by themselves (P4-8)."""
+"""Radii and weights of metaballs: as parameters of a subject fit, or fitted to points on one limb (P4-8)."""
 
 from __future__ import annotations
 
@@ -19,39 +19,41 @@ from kinefit.solvers.equations import inverse
 from kinefit.solvers.least_squares import relax
 from kinefit.subject.parameters import World
 
-GIRTH = 0.2  # standard deviation of a radius' logarithm between people, as of cylinders' half axes
-_WEIGHT = 0.3  # and of a weight's
-_STEP = 1e-3
-_HUBER = 2.0  # standard deviations
-_ITERATIONS, _DONE = 30, 1e-6
-_REACH = 0.2  # [m] beyond which no foot of a point is sought
-_GONE = 0.2  # of the body's radius: a ball that is smaller has collapsed
+RADIUS_STD = 0.2
+"""Standard deviation of a radius' logarithm between people, as of cylinders' half axes."""
+_WEIGHT_STD = 0.3  # standard deviation of a weight's logarithm
+_STEP = 1e-3  # of finite differences
+_HUBER_SIGMAS = 2.0
+_MAX_ITERATIONS = 30
+_MIN_STEP = 1e-6  # in a logarithm: below it the fit has converged
+_MAX_POINT_DISTANCE = 0.2  # [m] of a point from the surface
+_MIN_RADIUS_RATIO = 0.2  # to the radius at the start: a smaller ball has collapsed
 
 ROUNDS = 30, (1, 5)
-"""Rounds, and `coarse`, with which `fit_subject` finds radii of metaballs: points are matched anew after every step.
-With several steps a round radii follow matches that the poses leave in the next, and end in another minimum: so did
-two of four arms."""
+"""Rounds and `coarse` with which `fit_subject` fits radii of metaballs: points are matched again after every step.
+With several steps in a round, radii adapt to matches that change with the poses in the next round. They end in another
+minimum, as in two of four arms."""
 
 
 @dataclass(frozen=True, eq=False)
 class MetaballShape:
-    """Logarithms of the radii of a body's metaballs, and of their weights where these are sought; limb by limb.
+    """Logarithms of the radii of a body's metaballs, and optionally of their weights, limb by limb.
 
     Parameters
     ----------
-    body : Body with metaballs.
-    weights : whether weights are sought too: sharper edges.
-    girth : standard deviation of a radius' logarithm.
+    body : Body with metaballs
+    weights : whether weights are fitted too: sharper edges
+    girth : standard deviation of a radius' logarithm
 
     Raises
     ------
     BodyError
-        A body without metaballs.
+        The body has no metaballs.
     """
 
     body: Body
     weights: bool = False
-    girth: float = GIRTH
+    girth: float = RADIUS_STD
 
     def __post_init__(self) -> None:
         if not self._limbs:
@@ -60,7 +62,7 @@ class MetaballShape:
 
     @cached_property
     def _limbs(self) -> tuple[tuple[int, Metaballs], ...]:
-        """Place among the surfaces, and the limb."""
+        """Number of the surface, and the limb, for all limbs of metaballs."""
         return tuple((k, s) for k, s in enumerate(self.body.surfaces) if isinstance(s, Metaballs))
 
     @property
@@ -75,7 +77,7 @@ class MetaballShape:
 
     @property
     def touches(self) -> tuple[frozenset[int], ...]:
-        """Of each parameter the segment that it changes."""
+        """(p,) for each parameter the segment that it changes."""
         each = [(limb.segment, len(limb.radii) * (3 + self.weights)) for _, limb in self._limbs]
         return tuple(frozenset((segment,)) for segment, count in each for _ in range(count))
 
@@ -86,17 +88,17 @@ class MetaballShape:
 
     @property
     def information(self) -> NDArray:
-        """(p, p)."""
-        std = [_WEIGHT if name.endswith("weight") else self.girth for name in self.names]
+        """(p, p) prior information."""
+        std = [_WEIGHT_STD if name.endswith("weight") else self.girth for name in self.names]
         return np.diag(np.array(std) ** -2.0)
 
     @property
     def step(self) -> NDArray:
-        """(p,)."""
+        """(p,) steps of finite differences."""
         return np.full(len(self.names), _STEP)
 
     def apply(self, world: World, values: NDArray) -> World:
-        """The body with these radii and weights."""
+        """The body with these logarithms (p,) of factors on radii and weights."""
         surfaces, first = list(world.body.surfaces), 0
         for k, _ in self._limbs:
             limb = surfaces[k]
@@ -108,7 +110,12 @@ class MetaballShape:
 
 
 def grown(limb: Metaballs, values: NDArray, *, weights: bool = False) -> Metaballs:
-    """A limb with the logarithms of factors on its radii (3 K,), and on its weights (K,) after them."""
+    """A limb with its radii and weights multiplied by factors.
+
+    Parameters
+    ----------
+    values : (3 K,) logarithms of factors on radii, with `weights` followed by (K,) on weights
+    """
     radii, w = _scaled(limb, values, weights)
     return limb.changed(radii, w if weights else None)
 
@@ -122,7 +129,7 @@ def _scaled(limb: Metaballs, values: NDArray, weights: bool) -> tuple[NDArray, N
 
 @lru_cache(maxsize=64)
 def _grown(limb: Metaballs, values: bytes, weights: bool) -> Metaballs:
-    """As `grown`: derivatives change one limb at a time, and the others need no new mesh."""
+    """As `grown`, cached: finite differences change one limb at a time, and the others need no new mesh."""
     return grown(limb, np.frombuffer(values), weights=weights)
 
 
@@ -133,8 +140,8 @@ class BallFit:
     Parameters
     ----------
     limb : Metaballs
-    std : (p,) standard deviations of the logarithms of radii (3 K), and weights (K) where they were sought.
-    rms : float [m] of the points' distances.
+    std : (p,) standard deviations of the logarithms of radii (3 K), and of weights (K) if fitted
+    rms : float [m] of the points' distances
     iterations : int
     """
 
@@ -145,25 +152,28 @@ class BallFit:
 
 
 def fit_balls(
-    limb: Metaballs, x: ArrayLike, sigma: ArrayLike, *, weights: bool = False, girth: float = GIRTH
+    limb: Metaballs, x: ArrayLike, sigma: ArrayLike, *, weights: bool = False, girth: float = RADIUS_STD
 ) -> BallFit:
-    """Radii, and weights, of the limb whose surface is nearest to points, by robust least squares.
+    """Fit radii, and optionally weights, of a limb to points on its surface by robust least squares (Huber).
 
-    A residual is the distance [m] of a point from where the field is 1/2, not the field itself as in P4, eq. 15
-    (`fit_field`). Its derivatives by radii and weights are exact: (∂F/∂p) / |∇F| at the nearest point of the surface.
-    Robust (Huber), with a prior of `girth` about the radii that the limb has.
+    A residual is the distance [m] of a point from the surface, where the field is 1/2. It is not the field itself as in
+    P4, eq. 15 (`fit_field`). Its derivatives by radii and weights are exact: (∂F/∂p) / |∇F| at the nearest point of the
+    surface.
 
     Parameters
     ----------
-    x : (N, 3) [m] in the segment's frame.
-    sigma : (N,) or one, [m] standard deviations.
+    limb : Metaballs, whose radii are the prior mean
+    x : (N, 3) [m] points in the segment's frame
+    sigma : (N,) or scalar, [m] standard deviations
+    weights : whether weights are fitted too
+    girth : prior standard deviation of a radius' logarithm, unitless
 
     Raises
     ------
     ObservationError
-        Fewer points than radii, points that are not finite.
+        Fewer points than parameters; points not of shape (N, 3) or not finite; standard deviations not above 0.
     BodyError
-        A ball that collapses: its radius falls below a fifth of what it was.
+        A ball collapses: its radius falls below a fifth of its start.
     """
     x = np.asarray(x, float)
     s = np.broadcast_to(np.asarray(sigma, float), len(x))
@@ -174,7 +184,7 @@ def fit_balls(
     prior = _prior(limb, weights, girth)
     theta, H, r, tried = _least_squares(
         lambda t: _distances(unmeshed(limb, t, weights), x, weights), np.zeros(count), prior, s**-2.0,
-        huber(_HUBER), limb.radii.size, np.log(_GONE), _ITERATIONS,
+        huber(_HUBER_SIGMAS), limb.radii.size, np.log(_MIN_RADIUS_RATIO), _MAX_ITERATIONS,
     )  # fmt: skip
     found = grown(limb, theta, weights=weights)
     return BallFit(found, np.sqrt(np.diag(np.linalg.inv(H + np.diag(prior)))), float(np.sqrt(np.mean(r * r))), tried)
@@ -184,25 +194,25 @@ def fit_field(
     limb: Metaballs, x: ArrayLike, sigma: ArrayLike, values: ArrayLike, *, weights: bool = False,
     girth: float = np.inf, loss: Loss = SQUARED, iterations: int = 1,
 ) -> tuple[NDArray, NDArray]:  # fmt: skip
-    """Radii, and weights, that minimise Σ p (F − 1/2)² over points (P4, eqs. 10, 14 and 15), poses held.
+    """Fit radii, and optionally weights, that minimise Σ p (F − 1/2)² over points (P4, eqs. 10, 14 and 15).
 
     F is the field of the limb at a point, and p = 1 / σ² (eq. 12). Its derivatives are exact. Steps are damped, and
-    at most 0.5 in a logarithm. As printed there is no prior, no robust loss and no bound: the defaults.
+    at most 0.5 in a logarithm. The defaults are as in the paper: no prior, no robust loss, no bound.
 
     Parameters
     ----------
-    x : (N, 3) [m] in the segment's frame.
-    sigma : (N,) or one, standard deviations of F at the points: no unit.
-    values : (p,) to start from: logarithms of factors on the limb's radii (3 K), then on its weights (K).
-    weights : whether weights are fitted too (eq. 14); radii alone otherwise (eq. 15).
-    girth : standard deviation of a prior on the radii's logarithms.
-    loss : Loss of residuals in standard deviations.
-    iterations : steps tried.
+    x : (N, 3) [m] points in the segment's frame
+    sigma : (N,) or scalar, standard deviations of F at the points, unitless
+    values : (p,) to start from: logarithms of factors on the limb's radii (3 K), then on its weights (K)
+    weights : whether weights are fitted too (eq. 14); radii alone otherwise (eq. 15)
+    girth : prior standard deviation of the radii's logarithms, unitless
+    loss : Loss of residuals in standard deviations
+    iterations : number of steps tried
 
     Returns
     -------
-    values : (p,) logarithms, as for `grown`.
-    std : (p,) their standard deviations.
+    values : (p,) logarithms, as for `grown`
+    std : (p,) their standard deviations
     """
     x, weight, start = np.asarray(x, float), np.asarray(sigma, float) ** -2.0, np.asarray(values, float)
     prior = _prior(limb, weights, girth)
@@ -214,16 +224,16 @@ def fit_field(
 
 
 def _prior(limb: Metaballs, weights: bool, girth: float) -> NDArray:
-    """(p,) inverse variances of the logarithms; weights have a prior where radii have one."""
-    of_weight = _WEIGHT if np.isfinite(girth) else np.inf
-    return np.repeat([girth, of_weight], [limb.radii.size, len(limb.weights) * weights]) ** -2.0
+    """(p,) inverse variances of the logarithms; weights have a prior if radii have one."""
+    weight_std = _WEIGHT_STD if np.isfinite(girth) else np.inf
+    return np.repeat([girth, weight_std], [limb.radii.size, len(limb.weights) * weights]) ** -2.0
 
 
 def _least_squares(
     residuals: Callable[[NDArray], tuple[NDArray, NDArray]], theta: NDArray, prior: NDArray, weight: NDArray,
     loss: Loss, radii: int, lowest: float, iterations: int,
 ) -> tuple[NDArray, NDArray, NDArray, int]:  # fmt: skip
-    """Levenberg-Marquardt on θ -> (J, r): where it ended, its normal matrix without the prior, r, steps tried."""
+    """Levenberg-Marquardt on θ -> (J, r): final θ, normal matrix without the prior, r, number of steps tried."""
 
     def normal(t: NDArray) -> tuple[NDArray, NDArray, float, NDArray]:
         J, r = residuals(t)
@@ -249,7 +259,7 @@ def _least_squares(
         H2, b2, cost2, r2 = normal(trial)
         if cost2 <= cost:
             theta, H, b, cost, r, damping = trial, H2, b2, cost2, r2, relax(damping)
-            if np.abs(step).max() < _DONE:
+            if np.abs(step).max() < _MIN_STEP:
                 break
         else:
             damping *= 10.0
@@ -259,25 +269,27 @@ def _least_squares(
 
 
 def unmeshed(limb: Metaballs, values: NDArray, weights: bool) -> Metaballs:
-    """As `grown`, with the old mesh: for its field alone."""
+    """As `grown` (values (p,)), but with the old mesh: faster if only the field is needed."""
     radii, w = _scaled(limb, values, weights)
     return replace(limb, radii=radii, weights=w)
 
 
 def _fields(limb: Metaballs, x: NDArray, weights: bool) -> tuple[NDArray, NDArray]:
-    """(N, p) derivatives of the field by the logarithms, and (N,) by how much it should grow: 1/2 − F."""
+    """(N, p) derivatives of the field by the logarithms, and (N,) residuals 1/2 − F."""
     d = limb.derivatives(x)
     J = (d.by_radii * limb.radii).reshape(len(x), -1)
     return np.concatenate([J, d.by_weights * limb.weights], axis=1) if weights else J, LEVEL - d.value
 
 
 def _distances(limb: Metaballs, x: NDArray, weights: bool) -> tuple[NDArray, NDArray]:
-    """(N, p) how far the surface moves outwards by the logarithms, and (N,) [m] how far it should."""
+    """(N, p) derivatives of the surface's outward motion by the logarithms, and (N,) [m] signed distances to points."""
     limbs, balls = pack_balls([limb.on(0)], np.zeros((1, 3)))
-    r, normal, found = np.full(len(x), _REACH), np.zeros((3, len(x))), np.full(len(x), -1)
-    here = np.concatenate([np.eye(3).ravel(), np.zeros(3)])[None]
-    limbs[:, 6] = np.inf  # the mesh, from which the sphere about a limb is taken, is that of other radii
-    nearest_on_metaballs(np.ascontiguousarray(x.T), here, limbs, balls, np.full(len(x), -1), r, normal, found)
+    r, normal, found = np.full(len(x), _MAX_POINT_DISTANCE), np.zeros((3, len(x))), np.full(len(x), -1)
+    segment_frame = np.concatenate([np.eye(3).ravel(), np.zeros(3)])[None]
+    limbs[:, 6] = np.inf  # no bounding sphere: it comes from the mesh, which has other radii
+    nearest_on_metaballs(
+        np.ascontiguousarray(x.T), segment_frame, limbs, balls, np.full(len(x), -1), r, normal, found
+    )
     feet = (x.T - np.where(found >= 0, r, 0.0) * normal).T
     slope = np.maximum(np.linalg.norm(limb.derivatives(feet).by_point, axis=1), 1e-9)
     return np.where(found >= 0, 1.0 / slope, 0.0)[:, None] * _fields(limb, feet, weights)[0], r

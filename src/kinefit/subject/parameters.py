@@ -1,7 +1,7 @@
-"""What a subject fit may find: parameters of a world, each kind of them a few lines.
+"""Parameters of a subject fit: kinds of unknowns of a world, each with a prior.
 
-A kind of parameter is a prior and a function from values to a world. Derivatives are differences, and no sensor
-knows of parameters: the solver compares the rows of the same correspondences in worlds that differ a little.
+A kind of parameters is a prior and a function from values to a world. Sensors do not depend on parameters. The solver
+differentiates numerically: it compares the rows of the same correspondences in slightly different worlds.
 """
 
 from __future__ import annotations
@@ -20,17 +20,20 @@ from kinefit.errors import BodyError, ObservationError, choices
 from kinefit.geometry.camera import Rig
 from kinefit.solvers.bundle.shape import PROPORTIONS, mirror_points
 
-UNKNOWN_SIZE, KNOWN_SIZE = 0.2, 0.02
-"""Standard deviation of the logarithm of a person's size, and of one whose stature is known (shoes, posture)."""
+UNKNOWN_SIZE_STD = 0.2
+"""Standard deviation of the logarithm of a person's size."""
 
-_MIDDLE = 0.002  # [m] standard deviation of a point in the middle to either side
-_STEP = 1e-4  # [m, rad, logarithm] from which derivatives are taken
-_BELIEF = 5.0  # measured coordinates for which a stated spread of places counts
+KNOWN_SIZE_STD = 0.02
+"""Standard deviation of the logarithm of a person's size if the stature is known: shoes, posture."""
+
+_MIDLINE_STD = 0.002  # [m] of a midline point to either side
+_STEP = 1e-4  # [m, rad, logarithm] of finite differences
+_PRIOR_COORDINATES = 5.0  # number of measured coordinates that the prior value of a spread counts as
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Everything that measurements are compared with, but for poses.
+    """Body, cameras and sensors' unknowns: all that measurements are compared with, except the poses.
 
     Parameters
     ----------
@@ -47,16 +50,19 @@ class World:
 class Parameters(Protocol):
     """One kind of parameters: names, a prior, and a function from values to a world.
 
-    It may have `of_points`, True where the values move nothing but points and joints of the body: derivatives of rows
-    of points then take no rows of other worlds. They take no other bodies either where it has `slopes(values, own,
-    name, segment, points, out)`: of points (K, 3) of a set by name, or of joints for None, on segments (K,), where its
-    body has them, it carries derivatives out (K, 3, p) by all parameters before it on, and adds its own in columns
-    `own`. It may have `touches`, of each parameter the segments on which alone rows can feel it.
+    Optional attributes make derivatives faster:
+
+    - `of_points`: True if the values move nothing but points and joints of the body. Rows of points then need no rows
+      of changed worlds.
+    - `slopes(values, own, name, segment, points, out)`: analytic derivatives, which need no changed bodies either.
+      `points` (K, 3) on segments (K,) are those of the set `name`, or joints for None, with the parameters applied. It
+      propagates derivatives `out` (K, 3, p) by all earlier parameters, and adds its own in columns `own`.
+    - `touches`: (p,) for each parameter the only segments whose rows depend on it.
     """
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(p,) names, each of one parameter."""
+        """(p,) unique names."""
         ...
 
     @property
@@ -83,16 +89,16 @@ class Parameters(Protocol):
 class SegmentScales:
     """Logarithms of the scales of a body's lengths: `Body.scale_groups`.
 
-    All follow the person's size, which is unknown by 20 %, or known by 2 % where `size` is given; each differs from it
-    by 5 % (`PROPORTIONS`), so that a length that nothing measures goes with those that something does.
+    All lengths follow the person's size, with a standard deviation of 20 %, or 2 % if `size` is given. Each length
+    differs from it by 5 % (`PROPORTIONS`), so an unmeasured length follows the measured ones.
 
     Parameters
     ----------
-    body : Body, of scales 1.
+    body : Body, of scales 1
     size : float, optional
-        Of the person, as a share of the body's, where the stature is known.
-    about : float, mean of an unknown size.
-    proportions : standard deviation of each length about the size.
+        Size of the person as a share of the body's, if the stature is known.
+    about : float, prior mean of an unknown size, as a share of the body's
+    proportions : standard deviation of the logarithm of each length about the size
     """
 
     body: Body
@@ -108,7 +114,7 @@ class SegmentScales:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(G,)."""
+        """(G,) names."""
         return tuple(f"length {name}" for name in self.body.scale_groups)
 
     @property
@@ -118,18 +124,18 @@ class SegmentScales:
 
     @property
     def information(self) -> NDArray:
-        """(G, G)."""
-        common = UNKNOWN_SIZE if self.size is None else KNOWN_SIZE
+        """(G, G) prior information of the logarithms."""
+        common = UNKNOWN_SIZE_STD if self.size is None else KNOWN_SIZE_STD
         return np.linalg.inv(np.eye(len(self.names)) * self.proportions**2 + common**2)
 
     @property
     def step(self) -> NDArray:
-        """(G,)."""
+        """(G,) steps of finite differences."""
         return np.full(len(self.names), _STEP)
 
     @cached_property
     def touches(self) -> tuple[frozenset[int] | None, ...]:
-        """Of each parameter the segments that it moves: its own, and all beyond; None where a skin joins segments."""
+        """(G,) for each parameter the segments that it moves: its own and all distal ones; None for a skinned body."""
         body, count = self.body, len(self.body.scale_groups)
         if body.skin is not None or body.morphs:
             return (None,) * count
@@ -141,20 +147,20 @@ class SegmentScales:
     def slopes(
         self, values: NDArray, own: slice, name: str | None, segment: NDArray, points: NDArray, out: NDArray
     ) -> None:
-        """Points stretch with the scale of their segment; see `Parameters`."""
+        """Points (K, 3) [m] scale with their segment; derivatives go to `out` (K, 3, p), see `Parameters`."""
         fixed, group = self.body.gear_scale, self.body.segment_scale[segment]
         out *= np.where(fixed, 1.0, np.exp(values))[group][:, None, None]
-        felt = np.flatnonzero(~fixed[group])
-        out[felt, :, own.start + group[felt]] += points[felt]
+        scaled = np.flatnonzero(~fixed[group])
+        out[scaled, :, own.start + group[scaled]] += points[scaled]
 
     def apply(self, world: World, values: NDArray) -> World:
-        """The body with these lengths; all its points, surfaces and morphs go along."""
+        """The body with these logarithms of scales (G,); its points, surfaces and morphs scale with it."""
         return replace(world, body=world.body.scaled(np.exp(values)))
 
 
 @dataclass(frozen=True, eq=False)
 class KnownLengths(SegmentScales):
-    """The same, as sure of each as an earlier fit was.
+    """Segment scales with the posterior of an earlier fit as prior.
 
     Parameters
     ----------
@@ -171,20 +177,25 @@ class KnownLengths(SegmentScales):
 
     @property
     def information(self) -> NDArray:
-        """(G, G)."""
+        """(G, G) prior information of the logarithms."""
         return np.linalg.inv(self.covariance)
 
 
 @dataclass(frozen=True, eq=False)
 class PointOffsets:
-    """Shifts [m] of a detector's keypoints or of markers from their places on the body, along their segment's axes.
+    """Landmark offsets [m] of a detector's keypoints or of markers, along their segment's axes.
 
     Parameters
     ----------
-    body : Body, whose set it is.
-    name : of a keypoint set or of a marker set.
-    std : scalar or (K,) [m] standard deviation of each point, along each axis.
-    mirror : whether left and right points are shifted alike; by default those of keypoint sets are.
+    body : Body that has the set
+    name : of a keypoint set or marker set
+    std : scalar or (K,) [m] prior standard deviation of each point, along each axis
+    mirror : whether left and right points share an offset, mirrored; default: True for keypoint sets
+
+    Raises
+    ------
+    BodyError
+        The body lacks the set; standard deviations of another shape, or not above 0.
     """
 
     body: Body
@@ -204,12 +215,12 @@ class PointOffsets:
 
     @property
     def points(self) -> PointSet:
-        """The K points where the body has them."""
+        """The K points at the body's own places."""
         return {**self.body.marker_sets, **self.body.keypoint_sets}[self.name]
 
     @cached_property
     def _shared(self) -> tuple[NDArray, NDArray, NDArray]:
-        """For each point the point that leads it, and the sign of its z; then all leaders."""
+        """For each point the number of the point whose offset it shares and the sign of its z; then those numbers."""
         count = len(self.points)
         lead, sign = np.arange(count), np.ones(count)
         if self.mirror if self.mirror is not None else self.name in self.body.keypoint_sets:
@@ -218,7 +229,7 @@ class PointOffsets:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(3 L,) of the L points that lead."""
+        """(3 L,) names, of L points with offsets of their own."""
         return tuple(f"{self.name} {self.points.names[k]} {axis}" for k in self._shared[2] for axis in "xyz")
 
     @property
@@ -231,17 +242,17 @@ class PointOffsets:
         """(3 L, 3 L) [1/m²]."""
         _, sign, leaders = self._shared
         std = np.repeat(np.broadcast_to(np.asarray(self.std, float), len(self.points))[leaders], 3)
-        std[3 * np.flatnonzero(sign[leaders] == 0.0) + 2] = _MIDDLE
+        std[3 * np.flatnonzero(sign[leaders] == 0.0) + 2] = _MIDLINE_STD
         return np.diag(std**-2)
 
     @property
     def step(self) -> NDArray:
-        """(3 L,)."""
+        """(3 L,) [m] steps of finite differences."""
         return np.full(len(self.names), _STEP)
 
     @property
     def touches(self) -> tuple[frozenset[int], ...]:
-        """Of each parameter the segments of the points that it shifts."""
+        """(3 L,) for each parameter the segments of the points that it moves."""
         lead, _, leaders = self._shared
         on = [frozenset(int(s) for s in self.points.segments[lead == k]) for k in leaders]
         return tuple(segments for segments in on for _ in "xyz")
@@ -249,7 +260,7 @@ class PointOffsets:
     def slopes(
         self, values: NDArray, own: slice, name: str | None, segment: NDArray, points: NDArray, out: NDArray
     ) -> None:
-        """Points of this set move along their segment's axes; see `Parameters`."""
+        """Points (K, 3) [m] of this set move along their segment's axes; `out` (K, 3, p), see `Parameters`."""
         if name == self.name:
             lead, sign, leaders = self._shared
             k, first = np.arange(len(points)), own.start + 3 * np.searchsorted(leaders, lead)
@@ -257,18 +268,18 @@ class PointOffsets:
                 out[k, axis, first + axis] += way
 
     def shifts(self, values: NDArray) -> NDArray:
-        """(K, 3) [m] of all points, mirrored where they share."""
+        """(K, 3) [m] offsets of all points from values (3 L,) [m], shared ones mirrored."""
         lead, sign, leaders = self._shared
         out = np.asarray(values, float).reshape(-1, 3)[np.searchsorted(leaders, lead)].copy()
         out[:, 2] *= np.where(sign == 0.0, 1.0, sign)
         return out
 
     def values_of(self, shifts: NDArray) -> NDArray:
-        """(3 L,) of shifts (K, 3) [m] of all points; mirror images are left to those that lead them."""
+        """(3 L,) [m] values of offsets (K, 3) [m] of all points; a shared offset is that of its first point."""
         return np.asarray(shifts, float)[self._shared[2]].ravel()
 
     def apply(self, world: World, values: NDArray) -> World:
-        """The body with its points shifted."""
+        """The body with its points moved by offsets (3 L,) [m]."""
         body = world.body
         if self.name in body.keypoint_sets:
             old = body.keypoints(self.name)
@@ -279,36 +290,36 @@ class PointOffsets:
 
 
 def place_spread(moved: NDArray, variance: NDArray, spread: ArrayLike, believed: float) -> float:
-    """Standard deviation of how far points stand from their places on a body, as MacKay (1992) finds a prior's width.
+    """Estimate the prior standard deviation of landmark offsets from a fit, by evidence maximisation (MacKay 1992).
 
     Parameters
     ----------
-    moved, variance : (p,) [m], [m²] found with the prior standard deviation `spread`, and how certain that is
+    moved, variance : (p,) [m], [m²] posterior mean and variance of offsets, with the prior standard deviation `spread`
     spread : scalar or (p,) [m] prior standard deviation
-    believed : [m] the same before a take is seen, which counts as much as five coordinates that a take measures
+    believed : [m] value of the estimate without data; it counts as much as five measured coordinates
 
     All may be in any other unit, such as the standard deviation of each point.
     """
     measured = float(np.sum(np.maximum(1.0 - variance / np.square(spread), 0.0)))
-    return float(np.sqrt((np.sum(moved**2) + _BELIEF * believed**2) / (measured + _BELIEF)))
+    return float(np.sqrt((np.sum(moved**2) + _PRIOR_COORDINATES * believed**2) / (measured + _PRIOR_COORDINATES)))
 
 
 def stacked(parameters: Sequence[Parameters]) -> tuple[tuple[str, ...], NDArray, NDArray, NDArray]:
-    """Names, mean (p,), information (p, p) and steps (p,) of several kinds together.
+    """Names, mean (p,), information (p, p) and steps (p,) of several kinds, concatenated.
 
     Raises
     ------
     ObservationError
         No parameters, or two of one name.
     """
-    names = tuple(name for one in parameters for name in one.names)
+    names = tuple(name for kind in parameters for name in kind.names)
     twice = sorted({name for name in names if names.count(name) > 1})
     if not names or twice:
         problem = f"two parameters named '{twice[0]}'" if twice else "no parameters to fit"
         raise ObservationError(problem, remedy="Give every kind of parameter once, such as SegmentScales(body).")
     information, first = np.zeros((len(names), len(names))), 0
-    for one in parameters:
-        own = slice(first, first := first + len(one.names))
-        information[own, own] = one.information
-    mean, step = (np.concatenate([getattr(one, what) for one in parameters]) for what in ("mean", "step"))
+    for kind in parameters:
+        own = slice(first, first := first + len(kind.names))
+        information[own, own] = kind.information
+    mean, step = (np.concatenate([getattr(kind, name) for kind in parameters]) for name in ("mean", "step"))
     return names, mean, information, step

@@ -1,7 +1,7 @@
-"""How points of a body move with parameters: derivatives of rows of points, without the rows of other worlds.
+"""Derivatives of rows of points by parameters, without making rows of changed worlds.
 
-A row of a point feels the body by where the point sits in its segment and where joints sit in their parents'. Both do
-not depend on the pose: their derivatives are taken once for all frames.
+A row of a point depends on the body through the point's place in its segment and the joints' places in their parents.
+Neither depends on the pose, so their derivatives are computed once for all frames.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from kinefit.rows import Rows
 from kinefit.solvers import _kernels_border
 
 Place = tuple[str, str]
-"""A set of points and a name in it; landmarks are in the set ""."""
+"""Name of a set of points, and of a point in it; landmarks are in the set ""."""
 
 
 Slopes = Callable[[NDArray, slice, str | None, NDArray, NDArray, NDArray], None]
-"""Of a kind of parameters, see `Parameters`."""
+"""Analytic derivatives of a kind of parameters, see `Parameters`."""
 
 
 class PointMoves:
-    """Derivatives of a body's points and joints by some parameters that move nothing else.
+    """Derivatives of a body's points and joints by q parameters that move nothing else.
 
     Parameters
     ----------
-    body : Body there
-    joints : (S, 3, q) derivatives of every joint in its parent
-    of_set : of the name of a set, derivatives (K, 3, q) of its points in their segments
+    body : Body at the parameters
+    joints : (S, 3, q) derivatives of every joint in its parent's frame
+    of_set : name of a set -> derivatives (K, 3, q) of its points in their segments' frames
     """
 
     def __init__(self, body: Body, joints: NDArray, of_set: Callable[[str], NDArray]) -> None:
@@ -38,21 +38,21 @@ class PointMoves:
         self._chosen: dict[int, tuple[Sequence[Place], NDArray | None]] = {}
 
     @classmethod
-    def told(
+    def from_slopes(
         cls, body: Body, made: Sequence[tuple[Slopes, NDArray, slice, Body]], some: NDArray, count: int
     ) -> PointMoves:
-        """By what kinds of parameters tell of themselves.
+        """Analytic derivatives, from the slopes of each kind of parameters.
 
         Parameters
         ----------
-        made : of each kind in turn its slopes, values, columns, and the body that it made
-        some : (q,) the parameters that columns are wanted of, out of `count`
+        made : for each kind, in order of application: its slopes, values, columns, and the body with them applied
+        some : (q,) int, the parameters to derive by, out of `count`
         """
 
         def slopes(name: str | None, segment: NDArray, points: Callable[[Body], NDArray]) -> NDArray:
             out = np.zeros((len(segment), 3, count))
-            for tell, values, own, there in made:
-                tell(values, own, name, segment, points(there), out)
+            for add_slopes, values, own, applied in made:
+                add_slopes(values, own, name, segment, points(applied), out)
             return out[:, :, some]
 
         def of_set(name: str) -> NDArray:
@@ -61,18 +61,18 @@ class PointMoves:
         return cls(body, slopes(None, np.maximum(body.tree.parents, 0), lambda b: b.tree.offsets), of_set)
 
     @classmethod
-    def between(
+    def from_differences(
         cls, pairs: Sequence[tuple[list[int], Body, Body]], some: NDArray, steps: NDArray,
         touches: Sequence[frozenset[int] | None],
     ) -> PointMoves:  # fmt: skip
-        """By differences between bodies.
+        """Numeric derivatives, from differences between bodies.
 
         Parameters
         ----------
-        pairs : parameters that change together, and bodies a step below and above in them
-        some : (q,) the parameters that columns are wanted of
-        steps : (p,)
-        touches : (p,) of each parameter the segments that it moves, or whose points; None for any
+        pairs : parameters that change together, and bodies one step below and above in them
+        some : (q,) int, the parameters to derive by
+        steps : (p,) of the parameters
+        touches : (p,) for each parameter the segments that it moves, or whose points; None for any
         """
         body, column = pairs[0][1], {int(k): j for j, k in enumerate(some)}
 
@@ -90,12 +90,13 @@ class PointMoves:
         return cls(body, joints, lambda name: slopes(lambda b: _points(b, name).points, _points(body, name).segments))
 
     def columns(self, places: Sequence[Place], rows: Rows, tree: KinematicTree, frames: NDArray) -> NDArray | None:
-        """(N, q) how far the points of rows move along their directions, whitened; None where a point is not known.
+        """(N, q) whitened derivatives of rows of points; None if the body lacks one of the points.
 
         Parameters
         ----------
-        places : of the points that rows number by group; not to be changed
-        tree, frames : of the body, and (S, 12) of its segments
+        places : of the points, in the order of the rows' groups; the list must not change between calls
+        tree : of the body
+        frames : (S, 12) rotation and origin of each segment in the world
         """
         moves = self._of(places)
         if moves is None:
@@ -106,7 +107,7 @@ class PointMoves:
         return out
 
     def joints(self, tree: KinematicTree, frames: NDArray) -> NDArray:
-        """(S, 3, q) how joint centres move in the world, the pose as it is."""
+        """(S, 3, q) derivatives of the joint centres in the world, for a fixed pose; frames (S, 12) of the segments."""
         out = np.empty(self._joints.shape)
         _kernels_border.joint_columns(tree.parents, frames, self._joints, out)
         return out
@@ -130,7 +131,7 @@ class PointMoves:
 
 
 def _points(body: Body, name: str) -> PointSet:
-    """A set of points of a body; landmarks for no name."""
+    """The set of points of this name; landmarks for an empty name."""
     if not name:
         return body.landmarks
     return body.marker_sets[name] if name in body.marker_sets else body.keypoints(name)

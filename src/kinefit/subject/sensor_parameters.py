@@ -1,4 +1,4 @@
-"""Parameters of the measuring side: where cameras stand, and what sensors do not know of themselves."""
+"""Parameters of cameras and sensors: extrinsics, frames and clocks, and a sensor's own unknowns."""
 
 from __future__ import annotations
 
@@ -21,31 +21,38 @@ from kinefit.solvers import _kernels_border
 from kinefit.solvers.equations import inverse
 from kinefit.subject.parameters import World, place_spread
 
-FAR_OFF = 3.0
-"""Standard deviations of its calibration: one of 24 numbers is so far off in 6 % of takes."""
+OUTLIER_SIGMAS = 3.0
+"""Standard deviations of a camera's calibration: one of 24 numbers is farther off in 6 % of takes."""
 
-_WRONG = 2.0  # times its calibration's standard deviations, found of a camera, from which on it is moved
-_ROUNDS = 30  # of spreads and moves in turn; the slowest change by less than a hundredth from then on
-_STEP = 1e-4  # [m, rad] from which derivatives are taken
-_HELD = 1e4  # times the information that single cameras have, of their common motion where it means nothing
+_MIN_WRONG_FACTOR = 2.0  # estimated over stated standard deviations of a camera: above it the calibration is wrong
+_ROUNDS = 30  # of alternating spreads and moves; the slowest change by less than a hundredth from then on
+_STEP = 1e-4  # [m, rad] of finite differences
+_GAUGE_FACTOR = 1e4  # of information of the cameras' common motion over that of single cameras, where it is a gauge
 
 
 @dataclass(frozen=True, eq=False)
 class CameraExtrinsics:
-    """Six parameters a camera: the twist (v, ω) [m, rad] of its pose, in its own frame.
+    """Extrinsics of cameras: six parameters each, the twist (v, ω) [m, rad] of the pose in the camera's own frame.
 
-    Cameras and bodies may move together unseen. So one camera is the gauge, and stays; or none, where other sensors
-    such as markers know where the world is.
+    No measurement of cameras observes a common motion of cameras and bodies. So one camera is the gauge and stays, or
+    none if other sensors, such as markers, measure in the world.
 
     Parameters
     ----------
-    rig : Rig, from which twists count.
-    held : name of the camera that stays; None where other sensors hold the world.
-    std : (2,) standard deviations of v [m] and ω [rad].
-    cameras : names of those that move, besides the one that is held; default: all.
-    factors : (C,) of each camera that moves, on its standard deviations; default 1, see `with_errors_of`.
-    calibrated : Rig, the prior mean; default: `rig`.
-    own_world : bool, the mean motion of all cameras is held: the world is theirs, nothing else measures it.
+    rig : Rig, at zero twists
+    held : name of the camera that stays; None if other sensors constrain the world
+    std : (2,) standard deviations of v [m] and ω [rad]
+    cameras : names of the cameras that move, besides `held`; default: all
+    factors : (C,) for each camera that moves, on its standard deviations; default: 1, see `with_errors_of`
+    calibrated : Rig, the prior mean; default: `rig`
+    own_world : bool, whether the mean motion of all cameras is the gauge: nothing else measures in the world
+
+    Raises
+    ------
+    ObservationError
+        A standard deviation is not above 0.
+    CalibrationError
+        The rig lacks a camera.
     """
 
     rig: Rig
@@ -67,7 +74,15 @@ class CameraExtrinsics:
         cls, errors: CameraErrors, rig: Rig, cameras: tuple[str, ...], factors: NDArray | None = None,
         calibrated: Rig | None = None,
     ) -> CameraExtrinsics:  # fmt: skip
-        """Of cameras that stand where a calibration of these errors has them; none is held."""
+        """Parameters of cameras whose calibration has these errors; none of them is the gauge.
+
+        Parameters
+        ----------
+        errors : standard deviations of position [m] and direction [rad]
+        cameras : names of the C cameras that move
+        factors : (C,) on the standard deviations, see `with_errors_of`
+        calibrated : Rig, the prior mean; default: `rig`
+        """
         return cls(rig, None, (errors.position, errors.direction), cameras, factors, calibrated, errors.own_world)
 
     @property
@@ -78,23 +93,23 @@ class CameraExtrinsics:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(6 C,)."""
+        """(6 C,) names."""
         return tuple(f"{camera} {axis}" for camera in self.free for axis in ("tx", "ty", "tz", "rx", "ry", "rz"))
 
     @property
     def mean(self) -> NDArray:
-        """(6 C,) with which the cameras stand as their calibration has them."""
+        """(6 C,) [m, rad] prior mean: the twists to the calibrated poses."""
         return np.zeros(len(self.names)) if self.calibrated is None else self.values_of(self.calibrated)
 
     @property
     def information(self) -> NDArray:
-        """(6 C, 6 C)."""
+        """(6 C, 6 C) prior information."""
         own = np.diag(self.spreads.ravel() ** -2.0)
         if not (self.own_world and self.free):
             return own
-        together = own @ np.concatenate([se3.adjoint(self.rig[name].T_camera_world) for name in self.free])
-        common = together.T @ (together / np.diag(own)[:, None])
-        return own + _HELD * together @ np.linalg.solve(common, together.T)
+        joint = own @ np.concatenate([se3.adjoint(self.rig[name].T_camera_world) for name in self.free])
+        common = joint.T @ (joint / np.diag(own)[:, None])
+        return own + _GAUGE_FACTOR * joint @ np.linalg.solve(common, joint.T)
 
     @property
     def spreads(self) -> NDArray:
@@ -106,20 +121,20 @@ class CameraExtrinsics:
         return np.ones(len(self.free)) if self.factors is None else np.asarray(self.factors, float)
 
     def tighter(self, share: float) -> CameraExtrinsics:
-        """The same, held with so large a share of the standard deviations."""
+        """The same cameras with standard deviations multiplied by `share`, a number above 0."""
         return replace(self, factors=share * self._times)
 
     def with_errors_of(self, own: slice, moved: NDArray, information: NDArray, prior: NDArray) -> CameraExtrinsics:
-        """The same cameras with standard deviations as large as a take shows that their errors are.
+        """The same cameras with standard deviations estimated from a fit.
 
-        A multiple of the stated ones is found for all cameras together, and one for each that is drawn towards it; a
-        camera that is off by far beside the others says nothing of these. See `place_spread`.
+        One factor is estimated for all cameras, and one for each camera with the common factor as prior. A camera far
+        more off than the others does not count for the common factor. See `place_spread`.
 
         Parameters
         ----------
-        own : which of the p parameters of a fit are these cameras'
-        moved : (p,) found, from the prior means
-        information, prior : (p, p) of the sensors, and that with which it was found
+        own : slice of these cameras' parameters among the fit's p
+        moved : (p,) estimates minus prior means
+        information, prior : (p, p) of the sensors, and of the prior of that fit
         """
         out, prior, pull = self, prior.copy(), (information + prior) @ moved
         for _ in range(_ROUNDS):
@@ -129,44 +144,44 @@ class CameraExtrinsics:
         return out
 
     def _with_spreads_of(self, moved: NDArray, variance: NDArray) -> CameraExtrinsics:
-        """One round of it: from where cameras (6 C,) were found with the present standard deviations."""
+        """One round: factors from mean and variance (6 C,) of the cameras with the present standard deviations."""
         stated = np.repeat(self.std, 3)
-        of = np.stack([moved.reshape(-1, 6) / stated, variance.reshape(-1, 6) / stated**2, self.spreads / stated])
+        m, v, s = moved.reshape(-1, 6) / stated, variance.reshape(-1, 6) / stated**2, self.spreads / stated
 
-        def spread(which: Any, believed: float) -> float:
-            return place_spread(of[0, which], of[1, which], of[2, which], believed)
+        def spread(cameras: Any, believed: float) -> float:
+            return place_spread(m[cameras], v[cameras], s[cameras], believed)
 
-        each = np.array([spread(c, 1.0) for c in range(of.shape[1])])
-        common = spread(each <= FAR_OFF * max(float(np.median(each)), 1.0), 1.0)
-        return replace(self, factors=np.array([spread(c, common) for c in range(of.shape[1])]))
+        each = np.array([spread(c, 1.0) for c in range(len(m))])
+        common = spread(each <= OUTLIER_SIGMAS * max(float(np.median(each)), 1.0), 1.0)
+        return replace(self, factors=np.array([spread(c, common) for c in range(len(m))]))
 
     @property
     def wrong(self) -> bool:
-        """Whether a camera is farther off than its calibration says; two cameras do not tell which of them it is."""
-        return len(self.free) > 2 and float(self._times.max()) > _WRONG
+        """Whether a camera's calibration is wrong; always False for two cameras, where it could be either of them."""
+        return len(self.free) > 2 and float(self._times.max()) > _MIN_WRONG_FACTOR
 
     @property
     def step(self) -> NDArray:
-        """(6 C,)."""
+        """(6 C,) [m, rad] steps of finite differences."""
         return np.full(len(self.names), _STEP)
 
     def apply(self, world: World, values: NDArray) -> World:
-        """The rig with its cameras moved."""
+        """The world with cameras moved by twists (6 C,) [m, rad]."""
         twist = dict(zip(self.free, np.asarray(values, float).reshape(-1, 6)))
         return replace(world, rig=moved_rig(world.rig, twist))
 
     def values_of(self, rig: Rig) -> NDArray:
-        """(6 C,) with which the cameras stand as in another rig."""
-        there = [rig[name].T_camera_world @ se3.inverse(self.rig[name].T_camera_world) for name in self.free]
-        return np.concatenate([np.zeros(0), *(se3.log(T) for T in there)])
+        """(6 C,) [m, rad] twists from `self.rig` to the poses in another rig."""
+        moves = [rig[name].T_camera_world @ se3.inverse(self.rig[name].T_camera_world) for name in self.free]
+        return np.concatenate([np.zeros(0), *(se3.log(T) for T in moves)])
 
     def columns(self, rows: Rows, rig: Rig, camera: NDArray) -> NDArray:
-        """(N, 6 C) how far the points of rows move along their directions with the cameras that see them, whitened.
+        """(N, 6 C) whitened derivatives of rows by the poses of the cameras that measured them.
 
         Parameters
         ----------
         rig : Rig, near the prior's
-        camera : (N,) number in the rig of the camera that sees each row's point; none for no rows through cameras
+        camera : (N,) number in the rig of each row's camera; empty if the rows come from no camera
         """
         out = np.zeros((len(rows), 6 * len(self.free)))
         if not len(camera):
@@ -178,13 +193,13 @@ class CameraExtrinsics:
         return out
 
 
-def alike(a: Rig, b: Rig) -> bool:
-    """Whether two rigs are of the same cameras in the same places."""
+def same_cameras(a: Rig, b: Rig) -> bool:
+    """Whether two rigs have the same cameras with the same poses."""
     return a.names == b.names and all(np.array_equal(c.T_camera_world, d.T_camera_world) for c, d in zip(a, b))
 
 
 def moved_rig(rig: Rig, twists: Mapping[str, ArrayLike]) -> Rig:
-    """The rig with some cameras, by name, moved by twists (6,) (v, ω) [m, rad] in their own frames."""
+    """The rig with some cameras moved: {camera: twist (6,) (v, ω) [m, rad] in the camera's own frame}."""
     return Rig(tuple(
         c.with_pose(se3.exp(np.asarray(twists[c.name], float)) @ c.T_camera_world) if c.name in twists else c
         for c in rig
@@ -193,15 +208,20 @@ def moved_rig(rig: Rig, twists: Mapping[str, ArrayLike]) -> Rig:
 
 @dataclass(frozen=True, eq=False)
 class SensorFrames:
-    """Seven parameters a sensor: how its frame lies in the world, and its clock; of `Displaced` measurements.
+    """Pose of a sensor's frame in the world and its clock offset, of `Displaced` measurements: seven parameters each.
 
-    Something else must hold the world, such as keypoints of calibrated cameras.
+    Other sensors must constrain the world, such as keypoints of calibrated cameras.
 
     Parameters
     ----------
-    sensors : names
-    std : (3,) standard deviations of the shift [m] of a frame's origin, of its turn [rad] and of its clock [s].
-    arms : {sensor: (3,) [m]} from the centre about which its frame turns to that origin; default: it is the centre.
+    sensors : names of S sensors
+    std : (3,) standard deviations of a frame's translation [m], its rotation [rad] and its clock offset [s]
+    arms : {sensor: (3,) [m]} from the centre of the frame's rotation to its origin; default: zero
+
+    Raises
+    ------
+    ObservationError
+        A standard deviation is not above 0.
     """
 
     sensors: tuple[str, ...]
@@ -214,7 +234,7 @@ class SensorFrames:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(7 S,)."""
+        """(7 S,) names."""
         return tuple(f"{sensor} {what}" for sensor in self.sensors for what in (*AXES, CLOCK))
 
     @property
@@ -224,7 +244,7 @@ class SensorFrames:
 
     @property
     def information(self) -> NDArray:
-        """(7 S, 7 S)."""
+        """(7 S, 7 S) prior information."""
         out = np.zeros((len(self.names), len(self.names)))
         for k, sensor in enumerate(self.sensors):
             A = np.eye(7)
@@ -234,11 +254,11 @@ class SensorFrames:
 
     @property
     def step(self) -> NDArray:
-        """(7 S,)."""
+        """(7 S,) steps of finite differences."""
         return np.full(len(self.names), _STEP)
 
     def apply(self, world: World, values: NDArray) -> World:
-        """The world with the sensors' frames there."""
+        """The world with sensors' frames and clocks of these values (7 S,) [m, rad, s]."""
         own = np.asarray(values, float).reshape(-1, 7)
         frames = {s: dict(zip((*AXES, CLOCK), row.tolist())) for s, row in zip(self.sensors, own)}
         return replace(world, values={**world.values, **frames})
@@ -246,7 +266,7 @@ class SensorFrames:
 
 @dataclass(frozen=True, eq=False)
 class OwnUnknowns:
-    """What sensors do not know of themselves: a rope's length, a clock's delay; `Sensor.unknowns`.
+    """Unknowns of sensors, such as a rope's length or a clock's delay: `Sensor.unknowns`.
 
     Parameters
     ----------
@@ -255,7 +275,7 @@ class OwnUnknowns:
     Raises
     ------
     ObservationError
-        No mapping, a mean that is not finite, a standard deviation that is not positive.
+        `unknowns` is no mapping; a mean is not finite; a standard deviation is not positive.
     """
 
     unknowns: Mapping[str, Mapping[str, Unknown]]
@@ -270,7 +290,7 @@ class OwnUnknowns:
 
     @classmethod
     def of(cls, sensors: Iterable[Sensor]) -> OwnUnknowns:
-        """Of all sensors that have some."""
+        """Unknowns of all sensors that have some."""
         return cls({s.name: dict(s.unknowns) for s in sensors if s.unknowns})
 
     @property
@@ -279,26 +299,26 @@ class OwnUnknowns:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(p,)."""
+        """(p,) names."""
         return tuple(f"{sensor} {name}" for sensor, name, _ in self._each)
 
     @property
     def mean(self) -> NDArray:
-        """(p,)."""
+        """(p,) prior mean, each in its own unit."""
         return np.array([u.mean for _, _, u in self._each])
 
     @property
     def information(self) -> NDArray:
-        """(p, p)."""
+        """(p, p) prior information."""
         return np.diag([u.std**-2 for _, _, u in self._each])
 
     @property
     def step(self) -> NDArray:
-        """(p,) a thousandth of each standard deviation."""
+        """(p,) steps of finite differences: a thousandth of each standard deviation."""
         return np.array([1e-3 * u.std for _, _, u in self._each])
 
     def apply(self, world: World, values: NDArray) -> World:
-        """The world with these values."""
+        """The world with these values (p,) of the unknowns."""
         out = {sensor: dict(own) for sensor, own in world.values.items()}
         for (sensor, name, _), value in zip(self._each, values, strict=True):
             out.setdefault(sensor, {})[name] = float(value)

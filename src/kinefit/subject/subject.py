@@ -1,4 +1,4 @@
-"""Who is seen: the records of a person that fits leave."""
+"""Records of a fitted person: `Subject`, `SubjectFit`, and combinations of parameters left unmeasured."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from kinefit.solvers.equations import inverse
 from kinefit.subject.parameters import Parameters, World
 from kinefit.subject.sensor_parameters import CameraExtrinsics
 
-TOLD = 0.1
+MIN_MEASURED_SHARE = 0.1
 """Share of the prior's variance that data must explain for a direction to count as measured."""
 
 Progress = Callable[[str, int, int], None]
-"""(what is done, how many of it, of how many)."""
+"""Called with the name of the work, the number of steps done and the number of all steps."""
 
 
 @dataclass(frozen=True, eq=False)
 class Unmeasured:
-    """A combination of parameters that the prior alone holds.
+    """A combination of parameters that the prior alone constrains.
 
     Parameters
     ----------
-    direction : (p,) in prior standard deviations, of length 1.
-    share : of the prior's variance in it that data explain, below `TOLD`.
-    names : of the parameters that make up most of it, the largest first.
+    direction : (p,) unit vector, in prior standard deviations
+    share : of the prior's variance along it that data explain, below `MIN_MEASURED_SHARE`
+    names : of its largest parameters, the largest first
     """
 
     direction: NDArray
@@ -43,22 +43,22 @@ class Unmeasured:
 
 @dataclass(frozen=True, eq=False)
 class SubjectFit:
-    """A person, cameras and sensors as a fit found them.
+    """Fitted person, cameras and sensors.
 
     Parameters
     ----------
-    body, rig, values : the world that was found; see `World`.
-    names, mean : (p,) of the parameters.
-    covariance : (p, p) posterior, with the poses unknown and an excess above 1 counted.
-    states : K poses, refined along.
-    information : (p, p) what the sensors measure, without the prior, an excess above 1 counted.
+    body, rig, values : the fitted world, see `World`
+    names, mean : (p,) names and estimates of the parameters
+    covariance : (p, p) posterior with the poses marginalised, inflated by an excess above 1
+    states : K fitted poses
+    information : (p, p) of the sensors without the prior, deflated by an excess above 1
     prior : Prior
-    excess : {sensor: factor} by which what its frames measure together is less certain than its rows say; more certain
-        below 1.
+    excess : {sensor: factor} by which the variance of all its frames together exceeds that of its rows, see
+        `excess.excess`
     cost : float
     rounds : of match and solve
-    parameters : the kinds of them
-    prior_world : the world that they apply to
+    parameters : kinds of parameters
+    prior_world : the world to which they apply
     """
 
     body: Body
@@ -78,13 +78,13 @@ class SubjectFit:
 
     @cached_property
     def unmeasured(self) -> tuple[Unmeasured, ...]:
-        """Directions of which data explain less than a tenth of the prior's variance, the least measured first."""
+        """Directions along which data explain less than a tenth of the prior's variance, the least measured first."""
         root = np.linalg.cholesky(inverse(self.prior.information))
         values, vectors = np.linalg.eigh(root.T @ self.information @ root)
         out = []
         for value, vector in zip(values, vectors.T):
             share = max(float(value), 0.0) / (1.0 + max(float(value), 0.0))
-            if share < TOLD:
+            if share < MIN_MEASURED_SHARE:
                 moved = np.abs(root @ vector) / np.sqrt(np.diag(root @ root.T))
                 largest = [k for k in np.argsort(-moved) if moved[k] > 0.3 * moved.max()]
                 out.append(Unmeasured(vector, share, tuple(self.names[k] for k in largest)))
@@ -97,11 +97,11 @@ class SubjectFit:
 
     @property
     def cameras(self) -> CameraExtrinsics | None:
-        """The parameters of cameras, where they were sought."""
+        """The parameters of cameras; None if the fit had none."""
         return next((p for p in self.parameters if isinstance(p, CameraExtrinsics)), None)
 
     def value(self, name: str) -> tuple[float, float]:
-        """A parameter by name: its estimate and standard deviation.
+        """Estimate and standard deviation of the parameter of this name, in its own unit.
 
         Raises
         ------
@@ -116,12 +116,18 @@ class SubjectFit:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A body fitted to a person: lengths (G,) as `scales` of the generic one, and the detectors' points on it.
+    """A body fitted to a person: its lengths and the landmark offsets of the detectors' keypoints.
 
-    `fit` is the fit of keypoints that it came from, `covariance` (p, p) how sure each of its parameters is, logarithms
-    of the scales first; both None for a body that was given. `length_share` (G,) is each scale's standard deviation
-    over it, where other sensors gave it. `sets` are the detectors' keypoint sets that it was found from, `view_bias`
-    how far beside its points they see them from each side, `frames` the frames of whose poses are those of `fit`.
+    Parameters
+    ----------
+    body : Body, fitted
+    scales : (G,) lengths over those of the generic body
+    fit : the keypoint fit; None for a given body
+    covariance : (p, p) posterior of the fit's parameters, logarithms of the scales first; None for a given body
+    length_share : (G,) standard deviation of each scale over the scale, if other sensors determined it
+    sets : keypoint sets that the fit used
+    view_bias : the detectors' bias by direction of view
+    frames : numbers of the frames whose poses are in `fit`
     """
 
     body: Body
@@ -135,17 +141,17 @@ class Subject:
 
     @classmethod
     def as_is(cls, body: Body) -> Subject:
-        """A body that is the person's already."""
+        """The subject of a body that needs no fit: scales of 1."""
         return cls(body, np.ones(len(body.scale_groups)))
 
     @property
     def cameras(self) -> CameraExtrinsics | None:
-        """The parameters of cameras, where the fit sought them."""
+        """The parameters of cameras; None if there is no fit, or it had none."""
         return None if self.fit is None else self.fit.cameras
 
     @property
     def camera_errors(self) -> dict[str, NDArray]:
-        """{camera: (6,) [m, rad] twist} to where cameras were found that their calibration has wrongly; else none."""
+        """{camera: (6,) [m, rad] twist} from calibrated to fitted pose, if the calibration is wrong; else empty."""
         cameras = self.cameras
         if self.fit is None or cameras is None or not cameras.wrong:
             return {}
@@ -154,7 +160,7 @@ class Subject:
 
     @property
     def length_std(self) -> dict[str, float]:
-        """[m] standard deviation of each length, from one segment's joint to the next's: "thigh_l-shank_l"."""
+        """{"thigh_l-shank_l": [m]} standard deviation of each length from one segment's joint to the next's."""
         share = self.length_share
         if self.covariance is not None:
             share = np.sqrt(np.diag(self.covariance)[: len(self.scales)])

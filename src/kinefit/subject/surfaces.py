@@ -1,4 +1,4 @@
-"""Parameters of a body's surface: girths or whole cylinders, or the shape of an Anny body."""
+"""Parameters of a body's surface: girths, shapes of cylinders, or the shape of an Anny body."""
 
 from __future__ import annotations
 
@@ -18,9 +18,12 @@ from kinefit.errors import BodyError
 from kinefit.subject.metaballs import MetaballShape
 from kinefit.subject.parameters import Parameters, World
 
-GIRTH, OFFSET = 0.2, 0.015
-"""Standard deviations between people: of the logarithm of a half axis (ANSUR II: girths by 10 %; a body of cylinders
-differs from a person's by as much again), and of where a surface lies about its bone [m]."""
+GIRTH_STD = 0.2
+"""Between people, of the logarithm of a half axis. ANSUR II: 10 % in girths; a body of cylinders differs from a
+person's by as much again."""
+
+SURFACE_OFFSET_STD = 0.015
+"""[m] between people, of a surface's place on its bone."""
 
 _KINDS = ("start a", "start b", "end a", "end b", "start offset", "end offset")
 _STEP = 1e-3
@@ -28,22 +31,22 @@ _STEP = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class CylinderShape:
-    """Half axes (logarithms) and forward offsets [m] of tapered cylinders; left and right alike.
+    """Half axes (logarithms) and forward offsets [m] of tapered cylinders; left and right share them.
 
     Parameters
     ----------
-    body : Body with cylinders.
-    girth, offset : standard deviation of the logarithm of a half axis, and of an offset [m].
+    body : Body with cylinders
+    girth, offset : standard deviation of the logarithm of a half axis, and of an offset [m]
 
     Raises
     ------
     BodyError
-        A body without cylinders.
+        The body has no cylinders.
     """
 
     body: Body
-    girth: float = GIRTH
-    offset: float = OFFSET
+    girth: float = GIRTH_STD
+    offset: float = SURFACE_OFFSET_STD
 
     def __post_init__(self) -> None:
         if not any(isinstance(s, TaperedCylinder) for s in self.body.surfaces):
@@ -51,27 +54,27 @@ class CylinderShape:
 
     @cached_property
     def _groups(self) -> tuple[tuple[str, ...], tuple[int, ...]]:
-        """Names of what left and right share, and the group of each surface (-1 for a mesh)."""
+        """Names of the groups of left and right cylinders, and the group of each surface (-1 for a mesh)."""
         names: dict[str, int] = {}
         count = [0] * len(self.body.tree.segments)
-        of = []
+        groups = []
         for s in self.body.surfaces:
             own = self.body.tree.segments[s.segment].removesuffix("_r").removesuffix("_l")
             key = f"{own} {count[s.segment]}".removesuffix(" 0")
             count[s.segment] += 1
-            of.append(names.setdefault(key, len(names)) if isinstance(s, TaperedCylinder) else -1)
-        return tuple(names), tuple(of)
+            groups.append(names.setdefault(key, len(names)) if isinstance(s, TaperedCylinder) else -1)
+        return tuple(names), tuple(groups)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(6 C,)."""
+        """(6 C,) names of the parameters of C groups of cylinders."""
         return tuple(f"{name} {kind}" for name in self._groups[0] for kind in _KINDS)
 
     @property
     def touches(self) -> tuple[frozenset[int], ...]:
-        """Of each parameter the segments that it changes."""
-        names, of = self._groups
-        on = [frozenset(s.segment for s, g in zip(self.body.surfaces, of) if g == k) for k in range(len(names))]
+        """(6 C,) for each parameter the segments that it changes."""
+        names, groups = self._groups
+        on = [frozenset(s.segment for s, g in zip(self.body.surfaces, groups) if g == k) for k in range(len(names))]
         return tuple(segments for segments in on for _ in _KINDS)
 
     @property
@@ -81,16 +84,16 @@ class CylinderShape:
 
     @property
     def information(self) -> NDArray:
-        """(6 C, 6 C)."""
+        """(6 C, 6 C) prior information."""
         return np.diag(np.tile([self.girth] * 4 + [self.offset] * 2, len(self._groups[0])) ** -2.0)
 
     @property
     def step(self) -> NDArray:
-        """(6 C,) of logarithms, and a tenth of that in metres."""
+        """(6 C,) steps of finite differences: of logarithms, and a tenth of that in metres."""
         return np.tile([_STEP] * 4 + [0.1 * _STEP] * 2, len(self._groups[0]))
 
     def apply(self, world: World, values: NDArray) -> World:
-        """The body with these cylinders."""
+        """The body with cylinders of these values (6 C,)."""
         sizes = np.asarray(values, float).reshape(-1, 6).tolist()
         surfaces = tuple(
             _shaped(s, tuple(sizes[g])) if isinstance(s, TaperedCylinder) else s
@@ -103,22 +106,22 @@ class CylinderShape:
 class Girths:
     """Logarithms of the girths of a body's cylinders along both half axes, one pair for each of its scale groups.
 
-    Who is thick is so all over: half of the variance is common to all girths. A few frames tell these, where they leave
-    the many numbers of a `CylinderShape` to its prior.
+    Girths of one person are correlated: half of the variance is common to all of them. A few frames determine these
+    parameters, but not the larger number of a `CylinderShape`.
 
     Parameters
     ----------
-    body : Body with cylinders.
-    girth : standard deviation of each.
+    body : Body with cylinders
+    girth : standard deviation of each logarithm
 
     Raises
     ------
     BodyError
-        A body without cylinders.
+        The body has no cylinders.
     """
 
     body: Body
-    girth: float = GIRTH
+    girth: float = GIRTH_STD
 
     def __post_init__(self) -> None:
         if not self._groups:
@@ -127,17 +130,17 @@ class Girths:
     @cached_property
     def _groups(self) -> tuple[int, ...]:
         """Scale groups that have cylinders."""
-        of = self.body.segment_scale
-        return tuple(sorted({int(of[s.segment]) for s in self.body.surfaces if isinstance(s, TaperedCylinder)}))
+        group = self.body.segment_scale
+        return tuple(sorted({int(group[s.segment]) for s in self.body.surfaces if isinstance(s, TaperedCylinder)}))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(2 G,)."""
+        """(2 G,) names."""
         return tuple(f"girth {self.body.scale_groups[g]} {axis}" for g in self._groups for axis in "ab")
 
     @property
     def touches(self) -> tuple[frozenset[int], ...]:
-        """Of each parameter the segments that it changes."""
+        """(2 G,) for each parameter the segments that it changes."""
         on = [frozenset(np.flatnonzero(self.body.segment_scale == g).tolist()) for g in self._groups]
         return tuple(segments for segments in on for _ in "ab")
 
@@ -148,19 +151,19 @@ class Girths:
 
     @property
     def information(self) -> NDArray:
-        """(2 G, 2 G)."""
+        """(2 G, 2 G) prior information."""
         return np.linalg.inv(self.girth**2 * (0.5 * np.eye(len(self.names)) + 0.5))
 
     @property
     def step(self) -> NDArray:
-        """(2 G,)."""
+        """(2 G,) steps of finite differences."""
         return np.full(len(self.names), _STEP)
 
     def apply(self, world: World, values: NDArray) -> World:
-        """The body with these girths."""
+        """The body with these logarithms of girths (2 G,)."""
         size = np.zeros((len(self.body.scale_groups), 6))
         size[list(self._groups), :4] = np.tile(np.reshape(values, (-1, 2)), 2)
-        sizes = [tuple(one) for one in size.tolist()]
+        sizes = [tuple(row) for row in size.tolist()]
         surfaces = tuple(
             _shaped(s, sizes[self.body.segment_scale[s.segment]]) if isinstance(s, TaperedCylinder) else s
             for s in world.body.surfaces
@@ -183,16 +186,15 @@ def _shaped(surface: TaperedCylinder, size: tuple[float, ...]) -> Surface:
 class AnnyShape:
     """Sex, muscle, weight, height and proportions of an Anny body, as logits over 4 about a mean shape.
 
-    By itself it makes the body anew, so it goes before all other parameters; lengths beside the shape's are
-    `SegmentScales` after it, and the body that is fitted is one of the model's. With `flesh` it leaves bones and points
-    as it finds them, and changes what lies on them.
+    By default it replaces the body by one of the model's, so it must be the first kind of parameters. `SegmentScales`
+    after it add lengths beyond the shape's. With `flesh` it keeps bones and points, and changes the surface alone.
 
     Parameters
     ----------
     model : AnnyModel
-    usual : (6,) shape parameters at zero.
-    std : standard deviation of each: about a quarter of its range.
-    flesh : whether bones and points stay.
+    usual : (6,) shape parameters of the mean shape
+    std : standard deviation of each parameter: about a quarter of its range
+    flesh : whether bones and points stay
     """
 
     model: AnnyModel
@@ -209,12 +211,12 @@ class AnnyShape:
         return lru_cache(maxsize=16)(lambda values: self._family.at(np.frombuffer(values)))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the bodies that were made, which are made again."""
+        """State without the cached bodies, which can be made again."""
         return {name: value for name, value in self.__dict__.items() if name not in ("_made", "_family")}
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(5,)."""
+        """(5,) names."""
         return tuple(f"anny {name}" for name in self._family.names)
 
     @property
@@ -224,24 +226,24 @@ class AnnyShape:
 
     @property
     def information(self) -> NDArray:
-        """(5, 5)."""
+        """(5, 5) prior information."""
         return np.eye(len(self.names)) / self.std**2
 
     @property
     def step(self) -> NDArray:
-        """(5,)."""
+        """(5,) steps of finite differences."""
         return np.full(len(self.names), _STEP)
 
     def apply(self, world: World, values: NDArray) -> World:
-        """The world with a body of this shape."""
-        made, usual = (self._made(np.asarray(v, float).tobytes()) for v in (values, self.mean))
-        return replace(world, body=with_flesh(world.body, made, usual) if self.flesh else made)
+        """The world with a body of this shape (5,)."""
+        shaped, default = (self._made(np.asarray(v, float).tobytes()) for v in (values, self.mean))
+        return replace(world, body=with_flesh(world.body, shaped, default) if self.flesh else shaped)
 
 
 def shape_of(body: Body) -> list[Parameters]:
-    """What a take with surfaces tells of a body beside its lengths: Anny's shape, girths, radii of metaballs.
+    """Parameters of a body's surface that a take with surfaces can fit: Anny's shape, girths, radii of metaballs.
 
-    A mesh, or a skin of another make, is taken as it is.
+    A mesh or another skin has none.
     """
     family = body.family
     if isinstance(family, AnnyFamily) and family.model.segments == body.tree.segments:

@@ -10,7 +10,7 @@ import numpy as np
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.settings import CameraErrors
-from kinefit.subject.sensor_parameters import FAR_OFF, CameraExtrinsics, moved_rig
+from kinefit.subject.sensor_parameters import OUTLIER_SIGMAS, CameraExtrinsics, moved_rig
 from kinefit.subject.subject import SubjectFit
 
 CAMERAS = "cameras"
@@ -60,7 +60,7 @@ def sentences(provenance: Mapping[str, Any], errors: CameraErrors | None) -> lis
     errors : of the calibration
     """
     out = []
-    most = np.inf if errors is None else FAR_OFF * np.repeat([errors.position, errors.direction], 3)
+    most = np.inf if errors is None else OUTLIER_SIGMAS * np.repeat([errors.position, errors.direction], 3)
     for name, one in provenance.get(CAMERAS, {}).items():
         moved = np.array(one["moved"])
         if np.any(np.abs(moved) > most):

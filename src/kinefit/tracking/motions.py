@@ -26,7 +26,7 @@ from kinefit.smoothing.shape_errors import shape_errors
 from kinefit.smoothing.smoother import as_tracked, smooth_results
 from kinefit.smoothing.spool import STRETCH, Spool
 from kinefit.smoothing.tracked_frames import TrackedFrames
-from kinefit.smoothing.uncertainty import TIED, pixel_information, with_lasting_errors
+from kinefit.smoothing.uncertainty import MOTION_CORRELATION_TIME, pixel_information, with_systematic_errors
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.tracking.agreement import LOOKS, cameras_apart, contradictions
@@ -109,9 +109,9 @@ def motion_of(
         # the tracker's own frames hold the surfaces' errors already
         noise_of_others = other_noise(
             body, others, matched, take.roots, take.angles, pixel_information(take, weight, shared),
-            half=round(TIED * rate), surfaces=smooth or lag is not None,
+            half=round(MOTION_CORRELATION_TIME * rate), surfaces=smooth or lag is not None,
         )  # fmt: skip
-        provenance["sensor noise"] = noise_of_others.as_told()
+        provenance["sensor noise"] = noise_of_others.summary()
 
     def weighed(f: int) -> tuple[Scene, list[Matched]]:
         """The same with keypoints as they took part."""
@@ -124,7 +124,7 @@ def motion_of(
     if cameras := as_told(found):
         provenance[CAMERAS] = composed(provenance.get(CAMERAS, {}), cameras)
     elsewhere = any(one.cameras is not None for one in found)
-    last, detectors = with_lasting_errors(
+    last, detectors = with_systematic_errors(
         results, subject, take, weight, noise_of_others, answers,
         cameras=None if elsewhere else settings.camera_errors, shared=shared,
     )  # fmt: skip

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.limbs import limbs
-from kinefit.frame.prediction import forgetting
-from kinefit.frame.results import ANYWHERE, FrameResult, evidence_of, together
+from kinefit.frame.prediction import marginal_information
+from kinefit.frame.results import ROOT_PRIOR_STD, FrameResult, evidence_of, sum_evidence
 from kinefit.geometry.camera import Rig
 from kinefit.initialization.candidates import LEAP, dofs_of_limbs, find_limbs, starts_from_points, starts_from_views
 from kinefit.initialization.depth_search import PostureSearch
@@ -89,7 +89,7 @@ class Recovery:
         for m in result.measurements:
             m.doubt(doubtful)
         scene = tracker.scene_of(result.state, time)
-        told = together(scene, evidence_of(scene, result.matched))
+        told = sum_evidence(scene, evidence_of(scene, result.matched))
         return replace(result, segment_quality=told.segment_quality(self.body.tree))
 
     def _best(
@@ -187,8 +187,8 @@ class Recovery:
         seek: NDArray, lost: NDArray,
     ) -> FrameResult:  # fmt: skip
         free = dofs_of_limbs(self.body, seek)
-        std = np.minimum(result.dof_std, np.where(np.arange(len(free)) < 6, ANYWHERE, np.pi))
-        held = result.state, forgetting(inverse(np.diag(std**2)), free)
+        std = np.minimum(result.dof_std, np.where(np.arange(len(free)) < 6, ROOT_PRIOR_STD, np.pi))
+        held = result.state, marginal_information(inverse(np.diag(std**2)), free)
         now = best = search.score.of(result.state) - LEAP * _against(tracker, result)
         for state, least in find_limbs(search, result.state, seek):
             found = tracker.fitted(time, frames, state, held).result

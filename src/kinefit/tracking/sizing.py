@@ -279,7 +279,7 @@ def _by_all(
     def fit(unknown: Unknowns, seen: Sequence[Sequence[Measurement]], near: Sequence[BodyState]) -> SubjectFit:
         world = unknown.world
         balls = any(isinstance(p, MetaballShape) for p in unknown.parameters)
-        rounds, coarse = ROUNDS if balls else (_MATCHES, joint.COARSE)
+        rounds, coarse = ROUNDS if balls else (_MATCHES, joint.COARSE_ITERATIONS)
         return joint.fit_subject(
             world.body, world.rig, seen, near, unknown.parameters, start=unknown.start, loss=settings.loss,
             times=times, velocities=velocities, rounds=rounds, coarse=coarse,

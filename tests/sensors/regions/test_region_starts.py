@@ -6,7 +6,7 @@ from tests.oracle import central_differences
 from tests.sensors.region_arm import CAMERA, RIG, arm, frame, state
 
 from kinefit.bodies import PointSet
-from kinefit.frame.trust import leapt
+from kinefit.frame.trust import angles_off_prediction
 from kinefit.observations import DepthFrame
 from kinefit.rendering import render_body
 from kinefit.sensors.evidence import Evidence
@@ -127,8 +127,8 @@ def test_limbs_are_sought_in_turn_and_not_too_often():
 
 def test_what_leaps_is_not_held():
     n = arm().tree.n_dofs
-    assert leapt(TRUTH, 1e4 * np.eye(n), state(0.3, 0.4, -0.88)) is None
-    free = leapt(TRUTH, 1e4 * np.eye(n), state(0.3, 0.4, -0.5))
+    assert angles_off_prediction(TRUTH, 1e4 * np.eye(n), state(0.3, 0.4, -0.88)) is None
+    free = angles_off_prediction(TRUTH, 1e4 * np.eye(n), state(0.3, 0.4, -0.5))
     np.testing.assert_array_equal(np.flatnonzero(free), [8])
 
 

@@ -14,7 +14,7 @@ from kinefit.losses import SQUARED, huber
 from kinefit.rows import PairRows, ParameterRows
 from kinefit.solvers import _kernels_border
 from kinefit.solvers.bundle.border import Prior, solve
-from kinefit.solvers.bundle.border_frames import SETTLING, Weighing
+from kinefit.solvers.bundle.border_frames import MAX_POSE_STEPS, Weighing
 from kinefit.solvers.bundle.whitened import PoseScrews, columns, residuals
 
 ARM = load_body("arm")
@@ -75,7 +75,8 @@ def dense(problem, states, prior, posture=0.01):
 def test_it_finds_what_a_dense_solver_finds(seed):
     problem, states, prior = task(seed=seed)
     theta, angles, information, cost = dense(problem, states, prior)
-    found = solve(problem, np.zeros(3), states, prior, np.full(3, 1e-4), tolerance=1e-10, iterations=(60, SETTLING))
+    iterations = 60, MAX_POSE_STEPS
+    found = solve(problem, np.zeros(3), states, prior, np.full(3, 1e-4), tolerance=1e-10, iterations=iterations)
     assert found.converged
     assert found.cost == pytest.approx(cost, rel=1e-6)
     assert np.allclose(found.theta, theta, atol=2e-4)  # a fiftieth of a bar: derivatives are kept for small steps

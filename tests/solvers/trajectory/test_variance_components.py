@@ -34,7 +34,7 @@ def test_components_are_those_of_the_truth(unit, shape, bias, drift, jitter):
     whole = np.hypot(np.hypot(bias, drift), jitter) * unit
     for estimate, truth in ((found.bias, bias), (found.drift, drift), (found.jitter, jitter)):
         assert np.median(estimate) == pytest.approx(truth * unit, abs=0.25 * whole)
-    assert np.median(found.lasting) == pytest.approx(np.hypot(bias, drift) * unit, abs=0.2 * whole)
+    assert np.median(found.systematic) == pytest.approx(np.hypot(bias, drift) * unit, abs=0.2 * whole)
     assert found.outlier.mean() < 0.01
     if drift:
         assert 0.2 < found.drift_time < 0.45
@@ -56,7 +56,7 @@ def test_outliers_are_neither_drift_nor_bias(always):
     away = random.normal(size=(*wrong.shape, 3))
     residuals += np.where(wrong[..., None], 50.0 * away / np.linalg.norm(away, axis=-1, keepdims=True), 0.0)
     found = variance_components(residuals, TIMES)
-    assert np.median(found.lasting) < 0.5
+    assert np.median(found.systematic) < 0.5
     assert np.median(found.jitter) == pytest.approx(3.0, rel=0.05)
     if always:  # channels that are always wrong have a bias of their own
         assert found.bias[wrong].min() > 15.0 and found.bias[~wrong].max() < 1.0
@@ -127,8 +127,8 @@ def of_detector(channels, values):
 def test_jitter_and_drift_of_a_detector_are_distinguished(white, drift):
     found = of_detector(*pixels(noise_px=white, drift_px=drift, drift_time=0.3))
     assert np.median(found.jitter) == pytest.approx(white, abs=0.2 * max(white, drift))
-    assert np.median(found.lasting) == pytest.approx(drift, abs=0.25 * max(white, drift))
-    np.testing.assert_allclose(np.hypot(found.jitter, found.lasting), np.hypot(white, drift), rtol=0.5)
+    assert np.median(found.systematic) == pytest.approx(drift, abs=0.25 * max(white, drift))
+    np.testing.assert_allclose(np.hypot(found.jitter, found.systematic), np.hypot(white, drift), rtol=0.5)
     if drift:
         assert 0.1 < found.drift_time < 0.6
 
@@ -139,12 +139,12 @@ def test_the_bias_that_a_camera_shares_is_no_noise_of_its_points():
     found = of_detector(channels, values)
     np.testing.assert_allclose(found.shared[1], (6.0, 9.0), atol=0.3)
     assert found.shared[[0, 2, 3]].max() < 0.3
-    assert np.median(np.hypot(found.jitter, found.lasting)) == pytest.approx(2.0, rel=0.15)
+    assert np.median(np.hypot(found.jitter, found.systematic)) == pytest.approx(2.0, rel=0.15)
 
 
 def test_a_detectors_outliers_are_not_noise():
     found = of_detector(*pixels(noise_px=2.0, outliers=0.2))
-    assert np.median(np.hypot(found.jitter, found.lasting)) == pytest.approx(2.0, rel=0.2)
+    assert np.median(np.hypot(found.jitter, found.systematic)) == pytest.approx(2.0, rel=0.2)
 
 
 def test_points_that_are_hardly_seen_are_as_noisy_as_the_others():

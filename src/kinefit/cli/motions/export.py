@@ -129,7 +129,7 @@ def export(
     recorded = read_motion(motion)
     results.write_format(recorded, format, out, **options)
     stated = ", ".join(f"{key} {value}" for key, value in options.items())
-    _screen.say(f"{out}: {results.ABOUT[format]}, {len(recorded)} frames{', ' + stated if stated else ''}")
+    _screen.say(f"{out}: {results.DESCRIPTIONS[format]}, {len(recorded)} frames{', ' + stated if stated else ''}")
 
 
 def _meant(key: str, value: str, valid: Sequence[str]) -> str:

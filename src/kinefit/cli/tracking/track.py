@@ -49,8 +49,9 @@ def choices_options(command: Callable) -> Callable:
     options = (
         click.option("--overlays/--no-overlays", default=True, show_default=True, help="Draw the fit on every video."),
         click.option(
-            "--formats", default=",".join(results.USUAL), show_default=True, callback=chosen_formats, metavar="LIST",
-            help=f"What to write; {', '.join(sorted({*results.NAMES} - {*results.USUAL}))} are there too.",
+            "--formats", default=",".join(results.DEFAULT_FORMATS), show_default=True, callback=chosen_formats,
+            metavar="LIST",
+            help=f"What to write; {', '.join(sorted({*results.NAMES} - {*results.DEFAULT_FORMATS}))} are there too.",
         ),
         click.option("--report/--no-report", default=True, show_default=True, help="Write report.html."),
         click.option(

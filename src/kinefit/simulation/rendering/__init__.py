@@ -1,1 +1,1 @@
-"""Images that sensors would have taken of a known motion."""
+"""Render the images that sensors would record of a known motion."""

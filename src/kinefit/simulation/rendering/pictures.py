@@ -1,4 +1,4 @@
-"""What a colour or grey camera would have seen of a known motion: skin and clothes with a grain that sticks to them."""
+"""Render colour or grey images of a known motion: skin and clothes with a texture fixed to the surface."""
 
 from __future__ import annotations
 
@@ -19,22 +19,23 @@ from kinefit.simulation.rendering.room import PARTS
 from kinefit.simulation.rendering.scenes import RenderedView, SimulatedScene
 
 SKIN = (130, 160, 210)  # BGR, as all colours here
-_CLOTHES = {
+_COLOURS = {
     "skin": SKIN, "shirt": (70, 80, 170), "trousers": (120, 75, 55), "shoes": (45, 45, 50),
     "floor": (120, 135, 150), "wall": (165, 175, 170), "table": (75, 110, 140),
 }  # fmt: skip
-_WORN = {
+_COLOUR_OF_SEGMENT = {
     "head": "skin", "neck": "skin", "hand": "skin", "forearm": "skin",
     "thigh": "trousers", "shank": "trousers", "pelvis": "trousers", "foot": "shoes", "toes": "shoes",
 }  # fmt: skip
-_NOTHING = (105, 120, 95)
-GRAIN = 0.015  # [m] of the grain: a little more than a pixel at three metres, so that few samples alias
-_GRAINS = 64  # cells after which it repeats
-_CONTRAST = {"skin": 0.10}  # share of the colour, one standard deviation; cloth and walls have more
-_CLOTH = 0.25
-_BROW, _CHIN = 2.5, 0.5  # times the height of the mouth above the neck's joint
-_HAIR = (35, 45, 60)
-_LIGHT = (0.6, 1.0)  # light of surfaces turned away from it, and towards it
+_BACKGROUND_COLOUR = (105, 120, 95)
+GRAIN = 0.015  # [m] cell of the texture: a little more than a pixel at three metres, so that few samples alias
+_GRAIN_CELLS = 64  # after which the texture repeats
+_CONTRAST = {"skin": 0.10}  # standard deviation as a share of the colour; cloth and walls have more
+_DEFAULT_CONTRAST = 0.25
+_BROW_HEIGHT = 2.5  # times the height of the mouth above the neck's joint
+_CHIN_HEIGHT = 0.5  # times the height of the mouth above the neck's joint
+_HAIR_COLOUR = (35, 45, 60)
+_LIGHT_RANGE = (0.6, 1.0)  # brightness of surfaces facing away from the light, and facing it
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,14 @@ class ColourSensor:
     name : str
     size : (width, height) [px]
     focal : float [px]
-    samples : int, rays along each side of a pixel.
-    noise : float, standard deviation of a value in 0..255.
+    samples : int, rays along each side of a pixel
+    noise : float, standard deviation of a value in 0..255
     near, far : float [m]
+
+    Raises
+    ------
+    ObservationError
+        `samples` is below 1; `noise` is negative or not finite.
     """
 
     name: str
@@ -65,7 +71,7 @@ class ColourSensor:
             raise ObservationError(problem, remedy="Give one sample or more, and noise of zero or more.")
 
     def camera(self, T_camera_world: NDArray | None = None, *, name: str | None = None) -> Camera:
-        """The sensor as a camera of a rig."""
+        """The sensor as a camera of a rig, with the pose T_camera_world (4, 4) [m]."""
         (w, h), f = self.size, self.focal
         K = np.array([[f, 0, 0.5 * (w - 1)], [0, f, 0.5 * (h - 1)], [0, 0, 1.0]])
         return Camera(name or self.name, self.size, K, (), "radtan", T_camera_world)  # type: ignore[arg-type]
@@ -73,12 +79,12 @@ class ColourSensor:
 
 @dataclass(frozen=True)
 class StereoSensor(ColourSensor):
-    """Two grey cameras side by side, their axes parallel, rows aligned; `baseline` [m] apart."""
+    """Two rectified grey cameras with parallel axes, `baseline` [m] apart."""
 
     baseline: float = 0.12
 
     def pair(self, left: Camera) -> tuple[Camera, Camera]:
-        """The left camera, and the right one beside it."""
+        """The left camera and the right one."""
         return left, beside(left, f"{self.name}_right", self.baseline)
 
 
@@ -95,14 +101,14 @@ def picture(
     grey: bool = False,
     seed: int = 0,
 ) -> NDArray:
-    """Picture (H, W, 3) BGR, or (H, W) grey, 8 bit, of one frame of a scene.
+    """Image (H, W, 3) BGR, or (H, W) grey, 8 bit, of one frame of a scene.
 
-    The grain is a function of the place on the surface: both cameras of a stereo head, and all frames, see the same.
+    The texture is a function of the place on the surface, the same in all cameras and frames.
 
     Parameters
     ----------
     camera : Camera
-    sensor : ColourSensor, for its samples and noise.
+    sensor : ColourSensor, for its samples and noise
     seed : int
         Of the noise, together with the frame and the camera's name.
     """
@@ -116,7 +122,7 @@ def picture(
 
 
 def depth_picture(depth: NDArray, near: float, far: float) -> NDArray:
-    """(H, W, 3) BGR 8 bit: depth [m] as colours, near red, far blue, black where nothing was measured."""
+    """Depth (H, W) [m] as colours (H, W, 3) BGR 8 bit: near red, far blue, black for pixels without depth."""
     share = np.clip((far - depth) / (far - near), 0.0, 1.0)
     out = cv2.applyColorMap((255 * share).astype(np.uint8), cv2.COLORMAP_TURBO)
     out[depth <= 0.0] = 0
@@ -125,25 +131,25 @@ def depth_picture(depth: NDArray, near: float, far: float) -> NDArray:
 
 def _shaded(scene: SimulatedScene, view: RenderedView) -> NDArray:
     """(H, W, 3) float32 BGR without noise."""
-    names = [*map(_worn, scene.motion.body.tree.segments), *PARTS]
-    base = np.array([_CLOTHES[name] for name in names] + [_NOTHING], np.float32)
-    contrast = np.array([_CONTRAST.get(name, _CLOTH) for name in names] + [0.0], np.float32)
+    names = [*map(_colour_name, scene.motion.body.tree.segments), *PARTS]
+    base = np.array([_COLOURS[name] for name in names] + [_BACKGROUND_COLOUR], np.float32)
+    contrast = np.array([_CONTRAST.get(name, _DEFAULT_CONTRAST) for name in names] + [0.0], np.float32)
     label = view.raster.segment
     up = np.array(UP_AXES[scene.motion.up])
     light = 0.8 * up - 0.5 * view.camera.T_camera_world[2, :3] + 0.3 * view.camera.T_camera_world[0, :3]
     towards = np.clip(view.normals @ (light / np.linalg.norm(light)), 0.0, 1.0)
-    shade = (_LIGHT[0] + (_LIGHT[1] - _LIGHT[0]) * towards).astype(np.float32)[view.raster.face]
+    shade = (_LIGHT_RANGE[0] + (_LIGHT_RANGE[1] - _LIGHT_RANGE[0]) * towards).astype(np.float32)[view.raster.face]
     shade *= 1.0 + contrast[label] * grain(view.x_rest, label)
     colour = base[label]
-    for cloth in _sleeves(scene.motion.body, view):
-        colour[cloth] = _CLOTHES["shirt"]
+    for sleeve in _sleeves(scene.motion.body, view):
+        colour[sleeve] = _COLOURS["shirt"]
     hair, collar = _hair_and_collar(scene.motion.body, view)
-    colour[hair], colour[collar] = _HAIR, _CLOTHES["shirt"]
+    colour[hair], colour[collar] = _HAIR_COLOUR, _COLOURS["shirt"]
     return np.clip(colour * shade[..., None], 0.0, 255.0)
 
 
 def _sleeves(body: Body, view: RenderedView) -> list[NDArray]:
-    """(H, W) bool a forearm: its pixels above the wrist, where the hand is part of the forearm: both would be bare."""
+    """Masks (H, W) bool of the sleeves: pixels of a forearm above the wrist, for bodies without a hand segment."""
     tree, out = body.tree, []
     for side in "lr":
         wrist, name = f"{side}_wrist", f"forearm_{side}"
@@ -156,15 +162,15 @@ def _sleeves(body: Body, view: RenderedView) -> list[NDArray]:
     return out
 
 
-def _worn(segment: str) -> str:
+def _colour_name(segment: str) -> str:
     part = segment.removesuffix("_l").removesuffix("_r")
-    return _WORN.get(part, "shirt")
+    return _COLOUR_OF_SEGMENT.get(part, "shirt")
 
 
 def _hair_and_collar(body: Body, view: RenderedView) -> tuple[NDArray, NDArray]:
-    """(H, W) bool each, a head's pixels above its brow or behind its ears, and those below its chin.
+    """Masks (H, W) bool of a head's pixels above the brow or behind the ears, and below the chin.
 
-    Where the neck is part of the head: heads with a neck of their own are skin all over.
+    Both are empty for bodies with a neck segment, whose heads are skin all over.
     """
     tree = body.tree
     hair, collar = (np.zeros(view.raster.segment.shape, bool) for _ in range(2))
@@ -174,18 +180,18 @@ def _hair_and_collar(body: Body, view: RenderedView) -> tuple[NDArray, NDArray]:
         mouth, ear = body.points_rest(body.landmarks.select(("r_mouth", "r_tragion"))) - tree.rest[segment]
         own = view.raster.segment == segment
         x = view.x_rest[own] - tree.rest[segment]
-        hair[own] = (x[:, 1] > _BROW * mouth[1]) | (x[:, 0] < ear[0])
-        collar[own] = x[:, 1] < _CHIN * mouth[1]
+        hair[own] = (x[:, 1] > _BROW_HEIGHT * mouth[1]) | (x[:, 0] < ear[0])
+        collar[own] = x[:, 1] < _CHIN_HEIGHT * mouth[1]
     return hair & ~collar, collar
 
 
 @cache
 def grain_table() -> NDArray:
-    """(n, n, n) grain, periodic, mean 0 and deviation 1: three sizes of blobs, 1.5, 4 and 12 cm."""
+    """Periodic texture (N, N, N), mean 0 and standard deviation 1, with blobs of 1.5, 4 and 12 cm."""
     random = np.random.default_rng(20)
-    waves = np.fft.fftfreq(_GRAINS)
+    waves = np.fft.fftfreq(_GRAIN_CELLS)
     square = waves[:, None, None] ** 2 + waves[:, None] ** 2 + waves**2
-    out = np.zeros((_GRAINS,) * 3)
+    out = np.zeros((_GRAIN_CELLS,) * 3)
     for cells in (0.5, 1.3, 4.0):
         spectrum = np.fft.fftn(random.standard_normal(out.shape)) * np.exp(-2.0 * (np.pi * cells) ** 2 * square)
         layer = np.fft.ifftn(spectrum).real
@@ -194,7 +200,7 @@ def grain_table() -> NDArray:
 
 
 def grain(x: NDArray, label: NDArray) -> NDArray:
-    """(...) grain of mean 0 and deviation 1 at places x (..., 3) [m] of surfaces; every label (...) int has its own."""
+    """Texture (..., ), mean 0 and standard deviation 1, at places x (..., 3) [m]; another one for every label (...)."""
     cell = np.floor(x * (1.0 / GRAIN)).astype(np.int64) + (label.astype(np.int64) * 17)[..., None]
-    i, j, k = np.moveaxis(cell % _GRAINS, -1, 0)
+    i, j, k = np.moveaxis(cell % _GRAIN_CELLS, -1, 0)
     return grain_table()[i, j, k]

@@ -1,4 +1,4 @@
-"""A moving body in a room, and what lies behind every pixel of a camera that looks at it."""
+"""A moving body in a room, and its rendering in a camera: segment, depth and surface point of every pixel."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class RenderedView:
     raster : Raster
         `segment` is the segment of the body, or the number of segments plus the part of the room.
     camera : Camera
-    vertices : (V, 3) [m] of all triangles, in the world.
+    vertices : (V, 3) [m] of all triangles, in the world
     faces : (T, 3) int
-    frames : (S, 12) poses of the segments, as `KinematicTree.forward` gives them.
+    frames : (S, 12) poses of the segments, from `KinematicTree.forward`
     """
 
     raster: Raster
@@ -37,20 +37,20 @@ class RenderedView:
 
     @cached_property
     def normals(self) -> NDArray:
-        """(T + 1, 3) unit normals of the triangles in the world; the last, of nothing, is zero."""
+        """(T + 1, 3) unit normals of the triangles in the world; the last, for empty pixels, is zero."""
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         normals = np.cross(b - a, c - a)
         return np.append(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12), [[0.0] * 3], 0)
 
     @cached_property
     def x_camera(self) -> NDArray:
-        """(H, W, 3) [m] the point seen, in the camera's frame; not finite where nothing is."""
+        """(H, W, 3) [m] surface point of each pixel in the camera's frame; not finite for empty pixels."""
         a, b = self.camera.ray_table
         return np.stack([a, b, np.ones_like(a)], axis=-1) * self.raster.depth[..., None]
 
     @cached_property
     def cosine(self) -> NDArray:
-        """(H, W) between the surface's normal and the ray, 1 where the camera looks straight at it; 0 for nothing."""
+        """(H, W) cosine between the surface's normal and the ray; 0 for empty pixels."""
         a, b = self.camera.ray_table
         rays = np.stack([a, b, np.ones_like(a)], axis=-1) / np.sqrt(a * a + b * b + 1.0)[..., None]
         normals = (self.normals @ self.camera.T_camera_world[:3, :3].T)[self.raster.face]
@@ -58,9 +58,9 @@ class RenderedView:
 
     @cached_property
     def x_rest(self) -> NDArray:
-        """(H, W, 3) [m] the point seen where it lies when the body is at rest (root frame), the room's in the world.
+        """(H, W, 3) [m] surface point of each pixel in the body's rest pose (root frame); room points in the world.
 
-        The same point of a surface has the same x_rest in all cameras and frames; zero where nothing is.
+        A point of a surface has the same x_rest in all cameras and frames. Empty pixels have zero.
         """
         R, t = self.camera.T_camera_world[:3, :3], self.camera.T_camera_world[:3, 3]
         out = (np.where(self.raster.seen[..., None], self.x_camera, 0.0) - t) @ R
@@ -89,12 +89,12 @@ class SimulatedScene:
 
     @classmethod
     def of(cls, motion: Motion, camera: Camera | None = None) -> SimulatedScene:
-        """Scene of a motion; with a room that `camera` looks into, where one is given."""
+        """Scene of a motion; with a room around it if a camera is given, which looks into the room."""
         return cls(motion, body_mesh(motion.body), None if camera is None else room(motion, camera))
 
     @cached_property
     def faces(self) -> NDArray:
-        """(T, 3) int32 of the body, then of the room."""
+        """(T, 3) int32 triangles of the body, then of the room."""
         parts = [np.asarray(self.mesh.faces)]
         if self.room is not None:
             count = len(self.mesh.vertices)
@@ -103,14 +103,14 @@ class SimulatedScene:
 
     @cached_property
     def labels(self) -> NDArray:
-        """(T,) segment of every triangle; those of the room have the number of segments plus their part."""
+        """(T,) int, segment of every triangle; the number of segments plus the part for triangles of the room."""
         parts = [np.asarray(self.mesh.face_segment)]
         if self.room is not None:
             parts.append(self.room.parts + len(self.motion.body.tree.segments))
         return np.concatenate(parts)
 
     def view(self, frame: int, camera: Camera) -> RenderedView:
-        """What a camera sees in a frame of the motion, without any error."""
+        """Render a frame of the motion in a camera, without errors."""
         state = self.motion.state(frame)
         frames, _ = self.motion.body.tree.forward(state.T_world_root, state.angles)
         vertices = self.mesh.posed(frames)

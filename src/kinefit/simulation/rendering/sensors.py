@@ -1,4 +1,4 @@
-"""What a depth camera would have seen of a known motion, with its errors."""
+"""Simulate depth images of a known motion, with the errors of a depth camera."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from kinefit.observations.depth import DepthVideo
 from kinefit.rendering import scaled
 from kinefit.simulation.rendering.scenes import RenderedView, SimulatedScene
 
-_STEP = 0.1  # [m] within 3 x 3 pixels: an edge, for a sensor that matches patterns
-_BRIGHTEST = 0.2  # cosine below which a sensor's noise grows no more
+_MIN_EDGE_STEP = 0.1  # [m] within 3 x 3 pixels: an edge, for a sensor that matches patterns
+_MIN_NOISE_COSINE = 0.2  # of incidence, below which a sensor's noise no longer grows
 
 
 @dataclass(frozen=True)
@@ -29,24 +29,29 @@ class DepthSensor:
     size : (width, height) [px]
     focal : float [px]
     near, far : float [m]
-        Nothing outside is measured.
+        Range; pixels outside it have no depth.
     noise : (a, b, z0) [m, 1/m, m]
-        Standard deviation a + b (z - z0)² of a depth z, of every pixel and frame anew.
+        Standard deviation a + b (z - z0)² of a depth z, independent for every pixel and frame.
     oblique : float
-        The deviation grows with 1 / cosine^oblique of the angle at which the surface is seen.
+        Exponent of incidence: the standard deviation is divided by cosine^oblique of the angle of incidence.
     grazing : float
-        Cosine below which a surface sends nothing back.
+        Cosine of incidence below which a pixel has no depth.
     samples : int
-        Rays along each side of a pixel. A pixel that sees two surfaces tells a depth between them (flying pixel): the
-        mean weighted with 1/z², as the signal falls.
+        Rays along each side of a pixel. A pixel across an edge has a depth between both surfaces (flying pixel): the
+        mean weighted with 1/z², like the signal.
     baseline : float [m]
-        From the lens to the projector on its right: what the projector does not reach is not measured; 0 for none.
+        From the lens to the projector on its right: pixels in the projector's shadow have no depth; 0 for none.
     disparity_step : float [px]
-        Of the pattern's shift f baseline / z, to which depths are rounded; 0 for none.
+        Resolution of the pattern's disparity f baseline / z; 0 for none.
     lateral : float [px]
-        Standard deviation of the place at which the depth of a pixel is taken: ragged edges.
-    edges_lost : share of the pixels beside a step of depth that are not measured.
-    holes : share of the pixels that are not measured, in spots of 2 x 2.
+        Standard deviation of the place at which a pixel's depth is taken: ragged edges.
+    edges_lost : share of the pixels at depth edges without depth
+    holes : share of the pixels without depth, in spots of 2 x 2
+
+    Raises
+    ------
+    ObservationError
+        A range, number of samples or other value that is impossible.
     """
 
     name: str
@@ -72,18 +77,18 @@ class DepthSensor:
             )
 
     def sigma(self, z: NDArray | float) -> NDArray | float:
-        """Standard deviation [m] of depths z [m] on a surface seen straight on."""
+        """Standard deviations [m], of any shape (...,), of depths z [m] of the same shape at normal incidence."""
         a, b, z0 = self.noise
         return a + b * (z - z0) ** 2
 
     def camera(self, T_camera_world: NDArray | None = None, *, name: str | None = None) -> Camera:
-        """The sensor as a camera of a rig."""
+        """The sensor as a camera of a rig, with the pose T_camera_world (4, 4) [m]."""
         (w, h), f = self.size, self.focal
         K = np.array([[f, 0, 0.5 * (w - 1)], [0, f, 0.5 * (h - 1)], [0, 0, 1.0]])
         return Camera(name or self.name, self.size, K, (), "radtan", T_camera_world)  # type: ignore[arg-type]
 
     def without_errors(self) -> DepthSensor:
-        """The same sensor, measuring exactly what is within its range."""
+        """The same sensor without errors, apart from its range."""
         none = dict.fromkeys(("baseline", "disparity_step", "lateral", "edges_lost", "holes", "grazing"), 0.0)
         return replace(self, noise=(0.0, 0.0, 0.0), samples=1, **none)  # type: ignore[arg-type]
 
@@ -111,7 +116,7 @@ def simulate_depth(
     seed: int = 0,
     scene: SimulatedScene | None = None,
 ) -> DepthVideo:
-    """Depth images that a sensor would have taken of a motion, one for each of its frames.
+    """Simulate the depth images of a motion in a sensor, one for each frame.
 
     Parameters
     ----------
@@ -119,18 +124,18 @@ def simulate_depth(
     camera : Camera
         The sensor's, in the motion's world: `sensor.camera(T_camera_world)`, or any other lens.
     sensor : DepthSensor
-        Its range and errors; `TOF` and `KINECT` are there.
+        Its range and errors, such as `TOF` or `KINECT`.
     room : bool
-        Whether floor, walls and a table stand around the body.
+        Whether floor, walls and a table are around the body.
     seed : int
-        The same seed gives the same errors, in whatever order frames are asked for.
+        The same seed gives the same errors, in whatever order frames are read.
     scene : SimulatedScene, optional
-        Of the motion, where several sensors share one; `room` is then not looked at.
+        Of the motion, shared by several sensors; `room` is then ignored.
 
     Returns
     -------
     DepthVideo
-        Every frame is drawn when it is asked for.
+        Every frame is rendered on demand.
     """
     scene = scene or SimulatedScene.of(motion, camera if room else None)
 
@@ -146,7 +151,7 @@ def simulate_depth(
 def measured_depth(
     scene: SimulatedScene, frame: int, camera: Camera, sensor: DepthSensor, random: np.random.Generator
 ) -> NDArray:
-    """(H, W) float32 [m] one image of a sensor; 0 where nothing was measured."""
+    """Depth image (H, W) float32 [m] of one frame; 0 for pixels without depth."""
     width, height = camera.size
     view = scene.view(frame, scaled(camera, sensor.samples))
     z, cosine = _pixels(view, sensor.samples, height, width)
@@ -158,7 +163,7 @@ def measured_depth(
     if sensor.lateral:
         z, lost = _shifted(sensor.lateral, random, z, lost)
     z = np.where(lost, 1.0, z)
-    sigma = sensor.sigma(z) / np.maximum(cosine, _BRIGHTEST) ** sensor.oblique
+    sigma = sensor.sigma(z) / np.maximum(cosine, _MIN_NOISE_COSINE) ** sensor.oblique
     z = z + sigma * random.standard_normal(z.shape)
     if sensor.disparity_step:
         unit = camera.matrix[0, 0] * sensor.baseline / sensor.disparity_step
@@ -170,40 +175,40 @@ def measured_depth(
 
 
 def _pixels(view: RenderedView, n: int, height: int, width: int) -> tuple[NDArray, NDArray]:
-    """Depth (H, W) [m], inf where most of a pixel sees nothing, and cosine (H, W) of its nearest surface's slant."""
+    """Depth (H, W) [m], inf if most of a pixel is empty, and cosine (H, W) of incidence, averaged over each pixel."""
     z = view.raster.depth.astype(float)
     if n == 1:
         return z, view.cosine
     blocks, cosines = (
         a.reshape(height, n, width, n).swapaxes(1, 2).reshape(height, width, n * n) for a in (z, view.cosine)
     )
-    seen = np.isfinite(blocks)
-    weight = np.where(seen, 1.0 / np.where(seen, blocks, 1.0) ** 2, 0.0)
+    hit = np.isfinite(blocks)
+    weight = np.where(hit, 1.0 / np.where(hit, blocks, 1.0) ** 2, 0.0)
     total = np.maximum(weight.sum(axis=-1), 1e-12)
-    mean = np.where(seen, weight * np.where(seen, blocks, 0.0), 0.0).sum(axis=-1) / total
-    return np.where(2 * seen.sum(axis=-1) > n * n, mean, np.inf), (weight * cosines).sum(axis=-1) / total
+    mean = np.where(hit, weight * np.where(hit, blocks, 0.0), 0.0).sum(axis=-1) / total
+    return np.where(2 * hit.sum(axis=-1) > n * n, mean, np.inf), (weight * cosines).sum(axis=-1) / total
 
 
 def _edges(z: NDArray) -> NDArray:
-    """(H, W) bool, depth jumps within the 3 x 3 pixels around."""
+    """(H, W) bool: pixels with a depth edge within the 3 x 3 pixels around."""
     z = np.where(np.isfinite(z), z, 100.0).astype(np.float32)
     window = np.ones((3, 3), np.uint8)
-    return cv2.dilate(z, window) - cv2.erode(z, window) > _STEP
+    return cv2.dilate(z, window) - cv2.erode(z, window) > _MIN_EDGE_STEP
 
 
 def _in_shadow(scene: SimulatedScene, frame: int, camera: Camera, sensor: DepthSensor, z: NDArray) -> NDArray:
-    """(H, W) bool, points that something hides from the projector."""
+    """(H, W) bool: pixels whose point is occluded from the projector."""
     T = np.eye(4)
     T[0, 3] = -sensor.baseline
     projector = camera.with_pose(T @ camera.T_camera_world)
     lit = scene.view(frame, projector).raster.depth
-    u = np.arange(z.shape[1]) - camera.matrix[0, 0] * sensor.baseline / z  # inf where nothing is: no shift
+    u = np.arange(z.shape[1]) - camera.matrix[0, 0] * sensor.baseline / z  # no shift for z = inf
     column = np.clip(np.round(u), 0, z.shape[1] - 1).astype(int)
-    return np.take_along_axis(lit, column, axis=1) < z - _STEP / 2
+    return np.take_along_axis(lit, column, axis=1) < z - _MIN_EDGE_STEP / 2
 
 
 def _shifted(sigma: float, random: np.random.Generator, z: NDArray, lost: NDArray) -> tuple[NDArray, NDArray]:
-    """Depths taken a little beside their pixels."""
+    """Depths and lost pixels taken at randomly shifted places, with the standard deviation `sigma` [px]."""
     height, width = z.shape
     dv, du = np.round(sigma * random.standard_normal((2, height, width))).astype(int)
     rows = np.clip(np.arange(height)[:, None] + dv, 0, height - 1)

@@ -1,4 +1,4 @@
-"""Grey images of a moving body with a fine texture that sticks to it, as photogrammetry needs it."""
+"""Render grey images of a moving body with a fine texture fixed to its surface, for photogrammetry."""
 
 from __future__ import annotations
 
@@ -14,16 +14,18 @@ from kinefit.geometry.camera import Camera
 from kinefit.rendering import scaled
 from kinefit.simulation.rendering.scenes import SimulatedScene
 
-_CELLS = 64  # of the texture's lattice, after which it repeats
+_LATTICE_CELLS = 64  # of the texture, after which it repeats
 _SAMPLES = 2  # rays along each side of a pixel
-_GREY, _CONTRAST, _GROUND = 120.0, 45.0, 50.0
+_MEAN_GREY = 120.0
+_GREY_STD = 45.0
+_BACKGROUND_GREY = 50.0
 
 
 @checked
 def textured_picture(
     scene: SimulatedScene, frame: int, camera: Camera, *, grain: float = 0.003, noise: float = 2.0, seed: int = 0
 ) -> NDArray:
-    """Image (H, W), 8 bit grey, of one frame of a scene; the texture is a smooth function of the place on the body.
+    """Grey image (H, W), 8 bit, of one frame of a scene; the texture is a smooth function of the place on the body.
 
     Parameters
     ----------
@@ -33,15 +35,20 @@ def textured_picture(
         Standard deviation of a grey value.
     seed : int
         Of the noise, together with the frame and the camera's name.
+
+    Raises
+    ------
+    ObservationError
+        `grain` is not between 0 and 1 m; `noise` is negative or not finite.
     """
     if not (0 < grain < 1 and 0 <= noise < np.inf):
         problem = f"a grain of {grain} m, noise of {noise}"
         raise ObservationError(problem, remedy="Give metres, and noise of zero or more.")
     view = scene.view(frame, scaled(camera, _SAMPLES))
-    seen, segment = view.raster.seen, view.raster.segment
-    fine = np.full(seen.shape, _GROUND, np.float32)
-    x = view.x_rest[seen] / grain + 17.0 * segment[seen][:, None]  # every segment has its own
-    fine[seen] = _GREY + _CONTRAST * _lattice(x)
+    visible, segment = view.raster.seen, view.raster.segment
+    fine = np.full(visible.shape, _BACKGROUND_GREY, np.float32)
+    x = view.x_rest[visible] / grain + 17.0 * segment[visible][:, None]  # another texture for every segment
+    fine[visible] = _MEAN_GREY + _GREY_STD * _lattice(x)
     image = cv2.resize(fine, camera.size, interpolation=cv2.INTER_AREA)
     random = np.random.default_rng([seed, frame, *camera.name.encode()])
     return np.clip(np.rint(image + noise * random.standard_normal(image.shape)), 0, 255).astype(np.uint8)
@@ -49,8 +56,8 @@ def textured_picture(
 
 @cache
 def _table() -> NDArray:
-    """(n, n, n) values, mean 0 and deviation 1."""
-    return np.random.default_rng(31).standard_normal((_CELLS,) * 3).astype(np.float32)
+    """(n, n, n) lattice values with mean 0 and standard deviation 1."""
+    return np.random.default_rng(31).standard_normal((_LATTICE_CELLS,) * 3).astype(np.float32)
 
 
 def _lattice(x: NDArray) -> NDArray:
@@ -60,6 +67,6 @@ def _lattice(x: NDArray) -> NDArray:
     t = t * t * (3.0 - 2.0 * t)
     out, table = np.zeros(len(x)), _table()
     for corner in np.ndindex(2, 2, 2):
-        i, j, k = ((low[:, a] + corner[a]) % _CELLS for a in range(3))
+        i, j, k = ((low[:, a] + corner[a]) % _LATTICE_CELLS for a in range(3))
         out += table[i, j, k] * np.prod(np.where(corner, t, 1.0 - t), axis=1)
     return out

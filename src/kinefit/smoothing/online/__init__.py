@@ -1,1 +1,1 @@
-"""Smoothing while tracking goes on: a window of frames behind the newest one."""
+"""Smooth while tracking: a window of frames behind the newest one."""

@@ -1,8 +1,7 @@
-"""A few frames behind live: each frame's estimate is that of a window of frames solved with the motion prior.
+"""Fixed-lag smoothing: each frame is returned after a lag, estimated from a sliding window with the motion prior.
 
-The window reaches from the newest frame back over the lag, and some more frames before, which are still linearised
-anew. What left the window stays as a quadratic cost of its first three frames (`solvers.marginal`), so that nothing of
-it is forgotten.
+The window contains the frames of the lag, and some older ones, which are still linearised again. Frames that leave the
+window are marginalised: they become a quadratic cost of its first three frames (`solvers.trajectory.marginal`).
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import hard_equations
 from kinefit.errors import ObservationError
-from kinefit.frame.results import FrameResult, judged
+from kinefit.frame.results import FrameResult, frame_result
 from kinefit.observations.arrays import is_number
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.checks import of_kind
 from kinefit.smoothing.online.known_noise import KnownNoise
-from kinefit.smoothing.online.lag_frame import Follows, FrameCosts, LagFrame
+from kinefit.smoothing.online.lag_frame import FrameCosts, LagFrame, TrackerLike
 from kinefit.smoothing.unwrap import boxes, continued
 from kinefit.solvers.closed import on_null_space, onto
 from kinefit.solvers.equations import block_diagonal
@@ -31,31 +30,31 @@ from kinefit.solvers.trajectory.marginal import Entering, leave
 from kinefit.solvers.trajectory.motion_prior import MotionPrior
 from kinefit.solvers.trajectory.smoothing import Equations, Smoothed, posterior, smooth
 
-_BEFORE = 0.3  # [s] of frames before the lag that are still linearised anew
-_TRIED = 3  # steps of a window: it begins where the last one ended
-_LEAP = np.array([0.3, 1.0])  # [m], [rad] a frame: a larger jump is a body found elsewhere, no motion
+_OLDER_FRAMES_S = 0.3  # [s] of frames before the lag that are still linearised
+_MAX_ITERATIONS = 3  # of a window: it starts at the solution of the last one
+_MAX_STEPS = np.array([0.3, 1.0])  # [m], [rad] per frame: a larger jump is a re-detected body, no motion
 
 
 class FixedLag:
-    """Smooths what a tracker gives, a few frames behind it.
+    """Smooths a tracker's results, with a lag of a few frames.
 
     Parameters
     ----------
-    tracker : Tracker, or what has its `body`, `rate`, `settings`, `scene_of` and `apart`
-    lag : float [s] by which frames come later, a frame at least
+    tracker : Tracker, or an object with its `body`, `rate`, `settings`, `scene_of` and `apart`
+    lag : float [s] after which a frame is returned, one frame at least
     noise : KnownNoise; default: `KnownNoise.usual`
 
     Attributes
     ----------
-    seconds : float, the lag in whole frames
+    seconds : float [s], the lag rounded to whole frames
 
     Raises
     ------
     ObservationError
-        A lag of less than a frame.
+        The lag is less than a frame; `tracker` is no tracker.
     """
 
-    def __init__(self, tracker: Follows, lag: float, *, noise: KnownNoise | None = None) -> None:
+    def __init__(self, tracker: TrackerLike, lag: float, *, noise: KnownNoise | None = None) -> None:
         if not (isinstance(getattr(tracker, "body", None), Body) and is_number(lag)):
             problem = f"a lag of type {type(lag).__name__} behind a {type(tracker).__name__}"
             raise ObservationError(problem, remedy="Give a Tracker and seconds: FixedLag(tracker, 0.1).")
@@ -63,7 +62,7 @@ class FixedLag:
         self._lag = lag_frames(lag, rate)
         self.seconds = self._lag / rate
         self.rate, self.body = rate, tracker.body
-        self._most = self._lag + max(round(_BEFORE * rate), 3)
+        self._window = self._lag + max(round(_OLDER_FRAMES_S * rate), 3)
         self.noise = noise or KnownNoise.usual(self.body)
         self._memory = round(settings.smooth_memory * rate)
         memory = settings.acceleration_memory, settings.smooth_memory
@@ -78,24 +77,29 @@ class FixedLag:
 
     def _begin(self) -> None:
         self._frames: list[LagFrame] = []
-        self._waiting = 0  # frames of the window that were not handed out yet
+        self._waiting = 0  # frames of the window that are not returned yet
         self._entering: Entering | None = None
         self._livelier = np.ones((0, self.body.tree.n_dofs))
         self._count = 0
-        self._told = np.full(len(self.body.tree.coordinates), -(10**9))  # the last frame that tells of each coordinate
+        self._last_observed = np.full(len(self.body.tree.coordinates), -(10**9))  # frame number, of each coordinate
 
     def add(
         self, result: FrameResult | None, measurements: Sequence[Measurement] | None = None, *, ahead: int | None = None
     ) -> list[FrameResult]:
-        """Take the tracker's result of a new frame, and hand out those for which the lag is over, mostly one.
+        """Add the tracker's result of a new frame; returns the smoothed frames whose lag is over, usually one.
 
-        A gap in time of more than the window ends it: what waits is handed out, and it begins anew.
+        After a gap in time longer than the window, all waiting frames are returned, and smoothing starts again.
 
         Parameters
         ----------
-        result : as `Tracker.update` gives it; None, and the same one again, count for nothing.
-        measurements : what it was made from, all but keypoints; default: as the result has them
-        ahead : frames since the last one; default: by its time. Less than half a frame is joined to it.
+        result : from `Tracker.update`; None, and the same result again, are ignored
+        measurements : of the frame, all but keypoints; default: those of the result
+        ahead : number of frames since the last one; default: from the times. 0 merges the frame with the last one.
+
+        Raises
+        ------
+        ObservationError
+            `result` is no FrameResult.
         """
         if result is None or (self._frames and result is self._frames[-1].result):
             return []
@@ -105,9 +109,9 @@ class FixedLag:
             self._append(new)
             return self._solved()
         last = self._frames[-1]
-        gone = (result.time - last.result.time) * self.rate
-        ahead = round(gone) if ahead is None else ahead
-        if gone < 0.0 or ahead > self._most:
+        elapsed = (result.time - last.result.time) * self.rate
+        ahead = round(elapsed) if ahead is None else ahead
+        if elapsed < 0.0 or ahead > self._window:
             out = self.finish()
             self._append(new)
             return out + self._solved()
@@ -120,15 +124,15 @@ class FixedLag:
         for k in range(1, ahead):
             state = last.state.retract(k / ahead * last.state.difference(new.state))
             time = last.result.time + k / ahead * (result.time - last.result.time)
-            nothing = replace(result, time=time, state=state, matched=(), measurements=())
-            self._append(LagFrame(nothing, (), (), (), state, real=False))
+            empty = replace(result, time=time, state=state, matched=(), measurements=())
+            self._append(LagFrame(empty, (), (), (), state, real=False))
             out += self._solved()
         self._append(new)
         return out + self._solved()
 
     def finish(self) -> list[FrameResult]:
-        """All frames that wait for later ones; what comes then begins anew."""
-        out = self._handed(self._waiting) if self._waiting else []
+        """Return all waiting frames, and reset: the next frame starts a new window."""
+        out = self._results(self._waiting) if self._waiting else []
         self._begin()
         return out
 
@@ -141,11 +145,11 @@ class FixedLag:
         self._waiting += 1
         self._count += 1
         self._livelier = np.concatenate([self._livelier, np.ones((1, self._livelier.shape[1]))])
-        self._leap()
-        self._told[self._costs.told(self._frames, len(self._frames) - 1)] = self._count
+        self._allow_jump()
+        self._last_observed[self._costs.observed(self._frames, len(self._frames) - 1)] = self._count
 
-    def _leap(self) -> None:
-        """Where the tracker found the body elsewhere, the newest change of its steps is as large as it is."""
+    def _allow_jump(self) -> None:
+        """Raise the process noise of the newest step to its size, if the tracker re-detected the body elsewhere."""
         if len(self._frames) < 2:
             return
         recent = [f.state for f in self._frames[-4:]]
@@ -155,30 +159,30 @@ class FixedLag:
         for k, part in ((2, fast + slow), (3, -fast * slow)):
             if len(steps) >= k:
                 change = change - part * steps[-k]
-        limit = np.where(np.arange(len(change)) < 3, *_LEAP)
-        usual = 1.0 / np.sqrt(self._prior.weight)
-        factor = np.where(np.abs(change) > limit, np.maximum(np.abs(change) / usual, 1.0), 1.0)
+        limit = np.where(np.arange(len(change)) < 3, *_MAX_STEPS)
+        std = 1.0 / np.sqrt(self._prior.weight)
+        factor = np.where(np.abs(change) > limit, np.maximum(np.abs(change) / std, 1.0), 1.0)
         self._livelier[-2] = factor  # of the step that leads to the newest frame
 
     def _solved(self) -> list[FrameResult]:
-        """Solve the window, and hand out what is due."""
+        """Solve the window, and return the frames whose lag is over."""
         due = len(self._frames) - 1 - self._lag
         if due >= 0 and self._waiting > self._lag:
             self._costs.match(self._frames, due)
         self._fit()
         if self._waiting <= self._lag:
             return []
-        return self._handed(self._waiting - self._lag)
+        return self._results(self._waiting - self._lag)
 
     def _fit(self) -> None:
         frames, tree = self._frames, self.body.tree
-        while len(frames) > self._most and len(frames) > 4:
-            self._leave()
+        while len(frames) > self._window and len(frames) > 4:
+            self._marginalise_oldest()
         made = [self._costs.quadratic(self._frames, f) for f in range(len(frames))]
         H, g, cost = (np.array(v) for v in zip(*made))
         roots, angles = self._states()
-        lower, upper, usual = boxes(tree, angles)
-        prior = replace(self._prior, usual=usual, liveliness=self._livelier)
+        lower, upper, mean = boxes(tree, angles)
+        prior = replace(self._prior, mean=mean, liveliness=self._livelier)
 
         def equations(new_roots: NDArray, new_angles: NDArray) -> Equations:
             delta = np.empty(g.shape)
@@ -189,19 +193,19 @@ class FixedLag:
 
         self._last: Smoothed = smooth(
             self.body, roots, angles, equations, prior, bounds=(lower, upper), dense=True, entering=self._entering,
-            max_iterations=_TRIED, tolerance=1e-4,
+            max_iterations=_MAX_ITERATIONS, tolerance=1e-4,
         )  # fmt: skip
         for frame, T, q in zip(frames, self._last.roots, self._last.angles):
             frame.state = BodyState(T, q)
 
-    def _leave(self) -> None:
-        """Take the oldest frame out of the window, and keep what it tells of the next three."""
+    def _marginalise_oldest(self) -> None:
+        """Remove the oldest frame from the window, and keep its cost of the next three frames."""
         roots, angles = self._states(4)
-        lower, upper, usual = boxes(self.body.tree, angles)
+        lower, upper, mean = boxes(self.body.tree, angles)
         H, g, _ = self._costs.quadratic(self._frames, 0)
         weight = self.body.tree.posture_precision
         H[6:, 6:] += weight
-        g[6:] += weight @ (usual[0] - angles[0])
+        g[6:] += weight @ (mean[0] - angles[0])
         at_limit = (angles[0] <= lower[0]) | (angles[0] >= upper[0])
         held = np.concatenate([np.full(6, not self.body.tree.root_free), at_limit])
         motion = replace(self._prior, liveliness=self._livelier).rows(3)
@@ -214,8 +218,8 @@ class FixedLag:
         states = [f.state for f in self._frames[:count]]
         return np.stack([s.T_world_root for s in states]), np.stack([s.angles for s in states])
 
-    def _handed(self, count: int) -> list[FrameResult]:
-        """Results of the first frames that wait."""
+    def _results(self, count: int) -> list[FrameResult]:
+        """Results of the first `count` waiting frames, which no longer wait."""
         first = len(self._frames) - self._waiting
         found = posterior(self.body, self._last, first, self._share).frames
         out = []
@@ -226,24 +230,24 @@ class FixedLag:
                 if self._hard is not None:
                     frame.state = onto(self.body, frame.state, self._hard, limits=False)[0]
                 number = self._count - len(self._frames) + f + 1
-                observed = self._told >= number - self._memory
+                observed = self._last_observed >= number - self._memory
                 matched = (*frame.points, *frame.surfaces)
-                scene, sure = self._costs.scene(self._frames, f), self._exact(frame.state, found[f])
-                out.append(judged(scene, sure, matched, self._last.iterations, observed=observed))
+                scene, covariance = self._costs.scene(self._frames, f), self._on_closures(frame.state, found[f])
+                out.append(frame_result(scene, covariance, matched, self._last.iterations, observed=observed))
         return out
 
-    def _exact(self, state: BodyState, covariance: NDArray) -> NDArray:
-        """A covariance (n, n) of a state that is closed exactly."""
+    def _on_closures(self, state: BodyState, covariance: NDArray) -> NDArray:
+        """Covariance (n, n) restricted to motions that keep hard closures closed."""
         return covariance if self._hard is None else on_null_space(covariance, self._hard(state)[1])
 
 
 def lag_frames(lag: float, rate: float) -> int:
-    """A lag [s] in frames.
+    """Convert a lag [s] to frames, with the frame rate [Hz].
 
     Raises
     ------
     ObservationError
-        Less than a frame.
+        The lag is less than a frame.
     """
     if not (np.isfinite(lag) and round(lag * rate) >= 1):
         raise ObservationError(f"a lag of {lag:g} s", remedy=f"Give a frame at least, {1.0 / rate:.3f} s.")

@@ -1,4 +1,4 @@
-"""How lively a person is and how noisy the sensors are, known before a take: from settings, or from another take."""
+"""Process noise of a person and noise of sensors, known before a take: from defaults, or from another take."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from kinefit.bodies import Body
 from kinefit.errors import ObservationError
 from kinefit.sensors.channels import Channels
 
-_QUICK = 5.0, 30.0  # [m/s²], [rad/s²] of the root and of angles; takes of everyday movements tell 1 to 4 and 4 to 20
+_DEFAULT_ACCELERATIONS = 5.0, 30.0  # [m/s²], [rad/s²] of root and angles: quick; everyday takes have 1 to 4, 4 to 20
 
 
 @dataclass(frozen=True, eq=False)
 class KnownNoise:
-    """How lively a person and how noisy the sensors are, known beforehand.
+    """Process noise of a person and noise of sensors, known before a take.
 
     Parameters
     ----------
     acceleration : (n,) [m/s², rad/s²] random acceleration of every degree of freedom, one standard deviation
-    pixel_sigma : {source of keypoints: {point: standard deviation [px] at full confidence}}; others stay as stated
+    pixel_sigma : {source of keypoints: {point: standard deviation [px] at full confidence}}; others keep theirs
     scale : {sensor: factor on its standard deviation}
     """
 
@@ -33,33 +33,33 @@ class KnownNoise:
 
     @classmethod
     def usual(cls, body: Body) -> KnownNoise:
-        """Accelerations of a person who moves quickly, 5 m/s² and 30 rad/s², and the sensors as stated.
+        """Accelerations of a person who moves quickly, 5 m/s² and 30 rad/s², and the sensors' own noise.
 
-        Calm movements have half of them, and are smoothed a little less than they could be.
+        Calm movements have half of that. They are smoothed a little less than they could be.
         """
-        return cls(np.where(np.arange(body.tree.n_dofs) < 3, *_QUICK))
+        return cls(np.where(np.arange(body.tree.n_dofs) < 3, *_DEFAULT_ACCELERATIONS))
 
     @classmethod
     def of_take(cls, body: Body, provenance: Mapping[str, Any]) -> KnownNoise:
-        """What another take of a smoothed motion told: its `Motion.provenance`.
+        """Noise estimated from another take: the `Motion.provenance` of its smoothed motion.
 
         Raises
         ------
         ObservationError
-            A motion that was not smoothed as a whole, or of another body.
+            The motion was not smoothed as a whole, or has another body.
         """
-        told = provenance.get("smoothing", {})
-        found = told.get("acceleration", {})
+        smoothing = provenance.get("smoothing", {})
+        found = smoothing.get("acceleration", {})
         names = ("root_shift",) * 3 + ("root_turn",) * 3 + body.tree.coordinates
         missing = [name for name in names if name not in found]
         if missing:
             problem = f"a motion that tells no process noise of {missing[0]}"
             raise ObservationError(problem, remedy="Give one of this body that was smoothed as a whole.")
         acceleration = np.maximum(np.array([found[name] for name in names]), 1e-3)
-        return cls(acceleration, told.get("pixel_sigma", {}), told.get("sigma_factor", {}))
+        return cls(acceleration, smoothing.get("pixel_sigma", {}), smoothing.get("sigma_factor", {}))
 
     def as_told(self, body: Body) -> dict[str, Any]:
-        """The same by name, as `of_take` reads it."""
+        """The noise as a provenance record by name, readable by `of_take`."""
         names = ("root_shift", "root_turn", *body.tree.coordinates)
         values = [self.acceleration[0], *self.acceleration[5:]]
         return {
@@ -70,7 +70,7 @@ class KnownNoise:
 
 
 def known_sigma(channels: Channels, noise: KnownNoise) -> NDArray:
-    """(N,) [px] standard deviations of keypoints, as they are known or else as stated."""
+    """(N,) [px] standard deviations of keypoints: known ones, else the channels' own."""
     out = np.array(channels.sigma)
     for k, (q, c) in enumerate(zip(channels.source, channels.column)):
         out[k] = noise.pixel_sigma.get(channels.sources[q], {}).get(channels.points.names[c], out[k])

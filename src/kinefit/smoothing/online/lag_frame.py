@@ -1,4 +1,4 @@
-"""One frame of a window that is solved again and again: what was measured, matched, as a quadratic cost of the pose."""
+"""One frame of a sliding window: its measurements, matched and linearised as a quadratic cost of the pose."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure, looped
 from kinefit.frame.fit import rows_of, rows_of_points
-from kinefit.frame.results import BLIND, FrameResult
+from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched, Measurement, matched_by, pixels_of
 from kinefit.sensors.observability import moves_points
@@ -21,24 +21,24 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.linearised import ApartRows, SceneOf
 from kinefit.smoothing.online.known_noise import KnownNoise, known_sigma
-from kinefit.smoothing.process_noise import INLIER
+from kinefit.smoothing.process_noise import MIN_INLIER_FACTOR
 from kinefit.solvers.equations import inverse, normal_equations
 
 
-class Follows(Protocol):
-    """What is asked of a tracker."""
+class TrackerLike(Protocol):
+    """The attributes of a tracker that smoothing needs."""
 
     @property
     def body(self) -> Body:
-        """The body that it follows."""
+        """The tracked body."""
 
     @property
     def rate(self) -> float:
-        """[Hz] of its frames."""
+        """Frame rate [Hz]."""
 
     @property
     def settings(self) -> TrackSettings:
-        """Its settings."""
+        """The tracker's settings."""
 
     @property
     def scene_of(self) -> SceneOf:
@@ -46,12 +46,12 @@ class Follows(Protocol):
 
     @property
     def apart(self) -> ApartRows:
-        """Scene -> rows that keep parts of the body from running into each other."""
+        """Scene -> rows against collisions of the body with itself."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackerView:
-    """What is asked of a tracker, of one that has done its work."""
+    """The same attributes of a tracker that has finished."""
 
     body: Body
     rate: float
@@ -62,12 +62,12 @@ class TrackerView:
 
 @dataclass(eq=False)
 class LagFrame:
-    """A frame of the window: what was measured, and where the body is by the last solution."""
+    """A frame of the window: its measurements, and the body's state in the last solution."""
 
     result: FrameResult
     measurements: tuple[Measurement, ...]
-    points: tuple[Matched, ...]  # matched once; linearised anew in every window
-    surfaces: tuple[Matched, ...]  # matched again before the frame is handed out
+    points: tuple[Matched, ...]  # matched once, linearised in every window
+    surfaces: tuple[Matched, ...]  # matched again before the frame is returned
     state: BodyState
     real: bool = True
     about: BodyState | None = None
@@ -77,20 +77,20 @@ class LagFrame:
 
 
 class FrameCosts:
-    """Makes frames of a window, and their costs.
+    """Makes the frames of a window and their costs.
 
     Parameters
     ----------
-    tracker : see `Follows`
+    tracker : see `TrackerLike`
     noise : KnownNoise
     """
 
-    def __init__(self, tracker: Follows, noise: KnownNoise) -> None:
+    def __init__(self, tracker: TrackerLike, noise: KnownNoise) -> None:
         self.tracker, self.noise, self.body = tracker, noise, tracker.body
         self._sigma: dict[int, tuple[Any, NDArray]] = {}
 
     def frame(self, result: FrameResult, measurements: Sequence[Measurement] | None) -> LagFrame:
-        """Of a tracker's result, and of what it was made from, all but keypoints; None: as the result has it."""
+        """A frame of a tracker's result and its measurements, all but keypoints; None: those of the result."""
         scene = self.tracker.scene_of(result.state, result.time)
         if measurements is None:
             measurements, matched = result.measurements, list(result.matched)
@@ -103,61 +103,61 @@ class FrameCosts:
         surfaces = tuple(m for m in matched if m.sensor in loose)
         return LagFrame(result, tuple(measurements), points, surfaces, result.state)
 
-    def told(self, frames: Sequence[LagFrame], f: int) -> NDArray:
-        """(D,) bool: coordinates of which a frame tells on its own."""
+    def observed(self, frames: Sequence[LagFrame], f: int) -> NDArray:
+        """(D,) bool: coordinates that a frame observes on its own."""
         frame, scene, tree = frames[f], self.scene(frames, f), self.body.tree
         pixels = pixels_of(frame.points)
         others = [m for m in (*frame.points, *frame.surfaces) if m.pixels is None]
-        told = np.zeros(len(tree.coordinates), bool)
+        observed = np.zeros(len(tree.coordinates), bool)
         H = np.diag(np.concatenate([np.full(6, 1.0), 1.0 / np.square(tree.spread)]))
         closed = every_closure(self.body, scene.state)
         if closed:
             H = H + normal_equations(self.body, scene.state, closed).matrix
-        for several, far in ((others, False), (pixels, True)):
-            if several:
-                H = H + normal_equations(self.body, scene.state, self._rows(several, scene, frame.points)).matrix
-                seen = np.sqrt(np.maximum(np.diag(inverse(H)), 0.0))[6:] <= BLIND * tree.spread
-                told |= seen & (self._far(pixels, scene) | looped(self.body)) if far else seen
-        return told
+        for matched, of_keypoints in ((others, False), (pixels, True)):
+            if matched:
+                H = H + normal_equations(self.body, scene.state, self._rows(matched, scene, frame.points)).matrix
+                new = np.sqrt(np.maximum(np.diag(inverse(H)), 0.0))[6:] <= UNOBSERVED_STD_RATIO * tree.spread
+                observed |= new & (self._moves_keypoints(pixels, scene) | looped(self.body)) if of_keypoints else new
+        return observed
 
-    def _far(self, pixels: Sequence[KeypointMatched], scene: Scene) -> NDArray:
-        """(D,) bool: coordinates that move a keypoint that is seen."""
+    def _moves_keypoints(self, pixels: Sequence[KeypointMatched], scene: Scene) -> NDArray:
+        """(D,) bool: coordinates that move a keypoint whose detection is an inlier."""
         out = np.zeros(len(self.body.tree.coordinates), bool)
         for m in pixels:
-            inside = (m.weight > 0) & (m.loss.factor(m.squares(scene)) > INLIER)
+            inside = (m.weight > 0) & (m.loss.factor(m.squares(scene)) > MIN_INLIER_FACTOR)
             points, state = m.measurement.layout.points_of(self.body), scene.state
             out |= moves_points(self.body, points, inside[None], state.T_world_root[None], state.angles[None])[0]
         return out
 
     def scene(self, frames: Sequence[LagFrame], f: int) -> Scene:
-        """Of a frame of the window, with its velocity there."""
+        """The scene of a frame of the window, with its velocity there."""
         frame, (a, b) = frames[f], (max(f - 1, 0), min(f + 1, len(frames) - 1))
         velocity = None
         if b > a:
             first, last = frames[a], frames[b]
-            gone = max(last.result.time - first.result.time, 1e-6)
-            velocity = first.state.difference(last.state) / gone
+            elapsed = max(last.result.time - first.result.time, 1e-6)
+            velocity = first.state.difference(last.state) / elapsed
         scene = self.tracker.scene_of(frame.state, frame.result.time)
         return scene.at(frame.state, measurements=frame.measurements, velocity=velocity)
 
-    def _rows(self, matched: Sequence[Matched], scene: Scene, beside: Sequence[Matched] = ()) -> list[AnyRows]:
-        """Rows of matches, beside points that are no part of them."""
-        known = [m if m.pixels is None else self._known(m.pixels) for m in matched]
-        points = rows_of_points(scene, [m for m in beside if m not in matched])
-        return rows_of(scene, known, self.tracker.settings, self.noise.scale, points=points)
+    def _rows(self, matched: Sequence[Matched], scene: Scene, points: Sequence[Matched] = ()) -> list[AnyRows]:
+        """Rows of matches; `points` are all matches of points of the frame, which decide how surfaces count."""
+        weighted = [m if m.pixels is None else self._with_known_noise(m.pixels) for m in matched]
+        count = rows_of_points(scene, [m for m in points if m not in matched])
+        return rows_of(scene, weighted, self.tracker.settings, self.noise.scale, points=count)
 
-    def _known(self, m: KeypointMatched) -> KeypointMatched:
-        """Keypoints with the noise that is known."""
+    def _with_known_noise(self, m: KeypointMatched) -> KeypointMatched:
+        """Keypoints weighted by `KnownNoise.pixel_sigma`."""
         loss = self.tracker.settings.loss
         if not self.noise.pixel_sigma:
-            return m if m.loss is loss else _like(m, replace(m, loss=loss))
+            return m if m.loss is loss else _with_time(m, replace(m, loss=loss))
         layout = m.measurement.layout
         if id(layout) not in self._sigma:
             self._sigma[id(layout)] = layout, known_sigma(layout.channels, self.noise) / layout.channels.sigma
-        return _like(m, replace(m, loss=loss, weight=m.weight / np.square(self._sigma[id(layout)][1])))
+        return _with_time(m, replace(m, loss=loss, weight=m.weight / np.square(self._sigma[id(layout)][1])))
 
     def match(self, frames: Sequence[LagFrame], f: int) -> None:
-        """Find the correspondences of a frame's surfaces anew."""
+        """Match a frame's surfaces again at its present state."""
         frame, reach = frames[f], self.tracker.settings.near
         again = [m for m in frame.measurements if not m.settled]
         if again:
@@ -165,7 +165,7 @@ class FrameCosts:
             frame.surfaces, frame.H = tuple(matched_by(m, scene, reach) for m in again), None
 
     def quadratic(self, frames: Sequence[LagFrame], f: int) -> tuple[NDArray, NDArray, float]:
-        """Cost c − 2 gᵀδ + δᵀHδ of a frame's measurements about where it is now: H, g, c."""
+        """Cost c − 2 gᵀδ + δᵀHδ of a frame's measurements about its present state: H (n, n), g (n,), c (a number)."""
         frame, body, n = frames[f], self.body, self.body.tree.n_dofs
         H, g, cost = np.zeros((n, n)), np.zeros(n), 0.0
         if frame.points or body.closures or (frame.surfaces and frame.H is None):
@@ -187,7 +187,7 @@ class FrameCosts:
         return H, g, cost
 
 
-def _like(old: Matched, new: KeypointMatched) -> KeypointMatched:
-    """With the time of another match."""
+def _with_time(old: Matched, new: KeypointMatched) -> KeypointMatched:
+    """The new match, with the time of the old one."""
     object.__setattr__(new, "time", old.time)
     return new

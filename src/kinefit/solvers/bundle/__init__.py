@@ -1,1 +1,1 @@
-"""Bundle adjustment: bodies, cameras and shape of many frames in one bordered system."""
+"""Bundle adjustment: poses of many frames, body shape and cameras in one bordered system."""

@@ -1,4 +1,4 @@
-"""How a pixel moves when its camera changes."""
+"""Derivatives of pixels by the parameters of their camera."""
 
 from __future__ import annotations
 

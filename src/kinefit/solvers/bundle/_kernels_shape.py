@@ -1,4 +1,4 @@
-"""One frame's normal equations of pose and shape together, from pixels."""
+"""Joint normal equations of pose and shape from one frame's pixels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kinefit.solvers.bundle._kernels_cameras import COLUMNS, camera_columns
 
 @jit
 def scale_motion(parents, offsets, groups, frames, motion):
-    """motion (S, G, 3): how a joint centre moves [m] when a scale group is stretched by one."""
+    """motion (S, G, 3): derivatives [m] of the joint centres by the scale of each group."""
     motion[:] = 0.0
     for s in range(1, parents.size):
         p = parents[s]

@@ -1,4 +1,4 @@
-"""Bundle adjustment with a body: its shape, its pose in every frame, and the cameras, in one least-squares fit."""
+"""Bundle adjustment with a body: fit its shape, its poses and the cameras jointly."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.losses import geman_mcclure
 from kinefit.solvers import _kernels_linear
 from kinefit.solvers.bundle import _kernels_shape
-from kinefit.solvers.bundle.border_frames import POSTURE
+from kinefit.solvers.bundle.border_frames import POSTURE_SHARE
 from kinefit.solvers.bundle.cameras import (
     COLUMNS,
     TIME,
@@ -28,7 +28,7 @@ from kinefit.solvers.bundle.cameras import (
 from kinefit.solvers.bundle.shape import PixelFrames, ShapeParameters
 from kinefit.solvers.least_squares import LEAST_SCALED_DAMPING, relax
 
-_TOLERANCE = 1e-3  # share of the cost that a last iteration takes away
+_TOLERANCE = 1e-3  # fall of the cost in an iteration, as a share of it, below which the fit ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +39,9 @@ class BundleState:
     ----------
     rig : Rig
     offsets : (C,) [s]
-    theta : (p,) shape parameters.
-    states : of all frames.
-    x_static : (P, 3) [m] points that do not move.
+    theta : (p,) shape parameters
+    states : of all frames
+    x_static : (P, 3) [m] static points
     """
 
     rig: Rig
@@ -53,12 +53,12 @@ class BundleState:
 
 @dataclass(frozen=True, eq=False)
 class BodyBundle(BundleState):
-    """Cameras, shape and poses that agree best.
+    """Fitted cameras, shape and poses.
 
     Parameters
     ----------
     cost : float
-    S : (C · 10, C · 10) information of the data about the cameras, all else taken out.
+    S : (C · 10, C · 10) information of the data on the cameras, all other unknowns eliminated
     """
 
     cost: float
@@ -74,20 +74,20 @@ def fit_body_and_cameras(
     static: PointPixels | None = None,
     max_iterations: int = 15,
 ) -> BodyBundle:
-    """Cameras, shape and poses of least robust pixel error (Schur complement: poses and static points taken out).
+    """Minimise the robust pixel error over cameras, shape and poses (Schur complement: poses and points eliminated).
 
     Parameters
     ----------
-    model : ShapeParameters with its prior.
-    frames : PixelFrames, with velocities where time offsets are estimated.
+    model : ShapeParameters with its prior
+    frames : PixelFrames, with velocities if time offsets are estimated
     start : BundleState
     prior : CameraPrior
-    static : PointPixels of the points that do not move.
+    static : PointPixels of static points
     """
     loss = geman_mcclure()
     tree, n, p = model.body.tree, model.body.tree.n_dofs, len(model.mean)
     groups, size = len(model.body.scale_groups), len(start.rig) * COLUMNS
-    posture = POSTURE * tree.posture_precision
+    posture = POSTURE_SHARE * tree.posture_precision
     chain, depth, _ = tree.coupled_pattern
     shape_prior = model.prior
     precision, freedom = prior.precision, prior.freedom
@@ -97,12 +97,13 @@ def fit_body_and_cameras(
 
     def cost_of(at: BundleState) -> float:
         moved, rest, _ = model.geometry(at.theta)
-        away, bent, pixels = prior.departure(at.rig, at.offsets), at.theta - model.mean, frames.with_offsets(at.offsets)
-        total = float(precision @ away**2 + bent @ shape_prior @ bent)
+        pixels = frames.with_offsets(at.offsets)
+        camera_change, shape_change = prior.departure(at.rig, at.offsets), at.theta - model.mean
+        total = float(precision @ camera_change**2 + shape_change @ shape_prior @ shape_change)
         total += robust_cost(residuals(at.rig, at.offsets, static, at.x_static), static.weight, loss)[0]
         for f, state in enumerate(at.states):
             placed, _ = moved.forward(state.T_world_root, state.angles)
-            total += tree.posture_cost(state.angles, POSTURE) + _kernels_shape.frame_cost(
+            total += tree.posture_cost(state.angles, POSTURE_SHARE) + _kernels_shape.frame_cost(
                 owner, rest, at.rig.packed, frames.camera, frames.column, pixels.uv[f], frames.weight[f],
                 frames.shares, placed, loss.kind, loss.scale,
             )  # fmt: skip
@@ -127,26 +128,26 @@ def fit_body_and_cameras(
         S, b = np.zeros((p + size, p + size)), np.zeros(p + size)
         S[:p, :p], b[:p] = shape_prior, shape_prior @ (model.mean - at.theta)
         S[p:, p:], b[p:] = points.S, points.b
-        kept = np.empty((len(systems), p + size + 1, n))
+        solutions = np.empty((len(systems), p + size + 1, n))
         for f, (H, g) in enumerate(systems):
             S += H[n:, n:]
             b += g[n:]
-            if not _kernels_linear.eliminate(H, g, n, damping, chain, depth, S, b, kept[f]):
-                kept[f] = 0.0
-        return np.tril(S) + np.tril(S, -1).T, b, kept, points
+            if not _kernels_linear.eliminate(H, g, n, damping, chain, depth, S, b, solutions[f]):
+                solutions[f] = 0.0
+        return np.tril(S) + np.tril(S, -1).T, b, solutions, points
 
     now, cost, damping = start, cost_of(start), 1e-3
     for _ in range(max_iterations):
         systems, before = systems_of(now), cost
         while damping < 1e5:
-            S, b, kept, points = reduced(systems, now, damping)
+            S, b, solutions, points = reduced(systems, now, damping)
             S[range(p, p + size), range(p, p + size)] += precision
             b[p:] -= precision * prior.departure(now.rig, now.offsets)
             delta = np.linalg.solve(S + damping * np.diag(np.diag(S)), b)
             by_camera = delta[p:].reshape(-1, COLUMNS)
             theta = now.theta + delta[:p]
             theta[:groups] = np.clip(theta[:groups], 0.2, 5.0)
-            moves = kept[:, -1] - delta @ kept[:, :-1]
+            moves = solutions[:, -1] - delta @ solutions[:, :-1]
             new = BundleState(
                 moved_rig(now.rig, by_camera), now.offsets + by_camera[:, TIME], theta,
                 [s.retract(m, (tree.lower, tree.upper)) for s, m in zip(now.states, moves, strict=True)],

@@ -1,9 +1,9 @@
-"""Poses of many frames with a border of parameters that they share: damped Gauss-Newton, the poses eliminated.
+"""Fit poses of many frames and parameters that they share: damped Gauss-Newton, the poses eliminated.
 
-The normal equations of K frames and p parameters θ have the shape of an arrow: each frame's pose meets only itself and
-θ. Taking the poses out (Schur complement) leaves p equations, so the cost grows linearly with the frames. Derivatives
-by θ are central differences of whitened residuals √w·r of the same correspondences in two worlds, with the robust
-factors held: no sensor needs to know of a parameter.
+The normal equations of K frames and p parameters θ have the shape of an arrow: each frame's pose is coupled to itself
+and θ only. Eliminating the poses (Schur complement) leaves p equations, so the cost grows linearly with the frames.
+Derivatives by θ are central differences of whitened residuals √w·r of the same correspondences in two worlds, for fixed
+robust factors. So sensors need not know the parameters.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import BodyState
 from kinefit.solvers import _kernels_linear
 from kinefit.solvers.bundle.border_frames import (
-    SETTLING,
+    MAX_POSE_STEPS,
     BorderedProblem,
     FrameEquations,
     Weighing,
@@ -30,21 +30,21 @@ from kinefit.solvers.bundle.border_frames import (
 )
 from kinefit.solvers.equations import lock
 
-_FIRST = 1e-3  # damping to begin with, as a share of the poses' mean diagonal
-_STIFF = 0.01  # of the poses' damping that parameters have: their prior holds them, few angles have one
-_MOST = 1e8  # damping, as such a share, at which nothing is left to be gained
-_NEAR = 0.02  # [m, rad] of moves, typical of poses and most of parameters, within which derivatives stay as they are
-_LEAST = 0.3  # [1/m², 1/rad²] damping of poses when they move with parameters
+_INITIAL_DAMPING = 1e-3  # as a share of the poses' mean diagonal
+_PARAMETER_DAMPING_RATIO = 0.01  # to the poses' damping: parameters have a prior, few angles have one
+_MAX_DAMPING = 1e8  # as a share of the poses' mean diagonal: with more the cost cannot fall
+_MAX_REUSE_CHANGE = 0.02  # [m, rad] of poses (RMS) plus parameters (largest), within which derivatives are reused
+_MIN_POSE_DAMPING = 0.3  # [1/m², 1/rad²] of poses in steps with parameters
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known of the parameters before.
+    """Gaussian prior of the parameters.
 
     Parameters
     ----------
     mean : (p,)
-    information : (p, p) inverse covariance; zero for a parameter of which nothing is known.
+    information : (p, p) inverse covariance; zero for a parameter without a prior
     """
 
     mean: NDArray
@@ -53,17 +53,17 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Bordered:
-    """Where a fit of poses and shared parameters ended.
+    """The result of a fit of poses and shared parameters.
 
     Parameters
     ----------
-    theta : (p,)
+    theta : (p,) parameters
     states : K states
     prior : Prior
-    cost : float, of rows, postures and prior.
-    iterations : int, steps tried.
-    converged : bool, False when the iterations were used up.
-    told : function that makes `information`, when it is asked for.
+    cost : float, of rows, postures and prior
+    iterations : int, number of steps tried
+    converged : bool, False if the iterations were used up
+    compute_information : function that computes `information` on demand
     """
 
     theta: NDArray
@@ -72,12 +72,12 @@ class Bordered:
     cost: float
     iterations: int
     converged: bool
-    told: Callable[[], NDArray]
+    compute_information: Callable[[], NDArray]
 
     @cached_property
     def information(self) -> NDArray:
-        """(p, p) what the rows tell of θ, every pose eliminated; without the prior."""
-        return self.told()
+        """Information (p, p) of the rows on θ, every pose eliminated, without the prior."""
+        return self.compute_information()
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +85,8 @@ class _Block:
     """One frame's part of the arrow."""
 
     frame: FrameEquations
-    by_theta: NDArray  # (N, p) whitened, as it was found
-    felt: NDArray  # (N,) bool
+    by_theta: NDArray  # (N, p) whitened derivatives, without robust factors
+    used: NDArray  # (N,) bool, rows with a weight above 0
     B: NDArray  # (n, p)
     S: NDArray  # (p, p)
     b: NDArray  # (p,)
@@ -100,7 +100,7 @@ def solve(
     steps: NDArray,
     *,
     weighing: Weighing | None = None,
-    iterations: tuple[int, int] = (20, SETTLING),
+    iterations: tuple[int, int] = (20, MAX_POSE_STEPS),
     tolerance: float = 1e-4,
 ) -> Bordered:
     """Minimise Σ share·ρ(w r²) over K poses and the parameters that they share, prior and postures included.
@@ -108,31 +108,31 @@ def solve(
     Parameters
     ----------
     problem : BorderedProblem
-    theta : (p,) to start from.
-    states : K, to start from; limits of joints hold.
+    theta : (p,) to start from
+    states : K states to start from; coordinates stay within their limits
     prior : Prior
-    steps : (p,) of the central differences; parameters are in units of which one is about a metre or a radian.
-    weighing : how much sensors and the posture prior count, and the loss of rows without their own.
-    iterations : steps with the parameters, and those that poses take by themselves after each one, at most.
-    tolerance : stop when the predicted fall of the cost is below this share of it.
+    steps : (p,) of the central differences; parameters should be scaled to about a metre or a radian
+    weighing : shares of sensors and of the posture prior, and the loss of rows without their own
+    iterations : at most, steps with the parameters, and steps of the poses alone after each
+    tolerance : stop when the predicted fall of the cost is below this share of it
 
     Raises
     ------
     ObservationError
-        A sensor whose rows differ in number between two worlds; rows that the body cannot take.
+        A sensor's rows differ in number between two worlds; rows on segments that the body lacks.
     """
     task = _Task(problem, prior, np.asarray(steps, float), weighing or Weighing())
     theta, bounds, (most, settling) = np.array(theta, float), limits(problem.body(theta)), iterations
     states = [s.retract(np.zeros(6 + len(s.angles)), bounds) for s in states]
     frames, states = settle(problem, theta, states, task.weighing, settling)
-    cost, blocks, near = task.cost(theta, frames), None, None
+    cost, blocks, reusable = task.cost(theta, frames), None, None
     mean = float(np.mean([np.trace(f.H) / len(f.H) for f in frames])) if frames else 1.0
     least = _kernels_linear.LEAST_DAMPING * mean
-    damping, growth, converged, tried, far = _FIRST * mean, 2.0, False, 0, 0.0
+    damping, growth, converged, tried, change = _INITIAL_DAMPING * mean, 2.0, False, 0, 0.0
     while tried < most and not converged:
         tried += 1
-        if blocks is None:  # not before it is needed: derivatives by θ are most of the work
-            blocks = task.blocks(theta, states, frames, near)
+        if blocks is None:  # on demand: derivatives by θ are most of the work
+            blocks = task.blocks(theta, states, frames, reusable)
         delta, moves, predicted = task.step(theta, blocks, damping)
         if predicted <= tolerance * cost + 1e-300:
             converged = True
@@ -144,23 +144,23 @@ def solve(
         damping, growth = _kernels_linear.adapt(damping, growth, cost - new, predicted, least)
         if new < cost:
             turns = np.array([a.difference(b) for a, b in zip(states, moved)])
-            far += float(np.sqrt(np.mean(np.square(turns))) + np.abs(delta).max())
+            change += float(np.sqrt(np.mean(np.square(turns))) + np.abs(delta).max())
             theta, states, frames, cost = trial, moved, settled, new
-            near = blocks if far <= _NEAR else None
-            far, blocks = far if near else 0.0, None
-        elif damping > _MOST * mean:
+            reusable = blocks if change <= _MAX_REUSE_CHANGE else None
+            change, blocks = change if reusable else 0.0, None
+        elif damping > _MAX_DAMPING * mean:
             converged = True
 
-    def told() -> NDArray:
-        last = task.blocks(theta, states, frames, near) if blocks is None else blocks
+    def compute_information() -> NDArray:
+        last = task.blocks(theta, states, frames, reusable) if blocks is None else blocks
         return _information(last, len(theta), lock(problem.body(theta), None))
 
-    return Bordered(theta, tuple(states), prior, cost, tried, converged, told)
+    return Bordered(theta, tuple(states), prior, cost, tried, converged, compute_information)
 
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """A problem with all that weighs it."""
+    """A problem with its prior, difference steps and weights."""
 
     problem: BorderedProblem
     prior: Prior
@@ -169,11 +169,11 @@ class _Task:
 
     @property
     def _least(self) -> float:
-        """Damping of poses in steps with θ: angles that hardly anything holds settle by themselves."""
-        return _LEAST * self.weighing.most
+        """Damping of poses in steps with θ; weakly constrained angles then move in steps of the poses alone."""
+        return _MIN_POSE_DAMPING * self.weighing.most
 
     def cost(self, theta: NDArray, frames: Sequence[FrameEquations]) -> float:
-        """Of rows, postures and prior."""
+        """Cost of rows, postures and prior, with parameters (p,)."""
         away = theta - self.prior.mean
         return float(away @ self.prior.information @ away) + sum(f.cost for f in frames)
 
@@ -182,43 +182,43 @@ class _Task:
         theta: NDArray,
         states: Sequence[BodyState],
         frames: Sequence[FrameEquations],
-        near: Sequence[_Block] | None,
+        reusable: Sequence[_Block] | None,
     ) -> list[_Block]:
-        """The frames' parts of the arrow, with the derivatives by θ of `near` blocks where those will do."""
-        felt = [frame.felt for frame in frames]
-        if near is not None and all(np.array_equal(a.felt, b) for a, b in zip(near, felt, strict=True)):
-            by_theta = [block.by_theta for block in near]
+        """The frames' parts of the arrow, with derivatives by θ of `reusable` blocks if the used rows are the same."""
+        used = [frame.used for frame in frames]
+        if reusable is not None and all(np.array_equal(a.used, b) for a, b in zip(reusable, used, strict=True)):
+            by_theta = [block.by_theta for block in reusable]
         else:
             by_theta = differences(self.problem, theta, self.steps, states)
         out = []
-        for frame, D, some in zip(frames, by_theta, felt, strict=True):
+        for frame, D, some in zip(frames, by_theta, used, strict=True):
             T = (frame.factor * some)[:, None] * D
-            out.append(_Block(frame, D, some, gram(frame.J, T), gram(T, T), frame.left @ T))
+            out.append(_Block(frame, D, some, gram(frame.J, T), gram(T, T), frame.residual @ T))
         return out
 
     def step(self, theta: NDArray, blocks: Sequence[_Block], damping: float) -> tuple[NDArray, list[NDArray], float]:
         """δθ (p,), each pose's δ (n,), and the predicted fall of the cost."""
         p = len(theta)
-        S = self.prior.information + _STIFF * damping * np.eye(p)
+        S = self.prior.information + _PARAMETER_DAMPING_RATIO * damping * np.eye(p)
         pull = self.prior.information @ (self.prior.mean - theta)
-        b, kept = pull.copy(), []
+        b, solutions = pull.copy(), []
         for block in blocks:
             frame = block.frame
             back = solved(frame.H, np.column_stack([block.B, frame.g]), frame.held, damping + self._least)
             both = gram(block.B, back)
             S += block.S - both[:, :p]
             b += block.b - both[:, p]
-            kept.append(back)
+            solutions.append(back)
         delta = np.linalg.solve(S, b)
-        moves = [back[:, p] - back[:, :p] @ delta for back in kept]
-        fall = float(delta @ pull) + _STIFF * damping * float(delta @ delta)
+        moves = [back[:, p] - back[:, :p] @ delta for back in solutions]
+        fall = float(delta @ pull) + _PARAMETER_DAMPING_RATIO * damping * float(delta @ delta)
         for block, move in zip(blocks, moves, strict=True):
             fall += float(block.b @ delta + block.frame.g @ move) + (damping + self._least) * float(move @ move)
         return delta, moves, fall
 
 
 def _information(blocks: Sequence[_Block], p: int, known: NDArray) -> NDArray:
-    """(p, p) what all frames tell of θ with their poses unknown; limits of joints tell nothing."""
+    """Information (p, p) of all frames on θ, their poses eliminated; joint limits do not count."""
     out = np.zeros((p, p))
     for block in blocks:
         out += block.S - gram(block.B, solved(block.frame.H, block.B, known, 0.0))

@@ -19,28 +19,31 @@ from kinefit.solvers.bundle.whitened import PoseScrews, columns, residuals, soft
 from kinefit.solvers.equations import dense_pattern, lock, normal_equations
 from kinefit.solvers.pixels import fit_pixels
 
-POSTURE = 0.01
-"""Share of the body's posture prior that holds poses here: in full it would bend lengths."""
+POSTURE_SHARE = 0.01
+"""Share of the body's posture prior in fits with parameters: in full it would bias lengths."""
 
-SETTLING = 6
-"""Steps that a pose takes by itself, at most, after each one with the parameters."""
+MAX_POSE_STEPS = 6
+"""Steps of the poses alone after each step with the parameters."""
 
-_FIRST = 1e-3  # damping to begin with, as a share of the pose's mean diagonal
-_SETTLED = 1e-3  # fall of a pose's cost at which it rests
-_RESTING = 1e-5  # the same, as a share of the cost, in one kernel: some hundred pixels cost about that many
-_FLOOR = 1e-9  # share of a pose's mean diagonal that holds what nothing measures
+_INITIAL_DAMPING = 1e-3  # as a share of the pose's mean diagonal
+_MIN_COST_FALL = 1e-3  # of a pose's cost: below it the pose has converged
+_KERNEL_TOLERANCE = 1e-5  # the same as a share of the cost, in the compiled kernel: the cost is about a hundred
+_MIN_DIAGONAL_RATIO = 1e-9  # to a pose's mean diagonal, added to its diagonal for unmeasured coordinates
 
 Part = tuple[str, AnyRows]
-"""Rows, and the name of the sensor that made them."""
+"""Name of a sensor, and its rows."""
 
 
 class BorderedProblem(Protocol):
-    """What the parameters and the frames are.
+    """Frames with rows that depend on poses and shared parameters.
 
-    It may have `touches`, of each parameter the segments on which alone rows can feel it, None for anywhere: those of
-    different segments then share an evaluation. It may have `columns(theta, steps, states)`, what `differences` gives
-    as far as it is known without other worlds, NaN where it is not. It may have `packed(theta, frame, state)`, a rig
-    and the points of a frame of which pixels alone are measured, None for any other: its pose settles in one kernel.
+    Optional attributes make it faster:
+
+    - `touches`: (p,) for each parameter the only segments whose rows depend on it, None for any. Parameters of
+      different segments then share an evaluation.
+    - `columns(theta, steps, states)`: result of `differences` as far as it is known without changed worlds, else NaN.
+    - `packed(theta, frame, state)`: rig and points of a frame with keypoints alone, None for any other. Its pose is
+      fitted in one kernel.
     """
 
     def body(self, theta: NDArray) -> Body:
@@ -54,22 +57,22 @@ class BorderedProblem(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Weighing:
-    """How much everything counts.
+    """Weights of sensors and of the posture prior.
 
     Parameters
     ----------
-    shares : {sensor: 0..1} how much a sensor's rows count, where its errors last; 1 for those not named.
-    loss : Loss of rows without their own.
-    posture : share of the body's posture prior that holds the poses.
+    shares : {sensor: 0..1} factor on the cost of a sensor's rows, below 1 for biased sensors; 1 for sensors not named
+    loss : Loss of rows without their own
+    posture : share of the body's posture prior
     """
 
     shares: Mapping[str, float] = field(default_factory=dict)
     loss: Loss = SQUARED
-    posture: float = POSTURE
+    posture: float = POSTURE_SHARE
 
     @property
     def most(self) -> float:
-        """The share of the sensor that counts most; postures count no more."""
+        """The largest share of any sensor; the posture prior is multiplied by it."""
         return max(self.shares.values()) if self.shares else 1.0
 
 
@@ -79,10 +82,10 @@ class FrameEquations:
 
     Parameters
     ----------
-    body, state : what they are about
-    parts : its rows, by sensor
-    weighing : how much they count
-    H, g : (n, n), (n,) equations of the pose, with its posture prior
+    body, state : at which the rows are linearised
+    parts : rows by sensor
+    weighing : their weights
+    H, g : (n, n), (n,) equations of the pose, posture prior included
     cost : float
     """
 
@@ -96,7 +99,7 @@ class FrameEquations:
 
     @cached_property
     def factor(self) -> NDArray:
-        """(N,) square root of shares and robust factors."""
+        """(N,) square root of the rows' shares times robust factors."""
         w = self.weighing
         own = [np.sqrt(w.shares.get(sensor, 1.0)) * softening(rows, w.loss)[0] for sensor, rows in self.parts]
         return np.concatenate([np.empty(0), *own])
@@ -105,30 +108,30 @@ class FrameEquations:
     def J(self) -> NDArray:
         """(N, n) derivatives by the pose, whitened and softened."""
         pose = PoseScrews.of(self.body, self.state)
-        every = [np.empty((0, len(self.g))), *(columns(rows, pose) for _, rows in self.parts)]
-        return np.asarray(self.factor[:, None] * np.concatenate(every))
+        blocks = [np.empty((0, len(self.g))), *(columns(rows, pose) for _, rows in self.parts)]
+        return np.asarray(self.factor[:, None] * np.concatenate(blocks))
 
     @property
-    def left(self) -> NDArray:
+    def residual(self) -> NDArray:
         """(N,) residuals, whitened and softened."""
         return np.asarray(self.factor * _stacked(self.parts))
 
     @cached_property
     def held(self) -> NDArray:
-        """(n,) bool, at a limit that it presses on, or fixed: does not move."""
+        """(n,) bool: degrees of freedom that are fixed, or at a limit and pulled beyond it."""
         tree, angles, out = self.body.tree, self.state.angles, lock(self.body, None)
         out[6:] |= (angles <= tree.lower) & (self.g[6:] < 0.0)
         out[6:] |= (angles >= tree.upper) & (self.g[6:] > 0.0)
         return out
 
     @property
-    def felt(self) -> NDArray:
-        """(N,) bool, rows with a weight: a slack rope's row must not feel its length."""
-        felt = [np.ones(len(r), bool) if r.weight.ndim == 2 else r.weight > 0.0 for _, r in self.parts]
-        return np.concatenate([*felt, np.empty(0, bool)])
+    def used(self) -> NDArray:
+        """(N,) bool: rows with a weight above 0; a slack rope's row must not depend on its length."""
+        used = [np.ones(len(r), bool) if r.weight.ndim == 2 else r.weight > 0.0 for _, r in self.parts]
+        return np.concatenate([*used, np.empty(0, bool)])
 
     def step(self, damping: float) -> tuple[NDArray, float]:
-        """δ (n,) of the pose alone, and the predicted fall of the cost."""
+        """Step δ (n,) of the pose alone, and the predicted fall of the cost; `damping` in units of H."""
         n, tree = len(self.g), self.body.tree
         L, move = np.empty((n, n)), np.empty(n)
         fall = _kernels_linear.damped_step(
@@ -144,7 +147,13 @@ class FrameEquations:
 def frame_at(
     problem: BorderedProblem, theta: NDArray, frame: int, state: BodyState, weighing: Weighing
 ) -> FrameEquations:
-    """A frame's rows and equations at parameters (p,) and a state."""
+    """A frame's rows and equations at parameters (p,) and a state.
+
+    Raises
+    ------
+    ObservationError
+        Rows on segments or degrees of freedom that the body lacks.
+    """
     body = problem.body(theta)
     parts = problem.parts(theta, frame, state)
     shares = [weighing.shares.get(sensor, 1.0) for sensor, _ in parts]
@@ -158,9 +167,10 @@ def frame_at(
 
 
 def settle(
-    problem: BorderedProblem, theta: NDArray, states: Sequence[BodyState], weighing: Weighing, steps: int = SETTLING
-) -> tuple[list[FrameEquations], list[BodyState]]:
-    """Every frame's pose brought near its own minimum: each has other angles that hardly anything holds."""
+    problem: BorderedProblem, theta: NDArray, states: Sequence[BodyState], weighing: Weighing,
+    steps: int = MAX_POSE_STEPS,
+) -> tuple[list[FrameEquations], list[BodyState]]:  # fmt: skip
+    """Fit every frame's pose alone, for fixed parameters (p,): weakly constrained angles need steps of their own."""
     body, frames, out = problem.body(theta), [], []
     bounds, packed = limits(body), getattr(problem, "packed", None)
     posture = weighing.most * weighing.posture
@@ -170,7 +180,7 @@ def settle(
         of_pixels = None if packed is None else packed(theta, f, state)
         if of_pixels is not None and (found := fit_pixels(
             body, state, of_pixels[0], of_pixels[1], None,
-            max_iterations=steps, tolerance=_RESTING, posture=posture,
+            max_iterations=steps, tolerance=_KERNEL_TOLERANCE, posture=posture,
         )):  # fmt: skip
             state, H, g, cost, _ = found
             out.append(state)
@@ -178,10 +188,10 @@ def settle(
             continue
         frame = frame_at(problem, theta, f, state, weighing)
         mean = float(np.trace(frame.H)) / len(frame.H) + 1e-12
-        damping, growth, least = _FIRST * mean, 2.0, _kernels_linear.LEAST_DAMPING * mean
+        damping, growth, least = _INITIAL_DAMPING * mean, 2.0, _kernels_linear.LEAST_DAMPING * mean
         for _ in range(steps):
             move, predicted = frame.step(damping)
-            if predicted <= _SETTLED * (1.0 + 1e-3 * frame.cost):
+            if predicted <= _MIN_COST_FALL * (1.0 + 1e-3 * frame.cost):
                 break
             moved = state.retract(move, bounds)
             new = frame_at(problem, theta, f, moved, weighing)
@@ -194,27 +204,27 @@ def settle(
 
 
 def limits(body: Body) -> tuple[NDArray, NDArray]:
-    """(D,) lower and upper ends of every coordinate."""
+    """(D,) lower and upper limits of every coordinate."""
     return body.tree.lower, body.tree.upper
 
 
 def differences(problem: BorderedProblem, theta: NDArray, steps: NDArray, states: Sequence[BodyState]) -> list[NDArray]:
-    """(N, p) of every frame: how far each row's point moves, whitened, with each parameter; central differences.
+    """(N, p) of every frame: whitened derivatives of rows by the parameters, by central differences with steps (p,).
 
     Raises
     ------
     ObservationError
-        A sensor whose rows differ in number or kind between two worlds.
+        A sensor's rows differ in number or kind between two worlds.
     """
     centre = [problem.parts(theta, f, state) for f, state in enumerate(states)]
-    told = getattr(problem, "columns", None)
-    if told is None:
+    known_columns = getattr(problem, "columns", None)
+    if known_columns is None:
         out = [np.full((sum(len(rows) for _, rows in parts), len(theta)), np.nan) for parts in centre]
     else:
-        out = told(theta, steps, states)
+        out = known_columns(theta, steps, states)
     unknown = [np.isnan(D) for D in out]
-    left = np.any([u.any(axis=0) for u in unknown], axis=0)
-    if not left.any():
+    remaining = np.any([u.any(axis=0) for u in unknown], axis=0)
+    if not remaining.any():
         return out
     for D, u in zip(out, unknown):
         D[u] = 0.0
@@ -222,7 +232,7 @@ def differences(problem: BorderedProblem, theta: NDArray, steps: NDArray, states
     touches: Sequence[frozenset[int] | None] = (None,) * len(theta)
     if all(segment is not None for segment in on):
         touches = getattr(problem, "touches", touches)
-    for together in apart(touches, np.flatnonzero(left)):
+    for together in apart(touches, np.flatnonzero(remaining)):
         change = np.zeros(len(theta))
         change[together] = steps[together]
         owner = _owner(together, touches, len(problem.body(theta).tree.segments))
@@ -234,16 +244,16 @@ def differences(problem: BorderedProblem, theta: NDArray, steps: NDArray, states
             k = np.full(len(away), together[0])
             if owner is not None and segment is not None:
                 k = owner[segment]
-            felt = np.flatnonzero(k >= 0)
-            felt = felt[unknown[f][felt, k[felt]]]
-            out[f][felt, k[felt]] = away[felt] / steps[k[felt]]
+            dependent = np.flatnonzero(k >= 0)
+            dependent = dependent[unknown[f][dependent, k[dependent]]]
+            out[f][dependent, k[dependent]] = away[dependent] / steps[k[dependent]]
     return out
 
 
 def _by_rows(
     problem: BorderedProblem, theta: NDArray, change: NDArray, frame: int, state: BodyState, parts: Sequence[Part]
 ) -> NDArray:
-    """(N,) how far each row's point moves with half the change, whitened: from its rows on either side."""
+    """(N,) half the difference of whitened residuals between parameters `theta` minus and plus `change`."""
     ends = [problem.parts(theta + sign * change, frame, state) for sign in (1.0, -1.0)]
     for moved in ends:
         _same(parts, moved)
@@ -251,7 +261,7 @@ def _by_rows(
 
 
 def _owner(together: Sequence[int], touches: Sequence[frozenset[int] | None], count: int) -> NDArray | None:
-    """(S,) which of some parameters each of so many segments feels, -1 for none; None for one felt everywhere."""
+    """(S,) the one of some parameters on which each segment's rows depend, -1 for none; None if any segment may."""
     out = np.full(count, -1)
     for k in together:
         touched = touches[k]
@@ -262,14 +272,20 @@ def _owner(together: Sequence[int], touches: Sequence[frozenset[int] | None], co
 
 
 def _segments(parts: Sequence[Part]) -> NDArray | None:
-    """(N,) the segment of every row; None where a row may be about several."""
+    """(N,) the segment of every row; None if a row may depend on several."""
     if not all(isinstance(rows, Rows) for _, rows in parts):
         return None
     return np.concatenate([np.zeros(0, np.int64), *(rows.segment for _, rows in parts if isinstance(rows, Rows))])
 
 
 def apart(touches: Sequence[frozenset[int] | None], some: Iterable[int]) -> list[list[int]]:
-    """Some parameters that may change together, as no row feels two of them: greedily; None feels everywhere."""
+    """Groups of parameters that may change together, because no row depends on two of a group (greedy colouring).
+
+    Parameters
+    ----------
+    touches : (p,) for each parameter the only segments whose rows depend on it; None for any: a group of its own
+    some : the parameters to group
+    """
     groups: list[tuple[list[int], set[int]]] = []
     out: list[list[int]] = []
     for k in map(int, some):
@@ -288,7 +304,7 @@ def apart(touches: Sequence[frozenset[int] | None], some: Iterable[int]) -> list
 
 
 def solved(H: NDArray, right: NDArray, held: NDArray, damping: float) -> NDArray:
-    """(n, m) H⁻¹ right of a pose, zero for what is held."""
+    """(H + damping)⁻¹ right (n, m) of a pose's H (n, n), `damping` in units of H; zero for held (n,) coordinates."""
     A, right = H.copy(), np.ascontiguousarray(right).copy()
     A.flat[:: len(H) + 1] += damping + _floor(H)
     A[held], A[:, held], right[held] = 0.0, 0.0, 0.0
@@ -297,12 +313,12 @@ def solved(H: NDArray, right: NDArray, held: NDArray, damping: float) -> NDArray
 
 
 def _floor(H: NDArray) -> float:
-    """What is added to the diagonal of a pose's equations (n, n) in any case."""
-    return _FLOOR * float(H.trace()) / len(H) + 1e-12
+    """Least value added to the diagonal of a pose's H (n, n)."""
+    return _MIN_DIAGONAL_RATIO * float(H.trace()) / len(H) + 1e-12
 
 
 def gram(A: NDArray, B: NDArray) -> NDArray:
-    """(n, m) Aᵀ B."""
+    """Aᵀ B (n, m) of matrices (N, n) and (N, m), without threads."""
     out = np.zeros((A.shape[1], B.shape[1]))
     _kernels_border.gram(np.ascontiguousarray(A), np.ascontiguousarray(B), out)
     return out
@@ -314,7 +330,7 @@ def _stacked(parts: Sequence[Part]) -> NDArray:
 
 
 def _same(parts: Sequence[Part], moved: Sequence[Part]) -> None:
-    """Rows of one match correspond one to one in all worlds."""
+    """Check that rows of one match correspond one to one in both worlds."""
     remedy = "Give all rows of a match always; weight 0 for one that is not felt."
     for (sensor, a), (other, b) in zip(parts, moved):
         if sensor != other or len(a) != len(b) or type(a) is not type(b):

@@ -1,7 +1,7 @@
-"""Cameras as unknowns: their parameters, how a camera moves by them, and free points that see them.
+"""Cameras as unknowns: their parameters, cameras changed by them, and normal equations with free points.
 
-Ten parameters a camera: twist (v, ω) [m, rad] in its own frame (x_camera moves by v + ω × x_camera, so v is where it
-stands and ω where it looks), log of the focal length, the radial coefficients k1 and k2, time offset [s].
+Ten parameters for each camera: twist (v, ω) [m, rad] in its own frame (x_camera moves by v + ω × x_camera), log of the
+focal length, radial coefficients k1 and k2, time offset [s].
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from kinefit.losses import Loss
 from kinefit.solvers.bundle import _kernels_cameras
 from kinefit.solvers.bundle._kernels_cameras import COLUMNS
 
-_UNSEEN = 1e6  # squared standard deviations of a point that its camera cannot see
+_INVISIBLE_SQUARE = 1e6  # squared residual, in variances, of a point that its camera cannot see
 POSE, FOCAL, RADIAL, TIME = slice(0, 6), 6, slice(7, 9), 9
 
 
 def moved_camera(camera: Camera, delta: NDArray) -> Camera:
-    """The camera changed by δ (10,); the time offset is not part of it."""
+    """The camera changed by δ (10,), apart from the time offset."""
     matrix, k = np.array(camera.matrix), np.array(camera.distortion)
     matrix[:2, :2] *= np.exp(delta[FOCAL])
     if np.any(delta[RADIAL]):
         k = np.zeros(4) if k.size == 0 else k
         k[:2] += delta[RADIAL]
     T = se3.exp(delta[POSE]) @ camera.T_camera_world
-    T[:3, :3] = se3.nearest_rotation(T[:3, :3])  # many small turns must not add up to a shear
+    T[:3, :3] = se3.nearest_rotation(T[:3, :3])  # rounding of many small rotations must not add up
     return replace(camera, matrix=matrix, distortion=k, T_camera_world=T)
 
 
@@ -39,7 +39,7 @@ def moved_rig(rig: Rig, delta: NDArray) -> Rig:
 
 
 def departure(rig: Rig, start: Rig) -> NDArray:
-    """δ (C, 10) that leads from the cameras of one rig to those of another; the time offset's column is zero."""
+    """δ (C, 10) from the cameras of `start` to those of `rig`; zero for the time offset."""
     out = np.zeros((len(rig), COLUMNS))
     for row, a, b in zip(out, start, rig, strict=True):
         row[POSE] = se3.log(b.T_camera_world @ a.T_world_camera)
@@ -51,12 +51,12 @@ def departure(rig: Rig, start: Rig) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class CameraPrior:
-    """What is known of the cameras before.
+    """Gaussian prior of the cameras.
 
     Parameters
     ----------
-    rig : Rig, the mean.
-    sigma : (C, 10) standard deviation of each parameter about it; 0 for one that is fixed, inf for no prior.
+    rig : Rig, the mean
+    sigma : (C, 10) standard deviation of each parameter; 0 for a fixed one, inf for no prior
     """
 
     rig: Rig
@@ -64,17 +64,17 @@ class CameraPrior:
 
     @property
     def freedom(self) -> NDArray:
-        """(C, 10) 1 for what may change, else 0."""
+        """(C, 10) 1 for free parameters, 0 for fixed ones."""
         return (self.sigma > 0).astype(float)
 
     @property
     def precision(self) -> NDArray:
-        """(C · 10,) 1/σ²; what is fixed has 1, so that a system of it stays regular."""
+        """(C · 10,) 1/σ²; 1 for fixed parameters, so that the system is regular."""
         sigma = self.sigma.ravel()
         return np.where(sigma > 0, 1.0 / np.square(np.where(sigma > 0, sigma, 1.0)), 1.0)
 
     def departure(self, rig: Rig, offsets: NDArray) -> NDArray:
-        """(C · 10,) how far a rig and its time offsets (C,) [s] are from the mean."""
+        """(C · 10,) differences of a rig and its time offsets (C,) [s] from the mean; zero for fixed parameters."""
         out = departure(rig, self.rig)
         out[:, TIME] = offsets
         return (out * self.freedom).ravel()
@@ -89,7 +89,7 @@ class PointPixels:
     camera, point : (M,) int
     uv : (M, 2) [px]
     weight : (M,) [1/px²]
-    velocity : (M, 2) [px/s] of the points' images, for time offsets; default 0.
+    velocity : (M, 2) [px/s] of the pixels, for time offsets; default: 0
     """
 
     camera: NDArray
@@ -100,13 +100,13 @@ class PointPixels:
 
     @property
     def motion(self) -> NDArray:
-        """(M, 2) [px/s] of the points' images, 0 by default."""
+        """(M, 2) [px/s] velocity of the pixels, 0 by default."""
         return np.zeros(self.uv.shape) if self.velocity is None else self.velocity
 
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
-    """Normal equations of the cameras with the points taken out: S (C·10, C·10), b; and the way back to the points."""
+    """Normal equations of the cameras with the points eliminated, S (C·10, C·10) and b, and their back substitution."""
 
     S: NDArray
     b: NDArray
@@ -115,49 +115,49 @@ class Reduced:
     right: NDArray  # (P, 3)
 
     def points_step(self, delta: NDArray) -> NDArray:
-        """(P, 3) [m] how the points move with the cameras' δ."""
+        """(P, 3) [m] steps of the points for the cameras' δ (C·10,)."""
         return (self.inverse @ (self.right - self.cross @ delta)[..., None])[..., 0]
 
 
 def residuals(rig: Rig, offsets: NDArray, pixels: PointPixels, x: NDArray) -> NDArray:
-    """(M, 2) [px] measured minus seen; NaN for a point that its camera cannot see."""
-    seen = np.full(pixels.uv.shape, np.nan)
+    """(M, 2) [px] measured minus projected points x (P, 3) [m], time offsets (C,) [s] included; NaN if invisible."""
+    projected = np.full(pixels.uv.shape, np.nan)
     for c, camera in enumerate(rig):
-        mine = pixels.camera == c
-        seen[mine] = camera.project(x[pixels.point[mine]])
-    return pixels.uv - seen - offsets[pixels.camera, None] * pixels.motion
+        in_camera = pixels.camera == c
+        projected[in_camera] = camera.project(x[pixels.point[in_camera]])
+    return pixels.uv - projected - offsets[pixels.camera, None] * pixels.motion
 
 
-def robust_cost(left: NDArray, weight: NDArray, loss: Loss) -> tuple[float, NDArray]:
-    """Σ ρ(w r²) of residuals (M, 2), and each one's factor (M,); what cannot be seen counts as an outlier."""
-    s2 = weight * np.sum(left * left, axis=1)
-    seen, factor = np.isfinite(s2), np.empty(len(s2))
-    cost = _kernels_cameras.robust_values(loss.kind, loss.scale, np.where(seen, s2, _UNSEEN), factor)
-    return float(cost), np.where(seen, factor, 0.0)
+def robust_cost(residual: NDArray, weight: NDArray, loss: Loss) -> tuple[float, NDArray]:
+    """Σ ρ(w r²) of residuals (M, 2) with weights (M,), and robust factors (M,); NaN counts as an outlier."""
+    s2 = weight * np.sum(residual * residual, axis=1)
+    visible, factor = np.isfinite(s2), np.empty(len(s2))
+    cost = _kernels_cameras.robust_values(loss.kind, loss.scale, np.where(visible, s2, _INVISIBLE_SQUARE), factor)
+    return float(cost), np.where(visible, factor, 0.0)
 
 
 def reduce_points(
     rig: Rig, offsets: NDArray, freedom: NDArray, pixels: PointPixels, x: NDArray, loss: Loss, damping: float = 0.0
 ) -> Reduced:
-    """Take free points x (P, 3) [m] out of the normal equations of the cameras (Schur complement)."""
+    """Eliminate free points x (P, 3) [m] from the normal equations of the cameras (Schur complement)."""
     M, P, C = len(pixels.uv), len(x), len(rig)
     value, J_point, J_camera = np.empty((M, 2)), np.empty((M, 2, 3)), np.empty((M, 2, COLUMNS))
     motion = pixels.motion
     _kernels_cameras.point_systems(
         rig.packed, freedom, pixels.camera, pixels.point, x, motion, value, J_point, J_camera
     )
-    left = pixels.uv - value - offsets[pixels.camera, None] * motion
-    w = pixels.weight * robust_cost(left, pixels.weight, loss)[1]
-    left = np.where(w[:, None] > 0, left, 0.0)
+    residual = pixels.uv - value - offsets[pixels.camera, None] * motion
+    w = pixels.weight * robust_cost(residual, pixels.weight, loss)[1]
+    residual = np.where(w[:, None] > 0, residual, 0.0)
     JwT, JcT = w[:, None, None] * J_point.transpose(0, 2, 1), w[:, None, None] * J_camera.transpose(0, 2, 1)
     V, right = np.zeros((P, 3, 3)), np.zeros((P, 3))
     np.add.at(V, pixels.point, JwT @ J_point)
-    np.add.at(right, pixels.point, (JwT @ left[..., None])[..., 0])
+    np.add.at(right, pixels.point, (JwT @ residual[..., None])[..., 0])
     cross = np.zeros((P, C, 3, COLUMNS))
     np.add.at(cross, (pixels.point, pixels.camera), JwT @ J_camera)
     U, b = np.zeros((C, COLUMNS, COLUMNS)), np.zeros((C, COLUMNS))
     np.add.at(U, pixels.camera, JcT @ J_camera)
-    np.add.at(b, pixels.camera, (JcT @ left[..., None])[..., 0])
+    np.add.at(b, pixels.camera, (JcT @ residual[..., None])[..., 0])
     trace = np.trace(V, axis1=1, axis2=2)[:, None, None]
     inverse = np.linalg.inv(V + (damping * trace + 1e-9 * trace + 1e-12) * np.eye(3))
     flat = cross.transpose(0, 2, 1, 3).reshape(P, 3, C * COLUMNS)
@@ -169,7 +169,7 @@ def reduce_points(
 
 
 def camera_jacobian(camera: Camera, x_world: NDArray) -> NDArray:
-    """(P, 2, 10) derivative of the pixels of points (P, 3) [m] by the parameters of their camera; 0 where unseen."""
+    """(P, 2, 10) derivatives of the pixels of points (P, 3) [m] by the camera's parameters; 0 for invisible points."""
     count = len(x_world)
     value, J_point, J = np.empty((count, 2)), np.empty((count, 2, 3)), np.empty((count, 2, COLUMNS))
     first, each = np.zeros(count, np.int64), np.arange(count)

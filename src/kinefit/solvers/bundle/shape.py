@@ -1,4 +1,4 @@
-"""A body's shape as parameters, lengths and places of a detector's points, and the equations of pixels in them."""
+"""A body's shape as parameters (lengths, landmark offsets of a detector), and normal equations of pixels in them."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from kinefit.geometry.camera import Rig
 from kinefit.losses import SQUARED, Loss
 from kinefit.solvers.bundle import _kernels_shape
 
-_MIDDLE = 0.002  # [m] spread of a point in the middle to either side
+_MIDLINE_STD = 0.002  # [m] of a midline point to either side
 PROPORTIONS = 0.05
-"""How far one length departs from the person's size, as a share.
+"""Standard deviation of one length about the person's size, as a share.
 
 In the 1988 anthropometric survey of U.S. Army personnel (C. Gordon et al., 1989; J. Cheverud et al., 1990) segment
-lengths vary by 4 to 6 % and correlate with stature by 0.5 to 0.9, which leaves 2 to 4 %; and a detector's points are
-not quite the body's.
+lengths vary by 4 to 6 % and correlate with stature by 0.5 to 0.9, which leaves 2 to 4 %. A detector's points add some.
 """
-_UNKNOWN_SIZE, _KNOWN_SIZE = 0.2, 0.02  # one standard deviation of a person's size, as a share; shoes, posture, a guess
+_UNKNOWN_SIZE_STD = 0.2  # of a person's size, as a share
+_KNOWN_SIZE_STD = 0.02  # of a person's size with known stature, as a share: shoes, posture
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,14 +30,14 @@ class PixelFrames:
 
     Parameters
     ----------
-    points : PointSet of K points on the body (before scaling and shifts).
-    camera : (N,) int, index in the rig.
-    column : (N,) int, which of the K points.
+    points : PointSet of K points on the body, before scaling and landmark offsets
+    camera : (N,) int, index in the rig
+    column : (N,) int, which of the K points
     uv : (F, N, 2) [px]
-    weight : (F, N) [1/px²], 0 where unseen.
+    weight : (F, N) [1/px²], 0 where undetected
     share : (N,) in 0..1, optional
-        How much of a measurement counts beyond the loss: below 1 for points whose errors come together.
-    velocity : (F, N, 2) [px/s] of the pixels, where time offsets are estimated; default: 0.
+        Factor on a measurement's cost: below 1 for points with correlated errors.
+    velocity : (F, N, 2) [px/s] of the pixels, if time offsets are estimated; default: 0
     """
 
     points: PointSet
@@ -49,7 +49,7 @@ class PixelFrames:
     velocity: NDArray | None = None
 
     def with_offsets(self, offsets: NDArray) -> PixelFrames:
-        """What cameras (C,) whose clocks are late by `offsets` [s] would have seen in time."""
+        """The pixels corrected for clocks of cameras that are late by `offsets` (C,) [s]."""
         return self if self.velocity is None else replace(self, uv=self.uv - offsets[self.camera, None] * self.velocity)
 
     @property
@@ -58,11 +58,12 @@ class PixelFrames:
         return np.ones(len(self.column)) if self.share is None else self.share
 
 
-@lru_cache(maxsize=32)  # every kind of parameters asks again
+@lru_cache(maxsize=32)  # every kind of parameters calls it again
 def mirror_points(points: PointSet, segments: tuple[str, ...]) -> tuple[NDArray, NDArray]:
-    """For each point the one whose shift it shares, and ±1 for the sign of z: left and right are alike.
+    """For each point the number (K,) of the point whose offset it shares, and the sign (K,) of its z.
 
-    A point's image is the one on the mirrored segment at the mirrored place; a point in the middle is its own, sign 0.
+    Left and right share an offset. A point's mirror image is the point on the mirrored segment at the mirrored place. A
+    midline point is its own mirror image, with sign 0.
     """
     lead, sign = np.arange(len(points)), np.ones(len(points))
     names = [segments[s] for s in points.segments]
@@ -83,17 +84,17 @@ def mirror_points(points: PointSet, segments: tuple[str, ...]) -> tuple[NDArray,
 
 @dataclass(frozen=True, eq=False)
 class ShapeParameters:
-    """What a shape consists of: scales (G,), then three shifts for each point that leads its mirror images."""
+    """Parameters of a shape (p,): scales (G,), then a landmark offset (3,) for each point or pair of mirror images."""
 
     body: Body
     points: PointSet
-    shift: NDArray  # (K,) first shift parameter of each point
+    shift: NDArray  # (K,) first offset parameter of each point
     mirror: NDArray  # (K,) ±1, sign of z
     prior: NDArray  # (p, p) inverse covariance
     mean: NDArray  # (p,)
 
     def geometry(self, theta: NDArray) -> tuple[KinematicTree, NDArray, NDArray]:
-        """What `_geometry` gives; the latest is kept, for it is asked once for every frame."""
+        """Tree, points (K, 3) [m] in the root frame in the rest pose, offsets (K, 3) [m]; cached for the last theta."""
         key = theta.tobytes()
         if key not in self._latest:
             self._latest.clear()
@@ -105,7 +106,7 @@ class ShapeParameters:
         return {}
 
     def _geometry(self, theta: NDArray) -> tuple[KinematicTree, NDArray, NDArray]:
-        """The tree, the points (K, 3) in the root frame at rest, and their shifts (K, 3)."""
+        """As `geometry`, computed."""
         tree, groups = self.body.tree, len(self.body.scale_groups)
         factor = theta[:groups][self.body.segment_scale]
         scaled = tree.with_offsets(tree.offsets * factor[np.maximum(tree.parents, 0)][:, None])
@@ -118,9 +119,9 @@ class ShapeParameters:
         self, theta: NDArray, state: BodyState, rig: Rig, pixels: PixelFrames, f: int, *, loss: Loss = SQUARED,
         freedom: NDArray | None = None,
     ) -> tuple[NDArray, NDArray]:  # fmt: skip
-        """Frame f's pixels as H (n + p, n + p; lower triangle) and g: degrees of freedom, then shape, then cameras.
+        """Normal equations of frame f's pixels: H (n + p, n + p; lower triangle) and g (n + p,), pose then shape.
 
-        With `freedom` (C, 10) the cameras' parameters follow (see `solvers.cameras`).
+        With `freedom` (C, 10) the cameras' parameters follow, see `solvers.bundle.cameras`.
         """
         tree, body = self.body.tree, self.body
         moved, rest, _ = self.geometry(theta)
@@ -142,19 +143,25 @@ class ShapeParameters:
 def shape_parameters(
     body: Body, points: PointSet, scales: NDArray, scale_sigma: float, shift_sigma: float, *, whole: float | None = None
 ) -> ShapeParameters:
-    """What a body's shape consists of, and its prior: one scale a group, shifts of points [m].
+    """Parameters of a body's shape, with their prior: one scale for each group, landmark offsets [m] of points.
 
-    All scales follow the person's size: `whole` (known to 2 %), or else the middle of `scales`, loosely; each differs
-    from it by the share `scale_sigma`. So a length that nothing measures goes with those that something does.
+    All scales follow the person's size, so an unmeasured length follows the measured ones.
+
+    Parameters
+    ----------
+    scales : (G,) first estimates of the scales
+    scale_sigma : standard deviation of each scale about the size, as a share
+    shift_sigma : [m] standard deviation of a landmark offset
+    whole : size as a share of the body's, known to 2 %; default: the median of `scales`, known to 20 %
     """
     lead, sign = mirror_points(points, body.tree.segments)
     leaders = np.unique(lead)
     shift = 3 * np.searchsorted(leaders, lead)
     groups, size = len(scales), float(np.median(scales)) if whole is None else whole
-    common = (_UNKNOWN_SIZE if whole is None else _KNOWN_SIZE) * size
+    common = (_UNKNOWN_SIZE_STD if whole is None else _KNOWN_SIZE_STD) * size
     prior = np.diag(np.full(groups + 3 * len(leaders), shift_sigma**-2))
     middle = groups + shift[sign == 0.0] + 2
-    prior[middle, middle] = _MIDDLE**-2
+    prior[middle, middle] = _MIDLINE_STD**-2
     prior[:groups, :groups] = np.linalg.inv(np.eye(groups) * (scale_sigma * size) ** 2 + common**2)
     mean = np.concatenate([np.full(groups, size), np.zeros(3 * len(leaders))])
     return ShapeParameters(body, points, shift, np.where(sign == 0.0, 1.0, sign), prior, mean)

@@ -1,4 +1,4 @@
-"""Rows of any kind as whitened residuals √w·r, with their derivatives by the degrees of freedom."""
+"""Whitened residuals √w·r of rows of any kind, and their derivatives by the degrees of freedom."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from kinefit.solvers import _kernels_border
 
 @dataclass(frozen=True, eq=False)
 class PoseScrews:
-    """How a body at a state moves with its degrees of freedom.
+    """Screws of a body's coordinates at a state.
 
     Parameters
     ----------
     body : Body
     state : BodyState
-    screws : (D, 6) twist (v, ω) of each coordinate about the root's origin.
+    screws : (D, 6) twist (v, ω) of each coordinate about the root's origin
     """
 
     body: Body
@@ -35,7 +35,7 @@ class PoseScrews:
         return cls(body, state, body.tree.forward(state.T_world_root, state.angles)[1])
 
     def along(self, segment: NDArray, data: NDArray) -> NDArray:
-        """(N, n) [m] how far points, data[:3] (3, N), of segments (N,) move along directions, data[3:6] (3, N)."""
+        """(N, n) [m] derivatives of points data[:3] (3, N) on segments (N,), along directions data[3:6] (3, N)."""
         tree, out = self.body.tree, np.empty((len(segment), self.body.tree.n_dofs))
         centre = np.ascontiguousarray(self.state.T_world_root[:3, 3])
         _kernels_border.along(data, segment, centre, self.screws, tree.dof_parent, tree.last_dof, out)
@@ -43,14 +43,14 @@ class PoseScrews:
 
 
 def residuals(rows: AnyRows) -> NDArray:
-    """(N,) √w·r of rows, before any loss; for a joint weight Lᵀ r with W = L Lᵀ."""
+    """(N,) whitened residuals √w·r, before any loss; Lᵀ r for a joint weight W = L Lᵀ."""
     if rows.weight.ndim == 2:
         return np.asarray(np.linalg.cholesky(rows.weight).T @ rows.residual)
     return np.asarray(np.sqrt(rows.weight) * rows.residual)
 
 
 def softening(rows: AnyRows, loss: Loss) -> tuple[NDArray, float]:
-    """(N,) square root of each row's robust factor, and the cost Σ ρ; `loss` is that of rows without their own."""
+    """(N,) square roots of robust factors, and the cost Σ ρ (a number); `loss` is for rows without their own."""
     if isinstance(rows, Rows):
         factor, cost = (rows.loss or loss).of_rows(rows.data, rows.group)
         return np.sqrt(factor), cost
@@ -59,17 +59,17 @@ def softening(rows: AnyRows, loss: Loss) -> tuple[NDArray, float]:
         data[6], data[7] = rows.residual, rows.weight
         factor, cost = (rows.loss or loss).of_rows(data, rows.group)
         return np.sqrt(factor), cost
-    left = residuals(rows)
-    return np.ones(len(rows)), float(left @ left)
+    r = residuals(rows)
+    return np.ones(len(rows)), float(r @ r)
 
 
 def columns(rows: AnyRows, pose: PoseScrews) -> NDArray:
-    """(N, n) derivative of a point's whitened place by the degrees of freedom, so that `residuals` ≈ columns · δ.
+    """(N, n) whitened derivatives of rows by the degrees of freedom: a step δ changes residuals by −columns · δ.
 
     Raises
     ------
     ObservationError
-        Rows on degrees of freedom or segments that the body does not have.
+        Rows on degrees of freedom or segments that the body lacks.
     """
     n, count = pose.body.tree.n_dofs, len(pose.body.tree.segments)
     if isinstance(rows, Rows):

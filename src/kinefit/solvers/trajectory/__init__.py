@@ -1,1 +1,1 @@
-"""Smoothing of a whole trajectory: a banded system over the frames."""
+"""Smooth a whole trajectory: a banded system over the frames."""

@@ -1,10 +1,10 @@
-"""Cholesky factor of a whole take: frames along the diagonal, each coupled to the next three.
+"""Block band Cholesky factor of a whole take: frames along the diagonal, each coupled to the next three.
 
 The system of T frames with n unknowns each is given as packed blocks C (T, n, m) on its diagonal (pattern of chain and
 depth, see `_kernels_linear`) and sparse blocks band (4, T, n, 3): line i of band[l, t] couples unknown i of frame t + l
 to unknowns first[i] .. first[i] + width[i] - 1 of frame t.
 
-The factor L fills whole blocks. It is kept as W_t = L_tt⁻ᵀ (p, p), an upper triangle, and as below_t (3 p, p), the
+The factor L has dense blocks. It is stored as W_t = L_tt⁻ᵀ (p, p), an upper triangle, and as below_t (3 p, p), the
 blocks L_{t+1,t}, L_{t+2,t}, L_{t+3,t}; p is n rounded up to a multiple of four, so that loops go four lines at a time.
 """
 
@@ -38,7 +38,7 @@ def _add_product(out, i, sign, a, row, start, stop, B, high):
 
 @jit
 def product(A, B, out):
-    """out = A B of small matrices, of which lines and what is summed over divide by four; no threads in the way."""
+    """out = A B of small matrices, without threads; the rows and the inner dimension are multiples of four."""
     out[:] = 0.0
     for i in range(0, A.shape[0], 4):
         _add_product(out, i, 1.0, A, i, 0, B.shape[0], B, B.shape[1])

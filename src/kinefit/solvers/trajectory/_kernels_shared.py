@@ -1,9 +1,9 @@
-"""Points of one segment that a detector shifts together in one view: the shift is found along with the pose.
+"""Errors that a detector's points of one segment share in one view: a common shift, estimated with the pose.
 
 With residuals r_i [px] of a group's points, weights w_i and a shift b of variance U, the cost is
 Σ ρ(w_i |r_i − b|²) + |b|²/U. At its minimum over b the gradient by the pose is that of r_i − b, and the normal matrix
-Σ d_i a_i a_iᵀ − U/(1 + U Σ d_i) (Σ d_i a_i)(Σ d_i a_i)ᵀ with d_i = w_i times the robust factor: points that err
-together count as few.
+Σ d_i a_i a_iᵀ − U/(1 + U Σ d_i) (Σ d_i a_i)(Σ d_i a_i)ᵀ with d_i = w_i times the robust factor: correlated points
+count as few.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ import numpy as np
 from kinefit._jit import jit
 from kinefit.losses._kernels import robust
 
-_ROUNDS = 12  # of a shift and of what is an outlier beside it, at most
-_STILL = 0.01  # [px] of the last round
+_MAX_ROUNDS = 12  # of alternating shifts and robust factors
+_MIN_CHANGE_PX = 0.01  # [px] of a shift, below which it has converged
 
 
 @jit
-def without_shift(data, group, count, weight, member, shared, kind, scale, shift, told):
-    """Take each group's shift (G, 2) [px] out of the residuals of pixel rows 0 .. count; returns the shifts' cost.
+def without_shift(data, group, count, weight, member, shared, kind, scale, shift, information):
+    """Subtract each group's shift (G, 2) [px] from the residuals of pixel rows 0 .. count; returns the shifts' cost.
 
-    weight (K,) [1/px²] of points, member (K,) their group or -1, shared (G,) [px²]; told (G,) is room.
+    weight (K,) [1/px²] of points, member (K,) their group or -1, shared (G,) [px²]; information (G,) is workspace.
     """
     shift[:] = 0.0
-    for k in range(_ROUNDS):
-        told[:] = 0.0
+    for k in range(_MAX_ROUNDS):
+        information[:] = 0.0
         total = np.zeros(shift.shape)
         for i in range(0, count, 2):
             m = member[group[i]]
@@ -42,16 +42,16 @@ def without_shift(data, group, count, weight, member, shared, kind, scale, shift
                 s2 /= 1.0 + w * shared[m]
             _, factor = robust(kind, scale, s2)
             d = w * factor
-            told[m] += d
+            information[m] += d
             total[m, 0] += d * u
             total[m, 1] += d * v
         moved = 0.0
         for m in range(shared.size):
-            known = 1.0 / shared[m] + told[m]
-            u, v = total[m, 0] / known, total[m, 1] / known
+            posterior = 1.0 / shared[m] + information[m]
+            u, v = total[m, 0] / posterior, total[m, 1] / posterior
             moved = max(moved, abs(u - shift[m, 0]), abs(v - shift[m, 1]))
             shift[m, 0], shift[m, 1] = u, v
-        if moved < _STILL:
+        if moved < _MIN_CHANGE_PX:
             break
     for i in range(count):
         m = member[group[i]]
@@ -65,9 +65,9 @@ def without_shift(data, group, count, weight, member, shared, kind, scale, shift
 
 @jit
 def take_out(data, segment, group, count, factor, weight, member, shared, centre, blocks):
-    """Take out of segments' blocks (S, 27) what the groups' shifts could as well be; see `accumulate` for blocks."""
+    """Subtract from segments' blocks (S, 27) the information that the groups' shifts absorb; blocks: `accumulate`."""
     moved = np.zeros((shared.size, 2, 6))
-    told, owner = np.zeros(shared.size), np.zeros(shared.size, np.int64)
+    information, owner = np.zeros(shared.size), np.zeros(shared.size, np.int64)
     for i in range(count):
         m = member[group[i]]
         if m < 0:
@@ -83,10 +83,10 @@ def take_out(data, segment, group, count, factor, weight, member, shared, centre
         v[3] += d * (y * a2 - z * a1)
         v[4] += d * (z * a0 - x * a2)
         v[5] += d * (x * a1 - y * a0)
-        told[m] += 0.5 * w * factor[i]
+        information[m] += 0.5 * w * factor[i]
         owner[m] = segment[i]
     for m in range(shared.size):
-        share = shared[m] / (1.0 + shared[m] * told[m])
+        share = shared[m] / (1.0 + shared[m] * information[m])
         for axis in range(2):
             v, b, k = moved[m, axis], blocks[owner[m]], 0
             for p in range(6):

@@ -28,21 +28,21 @@ def pixel_equations(
 
     uv (F, K, 2) [px], weight (F, K) [1/px²] of points owner (K,), rest (K, 3) seen by camera (K,); and points
     anchor_owner (P,), anchor_rest (P, 3) that should lie at anchors (F, P, 3) [m], anchor_weight (F, P) [1/m²].
-    member (K,) is the group of a point, -1 for none, and shared (G,) [px²] the variance of what a group's points are
-    shifted by together, anew in every frame; see `_kernels_shared`.
+    member (K,) is the group of a point, -1 for none, and shared (G,) [px²] the variance of the group's common shift,
+    independent in every frame; see `_kernels_shared`.
     """
     size = 2 * owner.size + 3 * anchor_owner.size
     data, segment, group = np.empty((8, size)), np.empty(size, np.int64), np.empty(size, np.int64)
     factor, blocks = np.empty(size), np.empty((parents.size, 27))
     frames, screws = np.empty((parents.size, 12)), np.empty((axes.shape[0], 6))
-    shift, told = np.empty((shared.size, 2)), np.empty(shared.size)
+    shift, information = np.empty((shared.size, 2)), np.empty(shared.size)
     for t in range(roots.shape[0]):
         forward(parents, dof_start, prismatic, axes, rest_joints, roots[t], angles[t], frames, screws)
         count = pixel_rows(frames, owner, rest, cameras, camera, uv[t], weight[t], data, segment, group, 0)
         first = count
         of_shifts = 0.0
         if shared.size > 0:
-            of_shifts = without_shift(data, group, count, weight[t], member, shared, kind, scale, shift, told)
+            of_shifts = without_shift(data, group, count, weight[t], member, shared, kind, scale, shift, information)
         count = point_rows(
             frames, anchor_owner, anchor_rest, anchors[t], anchor_weight[t], data, segment, group, count
         )  # fmt: skip
@@ -168,7 +168,7 @@ def pixel_variance(
     roots, angles, owner, rest, cameras, camera, covariance,
     parents, dof_start, prismatic, axes, rest_joints, dof_parent, last_dof, out,
 ):  # fmt: skip
-    """Variance out (T, K, 2) [px²] along u and v of where points are seen, from covariances (T, n, n); NaN unseen."""
+    """Variance out (T, K, 2) [px²] along u and v of projected points, from covariances (T, n, n); NaN if invisible."""
     frames, screws = np.empty((parents.size, 12)), np.empty((axes.shape[0], 6))
     n = covariance.shape[1]
     index, row = np.empty(n, np.int64), np.empty((2, n))

@@ -1,7 +1,7 @@
-"""What a window of frames keeps of the frames that left it: a quadratic cost of its first three.
+"""Marginalise the oldest frames of a sliding window: they become a quadratic cost of its first three frames.
 
-The motion prior couples a frame to the next three. So all that is behind a frame tells of what is ahead only through
-three frames; taking one more frame out of the equations (a Schur complement) leaves a cost of the next three.
+The motion prior couples a frame to the next three. So earlier frames affect later ones only through three frames, and
+eliminating one more frame (a Schur complement) leaves a cost of the next three.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from kinefit.solvers.trajectory import _kernels_band, _kernels_smoothing
 
 @dataclass(frozen=True, eq=False)
 class Entering:
-    """A cost c − 2 gᵀδ + δᵀHδ of three consecutive frames, without its constant.
+    """Quadratic cost − 2 gᵀδ + δᵀHδ of three consecutive frames, from marginalised earlier ones.
 
     Parameters
     ----------
-    roots, angles : (3, 4, 4), (3, D) about which
+    roots, angles : (3, 4, 4), (3, D) states from which δ counts
     H, g : (3 n, 3 n), (3 n,)
-    H_covariance : (3 n, 3 n) the same with the posture prior's share in a covariance, see `MotionPrior.posture_share`
+    H_covariance : (3 n, 3 n) H for covariances, with `MotionPrior.posture_share` of the posture prior
     """
 
     roots: NDArray
@@ -34,13 +34,13 @@ class Entering:
     H_covariance: NDArray
 
     def moved(self, roots: NDArray, angles: NDArray) -> NDArray:
-        """(3 n,) from where it stands to three other states."""
+        """δ (3 n,) to three other states (3, 4, 4), (3, D)."""
         out = np.empty((3, len(self.g) // 3))
         _kernels_smoothing.differences(self.roots, roots, self.angles, angles, out)
         return out.ravel()
 
     def add(self, roots: NDArray, angles: NDArray, g: NDArray) -> float:
-        """Add its gradient at the first three of some states to g (T, n); returns its cost."""
+        """Add the gradient at the first three of T states to g (T, n); returns the cost (a number)."""
         delta = self.moved(np.ascontiguousarray(roots[:3]), np.ascontiguousarray(angles[:3]))
         pull = self.H @ delta
         g[:3] += (self.g - pull).reshape(3, -1)
@@ -50,7 +50,7 @@ class Entering:
 def start_of(
     entering: Entering | None, n: int, p: int, held: NDArray | None = None, *, covariance: bool = False
 ) -> NDArray:
-    """(3 p, 3 p) as `factor_band` takes it, for n of p unknowns a frame; `held` (3, n) bool are taken out."""
+    """H (3 p, 3 p) for `factor_band`, with n of p unknowns in each frame, without `held` (3, n) bool."""
     out = np.zeros((3, p, 3, p))
     if entering is not None:
         H = np.array(entering.H_covariance if covariance else entering.H)
@@ -62,7 +62,7 @@ def start_of(
 
 
 def blocks(body: Body) -> tuple[NDArray, NDArray]:
-    """First column (n,) and width (n,) of each line of a block of the prior: the root's turn is one of three."""
+    """First column (n,) and width (n,) of each row of a block of the prior: 3 for the root's rotation, else 1."""
     first, width = np.arange(body.tree.n_dofs), np.ones(body.tree.n_dofs, np.int64)
     first[3:6], width[3:6] = 3, 3
     return first, width
@@ -72,16 +72,16 @@ def leave(
     body: Body, states: tuple[NDArray, NDArray], H: NDArray, g: NDArray, posture: NDArray, held: NDArray,
     motion: tuple[NDArray, NDArray], entering: Entering | None,
 ) -> Entering:  # fmt: skip
-    """Take the first of four frames out of the equations.
+    """Marginalise the first of four frames; returns the cost of the other three.
 
     Parameters
     ----------
     states : roots (4, 4, 4) and angles (4, D)
-    H, g : (n, n), (n,) of all that the first frame measured, posture prior included
-    posture : (n, n) what the posture prior's weight in a covariance is more than in the fit
-    held : (n,) bool, degrees of freedom of the first frame that stand at a limit
-    motion : past (3, 2) and weight (3, n) of the three steps between them, see `MotionPrior.rows`
-    entering : what the first three frames bring along; the first two steps are in it.
+    H, g : (n, n), (n,) of the first frame's measurements and posture prior
+    posture : (n, n) weight of the posture prior in a covariance minus that in the fit
+    held : (n,) bool, degrees of freedom of the first frame at a limit
+    motion : past (3, 2) and weight (3, n) of the three steps, see `MotionPrior.rows`
+    entering : cost of the first three frames from earlier ones; it contains the prior of the first two steps
     """
     n, (roots, angles), (past, weight) = len(g), states, motion
     weight = np.array(weight)
@@ -104,13 +104,13 @@ def leave(
     A[0, held], b[0, held] = 0.0, 0.0
     A[:, :, 0, held] = 0.0
     A[0, held, 0, held] = 1.0
-    left, rest = _schur(A.reshape(4 * n, 4 * n), b.ravel(), n)
+    H_marginal, g_marginal = _schur(A.reshape(4 * n, 4 * n), b.ravel(), n)
     H_covariance, _ = _schur(A_covariance.reshape(4 * n, 4 * n), b.ravel(), n)
-    return Entering(np.array(roots[1:]), np.array(angles[1:]), left, rest, H_covariance)
+    return Entering(np.array(roots[1:]), np.array(angles[1:]), H_marginal, g_marginal, H_covariance)
 
 
 def _unpacked(band: NDArray, first: NDArray, width: NDArray) -> NDArray:
-    """(T, n, T, n) of blocks (4, T, n, 3) between frames, see `_kernels_band`."""
+    """Dense (T, n, T, n) from blocks (4, T, n, 3) between frames, see `_kernels_band`."""
     T, n = band.shape[1:3]
     out = np.zeros((T, n, T, n))
     for i in range(n):
@@ -124,13 +124,13 @@ def _unpacked(band: NDArray, first: NDArray, width: NDArray) -> NDArray:
 
 
 def _schur(A: NDArray, b: NDArray, n: int) -> tuple[NDArray, NDArray]:
-    """What is left of A (4 n, 4 n), b (4 n,) without the first n unknowns."""
+    """Schur complement of A (4 n, 4 n), b (4 n,) without the first n unknowns: (3 n, 3 n), (3 n,)."""
     p = 4 * -(-n // 4)
     alone = np.zeros((p, p))
     alone[:n, :n] = inverse(A[:n, :n] + 1e-12 * np.trace(A) / len(A) * np.eye(n))
-    below, fall, taken = np.zeros((3 * p, p)), np.empty((3 * p, p)), np.empty((3 * p, 3 * n))
+    below, fall, removed = np.zeros((3 * p, p)), np.empty((3 * p, p)), np.empty((3 * p, 3 * n))
     below[: 3 * n, :n] = A[n:, :n]
     _kernels_band.product(below, alone, fall)
-    _kernels_band.product(fall, np.ascontiguousarray(below[: 3 * n].T), taken)
-    left = A[n:, n:] - taken[: 3 * n]
-    return 0.5 * (left + left.T), b[n:] - fall[: 3 * n, :n] @ b[:n]
+    _kernels_band.product(fall, np.ascontiguousarray(below[: 3 * n].T), removed)
+    schur = A[n:, n:] - removed[: 3 * n]
+    return 0.5 * (schur + schur.T), b[n:] - fall[: 3 * n, :n] @ b[:n]

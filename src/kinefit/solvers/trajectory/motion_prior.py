@@ -1,4 +1,4 @@
-"""How a body moves when nobody looks: the prior on how motion changes, and on the posture (see `solvers.smoothing`)."""
+"""The motion prior: changes of motion, and posture (see `solvers.trajectory.smoothing`)."""
 
 from __future__ import annotations
 
@@ -10,44 +10,44 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class MotionPrior:
-    """How a body moves when nobody looks.
+    """Prior of a motion without measurements.
 
     Parameters
     ----------
-    acceleration : (n,) [m/s², rad/s²] one standard deviation, of every degree of freedom.
-    memory : (float, float) [s] in which an acceleration and a velocity forget themselves by 1/e.
-    dt : float [s] between frames.
-    usual : (T, D) or (D,) [rad or m] posture, in the chart of the angles.
+    acceleration : (n,) [m/s², rad/s²] random acceleration of every degree of freedom, one standard deviation
+    memory : (float, float) [s] time constants with which an acceleration and a velocity decay
+    dt : float [s] between frames
+    mean : (T, D) or (D,) [rad or m] mean of the posture prior, in the chart of the angles
     spread : (D,) [rad or m]
-        Standard deviation of an angle that nothing observes, about the usual one.
+        Standard deviation of the posture prior.
     couplings : (C, D) [1/rad or 1/m], optional
-        Departures from it that go together, see `KinematicTree`.
+        Correlated departures from the mean, see `KinematicTree`.
     liveliness : (T, n), optional
-        How much more than `acceleration` it is at times: a factor for every r_s, the last one for none.
+        Factor on `acceleration` for every r_s; the last one is not used.
     """
 
     acceleration: NDArray
     memory: tuple[float, float]
     dt: float
-    usual: NDArray
+    mean: NDArray
     spread: NDArray
     liveliness: NDArray | None = None
     couplings: NDArray | None = None
 
     @property
     def coupled(self) -> bool:
-        """Whether the posture couples coordinates, beyond the tree's pattern."""
+        """Whether the posture prior couples coordinates beyond the tree's pattern."""
         return self.couplings is not None and len(self.couplings) > 0
 
     @property
     def precision(self) -> NDArray:
-        """(D, D) inverse covariance of the posture."""
+        """(D, D) inverse covariance of the posture prior."""
         out: NDArray = np.diag(np.square(1.0 / self.spread))
         return out if self.couplings is None else out + self.couplings.T @ self.couplings
 
     @property
     def keep(self) -> tuple[float, float]:
-        """λ and κ, shares of an acceleration and of a velocity that are left one frame later."""
+        """λ and κ, shares of an acceleration and of a velocity that remain after one frame."""
         fast, slow = np.exp(-self.dt / np.array(self.memory))
         return float(fast), float(slow)
 
@@ -57,9 +57,9 @@ class MotionPrior:
         return 1.0 / (np.square(self.acceleration * self.dt**2) * (1.0 - self.keep[0] ** 2))
 
     def rows(self, count: int) -> tuple[NDArray, NDArray]:
-        """What r_s takes from v_{s−1} and v_{s−2}, (count, 2), and weights (count, n).
+        """Coefficients (count, 2) of v_{s−1} and v_{s−2} in r_s, and weights (count, n), of `count` (int) steps.
 
-        The first two steps have no past; they are as likely as any two of a motion that goes on for ever.
+        The first two steps have no past; they have the stationary distribution.
         """
         fast, slow = self.keep
         past = np.tile([fast + slow, -fast * slow], (count, 1))
@@ -73,19 +73,19 @@ class MotionPrior:
 
     @property
     def posture_share(self) -> NDArray:
-        """(D, D) weight that the usual posture has in each frame of a covariance.
+        """(D, D) weight of the posture prior in each frame of a covariance.
 
-        In the fit it weighs its `precision` in every frame, as much against the pixels as in the fit of a single frame:
-        both err the same way in frame after frame. But a posture is not drawn anew in every frame. Here its weight is
-        such that angles that nothing observes have the covariance precision⁻¹ in the middle of a long take. In
-        coordinates scaled to a motion prior of weight one, that is an equation for each principal axis of the precision
-        by itself: with variance σ² along it, σ² = ∫₀^π dθ/π / (w + |(1 − z)(1 − κ z)(1 − λ z)|²) with z = e^{iθ}.
+        In the fit its weight is `precision` in every frame, relative to the pixels as in the fit of a single frame,
+        since both have constant errors. But postures of neighbouring frames are not independent. So in covariances the
+        weight is such that unobserved angles have the covariance precision⁻¹ in the middle of a long take. In
+        coordinates scaled to a motion prior of weight one, this is one equation for each principal axis of the
+        precision: with variance σ² along it, σ² = ∫₀^π dθ/π / (w + |(1 − z)(1 − κ z)(1 − λ z)|²) with z = e^{iθ}.
         """
         root = np.sqrt(self.weight[6:])
         values, axes = np.linalg.eigh(self.precision / root[:, None] / root)
-        told = values > 1e-12 * values.max(initial=0.0)
+        has_prior = values > 1e-12 * values.max(initial=0.0)
         share = np.zeros(len(values))
-        share[told] = self._shares(1.0 / values[told])
+        share[has_prior] = self._shares(1.0 / values[has_prior])
         return np.asarray(root[:, None] * (axes * share) @ axes.T * root)
 
     def _shares(self, variance: NDArray) -> NDArray:
@@ -94,19 +94,19 @@ class MotionPrior:
         theta = np.geomspace(lowest, np.pi, 2000)
         z = np.exp(1j * theta)
         prior = np.abs((1 - z) * (1 - self.keep[0] * z) * (1 - self.keep[1] * z)) ** 2
-        width = np.zeros(len(theta))  # of the trapezoidal rule; below the lowest all is as there
+        width = np.zeros(len(theta))  # of the trapezoidal rule; constant below the lowest
         width[1:], width[0] = 0.5 * np.diff(theta), lowest
         width[:-1] += 0.5 * np.diff(theta)
         low, high = np.full(len(variance), -80.0), np.full(len(variance), 80.0)  # of log w
         log, wanted = -np.log(variance), np.log(variance)
-        for _ in range(60):  # Newton's method on logarithms, halves where it leaves what is known
+        for _ in range(60):  # Newton's method on logarithms, bisection where it leaves the bracket
             density = 1.0 / (np.exp(log)[:, None] + prior)
             whole = density @ width / np.pi
             wide = whole > variance
             low, high = np.where(wide, log, low), np.where(wide, high, log)
             slope = -np.exp(log) * (np.square(density) @ width) / np.pi / whole
             step = (wanted - np.log(whole)) / np.where(slope < 0.0, slope, -1.0)
-            if np.abs(step).max(initial=0.0) < 1e-9:  # the next would be less than rounding
+            if np.abs(step).max(initial=0.0) < 1e-9:  # the next step would be below rounding
                 return np.exp(log + step)
             log = np.where((log + step > low) & (log + step < high), log + step, 0.5 * (low + high))
         return np.exp(log)

@@ -1,4 +1,4 @@
-"""Pixels of a whole take, and points of the body that rest, as normal equations of all its frames."""
+"""Normal equations of all frames of a take from keypoints and foot contacts."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ NO_POINTS = PointSet((), np.empty(0, np.int64), np.empty((0, 3)))
 
 @dataclass(frozen=True, eq=False)
 class SeenPoints:
-    """Pixels of points of a body in every frame of a take.
+    """Pixels of points of a body in every frame of a take, and contacts.
 
     Parameters
     ----------
     rig : Rig
-    points : PointSet of K entries, one for each measurement; camera : (K,) int, which of the rig sees it.
-    uv : (T, K, 2) [px], anything where unseen.
-    weight : (T, K) [1/px²], 0 where unseen.
-    loss : Loss of a pixel, in standard deviations.
-    anchored : PointSet of P points that rest now and then.
-    anchors, anchor_weight : (T, P, 3) [m] where, and (T, P) [1/m²], 0 where they do not.
-    member, shared : (K,) int, which group of points of one segment is shifted together, -1 for none; and (G,) [px²] the
-        variance of each group's shift, new in every frame.
+    points : PointSet of K entries, one for each measurement; camera : (K,) int, number of its camera in the rig
+    uv : (T, K, 2) [px], ignored where weight is 0
+    weight : (T, K) [1/px²], 0 where undetected
+    loss : Loss of a pixel, in standard deviations
+    anchored : PointSet of P points with contacts
+    anchors, anchor_weight : (T, P, 3) [m] places of the contacts, and (T, P) [1/m²], 0 without contact
+    member, shared : (K,) int, group of points of one segment with a common shift, -1 for none; and (G,) [px²] variance
+        of each group's shift, independent in every frame
     """
 
     rig: Rig
@@ -46,12 +46,12 @@ class SeenPoints:
     shared: NDArray | None = None
 
     def equations(self, body: Body) -> MakeEquations:
-        """What `smooth` asks for."""
+        """Equations for `trajectory.smoothing.smooth`."""
         tree = body.tree
         T, n = len(self.uv), tree.n_dofs
         uv, weight = np.ascontiguousarray(np.nan_to_num(self.uv)), np.ascontiguousarray(self.weight)
         anchors = np.zeros((T, len(self.anchored), 3)) if self.anchors is None else self.anchors
-        held = np.zeros(anchors.shape[:2]) if self.anchor_weight is None else self.anchor_weight
+        anchor_weight = np.zeros(anchors.shape[:2]) if self.anchor_weight is None else self.anchor_weight
         member = np.full(len(self.points), -1) if self.member is None else self.member
         shared = np.zeros(0) if self.shared is None else self.shared
         rest, anchor_rest = body.points_rest(self.points), body.points_rest(self.anchored)
@@ -60,15 +60,16 @@ class SeenPoints:
             C, g, cost = np.zeros((T, *tree.chain.shape)), np.empty((T, n)), np.empty(T)
             _kernels_smoothing.pixel_equations(
                 roots, angles, self.points.segments, rest, self.rig.packed, self.camera, uv, weight,
-                self.anchored.segments, anchor_rest, anchors, held, member, shared, self.loss.kind, self.loss.scale,
-                tree.parents, tree.dof_start, tree.prismatic, tree.axes, tree.rest, tree.chain, tree.depth, C, g, cost,
+                self.anchored.segments, anchor_rest, anchors, anchor_weight, member, shared, self.loss.kind,
+                self.loss.scale, tree.parents, tree.dof_start, tree.prismatic, tree.axes, tree.rest, tree.chain,
+                tree.depth, C, g, cost,
             )  # fmt: skip
             return C, g, cost
 
         return make
 
     def variance(self, body: Body, roots: NDArray, angles: NDArray, covariance: NDArray) -> NDArray:
-        """(T, K, 2) [px²] along u and v, of where the points are seen, from covariances (T, n, n); NaN: not seen."""
+        """(T, K, 2) [px²] variances of projections along u and v, from covariances (T, n, n); NaN if invisible."""
         tree, out = body.tree, np.empty(self.uv.shape)
         _kernels_smoothing.pixel_variance(
             roots, angles, self.points.segments, body.points_rest(self.points), self.rig.packed, self.camera,

@@ -1,10 +1,10 @@
-"""Whole-take smoothing: all frames in one sparse least-squares problem, with a prior on how motion changes.
+"""Whole-take smoothing: all frames in one sparse least-squares problem, with a prior on changes of motion.
 
-With v_s the step from frame s to s + 1 of every degree of freedom (the root's turn as a rotation vector in the world),
-the prior says that r_s = v_s − (κ + λ) v_{s−1} + κ λ v_{s−2} is new and random in every frame: an acceleration that
-forgets itself by λ a frame drives a velocity that forgets itself by κ a frame (Singer 1970; Särkkä & Svensson, Bayesian
-Filtering and Smoothing, 2023). Frames couple to the next three; the system is solved by Levenberg-Marquardt with a
-block band Cholesky factor, and covariances are blocks of its inverse (Takahashi et al. 1973).
+With v_s the step from frame s to s + 1 of every degree of freedom (the root's rotation as a rotation vector in the
+world), the prior assumes that r_s = v_s − (κ + λ) v_{s−1} + κ λ v_{s−2} is white noise: an acceleration that decays by
+λ per frame drives a velocity that decays by κ per frame (Singer 1970; Särkkä & Svensson, Bayesian Filtering and
+Smoothing, 2023). Each frame is coupled to the next three. Levenberg-Marquardt solves the system with a block band
+Cholesky factor; covariances are blocks of its inverse (Takahashi et al. 1973).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from kinefit.solvers.trajectory import _kernels_band, _kernels_smoothing
 from kinefit.solvers.trajectory.marginal import Entering, blocks, start_of
 from kinefit.solvers.trajectory.motion_prior import MotionPrior
 
-_NEVER = 1e12  # of damping, beyond which no step is small enough
+_MAX_DAMPING = 1e12  # over the mean diagonal: with more the cost cannot fall
 
 Equations = tuple[NDArray, NDArray, NDArray]
 MakeEquations = Callable[[NDArray, NDArray], Equations]
@@ -31,7 +31,7 @@ MakeEquations = Callable[[NDArray, NDArray], Equations]
 
 @dataclass(frozen=True, eq=False)
 class _BandEquations:
-    """Normal equations, undamped; see `_kernels_band`."""
+    """Undamped normal equations; see `_kernels_band`."""
 
     C: NDArray
     band: NDArray
@@ -43,13 +43,13 @@ class _BandEquations:
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """All frames of a take, fitted together.
+    """All frames of a take, fitted jointly.
 
     Parameters
     ----------
     roots : (T, 4, 4) [m], T_world_root; angles : (T, D) [rad or m]
     cost : float
-    iterations : int, steps tried.
+    iterations : int, number of steps tried
     converged : bool
     """
 
@@ -64,7 +64,7 @@ class Smoothed:
 
     @property
     def changes(self) -> NDArray:
-        """(T - 1, n) r_s [m, rad] a frame²."""
+        """(T - 1, n) changes r_s [m, rad] per frame²."""
         return self.system.changes
 
 
@@ -74,10 +74,10 @@ class Posterior:
 
     Parameters
     ----------
-    frames : (T, n, n) of every frame.
-    following : (T - 1, n, n) of frame t + 1 (lines) with frame t (columns).
-    change_variance : (T - 1, n) of every r_s.
-    log_determinant : float, of the system's matrix.
+    frames : (T, n, n) covariance of every frame
+    following : (T - 1, n, n) cross-covariance of frame t + 1 (rows) and frame t (columns)
+    change_variance : (T - 1, n) of every r_s
+    log_determinant : float, of the system's matrix
     """
 
     frames: NDArray
@@ -99,20 +99,20 @@ def smooth(
     max_iterations: int = 30,
     tolerance: float = 1e-5,
 ) -> Smoothed:
-    """Minimise every frame's cost and the prior's together.
+    """Minimise the cost of all frames and of the motion prior jointly.
 
     Parameters
     ----------
-    roots, angles : (T, 4, 4), (T, D), where to start; angles without jumps of 2π.
-    equations : (roots, angles) -> (C (T, n, m) packed as the tree has it, g (T, n), cost (T,))
-        Called anew at every state tried; its arrays are changed.
-    bounds : (T, D) lower and upper ends of every angle.
+    roots, angles : (T, 4, 4), (T, D) to start from; angles without jumps of 2π
+    equations : (roots, angles) -> (C (T, n, m) packed along the tree, g (T, n), cost (T,))
+        Called at every state tried; its arrays are modified.
+    bounds : (T, D) lower and upper limits of every angle
     dense : bool
-        The equations couple degrees of freedom beyond the tree's pattern: C is (T, n, n), of which the lower triangle
-        is read. So it is, made dense here, where the prior's posture is coupled.
+        Whether the equations couple degrees of freedom beyond the tree's pattern: C is (T, n, n), of which the lower
+        triangle is read. If the posture prior is coupled, packed equations are made dense here.
     entering : Entering
-        What frames before these tell of the first three, of three or more; the first two steps then have their past.
-    tolerance : stop when the predicted fall of the cost is below this share of it.
+        Cost of the first three frames from marginalised earlier ones; it contains the prior of the first two steps.
+    tolerance : stop when the predicted fall of the cost is below this share of it
 
     Raises
     ------
@@ -151,7 +151,7 @@ def smooth(
         _kernels_band.back_substitute(W, below, delta)
         step = delta[:, : tree.n_dofs]
         predicted = float(np.vdot(step, now.g) + damping * np.vdot(step, step))
-        converged = predicted <= tolerance * now.cost + nothing or damping > _NEVER * mean
+        converged = predicted <= tolerance * now.cost + nothing or damping > _MAX_DAMPING * mean
         new_roots, new_angles = np.empty_like(roots), np.empty_like(angles)
         _kernels_smoothing.retract_all(roots, angles, step, lower, upper, new_roots, new_angles)
         new = _system(body, new_roots, new_angles, equations, prior, depth, entering)
@@ -159,7 +159,7 @@ def smooth(
         if new.cost < now.cost:
             fresh, now, roots, angles = True, new, new_roots, new_angles
     if any_held and not fresh:
-        now = _system(body, roots, angles, equations, prior, depth, entering)  # with what was held
+        now = _system(body, roots, angles, equations, prior, depth, entering)  # without held angles' modifications
     return Smoothed(roots, angles, now.cost, tried, converged, prior, now, pattern)
 
 
@@ -189,7 +189,7 @@ def _system(
 ) -> _BandEquations:
     T, n = len(roots), body.tree.n_dofs
     C, g, cost = equations(roots, angles)
-    precision, away = prior.precision, prior.usual - angles
+    precision, away = prior.precision, prior.mean - angles
     pull = away @ precision
     _add_posture(C, precision, depth)
     g[:, 6:] += pull
@@ -198,7 +198,7 @@ def _system(
     _kernels_smoothing.velocities(roots, angles, steps)
     past, weight = prior.rows(len(steps))
     if entering is not None:
-        weight[:2] = 0.0  # in what enters already
+        weight[:2] = 0.0  # contained in `entering`
         cost[0] += entering.add(roots, angles, g)
     total = float(cost.sum()) + _kernels_smoothing.add_motion(steps, past, weight, *blocks(body), band, g)
     changes = steps.copy()
@@ -208,10 +208,14 @@ def _system(
 
 
 def posterior(body: Body, smoothed: Smoothed, since: int = 0, share: NDArray | None = None) -> Posterior:
-    """Blocks of the inverse of the undamped system, with each frame's share of the posture prior.
+    """Covariances of a smoothed take: blocks of the inverse of the undamped system.
 
-    Limits are left out, as they are of a frame's covariance. Frames before `since` are left out: they stand as NaN.
-    `share` (D, D) is the prior's `posture_share`, where it is known already.
+    Joint limits are ignored, as in a frame's covariance.
+
+    Parameters
+    ----------
+    since : int, first frame whose covariance is computed; earlier ones are NaN
+    share : (D, D) the prior's `posture_share`; default: computed here
     """
     s, prior, (chain, depth) = smoothed.system, smoothed.prior, smoothed.pattern
     T, n = s.g.shape
@@ -247,7 +251,7 @@ def posterior(body: Body, smoothed: Smoothed, since: int = 0, share: NDArray | N
 
 
 def _add_posture(C: NDArray, weight: NDArray, depth: NDArray) -> None:
-    """Add a weight (D, D) of angles to every block of C, as far as the pattern goes: dense where it is coupled."""
+    """Add a weight (D, D) of angles to every block of C; only its diagonal if C is packed."""
     n = len(depth)
     if C.shape[2] == n:
         C[:, 6:, 6:] += weight
@@ -256,7 +260,7 @@ def _add_posture(C: NDArray, weight: NDArray, depth: NDArray) -> None:
 
 
 def _variance_of(past: NDArray, back: int, alone: NDArray) -> NDArray:
-    """Variance (n,) of r from covariances (4, 4, n) of each degree of freedom; turns of the root taken for small."""
+    """Variance (n,) of r from covariances (4, 4, n) of each degree of freedom, for small rotations of the root."""
     newest = 1 + back
     part = np.zeros(4)
     part[newest], part[newest - 1] = 1.0, -1.0

@@ -1,4 +1,4 @@
-"""Variance components of a sensor's errors: bias, drift and jitter of each channel, and the bias that a group shares.
+"""Estimate variance components of a sensor's errors: bias, drift and jitter of channels, and the bias of a group.
 
 With e the error of channel c in frame t along one axis, in the sensor's own unit,
 
@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 
 _NORMAL_MAD = 0.6745  # median |x| of a standard normal variable
 _OUTLIER_QUANTILE = 3.72  # standard normal quantile of probability 0.9999
-_PRIOR_SAMPLES = 10.0  # samples of a channel that count as much as the scale of its pool
-_MIN_PAIRS = 30  # pairs of frames of a pool; one with fewer takes the jitter and drift of the others
+_PRIOR_SAMPLES = 10.0  # samples of a channel that the scale of its pool counts as
+_MIN_PAIRS = 30  # pairs of frames of a pool; a pool with fewer gets the median jitter and drift of the others
 _MAX_LAG_S = 2.0
 _LAGS = 12
 _MIN_LAGS = 3  # with fewer, drift cannot be distinguished
 _TIME_CONSTANTS = 40  # that are tried
-_UNTOLD = 0.1  # share of an error's variance left in the residuals, below which they do not tell its size
+_MIN_RESIDUAL_SHARE = 0.1  # of an error's variance: with less in the residuals its size cannot be estimated
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +39,9 @@ class VarianceComponents:
     bias : (C,) of the constant part of each channel
     drift : (C,) of the part that is correlated in time
     jitter : (C,) of the white part
-    shared : (G, A) constant part that all channels of a group have in common
+    shared : (G, A) constant part that all channels of a group share
     drift_time : [s] time constant of the drift, in which its correlation falls to 1/e
-    bias_error : (C,) square root of the standard error of bias², of what jitter and drift leave uncertain
+    bias_error : (C,) square root of the standard error of bias², from jitter and drift
     outlier : (F, C) bool, residuals that were excluded
     """
 
@@ -54,12 +54,12 @@ class VarianceComponents:
     outlier: NDArray
 
     @property
-    def lasting(self) -> NDArray:
-        """(C,) standard deviation of what does not average out over neighbouring frames."""
+    def systematic(self) -> NDArray:
+        """(C,) standard deviation of systematic errors, which do not average out over neighbouring frames."""
         return np.asarray(np.sqrt(self.bias**2 + self.drift**2 + self.bias_error**2))
 
     def summary(self, unit: str, digits: int, groups: Sequence[str] = ()) -> dict[str, Any]:
-        """The same in a few numbers, medians over the channels, with the shared bias by the names of the groups."""
+        """Medians over the channels, rounded, and the shared bias of each group by name."""
         parts = (("bias", self.bias), ("drift", self.drift), ("jitter", self.jitter))
         shared = self.shared.round(digits).tolist()
         return {f"{name} [{unit}]": round(float(np.median(value)), digits) for name, value in parts} | {
@@ -76,13 +76,13 @@ def variance_components(
 
     Parameters
     ----------
-    residuals : (F, C, A) measured minus fitted, NaN where unseen
-    times : (F,) [s], increasing; None for frames so far apart that no drift connects them: it then counts as jitter.
-    leverage : (C,) share of the variance of each channel's bias and drift that the fit takes from the residuals;
-        below 0 where it adds errors of other channels; default 0
-    jitter_leverage : (C,) the same of its jitter, of which a fit that smooths follows less; default `leverage`
-    pool : (C,) int, channels of one number have the same standard deviations; default all
-    group : (C,) int from 0, channels of one number share a bias; default all
+    residuals : (F, C, A) measured minus fitted, NaN where missing
+    times : (F,) [s], increasing; None for frames so far apart that their drift is uncorrelated: it counts as jitter
+    leverage : (C,) share of the variance of each channel's bias and drift that the fit absorbs; below 0 where it adds
+        errors of other channels; default: 0
+    jitter_leverage : (C,) the same of jitter, of which a smoothing fit absorbs less; default: `leverage`
+    pool : (C,) int, channels of one number have the same standard deviations; default: all
+    group : (C,) int from 0, channels of one number share a bias; default: all
     """
     C = residuals.shape[1]
     pool = np.zeros(C, np.int64) if pool is None else np.unique(pool, return_inverse=True)[1]
@@ -91,55 +91,56 @@ def variance_components(
     r = np.where(outlier[..., None], np.nan, residuals)
     shared, centre = _shared(_means(r), group)
     r = r - centre
-    mean, seen = _means(r), np.isfinite(r)
-    count, axes = seen.sum(axis=(0, 2)), np.any(seen, axis=0).sum(axis=1)
+    mean, known = _means(r), np.isfinite(r)
+    count, axes = known.sum(axis=(0, 2)), np.any(known, axis=0).sum(axis=1)
     bias2 = np.nansum(mean**2, axis=1) / np.maximum(axes, 1)
     clipped = np.minimum(bias2, _bias_limit(bias2, axes, pool))
     within = _mean_of_pools(np.nansum((r - mean) ** 2, axis=(0, 2)) / np.maximum(count, 1), count, pool)
     square = within + _mean_of_pools(clipped, count, pool)
     jitter2, drift2, drift_time = _jitter_and_drift(r, times, pool, square)
-    lasting2 = np.maximum(square - jitter2, 0.0)
-    drift2 = np.minimum(drift2, lasting2)
-    of_mean = np.maximum(jitter2 + drift2 - within, 0.0)  # variance that a channel's mean has by jitter and drift
+    systematic2 = np.maximum(square - jitter2, 0.0)
+    drift2 = np.minimum(drift2, systematic2)
+    of_mean = np.maximum(jitter2 + drift2 - within, 0.0)  # variance of a channel's mean from jitter and drift
     error2 = of_mean * np.sqrt(2.0 / np.maximum(np.bincount(pool, axes), 1))
-    lasting = np.zeros(C) if leverage is None else leverage
-    back, jitter_back = (
-        _counted_back(1.0 - _mean_of_pools(hidden, count, pool))
-        for hidden in (lasting, lasting if jitter_leverage is None else jitter_leverage)
+    leverage = np.zeros(C) if leverage is None else leverage
+    factor, jitter_factor = (
+        _inflation(1.0 - _mean_of_pools(absorbed, count, pool))
+        for absorbed in (leverage, leverage if jitter_leverage is None else jitter_leverage)
     )
-    pooled2, drift2, error2 = ((v * back)[pool] for v in (lasting2 - drift2, drift2, error2))
-    jitter2 = (jitter2 * jitter_back)[pool]
+    pooled2, drift2, error2 = ((v * factor)[pool] for v in (systematic2 - drift2, drift2, error2))
+    jitter2 = (jitter2 * jitter_factor)[pool]
     bias2 = pooled2 + (bias2 - clipped)
     bias, drift, jitter, error = (np.sqrt(v) for v in (bias2, drift2, jitter2, error2))
     return VarianceComponents(bias, drift, jitter, shared, drift_time, error, outlier)
 
 
-def _counted_back(kept: NDArray) -> NDArray:
-    """Factor on variances of which a fit leaves so much in the residuals: 1 / kept, but 0 where it leaves nothing."""
-    return np.asarray(np.where(kept > 0.0, kept * (1.0 + _UNTOLD**2) / (kept**2 + _UNTOLD**2), 0.0))
+def _inflation(remaining: NDArray) -> NDArray:
+    """Factor on variances whose share `remaining` is in the residuals: about 1 / remaining, falling to 0 near 0."""
+    floor2 = _MIN_RESIDUAL_SHARE**2
+    return np.asarray(np.where(remaining > 0.0, remaining * (1.0 + floor2) / (remaining**2 + floor2), 0.0))
 
 
 def _outliers(residuals: NDArray, pool: NDArray) -> NDArray:
-    """(F, C) bool: residuals that the channel's own jitter in time does not explain."""
-    seen = np.isfinite(residuals)
+    """(F, C) bool: outliers from the channel's own distribution over time."""
+    known = np.isfinite(residuals)
     square = (residuals - _medians(residuals, axis=0)) ** 2
-    scale2, count = _medians(square, axis=(0, 2)) / _NORMAL_MAD**2, seen.sum(axis=(0, 2))
+    scale2, count = _medians(square, axis=(0, 2)) / _NORMAL_MAD**2, known.sum(axis=(0, 2))
     of_pool = _median_of_pools(scale2, pool)
     scale2 = (count * np.nan_to_num(scale2) + _PRIOR_SAMPLES * of_pool) / (count + _PRIOR_SAMPLES)
-    limit = np.where(scale2 > 0.0, scale2 * _chi_square(seen.sum(axis=2), _OUTLIER_QUANTILE), np.inf)
+    limit = np.where(scale2 > 0.0, scale2 * _chi_square(known.sum(axis=2), _OUTLIER_QUANTILE), np.inf)
     return np.asarray(np.nansum(square, axis=2) > limit)
 
 
 def _shared(mean: NDArray, group: NDArray) -> tuple[NDArray, NDArray]:
-    """(G, A) bias that each group shares, shrunk by its variance; (C, A) that of each channel's group, with sign."""
+    """(G, A) size of the bias that a group shares, shrunk by its variance; (C, A) signed, of each channel's group."""
     shared, centre = np.zeros((int(group.max(initial=-1)) + 1, mean.shape[1])), np.zeros(mean.shape)
     for g in np.flatnonzero(np.bincount(group, minlength=len(shared)) > 1):
         own = mean[group == g]
         away2 = (own - _medians(own, axis=0)) ** 2
-        alike = away2 <= _chi_square(np.ones(1), _OUTLIER_QUANTILE) * _medians(away2, axis=0) / _NORMAL_MAD**2
-        count, own = alike.sum(axis=0), np.where(alike, own, 0.0)
+        inlier = away2 <= _chi_square(np.ones(1), _OUTLIER_QUANTILE) * _medians(away2, axis=0) / _NORMAL_MAD**2
+        count, own = inlier.sum(axis=0), np.where(inlier, own, 0.0)
         middle = own.sum(axis=0) / np.maximum(count, 1)
-        spread2 = np.where(alike, own - middle, 0.0) ** 2
+        spread2 = np.where(inlier, own - middle, 0.0) ** 2
         variance = spread2.sum(axis=0) / np.maximum(count - 1, 1) / np.maximum(count, 1)
         shared2 = np.where(count > 1, np.maximum(middle**2 - variance, 0.0), 0.0)
         shared[g] = np.sqrt(shared2)
@@ -148,7 +149,7 @@ def _shared(mean: NDArray, group: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _bias_limit(bias2: NDArray, axes: NDArray, pool: NDArray) -> NDArray:
-    """(C,) squared bias per axis, beyond which a channel's bias says nothing of the others of its pool."""
+    """(C,) squared bias per axis above which a channel is an outlier of its pool."""
     scale2 = np.where(axes > 0, bias2 * axes / _chi_square(axes, 0.0), np.nan)
     return _median_of_pools(scale2, pool) * _chi_square(axes, _OUTLIER_QUANTILE) / np.maximum(axes, 1)
 
@@ -158,7 +159,7 @@ def _jitter_and_drift(
 ) -> tuple[NDArray, NDArray, float]:
     """Variances (P,) of jitter and drift, and the drift's time constant [s], from each pool's variogram.
 
-    The mean square (P,) of a pool counts as its jitter where no pool has enough pairs of frames.
+    If no pool has enough pairs of frames, the mean square (P,) of a pool counts as its jitter.
     """
     F, P = len(r), len(square)
     lags = np.unique(np.round(np.geomspace(1, max(F // 2, 1), _LAGS)).astype(int))
@@ -175,7 +176,7 @@ def _jitter_and_drift(
         return square, np.zeros(P), _MAX_LAG_S
     weight = pairs / lags[:, None]  # of pairs that do not overlap
     taus = np.full(1, _MAX_LAG_S)
-    if times is not None and len(dt) >= _MIN_LAGS:  # a drift that is gone in two frames is jitter
+    if times is not None and len(dt) >= _MIN_LAGS:  # a drift that decays within two frames is jitter
         taus = np.geomspace(2.0 * dt[0], 2.0 * dt[-1], _TIME_CONSTANTS)
     fits = [_fitted(gamma, weight, -np.expm1(-dt / tau)) for tau in taus]
     scale = np.maximum((weight * gamma**2).sum(axis=0), 1e-300)
@@ -185,7 +186,7 @@ def _jitter_and_drift(
 
 
 def _fitted(gamma: NDArray, weight: NDArray, rise: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Variances (P,) of jitter and drift, neither below 0, that fit γ (L, P) ≈ σ_j² + σ_d² rise (L,); squares left."""
+    """Variances (P,) of jitter and drift, neither below 0, that fit γ (L, P) ≈ σ_j² + σ_d² rise (L,); residual sum."""
     g, y = rise[:, None], gamma
     w, wg, wgg, wy, wgy = (np.sum(weight * v, axis=0) for v in (1.0, g, g * g, y, g * y))
     drift = np.maximum((w * wgy - wg * wy) / np.maximum(w * wgg - wg**2, 1e-9 * w * w + 1e-300), 0.0)
@@ -196,18 +197,18 @@ def _fitted(gamma: NDArray, weight: NDArray, rise: NDArray) -> tuple[NDArray, ND
 
 
 def _chi_square(dof: NDArray, quantile: float) -> NDArray:
-    """χ² of so many degrees of freedom at a standard normal quantile (Wilson and Hilferty, 1931)."""
+    """χ² with `dof` degrees of freedom at a standard normal quantile (Wilson and Hilferty, 1931)."""
     spread = 2.0 / (9.0 * np.maximum(dof, 1))
     return np.asarray(np.maximum(dof, 1) * (1.0 - spread + quantile * np.sqrt(spread)) ** 3)
 
 
 def _mean_of_pools(values: NDArray, weight: NDArray, pool: NDArray) -> NDArray:
-    """(P,) weighted mean of values (C,) in each pool, 0 without any."""
+    """(P,) weighted mean of values (C,) in each pool, 0 for a pool without weight."""
     return np.asarray(np.bincount(pool, values * weight) / np.maximum(np.bincount(pool, weight), 1e-300))
 
 
 def _median_of_pools(values: NDArray, pool: NDArray) -> NDArray:
-    """(C,) median of the values (C,) in each channel's pool, 0 without any."""
+    """(C,) median of the values (C,) in each channel's pool, 0 for a pool without values."""
     out = np.zeros(len(values))
     for p in range(int(pool.max(initial=-1)) + 1):
         known = values[(pool == p) & np.isfinite(values)]
@@ -216,19 +217,19 @@ def _median_of_pools(values: NDArray, pool: NDArray) -> NDArray:
 
 
 def _means(r: NDArray) -> NDArray:
-    """(C, A) means over frames, NaN where nothing is seen."""
+    """(C, A) means over frames, without NaN; NaN if all are."""
     count = np.isfinite(r).sum(axis=0)
     return np.where(count > 0, np.nansum(r, axis=0) / np.maximum(count, 1), np.nan)
 
 
 def _medians(values: NDArray, axis: int | tuple[int, ...]) -> NDArray:
-    """Medians along the first axis, or the first and the last, without NaN; NaN where nothing is seen."""
+    """Medians along the first axis, or the first and the last, without NaN; NaN if all are."""
     columns = values
     if axis != 0:
         columns = np.moveaxis(values, -1, 1).reshape(len(values) * values.shape[-1], *values.shape[1:-1])
     if not len(columns):
         return np.full(columns.shape[1:], np.nan)
     ordered, count = np.sort(columns, axis=0).reshape(len(columns), -1), np.isfinite(columns).sum(axis=0)
-    every, k = np.arange(ordered.shape[1]), count.ravel()  # NaN comes last
-    middle = 0.5 * (ordered[np.maximum(k - 1, 0) // 2, every] + ordered[k // 2, every])
+    column, k = np.arange(ordered.shape[1]), count.ravel()  # NaN is sorted last
+    middle = 0.5 * (ordered[np.maximum(k - 1, 0) // 2, column] + ordered[k // 2, column])
     return np.asarray(np.where(count > 0, middle.reshape(count.shape), np.nan))
