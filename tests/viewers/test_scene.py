@@ -6,6 +6,7 @@ from tests.exporters.synthetic import a_camera, smooth_motion
 
 from kinefit.bodies import load_body
 from kinefit.geometry import se3
+from kinefit.rendering import colours
 from kinefit.viewers import player, scene, show
 
 
@@ -56,17 +57,17 @@ def test_every_surface_is_there():
 def test_a_lost_segment_is_grey_whatever_the_colours_mean():
     usual = np.array([[1, 2, 3]] * 3, np.uint8)
     for by_quality in (False, True):
-        colours, opacities = scene.segment_looks(np.array([1.0, 0.6, 0.4]), usual, by_quality=by_quality)
-        assert tuple(colours[2]) == scene.LOST and opacities[2] < 0.5
+        shades, opacities = scene.segment_looks(np.array([1.0, 0.6, 0.4]), usual, by_quality=by_quality)
+        assert tuple(shades[2]) == colours.LOST and opacities[2] < 0.5
         assert list(opacities[:2]) == [1, 1]
     assert tuple(scene.segment_looks(np.ones(3), usual, by_quality=False)[0][0]) == (1, 2, 3)
 
 
-def test_the_ramp_goes_from_green_to_orange():
-    colours = scene.ramp(np.array([-1, 0.0, 0.5, 1.0, 9.0])).astype(int)
-    assert np.array_equal(colours[0], colours[1]) and np.array_equal(colours[3], colours[4])
-    assert colours[1, 1] > colours[1, 0] and colours[3, 0] > colours[3, 1]
-    assert np.all(np.diff(scene.ramp(np.linspace(0, 1, 9))[:, 0].astype(int)) >= 0)
+def test_the_colours_of_quality_go_from_blue_to_vermillion():
+    ramp = colours.quality_ramp(np.array([-1, 0.0, 0.5, 1.0, 9.0])).astype(int)
+    assert np.array_equal(ramp[0], ramp[1]) and np.array_equal(ramp[3], ramp[4])
+    assert ramp[1, 2] > ramp[1, 0] and ramp[3, 0] > ramp[3, 2]
+    assert np.all(np.diff(colours.quality_ramp(np.linspace(0, 1, 9))[:, 2].astype(int)[:5]) <= 0)
 
 
 def test_ellipsoids_are_two_sigmas_and_end_somewhere():

@@ -11,16 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, PointSet, TaperedCylinder
 from kinefit.geometry.camera import Camera
 from kinefit.motion import BELIEVED, UP_AXES, Motion, Residuals
+from kinefit.rendering.colours import LOST, RGB, quality_ramp, side_colour
 
-RGB = tuple[int, int, int]
-LEFT, RIGHT, MIDDLE, LOST = (70, 140, 255), (255, 140, 50), (140, 205, 130), (150, 150, 150)
-OTHERS: tuple[RGB, ...] = ((190, 80, 220), (20, 170, 170), (200, 170, 30), (120, 90, 60))
+OTHERS: tuple[RGB, ...] = ((204, 121, 167), (86, 180, 233), (230, 159, 0), (120, 90, 60))
 """Colours of the second, third ... motion, which are not told apart by side."""
 
 OUTLIER_WEIGHT = 0.05  # robust weight below which a measurement had no say
 OUTLIER = (255, 30, 30)
 LARGEST_ELLIPSOID = 0.5  # [m] half axis beyond which "somewhere there" says nothing more, and hides the rest
-_RAMP = np.array([(40, 170, 80), (240, 200, 40), (240, 120, 30)], float)  # good, middling, bad
 _JOINT = 0.016  # [m] radius of the ball at a joint, of one on thin segments less
 _AROUND, _CAP = 14, 4  # vertices around a capsule, rings of a rounded end
 
@@ -110,15 +108,7 @@ def surface_meshes(body: Body) -> list[Mesh | None]:
 
 def side_colours(body: Body) -> NDArray:
     """(S, 3) uint8: left blue, right orange, the middle green."""
-    sides = [LEFT if n.endswith("_l") else RIGHT if n.endswith("_r") else MIDDLE for n in body.tree.segments]
-    return np.array(sides, np.uint8).reshape(-1, 3)
-
-
-def ramp(values: NDArray) -> NDArray:
-    """(..., 3) uint8 from green (0) over yellow (0.5) to orange (1 and more)."""
-    t = 2.0 * np.clip(np.asarray(values, float), 0.0, 1.0)[..., None]
-    low = _RAMP[0] + (_RAMP[1] - _RAMP[0]) * np.minimum(t, 1.0)
-    return np.rint(low + (_RAMP[2] - _RAMP[1]) * np.maximum(t - 1.0, 0.0)).astype(np.uint8)
+    return np.array([side_colour(name) for name in body.tree.segments], np.uint8).reshape(-1, 3)
 
 
 def segment_looks(quality: NDArray, usual: NDArray, *, by_quality: bool) -> tuple[NDArray, NDArray]:
@@ -127,7 +117,7 @@ def segment_looks(quality: NDArray, usual: NDArray, *, by_quality: bool) -> tupl
     A segment that is lost is grey and half transparent whatever the colours mean.
     """
     lost = np.asarray(quality) < BELIEVED
-    colours = ramp(1.0 - np.asarray(quality, float)) if by_quality else usual
+    colours = quality_ramp(1.0 - np.asarray(quality, float)) if by_quality else usual
     return np.where(lost[:, None], np.array(LOST, np.uint8), colours), np.where(lost, 0.3, 1.0)
 
 
@@ -170,13 +160,13 @@ def camera_rays(
     norms, weights : (K,) [px], 0..1
         Residuals and robust weights; a point without weight is an outlier and red.
     middling : float [px]
-        Residual that is drawn yellow; half of it and less is greener, twice of it orange.
+        Residual that is drawn yellow; half of it and less is bluer, twice of it orange.
     """
     directions = camera.ray(measured)
     seen = np.flatnonzero(np.isfinite(directions).all(-1) & np.isfinite(norms))
     d, x, centre = directions[seen], np.asarray(x_world)[seen], camera.centre_world
     feet = centre + np.maximum(np.sum((x - centre) * d, axis=1), 0.1)[:, None] * d
-    colours = ramp(norms[seen] / (2.0 * max(middling, 1e-9)))
+    colours = quality_ramp(norms[seen] / (2.0 * max(middling, 1e-9)))
     colours[np.asarray(weights)[seen] < OUTLIER_WEIGHT] = OUTLIER
     points = np.concatenate([np.stack([np.broadcast_to(centre, feet.shape), feet], 1), np.stack([feet, x], 1)])
     return Rays(points, np.repeat(np.tile(colours, (2, 1))[:, None], 2, axis=1))

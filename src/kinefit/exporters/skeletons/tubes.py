@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, MeshSurface, TaperedCylinder
 from kinefit.bodies.surfaces import Metaballs
 from kinefit.bodies.surfaces.skins.body_skin import FOLLOWED, BodySkin, body_skins
+from kinefit.rendering.colours import side_colour
 
 AROUND, CAP, ALONG = 20, 6, 8  # vertices around a tube, rings of a rounded end, rings between the ends
-LEFT, RIGHT, CENTRE = (70, 140, 255), (255, 140, 50), (140, 205, 130)  # RGB
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +35,6 @@ class TubeMesh:
     triangles: NDArray
     segments: NDArray
     weights: NDArray
-
-
-def side_colour(name: str) -> tuple[int, int, int]:
-    """Colour of a segment by its name: left, right or in the middle."""
-    return LEFT if name.endswith("_l") else RIGHT if name.endswith("_r") else CENTRE
 
 
 def body_mesh(body: Body) -> TubeMesh:
