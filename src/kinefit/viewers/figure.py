@@ -14,6 +14,9 @@ from kinefit.viewers import scene as content
 PARTS = ("bones", "joints", "surface", "landmarks", "uncertainty")
 """Layers of a figure."""
 
+USUAL = frozenset(PARTS) - {"landmarks", "uncertainty"}
+"""Those that are shown at first."""
+
 _SURFACE_OPACITY, _ELLIPSOID = 0.22, (150, 60, 230)
 
 
