@@ -9,8 +9,8 @@ import pytest
 from kinefit.bodies import load_body
 from kinefit.exporters.report.figure import live_figure
 from kinefit.exporters.report.page import CENTRE, LEFT, RIGHT
-from kinefit.exporters.skeletons.tubes import body_mesh
 from kinefit.rendering import colours
+from kinefit.rendering.tubes import body_mesh
 from kinefit.viewers import scene
 
 # Machado, Oliveira and Fernandes, IEEE TVCG 15 (2009), severity 1: of linear RGB.

@@ -12,11 +12,11 @@ from kinefit.bodies import Body, MeshSurface, PointSet
 from kinefit.bodies.surfaces import Surface
 from kinefit.exporters.pictures.drawing import bones
 from kinefit.exporters.report.page import Html, to_json
-from kinefit.exporters.skeletons.tubes import is_last
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion, rotation_between_up
 from kinefit.rendering.colours import LEFT, LOST, RIGHT, side_colour, to_hex
+from kinefit.rendering.tubes import is_last
 
 RATE = 15.0  # [Hz] of the figure: enough for the eye to follow, the player goes smoothly between
 MOST = 3000  # frames: longer takes are shown at a lower rate

@@ -1,4 +1,4 @@
-"""A body's surfaces as closed, smooth meshes whose vertices follow up to four segments."""
+"""A body as it is drawn: closed, smooth meshes whose vertices follow up to four segments."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, MeshSurface, TaperedCylinder
 from kinefit.bodies.surfaces import Metaballs
 from kinefit.bodies.surfaces.skins.body_skin import FOLLOWED, BodySkin, body_skins
+from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh, strongest
 from kinefit.rendering.colours import side_colour
+from kinefit.rendering.person_skin import person_skin
 
 AROUND, CAP, ALONG = 20, 6, 8  # vertices around a tube, rings of a rounded end, rings between the ends
 
@@ -37,14 +39,18 @@ class TubeMesh:
     weights: NDArray
 
 
-def body_mesh(body: Body) -> TubeMesh:
-    """Tubes with rounded ends around all cylinders, meshes as they are, one skin over metaballs that hang together.
+def body_mesh(body: Body, *, cylinders: bool = False) -> TubeMesh:
+    """The body's own skin, or a person's (`person_skin`); else, or with `cylinders`, a tube around every cylinder.
 
-    Near a joint tubes and skins follow both segments.
+    Tubes have rounded ends. Meshes stay as they are, and one skin covers metaballs that hang together. Near a joint
+    tubes and skins follow both segments.
     """
-    others = [c for c in body.surfaces if not isinstance(c, Metaballs)]
-    parts = [_rigid(body, c) if isinstance(c, MeshSurface) else _tube(body, c) for c in others]
-    parts += [_skin(body, skin) for skin in body_skins(body)]
+    worn = None if cylinders else body.skin or person_skin(body)
+    covered = set() if worn is None else set(np.unique(worn.segment).tolist())
+    others = [c for c in body.surfaces if c.segment not in covered and not isinstance(c, Metaballs)]
+    parts = [] if worn is None else [_worn(body, worn)]
+    parts += [_rigid(body, c) if isinstance(c, MeshSurface) else _tube(body, c) for c in others]
+    parts += [] if covered else [_skin(body, skin) for skin in body_skins(body)]
     if not parts:
         columns = ((3, float), (3, float), (3, np.uint8), (3, int), (FOLLOWED, int), (FOLLOWED, float))
         return TubeMesh(*(np.zeros((0, count), kind) for count, kind in columns))
@@ -88,6 +94,15 @@ def _rigid(body: Body, mesh: MeshSurface) -> TubeMesh:
         triangles=mesh.faces,
         segments=np.full((count, 2), mesh.segment),
         weights=np.tile([1.0, 0.0], (count, 1)),
+    )
+
+
+def _worn(body: Body, skin: SkinnedMesh) -> TubeMesh:
+    which, weights = strongest(skin.weights, FOLLOWED)
+    colours = np.array([side_colour(name) for name in body.tree.segments], np.uint8)
+    return TubeMesh(
+        vertices=skin.vertices, normals=_normals(skin.vertices, skin.faces), colours=colours[skin.segment],
+        triangles=skin.faces, segments=np.take_along_axis(skin.owners, which, axis=1), weights=weights,
     )
 
 
