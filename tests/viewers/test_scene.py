@@ -33,7 +33,7 @@ def test_bones_reach_from_joint_to_joint(motion):
     body, Ts = motion.body, motion.segment_poses()[7]
     for child, parent in enumerate(body.tree.parents):
         if parent >= 0 and np.linalg.norm(body.tree.offsets[child]) > 1e-3:
-            bone = se3.apply(Ts[parent], scene.bone_meshes(body)[parent].vertices)
+            bone = se3.apply(Ts[parent], scene.bone_meshes(body)[0][parent].vertices)
             for joint in (Ts[child, :3, 3], Ts[parent, :3, 3]):
                 assert np.linalg.norm(bone - joint, axis=1).min() < 0.015
 

@@ -127,8 +127,10 @@ def test_ellipsoids_are_two_sigmas_to_a_tenth(server, motion):
 
 def test_layers_are_shown_and_hidden(server, motion, rig):
     show = Show(server, ViewerContent((motion,), rig=rig))
+    assert node(server, "body0/skin_thigh_l").visible
     show.frame(0, Choice(frozenset({"bones", "cameras"})))
     assert node(server, "body0/thigh_l/bones").visible and not node(server, "body0/thigh_l/surface").visible
+    assert not node(server, "body0/skin_thigh_l").visible
     assert node(server, "cameras/cam 0").visible and not node(server, "floor").visible
     show.frame(0, Choice(frozenset({"surface", "floor", "path"}), through="cam 1"))
     assert not node(server, "body0/thigh_l/bones").visible and node(server, "body0/thigh_l/surface").visible
@@ -269,7 +271,7 @@ def test_the_player_plays_steps_and_obeys_its_boxes(server, motion, rig):
     player._slider.value = 6  # as a user moves it
     player.tick(0.0)
     assert player.clock.frame == 6
-    player._boxes["bones"].value = False
+    assert not player._boxes["bones"].value and player._boxes["skin"].value
     player._rays.value, player._look.value, player._colour.value = ALL, "cam 1", "quality"
     player.tick(0.0)
     assert not node(server, "body0/thigh_l/bones").visible and node(server, "rays").visible
@@ -319,8 +321,8 @@ def test_a_page_that_plays_again_shows_the_first_frame_as_it_was(server, motion)
     show.frame(0)
 
     def looks():
-        bones = [(node.color, node.opacity) for nodes in body._bones for node, _ in nodes]
-        return [*bones, *(node.scale for node in body._parts["uncertainty"])]
+        shaded = [(node.color, node.opacity) for nodes in body._shaded for node, _, _ in nodes]
+        return [*shaded, *(node.scale for node in body._parts["uncertainty"])]
 
     first = looks()
     body.blank()

@@ -1,9 +1,10 @@
-"""What a 3D scene shows, as plain arrays: bones, uncertainty, rays, paths, floor. Nothing here draws."""
+"""What a 3D scene shows, as plain arrays: skin, bones, uncertainty, rays, paths, floor. Nothing here draws."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +13,7 @@ from kinefit.bodies import Body, PointSet, TaperedCylinder
 from kinefit.geometry.camera import Camera
 from kinefit.motion import BELIEVED, UP_AXES, Motion, Residuals
 from kinefit.rendering.colours import LOST, RGB, quality_ramp, side_colour
+from kinefit.rendering.tubes import TubeMesh
 
 OTHERS: tuple[RGB, ...] = ((204, 121, 167), (86, 180, 233), (230, 159, 0), (120, 90, 60))
 """Colours of the second, third ... motion, which are not told apart by side."""
@@ -19,6 +21,9 @@ OTHERS: tuple[RGB, ...] = ((204, 121, 167), (86, 180, 233), (230, 159, 0), (120,
 OUTLIER_WEIGHT = 0.05  # robust weight below which a measurement had no say
 OUTLIER = (255, 30, 30)
 LARGEST_ELLIPSOID = 0.5  # [m] half axis beyond which "somewhere there" says nothing more, and hides the rest
+_MAX_SIGMA = 0.11  # [m] of a joint, all directions together, above which its limb may lie beside itself
+_LOST_OPACITY, _UNCERTAIN_OPACITY = 0.3, 0.55
+_PIECES = 5  # of a bone: dashes and gaps of a lost one in turn
 _JOINT = 0.016  # [m] radius of the ball at a joint, of one on thin segments less
 _AROUND, _CAP = 14, 4  # vertices around a capsule, rings of a rounded end
 
@@ -73,16 +78,58 @@ def joined(meshes: Sequence[Mesh]) -> Mesh | None:
     return Mesh(np.concatenate([m.vertices for m in meshes]), faces)
 
 
-def bone_meshes(body: Body) -> list[Mesh | None]:
-    """One thin mesh a segment, in its frame: to the joints of its children, or to the end of the last surface."""
+@dataclass(frozen=True, eq=False)
+class SkinPiece:
+    """The part of a skin that one segment carries.
+
+    Parameters
+    ----------
+    segment : int
+    mesh : Mesh, its vertices in the root's frame at rest
+    followed : (B,) int, segments that its vertices follow
+    weights : (V, B) how much each vertex follows these; they sum to 1
+    """
+
+    segment: int
+    mesh: Mesh
+    followed: NDArray
+    weights: NDArray
+
+
+def skin_pieces(skin: TubeMesh) -> list[SkinPiece]:
+    """A skin cut along the borders of the segments."""
+    rows = np.arange(len(skin.vertices))
+    a, b, c = skin.segments[rows, skin.weights.argmax(axis=1)][skin.triangles].T if len(rows) else np.zeros((3, 0), int)
+    owners, out = np.where(b == c, b, a), []
+    for s in np.unique(owners):
+        used, faces = np.unique(skin.triangles[owners == s], return_inverse=True)
+        segments, shares = skin.segments[used], skin.weights[used]
+        followed, columns = np.unique(np.where(shares > 0, segments, s), return_inverse=True)
+        weights = np.zeros((len(used), len(followed)))
+        np.add.at(weights, (np.arange(len(used))[:, None], columns.reshape(shares.shape)), shares)
+        out.append(SkinPiece(int(s), Mesh(skin.vertices[used], faces.reshape(-1, 3)), followed, weights))
+    return out
+
+
+def bone_meshes(body: Body) -> tuple[list[Mesh | None], list[Mesh | None]]:
+    """Dashes and gaps between them, thin meshes of every segment in its frame; together they are solid bones.
+
+    Bones go to the joints of a segment's children, or to the end of the last surface.
+    """
     tree, ends = body.tree, body.segment_ends()
-    out = []
+    dashes, gaps = list[Mesh | None](), list[Mesh | None]()
+    at = np.linspace(0.0, 1.0, _PIECES + 1)
     for s in range(len(tree.segments)):
         tips = [tree.offsets[k] for k in np.flatnonzero(tree.parents == s)] or ([ends[s]] if s in ends else [])
         lengths = [float(np.linalg.norm(tip)) for tip in tips]
         bones = [(tip, min(0.013, 0.1 * n)) for tip, n in zip(tips, lengths) if n > 1e-6]
-        out.append(joined([capsule(np.zeros(3), tip, (radius, 0.6 * radius)) for tip, radius in bones]))
-    return out
+        pieces = [
+            [capsule(a * tip, b * tip, (radius * (1 - 0.4 * a), radius * (1 - 0.4 * b))) for a, b in pairwise(at)]
+            for tip, radius in bones
+        ]
+        dashes.append(joined([mesh for bone in pieces for mesh in bone[::2]]))
+        gaps.append(joined([mesh for bone in pieces for mesh in bone[1::2]]))
+    return dashes, gaps
 
 
 def joint_radii(body: Body) -> NDArray:
@@ -111,14 +158,27 @@ def side_colours(body: Body) -> NDArray:
     return np.array([side_colour(name) for name in body.tree.segments], np.uint8).reshape(-1, 3)
 
 
-def segment_looks(quality: NDArray, usual: NDArray, *, by_quality: bool) -> tuple[NDArray, NDArray]:
+def segment_looks(
+    quality: NDArray, usual: NDArray, *, by_quality: bool, uncertain: NDArray | None = None
+) -> tuple[NDArray, NDArray]:
     """Colours (S, 3) uint8 and opacities (S,) of the segments by their quality (S,) in 0..1.
 
-    A segment that is lost is grey and half transparent whatever the colours mean.
+    A segment that is lost is grey and translucent whatever the colours mean; one that is `uncertain` (S,) bool is a
+    little translucent.
     """
     lost = np.asarray(quality) < BELIEVED
     colours = quality_ramp(1.0 - np.asarray(quality, float)) if by_quality else usual
-    return np.where(lost[:, None], np.array(LOST, np.uint8), colours), np.where(lost, 0.3, 1.0)
+    opacities = np.where(False if uncertain is None else uncertain, _UNCERTAIN_OPACITY, 1.0)
+    shades = np.where(lost[:, None], np.array(LOST, np.uint8), colours)
+    return shades, np.where(lost, _LOST_OPACITY, np.broadcast_to(opacities, lost.shape))
+
+
+def uncertain_segments(body: Body, joint_std: NDArray) -> NDArray:
+    """(S,) bool: segments of which a joint, at either end, has standard deviations (S, 3) [m] above 11 cm in all."""
+    sigmas = np.sqrt(np.sum(np.square(np.nan_to_num(joint_std, nan=np.inf, posinf=np.inf)), axis=1))
+    out, parents = sigmas > _MAX_SIGMA, body.tree.parents
+    np.logical_or.at(out, parents[parents >= 0], (sigmas > _MAX_SIGMA)[parents >= 0])
+    return out
 
 
 def ellipsoids(body: Body, joint_std: NDArray, *, sigmas: float = 2.0) -> NDArray:

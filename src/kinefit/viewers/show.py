@@ -26,6 +26,9 @@ LAYERS = (*figure.PARTS, "path", "points", "markers", "cameras", "images", "floo
 USUAL = figure.USUAL | frozenset(LAYERS) - set(figure.PARTS)
 """What is shown at first."""
 
+CYLINDERS = USUAL - figure.USUAL | figure.CYLINDERS
+"""The same with the body's cylinders and bones in place of a skin."""
+
 ALL, NONE = "all cameras", "none"
 _POINT, _MARKER, _PATH = (245, 205, 40), (225, 60, 120), (110, 120, 135)
 
@@ -193,7 +196,7 @@ class Show:
                 if f is not None:
                     fig.pose(
                         self._poses[n][f], joint_std=motion.joint_std[f], quality=motion.segment_quality[f],
-                        by_quality=choice.by_quality and n == 0,
+                        by_quality=choice.by_quality and n == 0, see_through=choice.through != NONE,
                     )  # fmt: skip
             follow = choice.follow and choice.through == NONE
             self.stage.shift(self._way[0] - self._way[i] if follow else np.zeros(3))
