@@ -7,6 +7,7 @@ import sys
 import types
 import urllib.error
 import urllib.request
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,11 +22,12 @@ from kinefit.errors import BodyError, CalibrationError, ExportError, Observation
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Markers
+from kinefit.rendering.colours import LEFT, LOST, RIGHT
 from kinefit.serving.access import Access
 from kinefit.simulation import cut
 from kinefit.viewers import CameraImages, Choice, Player, View, ViewerContent, page
 from kinefit.viewers.page import MOST_FRAMES, chosen_frames
-from kinefit.viewers.show import ALL, Show
+from kinefit.viewers.show import ALL, CYLINDERS, Show
 from kinefit.viewers.stage import free_port, open_server, quiet
 
 ACCESS = Access()
@@ -116,6 +118,38 @@ def test_segments_stand_where_the_motion_says(server, motion):
             assert np.allclose(frame.position, T[:3, 3], atol=1e-5)
             assert np.allclose(se3.rotation_from_quaternion(frame.wxyz), T[:3, :3], atol=1e-5)
             assert np.allclose(node(server, f"body0/at_{name}").position, T[:3, 3], atol=1e-5)
+
+
+def test_the_skin_moves_with_the_segments_and_shows_what_is_lost_or_uncertain(server, motion):
+    quality, std = np.ones_like(motion.segment_quality), np.full_like(motion.joint_std, 0.01)
+    quality[3, motion.body.tree.segment("shank_l")] = 0.0
+    std[3, motion.body.tree.segment("hand_r")] = 0.2
+    told = replace(motion, segment_quality=quality, joint_std=std)
+    show = Show(server, ViewerContent((told,)))
+    show.frame(3)
+    for bone, s in show.figures[0]._followers:
+        assert np.allclose(bone.position, motion.segment_poses()[3, s, :3, 3], atol=1e-5)
+        assert np.allclose(se3.rotation_from_quaternion(bone.wxyz), motion.segment_poses()[3, s, :3, :3], atol=1e-5)
+    lost, unsure, good = (node(server, f"body0/skin_{name}") for name in ("shank_l", "hand_r", "thigh_l"))
+    assert good.opacity is None and good.color == LEFT
+    assert 0 < lost.opacity < unsure.opacity < 1 and lost.color == LOST and unsure.color == RIGHT
+    assert node(server, "body0/shank_l/gaps").opacity == 0.0 and node(server, "body0/shank_l/bones").opacity is None
+    show.frame(0)
+    assert lost.opacity is None and lost.color == LEFT and node(server, "body0/shank_l/gaps").opacity is None
+    show.frame(0, Choice(through="cam 0"))
+    assert good.opacity == 0.5
+
+
+def test_without_surfaces_the_bones_stand_for_the_skin(server, motion):
+    show = Show(server, ViewerContent((replace(motion, body=replace(motion.body, surfaces=())),)))
+    show.frame(0)
+    assert node(server, "body0/pelvis/bones").visible and node(server, "body0/shank_l/gaps").visible
+
+
+def test_cylinders_are_shown_where_they_are_asked_for(server, motion):
+    Player(server, ViewerContent((motion,)), layers=CYLINDERS).tick(0.0)
+    assert node(server, "body0/thigh_l/surface").visible and node(server, "body0/thigh_l/bones").visible
+    assert not node(server, "body0/skin_thigh_l").visible
 
 
 def test_ellipsoids_are_two_sigmas_to_a_tenth(server, motion):

@@ -22,7 +22,7 @@ OUTLIER_WEIGHT = 0.05  # robust weight below which a measurement had no say
 OUTLIER = (255, 30, 30)
 LARGEST_ELLIPSOID = 0.5  # [m] half axis beyond which "somewhere there" says nothing more, and hides the rest
 _MAX_SIGMA = 0.11  # [m] of a joint, all directions together, above which its limb may lie beside itself
-_LOST_OPACITY, _UNCERTAIN_OPACITY = 0.3, 0.55
+_LOST_OPACITY, _UNCERTAIN_OPACITY = 0.45, 0.6
 _PIECES = 5  # of a bone: dashes and gaps of a lost one in turn
 _JOINT = 0.016  # [m] radius of the ball at a joint, of one on thin segments less
 _AROUND, _CAP = 14, 4  # vertices around a capsule, rings of a rounded end
@@ -97,10 +97,19 @@ class SkinPiece:
 
 
 def skin_pieces(skin: TubeMesh) -> list[SkinPiece]:
-    """A skin cut along the borders of the segments."""
-    rows = np.arange(len(skin.vertices))
-    a, b, c = skin.segments[rows, skin.weights.argmax(axis=1)][skin.triangles].T if len(rows) else np.zeros((3, 0), int)
-    owners, out = np.where(b == c, b, a), []
+    """A skin cut along the borders of the segments.
+
+    A triangle belongs to the segment that the ends of its longest edge follow most. Both halves of a quadrilateral
+    share this edge, so borders have no teeth.
+    """
+    every = np.zeros((len(skin.vertices), int(skin.segments.max(initial=-1)) + 1))
+    np.add.at(every, (np.arange(len(every))[:, None], skin.segments), skin.weights)
+    corners = skin.vertices[skin.triangles]
+    longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).argmax(axis=1)
+    rows = np.arange(len(longest))
+    ends = [skin.triangles[rows, (longest + k) % 3] for k in range(2)]
+    owners = (every[ends[0]] + every[ends[1]]).argmax(axis=1) if len(rows) else rows
+    out = []
     for s in np.unique(owners):
         used, faces = np.unique(skin.triangles[owners == s], return_inverse=True)
         segments, shares = skin.segments[used], skin.weights[used]
