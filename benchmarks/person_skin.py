@@ -1,8 +1,8 @@
-"""Make the skin that people wear in figures: `python -m benchmarks.person_skin` writes `kinefit/data/person_skin.npz`.
+"""Make the skin of a person in figures: `python -m benchmarks.person_skin` writes `kinefit/data/person_skin.npz`.
 
 The humanoid's limbs get metaballs whose cross-sections follow the widths below, which are round figures of an average
 adult set by hand, no other model's. One seamless skin with weights is meshed over all of them
-(`kinefit.bodies.surfaces.skins.body_skin`). `kinefit.rendering.person_skin` brings it to a body's own lengths and
+(`kinefit.bodies.surfaces.skins.body_skin`). `kinefit.rendering.person_skin` scales it to a body's own lengths and
 widths.
 """
 
@@ -24,7 +24,7 @@ _SEEN = 0.82  # of a ball's radius across the limb, where balls overlap like tha
 
 # Of each limb in its segment's frame [m]: axis, then places along it, the middle's two offsets across (in the order of
 # the other axes), and half widths there.
-LIMBS = {
+LIMBS: dict[str, tuple[str, list[tuple[float, ...]]]] = {
     "pelvis": ("y", [(-0.075, 0.0, 0, 0.085, 0.150), (-0.02, -0.012, 0, 0.112, 0.168), (0.04, -0.006, 0, 0.108, 0.160),
                      (0.10, 0.0, 0, 0.100, 0.146)]),
     "abdomen": ("y", [(0.0, 0.030, 0, 0.098, 0.144), (0.05, 0.034, 0, 0.094, 0.138), (0.10, 0.037, 0, 0.096, 0.141),
@@ -93,5 +93,5 @@ def skin(times: int = 0) -> dict[str, NDArray]:
 
 if __name__ == "__main__":
     Path(FILE).parent.mkdir(exist_ok=True)
-    np.savez_compressed(FILE, **skin())
+    np.savez_compressed(FILE, **skin())  # type: ignore[arg-type]
     print(f"{FILE}: {Path(FILE).stat().st_size / 1e3:.0f} kB")

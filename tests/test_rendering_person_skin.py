@@ -1,4 +1,4 @@
-"""The skin that people wear in figures fits the bodies that wear it."""
+"""The skin of a person in figures fits the bodies that it is scaled to."""
 
 from dataclasses import replace
 
@@ -69,15 +69,15 @@ def test_it_is_stretched_with_the_segments_and_widened_with_the_cylinders():
 def test_what_is_no_limb_of_a_person_keeps_its_tubes(name):
     body = load_body(name)
     mesh, tubes = body_mesh(body), body_mesh(body, cylinders=True)
-    worn = len(person_skin(body).vertices)
+    shared = len(person_skin(body).vertices)
     more = {s for s in range(len(body.tree.segments)) if body.tree.segments[s] not in BODY.tree.segments}
-    assert set(mesh.segments[worn:, 0].tolist()) <= more | {-1} or not more
-    assert (len(mesh.vertices) > worn) == bool(more & set(tubes.segments[:, 0].tolist()))
+    assert set(mesh.segments[shared:, 0].tolist()) <= more | {-1} or not more
+    assert (len(mesh.vertices) > shared) == bool(more & set(tubes.segments[:, 0].tolist()))
     np.testing.assert_allclose(mesh.weights.sum(axis=1), 1.0)
 
 
 @pytest.mark.parametrize("name", ["arm", "humanoid10", "humanoid_metaballs"])
-def test_other_bodies_wear_none(name):
+def test_other_bodies_get_none(name):
     assert person_skin(load_body(name)) is None
 
 

@@ -1,4 +1,4 @@
-"""The skin that people wear in figures, brought to a body's own lengths and widths.
+"""The skin of a person in figures, scaled to a body's own lengths and widths.
 
 `benchmarks.person_skin` made the file: one seamless mesh about metaballs on the humanoid's limbs, with weights.
 """

@@ -45,12 +45,12 @@ def body_mesh(body: Body, *, cylinders: bool = False) -> TubeMesh:
     Tubes have rounded ends. Meshes stay as they are, and one skin covers metaballs that hang together. Near a joint
     tubes and skins follow both segments.
     """
-    worn = None if cylinders else body.skin or person_skin(body)
-    covered = set() if worn is None else set(np.unique(worn.segment).tolist())
+    skin = None if cylinders else body.skin or person_skin(body)
+    covered = set() if skin is None else set(np.unique(skin.segment).tolist())
     others = [c for c in body.surfaces if c.segment not in covered and not isinstance(c, Metaballs)]
-    parts = [] if worn is None else [_worn(body, worn)]
+    parts = [] if skin is None else [_skinned(body, skin)]
     parts += [_rigid(body, c) if isinstance(c, MeshSurface) else _tube(body, c) for c in others]
-    parts += [] if covered else [_skin(body, skin) for skin in body_skins(body)]
+    parts += [] if covered else [_metaballs(body, net) for net in body_skins(body)]
     if not parts:
         columns = ((3, float), (3, float), (3, np.uint8), (3, int), (FOLLOWED, int), (FOLLOWED, float))
         return TubeMesh(*(np.zeros((0, count), kind) for count, kind in columns))
@@ -97,7 +97,7 @@ def _rigid(body: Body, mesh: MeshSurface) -> TubeMesh:
     )
 
 
-def _worn(body: Body, skin: SkinnedMesh) -> TubeMesh:
+def _skinned(body: Body, skin: SkinnedMesh) -> TubeMesh:
     which, weights = strongest(skin.weights, FOLLOWED)
     colours = np.array([side_colour(name) for name in body.tree.segments], np.uint8)
     return TubeMesh(
@@ -106,7 +106,7 @@ def _worn(body: Body, skin: SkinnedMesh) -> TubeMesh:
     )
 
 
-def _skin(body: Body, skin: BodySkin) -> TubeMesh:
+def _metaballs(body: Body, skin: BodySkin) -> TubeMesh:
     there, faces, every = skin.mesh()
     vertices = skin.at_rest(there, every)
     order = np.argsort(-every, axis=1)[:, :FOLLOWED]

@@ -111,7 +111,7 @@ class ViewerContent:
             return np.concatenate([first.segment_poses()[0, :, :3, 3], first.positions()[0]])
         x = np.zeros((1, 0, 3)) if self.points is None else self.points
         x = self.markers[0].positions if self.points is None and self.markers else x
-        known = np.isfinite(x).all(axis=-1)
+        known = np.asarray(np.isfinite(x).all(axis=-1))
         frame = int(np.argmax(known.any(axis=1)))
         return np.asarray(x[frame][known[frame]])
 

@@ -55,7 +55,7 @@ def depth_picture(
         part, lost = raster.segment, np.append(motion.lost[frame], False)  # -1, the background, is not lost
         for a, b, there in ((part[1:], part[:-1], out[1:]), (part[:, 1:], part[:, :-1], out[:, 1:])):
             there[(a != b) & ~lost[a] & ~lost[b]] = WHITE
-        for s in np.flatnonzero(lost):
+        for s in np.flatnonzero(lost).tolist():
             for rim in segment_contours(part, s):
                 draw_line(out, rim, LOST, 1, _DASH_PX)
     if label:
