@@ -7,6 +7,7 @@ import pytest
 from benchmarks.person_skin import skin
 
 from kinefit.bodies import load_body
+from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
 from kinefit.rendering.person_skin import FILE, person_skin
 from kinefit.rendering.tubes import body_mesh
 
@@ -83,3 +84,15 @@ def test_other_bodies_get_none(name):
 
 def test_nor_does_a_body_that_only_has_the_names_of_a_person():
     assert person_skin(widened(4.0)) is None
+
+
+def test_a_body_that_has_a_skin_keeps_it():
+    shape = person_skin(BODY)
+    every = np.zeros((len(shape.vertices), len(BODY.tree.segments)))
+    np.add.at(every, (np.arange(len(every))[:, None], shape.owners), shape.weights)
+    own = SkinnedMesh.of(1.01 * shape.vertices, shape.faces, 0.9 * every + 0.1 / every.shape[1], BODY.tree, owners=6)
+    mesh = body_mesh(replace(BODY, skin=own))
+    np.testing.assert_allclose(mesh.vertices, own.vertices)
+    assert mesh.weights.shape[1] == 4 and own.weights.shape[1] == 6
+    np.testing.assert_allclose(mesh.weights.sum(axis=1), 1.0)
+    assert np.array_equal(mesh.segments[np.arange(len(every)), mesh.weights.argmax(axis=1)], own.segment)
