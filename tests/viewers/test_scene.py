@@ -1,11 +1,15 @@
 """What a scene shows, as arrays, against the motion and the cameras it is made of."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.exporters.synthetic import a_camera, smooth_motion
 
 from kinefit.bodies import load_body
 from kinefit.geometry import se3
+from kinefit.rendering import colours
+from kinefit.rendering.tubes import body_mesh
 from kinefit.viewers import player, scene, show
 
 
@@ -32,7 +36,7 @@ def test_bones_reach_from_joint_to_joint(motion):
     body, Ts = motion.body, motion.segment_poses()[7]
     for child, parent in enumerate(body.tree.parents):
         if parent >= 0 and np.linalg.norm(body.tree.offsets[child]) > 1e-3:
-            bone = se3.apply(Ts[parent], scene.bone_meshes(body)[parent].vertices)
+            bone = se3.apply(Ts[parent], scene.bone_meshes(body)[0][parent].vertices)
             for joint in (Ts[child, :3, 3], Ts[parent, :3, 3]):
                 assert np.linalg.norm(bone - joint, axis=1).min() < 0.015
 
@@ -53,20 +57,49 @@ def test_every_surface_is_there():
     assert np.ptp(meshes[thigh.segment].vertices, axis=0).max() == pytest.approx(reach, rel=0.05)
 
 
+def test_the_pieces_of_a_skin_are_all_of_it():
+    body = load_body("humanoid")
+    skin = body_mesh(body)
+    pieces = scene.skin_pieces(skin)
+    assert [p.segment for p in pieces] == list(range(len(body.tree.segments)))
+    assert sum(len(p.mesh.faces) for p in pieces) == len(skin.triangles)
+    assert sum(volume(p.mesh) for p in pieces) == pytest.approx(volume(scene.Mesh(skin.vertices, skin.triangles)))
+    for p in pieces:
+        assert np.allclose(p.weights.sum(axis=1), 1.0) and p.segment in p.followed
+        others = {int(body.tree.parents[p.segment]), p.segment, *np.flatnonzero(body.tree.parents == p.segment)}
+        assert p.weights[:, [k for k, s in enumerate(p.followed) if s in others]].sum(axis=1).mean() > 0.95
+
+
+def test_a_body_without_surfaces_has_no_skin():
+    assert scene.skin_pieces(body_mesh(replace(load_body("humanoid"), surfaces=()))) == []
+
+
+def test_segments_are_uncertain_where_a_joint_at_either_end_is():
+    body = load_body("humanoid")
+    std = np.full((len(body.tree.segments), 3), 0.05)
+    std[body.tree.segment("hand_r")] = 0.07, 0.07, 0.07
+    std[body.tree.segment("toes_l")] = np.nan
+    found = np.flatnonzero(scene.uncertain_segments(body, std))
+    assert {body.tree.segments[s] for s in found} == {"forearm_r", "hand_r", "foot_l", "toes_l"}
+    usual = np.ones((2, 3), np.uint8)
+    _, opacities = scene.segment_looks(np.array([1.0, 0.0]), usual, by_quality=False, uncertain=np.array([True, True]))
+    assert 0.0 < opacities[1] < opacities[0] < 1.0
+
+
 def test_a_lost_segment_is_grey_whatever_the_colours_mean():
     usual = np.array([[1, 2, 3]] * 3, np.uint8)
     for by_quality in (False, True):
-        colours, opacities = scene.segment_looks(np.array([1.0, 0.6, 0.4]), usual, by_quality=by_quality)
-        assert tuple(colours[2]) == scene.LOST and opacities[2] < 0.5
+        shades, opacities = scene.segment_looks(np.array([1.0, 0.6, 0.4]), usual, by_quality=by_quality)
+        assert tuple(shades[2]) == colours.LOST and opacities[2] < 0.5
         assert list(opacities[:2]) == [1, 1]
     assert tuple(scene.segment_looks(np.ones(3), usual, by_quality=False)[0][0]) == (1, 2, 3)
 
 
-def test_the_ramp_goes_from_green_to_orange():
-    colours = scene.ramp(np.array([-1, 0.0, 0.5, 1.0, 9.0])).astype(int)
-    assert np.array_equal(colours[0], colours[1]) and np.array_equal(colours[3], colours[4])
-    assert colours[1, 1] > colours[1, 0] and colours[3, 0] > colours[3, 1]
-    assert np.all(np.diff(scene.ramp(np.linspace(0, 1, 9))[:, 0].astype(int)) >= 0)
+def test_the_colours_of_quality_go_from_blue_to_vermillion():
+    ramp = colours.quality_ramp(np.array([-1, 0.0, 0.5, 1.0, 9.0])).astype(int)
+    assert np.array_equal(ramp[0], ramp[1]) and np.array_equal(ramp[3], ramp[4])
+    assert ramp[1, 2] > ramp[1, 0] and ramp[3, 0] > ramp[3, 2]
+    assert np.all(np.diff(colours.quality_ramp(np.linspace(0, 1, 9))[:, 2].astype(int)[:5]) <= 0)
 
 
 def test_ellipsoids_are_two_sigmas_and_end_somewhere():

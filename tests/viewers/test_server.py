@@ -7,6 +7,7 @@ import sys
 import types
 import urllib.error
 import urllib.request
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,10 +22,12 @@ from kinefit.errors import BodyError, CalibrationError, ExportError, Observation
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Markers
+from kinefit.rendering.colours import LEFT, LOST, RIGHT
 from kinefit.serving.access import Access
+from kinefit.simulation import cut
 from kinefit.viewers import CameraImages, Choice, Player, View, ViewerContent, page
 from kinefit.viewers.page import MOST_FRAMES, chosen_frames
-from kinefit.viewers.show import ALL, Show
+from kinefit.viewers.show import ALL, CYLINDERS, Show
 from kinefit.viewers.stage import free_port, open_server, quiet
 
 ACCESS = Access()
@@ -117,16 +120,51 @@ def test_segments_stand_where_the_motion_says(server, motion):
             assert np.allclose(node(server, f"body0/at_{name}").position, T[:3, 3], atol=1e-5)
 
 
+def test_the_skin_moves_with_the_segments_and_shows_what_is_lost_or_uncertain(server, motion):
+    quality, std = np.ones_like(motion.segment_quality), np.full_like(motion.joint_std, 0.01)
+    quality[3, motion.body.tree.segment("shank_l")] = 0.0
+    std[3, motion.body.tree.segment("hand_r")] = 0.2
+    told = replace(motion, segment_quality=quality, joint_std=std)
+    show = Show(server, ViewerContent((told,)))
+    show.frame(3)
+    for bone, s in show.figures[0]._followers:
+        assert np.allclose(bone.position, motion.segment_poses()[3, s, :3, 3], atol=1e-5)
+        assert np.allclose(se3.rotation_from_quaternion(bone.wxyz), motion.segment_poses()[3, s, :3, :3], atol=1e-5)
+    lost, unsure, good = (node(server, f"body0/skin_{name}") for name in ("shank_l", "hand_r", "thigh_l"))
+    assert good.opacity is None and good.color == LEFT
+    assert 0 < lost.opacity < unsure.opacity < 1 and lost.color == LOST and unsure.color == RIGHT
+    assert node(server, "body0/shank_l/gaps").opacity == 0.0 and node(server, "body0/shank_l/bones").opacity is None
+    show.frame(0)
+    assert lost.opacity is None and lost.color == LEFT and node(server, "body0/shank_l/gaps").opacity is None
+    show.frame(0, Choice(through="cam 0"))
+    assert good.opacity == 0.5
+
+
+def test_without_surfaces_the_bones_stand_for_the_skin(server, motion):
+    show = Show(server, ViewerContent((replace(motion, body=replace(motion.body, surfaces=())),)))
+    show.frame(0)
+    assert node(server, "body0/pelvis/bones").visible and node(server, "body0/shank_l/gaps").visible
+
+
+def test_cylinders_are_shown_where_they_are_asked_for(server, motion):
+    Player(server, ViewerContent((motion,)), layers=CYLINDERS).tick(0.0)
+    assert node(server, "body0/thigh_l/surface").visible and node(server, "body0/thigh_l/bones").visible
+    assert not node(server, "body0/skin_thigh_l").visible
+
+
 def test_ellipsoids_are_two_sigmas_to_a_tenth(server, motion):
     Show(server, ViewerContent((motion,))).frame(2)
+    assert not node(server, "body0/at_pelvis/uncertainty").visible  # until somebody asks for them
     for name, std in zip(motion.body.tree.segments, motion.joint_std[2], strict=True):
         assert np.allclose(node(server, f"body0/at_{name}/uncertainty").scale, 2 * std, rtol=0.06)
 
 
 def test_layers_are_shown_and_hidden(server, motion, rig):
     show = Show(server, ViewerContent((motion,), rig=rig))
+    assert node(server, "body0/skin_thigh_l").visible
     show.frame(0, Choice(frozenset({"bones", "cameras"})))
     assert node(server, "body0/thigh_l/bones").visible and not node(server, "body0/thigh_l/surface").visible
+    assert not node(server, "body0/skin_thigh_l").visible
     assert node(server, "cameras/cam 0").visible and not node(server, "floor").visible
     show.frame(0, Choice(frozenset({"surface", "floor", "path"}), through="cam 1"))
     assert not node(server, "body0/thigh_l/bones").visible and node(server, "body0/thigh_l/surface").visible
@@ -211,9 +249,9 @@ def test_a_long_way_is_followed_from_nearby(server):
     walk = smooth_motion(300, rate=RATE)  # 8 m
     show = Show(server, ViewerContent((walk,)))
     assert show.stage.goes_far
-    look = server.initial_camera
-    assert np.allclose(look.look_at, walk.Ts_world_root[0, :3, 3])
-    assert np.linalg.norm(look.position - look.look_at) == pytest.approx(5)
+    body = show.recording.first_places()
+    assert np.linalg.norm(server.initial_camera.look_at - body.mean(axis=0)) < 0.3
+    assert 0.5 < filled(body, server.initial_camera) < 0.9
 
 
 def test_markers_are_followed_by_their_middle():
@@ -234,6 +272,25 @@ def test_a_short_one_is_seen_whole(server, motion, rig):
     assert np.all(away > 0) and np.all(across < np.tan(look.fov / 2) * away)
 
 
+def filled(points, look):
+    """Share of the window's height over which points (N, 3) are seen; all of them."""
+    axis = (look.look_at - look.position) / np.linalg.norm(look.look_at - look.position)
+    upright = look.up - (look.up @ axis) * axis
+    seen = (points - look.position) @ (upright / np.linalg.norm(upright)) / ((points - look.position) @ axis)
+    assert np.abs(seen).max() < np.tan(look.fov / 2)
+    return np.ptp(seen) / (2 * np.tan(look.fov / 2))
+
+
+def test_the_first_look_is_at_the_person_from_the_front_however_far_the_cameras_are(server, motion):
+    still = cut(motion, 0, 1)
+    far = Rig([camera.with_pose(se3.transform(np.eye(3), [0, 0, 30.0]) @ camera.T_camera_world)
+               for camera in (a_camera("cam 0", 0.0), a_camera("cam 1", 0.7))])  # fmt: skip
+    for rig in (None, far):
+        show, look = Show(server, ViewerContent((still,), rig=rig)), server.initial_camera
+        assert 0.5 < filled(show.recording.first_places(), look) < 0.9
+        assert (look.position - look.look_at) @ still.Ts_world_root[0, :3, 0] > 0.3
+
+
 def test_the_player_plays_steps_and_obeys_its_boxes(server, motion, rig):
     player = Player(server, ViewerContent((motion,), rig=rig))
     player.tick(0.0)
@@ -248,7 +305,7 @@ def test_the_player_plays_steps_and_obeys_its_boxes(server, motion, rig):
     player._slider.value = 6  # as a user moves it
     player.tick(0.0)
     assert player.clock.frame == 6
-    player._boxes["bones"].value = False
+    assert not player._boxes["bones"].value and player._boxes["skin"].value
     player._rays.value, player._look.value, player._colour.value = ALL, "cam 1", "quality"
     player.tick(0.0)
     assert not node(server, "body0/thigh_l/bones").visible and node(server, "rays").visible
@@ -298,8 +355,8 @@ def test_a_page_that_plays_again_shows_the_first_frame_as_it_was(server, motion)
     show.frame(0)
 
     def looks():
-        bones = [(node.color, node.opacity) for nodes in body._bones for node, _ in nodes]
-        return [*bones, *(node.scale for node in body._parts["uncertainty"])]
+        shaded = [(node.color, node.opacity) for nodes in body._shaded for node, _, _ in nodes]
+        return [*shaded, *(node.scale for node in body._parts["uncertainty"])]
 
     first = looks()
     body.blank()

@@ -37,11 +37,12 @@ Examples:
 @_screen.token_option
 @click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page.")
 @_screen.hide_faces_option
+@click.option("--cylinders", is_flag=True, help="Show the body's cylinders and bones in place of a skin.")
 @click.option("--html", type=click.Path(path_type=Path), help="Write one self-contained page instead.")
 @_screen.verbose_option
 def view(
     sources: tuple[Path, ...], take: Path | None, port: int, host: str, token: str | None, browser: bool,
-    html: Path | None, hide_faces: bool,
+    cylinders: bool, html: Path | None, hide_faces: bool,
 ) -> None:
     """Show a motion, a take or a folder of results as a 3D scene in the browser.
 
@@ -55,9 +56,9 @@ def view(
         check_file(html, "--html")
     recording = gather(sources, take, hide_faces=hide_faces)
     if html is not None:
-        _write(recording, html)
+        _write(recording, html, cylinders)
     else:
-        _serve(recording, port, Access(host, token), browser)
+        _serve(recording, port, Access(host, token), browser, cylinders)
 
 
 def gather(sources: tuple[Path, ...], take_file: Path | None, *, hide_faces: bool = False) -> ViewerContent:
@@ -174,13 +175,14 @@ def _triangulated(take: Take, seen: Observations) -> NDArray | None:
     return triangulated(channels, np.arange(len(channels.uv)))
 
 
-def _serve(recording: ViewerContent, port: int, access: Access, browser: bool) -> None:
+def _serve(recording: ViewerContent, port: int, access: Access, browser: bool, cylinders: bool) -> None:
     from kinefit.viewers.player import Player
+    from kinefit.viewers.show import CYLINDERS, USUAL
     from kinefit.viewers.stage import open_server, quiet
 
     server = open_server(port, access, label=f"kinefit: {recording.name}")
     try:
-        player = Player(server, recording)
+        player = Player(server, recording, layers=CYLINDERS if cylinders else USUAL)
         player.tick(0.0)
         if port and server.get_port() != port:
             _screen.note(f"Port {port} is in use: another one is taken.")
@@ -198,12 +200,13 @@ def _serve(recording: ViewerContent, port: int, access: Access, browser: bool) -
             server.stop()
 
 
-def _write(recording: ViewerContent, html: Path) -> None:
+def _write(recording: ViewerContent, html: Path, cylinders: bool) -> None:
     from kinefit.exporters.atomic import write_text
     from kinefit.viewers.page import page
+    from kinefit.viewers.show import CYLINDERS, USUAL, Choice
 
     _screen.note("Drawing the scene ...")
-    text, frames = page(recording)
+    text, frames = page(recording, choice=Choice(CYLINDERS if cylinders else USUAL))
     write_text(html, text)
     thinned = f" of {len(recording.times)}" if frames < len(recording.times) else ""
     _screen.say(f"{html}: {frames}{thinned} frames, {len(text) / 1e6:.1f} MB; opens in any browser, offline")

@@ -11,11 +11,11 @@ from kinefit.bodies.surfaces import Surface
 from kinefit.errors import BodyError
 from kinefit.geometry.camera import Camera
 from kinefit.motion import Motion
+from kinefit.rendering.colours import side_colour
 from kinefit.simulation.placing import look_at
 from kinefit.solvers.mobility import closed_poses
 
 _GREY = (128, 128, 128)
-_COLOURS = {"_l": (196, 120, 60), "_r": (60, 110, 200), "": (150, 175, 110)}  # BGR: left, right, middle
 _END_CORNERS = 32  # of the polygon of a round end
 _SUBPIXEL_BITS = 4  # of corners in drawing functions
 
@@ -44,8 +44,7 @@ def draw_figure(motion: Motion, frame: int, camera: Camera, image: NDArray | Non
             continue
         hull = cv2.convexHull(contour.astype(np.float32))[:, 0]
         corners = np.round(hull * 2**_SUBPIXEL_BITS).astype(np.int32)
-        name = motion.body.tree.segments[segment]
-        colour = np.array(_COLOURS[name[-2:] if name[-2:] in _COLOURS else ""])
+        colour = np.array(side_colour(motion.body.tree.segments[segment])[::-1])
         shade = 1.0 - 0.35 * (depth - nearest) / max(farthest - nearest, 1e-9)
         cv2.fillPoly(image, [corners], (colour * shade).tolist(), cv2.LINE_AA, _SUBPIXEL_BITS)
         cv2.polylines(image, [corners], True, (colour * shade * 0.6).tolist(), 1, cv2.LINE_AA, _SUBPIXEL_BITS)

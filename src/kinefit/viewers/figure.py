@@ -1,4 +1,4 @@
-"""One body in the scene: bones, joints, skin, landmarks and how sure they are. Thin calls of viser."""
+"""One body in the scene: skin, bones, joints, surfaces, landmarks and their uncertainty. Thin calls of viser."""
 
 from __future__ import annotations
 
@@ -9,12 +9,18 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body
 from kinefit.geometry import se3
+from kinefit.motion import BELIEVED
+from kinefit.rendering.tubes import body_mesh
 from kinefit.viewers import scene as content
 
-PARTS = ("bones", "joints", "surface", "landmarks", "uncertainty")
+PARTS = ("skin", "bones", "joints", "surface", "landmarks", "uncertainty")
 """Layers of a figure."""
 
+USUAL, CYLINDERS = frozenset({"skin"}), frozenset({"bones", "joints", "surface"})
+"""Those that are shown at first, and those that show the cylinders of the fit instead."""
+
 _SURFACE_OPACITY, _ELLIPSOID = 0.22, (150, 60, 230)
+_SEEN_THROUGH = 0.5  # opacity of the skin before a camera's image
 
 
 class Figure:
@@ -38,13 +44,17 @@ class Figure:
         self._segments = [scene.add_frame(f"/world/{name}/{s}", show_axes=False) for s in body.tree.segments]
         self._parts: dict[str, list[Any]] = {part: [] for part in PARTS}
         self._looks: list[tuple[Any, ...]] = [()] * S
-        self._bones: list[list[Any]] = [[] for _ in range(S)]
+        self._shaded: list[list[tuple[Any, str, float]]] = [[] for _ in range(S)]  # node, its part, full opacity
+        self._followers: list[tuple[Any, int]] = []  # bones of the skin's pieces, and their segments
+        self._add_skin(scene, name)
+        bare = not self._parts["skin"]  # a body without surfaces: its bones stand for the skin
         balls = [_ball(radius) for radius in content.joint_radii(body)]
-        bones, surfaces = content.bone_meshes(body), content.surface_meshes(body)
+        (dashes, gaps), surfaces = content.bone_meshes(body), content.surface_meshes(body)
         for s, segment in enumerate(body.tree.segments):
             at, shade = f"/world/{name}/{segment}", tuple(int(v) for v in self.usual[s])
             for part, mesh, more in (
-                ("bones", bones[s], {}),
+                ("bones", dashes[s], {}),
+                ("gaps", gaps[s], {}),
                 ("surface", surfaces[s], {"opacity": _SURFACE_OPACITY, "cast_shadow": False, "receive_shadow": False}),
                 ("joints", balls[s], {}),
             ):
@@ -52,9 +62,10 @@ class Figure:
                     continue
                 colour_of: Any = (245, 245, 245) if part == "joints" else shade
                 node = scene.add_mesh_simple(f"{at}/{part}", mesh.vertices, mesh.faces, color=colour_of, **more)
-                self._parts[part].append(node)
+                layer = "skin" if bare and part != "surface" else "bones" if part == "gaps" else part
+                self._parts[layer].append(node)
                 if part != "joints":
-                    self._bones[s].append((node, more.get("opacity", 1.0)))
+                    self._shaded[s].append((node, part, float(more.get("opacity", 1.0))))
             mine = body.landmarks.points[body.landmarks.segments == s]
             if len(mine):
                 at = f"{at}/landmarks"
@@ -69,6 +80,20 @@ class Figure:
             for n in body.tree.segments
         ]  # fmt: skip
 
+    def _add_skin(self, scene: Any, name: str) -> None:
+        """Add the skin, a mesh for each segment, so that each can have its own colour and opacity."""
+        rest = self.body.tree.rest
+        for piece in content.skin_pieces(body_mesh(self.body)):
+            unturned = np.tile([1.0, 0.0, 0.0, 0.0], (len(piece.followed), 1))
+            node = scene.add_mesh_skinned(
+                f"/world/{name}/skin_{self.body.tree.segments[piece.segment]}", piece.mesh.vertices, piece.mesh.faces,
+                bone_wxyzs=unturned, bone_positions=rest[piece.followed], skin_weights=piece.weights,
+                color=tuple(int(v) for v in self.usual[piece.segment]),
+            )  # fmt: skip
+            self._parts["skin"].append(node)
+            self._shaded[piece.segment].append((node, "skin", 1.0))
+            self._followers += zip(node.bones, piece.followed.tolist(), strict=True)
+
     def show(self, part: str, visible: bool) -> None:
         """Show or hide one of `PARTS`."""
         for node in self._parts[part]:
@@ -81,7 +106,7 @@ class Figure:
     def blank(self) -> None:
         """Leave nothing that the next pose would not set: a recording that plays in a loop has to set all of it."""
         self._looks = [()] * len(self._looks)
-        for node, _ in (bone for bones in self._bones for bone in bones):
+        for node, _, _ in (shaded for of in self._shaded for shaded in of):
             node.color, node.opacity = (0, 0, 0), 0.0
         for node in self._parts["uncertainty"]:
             node.scale = (1e-6,) * 3
@@ -93,19 +118,30 @@ class Figure:
         joint_std: NDArray | None = None,
         quality: NDArray | None = None,
         by_quality: bool = False,
+        see_through: bool = False,
     ) -> None:
-        """Move the segments to poses (S, 4, 4), with the joints' standard deviations (S, 3) [m] and qualities (S,)."""
+        """Move the segments to poses (S, 4, 4), with the joints' standard deviations (S, 3) [m] and qualities (S,).
+
+        With `see_through` the skin lets the image behind it show.
+        """
         wxyz, x = se3.quaternion(Ts_world_segment[:, :3, :3]), Ts_world_segment[:, :3, 3]
         for node, q, t in zip(self._segments, wxyz, x, strict=True):
             node.wxyz, node.position = q, t
+        for bone, s in self._followers:
+            bone.wxyz, bone.position = wxyz[s], x[s]
+        uncertain = None if joint_std is None else content.uncertain_segments(self.body, joint_std)
         colours, opacities = content.segment_looks(
-            np.ones(len(x)) if quality is None else quality, self.usual, by_quality=by_quality and quality is not None
-        )
+            np.ones(len(x)) if quality is None else quality, self.usual, by_quality=by_quality and quality is not None,
+            uncertain=uncertain,
+        )  # fmt: skip
         for s, (colour, opacity) in enumerate(zip(colours.tolist(), opacities.tolist(), strict=True)):
-            if self._looks[s] != (*colour, opacity):
-                self._looks[s] = (*colour, opacity)
-                for node, usual in self._bones[s]:
-                    node.color, node.opacity = tuple(colour), None if opacity * usual == 1.0 else opacity * usual
+            if self._looks[s] != (*colour, opacity, see_through):
+                self._looks[s] = (*colour, opacity, see_through)
+                lost = quality is not None and quality[s] < BELIEVED
+                for node, part, full in self._shaded[s]:
+                    full = 0.0 if part == "gaps" and lost else _SEEN_THROUGH if part == "skin" and see_through else full
+                    share = full * (1.0 if part in ("bones", "gaps") else opacity)
+                    node.color, node.opacity = tuple(colour), None if share == 1.0 else share
         axes = np.zeros((len(x), 3)) if joint_std is None else content.ellipsoids(self.body, joint_std)
         steps = 1.1 ** np.rint(np.log(np.maximum(axes, 1e-5)) / np.log(1.1))  # sizes cost a browser more than moves
         for centre, t in zip(self._centres, x, strict=True):

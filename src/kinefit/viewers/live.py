@@ -74,7 +74,7 @@ class View:
         self._frames = dict(image_frames or {})
         self._maps: dict[str, NDArray] = {}
         self._time = self.server.gui.add_markdown("waiting for the first state")
-        boxes = {part: self.server.gui.add_checkbox(part, part != "landmarks") for part in figure.PARTS}
+        boxes = {part: self.server.gui.add_checkbox(part, part in figure.USUAL) for part in figure.PARTS}
         self._boxes = boxes
 
     @property

@@ -59,10 +59,13 @@ class Player:
     ----------
     server : viser.ViserServer
     recording : ViewerContent
+    layers : of `LAYERS`, those that are shown at first
     """
 
-    def __init__(self, server: viser.ViserServer, recording: ViewerContent) -> None:
-        self.server, self.recording = server, recording
+    def __init__(
+        self, server: viser.ViserServer, recording: ViewerContent, *, layers: frozenset[str] = USUAL
+    ) -> None:  # fmt: skip
+        self.server, self.recording, self._first_layers = server, recording, layers
         self.show = Show(server, recording)
         self.clock = PlaybackClock(len(recording.times), recording.rate)
         self._shown: tuple[int, Choice] | None = None
@@ -158,7 +161,8 @@ class Player:
                 self._colour = gui.add_dropdown("colours", ("side", "quality"))
             if motions or self.recording.markers or self.recording.points is not None:
                 self._follow = gui.add_checkbox("follow", self.show.stage.goes_far)
-            self._boxes = {layer: gui.add_checkbox(layer, layer in USUAL) for layer in LAYERS if there[layer]}
+            first = self._first_layers
+            self._boxes = {layer: gui.add_checkbox(layer, layer in first) for layer in LAYERS if there[layer]}
             gui.add_markdown(_HELP)
 
     def _welcome(self, client: viser.ClientHandle) -> None:

@@ -1,9 +1,10 @@
-"""What a 3D scene shows, as plain arrays: bones, uncertainty, rays, paths, floor. Nothing here draws."""
+"""What a 3D scene shows, as plain arrays: skin, bones, uncertainty, rays, paths, floor. Nothing here draws."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,16 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, PointSet, TaperedCylinder
 from kinefit.geometry.camera import Camera
 from kinefit.motion import BELIEVED, UP_AXES, Motion, Residuals
+from kinefit.rendering.colours import LOST, RGB, quality_ramp, side_colour
+from kinefit.rendering.tubes import TubeMesh
 
-RGB = tuple[int, int, int]
-LEFT, RIGHT, MIDDLE, LOST = (70, 140, 255), (255, 140, 50), (140, 205, 130), (150, 150, 150)
-OTHERS: tuple[RGB, ...] = ((190, 80, 220), (20, 170, 170), (200, 170, 30), (120, 90, 60))
+OTHERS: tuple[RGB, ...] = ((204, 121, 167), (86, 180, 233), (230, 159, 0), (120, 90, 60))
 """Colours of the second, third ... motion, which are not told apart by side."""
 
 OUTLIER_WEIGHT = 0.05  # robust weight below which a measurement had no say
 OUTLIER = (255, 30, 30)
 LARGEST_ELLIPSOID = 0.5  # [m] half axis beyond which "somewhere there" says nothing more, and hides the rest
-_RAMP = np.array([(40, 170, 80), (240, 200, 40), (240, 120, 30)], float)  # good, middling, bad
+_MAX_SIGMA = 0.11  # [m] of a joint, all directions together, above which its limb may lie beside itself
+_LOST_OPACITY, _UNCERTAIN_OPACITY = 0.45, 0.6
+_PIECES = 5  # of a bone: dashes and gaps of a lost one in turn
 _JOINT = 0.016  # [m] radius of the ball at a joint, of one on thin segments less
 _AROUND, _CAP = 14, 4  # vertices around a capsule, rings of a rounded end
 
@@ -75,16 +78,67 @@ def joined(meshes: Sequence[Mesh]) -> Mesh | None:
     return Mesh(np.concatenate([m.vertices for m in meshes]), faces)
 
 
-def bone_meshes(body: Body) -> list[Mesh | None]:
-    """One thin mesh a segment, in its frame: to the joints of its children, or to the end of the last surface."""
-    tree, ends = body.tree, body.segment_ends()
+@dataclass(frozen=True, eq=False)
+class SkinPiece:
+    """The part of a skin that one segment carries.
+
+    Parameters
+    ----------
+    segment : int
+    mesh : Mesh, its vertices in the root's frame at rest
+    followed : (B,) int, segments that its vertices follow
+    weights : (V, B) how much each vertex follows these; they sum to 1
+    """
+
+    segment: int
+    mesh: Mesh
+    followed: NDArray
+    weights: NDArray
+
+
+def skin_pieces(skin: TubeMesh) -> list[SkinPiece]:
+    """A skin cut along the borders of the segments.
+
+    A triangle belongs to the segment that the ends of its longest edge follow most. Both halves of a quadrilateral
+    share this edge, so borders have no teeth.
+    """
+    every = np.zeros((len(skin.vertices), int(skin.segments.max(initial=-1)) + 1))
+    np.add.at(every, (np.arange(len(every))[:, None], skin.segments), skin.weights)
+    corners = skin.vertices[skin.triangles]
+    longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).argmax(axis=1)
+    rows = np.arange(len(longest))
+    ends = [skin.triangles[rows, (longest + k) % 3] for k in range(2)]
+    owners = (every[ends[0]] + every[ends[1]]).argmax(axis=1) if len(rows) else rows
     out = []
+    for s in np.unique(owners):
+        used, faces = np.unique(skin.triangles[owners == s], return_inverse=True)
+        segments, shares = skin.segments[used], skin.weights[used]
+        followed, columns = np.unique(np.where(shares > 0, segments, s), return_inverse=True)
+        weights = np.zeros((len(used), len(followed)))
+        np.add.at(weights, (np.arange(len(used))[:, None], columns.reshape(shares.shape)), shares)
+        out.append(SkinPiece(int(s), Mesh(skin.vertices[used], faces.reshape(-1, 3)), followed, weights))
+    return out
+
+
+def bone_meshes(body: Body) -> tuple[list[Mesh | None], list[Mesh | None]]:
+    """Dashes and gaps between them, thin meshes of every segment in its frame; together they are solid bones.
+
+    Bones go to the joints of a segment's children, or to the end of the last surface.
+    """
+    tree, ends = body.tree, body.segment_ends()
+    dashes, gaps = list[Mesh | None](), list[Mesh | None]()
+    at = np.linspace(0.0, 1.0, _PIECES + 1)
     for s in range(len(tree.segments)):
         tips = [tree.offsets[k] for k in np.flatnonzero(tree.parents == s)] or ([ends[s]] if s in ends else [])
         lengths = [float(np.linalg.norm(tip)) for tip in tips]
         bones = [(tip, min(0.013, 0.1 * n)) for tip, n in zip(tips, lengths) if n > 1e-6]
-        out.append(joined([capsule(np.zeros(3), tip, (radius, 0.6 * radius)) for tip, radius in bones]))
-    return out
+        pieces = [
+            [capsule(a * tip, b * tip, (radius * (1 - 0.4 * a), radius * (1 - 0.4 * b))) for a, b in pairwise(at)]
+            for tip, radius in bones
+        ]
+        dashes.append(joined([mesh for bone in pieces for mesh in bone[::2]]))
+        gaps.append(joined([mesh for bone in pieces for mesh in bone[1::2]]))
+    return dashes, gaps
 
 
 def joint_radii(body: Body) -> NDArray:
@@ -110,25 +164,30 @@ def surface_meshes(body: Body) -> list[Mesh | None]:
 
 def side_colours(body: Body) -> NDArray:
     """(S, 3) uint8: left blue, right orange, the middle green."""
-    sides = [LEFT if n.endswith("_l") else RIGHT if n.endswith("_r") else MIDDLE for n in body.tree.segments]
-    return np.array(sides, np.uint8).reshape(-1, 3)
+    return np.array([side_colour(name) for name in body.tree.segments], np.uint8).reshape(-1, 3)
 
 
-def ramp(values: NDArray) -> NDArray:
-    """(..., 3) uint8 from green (0) over yellow (0.5) to orange (1 and more)."""
-    t = 2.0 * np.clip(np.asarray(values, float), 0.0, 1.0)[..., None]
-    low = _RAMP[0] + (_RAMP[1] - _RAMP[0]) * np.minimum(t, 1.0)
-    return np.rint(low + (_RAMP[2] - _RAMP[1]) * np.maximum(t - 1.0, 0.0)).astype(np.uint8)
-
-
-def segment_looks(quality: NDArray, usual: NDArray, *, by_quality: bool) -> tuple[NDArray, NDArray]:
+def segment_looks(
+    quality: NDArray, usual: NDArray, *, by_quality: bool, uncertain: NDArray | None = None
+) -> tuple[NDArray, NDArray]:
     """Colours (S, 3) uint8 and opacities (S,) of the segments by their quality (S,) in 0..1.
 
-    A segment that is lost is grey and half transparent whatever the colours mean.
+    A segment that is lost is grey and translucent whatever the colours mean; one that is `uncertain` (S,) bool is a
+    little translucent.
     """
     lost = np.asarray(quality) < BELIEVED
-    colours = ramp(1.0 - np.asarray(quality, float)) if by_quality else usual
-    return np.where(lost[:, None], np.array(LOST, np.uint8), colours), np.where(lost, 0.3, 1.0)
+    colours = quality_ramp(1.0 - np.asarray(quality, float)) if by_quality else usual
+    opacities = np.where(False if uncertain is None else uncertain, _UNCERTAIN_OPACITY, 1.0)
+    shades = np.where(lost[:, None], np.array(LOST, np.uint8), colours)
+    return shades, np.where(lost, _LOST_OPACITY, np.broadcast_to(opacities, lost.shape))
+
+
+def uncertain_segments(body: Body, joint_std: NDArray) -> NDArray:
+    """(S,) bool: segments of which a joint, at either end, has standard deviations (S, 3) [m] above 11 cm in all."""
+    sigmas = np.sqrt(np.sum(np.square(np.nan_to_num(joint_std, nan=np.inf, posinf=np.inf)), axis=1))
+    out, parents = sigmas > _MAX_SIGMA, body.tree.parents
+    np.logical_or.at(out, parents[parents >= 0], (sigmas > _MAX_SIGMA)[parents >= 0])
+    return out
 
 
 def ellipsoids(body: Body, joint_std: NDArray, *, sigmas: float = 2.0) -> NDArray:
@@ -170,13 +229,13 @@ def camera_rays(
     norms, weights : (K,) [px], 0..1
         Residuals and robust weights; a point without weight is an outlier and red.
     middling : float [px]
-        Residual that is drawn yellow; half of it and less is greener, twice of it orange.
+        Residual that is drawn yellow; half of it and less is bluer, twice of it orange.
     """
     directions = camera.ray(measured)
     seen = np.flatnonzero(np.isfinite(directions).all(-1) & np.isfinite(norms))
     d, x, centre = directions[seen], np.asarray(x_world)[seen], camera.centre_world
     feet = centre + np.maximum(np.sum((x - centre) * d, axis=1), 0.1)[:, None] * d
-    colours = ramp(norms[seen] / (2.0 * max(middling, 1e-9)))
+    colours = quality_ramp(norms[seen] / (2.0 * max(middling, 1e-9)))
     colours[np.asarray(weights)[seen] < OUTLIER_WEIGHT] = OUTLIER
     points = np.concatenate([np.stack([np.broadcast_to(centre, feet.shape), feet], 1), np.stack([feet, x], 1)])
     return Rays(points, np.repeat(np.tile(colours, (2, 1))[:, None], 2, axis=1))

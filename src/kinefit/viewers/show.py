@@ -23,8 +23,11 @@ if TYPE_CHECKING:
 LAYERS = (*figure.PARTS, "path", "points", "markers", "cameras", "images", "floor")
 """What can be shown and hidden."""
 
-USUAL = frozenset(LAYERS) - {"landmarks"}
+USUAL = figure.USUAL | frozenset(LAYERS) - set(figure.PARTS)
 """What is shown at first."""
+
+CYLINDERS = USUAL - figure.USUAL | figure.CYLINDERS
+"""The same with the body's cylinders and bones in place of a skin."""
 
 ALL, NONE = "all cameras", "none"
 _POINT, _MARKER, _PATH = (245, 205, 40), (225, 60, 120), (110, 120, 135)
@@ -101,6 +104,17 @@ class ViewerContent:
         found = found[np.isfinite(found).all(-1)]
         return found if len(found) or self.rig is None else scene.looked_at(tuple(self.rig))[None]
 
+    def first_places(self) -> NDArray:
+        """(N, 3) [m] where the person is in the first frame: joints and landmarks, else keypoints, else markers."""
+        if self.motions:
+            first = self.motions[0]
+            return np.concatenate([first.segment_poses()[0, :, :3, 3], first.positions()[0]])
+        x = np.zeros((1, 0, 3)) if self.points is None else self.points
+        x = self.markers[0].positions if self.points is None and self.markers else x
+        known = np.asarray(np.isfinite(x).all(axis=-1))
+        frame = int(np.argmax(known.any(axis=1)))
+        return np.asarray(x[frame][known[frame]])
+
     def way(self) -> NDArray:
         """(F, 3) [m] where the person is over `times`: root of the first motion, else middle of markers or points."""
         if self.motions:
@@ -149,10 +163,12 @@ class Show:
         self.server, self.recording = server, recording
         floor = scene.floor_height(recording.places, recording.up)
         self._way = recording.way()
-        self.stage = stage.Stage(
-            server, up=recording.up, points=recording.places, floor=floor, rig=recording.rig, first=self._way[0]
-        )
         self._poses = [m.segment_poses() for m in recording.motions]
+        facing = self._poses[0][0, 0, :3, 0] if recording.motions else None  # a body's root looks along its x
+        self.stage = stage.Stage(
+            server, up=recording.up, points=recording.places, floor=floor, rig=recording.rig,
+            person=recording.first_places(), facing=facing,
+        )  # fmt: skip
         self.figures, self._paths = [], []
         for n, motion in enumerate(recording.motions):
             colour = None if n == 0 else scene.OTHERS[(n - 1) % len(scene.OTHERS)]
@@ -180,7 +196,7 @@ class Show:
                 if f is not None:
                     fig.pose(
                         self._poses[n][f], joint_std=motion.joint_std[f], quality=motion.segment_quality[f],
-                        by_quality=choice.by_quality and n == 0,
+                        by_quality=choice.by_quality and n == 0, see_through=choice.through != NONE,
                     )  # fmt: skip
             follow = choice.follow and choice.through == NONE
             self.stage.shift(self._way[0] - self._way[i] if follow else np.zeros(3))

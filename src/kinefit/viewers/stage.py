@@ -32,7 +32,9 @@ POLICY = (
 )
 """Content security policy of viser's page: its scripts are its own, but what they see they can send nowhere else."""
 
-_FARTHEST = 10.0  # [m] from which a person still fills about a fifth of the window's height
+_FOV, _MAX_FILL = 0.7, 0.9  # [rad] of the first look, and share of the window's height that the person fills then
+_MAX_WAY = 2.0  # distance that shows a whole way over that which shows the person, beyond which the person is followed
+_MIN_DISTANCE = 1.0  # [m] of the first look: parts of a body are not seen from within
 
 
 def open_server(port: int, access: Access | None = None, *, label: str = "kinefit") -> viser.ViserServer:
@@ -167,12 +169,15 @@ class Stage:
     up : str
         Vertical axis of the world, as `Motion.up`.
     points : (N, 3) [m]
-        Where things are over time: the floor lies under them, the first look goes at their middle.
+        Where things are over time: the floor lies under them.
     floor : float [m]
         Height of the floor along the vertical axis.
     rig : Rig, optional
-    first : (3,) [m], optional
-        Where to look first when things go far, which would make them small.
+    person : (M, 3) [m], optional
+        Where the person is at first. The first look shows all `points`, or the person alone where these reach so far
+        that it would be small; `goes_far` says so.
+    facing : (3,), optional
+        Direction in which the person looks: the first look comes rather from the front.
     """
 
     def __init__(
@@ -183,7 +188,8 @@ class Stage:
         points: NDArray,
         floor: float,
         rig: Rig | None = None,
-        first: NDArray | None = None,
+        person: NDArray | None = None,
+        facing: NDArray | None = None,
     ) -> None:
         self.server, self.scene = server, server.scene
         self._vertical = vertical = np.array(UP_AXES[up])
@@ -206,31 +212,47 @@ class Stage:
             )
             size = min(0.3, 0.1 * far)  # [m] half the longer side of a camera's picture
             self.cameras = {c.name: CameraNode(self.scene, c, size=size, far=2.0 * far) for c in rig or ()}
+        eye = first_look(centres - middle, vertical, facing)
+        target, distance = framing(points, eye)
+        self.goes_far = False
+        if len(points) == 1:  # cameras alone are seen from outside
+            distance = 2.0 * far
+        elif person is not None and len(person):
+            near, close = framing(person, eye)
+            self.goes_far = distance > _MAX_WAY * close
+            target, distance = (near, close) if self.goes_far else (target, distance)
         look = server.initial_camera
-        eye = first_look(centres - middle, vertical)
-        self.goes_far = 1.8 * reach > _FARTHEST and first is not None
-        target = first if first is not None and self.goes_far else middle
-        around = 0.8 if len(points) > 1 else 2.0  # cameras alone are seen from outside
-        distance = _FARTHEST / 2 if self.goes_far else min(max(1.8 * reach, around * far), _FARTHEST)
         look.position = target + distance * eye
         look.look_at = target
         look.up = vertical
-        look.fov = 0.7
+        look.fov = _FOV
 
     def shift(self, way: NDArray) -> None:
         """Draw everything shifted by (3,) [m] along the floor; the part along the vertical is left out."""
         self._world.position = way - (way @ self._vertical) * self._vertical
 
 
-def first_look(cameras: NDArray, vertical: NDArray) -> NDArray:
-    """(3,) direction from the middle towards the eye: from above, in the widest gap between the cameras (C, 3)."""
+def framing(points: NDArray, eye: NDArray) -> tuple[NDArray, float]:
+    """Middle (3,) [m] of points (N, 3), and the distance [m] in the direction `eye` from which a window shows them."""
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    along = (points - middle) @ eye
+    across = np.linalg.norm(points - middle - along[:, None] * eye, axis=1)
+    return middle, max(float(np.max(along + across / (_MAX_FILL * np.tan(0.5 * _FOV)))), _MIN_DISTANCE)
+
+
+def first_look(cameras: NDArray, vertical: NDArray, facing: NDArray | None = None) -> NDArray:
+    """(3,) direction from the middle towards the eye: from above, in the widest gap between the cameras (C, 3).
+
+    With `facing` (3,), the direction in which a person looks, a gap before the person is preferred to one behind.
+    """
     side = np.roll(vertical, 1)
     level = np.linspace(0, 2 * np.pi, 72, endpoint=False)
     ways = np.cos(level)[:, None] * side + np.sin(level)[:, None] * np.cross(vertical, side)
     flat = cameras - (cameras @ vertical)[:, None] * vertical
     flat = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9)
     nearest = (ways @ flat.T).max(axis=1) if len(flat) else ways @ -(side + 0.6 * np.cross(vertical, side))
-    eye = ways[np.argmin(nearest)] + 0.35 * vertical
+    front = 0.0 if facing is None else ways @ facing
+    eye = ways[np.argmin(nearest - front)] + 0.35 * vertical
     return eye / np.linalg.norm(eye)
 
 

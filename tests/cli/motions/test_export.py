@@ -3,12 +3,15 @@
 from importlib.util import find_spec
 
 import numpy as np
+import pygltflib as gl
 import pytest
 from click.testing import CliRunner
 
 import kinefit
+from kinefit.bodies import load_body
 from kinefit.cli import main
 from kinefit.exporters import write_bvh, write_motion
+from kinefit.rendering.person_skin import person_skin
 from kinefit.simulation import cut, squat_and_wave
 
 
@@ -33,6 +36,18 @@ def test_a_file_beside_the_motion(format, file):
     assert told.exit_code == 0, told.output
     assert file.with_suffix(f".{format}").stat().st_size > 1000
     assert str(file.with_suffix(f".{format}")) in told.stdout
+
+
+def test_cylinders_are_written_in_place_of_a_skin(file):
+    skin, tubes = file.parent / "skin.glb", file.parent / "tubes.glb"
+    assert run("export", file, "--to", "glb", "--out", skin).exit_code == 0
+    told = run("export", file, "--to", "glb", "--cylinders", "--out", tubes)
+    assert told.exit_code == 0 and "cylinders" in told.stdout
+    counts = []
+    for path in (skin, tubes):
+        gltf = gl.GLTF2().load(str(path))
+        counts.append(gltf.accessors[gltf.meshes[0].primitives[0].attributes.POSITION].count)
+    assert counts[0] == len(person_skin(load_body("humanoid")).vertices) != counts[1]
 
 
 def test_usd_is_binary_unless_named_otherwise(file):
@@ -84,6 +99,7 @@ def test_unit_and_vertical_axis_are_those_asked_for(file, motion, tmp_path):
         (["--to", "usd", "--up", "x"], "USD knows y and z up. --up of usd is one of: y, z; not x"),
         (["--to", "bvh", "--names", "maya"], "--names of bvh is one of: bvh, kinefit, mixamo"),
         (["--to", "c3d", "--rest", "t"], "--rest is of bvh, glb, usd, x3d; not of c3d"),
+        (["--to", "bvh", "--cylinders"], "only glb and usd hold a mesh"),
         (["--to", "fbx"], "there are: csv, parquet, bvh, glb"),
         ([], "--to"),
     ],

@@ -14,9 +14,9 @@ from kinefit.errors import ExportError
 from kinefit.exporters import draw_overlay, write_montage, write_overlay
 from kinefit.exporters.pictures.drawing import bones
 from kinefit.exporters.pictures.overlay import frames_of, nearest_frame
-from kinefit.exporters.skeletons.tubes import CENTRE, LEFT, RIGHT
 from kinefit.geometry.camera import ImageFrame
 from kinefit.readers.video import Video
+from kinefit.rendering.colours import CENTRE, LEFT, LOST, RIGHT
 from kinefit.simulation import cut
 
 CAMERA = a_camera("cam 0", 0.3)
@@ -97,6 +97,21 @@ def test_lost_segments_turn_grey_and_are_named(motion, monkeypatch):
     assert told[2] == "lost: thigh_r"
     assert told[3:5] == ["cam 0   frame 99", "no motion here"]
     assert "0 points" in told[6] and "left out" in told[6] and "put right" in told[7] and told[8] == "not tracked"
+
+
+def test_a_lost_bone_is_dashed_and_grey(motion):
+    thigh = motion.body.tree.segment("thigh_r")
+    quality = np.array(motion.segment_quality)
+    quality[3, thigh] = 0
+    a, b = CAMERA.project(motion.positions(motion.body.landmarks.select(("r_hip", "r_knee")))[3])
+    along = np.linspace(0.1, 0.9, 200)[:, None] * (b - a) + a
+    for values, share in ((motion.segment_quality, 0.0), (quality, 0.2)):
+        image = draw_overlay(GREY, replace(motion, residuals={}, segment_quality=values), 3, CAMERA)
+        shades = np.array([at(image, uv) for uv in along])
+        dashes, gaps = (np.abs(shades - colour).max(axis=1) < 25 for colour in (LOST, GREY[0, 0]))
+        assert dashes.mean() >= share and gaps.mean() >= share
+        assert dashes.any() == gaps.any() == (share > 0)
+        assert (np.abs(shades - RIGHT).max(axis=1) < 25).mean() == (share == 0)
 
 
 def test_keypoints_are_rings_and_outliers_crosses(motion):

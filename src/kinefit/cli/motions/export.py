@@ -103,20 +103,24 @@ def _format(ctx: click.Context, parameter: click.Parameter, value: str | None) -
 @click.option("--up", metavar="AXIS", help="Vertical axis: x, y, z, -x, -y or -z.")
 @click.option("--names", metavar="NAMES", help="Names of joints: kinefit, mixamo, cmu, opensim, hanim or bvh.")
 @click.option("--rest", metavar="POSE", help="Rest pose: body (arms hanging, facing x) or t (a T facing z).")
+@click.option("--cylinders", is_flag=True, help="GLB and USD: the body's cylinders in place of a skin.")
 @_screen.verbose_option
 def export(
-    motion: Path, format: str | None, character: Path | None, table: Path | None, out: Path | None,
+    motion: Path, format: str | None, character: Path | None, table: Path | None, out: Path | None, cylinders: bool,
     **choices: str | None,
 ) -> None:
     """Write a motion file, as `kinefit track` leaves it, in another format, or on another character."""
     if character is not None:
-        others = [key for key, value in {"to": format, **choices}.items() if value is not None]
+        given = {"to": format, **choices, "cylinders": cylinders or None}
+        others = [key for key, value in given.items() if value is not None]
         return _retarget(motion, character, table, out, others)
     if table is not None:
         raise click.UsageError("--names-table names the joints of a --retarget CHARACTER.")
     if format is None:
         problem = f"Missing option '--to' (or --retarget CHARACTER). Give --to [{'|'.join(FREEDOM)}]."
         raise click.UsageError(problem)
+    if cylinders and format not in ("glb", "usd"):
+        raise click.UsageError(f"--cylinders has no place in {format}: only glb and usd hold a mesh of the body.")
     options = {
         key: _choice(format, key, _meant(key, value, getattr(FREEDOM[format], key)))
         for key, value in choices.items() if value is not None
@@ -127,8 +131,9 @@ def export(
     out = out or motion.with_name(f"{motion.stem}{_ENDINGS.get(format, '.' + format)}")
     (_results.check_folder if format in ("csv", "parquet") else _results.check_file)(out)
     recorded = read_motion(motion)
-    results.write_format(recorded, format, out, **options)
-    stated = ", ".join(f"{key} {value}" for key, value in options.items())
+    more = {"cylinders": True} if cylinders else {}
+    results.write_format(recorded, format, out, **options, **more)
+    stated = ", ".join([*(f"{key} {value}" for key, value in options.items()), *["cylinders"] * cylinders])
     _screen.say(f"{out}: {results.DESCRIPTIONS[format]}, {len(recorded)} frames{', ' + stated if stated else ''}")
 
 

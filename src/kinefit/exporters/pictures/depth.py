@@ -9,14 +9,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.exporters.pictures.drawing import WHITE, write_lines
+from kinefit.exporters.pictures.drawing import WHITE, draw_line, segment_contours, write_lines
 from kinefit.exporters.pictures.overlay import frames_of, nearest_frame, write_pictures
 from kinefit.geometry.camera import Camera
 from kinefit.motion import Motion
 from kinefit.observations import DepthVideo
 from kinefit.rendering import render_body, scaled
+from kinefit.rendering.colours import LOST
 
 _ABOUT = 0.6  # [m] in front of and behind the body that the colours are spread over
+_DASH_PX = 6.0  # of a lost segment's outline
 _WIDTH = 640  # [px] of a picture, at least: small sensors are enlarged
 
 
@@ -24,6 +26,8 @@ def depth_picture(
     depth: NDArray, motion: Motion, frame: int | None, camera: Camera, *, label: str = ""
 ) -> NDArray[np.uint8]:
     """One depth image, near red and far blue, with the outlines of all segments; holes are black.
+
+    Outlines of lost segments are dashed and grey.
 
     Parameters
     ----------
@@ -47,10 +51,13 @@ def depth_picture(
     picture = cv2.applyColorMap((255 * shade).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
     picture = np.where((depth > 0)[..., None], picture, 0).astype(np.uint8)
     out = np.ascontiguousarray(np.repeat(np.repeat(picture, times, axis=0), times, axis=1))
-    if raster is not None:
-        part = raster.segment
-        out[1:][part[1:] != part[:-1]] = WHITE
-        out[:, 1:][part[:, 1:] != part[:, :-1]] = WHITE
+    if raster is not None and frame is not None:
+        part, lost = raster.segment, np.append(motion.lost[frame], False)  # -1, the background, is not lost
+        for a, b, there in ((part[1:], part[:-1], out[1:]), (part[:, 1:], part[:, :-1], out[:, 1:])):
+            there[(a != b) & ~lost[a] & ~lost[b]] = WHITE
+        for s in np.flatnonzero(lost).tolist():
+            for rim in segment_contours(part, s):
+                draw_line(out, rim, LOST, 1, _DASH_PX)
     if label:
         write_lines(out, [(label, WHITE)])
     return out

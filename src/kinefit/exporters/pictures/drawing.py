@@ -13,17 +13,18 @@ from kinefit.bodies import Body, PointSet
 from kinefit.bodies.limbs import finger_groups
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.surfaces.mesh import MeshSurface
-from kinefit.exporters.skeletons.tubes import side_colour
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
 from kinefit.rendering import Canvas
+from kinefit.rendering.colours import LOST, side_colour
 
-LOST, DARK, WHITE = (150, 150, 150), (15, 15, 15), (255, 255, 255)
+DARK, WHITE = (15, 15, 15), (255, 255, 255)
 MEASURED, OUTLIER, WAY = (255, 240, 60), (255, 40, 40), (255, 90, 220)
 OUTLIER_WEIGHT = 0.05
 _SAMPLES = np.linspace(0.0, 1.0, 6)[:, None]  # along a bone, which a lens may bend
 _LIMB_WIDTH, _FINGER_WIDTH = 0.022, 0.007  # [m] of a bone as drawn
 _SHIFT, _FAR = 4, 20000.0  # OpenCV's sub-pixel bits; [px] beyond which nothing is drawn
+_DASH_WIDTHS = 3.0  # length of a dash, and of a gap, over the width of its line: its ends are round
 
 
 @lru_cache(maxsize=8)
@@ -50,7 +51,7 @@ def bones(body: Body) -> tuple[PointSet, tuple[int, ...], tuple[tuple[int, int, 
 
 
 def draw_bones(image: NDArray, motion: Motion, frame: int, camera: Camera, image_frame: ImageFrame) -> None:
-    """Draw the fitted skeleton into an image (H, W, 3) uint8 RGB, far bones first; thicker the nearer."""
+    """Draw the fitted skeleton into an image (H, W, 3) uint8 RGB, far bones first; lost ones are thin, grey, dashed."""
     points, owners, colours, widths = bones(motion.body)
     ends = motion.body.positions(motion.state(frame), points).reshape(-1, 2, 3)
     lines = ends[:, :1] * (1 - _SAMPLES) + ends[:, 1:] * _SAMPLES  # (B, samples, 3)
@@ -62,9 +63,10 @@ def draw_bones(image: NDArray, motion: Motion, frame: int, camera: Camera, image
     for b in np.argsort(-depth):
         lost = motion.lost[frame, owners[b]]
         width = max(1, int(thick[b]) // 3) if lost else int(thick[b])
-        _line(image, uv[b], DARK, width + 2 * edge)
-        _line(image, uv[b], LOST if lost else colours[b], width)
-    for b in range(len(uv)):
+        dash = _DASH_WIDTHS * (width + 2 * edge) if lost else 0.0
+        draw_line(image, uv[b], DARK, width + 2 * edge, dash)
+        draw_line(image, uv[b], LOST if lost else colours[b], width, dash)
+    for b in np.flatnonzero(~motion.lost[frame, list(owners)]):
         _dot(image, uv[b, 0], 0.36 * thick[b], WHITE, -1)
 
 
@@ -85,11 +87,17 @@ def draw_body(image: NDArray, motion: Motion, frame: int, camera: Camera, image_
     drawn = Canvas(camera.size).draw_for(camera, vertices, mesh.faces, cull=True, labels=mesh.face_segment).segment
     edge, lost = max(1, round(image.shape[0] / 480)), motion.lost[frame]
     for s in np.unique(drawn[drawn >= 0]):
-        rims, _ = cv2.findContours((drawn == s).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-        for rim in rims:
-            uv = image_frame.from_calibration(np.vstack([rim[:, 0], rim[:1, 0]]).astype(float))
-            _line(image, uv, DARK, 3 * edge)
-            _line(image, uv, LOST if lost[s] else side_colour(segments[s]), edge)
+        for rim in segment_contours(drawn, s):
+            uv = image_frame.from_calibration(rim)
+            dash = _DASH_WIDTHS * 3 * edge if lost[s] else 0.0
+            draw_line(image, uv, DARK, 3 * edge, dash)
+            draw_line(image, uv, LOST if lost[s] else side_colour(segments[s]), edge, dash)
+
+
+def segment_contours(segments: NDArray, segment: int) -> list[NDArray]:
+    """Closed contours (N, 2) [px] of one segment in an image (H, W) of segments."""
+    rims, _ = cv2.findContours((segments == segment).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    return [np.vstack([rim[:, 0], rim[:1, 0]]).astype(float) for rim in rims]
 
 
 def drawn_points(motion: Motion, frame: int) -> NDArray:
@@ -108,12 +116,12 @@ def draw_residuals(image: NDArray, residuals: Residuals, frame: int, image_frame
     for k in np.flatnonzero(np.isfinite(measured).all(-1)):
         outlier = residuals.weights[frame, k] < OUTLIER_WEIGHT
         if np.isfinite(fitted[k]).all() and not outlier:
-            _line(image, np.stack([measured[k], fitted[k]]), WAY, thin)
+            draw_line(image, np.stack([measured[k], fitted[k]]), WAY, thin)
         if outlier:
             for way in ((1, 1), (1, -1)):
                 step = size * np.array(way)
-                _line(image, np.stack([measured[k] - step, measured[k] + step]), DARK, thin + 2)
-                _line(image, np.stack([measured[k] - step, measured[k] + step]), OUTLIER, thin)
+                draw_line(image, np.stack([measured[k] - step, measured[k] + step]), DARK, thin + 2)
+                draw_line(image, np.stack([measured[k] - step, measured[k] + step]), OUTLIER, thin)
         else:
             _dot(image, measured[k], size, DARK, thin + 2)
             _dot(image, measured[k], size, MEASURED, thin)
@@ -131,11 +139,23 @@ def write_lines(image: NDArray, lines: Sequence[tuple[str, tuple[int, int, int]]
         cv2.putText(image, text, (pad, step * i), cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thick, cv2.LINE_AA)
 
 
-def _line(image: NDArray, uv: NDArray, colour: tuple[int, int, int], thickness: int) -> None:
-    seen = np.isfinite(uv).all(-1) & (np.abs(uv) < _FAR).all(-1)
-    if seen.sum() >= 2:
-        points = np.rint(uv[seen] * (1 << _SHIFT)).astype(np.int32)
-        cv2.polylines(image, [points], False, colour, thickness, cv2.LINE_AA, _SHIFT)
+def draw_line(
+    image: NDArray, uv: NDArray, colour: tuple[int, int, int], thickness: int, dash: float = 0.0
+) -> None:  # fmt: skip
+    """Draw a line through pixels (N, 2); with `dash` [px] in pieces of that length and gaps as long."""
+    uv = uv[np.isfinite(uv).all(-1) & (np.abs(uv) < _FAR).all(-1)]
+    if len(uv) >= 2:
+        pieces = _dashes(uv, dash) if dash else [uv]
+        points = [np.rint(piece * (1 << _SHIFT)).astype(np.int32) for piece in pieces]
+        cv2.polylines(image, points, False, colour, thickness, cv2.LINE_AA, _SHIFT)
+
+
+def _dashes(uv: NDArray, length: float) -> list[NDArray]:
+    """Every other piece, `length` px long, of a line through pixels (N, 2)."""
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(uv, axis=0), axis=1))])
+    at = np.append(np.arange(0.0, way[-1], 0.5 * length), way[-1])
+    samples = np.stack([np.interp(at, way, column) for column in uv.T], axis=1)
+    return [samples[k : k + 3] for k in range(0, len(samples) - 1, 4)]
 
 
 def _dot(image: NDArray, uv: NDArray, radius: float, colour: tuple[int, int, int], thickness: int) -> None:

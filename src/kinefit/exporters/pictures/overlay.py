@@ -39,9 +39,9 @@ def write_overlay(
 ) -> None:
     """Write a video (H.264 where the codec is there, else MPEG-4) of a motion's pictures with the fit drawn on them.
 
-    Left is blue, right orange, the middle green, a lost segment thin and grey; of bodies with a skin or a mesh outlines
-    are drawn. Measured keypoints are yellow rings, those left out as outliers red crosses; pink lines lead to the
-    fitted keypoints.
+    Left is blue, right orange, the middle green, a lost segment thin, grey and dashed; of bodies with a skin or a mesh
+    outlines are drawn. Measured keypoints are yellow rings, those left out as outliers red crosses; pink lines lead to
+    the fitted keypoints.
 
     Parameters
     ----------

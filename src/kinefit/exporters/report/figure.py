@@ -12,10 +12,11 @@ from kinefit.bodies import Body, MeshSurface, PointSet
 from kinefit.bodies.surfaces import Surface
 from kinefit.exporters.pictures.drawing import bones
 from kinefit.exporters.report.page import Html, to_json
-from kinefit.exporters.skeletons.tubes import is_last, side_colour
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion, rotation_between_up
+from kinefit.rendering.colours import LEFT, LOST, RIGHT, side_colour, to_hex
+from kinefit.rendering.tubes import is_last
 
 RATE = 15.0  # [Hz] of the figure: enough for the eye to follow, the player goes smoothly between
 MOST = 3000  # frames: longer takes are shown at a lower rate
@@ -86,6 +87,7 @@ def player(
         "rate": rate, "start": start, "frames": len(x), "points": x.shape[1], "quantum": quantum,
         "middle": 0.5 * (low + high), "low": low, "high": high, "floor": floor, "radii": capsules.radii,
         "ends": np.arange(x.shape[1]).reshape(-1, 2), "colours": capsules.colours,
+        "sides": [(c == to_hex(RIGHT)) - (c == to_hex(LEFT)) for c in capsules.colours], "lost": to_hex(LOST),
         "cameras": cameras or [], "x": _packed(whole),
         "dimmed": _packed(np.packbits(dimmed)) if dimmed is not None and dimmed.any() else "",
     }  # fmt: skip
@@ -108,7 +110,7 @@ def _capsules(body: Body) -> Capsules:
     else:
         points = bones(body)[0]
         radii = np.full((len(points) // 2, 2), _BONE)
-    colours = ["#%02x%02x%02x" % side_colour(tree.segments[s]) for s in points.segments[::2]]  # noqa: UP031
+    colours = [to_hex(side_colour(tree.segments[s])) for s in points.segments[::2]]
     return Capsules(points, radii, colours)
 
 

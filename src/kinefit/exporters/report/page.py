@@ -30,10 +30,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ExportError
+from kinefit.rendering import colours
 from kinefit.serving.policy import inline_policy
 
-# Okabe and Ito's colours, which common kinds of colour blindness tell apart; left blue, right orange as in overlays.
-LEFT, RIGHT, CENTRE = "#0072b2", "#d55e00", "#009e73"
+# Left and right as in overlays.
+LEFT, RIGHT, CENTRE = (colours.to_hex(c) for c in (colours.LEFT, colours.RIGHT, colours.CENTRE))
 SERIES = (LEFT, RIGHT, CENTRE, "#cc79a7", "#7a5195", "#56b4e9", "#b8860b", "#4d4d4d")
 SEVERITIES = {"good": "✓", "note": "i", "warning": "!", "bad": "✕"}
 
@@ -315,7 +316,7 @@ def _shades() -> str:
     """Rules of `shaded` cells: a page's policy allows no style of a single element."""
     rules = []
     for k in range(_SHADES + 1):
-        red, green, blue = (round(255 + (end - 255) * 0.75 * k / _SHADES) for end in (213, 94, 0))
+        red, green, blue = (round(255 + (end - 255) * 0.75 * k / _SHADES) for end in colours.RIGHT)
         rules.append(f".shade-{k} {{ background: rgb({red},{green},{blue}); }}\n")
     return "".join(rules)
 

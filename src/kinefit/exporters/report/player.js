@@ -44,8 +44,7 @@ document.querySelectorAll(".player").forEach(place => {
   // Direction in which the person looks: at right angles to the line from the left half of the body to the right.
   function heading() {
     const now = pose(), sum = [0, 0];
-    ends.forEach(([a], c) => { const side = colours[c] === "#468cff" ? -1 : colours[c] === "#ff8c32" ? 1 : 0;
-      sum[0] += side * now[a][0]; sum[1] += side * now[a][1]; });
+    ends.forEach(([a], c) => { sum[0] += data.sides[c] * now[a][0]; sum[1] += data.sides[c] * now[a][1]; });
     return Math.atan2(sum[0], -sum[1]);
   }
   function centre(now) {
@@ -121,11 +120,11 @@ document.querySelectorAll(".player").forEach(place => {
     }
     const wide = Math.max(r, s), nx = d > 1e-6 ? -dy / d : 0, ny = d > 1e-6 ? dx / d : 1, up = ny > 0 ? -1 : 1;
     const light = pen.createLinearGradient(P[0] + up * nx * wide, P[1] + up * ny * wide, P[0] - up * nx * wide, P[1] - up * ny * wide);
-    const tone = lost ? "#b9bfc5" : colour;
+    const tone = lost ? data.lost : colour;
     light.addColorStop(0, shade(tone, 1.25)); light.addColorStop(0.35, shade(tone, 1.08)); light.addColorStop(1, shade(tone, 0.62));
-    pen.fillStyle = light; pen.fill();
-    pen.setLineDash(lost ? [4, 3] : []);
-    pen.strokeStyle = shade(tone, 0.5); pen.lineWidth = 0.8; pen.stroke();
+    pen.fillStyle = light; pen.globalAlpha = lost ? 0.35 : 1; pen.fill(); pen.globalAlpha = 1;
+    pen.setLineDash(lost ? [5, 4] : []);
+    pen.strokeStyle = shade(tone, 0.5); pen.lineWidth = lost ? 1.4 : 0.8; pen.stroke();
     pen.setLineDash([]);
   }
   function pyramid(q, name) {

@@ -108,8 +108,9 @@ def write_report(
         *fault_sections(of_provenance(motion.provenance)),
         _summary(motion, moments, list(findings), date),
         p.section("Moving figure", figure(motion, rig), p.paragraph(
-            "Drag to turn, click and use the wheel (or two fingers) to zoom. Blue is left, orange right; grey was not "
-            "seen. Times anywhere on this page, and clicks into plots over time, move the figure there.", small=True)),
+            "Drag to turn, click and use the wheel (or two fingers) to zoom. Blue is left, orange right; what is "
+            "grey and dashed was not seen. Times anywhere on this page, and clicks into plots over time, move the "
+            "figure there.", small=True)),
         p.section("Angles", *_angles(motion)),
         p.section("Cycles", *_cycles(motion, cycles, norms or {})),
         p.section("Doubtful moments", *flagged(motion, moments, shown, width)),

@@ -14,19 +14,22 @@ from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes
 from kinefit.exporters.skeletons.common import bone_names, plain_names, slides
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
-from kinefit.exporters.skeletons.tubes import TubeMesh, body_mesh
 from kinefit.motion import Motion
+from kinefit.rendering.tubes import TubeMesh, body_mesh
 
 _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 _COMPONENTS = {"float32": gl.FLOAT, "uint32": gl.UNSIGNED_INT, "uint16": gl.UNSIGNED_SHORT, "uint8": gl.UNSIGNED_BYTE}
 
 
 @checked
-def write_glb(motion: Motion, path: str | PathLike[str], *, names: str = "kinefit", rest: str | None = None) -> None:
+def write_glb(
+    motion: Motion, path: str | PathLike[str], *, names: str = "kinefit", rest: str | None = None,
+    cylinders: bool = False,
+) -> None:  # fmt: skip
     """Write a motion as GLB, in metres and y up, as the format prescribes; time starts at 0.
 
-    One mesh hangs on one skin: rounded tubes about the body's surfaces, a seamless skin over its metaballs. The bind
-    pose is the rest pose; the animation turns every joint that can turn and moves the root.
+    One mesh follows the bones: the body's own skin or a person's, rounded tubes about the surfaces of other bodies. The
+    bind pose is the rest pose; the animation turns every joint that can turn and moves the root.
 
     Parameters
     ----------
@@ -36,6 +39,8 @@ def write_glb(motion: Motion, path: str | PathLike[str], *, names: str = "kinefi
         Names of the joints.
     rest : "body" or "t", optional
         Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with Mixamo's names.
+    cylinders : bool
+        The body's cylinders in place of a skin.
 
     Raises
     ------
@@ -56,8 +61,9 @@ def write_glb(motion: Motion, path: str | PathLike[str], *, names: str = "kinefi
         for s, name in enumerate(joints)
     ]
     roots = [0]
-    if body.surfaces:
-        gltf.meshes, gltf.materials = [_mesh(pose.posed(body_mesh(body), body), buffer)], [_material()]
+    if body.surfaces or body.skin is not None:
+        mesh = pose.posed(body_mesh(body, cylinders=cylinders), body)
+        gltf.meshes, gltf.materials = [_mesh(mesh, buffer)], [_material()]
         inverse_bind = np.tile(np.eye(4), (len(joints), 1, 1))
         inverse_bind[:, :3, 3] = -pose.positions
         matrices = buffer.add(inverse_bind.transpose(0, 2, 1))  # column after column

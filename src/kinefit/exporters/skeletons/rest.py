@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.errors import ExportError, choices
 from kinefit.exporters.skeletons.common import convention
-from kinefit.exporters.skeletons.tubes import TubeMesh
 from kinefit.geometry import se3
 from kinefit.motion import Motion
 from kinefit.motion_columns import continuous_quaternions
+from kinefit.rendering.tubes import TubeMesh
 
 RESTS = ("body", "t")
 """Rest poses: the body's own (arms hanging, facing x), or arms out to the sides, palms down, facing z."""

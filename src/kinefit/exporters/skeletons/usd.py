@@ -16,9 +16,9 @@ from kinefit.errors import ExportError
 from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import UNITS, bone_names, length_factor, turned
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
-from kinefit.exporters.skeletons.tubes import TubeMesh, body_mesh
 from kinefit.geometry import se3
 from kinefit.motion import Motion, rotation_between_up
+from kinefit.rendering.tubes import TubeMesh, body_mesh
 
 ENDINGS = (".usd", ".usda", ".usdc")
 _UPS = ("y", "z")
@@ -26,9 +26,9 @@ _UPS = ("y", "z")
 
 def write_usd(
     motion: Motion, path: str | PathLike[str], *, unit: str = "m", up: str = "y", names: str = "kinefit",
-    rest: str | None = None,
+    rest: str | None = None, cylinders: bool = False,
 ) -> None:
-    """Write a motion as USD: a skeleton with its animation, and rounded tubes skinned to it.
+    """Write a motion as USD: a skeleton with its animation, and a mesh that follows it, as of `write_glb`.
 
     The stage states its unit (metersPerUnit) and vertical axis (upAxis); a time code is a frame, 0 the first. The bind
     pose is the rest pose, upright. Characters that USD does not allow in names become "_": mixamorig_Hips.
@@ -44,6 +44,8 @@ def write_usd(
         Names of the joints.
     rest : "body" or "t", optional
         Rest pose: the body's own, arms hanging, facing x; or a T facing z. Default: "t" with Mixamo's names.
+    cylinders : bool
+        The body's cylinders in place of a skin.
 
     Raises
     ------
@@ -66,7 +68,7 @@ def write_usd(
     with writing(path) as temporary:
         try:
             stage = Usd.Stage.CreateInMemory()
-            _fill(stage, world, pose, joints, factor)
+            _fill(stage, world, pose, joints, factor, cylinders)
             written = stage.GetRootLayer().Export(str(temporary))
         except Tf.ErrorException as error:
             raise ExportError("USD cannot write it", file=path, remedy="Check the path and the disk.") from error
@@ -88,7 +90,7 @@ def joint_paths(body: Body, names: list[str]) -> list[str]:
     return out
 
 
-def _fill(stage: Any, motion: Motion, pose: Rest, joints: list[str], factor: float) -> None:
+def _fill(stage: Any, motion: Motion, pose: Rest, joints: list[str], factor: float, cylinders: bool) -> None:
     from pxr import Gf, Usd, UsdGeom, UsdSkel
 
     UsdGeom.SetStageUpAxis(stage, motion.up.upper())
@@ -107,8 +109,9 @@ def _fill(stage: Any, motion: Motion, pose: Rest, joints: list[str], factor: flo
     skeleton.CreateBindTransformsAttr([Gf.Matrix4d(T.T.tolist()) for T in bind])
     animation = _animation(stage, motion, pose, joints, factor)
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
-    if motion.body.surfaces:
-        _mesh(stage, pose.posed(body_mesh(motion.body), motion.body), bind[0], factor, skeleton)
+    if motion.body.surfaces or motion.body.skin is not None:
+        mesh = pose.posed(body_mesh(motion.body, cylinders=cylinders), motion.body)
+        _mesh(stage, mesh, bind[0], factor, skeleton)
     centres = factor * motion.joint_centres
     margin = factor * max((_reach(c) for c in motion.body.surfaces), default=0.0)
     extent = UsdGeom.Boundable(root).CreateExtentAttr()

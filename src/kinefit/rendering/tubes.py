@@ -1,4 +1,4 @@
-"""A body's surfaces as closed, smooth meshes whose vertices follow up to four segments."""
+"""A body as it is drawn: closed, smooth meshes whose vertices follow up to four segments."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, MeshSurface, TaperedCylinder
 from kinefit.bodies.surfaces import Metaballs
 from kinefit.bodies.surfaces.skins.body_skin import FOLLOWED, BodySkin, body_skins
+from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh, strongest
+from kinefit.rendering.colours import side_colour
+from kinefit.rendering.person_skin import person_skin
 
 AROUND, CAP, ALONG = 20, 6, 8  # vertices around a tube, rings of a rounded end, rings between the ends
-LEFT, RIGHT, CENTRE = (70, 140, 255), (255, 140, 50), (140, 205, 130)  # RGB
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,19 +39,18 @@ class TubeMesh:
     weights: NDArray
 
 
-def side_colour(name: str) -> tuple[int, int, int]:
-    """Colour of a segment by its name: left, right or in the middle."""
-    return LEFT if name.endswith("_l") else RIGHT if name.endswith("_r") else CENTRE
+def body_mesh(body: Body, *, cylinders: bool = False) -> TubeMesh:
+    """The body's own skin, or a person's (`person_skin`); else, or with `cylinders`, a tube around every cylinder.
 
-
-def body_mesh(body: Body) -> TubeMesh:
-    """Tubes with rounded ends around all cylinders, meshes as they are, one skin over metaballs that hang together.
-
-    Near a joint tubes and skins follow both segments.
+    Tubes have rounded ends. Meshes stay as they are, and one skin covers metaballs that hang together. Near a joint
+    tubes and skins follow both segments.
     """
-    others = [c for c in body.surfaces if not isinstance(c, Metaballs)]
-    parts = [_rigid(body, c) if isinstance(c, MeshSurface) else _tube(body, c) for c in others]
-    parts += [_skin(body, skin) for skin in body_skins(body)]
+    skin = None if cylinders else body.skin or person_skin(body)
+    covered = set() if skin is None else set(np.unique(skin.segment).tolist())
+    others = [c for c in body.surfaces if c.segment not in covered and not isinstance(c, Metaballs)]
+    parts = [] if skin is None else [_skinned(body, skin)]
+    parts += [_rigid(body, c) if isinstance(c, MeshSurface) else _tube(body, c) for c in others]
+    parts += [] if covered else [_metaballs(body, net) for net in body_skins(body)]
     if not parts:
         columns = ((3, float), (3, float), (3, np.uint8), (3, int), (FOLLOWED, int), (FOLLOWED, float))
         return TubeMesh(*(np.zeros((0, count), kind) for count, kind in columns))
@@ -96,7 +97,16 @@ def _rigid(body: Body, mesh: MeshSurface) -> TubeMesh:
     )
 
 
-def _skin(body: Body, skin: BodySkin) -> TubeMesh:
+def _skinned(body: Body, skin: SkinnedMesh) -> TubeMesh:
+    which, weights = strongest(skin.weights, FOLLOWED)
+    colours = np.array([side_colour(name) for name in body.tree.segments], np.uint8)
+    return TubeMesh(
+        vertices=skin.vertices, normals=_normals(skin.vertices, skin.faces), colours=colours[skin.segment],
+        triangles=skin.faces, segments=np.take_along_axis(skin.owners, which, axis=1), weights=weights,
+    )
+
+
+def _metaballs(body: Body, skin: BodySkin) -> TubeMesh:
     there, faces, every = skin.mesh()
     vertices = skin.at_rest(there, every)
     order = np.argsort(-every, axis=1)[:, :FOLLOWED]

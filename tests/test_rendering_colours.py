@@ -1,0 +1,53 @@
+"""Colours of left, right, middle and lost: far apart for people with any common colour vision deficiency."""
+
+from itertools import combinations
+
+import cv2
+import numpy as np
+import pytest
+
+from kinefit.bodies import load_body
+from kinefit.exporters.report.figure import live_figure
+from kinefit.exporters.report.page import CENTRE, LEFT, RIGHT
+from kinefit.rendering import colours
+from kinefit.rendering.tubes import body_mesh
+from kinefit.viewers import scene
+
+# Machado, Oliveira and Fernandes, IEEE TVCG 15 (2009), severity 1: of linear RGB.
+DEFICIENCIES = {
+    "none": np.eye(3),
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.01182, 0.04294, 0.968881]],
+    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.3039]],
+}
+
+
+def lab(rgb, deficiency):
+    """CIELab of an RGB colour as it looks to somebody."""
+    linear = np.clip(np.array(DEFICIENCIES[deficiency]) @ (np.array(rgb, float) / 255.0) ** 2.2, 0.0, 1.0)
+    return cv2.cvtColor(np.float32(linear ** (1 / 2.2)).reshape(1, 1, 3), cv2.COLOR_RGB2Lab).reshape(3)
+
+
+@pytest.mark.parametrize("deficiency", DEFICIENCIES)
+def test_sides_and_lost_differ_for_everybody(deficiency):
+    named = (colours.LEFT, colours.RIGHT, colours.CENTRE, colours.LOST)
+    gaps = [np.linalg.norm(lab(a, deficiency) - lab(b, deficiency)) for a, b in combinations(named, 2)]
+    print(deficiency, np.round(gaps, 1))
+    assert min(gaps) > 12.0
+
+
+@pytest.mark.parametrize("deficiency", DEFICIENCIES)
+def test_good_and_bad_quality_differ_for_everybody(deficiency):
+    good, middling, bad = (lab(c, deficiency) for c in colours.quality_ramp([0.0, 0.5, 1.0]))
+    assert min(np.linalg.norm(a - b) for a, b in combinations((good, middling, bad), 2)) > 25.0
+
+
+def test_every_place_uses_the_same_colours():
+    body = load_body("humanoid")
+    sides = {"_l": colours.LEFT, "_r": colours.RIGHT}
+    expected = [sides.get(name[-2:], colours.CENTRE) for name in body.tree.segments]
+    assert [tuple(c) for c in scene.side_colours(body)] == expected
+    assert {tuple(c) for c in body_mesh(body).colours} == set(expected)
+    assert (LEFT, RIGHT, CENTRE) == tuple(map(colours.to_hex, (colours.LEFT, colours.RIGHT, colours.CENTRE)))
+    page = str(live_figure(body)[0])
+    assert all(colour in page for colour in (LEFT, RIGHT, CENTRE, colours.to_hex(colours.LOST)))
