@@ -20,16 +20,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from kinefit import Motion, read_motion
-from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh
 from kinefit.cli import main
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 from kinefit.readers.video import Video
 from kinefit.rendering import Canvas
+from kinefit.rendering.colours import side_colour
+from kinefit.rendering.person_skin import person_skin
 
 _IMAGES = Path(__file__).parent / "images"
 _HEIGHT, _STEP, _SPEED = 360, 4, 80  # [px], every which frame, [ms] each is shown
-_FIGURE, _SKIN, _PAPER = 300, (205, 172, 150), (247, 249, 251)
+_FIGURE, _PAPER = 300, (247, 249, 251)
 _FINER = 3  # times: the figure is rendered so much larger, then reduced
 
 
@@ -72,7 +73,7 @@ def _reduced(image: NDArray) -> NDArray:
 
 def _figure(motion: Motion, i: int, share: float) -> NDArray:
     """(H, W, 3) uint8 the body in frame i on a floor, from a camera that sways about it."""
-    mesh, x = body_mesh(motion.body, around=32, along=10), motion.segment_poses()[..., :3, 3]
+    x = motion.segment_poses()[..., :3, 3]
     middle = 0.5 * (x.reshape(-1, 3).min(axis=0) + x.reshape(-1, 3).max(axis=0))
     angle = np.radians(30.0 + 40.0 * np.sin(np.pi * share))
     size = _FINER * _FIGURE, _FINER * _HEIGHT
@@ -89,13 +90,15 @@ def _figure(motion: Motion, i: int, share: float) -> NDArray:
             ends = camera.project(np.column_stack([np.array(line) + middle[:2], [floor, floor]]))
             a, b = (tuple(int(v) for v in end) for end in ends)
             cv2.line(image, a, b, (214, 221, 228), _FINER, cv2.LINE_AA)
-    shown, shade = _shaded(mesh, motion, i, camera)
+    shown, shade = _shaded(motion, i, camera)
     image[shown] = shade[shown]
     return cv2.resize(image, (_FIGURE, _HEIGHT), interpolation=cv2.INTER_AREA)
 
 
-def _shaded(mesh: BodyMesh, motion: Motion, i: int, camera: Camera) -> tuple[NDArray, NDArray]:
+def _shaded(motion: Motion, i: int, camera: Camera) -> tuple[NDArray, NDArray]:
     """(H, W) bool where the body is, and (H, W, 3) uint8 its colour in a light from above the camera."""
+    mesh = person_skin(motion.body)
+    assert mesh is not None
     frames, _ = motion.body.tree.forward(motion.Ts_world_root[i], motion.angles[i])
     vertices = mesh.posed(frames)
     corners = vertices[mesh.faces]
@@ -108,7 +111,8 @@ def _shaded(mesh: BodyMesh, motion: Motion, i: int, camera: Camera) -> tuple[NDA
     light = camera.T_world_camera[:3, :3] @ [0.35, -0.7, -0.6]
     bright = 0.55 + 0.45 * np.clip(faces @ (light / np.linalg.norm(light)), -0.2, 1.0)
     raster = Canvas(camera.size).draw_for(camera, vertices, mesh.faces, cull=True)
-    colours = np.clip(bright[:, None] * np.array(_SKIN), 0, 255).astype(np.uint8)
+    sides = np.array([side_colour(name) for name in motion.body.tree.segments])
+    colours = np.clip(bright[:, None] * (0.65 * sides[mesh.face_segment] + 70.0), 0, 255).astype(np.uint8)
     return raster.seen.copy(), colours[raster.face]
 
 
