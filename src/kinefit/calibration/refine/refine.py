@@ -147,6 +147,8 @@ def refine_from(
         offsets = offsets - offsets[0]
         if change[0] < _SETTLED and change[1] * seen.motion.rate < _SETTLED_FRAMES:
             break
+    else:  # the last adjustment may have changed the scale, which the gauge takes from the person
+        seen = _sight(rig, trial, offsets)
     step("refining", rounds, rounds + 1)
     covariance = chance(bundle, prior, seen, chosen) + bias(model, bundle, pixels, prior, static)
     rig, rule = gauge(rig, seen)
