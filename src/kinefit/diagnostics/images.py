@@ -213,15 +213,15 @@ def _flat_runs(
     shows (F,) bool: whether a frame shows a person. rate [Hz].
     """
     runs = [run for run in runs_of(~shows) if run[1] - run[0] >= max(_MIN_UNSEEN_S * rate, _MIN_COVERED_FRAMES)]
-    person_frames = np.flatnonzero(shows)
-    if not runs or not len(person_frames):
+    shown = np.flatnonzero(shows)
+    if not runs or not len(shown):
         return []
 
     def grey(frame: int) -> NDArray | None:
         found = image(int(frame))
         return None if found is None else cv2.resize(found[0].mean(axis=-1), (32, 24), interpolation=cv2.INTER_AREA)
 
-    references = [g for f in person_frames[np.linspace(0, len(person_frames) - 1, 5).astype(int)] if (g := grey(f)) is not None]
+    references = [g for f in shown[np.linspace(0, len(shown) - 1, 5).astype(int)] if (g := grey(f)) is not None]
     if not references:
         return []
     reference = np.median(references, axis=0)

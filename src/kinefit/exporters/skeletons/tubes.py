@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, MeshSurface, TaperedCylinder
 from kinefit.bodies.surfaces import Metaballs
-from kinefit.bodies.surfaces.skins.body_skin import FOLLOWED, BodySkin, body_skins
+from kinefit.bodies.surfaces.skins.body_skin import MAX_OWNERS, BodySkin, body_skins
 
 AROUND, CAP, ALONG = 20, 6, 8  # vertices around a tube, rings of a rounded end, rings between the ends
 LEFT, RIGHT, CENTRE = (70, 140, 255), (255, 140, 50), (140, 205, 130)  # RGB
@@ -51,7 +51,7 @@ def body_mesh(body: Body) -> TubeMesh:
     parts = [_rigid(body, c) if isinstance(c, MeshSurface) else _tube(body, c) for c in others]
     parts += [_skin(body, skin) for skin in body_skins(body)]
     if not parts:
-        columns = ((3, float), (3, float), (3, np.uint8), (3, int), (FOLLOWED, int), (FOLLOWED, float))
+        columns = ((3, float), (3, float), (3, np.uint8), (3, int), (MAX_OWNERS, int), (MAX_OWNERS, float))
         return TubeMesh(*(np.zeros((0, count), kind) for count, kind in columns))
     first = np.cumsum([0] + [len(p.vertices) for p in parts])
     return TubeMesh(
@@ -66,7 +66,7 @@ def body_mesh(body: Body) -> TubeMesh:
 
 def _four(columns: NDArray) -> NDArray:
     """(V, 4) with zeros for what is missing."""
-    return np.pad(columns, ((0, 0), (0, FOLLOWED - columns.shape[1])))
+    return np.pad(columns, ((0, 0), (0, MAX_OWNERS - columns.shape[1])))
 
 
 def is_last(body: Body, c: TaperedCylinder) -> bool:
@@ -99,7 +99,7 @@ def _rigid(body: Body, mesh: MeshSurface) -> TubeMesh:
 def _skin(body: Body, skin: BodySkin) -> TubeMesh:
     there, faces, every = skin.mesh()
     vertices = skin.at_rest(there, every)
-    order = np.argsort(-every, axis=1)[:, :FOLLOWED]
+    order = np.argsort(-every, axis=1)[:, :MAX_OWNERS]
     weights = np.take_along_axis(every, order, axis=1)
     colours = np.array([side_colour(name) for name in body.tree.segments], np.uint8)
     return TubeMesh(

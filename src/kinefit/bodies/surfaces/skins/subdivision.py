@@ -1,7 +1,7 @@
 """Bicubic B-spline patches over any closed net of quadrilaterals (E. Catmull and J. Clark, CAD 10, 1978).
 
-Wherever four quadrilaterals meet at every corner around, the limit is the bicubic B-spline patch of these 4 x 4 control
-points, with continuous second derivatives; where another number meets it has one tangent plane (U. Reif, CAGD 12,
+Where four quadrilaterals meet at all corners of a face, the limit is the bicubic B-spline patch of the 4 x 4 control
+points around, with continuous second derivatives. At other corners it has a continuous tangent plane (U. Reif, CAGD 12,
 1995).
 """
 
@@ -14,12 +14,12 @@ from kinefit.errors import BodyError
 
 
 def check_closed(faces: NDArray) -> None:
-    """Refuse a net of quadrilaterals (Q, 4) that is open somewhere, or whose faces do not all face outwards.
+    """Check that a net of quadrilaterals (Q, 4) is closed and consistently oriented.
 
     Raises
     ------
     BodyError
-        How many edges have no twin that runs the other way.
+        An edge without a twin in the opposite direction.
     """
     edges = np.concatenate([faces[:, [k, (k + 1) % 4]] for k in range(4)])
     size = int(faces.max()) + 1
@@ -31,9 +31,9 @@ def check_closed(faces: NDArray) -> None:
 
 
 def subdivided(values: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
-    """Values (V, K) of the vertices of a closed net (Q, 4), and its faces, once subdivided: (V', K), (4 Q, 4).
+    """Subdivide a closed net (Q, 4) with values (V, K) of its vertices once: values (V', K), faces (4 Q, 4).
 
-    The first V vertices remain; then those of faces, then those of edges follow.
+    The first V vertices are the old ones; those of faces and then those of edges follow.
     """
     V, Q = len(values), len(faces)
     edges, of = _edges(faces)
@@ -53,7 +53,7 @@ def subdivided(values: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def limit(values: NDArray, faces: NDArray) -> NDArray:
-    """(V, K) where the vertices of a closed net end up after any number of subdivisions."""
+    """Limits (V, K) of the vertices of a closed net under infinite subdivision, from values (V, K), faces (Q, 4)."""
     edges, _ = _edges(faces)
     n = np.bincount(edges.ravel(), minlength=len(values))[:, None].astype(float)
     beside, across = np.zeros_like(values), np.zeros_like(values)
@@ -64,7 +64,7 @@ def limit(values: NDArray, faces: NDArray) -> NDArray:
 
 
 def interpolated(targets: NDArray, faces: NDArray, rounds: int = 2) -> NDArray:
-    """(V, 3) control points whose limits lie at `targets` (V, 3), nearly: a patch runs inside of its control points."""
+    """Control points (V, 3) [m] whose limits are approximately `targets` (V, 3) [m]: a patch lies inside of them."""
     control = np.array(targets)
     for _ in range(rounds):
         control += targets - limit(control, faces)
@@ -72,7 +72,7 @@ def interpolated(targets: NDArray, faces: NDArray, rounds: int = 2) -> NDArray:
 
 
 def spread(values: NDArray, faces: NDArray, rounds: int) -> NDArray:
-    """(V, K) values, each half its own and half its neighbours' mean, so many times."""
+    """Smooth values (V, K): each becomes half itself and half its neighbours' mean, `rounds` times."""
     edges, _ = _edges(faces)
     n = np.bincount(edges.ravel(), minlength=len(values))[:, None]
     for _ in range(rounds):
@@ -84,7 +84,7 @@ def spread(values: NDArray, faces: NDArray, rounds: int) -> NDArray:
 
 
 def _edges(faces: NDArray) -> tuple[NDArray, NDArray]:
-    """(E, 2) edges of faces (Q, 4), and the number of each face's edge from its corner k to the next (Q, 4)."""
+    """Edges (E, 2) of faces (Q, 4), and the index (Q, 4) of each face's edge from its corner k to the next."""
     pairs = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     edges, of = np.unique(pairs, axis=0, return_inverse=True)
     return edges, of.reshape(faces.shape)
