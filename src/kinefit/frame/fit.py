@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.correspondences.closures import STIFF, hard_equations, looped, soft_closures
+from kinefit.correspondences.closures import HARD_SIGMA, hard_equations, looped, soft_closures
 from kinefit.correspondences.occupancy.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.correspondences.parameters import prior_rows
 from kinefit.frame.minimum import ROUGH, Minimum, minimum
@@ -205,7 +205,7 @@ class FrameFit:
         """Where measurements contradict a segment, none makes it more certain, nor does a surface that hides it."""
         scene, tree, told = found.scene, self.body.tree, together(found.scene, each)
         A = np.zeros((0, tree.n_dofs)) if self._hard is None else self._hard(scene.state)[1]
-        exact = A.T @ A / STIFF**2
+        exact = A.T @ A / HARD_SIGMA**2
         H = found.H + exact
         lost = told.lost if told.lost.any() else None
         off = [unseen(m, one) for m, one in zip(found.matched, each)]

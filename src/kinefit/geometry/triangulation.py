@@ -1,4 +1,4 @@
-"""Triangulation: pixels of one point in several cameras -> the point, by least squares on pixels."""
+"""Triangulate points from their pixels in several cameras, by least squares on pixels."""
 
 from __future__ import annotations
 
@@ -12,19 +12,25 @@ from kinefit.geometry.camera import Rig
 
 
 def triangulate(rig: Rig, points_px: ArrayLike, weights: ArrayLike | None = None) -> NDArray:
-    """Points of least weighted squared pixel error, using every camera that saw them.
+    """Triangulate points by least weighted squared pixel error, from all cameras.
 
     Parameters
     ----------
+    rig : Rig of C cameras
     points_px : (N, C, 2) [px]
-        In the image frame of each camera's calibration; NaN where unseen.
+        In the image frame of each camera's calibration; NaN if not detected.
     weights : (N, C), optional
-        Non-negative, multiplying the squared error; 0 where unseen.
+        Weights >= 0 of the squared errors; default 1.
 
     Returns
     -------
     x_world : (N, 3) [m]
-        NaN where fewer than two cameras saw the point or their rays are parallel.
+        NaN if fewer than two cameras detected the point or their rays are parallel.
+
+    Raises
+    ------
+    ObservationError
+        Arrays of other shapes, or weights that are negative or not finite.
     """
     return _run(rig, points_px, weights, np.inf)[0]
 
@@ -32,15 +38,15 @@ def triangulate(rig: Rig, points_px: ArrayLike, weights: ArrayLike | None = None
 def triangulate_robust(
     rig: Rig, points_px: ArrayLike, weights: ArrayLike | None = None, *, max_residual_px: float
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Points that the largest weight of cameras agrees on.
+    """Triangulate points from the consensus of cameras with the largest total weight.
 
-    All cameras if they agree; else the pair of cameras whose point most others support, and all that agree with it.
+    Uses all cameras if they agree; else the pair of cameras whose point has most support, and all that agree with it.
 
     Parameters
     ----------
-    points_px, weights : as in `triangulate`
+    rig, points_px, weights : as in `triangulate`
     max_residual_px : float [px]
-        Largest pixel error of a camera that agrees.
+        Largest reprojection error of an inlier.
 
     Returns
     -------
@@ -49,7 +55,12 @@ def triangulate_robust(
     inliers : (N, C) bool
         Cameras that agree.
     residual_px : (N, C) [px]
-        Pixel error in every camera that saw the point; infinite where the point is behind it, NaN where unseen.
+        Reprojection error in every camera that detected the point; infinite behind the camera, NaN if not detected.
+
+    Raises
+    ------
+    ObservationError
+        As `triangulate`, or a limit that is not positive.
     """
     if not max_residual_px > 0:
         raise ObservationError(f"largest pixel error {max_residual_px}", remedy="Give a positive number of pixels.")
