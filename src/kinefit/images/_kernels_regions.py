@@ -36,12 +36,12 @@ def count(image, bins, face, label, left, top, scale, box, inside, near, far):
         for x in range(0, width, 6):
             if y < box[1] or y >= box[3] or x < box[0] or x >= box[2]:
                 far[bins[_colour(image, y, x)]] += 1.0
-    beside = math.ceil(2.0 * scale) + 1
+    margin = math.ceil(2.0 * scale) + 1
     for y in range(max(box[1], 0), min(box[3], height), 3):
         j = math.floor((y - top + 0.5) * scale)
         for x in range(max(box[0], 0), min(box[2], width), 3):
             i = math.floor((x - left + 0.5) * scale)
-            if not (-beside <= i < face.shape[1] + beside and -beside <= j < face.shape[0] + beside):
+            if not (-margin <= i < face.shape[1] + margin and -margin <= j < face.shape[0] + margin):
                 near[bins[_colour(image, y, x)]] += 1.0
                 continue
             here = part(face, label, x, y, left, top, scale)

@@ -135,7 +135,7 @@ def find_floor(
         return None
     height = some @ normal.T - (normal * first).sum(axis=1)
     inside, below = (np.abs(height) < thickness).mean(axis=0), (height < -2.0 * thickness).mean(axis=0)
-    inside[below > 0.2 * inside] = 0.0  # a table, a seat: the floor goes on below it
+    inside[below > 0.2 * inside] = 0.0  # a table or a seat: there are points below it
     best = int(np.argmax(inside))
     if inside[best] < least:
         return None

@@ -70,13 +70,13 @@ class BackgroundPlate:
         ObservationError
             An image of another size.
         """
-        picture = _smooth(rgb_image(image))
-        if picture.shape != self.plate.shape:
-            problem = f"a picture of {picture.shape[1::-1]} px, the background has {self.size}"
+        smoothed = _smooth(rgb_image(image))
+        if smoothed.shape != self.plate.shape:
+            problem = f"a picture of {smoothed.shape[1::-1]} px, the background has {self.size}"
             raise ObservationError(problem, remedy="Take both with the same camera and settings.")
-        alpha = np.einsum("ijk,ijk->ij", picture, self.plate) / self._square
+        alpha = np.einsum("ijk,ijk->ij", smoothed, self.plate) / self._square
         alpha /= max(float(np.median(alpha[::4, ::4])), 1e-3)  # the camera's own exposure
-        difference = picture - alpha[..., None] * self.plate
+        difference = smoothed - alpha[..., None] * self.plate
         d = np.sqrt(np.einsum("ijk,ijk->ij", difference, difference))
         noise = max(1.4826 * float(np.median(d[::4, ::4])), _MIN_NOISE) if self.noise is None else self.noise
         change = np.abs(alpha - 1.0) * np.sqrt(self._square)
@@ -99,6 +99,6 @@ def cleaned(mask: NDArray, *, share: float = _MIN_BLOB_SHARE) -> NDArray:
     return out
 
 
-def _smooth(picture: NDArray) -> NDArray:
+def _smooth(smoothed: NDArray) -> NDArray:
     """Smoothed image as float32."""
-    return np.asarray(cv2.GaussianBlur(picture.astype(np.float32), (0, 0), _BLUR_PX))
+    return np.asarray(cv2.GaussianBlur(smoothed.astype(np.float32), (0, 0), _BLUR_PX))

@@ -1,7 +1,7 @@
 """Pose from silhouettes as published by Rosenhahn and Klette (P1 2.4): contour, occluding contour, pairs, rays.
 
 1. The image's silhouette comes from a threshold on colour and the Laplace operator.
-2. The model's 3D silhouette comes from its projection in a rendered image, anew in every cycle; optionally from its low
+2. The model's 3D silhouette comes from its projection in a rendered image, in every cycle; optionally from its low
    frequencies first. Skins and morphing bodies are posed as such.
 3. Each of its points is paired with the nearest contour point (ICP), which defines a projection ray.
 4. The motor of the pose and the joint angles solve (M X M̃) × L = 0 for all pairs; this is iterated to convergence.

@@ -179,9 +179,9 @@ def _placed(surface: TaperedCylinder | MeshSurface, x: NDArray) -> tuple[NDArray
     t = local[:, 2:] / surface.length
     half = np.maximum(first + t * (last - first), 1e-6)
     at = np.concatenate([local[:, :2] / half, t], axis=1)
-    beside = (np.linalg.norm(at[:, :2], axis=1) - 1.0) * np.sqrt(half.prod(axis=1))
-    beyond = (np.abs(t[:, 0] - 0.5) - 0.5) * surface.length
-    return np.abs(np.maximum(beside, beyond)), np.zeros(len(x), np.int64), at
+    from_side = (np.linalg.norm(at[:, :2], axis=1) - 1.0) * np.sqrt(half.prod(axis=1))
+    from_ends = (np.abs(t[:, 0] - 0.5) - 0.5) * surface.length
+    return np.abs(np.maximum(from_side, from_ends)), np.zeros(len(x), np.int64), at
 
 
 def _face_axes(surface: MeshSurface, face: NDArray) -> tuple[NDArray, NDArray]:

@@ -169,7 +169,7 @@ class SkinTracker:
         for k, b in enumerate(self.blobs):
             if b is not None:
                 unseen = b.unseen + self._step
-                speed = 0.7 * b.velocity  # a hand turns round more often than it goes on
+                speed = 0.7 * b.velocity  # hands reverse their motion more often than not
                 moved = replace(b, centre=b.centre + self._step * speed, velocity=speed, unseen=unseen, confidence=0.0)
                 self.blobs[k] = moved if unseen <= _MAX_TIME_LOST or k == FACE else None
 

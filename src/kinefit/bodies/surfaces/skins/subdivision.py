@@ -39,8 +39,8 @@ def subdivided(values: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
     edges, of = _edges(faces)
     centre = values[faces].mean(axis=1)
     ends = values[edges[:, 0]] + values[edges[:, 1]]
-    beside = np.zeros_like(ends)
-    np.add.at(beside, of.ravel(), centre.repeat(4, axis=0))
+    neighbour_sum = np.zeros_like(ends)
+    np.add.at(neighbour_sum, of.ravel(), centre.repeat(4, axis=0))
     n = np.bincount(edges.ravel(), minlength=V)[:, None].astype(float)
     about, middles = np.zeros_like(values), np.zeros_like(values)
     np.add.at(about, faces.ravel(), centre.repeat(4, axis=0))
@@ -49,18 +49,18 @@ def subdivided(values: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
     of = V + Q + of
     middle = V + np.arange(Q)
     quads = [np.stack([faces[:, k], of[:, k], middle, of[:, (k + 3) % 4]], axis=1) for k in range(4)]
-    return np.concatenate([corners, centre, 0.25 * (ends + beside)]), np.concatenate(quads)
+    return np.concatenate([corners, centre, 0.25 * (ends + neighbour_sum)]), np.concatenate(quads)
 
 
 def limit(values: NDArray, faces: NDArray) -> NDArray:
     """Limits (V, K) of the vertices of a closed net under infinite subdivision, from values (V, K), faces (Q, 4)."""
     edges, _ = _edges(faces)
     n = np.bincount(edges.ravel(), minlength=len(values))[:, None].astype(float)
-    beside, across = np.zeros_like(values), np.zeros_like(values)
-    np.add.at(beside, edges[:, 0], values[edges[:, 1]])
-    np.add.at(beside, edges[:, 1], values[edges[:, 0]])
+    neighbour_sum, across = np.zeros_like(values), np.zeros_like(values)
+    np.add.at(neighbour_sum, edges[:, 0], values[edges[:, 1]])
+    np.add.at(neighbour_sum, edges[:, 1], values[edges[:, 0]])
     np.add.at(across, faces.ravel(), values[np.roll(faces, 2, axis=1).ravel()])
-    return np.asarray((n * n * values + 4.0 * beside + across) / (n * (n + 5.0)))
+    return np.asarray((n * n * values + 4.0 * neighbour_sum + across) / (n * (n + 5.0)))
 
 
 def interpolated(targets: NDArray, faces: NDArray, rounds: int = 2) -> NDArray:
@@ -76,10 +76,10 @@ def spread(values: NDArray, faces: NDArray, rounds: int) -> NDArray:
     edges, _ = _edges(faces)
     n = np.bincount(edges.ravel(), minlength=len(values))[:, None]
     for _ in range(rounds):
-        beside = np.zeros_like(values)
-        np.add.at(beside, edges[:, 0], values[edges[:, 1]])
-        np.add.at(beside, edges[:, 1], values[edges[:, 0]])
-        values = 0.5 * (values + beside / n)
+        neighbour_sum = np.zeros_like(values)
+        np.add.at(neighbour_sum, edges[:, 0], values[edges[:, 1]])
+        np.add.at(neighbour_sum, edges[:, 1], values[edges[:, 0]])
+        values = 0.5 * (values + neighbour_sum / n)
     return values
 
 
