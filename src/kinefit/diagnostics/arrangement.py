@@ -31,13 +31,13 @@ def disagreement_share(rig: Rig, uv: NDArray) -> float:
     Errors are clipped at the limit. 1 where no point is visible in two cameras.
     """
     limit = MAX_ERROR_SHARE * max(float(np.hypot(*camera.size)) for camera in rig)
-    seen = np.isfinite(uv).all(-1)
-    seen &= (seen.sum(axis=1) >= 2)[:, None]
-    if not seen.any():
+    detected = np.isfinite(uv).all(-1)
+    detected &= (detected.sum(axis=1) >= 2)[:, None]
+    if not detected.any():
         return 1.0
     _, agree, residual = triangulate_robust(rig, uv, max_residual_px=limit)
     error = np.where(agree, np.nan_to_num(residual, nan=limit, posinf=limit), limit)
-    return float(np.minimum(error, limit)[seen].mean() / limit)
+    return float(np.minimum(error, limit)[detected].mean() / limit)
 
 
 def sample(views: KeypointViews) -> NDArray:
@@ -194,9 +194,9 @@ def frame_findings(
         return [], views
     right = "calibration" if stated[fits[0]] == "video" else "video"
     text = f"The keypoints of {listed(fits)} are not in the {stated[fits[0]]}'s image, but in the {right}'s."
-    sure = f"Sure: the cameras' mean error falls to {100 * least / before:.0f} %."
+    confidence = f"Sure: the cameras' mean error falls to {100 * least / before:.0f} %."
     remedy = f'Write frame = "{right}" into [[keypoints]] of {listed(fits)}.'
-    return [Finding("fault", "frame", text, tuple(fits), sure, remedy)], best
+    return [Finding("fault", "frame", text, tuple(fits), confidence, remedy)], best
 
 
 def _in_other_frame(

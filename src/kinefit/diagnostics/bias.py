@@ -60,7 +60,7 @@ def camera_biases(views: KeypointViews) -> tuple[CameraBias, ...]:
     x, agree = meet(views)
     out = []
     for c, camera in enumerate(views.rig):
-        seen = np.isfinite(views.uv[:, :, c]).all(-1)
+        detected = np.isfinite(views.uv[:, :, c]).all(-1)
         used = agree[:, :, c] & np.isfinite(x[..., 0])
         d = np.where(used[..., None], camera.project(x) - views.uv[:, :, c], np.nan)
         bias, std = _median_bias(d)
@@ -68,7 +68,7 @@ def camera_biases(views: KeypointViews) -> tuple[CameraBias, ...]:
         if len(views.rig) > 2:
             alone, _ = _median_bias(from_others(views, c) - views.uv[:, :, c], limit=views.limit)
         apart = np.linalg.norm(d - bias, axis=-1)[used]
-        compared = seen & np.isfinite(x[..., 0])
+        compared = detected & np.isfinite(x[..., 0])
         out.append(
             CameraBias(
                 camera.name, bias, std, alone, float(np.median(apart)) if len(apart) else np.nan,
@@ -151,15 +151,15 @@ def disagreement(views: KeypointViews) -> Disagreement:
     residual = np.zeros((count, 2 * cameras))
     for c, camera in enumerate(views.rig):
         predicted, by_point = camera.project_with_jacobian(x)
-        seen, rows = agree[:, c, None], slice(2 * c, 2 * c + 2)
+        detected, rows = agree[:, c, None], slice(2 * c, 2 * c + 2)
         q = predicted - camera.matrix[:2, 2]
         own = np.zeros((count, 2, PER_CAMERA))
         own[:, 0, 0] = own[:, 1, 1] = 1.0
         own[:, 0, 2], own[:, 1, 2] = -q[:, 1], q[:, 0]
         own[:, :, 3] = q
-        design[:, rows, PER_CAMERA * c : PER_CAMERA * (c + 1)] = np.where(seen[..., None], own, 0.0)
-        jacobian[:, rows] = np.where(seen[..., None], by_point, 0.0)
-        residual[:, rows] = np.where(seen, predicted - uv[:, c], 0.0)
+        design[:, rows, PER_CAMERA * c : PER_CAMERA * (c + 1)] = np.where(detected[..., None], own, 0.0)
+        jacobian[:, rows] = np.where(detected[..., None], by_point, 0.0)
+        residual[:, rows] = np.where(detected, predicted - uv[:, c], 0.0)
     matrix, right = without_points(jacobian, design, residual)
     return Disagreement(views.rig.names, matrix.sum(0), right.sum(0), int(2 * agree.sum() - 3 * count))
 

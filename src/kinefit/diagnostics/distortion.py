@@ -46,9 +46,9 @@ def distortion_findings(views: KeypointViews) -> list[Finding]:
     names = tuple(views.rig.names[ideal[n]] for n in bent)
     coefficients = listed(f"{name} as if k1 were {k1[n]:+.2f}" for n, name in zip(bent, names))
     text = f"The calibration has no lens distortion for {listed(names)}, and the keypoints lie bent: {coefficients}."
-    sure = f"Sure: with it the cameras' median error falls from {before:.1f} to {after:.1f} px."
+    confidence = f"Sure: with it the cameras' median error falls from {before:.1f} to {after:.1f} px."
     remedy = "Write the distortion coefficients that the lenses were calibrated with into the calibration."
-    return [Finding("fault", "distortion", text, names, sure, remedy)]
+    return [Finding("fault", "distortion", text, names, confidence, remedy)]
 
 
 def _solve(views: KeypointViews, ideal: list[int]) -> tuple[NDArray, NDArray, float]:
@@ -64,13 +64,13 @@ def _solve(views: KeypointViews, ideal: list[int]) -> tuple[NDArray, NDArray, fl
     residual = np.zeros((count, 2 * cameras))
     for c, camera in enumerate(views.rig):
         predicted, by_point = camera.project_with_jacobian(x)
-        seen, rows = agree[:, c, None], slice(2 * c, 2 * c + 2)
-        jacobian[:, rows] = np.where(seen[..., None], by_point, 0.0)
-        residual[:, rows] = np.where(seen, predicted - uv[:, c], 0.0)
+        agreed, rows = agree[:, c, None], slice(2 * c, 2 * c + 2)
+        jacobian[:, rows] = np.where(agreed[..., None], by_point, 0.0)
+        residual[:, rows] = np.where(agreed, predicted - uv[:, c], 0.0)
         if c in ideal:
             off = predicted - camera.matrix[:2, 2]
             squared = np.sum(np.square(off / np.diag(camera.matrix)[:2]), axis=1)
-            design[:, rows, ideal.index(c)] = np.where(seen, off * squared[:, None], 0.0)
+            design[:, rows, ideal.index(c)] = np.where(agreed, off * squared[:, None], 0.0)
     matrix, right = (part.sum(0) for part in without_points(jacobian, design, residual))
     power = np.maximum(np.diag(matrix), 1e-12)
     k1 = -np.linalg.lstsq(matrix, right, rcond=None)[0]

@@ -110,9 +110,9 @@ def _finding(rig: Rig, group: tuple[int, ...], good: _FrameRun, bad: _FrameRun, 
         f"{first + bad.stop - 1}; in frames "
         f"{first + good.start} to {first + good.stop - 1} all show the same."
     )
-    sure = "Sure: no shift in time brings them together there, while the cameras of one group still agree."
+    confidence = "Sure: no shift in time brings them together there, while the cameras of one group still agree."
     remedy = (
         "Look whether videos are cut, have lost frames or go on with another take. Until then write "
         f"frames = [{first + good.start}, {first + good.stop}] into [take]."
     )
-    return Finding("fault", "groups", text, (*names, *others), sure, remedy)
+    return Finding("fault", "groups", text, (*names, *others), confidence, remedy)

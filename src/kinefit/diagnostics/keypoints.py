@@ -145,8 +145,8 @@ def check_keypoints(
         views = with_sides_right(views) if quick and not late else stepped
         gross = stranger_findings(views.spread(_SAMPLE_FRAMES))
         if gross:  # a mistake is certain: smaller improvements suffice
-            some = views.spread(_SAMPLE_FRAMES)
-            gross = distortion_findings(some) or mistake_findings(some, file.name, lenient=True) or gross
+            sampled = views.spread(_SAMPLE_FRAMES)
+            gross = distortion_findings(sampled) or mistake_findings(sampled, file.name, lenient=True) or gross
     findings += gross
     if any(g.kind != "stranger" for g in gross) or len(views.rig) < 2:
         return ended(views)
@@ -156,26 +156,26 @@ def check_keypoints(
         rest = [n for n in views.rig.names if n not in stranger_names]
         times, stepped, late = _synchronised(moving.select(rest))
         views = with_sides_right(views.select(rest)) if quick and not late else stepped
-    some = views.spread(_SAMPLE_FRAMES)
-    x, _ = meet(some)
+    sampled = views.spread(_SAMPLE_FRAMES)
+    x, _ = meet(sampled)
     if not np.isfinite(x).any():
         findings.append(
             Finding("fault", "apart", "No two cameras see a point together.", remedy="Point the cameras at one place.")
         )
         return ended(views, times=times)
-    biases = camera_biases(some)
+    biases = camera_biases(sampled)
     done(4)
     sets = list(dict.fromkeys(k.keypoint_set for k in keypoints))
-    size = size_findings(stature(load_body(body) if isinstance(body, str) else body, sets, some, x), height)
-    findings += (focal_findings(some) if size[0].severity == "fault" else []) or size
+    size = size_findings(stature(load_body(body) if isinstance(body, str) else body, sets, sampled, x), height)
+    findings += (focal_findings(sampled) if size[0].severity == "fault" else []) or size
     findings += upright_findings(views.rig, x, views.names, up)
     done(5)
-    findings += distortion_findings(some)
+    findings += distortion_findings(sampled)
     offsets = {c.name: c.time_offset for c in take.cameras} if take else {}
     findings += time_findings(times, offsets, fast_pixels(stepped), confirmed=bool(late))
-    findings += bias_findings(biases, disagreement(some) if len(views.rig) > 2 else None, _sigmas(take), file)
+    findings += bias_findings(biases, disagreement(sampled) if len(views.rig) > 2 else None, _sigmas(take), file)
     findings += side_findings(views) + placement_findings(views.rig, x[np.isfinite(x).all(-1)])
-    covered = coverage(some, x)
+    covered = coverage(sampled, x)
     findings += coverage_findings(covered)
     done(_PROGRESS_STEPS)
     findings = explained(findings)
@@ -200,20 +200,20 @@ def _most_motion(record: Keypoints, keypoints: Sequence[Keypoints]) -> Keypoints
     starts = np.unique(np.linspace(0, max(length - _QUICK_FRAMES, 0), _QUICK_INTERVALS).astype(int))
     moved = []
     for start in starts if len(starts) > 1 else ():
-        seen = [k.points[start : start + _QUICK_FRAMES : 5, 0] for k in keypoints if k.points.shape[1]]
-        moved.append(sum(float(np.nansum(np.minimum(np.abs(np.diff(uv, axis=0)), _MAX_JUMP_PX))) for uv in seen))
+        detected = [k.points[start : start + _QUICK_FRAMES : 5, 0] for k in keypoints if k.points.shape[1]]
+        moved.append(sum(float(np.nansum(np.minimum(np.abs(np.diff(uv, axis=0)), _MAX_JUMP_PX))) for uv in detected))
     start = int(starts[int(np.argmax(moved))]) if moved else 0
     return record.rows(slice(start, min(start + _QUICK_FRAMES, length)), record.time_offset)
 
 
 def _with_person(views: KeypointViews) -> tuple[KeypointViews, list[Finding]]:
     """The views of cameras in which a person was detected, and findings on the others."""
-    seen = np.isfinite(views.uv).any(axis=(0, 1, 3))
+    detected = np.isfinite(views.uv).any(axis=(0, 1, 3))
     out = []
-    for name in (n for n, s in zip(views.rig.names, seen, strict=True) if not s):
+    for name in (n for n, s in zip(views.rig.names, detected, strict=True) if not s):
         remedy = "Check its video and keypoints; or leave it out of the take."
         out.append(Finding("fault", "coverage", f"Nobody was detected in {name}.", (name,), remedy=remedy))
-    return views.select([n for n, s in zip(views.rig.names, seen, strict=True) if s]), out
+    return views.select([n for n, s in zip(views.rig.names, detected, strict=True) if s]), out
 
 
 def _synchronised(views: KeypointViews) -> tuple[TimeOffsets, KeypointViews, dict[str, int]]:

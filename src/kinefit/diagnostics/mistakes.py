@@ -82,12 +82,12 @@ class Mistake:
     def finding(self, names: Sequence[str], limit: float) -> Finding:
         """The finding; `names` of all cameras, `limit` [px] of the shares."""
         word = "Sure" if self.explains(lenient=False) else "Likely"
-        sure = (
+        confidence = (
             f"{word}: it was tried, and the cameras' mean error falls from {100 * self.before:.0f} % to "
             f"{100 * self.after:.0f} % of the {limit:.0f} px within which two views count as one point."
         )
         text = self.text if self.text.startswith(tuple(names)) else self.text[:1].upper() + self.text[1:]
-        return Finding("fault", self.kind, f"{text}.", self.cameras, sure, self.remedy)
+        return Finding("fault", self.kind, f"{text}.", self.cameras, confidence, self.remedy)
 
 
 def mistake_findings(views: KeypointViews, take_file: str = "the take", *, lenient: bool = False) -> list[Finding]:

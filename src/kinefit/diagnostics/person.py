@@ -96,12 +96,12 @@ def _hand_findings(x: NDArray, names: Sequence[str]) -> list[Finding]:
     if len(votes) < 10 or votes.mean() > -0.5:
         return []
     text = "Left and right are exchanged: the person's face, toes and knees point backwards."
-    sure = f"Sure: so in {100 * np.mean(votes < 0):.0f} % of the frames, while the cameras agree."
+    confidence = f"Sure: so in {100 * np.mean(votes < 0):.0f} % of the frames, while the cameras agree."
     remedy = (
         "Exchange the names of left and right in the keypoints of all cameras (is their format or set another?); or, "
         "if images and calibration were mirrored together, mirror the videos back, calibrate and detect anew."
     )
-    return [Finding("fault", "mirrored", text, (), sure, remedy)]
+    return [Finding("fault", "mirrored", text, (), confidence, remedy)]
 
 
 def _ahead_of_knee(hip: NDArray, knee: NDArray, ankle: NDArray) -> NDArray:
@@ -148,9 +148,9 @@ def size_findings(height: float | None, stated: float | None) -> list[Finding]:
     ratio = 0.0 if stated is None else abs(np.log(height / stated))
     if ratio > _MAX_STATURE_ERROR:
         text = f"The person measures {height:.3g} m by the long bones, and the take says {stated:.2f} m."
-        sure = "Likely: a detector's points are a few per cent off the joints, not more."
+        confidence = "Likely: a detector's points are a few per cent off the joints, not more."
         remedy = f"Check height in [take], and the scale of the calibration{_unit_remedy(height / (stated or 1.0))}."
-        return [Finding("fault" if ratio > _MIN_SCALE_FAULT else "doubt", "scale", text, (), sure, remedy)]
+        return [Finding("fault" if ratio > _MIN_SCALE_FAULT else "doubt", "scale", text, (), confidence, remedy)]
     if stated is None and not _MIN_STATURE <= height <= _MAX_STATURE:
         text = (
             f"The person would be {height:.3g} m tall: the calibration's unit or scale is wrong. People are "

@@ -214,23 +214,23 @@ def _speed(x: NDArray, reach: int) -> NDArray:
     ways = np.arange(-reach, reach + 1)
     at = np.arange(len(x))[:, None] + ways
     near = np.where(((at >= 0) & (at < len(x)))[..., None, None], x[np.clip(at, 0, len(x) - 1)], np.nan)  # (F, W, K, 3)
-    seen = np.isfinite(near[..., :1])
-    near, t, weight = np.where(seen, near, 0.0), ways[:, None, None].astype(float), 1.0 * seen
+    known = np.isfinite(near[..., :1])
+    near, t, weight = np.where(known, near, 0.0), ways[:, None, None].astype(float), 1.0 * known
     for _ in range(4):
         n, s, ss = (np.sum(weight * t**k, axis=1) for k in range(3))
         y, ty = np.sum(weight * near, axis=1), np.sum(weight * t * near, axis=1)
         spread = np.maximum(n * ss - s * s, 1e-9)
         slope, level = (n * ty - s * y) / spread, (ss * y - s * ty) / spread
         off = np.linalg.norm(near - level[:, None] - t * slope[:, None], axis=-1, keepdims=True)
-        typical = np.median(off[seen]) if seen.any() else 1.0
-        weight = seen / (1.0 + np.square(off / (2.0 * typical + 1e-12)))
+        typical = np.median(off[known]) if known.any() else 1.0
+        weight = known / (1.0 + np.square(off / (2.0 * typical + 1e-12)))
     noise = np.sum(weight * off**2, axis=1) / np.maximum(n - 1.0, 1.0) * n / spread
     power = np.sum(slope**2, axis=-1, keepdims=True)
     slope = slope * np.maximum(0.0, 1.0 - _NOISE_VARIANCES * noise / np.maximum(power, 1e-30))
-    return np.where(seen.sum(axis=1) > reach, slope, np.nan)
+    return np.where(known.sum(axis=1) > reach, slope, np.nan)
 
 
 def _nanmedian(values: NDArray) -> NDArray:
     """Median over time, 0 where all values are NaN."""
-    seen = np.isfinite(values).any(axis=0)
-    return np.where(seen, np.nanmedian(np.where(seen, values, 0.0), axis=0), 0.0)
+    known = np.isfinite(values).any(axis=0)
+    return np.where(known, np.nanmedian(np.where(known, values, 0.0), axis=0), 0.0)

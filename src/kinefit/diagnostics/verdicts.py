@@ -85,10 +85,10 @@ def _bias_finding(b: CameraBias, accuracy: float, take: Path) -> list[Finding]:
         else ""
     )
     words = "Sure" if significance > 2 * _MIN_SIGMAS else "Likely" if significance >= _MIN_SIGMAS else "Not sure"
-    sure = f"{words}: {significance:.0f} standard errors, from {b.count} points"
+    confidence = f"{words}: {significance:.0f} standard errors, from {b.count} points"
     more = f"; more than the keypoints' standard deviation ({accuracy:g} px) and scatter" if is_fault else ""
     remedy = f"Run: {command('check', take, '--refine')}"
-    return [Finding(severity, "bias", f"{text}{alone}).", (b.camera,), f"{sure}{more}.", remedy)]
+    return [Finding(severity, "bias", f"{text}{alone}).", (b.camera,), f"{confidence}{more}.", remedy)]
 
 
 def _moved_cameras(parts: Disagreement, accuracy: float, take: Path, noticed: bool) -> Finding | None:
@@ -118,13 +118,13 @@ def _moved_cameras(parts: Disagreement, accuracy: float, take: Path, noticed: bo
         names = tuple(parts.cameras[c] for c in best)
         lines = "; ".join(_image_change(parts, c, values) for c, values in zip(best, parts.solve(*best), strict=True))
         others = listed(parts.cameras[c] for c in second)
-        sure = (
+        confidence = (
             f"{'Likely' if clear else 'A guess'}: it would explain {100 * shares[best]:.0f} % of the squared "
             f"disagreement, {others} instead {100 * shares[second]:.0f} %."
         )
         verb = "has" if count == 1 else "have"
         text = f"{text}: {listed(names)} {verb} moved or turned since the calibration ({lines})."
-        return Finding("note" if noticed else "doubt", "moved", text, names, sure, refine)
+        return Finding("note" if noticed else "doubt", "moved", text, names, confidence, refine)
     return Finding(
         "note", "moved", f"{text}; no one or two cameras explain it: the calibration as a whole is inaccurate.", (), "",
         f"{refine}; or calibrate again.",
@@ -178,11 +178,11 @@ def time_findings(
         )
         is_fault = confirmed and abs(late) >= max(least + 3.0 * std, _MIN_SHARE_OF_LARGEST * largest)
         severity: Severity = "fault" if is_fault else "doubt" if abs(late) >= _MIN_OFFSET_DOUBT else "note"
-        sure = "Sure" if abs(late) >= 2 * max(_MIN_OFFSET_NOTE, _MIN_SIGMAS * std) else "Likely"
+        confidence = "Sure" if abs(late) >= 2 * max(_MIN_OFFSET_NOTE, _MIN_SIGMAS * std) else "Likely"
         if abs(late) < 1.0:
-            sure += "; a detector that smooths over time, or a rolling shutter, can also delay by part of a frame"
+            confidence += "; a detector that smooths over time, or a rolling shutter, can also delay by part of a frame"
         out.append(Finding(
-            severity, "time", text, (name,), f"{sure}.",
+            severity, "time", text, (name,), f"{confidence}.",
             f"Write time_offset = {value:.4f} into [[camera]] {name}.",
         ))  # fmt: skip
     if not out:
@@ -207,8 +207,8 @@ def side_findings(views: KeypointViews) -> list[Finding]:
         f"Is the image of {most} mirrored?" if mostly else "Nothing: tracking puts it right from the other cameras."
     )
     text = f"The detector took left for right in {listed(exchanges)}."
-    sure = "Sure: exchanged, they fit the other cameras."
-    return [Finding("doubt" if mostly else "note", "sides", text, tuple(found), sure, remedy)]
+    confidence = "Sure: exchanged, they fit the other cameras."
+    return [Finding("doubt" if mostly else "note", "sides", text, tuple(found), confidence, remedy)]
 
 
 def explained(findings: Sequence[Finding]) -> list[Finding]:

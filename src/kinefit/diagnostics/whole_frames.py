@@ -57,8 +57,8 @@ def _epipolar_error(rays_a: NDArray, rays_b: NDArray, base: NDArray, frames: NDA
     normal = np.cross(base / np.linalg.norm(base), a)
     sine = np.linalg.norm(normal, axis=-1, keepdims=True)
     angle = np.sum(np.where(sine > _MIN_SINE, normal / np.maximum(sine, _MIN_SINE), np.nan) * b, axis=-1)
-    seen = np.isfinite(angle)
-    enough = seen.sum(axis=0) >= MIN_FRAMES
+    finite = np.isfinite(angle)
+    enough = finite.sum(axis=0) >= MIN_FRAMES
     if not enough.any():
         return np.nan
     angle = angle[:, enough]

@@ -283,7 +283,7 @@ class Rig:
     cameras: tuple[Camera, ...]
 
     def __post_init__(self) -> None:
-        if not isinstance(self.cameras, Sequence) or not all(isinstance(one, Camera) for one in self.cameras):
+        if not isinstance(self.cameras, Sequence) or not all(isinstance(c, Camera) for c in self.cameras):
             problem = f"a rig of a {type(self.cameras).__name__} that holds other things than cameras"
             raise CalibrationError(problem, remedy="Give a tuple of Camera; read_calibration reads some from a file.")
         object.__setattr__(self, "cameras", tuple(self.cameras))

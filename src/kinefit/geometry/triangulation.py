@@ -69,15 +69,15 @@ def triangulate_robust(
 
 def _run(rig: Rig, points_px: ArrayLike, weights: ArrayLike | None, limit: float) -> tuple[NDArray, NDArray, NDArray]:
     points = np.array(shaped(points_px, ("points", len(rig), 2), "points"))
-    seen = np.isfinite(points).all(-1)
-    weight = np.ones(seen.shape) if weights is None else np.array(weights, dtype=float, order="C")
-    if weight.shape != seen.shape or np.any(weight[seen] < 0) or not np.isfinite(weight[seen]).all():
+    detected = np.isfinite(points).all(-1)
+    weight = np.ones(detected.shape) if weights is None else np.array(weights, dtype=float, order="C")
+    if weight.shape != detected.shape or np.any(weight[detected] < 0) or not np.isfinite(weight[detected]).all():
         raise ObservationError(
             f"weights have shape {weight.shape} or a negative or missing value",
-            remedy=f"Give {seen.shape}, finite and not negative.",
+            remedy=f"Give {detected.shape}, finite and not negative.",
         )
-    weight = np.where(seen, weight, 0.0)
+    weight = np.where(detected, weight, 0.0)
     x_world = np.empty((len(points), 3))
-    inliers, residual = np.empty(seen.shape, dtype=bool), np.empty(seen.shape)
+    inliers, residual = np.empty(detected.shape, dtype=bool), np.empty(detected.shape)
     triangulate_points(rig.packed, points, weight, limit, x_world, inliers, residual)
     return x_world, inliers, residual

@@ -72,19 +72,19 @@ def sight_of(frames: Sequence[Frame], body: Body, rig: Rig, weights: Mapping[str
     for name, weight in weights.items():
         if not 0.0 <= weight < np.inf:
             raise ObservationError(f"the weight of {name} is {weight}", remedy="Give 0 or more.")
-    seen, of = by_record(frames), {f.sensor: weights.get(f.sensor, 1.0) for f in frames}
+    by_type, of = by_record(frames), {f.sensor: weights.get(f.sensor, 1.0) for f in frames}
     clouds: list[list] = [[], [], []]  # free, on the body, on a limb: (points, weight, limb)
-    for f in seen[DepthFrame]:
+    for f in by_type[DepthFrame]:
         step = max(f.size[0] // _MAX_COLUMNS, 1)
         clouds[0].append((to_points(f.depth, rig[f.sensor], step=step), of[f.sensor], -1))
-    for f in seen[PointCloud]:
+    for f in by_type[PointCloud]:
         limb = -1 if f.segment is None else body.tree.segment(f.segment)
         clouds[2 if limb >= 0 else int(f.on_body)].append((f.points, of[f.sensor], limb))
-    sets = [body.markers(f.marker_set) if f.marker_set else body.landmarks for f in seen[MarkerFrame]]
-    places = [_named(k, f.names, f.positions, weights, of[f.sensor]) for k, f in zip(sets, seen[MarkerFrame])]
-    sets = [body.keypoints(f.keypoint_set) if f.keypoint_set else body.landmarks for f in seen[KeypointFrame]]
+    sets = [body.markers(f.marker_set) if f.marker_set else body.landmarks for f in by_type[MarkerFrame]]
+    places = [_named(k, f.names, f.positions, weights, of[f.sensor]) for k, f in zip(sets, by_type[MarkerFrame])]
+    sets = [body.keypoints(f.keypoint_set) if f.keypoint_set else body.landmarks for f in by_type[KeypointFrame]]
     rays = [
-        _named(k, f.names, _rays(f, rig[f.sensor]), weights, of[f.sensor]) for k, f in zip(sets, seen[KeypointFrame])
+        _named(k, f.names, _rays(f, rig[f.sensor]), weights, of[f.sensor]) for k, f in zip(sets, by_type[KeypointFrame])
     ]
     x = [np.concatenate([p for p, _, _ in part] or [np.zeros((0, 3))]) for part in clouds]
     w = [np.concatenate([np.full(len(p), a) for p, a, _ in part] or [np.zeros(0)]) for part in clouds]
@@ -95,9 +95,9 @@ def sight_of(frames: Sequence[Frame], body: Body, rig: Rig, weights: Mapping[str
 def _rays(frame: KeypointFrame, camera: Camera) -> NDArray:
     """Plücker lines (K, 6) in the world, NaN for keypoints without detection."""
     directions, out = camera.ray(frame.uv), np.full((len(frame.names), 6), np.nan)
-    seen = np.isfinite(directions).all(axis=1) & (frame.confidence > 0.0)
-    if seen.any():
-        out[seen] = lines.line_along(camera.centre_world, directions[seen])
+    by_type = np.isfinite(directions).all(axis=1) & (frame.confidence > 0.0)
+    if by_type.any():
+        out[by_type] = lines.line_along(camera.centre_world, directions[by_type])
     return out
 
 

@@ -101,7 +101,7 @@ def metaball_bodies(
             remedy = "Give one sigma alone, or use subject.fit.fit_subject."
             raise ObservationError("the joint fit takes no locked, others or helps", remedy=remedy)
         return _joint(body, points, states, sigma, weights)
-    held = None if locked is None else np.asarray(locked, bool)
+    fixed = None if locked is None else np.asarray(locked, bool)
     closest = [nearest(body, s, x, max_distance=helps.max_distance) for s, x in zip(states, points)]
     of, sigmas = [n.segment for n in closest], sigma_of_fields(limbs, sigma, [n.normal for n in closest])
     check_influence(body, points, states, of)
@@ -113,7 +113,7 @@ def metaball_bodies(
         for k, x in enumerate(points):
             fit = levenberg_marquardt(
                 now, poses[k], partial(pose_rows, now, k, x, of[k], sigmas[k], others, helps), loss=helps.loss,
-                limits=helps.limits, locked=held, damping=damping[k], max_iterations=1)  # fmt: skip
+                limits=helps.limits, locked=fixed, damping=damping[k], max_iterations=1)  # fmt: skip
             moved = max(moved, float(np.abs(poses[k].difference(fit.state)).max()))
             poses[k], damping[k] = fit.state, fit.damping
         frames = [now.tree.forward(s.T_world_root, s.angles)[0] for s in poses]

@@ -174,7 +174,7 @@ def _gather(x, first, count, f, t, best, only, place, buffer):
     a1, b1 = a0 + t[16] * length, b0 + t[17] * length
     wide, deep, half = a0 if a0 > a1 else a1, b0 if b0 > b1 else b1, 0.5 * length
     px, py, pz = x[0, first : first + count], x[1, first : first + count], x[2, first : first + count]
-    reach, mine, s = best[first : first + count], only[first : first + count], int(t[0])
+    reach, wanted, s = best[first : first + count], only[first : first + count], int(t[0])
     p, q, h = buffer[0:BLOCK], buffer[BLOCK : 2 * BLOCK], buffer[2 * BLOCK : 3 * BLOCK]
     spare = buffer[3 * BLOCK : 4 * BLOCK]
     for i in range(count):
@@ -185,7 +185,7 @@ def _gather(x, first, count, f, t, best, only, place, buffer):
         ep, eq, eh = abs(pi) - wide, abs(qi) - deep, abs(hi - half) - half
         ep, eq, eh = ep if ep > 0.0 else 0.0, eq if eq > 0.0 else 0.0, eh if eh > 0.0 else 0.0
         room = reach[i] * reach[i] - (ep * ep + eq * eq + eh * eh)
-        spare[i] = room if (mine[i] - s) * (mine[i] + 1) == 0 else -1.0
+        spare[i] = room if (wanted[i] - s) * (wanted[i] + 1) == 0 else -1.0
         p[i], q[i], h[i] = pi, qi, hi
     n = 0
     for i in range(count):
