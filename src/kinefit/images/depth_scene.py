@@ -154,8 +154,8 @@ def find_floor(
 def clusters(x: NDArray, gap: float = _MAX_GAP) -> NDArray:
     """Cluster points (N, 3) [m] by distance: labels (N,) from 0.
 
-    Cubes of edge `gap` [m] that touch by a face, an edge or a corner belong to one cluster. Points closer than `gap`
-    always share a cluster; two clusters can be as far apart as 2√3·`gap` before they are certain to be separate.
+    Cubes of edge `gap` [m] that touch by a face, an edge or a corner belong to one cluster. So points closer than `gap`
+    share a cluster, and points farther apart than 2√3·`gap` share one only through points between them.
     """
     if not len(x):
         return np.zeros(0, int)

@@ -316,8 +316,8 @@ def detect_people(
     Returns
     -------
     Detections
-        One column for each person. A person who leaves and returns after two seconds gets a new column. Detections that
-        last less than 0.2 s in all are dropped as false positives.
+        One column for each person. A person who returns later than two seconds after leaving gets a new column.
+        Detections of less than 0.2 s in total are dropped as false positives.
     """
     follower = Follower(models, rate, people, masks)
     frames: list[list[PersonDetection]] = []

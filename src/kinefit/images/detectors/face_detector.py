@@ -104,7 +104,7 @@ class FaceDetector:
 
 
 def _is_inside(point: NDArray, body: NDArray) -> bool:
-    """Whether a point [px] lies in the bounding box of a person's landmarks (33, 2) [px]: a belly, not a person."""
+    """Whether a point [px] lies in the box of a person's landmarks (33, 2) [px], as a belly does that a face detector finds."""
     return bool((point > body.min(axis=0)).all() and (point < body.max(axis=0)).all())
 
 

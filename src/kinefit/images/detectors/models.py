@@ -53,12 +53,12 @@ class Models:
         self._detect = PersonDetector(interpreter(Path(folder) / DETECTOR, threads))
 
     @cached_property
-    def _outlines(self) -> PoseModel:
+    def _with_mask(self) -> PoseModel:
         return _pose_model(self._landmarks, self._threads)
 
     def pose(self, crop: NDArray[np.uint8], *, mask: bool = True) -> PersonLandmarks:
         """Landmarks of the person in an RGB crop (256, 256, 3). The mask nearly doubles the time."""
-        return (self._outlines if mask else self._points)(crop)
+        return (self._with_mask if mask else self._points)(crop)
 
     def find_people(self, image: NDArray[np.uint8]) -> list[DetectedPerson]:
         """Detect people in an image (H, W, 3) RGB who fill a quarter of its height, in order of decreasing score."""
