@@ -104,7 +104,7 @@ class FaceDetector:
 
 
 def _is_inside(point: NDArray, body: NDArray) -> bool:
-    """Whether a point [px] lies in the box of a person's landmarks (33, 2) [px], as a belly does that a face detector finds."""
+    """Whether a point [px] lies in the box of a body (33, 2) [px], such as a belly that is mistaken for a face."""
     return bool((point > body.min(axis=0)).all() and (point < body.max(axis=0)).all())
 
 
