@@ -11,7 +11,7 @@ from kinefit.bodies.closures import known_gear
 from kinefit.correspondences import _kernels_closures as kernels
 from kinefit.correspondences import point_rows
 from kinefit.correspondences.closures import (
-    STIFF,
+    HARD_SIGMA,
     closed_at,
     closure_rows,
     closure_targets,
@@ -73,15 +73,15 @@ def test_weights_are_those_of_the_deviations():
     rows, owner = closure_rows(body, BodyState(np.eye(4), body.tree.usual)), owners(body)
     for k, c in enumerate(body.closures):
         std = 1.0 / np.sqrt(rows.weight[owner == k])
-        wanted = [np.hypot(STIFF if c.hard and not c.place_std else 0.0 if c.hard else c.sigma, c.place_std)] * 3
-        wanted += [np.hypot(STIFF if not c.turn_std else 0.0, c.turn_std)] * (c.rows - 3)
+        wanted = [np.hypot(HARD_SIGMA if c.hard and not c.place_std else 0.0 if c.hard else c.sigma, c.place_std)] * 3
+        wanted += [np.hypot(HARD_SIGMA if not c.turn_std else 0.0, c.turn_std)] * (c.rows - 3)
         np.testing.assert_allclose(std, wanted, rtol=1e-9)
     assert np.all(rows.group == -1)  # no closure is ever an outlier
 
 
 def paper_rows(body, state):
     """Equations (18) and (19), weighted as hard closures are."""
-    return point_rows(body, state, *closure_targets(body, state), sigma=STIFF)
+    return point_rows(body, state, *closure_targets(body, state), sigma=HARD_SIGMA)
 
 
 TO_THE_WORLD = LEG.replace('to = "pedal"', "at = [0.1, 0.7, 0.0]")

@@ -125,12 +125,12 @@ def test_a_parzen_density_is_a_sum_of_windows_and_a_mixture_of_one_colour_a_gaus
     colours = np.tile(np.array([[180, 90, 60]], np.uint8), (50, 1))
     cell = cells_of(colours)
     count = np.bincount(cell, minlength=densities.COLOURS).astype(float)
-    centres = (np.indices(densities._GRID).reshape(3, -1).T + 0.5) * densities._CELL
+    centres = (np.indices(densities._GRID_SHAPE).reshape(3, -1).T + 0.5) * densities._CELL_WIDTH
     away = centres - centres[cell[0]]
     near = np.linalg.norm(away, axis=1) < 9.0
-    for form, variance in (("parzen", densities._WINDOW**2), ("mixture", densities._CELL**2 / 12)):
+    for form, variance in (("parzen", densities._PARZEN_SIGMA**2), ("mixture", densities._CELL_WIDTH**2 / 12)):
         told = np.exp(densities.DENSITIES[form](count))
-        expected = multivariate_normal.pdf(away, cov=variance * np.eye(3)) + densities._FLOOR
+        expected = multivariate_normal.pdf(away, cov=variance * np.eye(3)) + densities._MIN_DENSITY
         np.testing.assert_allclose(told[near], expected[near], rtol=0.15, atol=1e-7)
 
 

@@ -1,4 +1,4 @@
-"""What is tracked: trees of segments with named points."""
+"""Bodies: kinematic trees with named points and surfaces."""
 
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.files import load_body

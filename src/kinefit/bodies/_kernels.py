@@ -56,7 +56,7 @@ def forward(parents, dof_start, prismatic, axes, rest, root, angles, frames, scr
             versine = 2.0 * half * half
             for i in range(
                 0, 9, 3
-            ):  # rows of R exp(q â), with a as it is at rest: w's rounding would grow along a chain
+            ):  # rows of R exp(q â), with a at rest: rounding errors of w would grow along a chain
                 r0, r1, r2 = f[i], f[i + 1], f[i + 2]
                 dot = r0 * ax + r1 * ay + r2 * az
                 f[i] = r0 + sine * (r1 * az - r2 * ay) + versine * (ax * dot - r0)
@@ -77,14 +77,14 @@ def forward_many(parents, dof_start, prismatic, axes, rest, roots, angles, frame
 
 @jit
 def difference(root, other, angles, other_angles, out):
-    """δ (6 + D,) from one state to another: shift of the root, its turn (logarithm), then the angles."""
+    """Write δ (6 + D,) from one state to another to `out`: the root's shift, its rotation vector, then the angles."""
     for i in range(3):
         out[i] = other[i, 3] - root[i, 3]
     m = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
             m[i, j] = other[i, 0] * root[j, 0] + other[i, 1] * root[j, 1] + other[i, 2] * root[j, 2]
-    # the largest of the quaternion's parts first (Shepperd): exact for every angle up to π
+    # the largest component of the quaternion first (Shepperd): exact for every angle up to π
     trace = m[0, 0] + m[1, 1] + m[2, 2]
     q = np.empty(4)
     best, value = 0, trace
@@ -112,7 +112,7 @@ def difference(root, other, angles, other_angles, out):
 
 @jit
 def retract(root, angles, delta, lower, upper, new_root, new_angles):
-    """State moved by δ: root's twist in the world about its origin, then angles, kept within their limits."""
+    """Move a state by δ (6 + D,): the root's twist in the world about its origin; angles are clipped to the limits."""
     wx, wy, wz = delta[3], delta[4], delta[5]
     t2 = wx * wx + wy * wy + wz * wz
     if t2 < 1e-8:
@@ -139,7 +139,7 @@ def retract(root, angles, delta, lower, upper, new_root, new_angles):
 
 @jit
 def place(frames, segments, rest, out):
-    """out (K, 3): points (K, 3) of a resting body where their segments are."""
+    """Write points (K, 3) in the world to `out`: those given in the root frame at rest, moved with their segments."""
     for k in range(segments.size):
         f, p = frames[segments[k]], rest[k]
         for r in range(3):

@@ -20,12 +20,12 @@ from kinefit.bodies.tree import ROOT_DOFS, KinematicTree
 from kinefit.errors import BodyError, choices
 from kinefit.geometry import se3
 
-_LONG = 0.05  # [m] from a joint to the next, from where on detectors err as they do on limbs; fingers are shorter
+_MIN_LIMB_LENGTH = 0.05  # [m] of segments with a detector's full error; on shorter ones, such as fingers, it is smaller
 
 
 @dataclass(frozen=True, eq=False)
 class PointSet:
-    """Named points tied to segments: landmarks, a detector's keypoints, a marker set.
+    """Named points on segments: landmarks, a detector's keypoints, a marker set.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class PointSet:
     Raises
     ------
     BodyError
-        Arrays of other shapes, or no numbers.
+        Arrays of other shapes, or not numeric.
     """
 
     names: tuple[str, ...]
@@ -60,62 +60,68 @@ class PointSet:
         return len(self.names)
 
     def index(self, name: str) -> int:
-        """Position of a point by name."""
+        """Index of a point by name.
+
+        Raises
+        ------
+        BodyError
+            No such point.
+        """
         if name not in self.names:
             raise BodyError(choices("point", name, self.names))
         return self.names.index(name)
 
     def select(self, names: tuple[str, ...]) -> PointSet:
-        """The named points, in that order."""
+        """The named points, in that order; a BodyError is raised for an unknown name."""
         places = dict(zip(reversed(self.names), range(len(self) - 1, -1, -1)))
         rows = [places[name] if name in places else self.index(name) for name in names]
         return PointSet(tuple(names), self.segments[rows], self.points[rows])
 
 
 class BodyFamily(Protocol):
-    """Bodies of one make and many shapes."""
+    """A family of bodies with shape parameters."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(P,) shape parameters."""
+        """Names (P,) of the shape parameters."""
         ...
 
     @property
     def std(self) -> NDArray:
-        """(P,) standard deviation of each between people; their mean is zero."""
+        """Standard deviations (P,) of the parameters in the population; their mean is zero."""
         ...
 
     @property
     def shape(self) -> dict[str, float]:
-        """The shape at zero, as its maker's parameters have it."""
+        """The shape at zero, {name: number} in the family's original parameters."""
         ...
 
     def at(self, values: NDArray) -> Body:
-        """The body with parameters (P,), whose family has that shape at zero."""
+        """The body with shape parameters (P,) [standard units]; its own family has that shape at zero."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """What is tracked.
+    """A kinematic tree with named points, scale groups and surfaces.
 
     Parameters
     ----------
     name : str
     tree : KinematicTree
-    joints : (S,) name of the joint that ties each segment to its parent.
-    scale_groups : (G,) names of the lengths that can be scaled; left and right limbs share one.
+    joints : (S,) name of the joint between each segment and its parent.
+    scale_groups : (G,) names of the groups that are scaled together; left and right limbs share one.
     segment_scale : (S,) int, scale group of each segment.
     landmarks : PointSet
     keypoint_sets, marker_sets : name -> PointSet
     surfaces : tapered elliptical cylinders and meshes; a segment may have several, or none.
-    aliases : convention ("opensim", "bvh", "hanim") -> segment name -> name there.
-    stature : float [m] of the body as it stands.
-    morphs : what changes with its angles; `Morphing` lets them act.
-    skin : SkinnedMesh, a surface over all segments; depth and drawings go by `surfaces`.
-    family : BodyFamily, bodies of other shapes of which this is one; files do not keep it.
-    closures : what closes chains of the tree, see `closures`.
-    dimensions : lengths and angles of gear that closures need.
+    aliases : convention ("opensim", "bvh", "hanim") -> segment name -> name in that convention.
+    stature : float [m], height when standing.
+    morphs : shape changes that depend on the angles; `Morphing` applies them.
+    skin : SkinnedMesh, a surface over all segments; depth sensors and rendering use `surfaces`.
+    family : BodyFamily that this body belongs to; files do not store it.
+    closures : constraints that close chains of the tree, see `closures`.
+    dimensions : lengths and angles of gear that closures depend on.
     """
 
     name: str
@@ -137,52 +143,70 @@ class Body:
 
     @property
     def dof_names(self) -> tuple[str, ...]:
-        """(6 + D,) names of all degrees of freedom."""
+        """Names (6 + D,) of all degrees of freedom."""
         return ROOT_DOFS + self.tree.coordinates
 
     def usual_state(self, T_world_root: NDArray | None = None) -> BodyState:
-        """A common posture: where a fit with no pose given starts."""
+        """State in the default posture, from which fits start; T_world_root (4, 4) [m], default the identity."""
         return BodyState(np.eye(4) if T_world_root is None else T_world_root, self.tree.usual)
 
     def rest_state(self, T_world_root: NDArray | None = None) -> BodyState:
-        """All angles zero, or the nearest value within the limits."""
+        """State with all angles zero, or at the nearest limit; T_world_root (4, 4) [m], default the identity."""
         angles = np.clip(np.zeros(len(self.tree.coordinates)), self.tree.lower, self.tree.upper)
         return BodyState(np.eye(4) if T_world_root is None else T_world_root, angles)
 
     def keypoints(self, name: str) -> PointSet:
-        """The points of a detector's keypoint set."""
+        """The points of a detector's keypoint set.
+
+        Raises
+        ------
+        BodyError
+            No such set.
+        """
         if name not in self.keypoint_sets:
             raise BodyError(choices(f"keypoint set of body '{self.name}' named", name, self.keypoint_sets))
         return self.keypoint_sets[name]
 
     def markers(self, name: str) -> PointSet:
-        """The points of a marker set."""
+        """The points of a marker set.
+
+        Raises
+        ------
+        BodyError
+            No such set.
+        """
         if name not in self.marker_sets:
             raise BodyError(choices(f"marker set of body '{self.name}' named", name, self.marker_sets))
         return self.marker_sets[name]
 
     def alias(self, convention: str, segment: str) -> str:
-        """Name of a segment in another convention; its own where that has none."""
+        """Name of a segment in another convention; its own name if that has none."""
         return self.aliases.get(convention, {}).get(segment, segment)
 
     def points_rest(self, points: PointSet) -> NDArray:
-        """(K, 3) [m] points in the root frame at rest, as kernels take them."""
+        """Points (K, 3) [m] in the root frame at rest, the input of kernels."""
         return points.points + self.tree.rest[points.segments]
 
     def positions(self, state: BodyState, points: PointSet) -> NDArray:
-        """(K, 3) [m] points in the world at a state."""
+        """Points (K, 3) [m] in the world at a state."""
         frames, _ = self.tree.forward(state.T_world_root, state.angles)
         out = np.empty((len(points), 3))
         _kernels.place(frames, points.segments, self.points_rest(points), out)
         return out
 
     def trajectories(self, Ts_world_root: NDArray, angles: NDArray, points: PointSet) -> NDArray:
-        """(F, K, 3) [m] points in the world over time: roots (F, 4, 4), angles (F, D)."""
+        """Points (F, K, 3) [m] in the world over time, for roots (F, 4, 4) [m] and angles (F, D) [rad, m]."""
         Ts = self.tree.segment_poses(Ts_world_root, angles)
         return se3.apply(Ts[:, points.segments], points.points)
 
     def scaled(self, scales: NDArray) -> Body:
-        """The body with every scale group but gear's stretched: (G,) factors; joints and points move along."""
+        """Scale the body: one factor (G,) for every scale group; gear keeps its size. Joints and points move along.
+
+        Raises
+        ------
+        BodyError
+            Another number of factors, or one that is not positive and finite.
+        """
         factors = np.asarray(scales, float)
         if factors.shape != (len(self.scale_groups),) or not np.all(np.isfinite(factors)) or np.any(factors <= 0):
             raise BodyError(
@@ -206,35 +230,35 @@ class Body:
 
     @property
     def gear_scale(self) -> NDArray:
-        """(G,) bool, the scale group of gear, which no person's size stretches."""
+        """Whether each scale group (G,) is that of gear, which is not scaled with the person; bool."""
         return np.array([name == FIXED for name in self.scale_groups], bool)
 
     def _extent(self) -> float:
-        """[m] from the lowest to the highest landmark or joint at rest."""
+        """Distance [m] from the lowest to the highest landmark or joint at rest."""
         heights = np.concatenate([self.points_rest(self.landmarks)[:, 1], self.tree.rest[:, 1]])
         return float(np.ptp(heights)) if len(heights) else 0.0
 
     def with_keypoints(self, name: str, points: NDArray) -> Body:
-        """The body with the points (K, 3) [m] of one keypoint set replaced (learnt offsets)."""
+        """Replace the points of one keypoint set by (K, 3) [m] in the segments' frames, such as estimated offsets."""
         old = self.keypoints(name)
         return replace(self, keypoint_sets={**self.keypoint_sets, name: PointSet(old.names, old.segments, points)})
 
     @cached_property
     def offset_shares(self) -> NDArray:
-        """(S,) how far points of detectors stand from their places on each segment, as a share of that on long ones."""
+        """Detector error on each segment (S,), as a share 0..1 of that on long segments."""
         tree, x = self.tree, self.landmarks
         reach = np.zeros(len(tree.segments))
         np.maximum.at(reach, x.segments, np.linalg.norm(x.points, axis=1))
         np.maximum.at(reach, tree.parents[1:], np.linalg.norm(tree.offsets[1:], axis=1))
-        return np.where(reach > 0.0, np.minimum(reach / _LONG, 1.0), 1.0)
+        return np.where(reach > 0.0, np.minimum(reach / _MIN_LIMB_LENGTH, 1.0), 1.0)
 
     @cached_property
     def surface_tables(self) -> SurfaceTables:
-        """All surfaces as the kernels that search them take them, packed once."""
+        """All surfaces, packed once for the kernels that search them."""
         return tables(self.surfaces, self.tree.rest)
 
     def segment_ends(self) -> dict[int, NDArray]:
-        """(3,) [m] far end of each segment that has a surface, in its frame: of the first one that its file gives."""
+        """Far end (3,) [m] of each segment with a surface, in its frame, from its first surface in the file."""
         ends: dict[int, NDArray] = {}
         for surface in reversed(self.surfaces):
             if isinstance(surface, TaperedCylinder):
@@ -244,7 +268,7 @@ class Body:
         return ends
 
     def segment_lengths(self) -> dict[str, float]:
-        """[m] distance between the two joints of every scale group that has a child joint (bone lengths)."""
+        """Bone lengths {"parent-child": [m]}: distance from the joint of each segment to that of its parent."""
         out: dict[str, float] = {}
         for child, parent in enumerate(self.tree.parents):
             if parent >= 0:

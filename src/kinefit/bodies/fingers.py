@@ -1,4 +1,4 @@
-"""Fingers: what of a hand may be folded away, though bodies without finger joints are always drawn with them."""
+"""Fingers of bodies without finger joints: parts of a hand's surface that a person may fold away."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from kinefit.bodies.body import Body
 
 KNUCKLE = "metacarpal_phalanx_3"
-"""How the name of the landmark ends at which the middle finger begins."""
+"""End of the name of the landmark at the middle finger's knuckle."""
 
 
 def knuckles(body: Body) -> dict[int, NDArray]:
-    """Segment -> (3,) [m] its middle finger's knuckle in its frame, of hands that no segment goes on from."""
+    """Knuckle of the middle finger {segment: (3,) [m] in its frame}, of hands without finger segments."""
     leaf = ~np.isin(np.arange(len(body.tree.parents)), body.tree.parents)
     points = body.landmarks
     return {
@@ -22,9 +22,9 @@ def knuckles(body: Body) -> dict[int, NDArray]:
 
 
 def of_fingers(body: Body, segment: NDArray, x_rest: NDArray) -> NDArray:
-    """(N,) bool: points (N, 3) [m] at rest, in the root's frame, of segments (N,) that lie beyond the knuckles.
+    """Whether points of segments (N,) lie beyond the knuckles: (N,) bool, from x_rest (N, 3) [m] in the root's frame.
 
-    Where a fist is made there is nothing. What is measured there is the hand's; that nothing is speaks against nobody.
+    A fist leaves these points empty. A measurement there supports the hand, a missing one does not contradict it.
     """
     out = np.zeros(len(segment), bool)
     for s, knuckle in knuckles(body).items():

@@ -1,4 +1,4 @@
-"""One body's surfaces on another's bones."""
+"""Transfer the surfaces of one body to another body with the same segments."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from kinefit.bodies.surfaces import Surface, TaperedCylinder
 
 
 def with_flesh(body: Body, other: Body, usual: Body) -> Body:
-    """A body with the skin of another of the same segments, brought to its own bones, and cylinders as much wider.
+    """Transfer the skin of another body with the same segments, and scale the radii of cylinders accordingly.
 
-    What lies on a segment is stretched as the segment is, then moved with its joint; bones and points stay.
+    The skin of a segment is stretched with the segment, then moved with its joint. Bones and points do not change.
 
     Parameters
     ----------
     body, other : of the same segments and surfaces
-    usual : whose shape the body has: by as much as `other`'s cylinders are wider than its, the body's become wider.
+    usual : body of the shape that `body` has now. The radii of `body` grow by the ratio of `other`'s to its radii.
     """
-    fitted, before = (_on_bones(one, body) for one in (other, usual))
+    fitted, before = (_scaled_to(b, body) for b in (other, usual))
     skin = fitted.skin
     if skin is not None:
         skin = replace(skin, nodes=skin.nodes + (body.tree.rest - fitted.tree.rest)[skin.owners])
@@ -33,9 +33,9 @@ def with_flesh(body: Body, other: Body, usual: Body) -> Body:
     )
 
 
-def _on_bones(one: Body, body: Body) -> Body:
-    own, its = _sizes(body), _sizes(one)
-    return one.scaled(np.where(its > 0.0, own / np.maximum(its, 1e-12), 1.0))
+def _scaled_to(source: Body, body: Body) -> Body:
+    target_sizes, sizes = _sizes(body), _sizes(source)
+    return source.scaled(np.where(sizes > 0.0, target_sizes / np.maximum(sizes, 1e-12), 1.0))
 
 
 def _wider(surface: Surface, made: Surface, usual: Surface) -> Surface:
@@ -47,6 +47,6 @@ def _wider(surface: Surface, made: Surface, usual: Surface) -> Surface:
 
 
 def _sizes(body: Body) -> NDArray:
-    """(G,) [m] how far a group's landmarks lie from their joints, in all."""
+    """Size (G,) [m] of each scale group: the sum of its landmarks' distances from their joints."""
     points, group = body.landmarks, body.segment_scale[body.landmarks.segments]
     return np.bincount(group, np.linalg.norm(points.points, axis=1), len(body.scale_groups))

@@ -1,4 +1,4 @@
-"""A body whose parts all move freely: the elastic model's, whose joints are bands (P2 3.4)."""
+"""A body whose parts move freely: for the elastic model, whose joints are bands (P2 3.4)."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from kinefit.errors import BodyError
 from kinefit.geometry import se3
 
 _SLIDES = ("tx", "ty", "tz")
-_TURNS = ("rz", "rx", "ry")  # in this order: at right angles to each other, locked where an arm is raised sideways
+_TURNS = ("rz", "rx", "ry")  # in this order the gimbal lock is at an arm raised sideways
 _AXES = np.concatenate([np.eye(3), np.eye(3)[[2, 0, 1]]])
 
 
 def free_parts(body: Body) -> Body:
-    """The body cut at its joints: every part has six degrees of freedom, three slides and three turns.
+    """Cut a body at its joints: every part has six degrees of freedom, three translations and three rotations.
 
-    Segments keep their indices, names, surfaces and points; all but the first become children of it. What held the
-    joints together is to come from `correspondences.band_rows`.
+    Segments keep their indices, names, surfaces and points, and all become children of the first.
+    `correspondences.band_rows` replaces the joints.
     """
     tree, count = body.tree, len(body.tree.segments)
     free = 6 * (count - 1)
@@ -46,7 +46,7 @@ def free_parts(body: Body) -> Body:
 
 
 def parts_state(parts: Body, frames: NDArray) -> BodyState:
-    """State of a body of free parts whose segments stand at frames (S, 12), as `KinematicTree.forward` gives them.
+    """State of a body of free parts from its segments' frames (S, 12), see `KinematicTree.forward`.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def parts_state(parts: Body, frames: NDArray) -> BodyState:
     sine = np.clip(turned[:, 2, 1], -1.0, 1.0)  # R = Rz(a) Rx(b) Ry(c)
     a, b = np.arctan2(-turned[:, 0, 1], turned[:, 1, 1]), np.arcsin(sine)
     c = np.arctan2(-turned[:, 2, 0], turned[:, 2, 2])
-    locked = np.abs(sine) > 1.0 - 1e-12  # a and c turn about one axis: all of it is a
+    locked = np.abs(sine) > 1.0 - 1e-12  # gimbal lock: a and c rotate about one axis
     a = np.where(locked, np.arctan2(turned[:, 1, 0], turned[:, 0, 0]), a)
     c = np.where(locked, 0.0, c)
     return BodyState(se3.transform(root, joints[0]), np.column_stack([slides, a, b, c]).ravel())

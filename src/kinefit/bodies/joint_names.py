@@ -1,4 +1,4 @@
-"""Names that skeletons of other programs give their joints: one map for recorded motions and for characters."""
+"""Joint names of other programs' skeletons, mapped to segments: for recorded motions and for characters."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ SIDES = {
     "l": {"s": "l", "S": "L", "Side": "Left", "side": "left"},
     "r": {"s": "r", "S": "R", "Side": "Right", "side": "right"},
 }
-"""What {s}, {S}, {Side} and {side} of a name stand for."""
+"""Values of {s}, {S}, {Side} and {side} in a name."""
 
 LIMBS = ("thigh", "shank", "foot", "toes", "upperarm", "forearm", "hand")
-"""Segments of both sides whose joint is the hip, the knee, ... of a skeleton."""
+"""Segments of both sides, with their joints hip, knee, ankle, ball of the foot, shoulder, elbow, wrist."""
 
 SEGMENTS = ("pelvis", "abdomen", "thorax", "neck", "head") + tuple(
     f"{name}_{side}" for name in ("clavicle", *LIMBS) for side in SIDES
 )
-"""Segments of the humanoid, and the neck, that a joint may move."""
+"""Segments of the humanoid, and the neck, that a joint may be mapped to."""
 
 DIGITS = {
     "thumb": ("metacarpal", "proximal", "distal"),
@@ -32,10 +32,10 @@ DIGITS = {
 """Digits of a hand -> its bones, from the palm to the tip."""
 
 FINGERS = tuple(f"{digit}_{bone}_{side}" for side in SIDES for digit, bones in DIGITS.items() for bone in bones)
-"""Segments of the fingers of `humanoid_hands`, each before the next on its digit; a character may lack any of them."""
+"""Segments of the fingers of `humanoid_hands`, from the palm to the tip; a character may have none."""
 
-MORE = ("head_top",) + tuple(f"{name}_{side}" for name in ("toe_end", "knuckle") for side in SIDES)
-"""Ends of bones that a table of names may name, too."""
+ENDS = ("head_top",) + tuple(f"{name}_{side}" for name in ("toe_end", "knuckle") for side in SIDES)
+"""Ends of bones that a table of names may also contain."""
 
 _NEEDED = ("pelvis", "head") + tuple(
     f"{name}_{side}" for name in ("thigh", "shank", "foot", "upperarm", "forearm", "hand") for side in SIDES
@@ -44,7 +44,7 @@ _NEEDED = ("pelvis", "head") + tuple(
 
 @dataclass(frozen=True, eq=False)
 class NamingConvention:
-    """Joint names of one family of skeletons; {s}, {S}, {Side}, {side} stand for l, L, Left, left.
+    """Joint names of one family of skeletons; {s}, {S}, {Side}, {side} are replaced by l, L, Left, left.
 
     Parameters
     ----------
@@ -52,14 +52,14 @@ class NamingConvention:
     trunk : segment of `SEGMENTS` without a side -> name; "clavicle" with one.
     limbs : names of hip, knee, ankle, ball of the foot, shoulder, elbow, wrist.
     spine : of recorded motions, names of the joints at the sacrum, a third of the way up the spine, at the root of the
-        neck, in the head; those of abdomen, thorax, neck, head where there is none.
+        neck, in the head; default those of abdomen, thorax, neck, head.
     knuckle, toe_end : names of a finger's first joint, of the tip of the toes; None: the first child of hand and toes.
-    hand : names of the joint whose frame turns with the hand (at rest the thumbs are in front), or of two joints, the
-        second one on the thumb's side; none: the wrist's.
-    head_top : name of the top of the head; None where the eyes tell how the head is turned, or else the head's child.
+    hand : name of the joint whose frame rotates with the hand (at rest the thumbs point forward), or of two joints, the
+        second one on the thumb's side; default the wrist.
+    head_top : name of the top of the head; None: the eyes give the orientation of the head, else the head's child.
     eyes : name of the eyes, or None.
-    upright : (forward, up) of the bones "pelvis", "abdomen", "thorax", "head" of a person who stands upright; None
-        where the rest pose of the file is that.
+    upright : (forward, up) of the bones "pelvis", "abdomen", "thorax", "head" of an upright person; None if the rest
+        pose of the file is upright.
     """
 
     name: str
@@ -85,7 +85,7 @@ class NamingConvention:
 
     @property
     def recorded(self) -> dict[str, str]:
-        """What a joint is, as in `Recorded` -> its name, of recorded motions."""
+        """Role of a joint, see `Recorded` -> its name, in recorded motions."""
         spine = self.spine or tuple(self.trunk[segment] for segment in ("abdomen", "thorax", "neck", "head"))
         out = dict(zip(("sacrum", "spine", "neck", "head"), spine))
         ends = {"knuckle": self.knuckle, "toe_end": self.toe_end, "eye": self.eyes}
@@ -96,7 +96,7 @@ class NamingConvention:
 
 
 def _trunk(*names: str) -> dict[str, str]:
-    """Names of pelvis, abdomen, thorax, neck, head, clavicle; "" where there is none."""
+    """Names of pelvis, abdomen, thorax, neck, head, clavicle; "" for none."""
     return {segment: name for segment, name in zip((*SEGMENTS[:5], "clavicle"), names) if name}
 
 
@@ -160,11 +160,11 @@ FAMILIES = (
         knuckle="f_middle.01.{S}",
     ),
 )  # fmt: skip
-"""Known families; those of `conventions`, which the body files name, come beside them."""
+"""Known families; `conventions` adds those of the body files."""
 
 
 def _fingers(pattern: str, digits: str, bones: str = "1 2 3", thumb: str = "") -> dict[str, str]:
-    """Segment of `FINGERS` -> name, of a pattern in which * stands for the digit and # for its bone."""
+    """Segment of `FINGERS` -> name, from a pattern with * for the digit and # for its bone."""
     out = dict[str, str]()
     for (digit, segments), word in zip(DIGITS.items(), digits.split()):
         for segment, number in zip(segments, (thumb if thumb and digit == "thumb" else bones).split(" ")):
@@ -175,7 +175,7 @@ def _fingers(pattern: str, digits: str, bones: str = "1 2 3", thumb: str = "") -
 
 _UNITY = "Proximal Intermediate Distal"
 VRM0_FINGERS = _fingers("{side}*#", "Thumb Index Middle Ring Little", _UNITY)
-"""Names of VRM 0 and of Unity's humanoid, which call the thumb's metacarpal its proximal bone."""
+"""Names of VRM 0 and of Unity's humanoid, in which "proximal" is the thumb's metacarpal."""
 VRM1_FINGERS = _fingers("{side}*#", "Thumb Index Middle Ring Little", _UNITY, "Metacarpal Proximal Distal")
 """Names of VRM 1."""
 
@@ -193,7 +193,7 @@ _FINGER_NAMES = (
 
 @cache
 def conventions() -> tuple[NamingConvention, ...]:
-    """`FAMILIES`, and the conventions under which motions are exported ("mixamo", "hanim", ...)."""
+    """`FAMILIES`, and the conventions in which motions are exported ("mixamo", "hanim", ...)."""
     out = list(FAMILIES)
     body = read_toml_body("humanoid_hands")
     for name, names in {**body.aliases, "kinefit": {s: s for s in body.tree.segments}}.items():
@@ -203,7 +203,7 @@ def conventions() -> tuple[NamingConvention, ...]:
 
 @dataclass(frozen=True, eq=False)
 class _ExplicitNaming(NamingConvention):
-    """A family whose `trunk` tells the joints of limbs, too."""
+    """A family whose `trunk` contains the joints of limbs too."""
 
     limbs: tuple[str, ...] = ()
 
@@ -213,7 +213,7 @@ class _ExplicitNaming(NamingConvention):
 
     @property
     def recorded(self) -> dict[str, str]:
-        """Of what kinefit exported: the head's joint is at the root of the neck; ends of bones are the joints' own."""
+        """Roles in kinefit's exports: the head's joint is at the root of the neck, and bones have no end points."""
         out = {"sacrum": "abdomen", "spine": "thorax", "neck": "head", "head": "head"}
         out |= {segment: segment for segment in self.joints if segment.rpartition("_")[0] in LIMBS}
         return {role: self.trunk[segment] for role, segment in out.items()}
@@ -221,14 +221,14 @@ class _ExplicitNaming(NamingConvention):
 
 @cache  # characters have up to 20,000 nodes, each compared with some 800 names
 def plain(name: str) -> str:
-    """A name without namespace, program's prefix, capitals and separators: "mixamorig1:LeftArm" is "leftarm"."""
+    """Normalise a name: no namespace, program's prefix, capitals, separators; "mixamorig1:LeftArm" is "leftarm"."""
     last = re.split(r"[:|]", name)[-1]
     last = re.sub(r"(?i)^(mixamorig\d*|bip0*1|def)[ _\-]", "", last)
     return re.sub(r"[\s_.\-]+", "", last).lower()
 
 
 def find(names: Sequence[str], name: str) -> int | None:
-    """Index of a joint: of exactly that name, or the first that differs in prefix, capitals or separators only."""
+    """Index of the joint of that name, or the first that differs only in prefix, capitals or separators; else None."""
     if name in names:
         return list(names).index(name)
     key = plain(name)
@@ -236,41 +236,41 @@ def find(names: Sequence[str], name: str) -> int | None:
 
 
 def joint_map(names: Sequence[str], table: Mapping[str, str] | None = None, *, source: str = "") -> dict[str, int]:
-    """Which joint of a character moves which segment.
+    """Map the joints of a character to segments by their names.
 
     Parameters
     ----------
     names : (J,) of the joints.
     table : segment of `SEGMENTS`, `FINGERS` or `FACE` -> name of a joint, optional
-        Goes before what the names tell.
+        Overrides the conventions.
     source : str
         File of the character, for messages.
 
     Returns
     -------
     segment -> index of the joint
-        Of `FINGERS` those that one convention names most of, whichever the other joints follow.
+        `FINGERS` follow the convention with most matches, whatever the convention of the other joints.
 
     Raises
     ------
     BodyError
-        A table that names what there is not; joints that a person needs are not there: they are named.
+        A table with an unknown joint, a joint named twice, or a skeleton without the required joints.
     """
-    told = {}
+    explicit_joints = {}
     for segment, name in (table or {}).items():
         index = find(names, name)
         if index is None:
             raise BodyError(choices("joint", name, names), file=source or None, place=f"table of names, {segment}")
         if segment in (*SEGMENTS, *FINGERS, *FACE):
-            told[segment] = index
+            explicit_joints[segment] = index
     found = [
-        (family, {s: i for s, n in family.joints.items() if (i := find(names, n)) is not None} | told)
+        (family, {s: i for s, n in family.joints.items() if (i := find(names, n)) is not None} | explicit_joints)
         for family in conventions()
     ]
     family, best = max(found, key=lambda pair: (-len(lacking(pair[1])), len(pair[1])))
-    if lost := lacking(best):
+    if missing := lacking(best):
         wanted = [f"{segment} ('{family.joints[segment]}' in {family.name})" if segment in family.joints else segment
-                  for segment in lost]  # fmt: skip
+                  for segment in missing]  # fmt: skip
         known = ", ".join(family.name for family in FAMILIES)
         remedy = f"Name its joints by a table (--names-table), or as one of: {known}. It has: {', '.join(names)}"
         raise BodyError(f"the character has no joint for {', '.join(wanted)}", file=source or None, remedy=remedy)
@@ -286,7 +286,7 @@ def joint_map(names: Sequence[str], table: Mapping[str, str] | None = None, *, s
 
 
 def lacking(segments: Iterable[str]) -> list[str]:
-    """Segments that a character needs and that are not among some."""
+    """Required segments that are missing."""
     there = set(segments)
     return [segment for segment in _NEEDED if segment not in there]
 
@@ -298,10 +298,10 @@ class Recorded:
     Parameters
     ----------
     family : str
-    joints : what a joint is -> its index
-        "sacrum", "spine", "neck", "head", of both sides `LIMBS`; where they are there "head_top", "knuckle_l",
-        "toe_end_l", "eye_l", "palm_l" (its frame turns with the hand), "thumb_l" (then "palm_l" is on the other side).
-    upright : as of `NamingConvention`.
+    joints : role of a joint -> its index
+        "sacrum", "spine", "neck", "head", of both sides `LIMBS`; optional "head_top", "knuckle_l", "toe_end_l",
+        "eye_l", "palm_l" (its frame rotates with the hand), "thumb_l" (then "palm_l" is on the other side).
+    upright : see `NamingConvention`.
     """
 
     family: str
@@ -310,27 +310,27 @@ class Recorded:
 
 
 def recorded_joints(names: Sequence[str], table: Mapping[str, str] | None = None, *, source: str = "") -> Recorded:
-    """What the joints of a recorded skeleton are, by their names; by a table alone where one is given.
+    """Map the joints of a recorded skeleton to their roles by their names, or by a table alone if given.
 
-    Names are those of `FAMILIES`, or else of a convention under which kinefit exports.
+    Names are those of `FAMILIES`, or of a convention in which kinefit exports.
 
     Parameters
     ----------
     names : (J,) of the joints.
-    table : segment of `SEGMENTS`, or one of `MORE` -> name of a joint, optional
+    table : segment of `SEGMENTS`, or one of `ENDS` -> name of a joint, optional
     source : str
         File of the skeleton, for messages.
 
     Raises
     ------
     ObservationError
-        No family fits; the message tells which joints lack for the nearest one.
+        No family fits; the message names the joints missing for the nearest one.
     """
     if table:
         family = NamingConvention("table of names", {}, ())
         wanted = {"sacrum": table.get("abdomen", table.get("pelvis", "")), "spine": table.get("thorax", ""), **table}
-        known = ("sacrum", "spine", "neck", "head", *(f"{limb}_{side}" for limb in LIMBS for side in SIDES), *MORE)
-        wanted = {role: wanted.get(role, "") for role in known if role not in MORE or role in wanted}
+        known = ("sacrum", "spine", "neck", "head", *(f"{limb}_{side}" for limb in LIMBS for side in SIDES), *ENDS)
+        wanted = {role: wanted.get(role, "") for role in known if role not in ENDS or role in wanted}
     else:
         short = {family: [n for n in family.recorded.values() if find(names, n) is None] for family in FAMILIES}
         exact = {family: sum(n not in names for n in family.recorded.values()) for family in FAMILIES}
@@ -339,12 +339,12 @@ def recorded_joints(names: Sequence[str], table: Mapping[str, str] | None = None
         own = (f for f in exported if all(find(names, n) is not None for n in f.recorded.values()))
         family = next(own, family) if short[family] else family
         wanted = family.recorded
-    lost = {role: name for role, name in wanted.items() if find(names, name) is None}
-    if lost:
+    missing = {role: name for role, name in wanted.items() if find(names, name) is None}
+    if missing:
         of = f"of no known family ({', '.join(f.name for f in FAMILIES)}); for '{family.name}' it"
-        words = [f"{name or 'no name'} ({role})" if table else name for role, name in lost.items()]
-        told = ", ".join(dict.fromkeys(words))
+        words = [f"{name or 'no name'} ({role})" if table else name for role, name in missing.items()]
+        lacks = ", ".join(dict.fromkeys(words))
         remedy = "Rename its joints to those of a known family, or name them by --names-table."
-        problem = f"the skeleton is {of} lacks: {told}" if not table else f"for the table of names it lacks: {told}"
+        problem = f"the skeleton is {of} lacks: {lacks}" if not table else f"for the table of names it lacks: {lacks}"
         raise ObservationError(problem, file=source or None, remedy=remedy)
     return Recorded(family.name, {role: find(names, name) or 0 for role, name in wanted.items()}, family.upright)

@@ -1,4 +1,4 @@
-"""Limbs of a body: chains of segments from where the tree branches to its leaves."""
+"""Limbs of a body: chains of segments from a branch of the tree to a leaf."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from numpy.typing import NDArray
 
 from kinefit.bodies.body import Body
 
-_MAX_BRANCHES = 4  # of a trunk; what forks into more, none of which forks again, is a hand
+_MAX_BRANCHES = 4  # of a trunk segment; one with more, none of which branches again, is a hand
 
 FACE = {
     "jaw": ("jaw", "CC_Base_JawRoot", "temporomandibular"),
     "eye_l": ("leftEye", "eye.L", "CC_Base_L_Eye", "l_eyeball_joint"),
     "eye_r": ("rightEye", "eye.R", "CC_Base_R_Eye", "r_eyeball_joint"),
 }
-"""Segments of the face of `humanoid_face` -> names in VRM, Rigify, iClone, H-Anim; a character may lack any."""
+"""Segments of the face of `humanoid_face` -> names in VRM, Rigify, iClone, H-Anim; a character may have none."""
 
 
 def limbs(body: Body) -> tuple[tuple[int, ...], ...]:
-    """Segments from each leaf up to where the tree branches, the nearest to the trunk first; fingers with their arm."""
+    """Segments of each limb, from a branch of the tree to a leaf; fingers belong to their arm."""
     parents = body.tree.parents
     children, hand = _children(parents), _is_hand(parents)
     out: dict[int, list[int]] = {}
@@ -33,7 +33,7 @@ def limbs(body: Body) -> tuple[tuple[int, ...], ...]:
 
 
 def finger_groups(body: Body) -> dict[str, tuple[str, ...]]:
-    """Name of a hand -> names of all segments below it, of hands that fork into fingers."""
+    """Names of all finger segments {hand: segments}, of hands with fingers."""
     tree = body.tree
     of = np.where(_is_hand(tree.parents), np.arange(len(tree.parents)), -1)
     for s, parent in enumerate(tree.parents):  # parents come first
@@ -46,15 +46,15 @@ def finger_groups(body: Body) -> dict[str, tuple[str, ...]]:
 
 
 def _children(parents: NDArray) -> NDArray:
-    """(S,) how many segments hang on each."""
+    """Number (S,) of children of each segment."""
     return np.bincount(parents[parents >= 0], minlength=len(parents))
 
 
 def _is_hand(parents: NDArray) -> NDArray:
-    """(S,) bool."""
+    """Whether each segment (S,) is a hand; bool."""
     children = _children(parents)
     forks = children > 1
-    below = np.zeros(len(parents), bool)  # whether anything below forks; parents come first
+    below = np.zeros(len(parents), bool)  # whether a descendant branches; parents come first
     for s in range(len(parents) - 1, 0, -1):
         if parents[s] >= 0:
             below[parents[s]] |= forks[s] | below[s]

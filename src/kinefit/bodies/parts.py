@@ -1,6 +1,6 @@
-"""A body that changes while it is tracked: parts added and taken away, surfaces replaced, its state carried over.
+"""Change a body while it is tracked: add and remove parts, replace surfaces, convert its state.
 
-New parts stand behind all others, so that indices of segments and coordinates stay as they were.
+New parts are appended, so that indices of segments and coordinates do not change.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ _SIDES = ((0, 4, 6, 2), (1, 3, 7, 5), (0, 1, 5, 4), (2, 6, 7, 3), (0, 2, 3, 1), 
 
 @dataclass(frozen=True)
 class PartJoint:
-    """How a part hangs on its parent; without coordinates it is fixed to it.
+    """Joint between a part and its parent; without coordinates the part is fixed.
 
     Parameters
     ----------
     at : (3,) [m] joint centre in the parent's frame.
     coordinates : (k,) names
     axes : (k, 3) directions in the root-aligned rest frame
-    slides : (k,) bool, along its axis instead of turning about it; default none.
-    lower, upper : (k,) [rad] or [m], default without limits.
-    usual, spread : (k,) [rad] or [m], default 0 and no prior.
+    slides : (k,) bool, whether it slides along its axis instead of rotating about it; default none.
+    lower, upper : (k,) [rad] or [m], default no limits.
+    usual, spread : (k,) [rad] or [m], mean and standard deviation of the prior; default 0 and no prior.
     """
 
     at: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -57,19 +57,21 @@ def with_part(
     joint: PartJoint | None = None,
     landmarks: dict[str, tuple[float, float, float]] | None = None,
 ) -> Body:
-    """The body with one more segment: a carried box, a ski, a tool.
+    """Add a segment to a body: a carried box, a ski, a tool.
 
     Parameters
     ----------
+    body : Body
+    name : of the new segment.
     parent : name of the segment that holds it.
-    surfaces : one or several; the `segment` that they name is replaced by the new one.
+    surfaces : one or several; their `segment` is set to the new one.
     joint : PartJoint, default fixed at the parent's joint.
     landmarks : name -> (3,) [m] in the part's frame, which is aligned with the root's at rest.
 
     Raises
     ------
     BodyError
-        A name that is taken, a parent that is not there, a joint whose numbers do not fit together.
+        A name that exists, an unknown parent, a joint with inconsistent or invalid numbers.
     """
     joint, tree = joint or PartJoint(), body.tree
     for what, new, old in (
@@ -87,7 +89,7 @@ def with_part(
         raise BodyError("a landmark is not finite", place=f"part {name}", remedy="Give three numbers in metres.")
     return replace(
         body,
-        tree=_grown(tree, name, tree.segment(parent), joint),
+        tree=_with_segment(tree, name, tree.segment(parent), joint),
         joints=(*body.joints, f"{name}_joint"),
         scale_groups=(*body.scale_groups, _free_name(name, body.scale_groups)),
         segment_scale=np.append(body.segment_scale, len(body.scale_groups)),
@@ -101,47 +103,49 @@ def with_part(
 
 
 def without_part(body: Body, name: str) -> Body:
-    """The body without a segment and all that is on it: surfaces, landmarks, keypoints, markers, coordinates.
+    """Remove a segment with its surfaces, landmarks, keypoints, markers and coordinates.
 
     Raises
     ------
     BodyError
-        A name that is not there, the root, a segment that others hang on, or a body with a skin.
+        An unknown name, the root, a segment with children, or a body with a skin.
     """
     tree = body.tree
     if body.skin is not None:
         raise BodyError("a body with a skin keeps its parts", place=f"part {name}", remedy="Leave out the skin first.")
-    gone = tree.segment(name)
-    if gone == 0:
+    removed = tree.segment(name)
+    if removed == 0:
         raise BodyError(f"'{name}' is the root", place=f"part {name}", remedy="Every body has one; track another body.")
-    children = [s for s, p in zip(tree.segments, tree.parents) if p == gone]
+    children = [s for s, p in zip(tree.segments, tree.parents) if p == removed]
     if children:
         remedy = "Take those away first, the last of the chain before the others."
         raise BodyError(f"{', '.join(children)} hang on it", place=f"part {name}", remedy=remedy)
-    stay = np.arange(len(tree.segments)) != gone
-    used = sorted(set(body.segment_scale[stay].tolist()))
-    landmarks = _left(body.landmarks, gone)
+    kept = np.arange(len(tree.segments)) != removed
+    used = sorted(set(body.segment_scale[kept].tolist()))
+    landmarks = _remaining_points(body.landmarks, removed)
     return replace(
         body,
-        tree=_shrunk(tree, gone),
-        joints=tuple(j for j, keep in zip(body.joints, stay) if keep),
+        tree=_without_segment(tree, removed),
+        joints=tuple(j for j, keep in zip(body.joints, kept) if keep),
         scale_groups=tuple(body.scale_groups[g] for g in used),
-        segment_scale=np.searchsorted(used, body.segment_scale[stay]),
+        segment_scale=np.searchsorted(used, body.segment_scale[kept]),
         landmarks=landmarks,
-        keypoint_sets={n: _left(p, gone) for n, p in body.keypoint_sets.items()},
-        marker_sets={n: _left(p, gone) for n, p in body.marker_sets.items()},
-        surfaces=tuple(replace(s, segment=s.segment - (s.segment > gone)) for s in body.surfaces if s.segment != gone),
+        keypoint_sets={n: _remaining_points(p, removed) for n, p in body.keypoint_sets.items()},
+        marker_sets={n: _remaining_points(p, removed) for n, p in body.marker_sets.items()},
+        surfaces=tuple(
+            replace(s, segment=s.segment - (s.segment > removed)) for s in body.surfaces if s.segment != removed
+        ),
         aliases={c: {s: n for s, n in names.items() if s != name} for c, names in body.aliases.items()},
-        morphs=tuple(m for m in body.morphs if not _is_about(m, name, tree.coordinates, tree.owners == gone)),
+        morphs=tuple(m for m in body.morphs if not _is_about(m, name, tree.coordinates, tree.owners == removed)),
         closures=without_landmarks(body.closures, landmarks.names),
         dimensions=tuple(d for d in body.dimensions if name not in d.moves),
     )
 
 
 def with_surfaces(body: Body, segment: str, surfaces: Surface | Sequence[Surface]) -> Body:
-    """The body with other surfaces of one segment; none for a segment that is not to be seen.
+    """Replace the surfaces of one segment; an empty sequence makes it invisible.
 
-    The `segment` that the surfaces name is replaced by this one.
+    The surfaces' `segment` is set to this one.
     """
     here = body.tree.segment(segment)
     new = [surfaces] if isinstance(surfaces, Surface) else list(surfaces)
@@ -151,7 +155,13 @@ def with_surfaces(body: Body, segment: str, surfaces: Surface | Sequence[Surface
 
 
 def box(size: tuple[float, float, float], centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> MeshSurface:
-    """A box of a size (3,) [m] about a centre (3,) [m], along the axes of its segment's frame."""
+    """A box of a size (3,) [m] about a centre (3,) [m], along the axes of its segment's frame.
+
+    Raises
+    ------
+    BodyError
+        A size that is not three positive numbers.
+    """
     sides = np.asarray(size, float)
     if sides.shape != (3,) or not (np.isfinite(sides).all() and sides.min() > 0):
         raise BodyError(f"a box of the size {size}", remedy="Give three positive lengths in metres.")
@@ -161,7 +171,7 @@ def box(size: tuple[float, float, float], centre: tuple[float, float, float] = (
 
 
 def carry_state(state: BodyState, old: Body, new: Body) -> BodyState:
-    """A state of one body as that of another: angles by their names, new ones as usual; so that a tracker goes on.
+    """Convert a state from one body to another by the names of its angles; new ones get their default value.
 
     Raises
     ------
@@ -177,7 +187,22 @@ def carry_state(state: BodyState, old: Body, new: Body) -> BodyState:
 
 
 def carry_dofs(values: NDArray, old: Body, new: Body, *, missing: float = 0.0) -> NDArray:
-    """(6 + D_new,) values of degrees of freedom (velocities, deviations) by name; `missing` for new ones."""
+    """Convert values of degrees of freedom (velocities, deviations) to another body, by name.
+
+    Parameters
+    ----------
+    values : (6 + D,) of the old body
+    missing : float, value of new degrees of freedom
+
+    Returns
+    -------
+    (6 + E,) of the new body
+
+    Raises
+    ------
+    BodyError
+        Values of another shape.
+    """
     if np.shape(values) != (old.tree.n_dofs,):
         problem = f"values of shape {np.shape(values)} for {old.tree.n_dofs} degrees of freedom"
         raise BodyError(problem, remedy="Give one for each of the old body's.")
@@ -186,11 +211,11 @@ def carry_dofs(values: NDArray, old: Body, new: Body, *, missing: float = 0.0) -
 
 
 def _is_about(morph: Operator, segment: str, coordinates: tuple[str, ...], own: NDArray) -> bool:
-    """Whether a morph is of a segment, or steered by one of its own coordinates."""
+    """Whether a morph acts on a segment, or depends on one of its coordinates."""
     return getattr(morph, "segment", None) == segment or own[coordinates.index(morph.steering.coordinate)]
 
 
-def _grown(tree: KinematicTree, name: str, parent: int, joint: PartJoint) -> KinematicTree:
+def _with_segment(tree: KinematicTree, name: str, parent: int, joint: PartJoint) -> KinematicTree:
     k = len(joint.coordinates)
     axes, at = np.array(joint.axes, float).reshape(-1, 3), np.array(joint.at, float)
     columns = {
@@ -200,9 +225,9 @@ def _grown(tree: KinematicTree, name: str, parent: int, joint: PartJoint) -> Kin
         "usual": np.array(joint.usual or (0.0,) * k, float),
         "spread": np.array(joint.spread or (np.inf,) * k, float),
     }
-    odd = [n for n, v in columns.items() if len(v) != k] + ["axes"] * (len(axes) != k)
-    if odd:
-        problem = f"{odd[0]} of its joint do not match its {k} coordinates"
+    mismatched = [n for n, v in columns.items() if len(v) != k] + ["axes"] * (len(axes) != k)
+    if mismatched:
+        problem = f"{mismatched[0]} of its joint do not match its {k} coordinates"
         raise BodyError(problem, place=f"part {name}", remedy="Give one for each coordinate.")
     length = np.linalg.norm(axes, axis=1)
     if not (np.isfinite(length).all() and (length > 1e-9).all() and at.shape == (3,) and np.isfinite(at).all()):
@@ -229,16 +254,16 @@ def _grown(tree: KinematicTree, name: str, parent: int, joint: PartJoint) -> Kin
     )
 
 
-def _shrunk(tree: KinematicTree, gone: int) -> KinematicTree:
-    stay, own = np.arange(len(tree.segments)) != gone, tree.owners != gone
-    parents, owners = tree.parents[stay], tree.owners[own]
+def _without_segment(tree: KinematicTree, removed: int) -> KinematicTree:
+    kept, own = np.arange(len(tree.segments)) != removed, tree.owners != removed
+    parents, owners = tree.parents[kept], tree.owners[own]
     return replace(
         tree,
-        segments=tuple(s for s, keep in zip(tree.segments, stay) if keep),
-        parents=parents - (parents > gone),
-        offsets=tree.offsets[stay],
+        segments=tuple(s for s, keep in zip(tree.segments, kept) if keep),
+        parents=parents - (parents > removed),
+        offsets=tree.offsets[kept],
         coordinates=tuple(c for c, keep in zip(tree.coordinates, own) if keep),
-        owners=owners - (owners > gone),
+        owners=owners - (owners > removed),
         axes=tree.axes[own],
         prismatic=tree.prismatic[own],
         lower=tree.lower[own],
@@ -249,11 +274,11 @@ def _shrunk(tree: KinematicTree, gone: int) -> KinematicTree:
     )
 
 
-def _left(points: PointSet, gone: int) -> PointSet:
-    stay = points.segments != gone
-    segments = points.segments[stay]
-    names = tuple(n for n, keep in zip(points.names, stay) if keep)
-    return PointSet(names, segments - (segments > gone), points.points[stay])
+def _remaining_points(points: PointSet, removed: int) -> PointSet:
+    kept = points.segments != removed
+    segments = points.segments[kept]
+    names = tuple(n for n, keep in zip(points.names, kept) if keep)
+    return PointSet(names, segments - (segments > removed), points.points[kept])
 
 
 def _free_name(name: str, taken: tuple[str, ...]) -> str:

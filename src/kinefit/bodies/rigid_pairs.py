@@ -1,4 +1,4 @@
-"""Pairs of a body's points that stay as far apart as they are."""
+"""Pairs of a body's points with a constant distance."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from kinefit.bodies.body import Body, PointSet
 
 
 def rigid_pairs(body: Body, points: PointSet) -> list[tuple[int, int, int, float]]:
-    """Pairs of points whose distance no angle changes: (point, point, scale group, distance at rest [m]).
+    """Pairs of points on one segment, whose distance is constant: (point, point, scale group, distance at rest [m]).
 
     A point at a joint's centre belongs to both segments there.
     """

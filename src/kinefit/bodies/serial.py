@@ -1,4 +1,4 @@
-"""Body as plain arrays, exactly: for files that hold a fitted body beside its motion.
+"""Convert a body to plain arrays and back, without loss: for files that hold a fitted body with its motion.
 
 S segments, D coordinates, G scale groups; names are arrays of text, indices int64, the rest float64, in metres and
 radians:
@@ -8,8 +8,8 @@ radians:
     offsets (S, 3)                                     joint centre in the parent's frame at rest [m]
     coordinates (D,)  owners (D,)  axes (D, 3)         owners: segment moved; axes in the root-aligned rest frame
     prismatic (D,)  lower (D,)  upper (D,)             limits [rad] or [m], ±inf for none
-    usual, spread (D,)                                 common posture and usual departure from it [rad] or [m]
-    couplings (C, D)                                   departures that go together [1/rad] or [1/m]; may be missing
+    usual, spread (D,)                                 mean and standard deviation of the posture prior [rad] or [m]
+    couplings (C, D)                                   correlated deviations [1/rad] or [1/m]; may be missing
     scale_groups (G,)  segment_scale (S,)
     landmarks/names (K,)  landmarks/segments (K,)  landmarks/points (K, 3)    in the segment's frame [m]
     keypoints/SET/names, segments, points              as the landmarks, one of these for every set
@@ -18,7 +18,7 @@ radians:
     surfaces/starts, ends, sides (C, 3)                in the segment's frame [m]; sides: directions
     surfaces/radii (C, 2, 2)                           half axes at both ends [m]
     surfaces/K/vertices (V, 3), faces (T, 3)           of surface K where it is a mesh [m]
-    aliases/CONVENTION (N, 2)                          pairs: segment, name there
+    aliases/CONVENTION (N, 2)                          pairs: segment, name in the convention
     morphs/..., skin/...                               see `serial_morphs`
     closures, dimensions                               each as JSON, fields as of `closures`; may be missing
 
@@ -58,7 +58,7 @@ _TREE = ("parents", "offsets", "owners", "axes", "prismatic", "lower", "upper", 
 
 
 def body_to_arrays(body: Body) -> dict[str, NDArray]:
-    """Arrays of a body, keyed as the module tells."""
+    """Convert a body to arrays, with the keys of the module's docstring, such as offsets (S, 3) [m]."""
     tree = body.tree
     out: dict[str, NDArray] = {
         "name": np.array(body.name),
@@ -77,9 +77,9 @@ def body_to_arrays(body: Body) -> dict[str, NDArray]:
     for kind, sets in (("keypoints", body.keypoint_sets), ("markers", body.marker_sets)):
         for name, points in sets.items():
             out |= _points_to_arrays(f"{kind}/{quote(name, safe='')}", points)
-    for one in ("closures", "dimensions"):
-        if getattr(body, one):
-            out[one] = text_array([msgspec.json.encode(each).decode() for each in getattr(body, one)])
+    for key in ("closures", "dimensions"):
+        if getattr(body, key):
+            out[key] = text_array([msgspec.json.encode(record).decode() for record in getattr(body, key)])
     for convention, names in body.aliases.items():
         pairs = [text_array(names), text_array(names.values())]
         out[f"aliases/{quote(convention, safe='')}"] = np.stack(pairs, axis=1)
@@ -87,12 +87,12 @@ def body_to_arrays(body: Body) -> dict[str, NDArray]:
 
 
 def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
-    """Body of such arrays.
+    """Body from arrays with the keys of the module's docstring, such as offsets (S, 3) [m].
 
     Raises
     ------
     BodyError
-        An array is missing, has the wrong shape, or names a segment that is not there.
+        An array is missing, has the wrong shape, or an index out of range.
     """
     n_segments, n_coordinates = len(_array(arrays, "segments", (None,))), len(_array(arrays, "coordinates", (None,)))
     shapes = {"offsets": (n_segments, 3), "axes": (n_coordinates, 3), "parents": (n_segments,)}
@@ -140,7 +140,7 @@ def save_body(body: Body, path: str | PathLike[str]) -> None:
     Raises
     ------
     BodyError
-        A name that does not end in .npz, or a file that cannot be written; then an older one stays.
+        A name that does not end in .npz, or a file that cannot be written; an older file is then kept.
     """
     target = Path(path)
     if target.suffix != ".npz":
@@ -156,12 +156,12 @@ def save_body(body: Body, path: str | PathLike[str]) -> None:
 
 
 def saved_body(path: str | PathLike[str]) -> Body:
-    """The body that `save_body` wrote.
+    """Load a body that `save_body` wrote.
 
     Raises
     ------
     BodyError
-        A file that cannot be read, or does not hold a body.
+        A file that cannot be read, or that holds no body.
     """
     remedy = "Give a file written by save_body, or a body file in TOML."
     arrays = read_npz(path, remedy=remedy, error=BodyError)
@@ -174,11 +174,11 @@ def saved_body(path: str | PathLike[str]) -> Body:
 
 
 def text_array(names: object) -> NDArray:
-    """(N,) array of text, also for no names at all."""
+    """Array (N,) of text, also for N = 0."""
     return np.array(list(names), dtype=np.str_)  # type: ignore[call-overload]
 
 
-_BALLS = ("centres", "radii", "weights", "axes")
+_BALL_FIELDS = ("centres", "radii", "weights", "axes")
 
 
 def _surfaces_to_arrays(surfaces: tuple[Surface, ...]) -> dict[str, NDArray]:
@@ -192,7 +192,7 @@ def _surfaces_to_arrays(surfaces: tuple[Surface, ...]) -> dict[str, NDArray]:
                 out[f"surfaces/{name}"][k] = getattr(surface, name[:-1])
             out["surfaces/radii"][k] = surface.radii
         elif isinstance(surface, Metaballs):
-            out |= {f"surfaces/{k}/{name}": np.array(getattr(surface, name)) for name in _BALLS}
+            out |= {f"surfaces/{k}/{name}": np.array(getattr(surface, name)) for name in _BALL_FIELDS}
         else:
             out |= {f"surfaces/{k}/{name}": np.array(getattr(surface, name)) for name in ("vertices", "faces")}
     return out
@@ -203,7 +203,7 @@ def _surfaces_from_arrays(arrays: Mapping[str, NDArray], n_segments: int) -> tup
     _check_indices(owners, n_segments, "surfaces/segments")
     count, out = len(owners), list[Surface]()
     ends = _array(arrays, "surfaces/ends", (count, 3))
-    if "surfaces/starts" not in arrays:  # files of before there were ellipses: two radii, from the joint
+    if "surfaces/starts" not in arrays:  # older files, with round cylinders: two radii, from the joint
         radii = _array(arrays, "surfaces/radii", (count, 2))
         return tuple(TaperedCylinder.round(int(s), e, (r[0], r[1])) for s, e, r in zip(owners, ends, radii))
     starts, sides = (_array(arrays, f"surfaces/{name}", (count, 3)) for name in ("starts", "sides"))
@@ -211,7 +211,7 @@ def _surfaces_from_arrays(arrays: Mapping[str, NDArray], n_segments: int) -> tup
     for k, segment in enumerate(owners):
         if f"surfaces/{k}/centres" in arrays:
             shapes = (None, 3), (None, 3), (None,), (None, 3, 3)
-            balls = [_array(arrays, f"surfaces/{k}/{name}", shape) for name, shape in zip(_BALLS, shapes)]
+            balls = [_array(arrays, f"surfaces/{k}/{name}", shape) for name, shape in zip(_BALL_FIELDS, shapes)]
             out.append(Metaballs.of(int(segment), *balls))
         elif f"surfaces/{k}/vertices" in arrays:
             vertices, faces = (_array(arrays, f"surfaces/{k}/{name}", (None, 3)) for name in ("vertices", "faces"))
@@ -244,7 +244,7 @@ def _sets(arrays: Mapping[str, NDArray], kind: str, n_segments: int) -> dict[str
 
 
 def _decoded(arrays: Mapping[str, NDArray], key: str, kind: type[_Kind]) -> tuple[_Kind, ...]:
-    """Closures or dimensions; none in older files."""
+    """Closures or dimensions from JSON; empty for older files."""
     if key not in arrays:
         return ()
     try:
@@ -266,8 +266,8 @@ def _array(arrays: Mapping[str, NDArray], key: str, shape: tuple[int | None, ...
         raise BodyError(f"no array '{key}'")
     array = arrays[key]
     if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape)):
-        told = ", ".join("any" if n is None else str(n) for n in shape)
-        raise BodyError(f"array '{key}' has shape {array.shape} instead of ({told})")
+        expected = ", ".join("any" if n is None else str(n) for n in shape)
+        raise BodyError(f"array '{key}' has shape {array.shape} instead of ({expected})")
     return array
 
 

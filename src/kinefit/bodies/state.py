@@ -1,4 +1,4 @@
-"""BodyState: where a body is at one time."""
+"""BodyState: the pose of a body at one time."""
 
 from __future__ import annotations
 
@@ -38,9 +38,14 @@ class BodyState:
             object.__setattr__(self, name, array)
 
     def retract(self, delta: NDArray, bounds: tuple[NDArray, NDArray] | None = None) -> BodyState:
-        """State moved by δ (6 + D,): the root's twist (v, ω) in the world about its own origin, then the angles.
+        """Move the state by δ (6 + D,): the root's twist (v, ω) [m, rad] in the world about its origin, then angles.
 
-        `bounds` are the lower and upper ends (D,) that the angles are kept within; a δ of another length is a BodyError
+        bounds: lower and upper limits (D,) to which the angles are clipped; default none.
+
+        Raises
+        ------
+        BodyError
+            A δ of another length.
         """
         root, angles = np.empty((4, 4)), np.empty(len(self.angles))
         if bounds is None:

@@ -26,7 +26,7 @@ def _frozen(array: object, dtype: type = float) -> NDArray:
 
 
 def _paths(parent: NDArray) -> tuple[NDArray, NDArray]:
-    """What stands from the first down to each of n (n, m), then -1, and its number (n,), from the next above (n,)."""
+    """Paths (n, m) from the first node to each one, padded with -1, and their depths (n,), from each parent (n,)."""
     depth = np.zeros(len(parent), np.int64)
     for k in range(1, len(parent)):
         depth[k] = depth[parent[k]] + 1
@@ -49,16 +49,16 @@ class KinematicTree:
     offsets : (S, 3) [m] joint centre in the parent's frame at rest (zero for the root).
     coordinates : (D,) names of the joint angles (and prismatic lengths).
     owners : (D,) index of the segment that each coordinate moves.
-    axes : (D, 3) unit axes in the root-aligned rest frame; a positive angle turns right-handed about it.
-    prismatic : (D,) bool, slides along its axis instead of turning.
-    lower, upper : (D,) [rad] or [m], limits; ±inf where there are none.
+    axes : (D, 3) unit axes in the root-aligned rest frame; a positive angle is a right-handed rotation.
+    prismatic : (D,) bool, whether a coordinate slides along its axis instead of rotating about it.
+    lower, upper : (D,) [rad] or [m], limits; ±inf for none.
     usual, spread : (D,) [rad] or [m]
-        A common posture and one standard deviation of departures from it: where a fit starts, and what decides where
-        measurements leave something open; spread inf for no prior.
+        Mean and standard deviation of the posture prior: the start of fits, and the estimate of what measurements do
+        not observe; spread inf for no prior.
     couplings : (C, D) [1/rad] or [1/m]
-        Departures from the usual posture that go together: each line's sum c · (angles − usual) has a standard
-        deviation of one. Not of the middle axis of a ball joint, which turns the other way in the joint's other chart.
-    root_free : bool, False for a body whose root stays where it is put.
+        Correlated deviations from the mean posture: each row's sum c · (angles − usual) has a standard deviation of
+        one. Not of the middle axis of a ball joint, whose sign changes in the joint's other chart.
+    root_free : bool, False for a body with a fixed root.
     """
 
     segments: tuple[str, ...]
@@ -94,7 +94,7 @@ class KinematicTree:
                 raise BodyError(problem, remedy="Couple other coordinates, with a finite spread.")
 
     def _check_numbers(self) -> None:
-        """Raise BodyError where a number of a segment or a coordinate cannot be."""
+        """Raise BodyError for a number that is not finite or out of range."""
         finite = {name: np.isfinite(getattr(self, name)) for name in ("offsets", "axes", "usual", "couplings")}
         wrong = {
             "offset": (~finite["offsets"].all(axis=-1), self.segments, "Give three numbers in metres."),
@@ -112,7 +112,7 @@ class KinematicTree:
 
     @property
     def n_dofs(self) -> int:
-        """Degrees of freedom: six of the root and one for each coordinate."""
+        """Number of degrees of freedom: six of the root and one for each coordinate."""
         return 6 + len(self.coordinates)
 
     @property
@@ -122,36 +122,36 @@ class KinematicTree:
 
     @cached_property
     def posture_precision(self) -> NDArray:
-        """(D, D) inverse covariance of the posture prior, a Gaussian about `usual`; zero where there is no prior."""
+        """Inverse covariance (D, D) of the posture prior, a Gaussian about `usual`; zero without a prior."""
         return _frozen(np.diag(np.square(1.0 / self.spread)) + self.couplings.T @ self.couplings)
 
     @cached_property
     def held_by_posture(self) -> tuple[NDArray, NDArray]:
-        """(H,) coordinates with a posture prior, and their (H, H) inverse covariance; (H,) where none are coupled."""
-        held = np.flatnonzero(np.isfinite(self.spread))
-        precision = self.posture_precision[np.ix_(held, held)]
-        return _frozen(held, np.int64), _frozen(precision if self.coupled else np.diag(precision))
+        """Coordinates (H,) with a posture prior, and their precision matrix (H, H); its diagonal if uncoupled."""
+        constrained = np.flatnonzero(np.isfinite(self.spread))
+        precision = self.posture_precision[np.ix_(constrained, constrained)]
+        return _frozen(constrained, np.int64), _frozen(precision if self.coupled else np.diag(precision))
 
     def posture_cost(self, angles: NDArray, share: float = 1.0) -> float:
-        """A share of the posture prior's cost of angles (D,)."""
-        away = angles - self.usual
-        return share * float(away @ self.posture_precision @ away)
+        """Cost of the posture prior at angles (D,) [rad, m], times a share."""
+        deviation = angles - self.usual
+        return share * float(deviation @ self.posture_precision @ deviation)
 
     @cached_property
     def posture_std(self) -> NDArray:
-        """(D,) [rad] or [m] standard deviation of each coordinate by the posture prior; inf where there is none."""
-        out, held = np.array(self.spread), np.flatnonzero((self.couplings != 0.0).any(axis=0))
-        out[held] = np.sqrt(np.diag(np.linalg.inv(self.posture_precision[np.ix_(held, held)])))
+        """Standard deviation (D,) [rad] or [m] of each coordinate in the posture prior; inf without a prior."""
+        out, constrained = np.array(self.spread), np.flatnonzero((self.couplings != 0.0).any(axis=0))
+        out[constrained] = np.sqrt(np.diag(np.linalg.inv(self.posture_precision[np.ix_(constrained, constrained)])))
         return _frozen(out)
 
     @cached_property
     def dof_start(self) -> NDArray:
-        """(S+1,) first coordinate of each segment."""
+        """Index (S+1,) of the first coordinate of each segment."""
         return _frozen(np.searchsorted(self.owners, np.arange(len(self.segments) + 1)), np.int64)
 
     @cached_property
     def rest(self) -> NDArray:
-        """(S, 3) [m] joint centres in the root frame at rest."""
+        """Joint centres (S, 3) [m] in the root frame at rest."""
         out = np.array(self.offsets)
         for s in range(1, len(out)):
             out[s] += out[self.parents[s]]
@@ -159,7 +159,7 @@ class KinematicTree:
 
     @cached_property
     def dof_parent(self) -> NDArray:
-        """(6 + D,) the next degree of freedom towards the root, -1 for the first."""
+        """Next degree of freedom towards the root (6 + D,), -1 for the first."""
         last = np.full(len(self.segments), 5)
         out = list(range(-1, 5))
         for s, parent in enumerate(self.parents):
@@ -171,7 +171,7 @@ class KinematicTree:
 
     @cached_property
     def last_dof(self) -> NDArray:
-        """(S,) the degree of freedom nearest to each segment that moves it."""
+        """Nearest degree of freedom (S,) that moves each segment."""
         last = np.full(len(self.segments), 5)
         for s, parent in enumerate(self.parents):
             last[s] = last[parent] if parent >= 0 else 5
@@ -181,20 +181,20 @@ class KinematicTree:
 
     @cached_property
     def depth(self) -> NDArray:
-        """(n,) how many degrees of freedom stand above each one."""
+        """Number (n,) of degrees of freedom above each one."""
         return _frozen(_paths(self.dof_parent)[1], np.int64)
 
     @cached_property
     def chain(self) -> NDArray:
-        """(n, m) degrees of freedom from the root down to each one: the pattern of the normal matrix; then -1."""
+        """Degrees of freedom (6 + D, m) from the root to each one, padded with -1: the pattern of the normal matrix."""
         return _frozen(_paths(self.dof_parent)[0], np.int64)
 
     @cached_property
     def coupled_pattern(self) -> tuple[NDArray, NDArray, NDArray]:
-        """Chain and depth of the normal matrix with the posture prior in it; (n, m) places of `chain` in that chain.
+        """Chain (n, m) and depth (n,) of the normal matrix with the posture prior; index (n, m) of `chain` in it.
 
-        They are the paths of its elimination tree: as `chain` and `depth` where the prior couples nothing; else what is
-        coupled, and what elimination makes meet, stands above each other, too.
+        They are the paths of its elimination tree. Without couplings they equal `chain` and `depth`; couplings, and the
+        fill-in of the elimination, add entries.
         """
         meets = np.zeros((self.n_dofs, self.n_dofs), bool)
         np.put_along_axis(meets, np.maximum(self.chain, 0), True, axis=1)
@@ -210,7 +210,7 @@ class KinematicTree:
 
     @cached_property
     def posture_entries(self) -> tuple[NDArray, NDArray]:
-        """Lower triangle of `posture_precision`: (E, 3) row, column, place in `coupled_pattern`; (E,) values."""
+        """Lower triangle of `posture_precision`: (E, 3) row, column, index in `coupled_pattern`; (E,) values."""
         chain, depth, _ = self.coupled_pattern
         row, column = np.nonzero(np.tril(self.posture_precision))
         place = [np.searchsorted(chain[6 + i, : depth[6 + i] + 1], 6 + j) for i, j in zip(row, column)]
@@ -219,7 +219,7 @@ class KinematicTree:
 
     @cached_property
     def ball_joints(self) -> tuple[slice, ...]:
-        """Coordinates of every joint that turns about three axes at right angles; see `charts`."""
+        """Coordinates of every joint with three orthogonal rotation axes; see `charts`."""
         out = []
         for s in range(len(self.segments)):
             d = slice(int(self.dof_start[s]), int(self.dof_start[s + 1]))
@@ -230,26 +230,38 @@ class KinematicTree:
         return tuple(out)
 
     def segment(self, name: str) -> int:
-        """Index of a segment by name."""
+        """Index of a segment by name.
+
+        Raises
+        ------
+        BodyError
+            No such segment.
+        """
         if name not in self.segments:
             raise BodyError(choices("segment", name, self.segments))
         return self.segments.index(name)
 
     def coordinate(self, name: str) -> int:
-        """Index of a coordinate by name."""
+        """Index of a coordinate by name.
+
+        Raises
+        ------
+        BodyError
+            No such coordinate.
+        """
         if name not in self.coordinates:
             raise BodyError(choices("coordinate", name, self.coordinates))
         return self.coordinates.index(name)
 
     def with_offsets(self, offsets: NDArray) -> KinematicTree:
-        """The same tree with other joint centres, (S, 3) [m]."""
-        out = object.__new__(KinematicTree)  # what does not depend on them is not made again
+        """The tree with other joint centres (S, 3) [m] in the parents' frames."""
+        out = object.__new__(KinematicTree)  # keeps cached properties that do not depend on the offsets
         out.__dict__.update(self.__dict__, offsets=_frozen(offsets))
         out.__dict__.pop("rest", None)
         return out
 
     def forward(self, T_world_root: NDArray, angles: NDArray) -> tuple[NDArray, NDArray]:
-        """Frames (S, 12) and screws (D, 6) of one pose; see `_kernels.forward`."""
+        """Frames (S, 12) and screws (D, 6) of one pose, root (4, 4) and angles (D,); see `_kernels.forward`."""
         self._check_angles(angles.shape[-1])
         frames, screws = np.empty((len(self.segments), 12)), np.empty((len(self.coordinates), 6))
         _kernels.forward(
@@ -258,7 +270,7 @@ class KinematicTree:
         return frames, screws
 
     def segment_poses(self, Ts_world_root: NDArray, angles: NDArray) -> NDArray:
-        """T_world_segment (F, S, 4, 4) of many poses: roots (F, 4, 4), angles (F, D)."""
+        """T_world_segment (F, S, 4, 4) [m] of many poses: roots (F, 4, 4) [m], angles (F, D) [rad, m]."""
         roots = np.ascontiguousarray(Ts_world_root, dtype=float)
         frames = np.empty((len(roots), len(self.segments), 12))
         angles = np.ascontiguousarray(angles, dtype=float)
@@ -276,7 +288,7 @@ class KinematicTree:
             raise BodyError(problem, remedy="Is the state that of another body?")
 
     def segment_jacobian(self, screws: NDArray, segment: int) -> NDArray:
-        """J_s (6, 6 + D): twist (v, ω) of a segment about the root's origin for each degree of freedom."""
+        """Jacobian J_s (6, 6 + D): twist (v, ω) of a segment about the root's origin, from screws (D, 6)."""
         out = np.zeros((6, self.n_dofs))
         out[:, :6] = np.eye(6)
         d = self.last_dof[segment]

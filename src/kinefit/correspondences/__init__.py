@@ -1,4 +1,4 @@
-"""Observations and a body at a state become rows: one file a kind."""
+"""Row makers: observations and a body at a state to linearised measurements, one file for each kind."""
 
 from kinefit.correspondences.anchored import anchored_rows, target_rows
 from kinefit.correspondences.bands import Bands, band_rows, joint_bands

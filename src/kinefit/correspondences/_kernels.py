@@ -1,4 +1,4 @@
-"""Row makers as kernels: they fill lines `start..` of the row buffers and return the next free line.
+"""Compiled row makers: they fill the row buffers from line `start` on and return the next free line.
 
 Common parameters: frames (S, 12) from forward kinematics; owner (K,) segments and rest (K, 3) points in the root frame
 at rest; buffers data (8, N) = x, n, r, w; segment (N,); group (N,).
@@ -16,7 +16,7 @@ from kinefit.geometry._kernels_camera import project_jacobian
 
 @jit
 def place(frames, owner, rest, k):
-    """World position of point k."""
+    """Position (x, y, z) [m] of point k in the world."""
     f = frames[owner[k]]
     x, y, z = rest[k, 0], rest[k, 1], rest[k, 2]
     return (
@@ -36,7 +36,7 @@ def _put(data, segment, group, i, s, g, x, y, z, nx, ny, nz, r, w):
 
 @jit
 def point_rows(frames, owner, rest, target, weight, data, segment, group, start):
-    """Three rows a point along the world's axes: target (K, 3) [m], weight (K,) [1/m²], 0 for none."""
+    """Three rows for each point, along the world's axes: target (K, 3) [m], weight (K,) [1/m²], 0 for none."""
     i = start
     for k in range(owner.size):
         w = weight[k]
@@ -53,10 +53,10 @@ def point_rows(frames, owner, rest, target, weight, data, segment, group, start)
 
 @jit
 def plane_rows(frames, owner, rest, target, normal, weight, first_group, data, segment, group, start):
-    """One row a point along the normal of the plane through target; weight (K,) [1/m²].
+    """One row for each point, along the normal of the plane through target; weight (K,) [1/m²].
 
-    For thousands of points: rest, target and normal are (3, K), points of one segment stand together, and a point
-    without weight gets a row without effect.
+    For thousands of points: rest, target and normal are (3, K), points are sorted by segment, and a point without
+    weight gets a row without effect.
     """
     k = 0
     while k < owner.size:
@@ -71,7 +71,7 @@ def plane_rows(frames, owner, rest, target, normal, weight, first_group, data, s
             rest[0, first:k],
             rest[1, first:k],
             rest[2, first:k],
-        )  # slices: so that the loop becomes vector code
+        )  # slices, so that the compiler vectorises the loop
         tx, ty, tz = target[0, first:k], target[1, first:k], target[2, first:k]
         nx, ny, nz, w = normal[0, first:k], normal[1, first:k], normal[2, first:k], weight[first:k]
         px, py, pz = data[0, i : i + n], data[1, i : i + n], data[2, i : i + n]
@@ -97,10 +97,10 @@ def plane_rows(frames, owner, rest, target, normal, weight, first_group, data, s
 
 @jit
 def pixel_rows(frames, owner, rest, cameras, camera, target, weight, data, segment, group, start):
-    """Two rows a pixel: the exact linearisation of reprojection with distortion.
+    """Two rows for each pixel: the exact linearisation of reprojection with distortion.
 
     cameras (C, P) packed, camera (K,) index, target (K, 2) [px], weight (K,) [1/px²]. With g = ∂u/∂x: n = g/|g|,
-    r = Δu/|g|, w = weight |g|². A point that its camera cannot see makes no row.
+    r = Δu/|g|, w = weight |g|². A point that does not project into its camera makes no row.
     """
     i = start
     for k in range(owner.size):
@@ -124,7 +124,7 @@ def pixel_rows(frames, owner, rest, cameras, camera, target, weight, data, segme
 
 @jit
 def image_line_rows(frames, owner, rest, cameras, camera, line, weight, data, segment, group, start):
-    """One row a point: its pixel should lie on the image line a u + b v + c = 0 (K, 3), weight (K,) [1/px²]."""
+    """One row for each point, from its pixel to the image line a u + b v + c = 0 (K, 3); weight (K,) [1/px²]."""
     i = start
     for k in range(owner.size):
         w = weight[k]
@@ -148,7 +148,7 @@ def image_line_rows(frames, owner, rest, cameras, camera, line, weight, data, se
 
 @jit
 def ray_rows(frames, owner, rest, line, weight, data, segment, group, start):
-    """Two rows a point: its distance to the Plücker line (K, 6) along two directions at right angles to it."""
+    """Two rows for each point: its offset from the Plücker line (K, 6) along two directions normal to it."""
     i = start
     for k in range(owner.size):
         w = weight[k]
@@ -177,5 +177,5 @@ def ray_rows(frames, owner, rest, line, weight, data, segment, group, start):
 
 @jit
 def buffers(count):
-    """Row buffers of `count` lines: data, segment, group."""
+    """Empty row buffers of N = count lines: data (8, N), segment (N,), group (N,)."""
     return np.empty((8, count)), np.empty(count, np.int64), np.empty(count, np.int64)

@@ -1,4 +1,4 @@
-"""Values of closures, and their derivatives by the degrees of freedom."""
+"""Compiled values of closures, and their derivatives by the degrees of freedom."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kinefit._jit import jit
 
 @jit
 def rotation_vector(R, e):
-    """e (3,) [rad] of a rotation R (3, 3), of length 0..π: by the largest part of its quaternion."""
+    """Write the rotation vector of R (3, 3), of length 0..π, to e (3,) [rad], by the largest quaternion component."""
     q, trace = np.empty(4), R[0, 0] + R[1, 1] + R[2, 2]
     best, k = trace, 3
     for i in range(3):
@@ -34,7 +34,7 @@ def rotation_vector(R, e):
 
 @jit
 def turn_rows(e, M, out):
-    """out (3, 3) = J_l⁻¹(e) Mᵀ, of a rotation vector e (3,) and a frame M (3, 3); Barfoot, eq. 7.77."""
+    """Write J_l⁻¹(e) Mᵀ to out (3, 3), for a rotation vector e (3,) and a frame M (3, 3); Barfoot, eq. 7.77."""
     t2 = e[0] * e[0] + e[1] * e[1] + e[2] * e[2]
     if t2 < 1e-6:
         d = 1.0 / 12.0 + t2 / 720.0
@@ -53,11 +53,12 @@ def turn_rows(e, M, out):
 def close(
     frames, screws, centre, segments, rest, directions, first, rigid, turns, dof_parent, last_dof, value, J,
 ):  # fmt: skip
-    """Values (m,) of K closures, and J (m, n) of them where it has lines.
+    """Write the values (m,) of K closures, and their Jacobian J (m, n) unless it is empty.
 
-    frames (S, 12) and screws (D, 6) of a pose about centre (3,); segments (K, 2), -1 for the world; rest (K, 2, 3)
-    points in the root frame at rest, or in the world; directions (m, 3) in the other's frame; first (K + 1,) equation
-    of each; rigid (K,) bool, the last three of which are turns, against frames turns (K, 3, 3) of the other's.
+    frames (S, 12), screws (D, 6): of a pose about centre (3,). segments (K, 2): -1 for the world. rest (K, 2, 3) [m]:
+    points in the root frame at rest, or in the world. directions (m, 3): in the other frame. first (K + 1,): first
+    equation of each closure. rigid (K,) bool: the last three equations of these are rotations relative to frames turns
+    (K, 3, 3) in the other frame.
     """
     R, x = np.empty((2, 3, 3)), np.empty((2, 3))
     M, relative, e, rows, a = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty(6)

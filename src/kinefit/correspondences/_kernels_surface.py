@@ -1,4 +1,4 @@
-"""Nearest points of surfaces as rows; rows of correspondences that were found before."""
+"""Compiled rows of nearest surface points, and of fixed correspondences."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from kinefit.geometry._kernels_camera import project_jacobian
 
 @jit
 def surface_rows(x, distance, normal, owner, weight, eye, least, data, segment, group):
-    """One row for each point that has a surface; returns how many.
+    """One row for each point with a nearest surface; returns their number.
 
-    x, normal (3, N); distance, owner, weight (N,); eye (3,): rows whose normal·(eye - p) is not above `least` are left
-    out. Out: data (8, N) = p, n, r, w; segment (N,); group (N,).
+    x, normal (3, N); distance, owner, weight (N,); eye (3,): rows need normal·(eye - p) above `least`. Out: data (8, N)
+    = p, n, r, w; segment (N,); group (N,).
     """
     ex, ey, ez = eye[0], eye[1], eye[2]
     i = 0
@@ -34,7 +34,7 @@ def surface_rows(x, distance, normal, owner, weight, eye, least, data, segment, 
 
 @jit
 def anchors(data, segment, group, frames, measured, x, rest, normal):
-    """The point and normal of the surface that each row (8, N) of `surface_rows` is about, in the root frame at rest.
+    """Surface point and normal of each row (8, N) of `surface_rows`, in the root frame at rest.
 
     measured (M, 3) [m]; frames (S, 12). Out: x (N, 3), the row's measured point; rest, normal (N, 3).
     """
@@ -51,10 +51,10 @@ def anchors(data, segment, group, frames, measured, x, rest, normal):
 
 @jit
 def anchored_rows(frames, owner, rest, normal, target, weight, at_surface, data):
-    """One row for each point of a surface: what was measured lies r further along the surface's normal.
+    """One row for each surface point: the measured point lies r further along the surface's normal.
 
     frames (S, 12); owner (N,), rest and normal (N, 3) in the root frame at rest; target (N, 3) [m] in the world, weight
-    (N,) [1/m²]; at_surface: whether a row's point is the target's foot on the tangent plane, or the target itself; the
+    (N,) [1/m²]; at_surface: whether a row's point is the target's projection on the tangent plane, or the target; the
     derivative is the same. Out: data (8, N).
     """
     for k in range(owner.size):
@@ -77,8 +77,8 @@ def anchored_rows(frames, owner, rest, normal, target, weight, at_surface, data)
 def target_rows(frames, owner, rest, camera, target, slack, weight, data):
     """One row for each point: its pixel should lie within `slack` [px] of target (N, 2) [px].
 
-    frames (S, 12); owner (N,), rest (N, 3) in the root frame at rest; camera packed; weight [1/px²], which is 0 for
-    points that lie there already or that the camera does not see. Out: data (8, N).
+    frames (S, 12); owner (N,), rest (N, 3) in the root frame at rest; camera packed; weight [1/px²]. Points within
+    `slack`, or outside of the camera's view, get weight 0. Out: data (8, N).
     """
     for k in range(owner.size):
         f = frames[owner[k]]

@@ -1,4 +1,4 @@
-"""Points of a body's surface with a correspondence that was found before: rows that hold at any state near it."""
+"""Surface points with a fixed correspondence: rows that are valid at any state near that of the match."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def anchored_rows(
     weight: ArrayLike = 1e4,
     at_surface: bool = True,
 ) -> Rows:
-    """One row a point of the surface: what was measured, q, lies r = n·(q − x) along its normal n, which turns with it.
+    """One row for each surface point x: r = n·(q − x) to a measured point q, along the normal n, which rotates with x.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def anchored_rows(
     x_world : (N, 3) [m] measured.
     weight : scalar or (N,) [1/m²]
     at_surface : bool
-        Whether a row's point is q's foot on the tangent plane, as of `surface_rows`, or q itself, as of
+        Whether a row's point is q's projection on the tangent plane, as in `surface_rows`, or q itself, as in
         `depth_image_rows`. The derivative is the same.
 
     Raises
@@ -41,20 +41,20 @@ def anchored_rows(
         Arrays of other sizes.
     """
     count = len(segment)
-    x, given = _checked(points, count), _checked(x_world, count)
+    x, measured = _checked(points, count), _checked(x_world, count)
     w = np.ascontiguousarray(np.broadcast_to(np.asarray(weight, float), count))
     data = np.empty((8, count))
-    kernels.anchored_rows(frames, segment, x, _checked(normals, count), given, w, at_surface, data)
+    kernels.anchored_rows(frames, segment, x, _checked(normals, count), measured, w, at_surface, data)
     return Rows(data, segment, np.arange(count))
 
 
 def anchored(rows: Rows, x_world: NDArray, frames: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """(N, 3) each: the measured points of N rows, and the points and normals of the surface that belong to them.
+    """Measured points (N, 3) [m] of N rows, and their surface points and normals (N, 3) in the root frame at rest.
 
     Parameters
     ----------
-    rows : as of `surface_rows`, of measured points x_world (M, 3) [m].
-    frames : (S, 12) of the state that they were made at; what is of the surface comes in the root frame at rest.
+    rows : from `surface_rows`, of measured points x_world (M, 3) [m].
+    frames : (S, 12) of the state of the match.
     """
     x, rest, normal = np.empty((3, len(rows), 3))
     kernels.anchors(rows.data, rows.segment, rows.group, frames, _checked(x_world, len(x_world)), x, rest, normal)
@@ -71,10 +71,10 @@ def target_rows(
     slack: float = 0.0,
     sigma: float = 2.0,
 ) -> Rows:
-    """One row a point of the body: its pixel should come within `slack` of a target, straight towards it.
+    """One row for each point of the body: its pixel should lie within `slack` of a target.
 
     With the distance d and g = −∂d/∂x: n = g/|g|, r = (d − slack)/|g|, w = |g|²/σ², the exact linearisation. A point
-    that is there already, or that the camera does not see, has the weight 0.
+    within `slack`, or outside of the camera's view, gets weight 0.
 
     Parameters
     ----------

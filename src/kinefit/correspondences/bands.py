@@ -1,4 +1,4 @@
-"""Elastic bands that hold the parts of a body together at its joints (P2 3.4, fig. 2)."""
+"""Elastic bands that connect the parts of a body at its joints (P2 3.4, fig. 2)."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from kinefit.correspondences.coincidence import coincidence_rows
 from kinefit.errors import BodyError
 from kinefit.rows import PairRows
 
-_WIDTH = 0.05  # [m] half the width of a joint between parts without cylinders: that of an elbow
+_DEFAULT_HALF_WIDTH = 0.05  # [m] of a joint between parts without cylinders: that of an elbow
 
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """Pairs of points that elastic bands pull together; K bands.
+    """Pairs of points that K elastic bands pull together.
 
     Parameters
     ----------
-    parent, child : PointSet of K points each, on both parts of a joint; they fall together at rest.
+    parent, child : PointSet of K points each, on both parts of a joint; they coincide at rest.
     joint : (K,) int, segment whose joint each band belongs to.
     """
 
@@ -35,18 +35,18 @@ class Bands:
 
 
 def universal_band(centre: ArrayLike) -> NDArray:
-    """(1, 3) [m] one band at a joint's centre: three free turns, such as a shoulder's (P2 fig. 2a)."""
+    """One band (1, 3) [m] at a joint's centre (3,): three rotations are free, such as a shoulder's (P2 fig. 2a)."""
     return np.asarray(centre, float).reshape(1, 3)
 
 
 def hinge_bands(centre: ArrayLike, axis: ArrayLike, half_width: float, count: int = 2) -> NDArray:
-    """(count, 3) [m] bands evenly along a line: one free turn about it, such as an elbow's (P2 fig. 2b)."""
+    """Bands (K, 3) [m], K = count, evenly along a line: the rotation about it is free, as of an elbow (P2 fig. 2b)."""
     direction = np.asarray(axis, float) / np.linalg.norm(axis)
     return np.asarray(centre, float) + half_width * np.linspace(-1.0, 1.0, count)[:, None] * direction
 
 
 def elliptic_bands(centre: ArrayLike, half_axes: ArrayLike, count: int = 4) -> NDArray:
-    """(count, 3) [m] bands along an ellipse with half axes (2, 3) [m]: no free turn, such as a neck's (P2 fig. 2c)."""
+    """Bands (K, 3) [m], K = count, on an ellipse with half axes (2, 3) [m]: no free rotation, as of a neck (2c)."""
     a, b = np.asarray(half_axes, float)
     turn = 2 * np.pi * np.arange(count)[:, None] / count
     return np.asarray(centre, float) + np.cos(turn) * a + np.sin(turn) * b
@@ -60,16 +60,15 @@ def joint_bands(
     Parameters
     ----------
     body : Body
-        With its joints; bands of `free_parts(body)` are the same, as segments keep their indices.
-    elliptic : names of joints that turn about three axes, but little: those become elliptic, too.
-        Names that the body does not have count for nothing.
+        With its joints; `free_parts(body)` has the same bands, because segments keep their indices.
+    elliptic : names of joints with three axes but a small range, which become elliptic too; unknown names are ignored.
     along_line, along_ellipse : int
-        Bands of a hinge and of an elliptic joint.
+        Number of bands of a hinge and of an elliptic joint.
 
     Raises
     ------
     BodyError
-        Fewer than two bands of a hinge, or than three of an ellipse.
+        A sliding joint, fewer than two bands of a hinge, or than three of an ellipse.
     """
     if along_line < 2 or along_ellipse < 3:
         problem = f"{along_line} bands of a hinge and {along_ellipse} of an elliptic joint"
@@ -98,22 +97,24 @@ def joint_bands(
 
 
 def band_rows(body: Body, state: BodyState, bands: Bands, *, sigma: ArrayLike = 0.005) -> PairRows:
-    """Three pair rows a band: the points of both parts should meet (P2 4.2.6).
+    """Three pair rows for each band: the points of both parts should coincide (P2 4.2.6).
 
     Parameters
     ----------
     body : Body
-        Of free parts (`bodies.free_parts`); the joints of an ordinary one are never stretched.
+        Of free parts (`bodies.free_parts`); in an ordinary body the bands are never stretched.
+    state : BodyState
+    bands : Bands
     sigma : scalar or (K,) [m]
-        How far a band gives.
+        Standard deviation of a band's extension.
     """
     return coincidence_rows(body, state, bands.parent, bands.child, sigma=sigma)
 
 
 def _section(body: Body, segment: int) -> NDArray:
-    """(2, 3) [m] half axes of the section of a part at its joint."""
+    """Half axes (2, 3) [m] of the cross-section of a part at its joint."""
     own = [c for c in body.surfaces if isinstance(c, TaperedCylinder) and c.segment == segment]
     if not own:
-        return _WIDTH * np.eye(3)[[0, 2]]
+        return _DEFAULT_HALF_WIDTH * np.eye(3)[[0, 2]]
     nearest = min(own, key=lambda c: float(np.linalg.norm(c.start)))
     return nearest.axes[:2] * np.array(nearest.radii[0])[:, None]

@@ -1,16 +1,17 @@
-"""What closes chains of a body, as rows (P3 3.2, eq. 15, linearised in both of its points).
+"""Closures of a body as rows (P3 3.2, eq. 15, linearised in both points).
 
 A point x_a of one segment stays at x_b of another (or of the world) along the directions n of b's frame:
 
     r = n·(x_b − x_a),    δr = −(n, x_a × n)·(δξ_a − δξ_b)
 
-Both twists act at x_a, since n turns with b. A rigid closure also has e = log((R_b R_turn)ᵀ R_a), with
-δe = J_l⁻¹(e) (R_b R_turn)ᵀ (δω_a − δω_b). Soft closures are rows of their standard deviation, as in the paper; hard
-ones are equations for `solvers.closed`, or rows of `STIFF` where a quadratic cost is asked for.
+Both twists act at x_a, because n rotates with b. A rigid closure also has e = log((R_b R_turn)ᵀ R_a), with
+δe = J_l⁻¹(e) (R_b R_turn)ᵀ (δω_a − δω_b). Soft closures are rows with their standard deviation, as in the paper. Hard
+ones are equations for `solvers.closed`, or rows with `HARD_SIGMA` in a quadratic cost.
 
-The paper linearises (15) as (18) and (19) instead: each point is drawn to where the other one stands, which counts as
+The paper linearises (15) as (18) and (19) instead: each point is pulled to the position of the other one, which is kept
 constant. That is `point_rows` of `closure_targets`. Both have the same gradient −Jᵀ W c, and so the same solution.
-Their matrices differ: Jₐᵀ W Jₐ + J_bᵀ W J_b also holds the pair in place, where (Jₐ − J_b)ᵀ W (Jₐ − J_b) does not.
+Their matrices differ: Jₐᵀ W Jₐ + J_bᵀ W J_b also constrains the position of the pair, (Jₐ − J_b)ᵀ W (Jₐ − J_b) does
+not.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from kinefit.errors import BodyError
 from kinefit.geometry import se3
 from kinefit.rows import DofRows
 
-STIFF = 1e-4
-"""[m, rad] standard deviation of a hard closure where it enters a quadratic cost; what is solved is then made exact."""
+HARD_SIGMA = 1e-4
+"""[m, rad] standard deviation of a hard closure in a quadratic cost; the solution is made exact afterwards."""
 
 _RIGID_PAIRS = 0.1 * np.concatenate([np.zeros((1, 3)), np.eye(3)])
-"""(4, 3) [m] from a rigid closure's landmark to the points of its segment that stand for it: about a boot's width."""
+"""(4, 3) [m] from a rigid closure's landmark to the points of its segment that represent it: about a boot's width."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +42,9 @@ class Closed:
 
     Parameters
     ----------
-    value : (m,) [m, rad] c, how far each is off.
+    value : (m,) [m, rad] c, error of each equation.
     jacobian : (m, n) of c by the degrees of freedom.
-    sigma : (m,) [m, rad] standard deviation, what is not known of gear included; 0 where it holds exactly.
+    sigma : (m,) [m, rad] standard deviation, including that of unknown gear; 0 if it holds exactly.
     """
 
     value: NDArray
@@ -52,22 +53,22 @@ class Closed:
 
     @property
     def hard(self) -> NDArray:
-        """(m,) bool, equations that hold exactly."""
+        """Whether each equation (m,) holds exactly; bool."""
         return self.sigma == 0.0
 
     def chosen(self, some: NDArray) -> Closed:
-        """Some of the equations."""
+        """The equations selected by a mask or indices (k,)."""
         return Closed(self.value[some], self.jacobian[some], self.sigma[some])
 
-    def rows(self, stiff: float = STIFF) -> DofRows:
-        """All of them as rows, hard ones with a standard deviation."""
+    def rows(self, stiff: float = HARD_SIGMA) -> DofRows:
+        """All equations as rows; hard ones with the standard deviation `stiff` [m, rad]."""
         weight = 1.0 / np.square(np.where(self.hard, stiff, self.sigma))
         return DofRows(self.jacobian, -self.value, weight, np.full(len(weight), -1))
 
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """Closures of a body as arrays, as `_kernels_closures.close` takes them: K closures, m equations."""
+    """Closures of a body as arrays for `_kernels_closures.close`: K closures, m equations."""
 
     segments: NDArray
     rest: NDArray
@@ -104,19 +105,19 @@ def _table(body: Body) -> _Table:
 
 
 def owners(body: Body) -> NDArray:
-    """(m,) int, the closure of each equation."""
+    """Index (m,) of the closure of each equation."""
     return _table(body).owner
 
 
 @lru_cache(maxsize=64)
-def _loose(body: Body) -> NDArray:
-    """(m,) standard deviation of each equation by what is not known of the gear's dimensions, in the usual posture."""
+def _gear_sigma(body: Body) -> NDArray:
+    """Standard deviation (m,) of each equation by the unknown dimensions of gear, in the default posture."""
     variance = np.zeros(len(_table(body).owner))
     for d in body.dimensions:
         if d.std > 0.0:
             step = 0.1 * d.std
-            worlds = [with_dimensions(body, {d.name: d.value + s * step}) for s in (1.0, -1.0)]
-            ends = [closure_values(one, body.usual_state()) for one in worlds]
+            changed = [with_dimensions(body, {d.name: d.value + s * step}) for s in (1.0, -1.0)]
+            ends = [closure_values(b, body.usual_state()) for b in changed]
             variance += np.square((ends[0] - ends[1]) / (2.0 * step) * d.std)
     out = np.sqrt(variance)
     out[out < 1e-9] = 0.0
@@ -124,12 +125,12 @@ def _loose(body: Body) -> NDArray:
 
 
 def closure_values(body: Body, state: BodyState) -> NDArray:
-    """(m,) [m, rad] how far every equation of a body's closures is off."""
+    """Errors (m,) [m, rad] of all equations of a body's closures."""
     return _closed(body, state, 0)[0]
 
 
 def _closed(body: Body, state: BodyState, lines: int) -> tuple[NDArray, NDArray]:
-    """Values (m,), and their Jacobian with so many lines: m or none."""
+    """Values (m,), and their Jacobian with `lines` rows: m or 0."""
     t, tree = _table(body), body.tree
     frames, screws = tree.forward(state.T_world_root, state.angles)
     value, J = np.empty(len(t.owner)), np.zeros((lines, tree.n_dofs))
@@ -143,19 +144,19 @@ def _closed(body: Body, state: BodyState, lines: int) -> tuple[NDArray, NDArray]
 def closed_at(body: Body, state: BodyState) -> Closed:
     """The closures of a body at a state."""
     t = _table(body)
-    return Closed(*_closed(body, state, len(t.owner)), np.hypot(t.sigma, _loose(body)))
+    return Closed(*_closed(body, state, len(t.owner)), np.hypot(t.sigma, _gear_sigma(body)))
 
 
 def closure_rows(body: Body, state: BodyState) -> DofRows:
-    """Rows of all closures of a body, r = −c: soft ones by their standard deviation, hard ones by `STIFF`."""
+    """Rows of all closures of a body, r = −c: soft ones with their standard deviation, hard ones with `HARD_SIGMA`."""
     return closed_at(body, state).rows()
 
 
 def closure_targets(body: Body, state: BodyState) -> tuple[PointSet, NDArray]:
-    """Points of a body's closures, and where each should lie, as the paper linearises them (P3 3.2, eqs. 18, 19).
+    """Points of a body's closures and their targets, in the linearisation of the paper (P3 3.2, eqs. 18, 19).
 
-    A pair of points gives two: either one should lie where the other one stands. A place in the world gives one, (18)
-    alone. A rigid closure is four pairs, as the paper ties a boot to its binding.
+    A pair of points gives two: the target of each is the position of the other. A position in the world gives one, (18)
+    alone. A rigid closure gives four pairs, as for the paper's boot and binding.
 
     Returns
     -------
@@ -165,7 +166,7 @@ def closure_targets(body: Body, state: BodyState) -> tuple[PointSet, NDArray]:
     Raises
     ------
     BodyError
-        A line or a plane, which the paper does not have; gear that is to be estimated.
+        A closure to a line or a plane, which the paper does not have; gear that is to be estimated.
     """
     if has_unknown_gear(body):
         problem = f"body '{body.name}' has gear that is to be estimated, which equations (18) and (19) cannot do"
@@ -177,13 +178,13 @@ def closure_targets(body: Body, state: BodyState) -> tuple[PointSet, NDArray]:
             raise BodyError(problem, remedy='Write kind = "point" or "rigid", or take `closure_rows`.')
         shifts = _RIGID_PAIRS if c.kind == "rigid" else _RIGID_PAIRS[:1]
         turned = shifts @ se3.exp_so3(np.array(c.turn)).T
-        held = _shifted(body.landmarks, c.point, shifts)
+        own = _shifted(body.landmarks, c.point, shifts)
         if c.to:
             other = _shifted(body.landmarks, c.to, turned)
-            points += [held, other]
-            x_world += [body.positions(state, other), body.positions(state, held)]
+            points += [own, other]
+            x_world += [body.positions(state, other), body.positions(state, own)]
         else:
-            points.append(held)
+            points.append(own)
             x_world.append(np.array(c.place) + turned)
     joined = PointSet(
         tuple(name for p in points for name in p.names), np.concatenate([p.segments for p in points]),
@@ -193,13 +194,13 @@ def closure_targets(body: Body, state: BodyState) -> tuple[PointSet, NDArray]:
 
 
 def _shifted(landmarks: PointSet, name: str, shifts: NDArray) -> PointSet:
-    """Points of a landmark's segment at shifts (k, 3) [m] from it."""
+    """Points of a landmark's segment at offsets (k, 3) [m] from it."""
     same = landmarks.select((name,) * len(shifts))
     return PointSet(same.names, same.segments, same.points + shifts)
 
 
 def soft_closures(body: Body, state: BodyState) -> list[DofRows]:
-    """Rows of the closures that do not hold exactly, where there are any."""
+    """Rows of the soft closures, if there are any."""
     if not body.closures:
         return []
     closed = closed_at(body, state)
@@ -208,38 +209,38 @@ def soft_closures(body: Body, state: BodyState) -> list[DofRows]:
 
 
 def every_closure(body: Body, state: BodyState) -> list[DofRows]:
-    """Rows of all closures, where there are any: for quadratic costs."""
+    """Rows of all closures, if there are any, for quadratic costs."""
     return [closure_rows(body, state)] if body.closures else []
 
 
 @dataclass(frozen=True, eq=False)
 class HardEquations:
-    """What holds exactly.
+    """The closure equations that hold exactly.
 
     Parameters
     ----------
     body : Body
-    hard : (m,) bool, of the body's equations those that do
+    hard : (m,) bool, which of the body's equations hold exactly
     """
 
     body: Body
     hard: NDArray
 
     def __call__(self, state: BodyState) -> tuple[NDArray, NDArray]:
-        """(h,) [m, rad] values and (h, n) Jacobian at a state."""
+        """Values (h,) [m, rad] and Jacobian (h, n) at a state."""
         closed = closed_at(self.body, state)
         return closed.value[self.hard], closed.jacobian[self.hard]
 
 
 def hard_equations(body: Body) -> HardEquations | None:
-    """State -> values and Jacobian of what holds exactly; None where nothing does."""
-    hard = np.hypot(_table(body).sigma, _loose(body)) == 0.0 if body.closures else np.zeros(0, bool)
+    """Function of a state: values and Jacobian of the hard closures; None without hard closures."""
+    hard = np.hypot(_table(body).sigma, _gear_sigma(body)) == 0.0 if body.closures else np.zeros(0, bool)
     return HardEquations(body, hard) if hard.any() else None
 
 
 @lru_cache(maxsize=64)
 def looped(body: Body) -> NDArray:
-    """(D,) bool, coordinates within a closed chain: what they are follows from those of the others in it."""
+    """Whether each coordinate (D,) is inside a closed chain, so that the others in it determine it; bool."""
     out = np.zeros(body.tree.n_dofs, bool)
     for a, b in _table(body).segments:
         paths = []

@@ -14,13 +14,18 @@ from kinefit.rows import PairRows
 def coincidence_rows(
     body: Body, state: BodyState, points_a: PointSet, points_b: PointSet, *, sigma: ArrayLike = 0.001
 ) -> PairRows:
-    """Three pair rows for each pair of points that should meet: r = x_b − x_a along the world's axes.
+    """Three pair rows for each pair of points that should coincide: r = x_b − x_a along the world's axes.
 
     Parameters
     ----------
     points_a, points_b : PointSet of K points each, on different segments.
     sigma : scalar or (K,) [m]
-        Softness of the contact; a strong weight makes a closed chain.
+        Standard deviation of the gap; a small one makes a closed chain.
+
+    Raises
+    ------
+    ObservationError
+        Different numbers of points, or a sigma that is not positive.
     """
     if len(points_a) != len(points_b):
         problem = f"{len(points_a)} points should meet {len(points_b)}"

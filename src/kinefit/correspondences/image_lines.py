@@ -21,15 +21,15 @@ def image_line_rows(
     *,
     sigma: ArrayLike = 2.0,
 ) -> Rows:
-    """One row a point: its pixel should lie on an image line; linearised with distortion like `pixel_rows`.
+    """One row for each point, whose pixel should lie on an image line; linearised with distortion, as `pixel_rows`.
 
     Parameters
     ----------
     points : PointSet of K points on the body.
     camera : (K,) int, or one for all, index in the rig.
     lines : (K, 3)
-        a u + b v + c = 0 in the calibration's image frame, of any scale; NaN for none. A straight edge in the world is
-        bent by distortion: then give the tangent near the point.
+        a u + b v + c = 0 in the calibration's image frame, of any scale; NaN for none. Distortion bends a straight edge
+        of the world: then give the tangent near the point.
     sigma : scalar or (K,) [px]
     """
     line, present = targets.array(lines, 3, len(points), "image lines")
@@ -50,7 +50,7 @@ def edge_rows(
     *,
     sigma: ArrayLike = 2.0,
 ) -> Rows:
-    """Two rows an edge of the body: both its ends should project onto an image line (3D line - 2D line).
+    """Two rows for each edge of the body: both ends should project onto an image line (3D line - 2D line).
 
     A line lies in a plane when two of its points do, so P1's line-plane constraint is two point-plane ones.
 

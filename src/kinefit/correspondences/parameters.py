@@ -12,54 +12,55 @@ from kinefit.rows import ParameterRows
 
 
 def limit_rows(body: Body, state: BodyState, *, sigma: float = 0.02) -> ParameterRows:
-    """One row for each coordinate outside its range, back to the nearer end. For limits that hold see the solver.
+    """One row for each coordinate outside its range, towards the nearer limit. The solvers have hard limits.
 
     Parameters
     ----------
     sigma : float [rad or m]
-        Softness of a limit.
+        Standard deviation of a violation.
     """
     inside = np.clip(state.angles, body.tree.lower, body.tree.upper)
-    beyond = np.flatnonzero(inside != state.angles)
+    violated = np.flatnonzero(inside != state.angles)
     w = targets.weights(sigma, np.ones(len(inside), bool), "limits")
-    return ParameterRows(6 + beyond, (inside - state.angles)[beyond], w[beyond])
+    return ParameterRows(6 + violated, (inside - state.angles)[violated], w[violated])
 
 
 def prior_rows(
     body: Body, state: BodyState, *, mean: ArrayLike | None = None, sigma: ArrayLike | None = None
 ) -> ParameterRows:
-    """One row for each coordinate, towards a mean posture; weighed together where the body's prior couples them.
+    """One row for each coordinate, towards a mean posture; with a full weight matrix if the body's prior has couplings.
 
     Parameters
     ----------
     mean : scalar or (D,) [rad or m]
-        Default: the body's usual posture.
+        Default: the mean of the body's posture prior.
     sigma : scalar or (D,) [rad or m]
-        Spread of the posture, inf for a coordinate without prior; default: the body's posture prior, couplings and all.
+        Standard deviations, inf for a coordinate without prior; default: the body's posture prior with its couplings.
     """
     tree, count = body.tree, len(body.tree.coordinates)
     if mean is None and sigma is None:
-        held, precision = tree.held_by_posture
-        return ParameterRows(6 + held, (tree.usual - state.angles)[held], precision)
+        constrained, precision = tree.held_by_posture
+        return ParameterRows(6 + constrained, (tree.usual - state.angles)[constrained], precision)
     w = targets.weights(tree.spread if sigma is None else sigma, np.ones(count, bool), "priors")
-    held = np.flatnonzero(w > 0.0)
+    constrained = np.flatnonzero(w > 0.0)
     gap = np.broadcast_to(np.asarray(tree.usual if mean is None else mean, float), count) - state.angles
     joint = sigma is None and tree.coupled
-    return ParameterRows(6 + held, gap[held], tree.held_by_posture[1] if joint else w[held])
+    return ParameterRows(6 + constrained, gap[constrained], tree.held_by_posture[1] if joint else w[constrained])
 
 
 def prediction_rows(body: Body, state: BodyState, predicted: BodyState, *, sigma: NDArray) -> ParameterRows:
     """One row for each degree of freedom, towards a predicted state.
 
-    For the root's turn r ≈ δ holds to first order in r: exact in sum where its three deviations are alike.
+    For the root's rotation r ≈ δ holds to first order in r. Their sum of squares is exact if the three sigmas are
+    equal.
 
     Parameters
     ----------
     predicted : BodyState
     sigma : (6 + D,) [m, rad]
-        Standard deviation of the prediction; inf for a degree of freedom that is not predicted.
+        Standard deviation of the prediction; inf for a degree of freedom without prediction.
     """
     sigma = shaped(sigma, (body.tree.n_dofs,), "sigma of a prediction")
     w = targets.weights(sigma, np.ones(len(sigma), bool), "predictions")
-    held = np.flatnonzero(w > 0.0)
-    return ParameterRows(held, state.difference(predicted)[held], w[held])
+    constrained = np.flatnonzero(w > 0.0)
+    return ParameterRows(constrained, state.difference(predicted)[constrained], w[constrained])

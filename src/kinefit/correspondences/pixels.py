@@ -22,13 +22,13 @@ def pixel_rows(
     *,
     sigma: ArrayLike = KEYPOINT_SIGMA,
 ) -> Rows:
-    """Two rows a pixel: g = ∂(u or v)/∂x with distortion, n = g/|g|, r = Δpx/|g|, w = |g|²/σ².
+    """Two rows for each pixel: g = ∂(u or v)/∂x with distortion, n = g/|g|, r = Δpx/|g|, w = |g|²/σ².
 
     Parameters
     ----------
-    points : PointSet of K points on the body, one for each pixel (a point seen twice stands twice).
+    points : PointSet of K points on the body, one for each pixel (repeat a point that several cameras see).
     rig : Rig
-    camera : (K,) int, or one for all, index in the rig of the camera that saw each.
+    camera : (K,) int, or one for all, index of the camera in the rig.
     uv : (K, 2) [px]
         In the calibration's image frame; NaN for none.
     sigma : scalar or (K,) [px]

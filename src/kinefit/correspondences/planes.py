@@ -13,7 +13,7 @@ from kinefit.rows import Rows
 def plane_rows(
     body: Body, state: BodyState, points: PointSet, x_world: ArrayLike, normal: ArrayLike, *, sigma: ArrayLike = 0.01
 ) -> Rows:
-    """One row a point along the plane's normal: r = n·(target − x) (P1 2.3, point-plane).
+    """One row for each point, along the plane's normal: r = n·(target − x) (P1 2.3, point-plane).
 
     Parameters
     ----------
@@ -36,4 +36,4 @@ def plane_rows(
         0, data, segment, group, 0,
     )  # fmt: skip
     kept = data[7] > 0
-    return Rows(np.ascontiguousarray(data[:, kept]), segment[kept], order[group[kept]])  # ids: which of the points
+    return Rows(np.ascontiguousarray(data[:, kept]), segment[kept], order[group[kept]])  # group: index of the point

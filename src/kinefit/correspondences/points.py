@@ -1,4 +1,4 @@
-"""Point to point: a marker, a triangulated joint, a clicked 3D point."""
+"""Point to point: a marker, a triangulated joint, a manually annotated 3D point."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from kinefit.rows import Rows
 
 
 def point_rows(body: Body, state: BodyState, points: PointSet, x_world: ArrayLike, *, sigma: ArrayLike = 0.01) -> Rows:
-    """Three rows a point: n = the world's axes, r = target − x (P2 3.2, "3D point to point").
+    """Three rows for each point: n = the world's axes, r = target − x (P2 3.2, "3D point to point").
 
     Parameters
     ----------
     points : PointSet of K points on the body.
     x_world : (K, 3) [m]
-        Where they were measured; NaN for one that was not.
+        Measured positions; NaN for none.
     sigma : scalar or (K,) [m]
         Standard deviation along each axis.
     """

@@ -11,7 +11,7 @@ from kinefit.rows import Rows
 
 
 def ray_rows(body: Body, state: BodyState, points: PointSet, lines: ArrayLike, *, sigma: ArrayLike = 0.01) -> Rows:
-    """Two rows a point: its offset to the line along two directions at right angles (x × n − m, P3 eq. 4).
+    """Two rows for each point: its offset from the line along two directions normal to it (x × n − m, P3 eq. 4).
 
     Parameters
     ----------
@@ -19,7 +19,7 @@ def ray_rows(body: Body, state: BodyState, points: PointSet, lines: ArrayLike, *
     lines : (K, 6)
         Plücker lines (n, m) in the world, see `geometry.lines`; NaN for none.
     sigma : scalar or (K,) [m]
-        Standard deviation of the distance. For pixels use `pixel_rows`, which weighs by their true size.
+        Standard deviation of the distance. For pixels use `pixel_rows`, whose weights account for the depth.
     """
     line, present = targets.array(lines, 6, len(points), "lines")
     targets.unit(line[:, :3], present, "directions of lines")

@@ -27,23 +27,23 @@ def surface_rows(
     exact: bool = False,
     frames: NDArray | None = None,
 ) -> Rows:
-    """One row a point: the surface's nearest point p = x − d n should lie further along its normal n by d.
+    """One row for each point x: the surface's nearest point p = x − d n should lie d further along its normal n.
 
-    The nearest point may slide on the surface, which costs nothing: point to plane along the model's normal.
+    This is point-to-plane along the model's normal: sliding of the nearest point on the surface has no cost.
 
     Parameters
     ----------
     x_world : (N, 3) [m]
         Measured points; NaN for none. The rows' `group` is the index of the point.
-    max_distance : float [m], beyond which a point makes no row.
+    max_distance : float [m], largest distance of a point with a row.
     sigma : scalar or (N,) [m]
     segment : (N,) int, or one for all, optional
-        Segment that each point is known to belong to, -1 for any.
+        Segment of each point if known, -1 for any.
     viewpoint : (3,) [m], optional
-        Where the sensor was: points whose nearest surface faces away from it make no row.
+        Position of the sensor: points whose nearest surface faces away from it make no row.
     exact : bool
         See `nearest`.
-    frames : (S, 12), optional, of a body whose joints move with its angles.
+    frames : (S, 12), optional, for a body whose joints move with its angles.
 
     Raises
     ------
@@ -53,31 +53,31 @@ def surface_rows(
     x = shaped(x_world, ("N", 3), "points on surfaces")
     present = np.isfinite(x).all(axis=1)
     weight = targets.weights(sigma, present, "points on surfaces")
-    eye, least = np.zeros(3), -np.inf
+    eye, min_facing = np.zeros(3), -np.inf
     if viewpoint is not None:
-        eye, least = shaped(viewpoint, (3,), "a viewpoint", finite=True), 0.0
+        eye, min_facing = shaped(viewpoint, (3,), "a viewpoint", finite=True), 0.0
     frames = targets.of_segments(body, state, frames)
     lines = targets.lines(x)
     distance, normal, owner = nearest_lines(body, frames, lines, max_distance, segment, exact=exact)
     data, owners, group = _kernels.buffers(len(x))
-    count = fill(lines, distance, normal, owner, weight, eye, least, data, owners, group)
+    count = fill(lines, distance, normal, owner, weight, eye, min_facing, data, owners, group)
     return Rows(np.ascontiguousarray(data[:, :count]), owners[:count], group[:count])
 
 
 def field_rows(
     body: Body, state: BodyState, x_world: ArrayLike, segment: ArrayLike, *, sigma: ArrayLike = 1.0
 ) -> Rows:
-    """One row a point: the field F of its segment's metaballs should be 1/2 there, r = F − 1/2 (P4, eqs. 14 and 15).
+    """One row for each point: the field F of its segment's metaballs should be 1/2, r = F − 1/2 (P4, eqs. 14 and 15).
 
-    A segment that moves by δ along the field's slope n = ∇F lowers F at the point by n·δ. So n is no unit vector but
-    [1/m], and r has no unit. Derivatives are exact.
+    A segment that moves by δ along the gradient n = ∇F lowers F at the point by n·δ. So n is in [1/m], not a unit
+    vector, and r has no unit. Derivatives are exact.
 
     Parameters
     ----------
     x_world : (N, 3) [m]
         Measured points; NaN for none. The rows' `group` is the index of the point.
     segment : (N,) int, or one for all
-        Segment that each point belongs to; a point of a segment without metaballs, or of -1, makes no row.
+        Segment of each point; a point of a segment without metaballs, or of -1, makes no row.
     sigma : scalar or (N,), no unit
         Standard deviation of F at each point.
 

@@ -1,4 +1,4 @@
-"""What a point of the body is compared with: the common part of all row makers."""
+"""Checks and weights of measurements: the common part of all row makers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,13 @@ from kinefit.rows import Rows
 
 
 def weights(sigma: ArrayLike, present: NDArray, what: str) -> NDArray:
-    """(K,) weight 1/σ² of each measurement, 0 where it is absent; σ a scalar or (K,)."""
+    """Weights 1/σ² (K,) of measurements present (K,) bool, 0 for absent ones; sigma a scalar or (K,).
+
+    Raises
+    ------
+    ObservationError
+        A sigma of another shape, or not positive.
+    """
     sigma = np.asarray(sigma, float)
     if sigma.shape not in ((), present.shape):
         raise ObservationError(f"deviations of {what} have shape {sigma.shape}", remedy=f"Give {present.shape}.")
@@ -35,9 +41,9 @@ def fill(
     kernel: Any, lines: int, body: Body, state: BodyState, points: PointSet, *arguments: Any,
     frames: NDArray | None = None,
 ) -> Rows:  # fmt: skip
-    """Run a row-making kernel for the points of a body at a state; `lines` rows for each point at most.
+    """Run a row-making kernel for the points of a body at a state, with at most `lines` rows for each point.
 
-    `frames` (S, 12) are those of a body whose joints move with its angles.
+    frames (S, 12): given for a body whose joints move with its angles.
     """
     frames = of_segments(body, state, frames)
     data, segment, group = _kernels.buffers(lines * len(points))
@@ -46,37 +52,49 @@ def fill(
 
 
 def of_segments(body: Body, state: BodyState, frames: NDArray | None = None) -> NDArray:
-    """(S, 12) frames of a body's segments: those given, of joints that move with angles, or else the tree's."""
+    """Frames (S, 12) of a body's segments: those given, for joints that move with angles, else those of the tree."""
     return body.tree.forward(state.T_world_root, state.angles)[0] if frames is None else frames
 
 
 def array(values: ArrayLike, columns: int, count: int, what: str) -> tuple[NDArray, NDArray]:
-    """(K, columns) contiguous floats and which rows are finite; NaN means not measured."""
+    """Values as contiguous floats (K, columns), and whether each row (K,) is finite; NaN means not measured."""
     out = shaped(values, (count, columns), what)
     return out, np.isfinite(out).all(axis=1)
 
 
 def check_depth_image(depth: NDArray, camera: Camera) -> None:
-    """ObservationError for a depth image of another size than its camera's."""
+    """Raise ObservationError for a depth image (H, W) of another size than its camera's."""
     remedy = "Give the camera of this image, or camera.scaled(size)."
     check_shape(depth, camera.size[::-1], f"a depth image of camera {camera.name}", remedy=remedy)
 
 
 def lines(vectors: NDArray) -> NDArray:
-    """(3, K) contiguous lines of x, y and z from (K, 3); zeros where not finite."""
+    """Contiguous rows (3, K) of x, y and z from vectors (K, 3); zeros where not finite."""
     out = np.ascontiguousarray(vectors.T)
     finite = np.isfinite(out)
     return out if finite.all() else np.where(finite, out, 0.0)
 
 
 def unit(directions: NDArray, present: NDArray, what: str) -> None:
-    """Check that the directions (K, 3) that are present are unit vectors: their length is part of a row's residual."""
+    """Check that directions (K, 3) present (K,) are unit vectors, because their length scales a row's residual.
+
+    Raises
+    ------
+    ObservationError
+        One is not.
+    """
     if np.any(np.abs(np.linalg.norm(directions[present], axis=1) - 1.0) > 1e-6):
         raise ObservationError(f"{what} are no unit vectors", remedy="Divide them by their lengths.")
 
 
 def cameras(rig: Rig, camera: ArrayLike, count: int) -> NDArray:
-    """(K,) index in the rig of the camera of each measurement, from (K,) or one for all; a kernel trusts it."""
+    """Checked camera indices (K,) in the rig, from (K,) or one for all; kernels do not check them.
+
+    Raises
+    ------
+    ObservationError
+        Indices of another shape or type, or out of range.
+    """
     index = np.asarray(camera)
     if index.shape not in ((), (count,)) or index.dtype.kind not in "iu":
         raise ObservationError(f"camera indices have shape {index.shape}", remedy=f"Give ({count},) integers, or one.")

@@ -1,4 +1,4 @@
-"""What is wrong with the inputs of a take: cameras, keypoints, clocks, the world's scale and vertical.
+"""Check the inputs of a take: calibration, keypoints, clocks, scale and vertical of the world.
 
-`keypoints.check_keypoints` runs all of it, `quick.input_findings` what `track` always runs.
+`keypoints.check_keypoints` runs all checks, `quick.input_findings` those that `track` always runs.
 """

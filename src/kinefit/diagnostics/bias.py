@@ -1,8 +1,8 @@
-"""How far each camera is off, from points that several cameras see: a shift, a turn, a scale of its picture.
+"""Calibration errors of each camera, from points that several cameras see: shift, rotation and scale of its image.
 
-Bias is where the calibration places the points minus where the camera saw them. Two kinds are told: with the camera's
-own view among those that make the points (what is left of its error in a fit), and from all other cameras alone (its
-error against them, about twice as large with four cameras).
+The bias is the projection of the triangulated points minus their detections. It is computed in two ways: from points
+that include the camera's own view (the part of its error that remains in a fit), and from points of all other cameras
+(its error against them, about twice as large with four cameras).
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ from numpy.typing import NDArray
 from kinefit.diagnostics.views import KeypointViews, from_others, meet
 
 SHIFT, TURN, SCALE = slice(0, 2), slice(2, 3), slice(3, 4)
-PER_CAMERA = 4  # parameters of a camera's picture: shift along u and v [px], turn [rad], scale [1]
-_MAD = 1.4826  # median absolute deviation -> standard deviation
-_NULL = 1e-6  # of the largest eigenvalue: what cameras do together as one body, which nobody can see
+PER_CAMERA = 4  # parameters of a camera's image error: shift along u and v [px], rotation [rad], scale [1]
+_MAD_TO_SIGMA = 1.4826  # median absolute deviation to standard deviation, of a normal distribution
+_MIN_EIGENVALUE = 1e-6  # as a share of the largest: smaller ones are unobserved motions of all cameras together
 
 
 @dataclass(frozen=True, eq=False)
 class CameraBias:
-    """What one camera's keypoints say about its calibration.
+    """Bias of one camera's keypoints.
 
     Parameters
     ----------
     camera : str
     bias, std : (2,) [px]
-        Median of predicted minus seen, with its standard error, which counts each keypoint once: a detector misses a
-        point of the body alike in every frame.
+        Median of projected minus detected points, and its standard error. Each keypoint counts once, because a
+        detector's error of one landmark is the same in every frame.
     alone : (2,) [px]
-        The bias, predicted from the other cameras only; NaN where these are fewer than two.
+        Bias against points of the other cameras only; NaN if these are fewer than two.
     spread : float [px]
         Median distance of the points from the bias.
-    outliers : float
-        Share of the points seen that agree with no other camera.
+    outliers : float in 0..1
+        Share of the detected points that agree with no other camera.
     count : int
-        Points that were compared.
+        Number of compared points.
     """
 
     camera: str
@@ -51,7 +51,7 @@ class CameraBias:
 
     @property
     def size(self) -> float:
-        """[px] length of the bias."""
+        """Length [px] of the bias."""
         return float(np.hypot(*self.bias))
 
 
@@ -60,26 +60,26 @@ def camera_biases(views: KeypointViews) -> tuple[CameraBias, ...]:
     x, agree = meet(views)
     out = []
     for c, camera in enumerate(views.rig):
-        seen = np.isfinite(views.uv[:, :, c]).all(-1)
+        detected = np.isfinite(views.uv[:, :, c]).all(-1)
         used = agree[:, :, c] & np.isfinite(x[..., 0])
         d = np.where(used[..., None], camera.project(x) - views.uv[:, :, c], np.nan)
-        bias, std = _middle(d)
+        bias, std = _median_bias(d)
         alone = np.full(2, np.nan)
         if len(views.rig) > 2:
-            alone, _ = _middle(from_others(views, c) - views.uv[:, :, c], limit=views.limit)
+            alone, _ = _median_bias(from_others(views, c) - views.uv[:, :, c], limit=views.limit)
         apart = np.linalg.norm(d - bias, axis=-1)[used]
-        told = seen & np.isfinite(x[..., 0])
+        compared = detected & np.isfinite(x[..., 0])
         out.append(
             CameraBias(
                 camera.name, bias, std, alone, float(np.median(apart)) if len(apart) else np.nan,
-                1.0 - float(used.sum() / told.sum()) if told.any() else np.nan, int(used.sum()),
+                1.0 - float(used.sum() / compared.sum()) if compared.any() else np.nan, int(used.sum()),
             )
         )  # fmt: skip
     return tuple(out)
 
 
-def _middle(d: NDArray, *, limit: float = np.inf) -> tuple[NDArray, NDArray]:
-    """Median of differences (F, K, 2) and its standard error over keypoints; NaN where nothing is known."""
+def _median_bias(d: NDArray, *, limit: float = np.inf) -> tuple[NDArray, NDArray]:
+    """Median (2,) of differences (F, K, 2) and its standard error over keypoints; NaN where there are none."""
     d = np.where((np.linalg.norm(d, axis=-1) <= limit)[..., None], d, np.nan)
     columns = [d[:, k][np.isfinite(d[:, k, 0])] for k in range(d.shape[1])]
     columns = [column for column in columns if len(column)]
@@ -87,21 +87,21 @@ def _middle(d: NDArray, *, limit: float = np.inf) -> tuple[NDArray, NDArray]:
         return np.full(2, np.nan), np.full(2, np.nan)
     middle = np.median(np.concatenate(columns), axis=0)
     medians = np.stack([np.median(column, axis=0) for column in columns])
-    spread = _MAD * np.median(np.abs(medians - np.median(medians, axis=0)), axis=0)
-    return middle, 1.2533 * spread / np.sqrt(max(len(columns) / 2, 1))  # of a median; left and right err alike
+    spread = _MAD_TO_SIGMA * np.median(np.abs(medians - np.median(medians, axis=0)), axis=0)
+    return middle, 1.2533 * spread / np.sqrt(max(len(columns) / 2, 1))  # of a median; left and right are correlated
 
 
 @dataclass(frozen=True, eq=False)
 class Disagreement:
-    """Normal equations of all cameras' picture errors, the points in space taken out.
+    """Normal equations of the image errors of all cameras, with the points in space eliminated.
 
     Parameters
     ----------
     cameras : (C,) names
     matrix : (P, P), right : (P,), P = 4 C
-        Of the unknown errors θ (see `PER_CAMERA`) in predicted − seen ≈ D θ.
+        Of the unknown errors θ (see `PER_CAMERA`) in projected − detected ≈ D θ.
     count : int
-        Pixels (u or v) of it that the points leave over.
+        Degrees of freedom: pixel coordinates minus the unknowns of the points.
     """
 
     cameras: tuple[str, ...]
@@ -110,7 +110,7 @@ class Disagreement:
     count: int
 
     def explained(self, columns: Sequence[int] | NDArray) -> float:
-        """[px] root mean square of the disagreement that errors of some parameters alone explain."""
+        """Root mean square [px] of the disagreement that the parameters in columns (N,) alone explain."""
         at = np.asarray(columns, int)
         if not len(at) or not self.count:
             return 0.0
@@ -118,29 +118,29 @@ class Disagreement:
         return float(np.sqrt(max(self.right[at] @ solved, 0.0) / self.count))
 
     def of(self, *cameras: int, parts: Sequence[slice] = (SHIFT, TURN, SCALE)) -> NDArray:
-        """Columns of some cameras' parameters."""
+        """Columns (N,) int of some cameras' parameters."""
         own = np.concatenate([np.arange(PER_CAMERA)[part] for part in parts])
         return np.concatenate([PER_CAMERA * c + own for c in cameras]) if cameras else np.zeros(0, int)
 
     def solve(self, *cameras: int) -> NDArray:
-        """(len(cameras), 4) errors of some cameras if all others are right."""
+        """Errors (N, 4) [px, px, rad, 1] of N cameras if all other cameras are correct."""
         at = self.of(*cameras)
         return _solve(self.matrix[np.ix_(at, at)], self.right[at]).reshape(-1, PER_CAMERA)
 
 
 def _solve(matrix: NDArray, right: NDArray) -> NDArray:
-    """Solution of least norm, in scaled parameters, as some of them all cameras share unseen."""
+    """Minimum-norm solution in scaled parameters: motions of all cameras together are unobserved."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
-    sure = values > _NULL * max(values[-1], 1e-300)
-    return scale * (vectors[:, sure] @ ((vectors[:, sure].T @ (scale * right)) / values[sure]))
+    observed = values > _MIN_EIGENVALUE * max(values[-1], 1e-300)
+    return scale * (vectors[:, observed] @ ((vectors[:, observed].T @ (scale * right)) / values[observed]))
 
 
 def disagreement(views: KeypointViews) -> Disagreement:
-    """How the cameras disagree, in terms of each one's picture being shifted, turned and scaled.
+    """Normal equations of each camera's image shift, rotation and scale, from the disagreement of the cameras.
 
-    Each point's normal equations with its own three unknowns taken out (Schur complement); only points that three or
-    more cameras agree on, as two always find one along a line.
+    The three unknowns of each point are eliminated (Schur complement). Only points that three or more cameras agree on
+    are used, because two cameras always agree along the epipolar line.
     """
     x, agree = meet(views)
     cameras = len(views.rig)
@@ -151,23 +151,23 @@ def disagreement(views: KeypointViews) -> Disagreement:
     residual = np.zeros((count, 2 * cameras))
     for c, camera in enumerate(views.rig):
         predicted, by_point = camera.project_with_jacobian(x)
-        seen, rows = agree[:, c, None], slice(2 * c, 2 * c + 2)
+        detected, rows = agree[:, c, None], slice(2 * c, 2 * c + 2)
         q = predicted - camera.matrix[:2, 2]
         own = np.zeros((count, 2, PER_CAMERA))
         own[:, 0, 0] = own[:, 1, 1] = 1.0
         own[:, 0, 2], own[:, 1, 2] = -q[:, 1], q[:, 0]
         own[:, :, 3] = q
-        design[:, rows, PER_CAMERA * c : PER_CAMERA * (c + 1)] = np.where(seen[..., None], own, 0.0)
-        jacobian[:, rows] = np.where(seen[..., None], by_point, 0.0)
-        residual[:, rows] = np.where(seen, predicted - uv[:, c], 0.0)
+        design[:, rows, PER_CAMERA * c : PER_CAMERA * (c + 1)] = np.where(detected[..., None], own, 0.0)
+        jacobian[:, rows] = np.where(detected[..., None], by_point, 0.0)
+        residual[:, rows] = np.where(detected, predicted - uv[:, c], 0.0)
     matrix, right = without_points(jacobian, design, residual)
     return Disagreement(views.rig.names, matrix.sum(0), right.sum(0), int(2 * agree.sum() - 3 * count))
 
 
 def without_points(jacobian: NDArray, design: NDArray, residual: NDArray) -> tuple[NDArray, NDArray]:
-    """Normal equations (N, P, P), (N, P) of the parameters of `design` (N, R, P), each point's own three taken out.
+    """Normal equations (N, P, P), (N, P) of the parameters of `design` (N, R, P), with the points eliminated.
 
-    jacobian (N, R, 3) is the derivative of the residuals (N, R) by the points.
+    jacobian (N, R, 3): derivative of the residuals (N, R) by each point.
     """
     own = np.swapaxes(jacobian, 1, 2)
     inverse = np.linalg.inv(own @ jacobian + 1e-9 * np.eye(3))

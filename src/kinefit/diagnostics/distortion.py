@@ -1,4 +1,4 @@
-"""Lenses that the calibration takes for ideal, and that bend straight lines."""
+"""Find lenses with distortion for which the calibration states none."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from kinefit.diagnostics.views import KeypointViews, meet
 from kinefit.findings import Finding, listed
 from kinefit.geometry.camera import Rig
 
-_MAX_ERROR_LEFT = 0.8
-"""Of the cameras' error, once the lenses bend as the points want: 0.57 and 0.74 of two real recordings of wide lenses
-whose distortion was taken out; 0.89 and more of lenses that hardly have any."""
-_MIN_EXPLAINED_PX = 5.0  # root mean square that the bending explains: a detector's habits explain up to 5
-_MIN_OVER_MOVED = 0.75  # of what one camera that moved explains: bent lenses 0.83 and 1.02, moved cameras up to 0.69
-_MAX_BENDING = 0.7  # |k1| of real lenses: fisheyes have another model
+_MAX_ERROR_RATIO = 0.8
+"""Error with distortion to error without: 0.57 and 0.74 in two real recordings of wide lenses whose distortion was
+removed; 0.89 and more for lenses with almost none."""
+_MIN_EXPLAINED_PX = 5.0  # root mean square that distortion explains: systematic detector errors explain up to 5
+_MIN_OVER_MOVED = 0.75  # of what one moved camera explains: distorted lenses 0.83 and 1.02, moved cameras up to 0.69
+_MAX_K1 = 0.7  # |k1| of real lenses: fisheyes have another model
 
 
 def distortion_findings(views: KeypointViews) -> list[Finding]:
-    """Whether the points lie as if lenses that the calibration states without distortion had some.
+    """Findings on lenses with distortion for which the calibration states none.
 
-    One radial coefficient k1 of each of these cameras is solved for, every point in space taken out.
+    Solves for one radial coefficient k1 of each of these cameras, with the points in space eliminated.
     """
     ideal = [c for c, camera in enumerate(views.rig) if not np.any(camera.distortion)]
     if len(views.rig) < 3 or not ideal:
         return []
     k1, explained, together = _solve(views, ideal)
-    if together < _MIN_EXPLAINED_PX or np.max(np.abs(k1)) > _MAX_BENDING:
+    if together < _MIN_EXPLAINED_PX or np.max(np.abs(k1)) > _MAX_K1:
         return []
     parts = disagreement(views)
     if together < _MIN_OVER_MOVED * max(parts.explained(parts.of(c)) for c in range(len(views.rig))):
@@ -40,19 +40,19 @@ def distortion_findings(views: KeypointViews) -> list[Finding]:
         cameras[c] = replace(cameras[c], distortion=np.array([k, 0.0, 0.0, 0.0]), model="radtan")
     uv = sample(views)
     before, after = median_error(views.rig, uv), median_error(Rig(tuple(cameras)), uv)
-    if not after <= _MAX_ERROR_LEFT * before:
+    if not after <= _MAX_ERROR_RATIO * before:
         return []
     bent = [n for n in np.argsort(-explained) if explained[n] >= 0.5 * np.max(explained)]
     names = tuple(views.rig.names[ideal[n]] for n in bent)
     coefficients = listed(f"{name} as if k1 were {k1[n]:+.2f}" for n, name in zip(bent, names))
     text = f"The calibration has no lens distortion for {listed(names)}, and the keypoints lie bent: {coefficients}."
-    sure = f"Sure: with it the cameras' median error falls from {before:.1f} to {after:.1f} px."
+    confidence = f"Sure: with it the cameras' median error falls from {before:.1f} to {after:.1f} px."
     remedy = "Write the distortion coefficients that the lenses were calibrated with into the calibration."
-    return [Finding("fault", "distortion", text, names, sure, remedy)]
+    return [Finding("fault", "distortion", text, names, confidence, remedy)]
 
 
 def _solve(views: KeypointViews, ideal: list[int]) -> tuple[NDArray, NDArray, float]:
-    """k1 of some cameras, and how much of the disagreement [px] each alone and all together explain."""
+    """k1 (N,) of the ideal cameras, and the root mean square [px] that each alone and all together explain."""
     x, agree = meet(views)
     use = (agree.sum(axis=2) >= 2) & np.isfinite(x[..., 0])
     x, agree, uv = x[use], agree[use], views.uv[use]
@@ -64,13 +64,13 @@ def _solve(views: KeypointViews, ideal: list[int]) -> tuple[NDArray, NDArray, fl
     residual = np.zeros((count, 2 * cameras))
     for c, camera in enumerate(views.rig):
         predicted, by_point = camera.project_with_jacobian(x)
-        seen, rows = agree[:, c, None], slice(2 * c, 2 * c + 2)
-        jacobian[:, rows] = np.where(seen[..., None], by_point, 0.0)
-        residual[:, rows] = np.where(seen, predicted - uv[:, c], 0.0)
+        agreed, rows = agree[:, c, None], slice(2 * c, 2 * c + 2)
+        jacobian[:, rows] = np.where(agreed[..., None], by_point, 0.0)
+        residual[:, rows] = np.where(agreed, predicted - uv[:, c], 0.0)
         if c in ideal:
             off = predicted - camera.matrix[:2, 2]
             squared = np.sum(np.square(off / np.diag(camera.matrix)[:2]), axis=1)
-            design[:, rows, ideal.index(c)] = np.where(seen, off * squared[:, None], 0.0)
+            design[:, rows, ideal.index(c)] = np.where(agreed, off * squared[:, None], 0.0)
     matrix, right = (part.sum(0) for part in without_points(jacobian, design, residual))
     power = np.maximum(np.diag(matrix), 1e-12)
     k1 = -np.linalg.lstsq(matrix, right, rcond=None)[0]

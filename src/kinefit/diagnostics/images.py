@@ -1,4 +1,4 @@
-"""What a camera's images show to be wrong: sizes, black bars, a covered lens, noise."""
+"""Check a camera's images: size, black bars, covered lens, noise."""
 
 from __future__ import annotations
 
@@ -27,36 +27,42 @@ _MAX_DARK_BORDER = 0.02  # of the image: narrower bars may be a camera's own dar
 _MIN_BAR_ERROR_PX = 2.0  # video codecs smear edges
 _MIN_BAR_ERROR = 0.2  # of a bar's width, the same
 
-_LOOKS_HZ = 4.0  # depth images in which a covered lens is looked for; where it begins and ends is found to a frame
+_COVER_SEARCH_HZ = 4.0  # of depth images that are tested for a covered lens, before its interval is refined
 _MIN_COVERED_FRAMES = 2  # a single bad image is the sensor's own
-_MAX_SEEN_COVERED = 0.1  # of what a camera measures in most images
-_MIN_MEASURED = 0.4  # of the pixels: a camera that measures the person alone sees nothing of an empty place, either
-_ON_LENS_M, _ON_LENS = 0.3, 1.2  # [m], and times the stated least range, within which lies what covers a lens
-_CONFIDENT, _FEW_POINTS = 0.3, 5  # detections by which an image shows somebody
-_MIN_UNSEEN_S = 0.25  # stretches without anybody in which images of a video are looked at
-_MAX_STRETCHES = 8  # of them, the longest
-_MAX_CONTRAST_COVERED = 0.35  # of the contrast in images that show somebody: light comes through a hand
-_MIN_CHANGE_COVERED = 0.3  # of the same contrast, by which half of the image changes: not where a person walks off
-_TRIPLES = 24  # of consecutive depth images, in which noise is looked at
+_MAX_COVERED_SHARE = 0.1  # of the pixels that the camera measures in most images
+_MIN_MEASURED_SHARE = 0.4  # of the pixels: cameras that measure the person alone see nothing in an empty room, either
+_COVER_DISTANCE = 0.3  # [m] of objects that cover the lens
+_COVER_DISTANCE_RATIO = 1.2  # the same, to the sensor's stated minimal range
+_MIN_CONFIDENCE = 0.3  # of points of a detected person
+_MIN_PERSON_POINTS = 5
+_MIN_UNSEEN_S = 0.25  # of intervals without a person in which a video's images are tested
+_MAX_INTERVALS = 8  # of them, the longest
+_MAX_CONTRAST_COVERED = 0.35  # to the contrast of images with a person: light comes through a hand
+_MIN_CHANGE_COVERED = 0.3  # of half the image, to the same contrast: more than a person who leaves
+_MAX_TRIPLES = 24  # of consecutive depth images, from which noise is estimated
 _MIN_TRIPLES = 3
-_NOTHING = np.zeros(0), np.zeros((0, 2))  # times and noise of a camera in which nothing rests
+_NO_STATIC_PIXELS = np.zeros(0), np.zeros((0, 2))  # times and noise of a camera without static pixels
 _NOISE_GROWTH = 1.4e-3  # [1/m] noise by squared depth that a sensor may have beyond its sigma (Khoshelham 2012)
 _OUTLIER_SIGMAS = 6.0
-_MAX_NOISE = 1.5  # times the stated
-_MAX_UNSTABLE = 0.1  # of resting pixels that fall out of one image; Kinects alone: 0.01 to 0.04
+_MAX_NOISE_RATIO = 1.5  # to the stated sigma
+_MAX_UNSTABLE_SHARE = 0.1  # of static pixels that are missing in one image; single Kinects: 0.01 to 0.04
 
 
 def fit_image(
     entry: CameraEntry, calibrated: tuple[int, int], rate: float | None, *, frames: int = 5
 ) -> tuple[CameraEntry, list[Finding]]:
-    """The entry with `image` or `rotation` as the video's image wants it, and what is wrong with those it has.
+    """Compare a video's image with the calibration's, and correct `image` or `rotation` of the camera's entry.
 
     Parameters
     ----------
     entry : of the camera in the take.
     calibrated : (width, height) [px] of the calibration's image.
     rate : float [Hz] of the take, where it states one.
-    frames : int, how many images of the video black bars are looked for in.
+    frames : int, number of images that are searched for black bars.
+
+    Returns
+    -------
+    The corrected entry, and findings on the original one.
     """
     if entry.video is None:
         return entry, []
@@ -113,47 +119,47 @@ def fit_image(
 
 
 def finding_of(error: KinefitError, cameras: tuple[str, ...] = ()) -> Finding:
-    """What cannot be read, as a fault."""
+    """Fault for an input that cannot be read."""
     where = ", ".join(str(part) for part in (error.file, error.place) if part)
     text = f"{where}: {error.problem}." if where else f"{error.problem}."
     return Finding("fault", "load", text, cameras, remedy=error.remedy or "")
 
 
 def _bars(calibrated: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
-    """[px] width of the bars (at the sides, above and below) of a letterboxed image."""
+    """Widths [px] of the bars of a letterboxed image: at the sides, above and below."""
     low = ImageFrame.letterboxed(calibrated, size).from_calibration(np.array([-0.5, -0.5])) + 0.5
     return float(low[0]), float(low[1])
 
 
 def load_uncovered(take: Take) -> Observations:
-    """Everything that a take names, without the images of covered depth cameras; its notes say which lens was covered.
+    """Load the observations of a take, and drop images of covered depth cameras; its notes name them.
 
     Raises
     ------
     KinefitError
-        What `load_observations` raises.
+        As `load_observations`.
     """
     seen, found = without_covered(take, load_observations(take))
     return replace(seen, notes=(*seen.notes, *(f"{f.text} {f.remedy.rstrip('.')}" for f in found)))
 
 
 def without_covered(take: Take, seen: Observations) -> tuple[Observations, list[Finding]]:
-    """What the sensors of a take saw, without the images of depth cameras whose lens was covered; who was, and when.
+    """Drop images of depth cameras whose lens was covered; and findings on covered cameras, with times.
 
-    The findings are of video cameras, too: their images are looked at where nobody is detected in them.
+    Video cameras are tested too, in intervals in which no person is detected.
     """
     findings, depth = [], []
     for video in seen.depth:
         runs = _covered_runs(video)
         for a, b in runs:
-            what = f"its images are empty or nearer than {_on_lens(video):.2f} m, and are left out"
+            what = f"its images are empty or nearer than {_cover_distance(video):.2f} m, and are left out"
             findings.append(_covered(video.sensor, video.times[a], video.times[b - 1], what))
         depth.append(video.without(np.concatenate([np.arange(*run) for run in runs])) if runs else video)
     with TakePictures(take, seen) as pictures:
         for camera in dict.fromkeys(k.camera for k in seen.keypoints if k.camera in seen.videos):
             own = [k for k in seen.keypoints if k.camera == camera]
-            points = np.max([(k.confidence > _CONFIDENT).sum(axis=-1).max(axis=1, initial=0) for k in own], axis=0)
-            for a, b in _flat_runs(points >= _FEW_POINTS, seen.rate, partial(pictures, camera)):
+            points = np.max([(k.confidence > _MIN_CONFIDENCE).sum(axis=-1).max(axis=1, initial=0) for k in own], axis=0)
+            for a, b in _flat_runs(points >= _MIN_PERSON_POINTS, seen.rate, partial(pictures, camera)):
                 findings.append(_covered(camera, own[0].times[a], own[0].times[b - 1], "its image is flat"))
     return replace(seen, depth=tuple(depth)), findings
 
@@ -164,30 +170,31 @@ def _covered(camera: str, start: float, stop: float, what: str) -> Finding:
     return Finding("doubt", "covered", text, (camera,), remedy=remedy)
 
 
-def _on_lens(video: DepthVideo) -> float:
-    """[m] within which lies what covers the lens."""
-    return max(_ON_LENS_M, _ON_LENS * video.near)
+def _cover_distance(video: DepthVideo) -> float:
+    """Largest distance [m] of an object that covers the lens."""
+    return max(_COVER_DISTANCE, _COVER_DISTANCE_RATIO * video.near)
 
 
 def _covered_runs(video: DepthVideo) -> list[tuple[int, int]]:
-    """(first, last + 1) frames in which a depth camera measures next to nothing of what it measures in most others."""
+    """Frames (first, last + 1) in which a depth camera measures almost none of the pixels that it usually measures."""
 
     @cache
     def shares(i: int) -> tuple[float, float]:
-        """Of the pixels, those that measure the scene, and what is on the lens."""
+        """Shares of the pixels that measure the scene, and an object on the lens."""
         depth = video.frame(i).depth[::2, ::2]
-        return float((depth > _on_lens(video)).mean()), float(((depth > 0.0) & (depth <= _on_lens(video))).mean())
+        near = _cover_distance(video)
+        return float((depth > near).mean()), float(((depth > 0.0) & (depth <= near)).mean())
 
-    step = max(int(video.rate / _LOOKS_HZ), 1)
-    looks = range(0, len(video), step)
-    usual = 0.0 if video.on_body else float(np.quantile([shares(i)[0] for i in looks], 0.75))
+    step = max(int(video.rate / _COVER_SEARCH_HZ), 1)
+    tested = range(0, len(video), step)
+    reference = 0.0 if video.on_body else float(np.quantile([shares(i)[0] for i in tested], 0.75))
 
     def is_covered(i: int) -> bool:
         scene, lens = shares(i)
-        return scene < _MAX_SEEN_COVERED * usual and max(usual, lens) > _MIN_MEASURED
+        return scene < _MAX_COVERED_SHARE * reference and max(reference, lens) > _MIN_MEASURED_SHARE
 
     out = []
-    for a, b in runs_of(np.array([is_covered(i) for i in looks])):
+    for a, b in runs_of(np.array([is_covered(i) for i in tested])):
         first, last = a * step, (b - 1) * step
         while first > 0 and is_covered(first - 1):
             first -= 1
@@ -201,40 +208,46 @@ def _covered_runs(video: DepthVideo) -> list[tuple[int, int]]:
 def _flat_runs(
     shows: NDArray, rate: float, image: Callable[[int], tuple[NDArray, ImageFrame] | None]
 ) -> list[tuple[int, int]]:
-    """(first, last + 1) frames in which nobody is shown (F,) and a camera's images are flat, beside those that show."""
+    """Frames (first, last + 1) without a person in which a camera's image is flat, compared with those of a person.
+
+    shows (F,) bool: whether a frame shows a person. rate [Hz].
+    """
     runs = [run for run in runs_of(~shows) if run[1] - run[0] >= max(_MIN_UNSEEN_S * rate, _MIN_COVERED_FRAMES)]
-    there = np.flatnonzero(shows)
-    if not runs or not len(there):
+    shown = np.flatnonzero(shows)
+    if not runs or not len(shown):
         return []
 
     def grey(frame: int) -> NDArray | None:
         found = image(int(frame))
         return None if found is None else cv2.resize(found[0].mean(axis=-1), (32, 24), interpolation=cv2.INTER_AREA)
 
-    some = [g for f in there[np.linspace(0, len(there) - 1, 5).astype(int)] if (g := grey(f)) is not None]
-    if not some:
+    references = [g for f in shown[np.linspace(0, len(shown) - 1, 5).astype(int)] if (g := grey(f)) is not None]
+    if not references:
         return []
-    usual = np.median(some, axis=0)
+    reference = np.median(references, axis=0)
 
     def is_covered(frame: int) -> bool:
         g = grey(frame)
-        flat = g is not None and g.std() < _MAX_CONTRAST_COVERED * usual.std()
-        return flat and np.median(np.abs(g - usual)) > _MIN_CHANGE_COVERED * usual.std()
+        flat = g is not None and g.std() < _MAX_CONTRAST_COVERED * reference.std()
+        return flat and np.median(np.abs(g - reference)) > _MIN_CHANGE_COVERED * reference.std()
 
-    longest = sorted(runs, key=lambda run: run[0] - run[1])[:_MAX_STRETCHES]
+    longest = sorted(runs, key=lambda run: run[0] - run[1])[:_MAX_INTERVALS]
     return sorted(run for run in longest if all(map(is_covered, np.linspace(run[0], run[1] - 1, 5)[1:4].astype(int))))
 
 
 def noise_findings(take: Take, videos: Sequence[DepthVideo]) -> list[Finding]:
-    """Depth cameras whose resting pixels scatter or fall out more than is stated: by light of the same kind, often."""
+    """Findings on depth cameras whose static pixels are noisier than stated, or often missing.
+
+    The usual cause is other light of the same wavelength.
+    """
     out = []
     for entry in take.depth:
         others = [v for v in videos if v.sensor != entry.name]
-        times, values = next((_instability(v, entry.sigma) for v in videos if v not in others), _NOTHING)
+        times, values = next((_instability(v, entry.sigma) for v in videos if v not in others), _NO_STATIC_PIXELS)
         noise, unstable = np.quantile(values, 0.75, axis=0) if len(times) else (0.0, 0.0)
-        if noise < _MAX_NOISE and unstable < _MAX_UNSTABLE:
+        if noise < _MAX_NOISE_RATIO and unstable < _MAX_UNSTABLE_SHARE:
             continue
-        how = "flickers" if noise < _MAX_NOISE else f"is noisier than stated, by a factor of {noise:.1f}"
+        how = "flickers" if noise < _MAX_NOISE_RATIO else f"is noisier than stated, by a factor of {noise:.1f}"
         text = f"{entry.name} {how}: from image to image {100 * unstable:.0f} % of the pixels at rest are lost or jump"
         both = np.array([any(v.times[0] <= t <= v.times[-1] for v in others) for t in times])
         if min(both.sum(), (~both).sum()) >= _MIN_TRIPLES:
@@ -247,23 +260,23 @@ def noise_findings(take: Take, videos: Sequence[DepthVideo]) -> list[Finding]:
 
 
 def _instability(video: DepthVideo, sigma: float) -> tuple[NDArray, NDArray]:
-    """Times (T,) [s] and of each (T, 2): noise of resting pixels in time over the stated, share of those that fall out.
+    """Times (T,) [s], and (T, 2): temporal noise of static pixels as a ratio to the stated, share of missing ones.
 
-    By three consecutive images: a person who comes or goes makes a step, which is not counted. Nothing where the
-    camera measures the person alone.
+    Computed over three consecutive images, so that the step of a person who enters or leaves is not counted. Empty if
+    the camera measures the person alone.
     """
     middles = np.setdiff1d(np.arange(1, len(video) - 1), np.r_[video.gaps, video.gaps - 1])
     thin = max(min(video.size) // 120, 1)
-    looks = middles[np.unique(np.linspace(0, len(middles) - 1, _TRIPLES).astype(int))] if len(middles) else middles
-    triples = [np.stack([video.frame(int(i) + k).depth[::thin, ::thin] for k in (-1, 0, 1)]) for i in looks]
+    tested = middles[np.unique(np.linspace(0, len(middles) - 1, _MAX_TRIPLES).astype(int))] if len(middles) else middles
+    triples = [np.stack([video.frame(int(i) + k).depth[::thin, ::thin] for k in (-1, 0, 1)]) for i in tested]
     if len(triples) < _MIN_TRIPLES:
-        return _NOTHING
-    often = np.mean([t[1] > 0.0 for t in triples], axis=0) > 0.5
-    if often.mean() < _MIN_MEASURED:
-        return _NOTHING
+        return _NO_STATIC_PIXELS
+    measurable = np.mean([t[1] > 0.0 for t in triples], axis=0) > 0.5
+    if measurable.mean() < _MIN_MEASURED_SHARE:
+        return _NO_STATIC_PIXELS
     out = []
     for before, z, after in triples:
-        ends = (before > 0.0) & (after > 0.0) & often
+        ends = (before > 0.0) & (after > 0.0) & measurable
         measured = ends & (z > 0.0)
         stated = np.maximum(sigma, _NOISE_GROWTH * np.square(after))
         second = np.abs(before - 2.0 * z + after) / stated
@@ -271,4 +284,4 @@ def _instability(video: DepthVideo, sigma: float) -> tuple[NDArray, NDArray]:
         lost = rests & ((z <= 0.0) | (np.abs(z - after) > _OUTLIER_SIGMAS * stated))
         noise = float(np.median(second[measured])) / (0.6745 * np.sqrt(6.0)) if measured.any() else 0.0
         out.append((noise, lost.sum() / max(rests.sum(), 1)))
-    return video.times[looks], np.array(out)
+    return video.times[tested], np.array(out)

@@ -1,4 +1,4 @@
-"""`check_keypoints`: what is wrong with calibrated keypoints, how sure that is, and what would mend it."""
+"""Check calibrated keypoints: each finding states what is wrong, the confidence, and the remedy."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from kinefit.readers.take.load import Observations
 
 Progress = Callable[[str, int, int], None]
 
-_FRAMES = 240  # for what does not change over time, spread over the recording
-_QUICK_FRAMES = 150  # consecutive ones that clocks are compared in, where it must be quick
-_QUICK_PLACES = 5  # where these may lie, spread over the recording: where the person moves most
-_LEAP = 100.0  # [px] in five frames, beyond which a point is another person's
-_STEPS = 6
+_SAMPLE_FRAMES = 240  # spread over the recording, for properties that are constant over time
+_QUICK_FRAMES = 150  # consecutive frames in which a quick check compares clocks
+_QUICK_INTERVALS = 5  # candidates for these, spread over the recording: the one with most motion is used
+_MAX_JUMP_PX = 100.0  # in five frames; a larger one is to another person
+_PROGRESS_STEPS = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """What a check found and measured.
+    """Findings and measurements of a check.
 
     Parameters
     ----------
@@ -47,17 +47,18 @@ class Check:
         Of the take.
     findings : tuple of Finding, worst first.
     take : Take or None
-        As it could be read: where something did not fit, with the remedy that the finding names.
+        As read, with the remedies of the findings applied where entries did not fit.
     observations : Observations or None
     views : KeypointViews or None
-        The person's keypoints, left and right put right, brought in step; of some frames alone after a quick check.
+        The person's keypoints, with left and right corrected and cameras synchronised; a sample of the frames after a
+        quick check.
     x_world : (F, K, 3) [m] or None
-        Where they meet.
+        Triangulated keypoints.
     biases, coverage : one for each camera.
     times : TimeOffsets or None
     frames_late : {camera: int}
-        By how many frames a camera's views were moved to bring them in step; none where empty.
-    sensors : of each depth camera and marker system, how it lies against the videos.
+        Number of frames by which a camera's views were shifted to synchronise them; empty if none were.
+    sensors : alignment of each depth camera and marker system with the videos.
     """
 
     name: str
@@ -74,11 +75,11 @@ class Check:
 
     @property
     def faults(self) -> tuple[Finding, ...]:
-        """The findings that spoil results."""
+        """Findings of the severity "fault"."""
         return faults_of(self.findings)
 
     def of(self, camera: str) -> tuple[Finding, ...]:
-        """The findings about one camera."""
+        """Findings about one camera."""
         return tuple(found for found in self.findings if camera in found.cameras)
 
 
@@ -93,19 +94,20 @@ def check_keypoints(
     quick: bool = False,
     progress: Progress | None = None,
 ) -> Check:
-    """Look for everything that is wrong with keypoints and the rig of their cameras.
+    """Run all checks on keypoints and the rig of their cameras.
 
     Parameters
     ----------
     rig : Rig of the cameras of the keypoints.
     keypoints : records of the same number of frames and the same rate.
-    body : name or file of the body whose bone lengths give the person's height, or the body.
+    body : the body, or its name or file; its bone lengths give the person's height.
     up : str, vertical axis of the world.
-    height : float [m] stature, where it is known.
-    begun : name, take and observations that the keypoints are of, for their standard deviations, remedies and images;
-        its findings are kept among the others.
-    quick : bool, whether a second must do: clocks are compared in the liveliest of some stretches of the recording,
-        left and right in some frames.
+    height : float [m] stature; None if unknown.
+    begun : Check with name, take and observations of the keypoints, for standard deviations, remedies and images. Its
+        findings are kept.
+    quick : bool, whether to finish within a second: clocks are compared in the interval with most motion, left and
+        right in a sample of the frames.
+    progress : called with an action, the steps done and their number.
     """
     begun = begun or Check("take")
     take, observations = begun.take, begun.observations
@@ -113,15 +115,15 @@ def check_keypoints(
     findings = [*begun.findings, *lens_findings(rig)]
 
     def done(what: int) -> None:
-        step("checking", what, _STEPS)
+        step("checking", what, _PROGRESS_STEPS)
 
     def ended(views: KeypointViews | None = None, **more: object) -> Check:
         return replace(begun, findings=ranked(findings), views=views, **more)  # type: ignore[arg-type]
 
     done(0)
     try:
-        lively = make_views(rig, [_liveliest(k, keypoints) for k in keypoints] if quick else keypoints)
-        views = make_views(rig, [_thinned(k) for k in keypoints]) if quick else lively
+        moving = make_views(rig, [_most_motion(k, keypoints) for k in keypoints] if quick else keypoints)
+        views = make_views(rig, [_thinned(k) for k in keypoints]) if quick else moving
     except KinefitError as error:
         text = f"{error.problem[:1].upper()}{error.problem[1:]}."
         findings.append(Finding("fault", "nobody", text, remedy=error.remedy or ""))
@@ -131,93 +133,93 @@ def check_keypoints(
         pictures = {k.camera: k.frame for k in take.keypoints if k.frame is not None}
         more, views = frame_findings(views, observations.images, pictures)
         findings += more
-    gross = mistake_findings(views.spread(_FRAMES), file.name)
+    gross = mistake_findings(views.spread(_SAMPLE_FRAMES), file.name)
     if not gross:
-        views, more = _seen(views)
+        views, more = _with_person(views)
         findings += more
         done(2)
         gross = group_findings(rig, keypoints, observations.frames[0] if observations is not None else 0)
     if not gross:
-        lively = lively.select(views.rig.names) if quick else views
-        times, stepped, late = _in_step(lively)
+        moving = moving.select(views.rig.names) if quick else views
+        times, stepped, late = _synchronised(moving)
         views = with_sides_right(views) if quick and not late else stepped
-        gross = stranger_findings(views.spread(_FRAMES))
-        if gross:  # and something is wrong for sure
-            some = views.spread(_FRAMES)
-            gross = distortion_findings(some) or mistake_findings(some, file.name, lenient=True) or gross
+        gross = stranger_findings(views.spread(_SAMPLE_FRAMES))
+        if gross:  # a mistake is certain: smaller improvements suffice
+            sampled = views.spread(_SAMPLE_FRAMES)
+            gross = distortion_findings(sampled) or mistake_findings(sampled, file.name, lenient=True) or gross
     findings += gross
     if any(g.kind != "stranger" for g in gross) or len(views.rig) < 2:
         return ended(views)
     done(3)
-    strangers = {camera for g in gross for camera in g.cameras}
-    if strangers:
-        rest = [n for n in views.rig.names if n not in strangers]
-        times, stepped, late = _in_step(lively.select(rest))
+    stranger_names = {camera for g in gross for camera in g.cameras}
+    if stranger_names:
+        rest = [n for n in views.rig.names if n not in stranger_names]
+        times, stepped, late = _synchronised(moving.select(rest))
         views = with_sides_right(views.select(rest)) if quick and not late else stepped
-    some = views.spread(_FRAMES)
-    x, _ = meet(some)
+    sampled = views.spread(_SAMPLE_FRAMES)
+    x, _ = meet(sampled)
     if not np.isfinite(x).any():
         findings.append(
             Finding("fault", "apart", "No two cameras see a point together.", remedy="Point the cameras at one place.")
         )
         return ended(views, times=times)
-    biases = camera_biases(some)
+    biases = camera_biases(sampled)
     done(4)
     sets = list(dict.fromkeys(k.keypoint_set for k in keypoints))
-    size = size_findings(stature(load_body(body) if isinstance(body, str) else body, sets, some, x), height)
-    findings += (focal_findings(some) if size[0].severity == "fault" else []) or size
+    size = size_findings(stature(load_body(body) if isinstance(body, str) else body, sets, sampled, x), height)
+    findings += (focal_findings(sampled) if size[0].severity == "fault" else []) or size
     findings += upright_findings(views.rig, x, views.names, up)
     done(5)
-    findings += distortion_findings(some)
+    findings += distortion_findings(sampled)
     offsets = {c.name: c.time_offset for c in take.cameras} if take else {}
     findings += time_findings(times, offsets, fast_pixels(stepped), confirmed=bool(late))
-    findings += bias_findings(biases, disagreement(some) if len(views.rig) > 2 else None, _sigmas(take), file)
+    findings += bias_findings(biases, disagreement(sampled) if len(views.rig) > 2 else None, _sigmas(take), file)
     findings += side_findings(views) + placement_findings(views.rig, x[np.isfinite(x).all(-1)])
-    covered = coverage(some, x)
+    covered = coverage(sampled, x)
     findings += coverage_findings(covered)
-    done(_STEPS)
+    done(_PROGRESS_STEPS)
     findings = explained(findings)
     whole = None if quick else meet(views)[0]
     return ended(views, x_world=whole, biases=biases, coverage=covered, times=times, frames_late=late)
 
 
 def _sigmas(take: Take | None) -> dict[str, float]:
-    """[px] of each camera's keypoints, the least of its detectors'; empty without a take."""
+    """Sigma [px] of each camera's keypoints, the smallest of its detectors; empty without a take."""
     entries = sorted(take.keypoints if take else (), key=lambda entry: -entry.sigma)
     return {entry.camera: entry.sigma for entry in entries}
 
 
 def _thinned(record: Keypoints) -> Keypoints:
-    """Some frames, spread over the recording."""
-    return record.rows(slice(None, None, max(1, -(-len(record) // _FRAMES))), record.time_offset)
+    """A sample of the frames, spread over the recording."""
+    return record.rows(slice(None, None, max(1, -(-len(record) // _SAMPLE_FRAMES))), record.time_offset)
 
 
-def _liveliest(record: Keypoints, keypoints: Sequence[Keypoints]) -> Keypoints:
-    """The same stretch of every record: of some places, the one where most moves."""
+def _most_motion(record: Keypoints, keypoints: Sequence[Keypoints]) -> Keypoints:
+    """The same interval of every record: of some candidates, the one with most motion."""
     length = min(len(k) for k in keypoints)
-    starts = np.unique(np.linspace(0, max(length - _QUICK_FRAMES, 0), _QUICK_PLACES).astype(int))
+    starts = np.unique(np.linspace(0, max(length - _QUICK_FRAMES, 0), _QUICK_INTERVALS).astype(int))
     moved = []
     for start in starts if len(starts) > 1 else ():
-        seen = [k.points[start : start + _QUICK_FRAMES : 5, 0] for k in keypoints if k.points.shape[1]]
-        moved.append(sum(float(np.nansum(np.minimum(np.abs(np.diff(uv, axis=0)), _LEAP))) for uv in seen))
+        detected = [k.points[start : start + _QUICK_FRAMES : 5, 0] for k in keypoints if k.points.shape[1]]
+        moved.append(sum(float(np.nansum(np.minimum(np.abs(np.diff(uv, axis=0)), _MAX_JUMP_PX))) for uv in detected))
     start = int(starts[int(np.argmax(moved))]) if moved else 0
     return record.rows(slice(start, min(start + _QUICK_FRAMES, length)), record.time_offset)
 
 
-def _seen(views: KeypointViews) -> tuple[KeypointViews, list[Finding]]:
-    """The views of the cameras that saw somebody, and which did not."""
-    seen = np.isfinite(views.uv).any(axis=(0, 1, 3))
+def _with_person(views: KeypointViews) -> tuple[KeypointViews, list[Finding]]:
+    """The views of cameras in which a person was detected, and findings on the others."""
+    detected = np.isfinite(views.uv).any(axis=(0, 1, 3))
     out = []
-    for name in (n for n, s in zip(views.rig.names, seen, strict=True) if not s):
+    for name in (n for n, s in zip(views.rig.names, detected, strict=True) if not s):
         remedy = "Check its video and keypoints; or leave it out of the take."
         out.append(Finding("fault", "coverage", f"Nobody was detected in {name}.", (name,), remedy=remedy))
-    return views.select([n for n, s in zip(views.rig.names, seen, strict=True) if s]), out
+    return views.select([n for n, s in zip(views.rig.names, detected, strict=True) if s]), out
 
 
-def _in_step(views: KeypointViews) -> tuple[TimeOffsets, KeypointViews, dict[str, int]]:
-    """Time offsets, and the views with left and right put right and brought in step where that is sure.
+def _synchronised(views: KeypointViews) -> tuple[TimeOffsets, KeypointViews, dict[str, int]]:
+    """Time offsets, and the views with left and right corrected and, where offsets are significant, synchronised.
 
-    Sides can only be told of cameras in step, offsets only of points with their right names; two rounds do both.
+    Sides can only be corrected in synchronised cameras, offsets only estimated from correct sides: two rounds do both.
     """
     right = with_sides_right(views)
     times = time_offsets(right)
@@ -229,12 +231,12 @@ def _in_step(views: KeypointViews) -> tuple[TimeOffsets, KeypointViews, dict[str
     moved = with_sides_right(shifted(views, delays))
     if disagreement_share(moved.rig, sample(moved)) > disagreement_share(right.rig, sample(right)):
         return times, right, {}
-    again = time_offsets(_unmoved(views, moved, delays) if moved.swapped.any() else right)
+    again = time_offsets(_unshifted(views, moved, delays) if moved.swapped.any() else right)
     return again, moved, dict(zip(views.rig.names, delays.astype(int).tolist(), strict=True))
 
 
-def _unmoved(views: KeypointViews, moved: KeypointViews, delays: NDArray) -> KeypointViews:
-    """The views as they came, with the sides exchanged that were found exchanged once they were in step."""
+def _unshifted(views: KeypointViews, moved: KeypointViews, delays: NDArray) -> KeypointViews:
+    """The original views, with the sides swapped that were found swapped after synchronisation."""
     uv, swapped = views.uv.copy(), views.swapped.copy()
     for c, delay in enumerate(delays.astype(int)):
         frames = np.flatnonzero(moved.swapped[:, c]) - delay

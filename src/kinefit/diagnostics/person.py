@@ -1,4 +1,4 @@
-"""What the person tells about the world: which way is up, where the floor is, left and right, how tall people are."""
+"""Check the world by the person in it: vertical, floor, left and right, scale."""
 
 from __future__ import annotations
 
@@ -15,44 +15,45 @@ from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
 from kinefit.readers.guess.views import nearest_axis, up_of_cameras, up_of_person
 
-_WRONG = 45.0  # [deg] from which another axis is nearer
-_LEANING = 20.0  # [deg] people stand, but not like poles
-_FLOOR = 0.15  # [m] foot points lie above the sole, by up to this
+_MAX_UP_ANGLE = 45.0  # [deg] beyond which another axis is nearer
+_MAX_LEAN = 20.0  # [deg] of a standing person
+_MAX_FLOOR_HEIGHT = 0.15  # [m] of foot points, which lie above the sole
 # [m] From the smallest boys of eight (CDC growth charts, Kuczmarski et al. 2002, Vital and Health Statistics 11(246):
-# 5th percentile 1.18 m) to the tallest men (2.03 m, 1 in 1,000), whose bones two noisy cameras see 13 % too long.
+# 5th percentile 1.18 m) to the tallest men (2.03 m, 1 in 1,000), whose bones two noisy cameras measure 13 % too long.
 _MIN_STATURE, _MAX_STATURE = 1.2, 2.3
 # [m] Adults: women are 1.629 +- 0.064 m tall, men 1.756 +- 0.069 m (Gordon et al., 2012 anthropometric survey of U.S.
 # Army personnel, NATICK/TR-15/007); below and above, one in 300 women and one in 10,000 men.
-_MIN_ADULT, _MAX_ADULT = 1.45, 2.03
-_LONG = 0.15  # [m] bones from here on are measured; shorter ones are mostly the detector's habits
-_MAX_STATURE_ERROR = 0.08  # log ratio of a stated height and the bones: detectors' points are off the joints
-_MIN_SCALE_FAULT = 0.22  # the same, that no detector and no build explains: three times as much
-_MIN_BEND = np.radians(20.0)  # of a knee, from which it shows where forward is
+_MIN_ADULT_STATURE = 1.45
+_MAX_ADULT_STATURE = 2.03
+_MIN_BONE_LENGTH = 0.15  # [m] shorter bones are dominated by systematic errors of the detector
+_MAX_STATURE_ERROR = 0.08  # log ratio of the measured to the stated height: detected points are off the joints
+_MIN_SCALE_FAULT = 0.22  # the same, about three times as much: beyond any detector and build
+_MIN_KNEE_BEND = np.radians(20.0)  # of a knee that indicates the forward direction
 _UNIT_TOLERANCE = 0.4  # log ratio: people differ by 1.25 in size, and detectors add to it
 _UNITS = {"mm": 1e3, "cm": 1e2, "dm": 1e1, "inch": 39.37}
 _FEET = ("Ankle", "Heel", "BigToe", "SmallToe", "ankle", "heel", "foot_index")
 
 
 def upright_findings(rig: Rig, x: NDArray, names: Sequence[str], up: str) -> list[Finding]:
-    """Whether `up` points up, the floor lies under the feet, and left is left: x (F, K, 3) [m] points of the person."""
+    """Check the vertical `up`, the floor, and left and right, by the person's points x (F, K, 3) [m]."""
     axis, person, cameras = np.array(UP_AXES[up]), up_of_person(x, names), up_of_cameras(rig)
     ways = {"the cameras' images": cameras} | ({} if person is None else {"the person's head and feet": person})
     angles = {why: float(np.degrees(np.arccos(np.clip(way @ axis, -1, 1)))) for why, way in ways.items()}
-    wrong = [why for why, angle in angles.items() if angle > _WRONG]
+    wrong = [why for why, angle in angles.items() if angle > _MAX_UP_ANGLE]
     if len(wrong) == len(angles) and person is not None:
         right, off = nearest_axis(person)
-        how = "the floor would be the ceiling" if min(angles.values()) > 180 - _WRONG else "the person would lie"
-        told = " and ".join(f"{why} ({angle:.0f} degrees off)" for why, angle in angles.items())
+        how = "the floor would be the ceiling" if min(angles.values()) > 180 - _MAX_UP_ANGLE else "the person would lie"
+        evidence = " and ".join(f"{why} ({angle:.0f} degrees off)" for why, angle in angles.items())
         remedy = f'Write up = "{right}" into [take].'
-        if off > _LEANING:
+        if off > _MAX_LEAN:
             remedy += f" It leans by {off:.0f} degrees."
-        out = [Finding("fault", "up", f'up = "{up}" is wrong: {how}.', (), f"Sure: by {told}.", remedy)]
+        out = [Finding("fault", "up", f'up = "{up}" is wrong: {how}.', (), f"Sure: by {evidence}.", remedy)]
         axis = np.array(UP_AXES[right])
     elif wrong:
-        told = " and ".join(f"{why} show {nearest_axis(ways[why])[0]}" for why in wrong)
+        evidence = " and ".join(f"{why} show {nearest_axis(ways[why])[0]}" for why in wrong)
         remedy = "Look whether the person lies, or a camera stands on its side."
-        out = [Finding("doubt", "up", f'up = "{up}" is not sure: {told}.', remedy=remedy)]
-    elif min(angles.values()) > _LEANING:
+        out = [Finding("doubt", "up", f'up = "{up}" is not sure: {evidence}.', remedy=remedy)]
+    elif min(angles.values()) > _MAX_LEAN:
         text = f'up = "{up}", but person and cameras lean by {min(angles.values()):.0f} degrees or more.'
         out = [Finding("doubt", "up", text, remedy="Is the floor of the calibration level?")]
     else:
@@ -68,16 +69,16 @@ def _floor_findings(x: NDArray, names: Sequence[str], up: NDArray) -> list[Findi
         return []
     floor = float(np.percentile(heights, 5))
     text = f"The lowest foot points are {100 * floor:+.0f} cm from the world's zero height"
-    if abs(floor) < _FLOOR:
+    if abs(floor) < _MAX_FLOOR_HEIGHT:
         return [Finding("good", "floor", f"{text}: the floor is at zero.")]
     remedy = "Nothing, unless heights above the floor are wanted: then move the world's origin."
     return [Finding("note", "floor", f"{text}: the floor is not at zero.", remedy=remedy)]
 
 
 def _hand_findings(x: NDArray, names: Sequence[str]) -> list[Finding]:
-    """Whether the person's left is where it must be, seen from above and from behind.
+    """Check left and right against the forward direction of the person.
 
-    In front are the nose before the ears, toes before heels, and knees that bend.
+    Forward is the nose relative to the ears, the toes relative to the heels, and the bent knees.
     """
     sides = ("left", "right")
     at = {joint: [_index(names, side, joint) for side in sides] for joint in ("ear", "hip", "shoulder")}
@@ -99,39 +100,39 @@ def _hand_findings(x: NDArray, names: Sequence[str]) -> list[Finding]:
     if len(votes) < 10 or votes.mean() > -0.5:
         return []
     text = "Left and right are exchanged: the person's face, toes and knees point backwards."
-    sure = f"Sure: so in {100 * np.mean(votes < 0):.0f} % of the frames, while the cameras agree."
+    confidence = f"Sure: so in {100 * np.mean(votes < 0):.0f} % of the frames, while the cameras agree."
     remedy = (
         "Exchange the names of left and right in the keypoints of all cameras (is their format or set another?); or, "
         "if images and calibration were mirrored together, mirror the videos back, calibrate and detect anew."
     )
-    return [Finding("fault", "mirrored", text, (), sure, remedy)]
+    return [Finding("fault", "mirrored", text, (), confidence, remedy)]
 
 
 def _ahead_of_knee(hip: NDArray, knee: NDArray, ankle: NDArray) -> NDArray:
-    """(F, 3) [m] from the line of hip and ankle to the knee; NaN where it is hardly bent."""
+    """Vector (F, 3) [m] from the middle of hip and ankle to the knee; NaN where the knee is nearly straight."""
     thigh, shank = knee - hip, ankle - knee
     cosine = np.sum(thigh * shank, axis=-1) / np.maximum(
         np.linalg.norm(thigh, axis=-1) * np.linalg.norm(shank, axis=-1), 1e-12
     )
     ahead = np.asarray(knee - 0.5 * (hip + ankle))
-    return np.where((cosine < np.cos(_MIN_BEND))[:, None], ahead, np.nan)
+    return np.where((cosine < np.cos(_MIN_KNEE_BEND))[:, None], ahead, np.nan)
 
 
 def _index(names: Sequence[str], side: str, joint: str) -> int | None:
-    """Of a joint under a detector's spelling: "LHip", "left_hip", "LBigToe"."""
+    """Index of a joint in a detector's spelling: "LHip", "left_hip", "LBigToe"; None without it."""
     short = {"foot_index": "BigToe"}.get(joint, joint.capitalize())
     return next((k for k, n in enumerate(names) if n in (f"{side}_{joint}", f"{side[0].upper()}{short}")), None)
 
 
 def stature(body: Body, keypoint_sets: Sequence[str], views: KeypointViews, x: NDArray) -> float | None:
-    """[m] height of the person by the median length of the bones seen; None where none is."""
+    """Height [m] of the person by the median of the measured bone lengths in x (F, K, 3) [m]; None with too few."""
     ratios = []
     for name in keypoint_sets:
         points = body.keypoints(name)
         columns = {n: views.names.index(n) for n in points.names if n in views.names}
         for i, j, _, length in rigid_pairs(body, points):
             a, b = columns.get(points.names[i]), columns.get(points.names[j])
-            if a is not None and b is not None and length > _LONG:
+            if a is not None and b is not None and length > _MIN_BONE_LENGTH:
                 found = np.linalg.norm(x[:, a] - x[:, b], axis=-1)
                 if np.isfinite(found).sum() >= 5:
                     ratios.append(float(np.nanmedian(found)) / length)
@@ -139,21 +140,21 @@ def stature(body: Body, keypoint_sets: Sequence[str], views: KeypointViews, x: N
 
 
 def size_findings(height: float | None, stated: float | None) -> list[Finding]:
-    """Whether the person is as tall as people are: the calibration's unit and scale.
+    """Check unit and scale of the calibration by the person's height.
 
     Parameters
     ----------
-    height : float [m] as measured, None where too little is seen.
-    stated : float [m] as the take says.
+    height : float [m] as measured; None if too few bones were measured.
+    stated : float [m] as the take states it; None if it does not.
     """
     if height is None:
         return [Finding("note", "scale", "Too few bones are seen to estimate the person's size.")]
     ratio = 0.0 if stated is None else abs(np.log(height / stated))
     if ratio > _MAX_STATURE_ERROR:
         text = f"The person measures {height:.3g} m by the long bones, and the take says {stated:.2f} m."
-        sure = "Likely: a detector's points are a few per cent off the joints, not more."
+        confidence = "Likely: a detector's points are a few per cent off the joints, not more."
         remedy = f"Check height in [take], and the scale of the calibration{_unit_remedy(height / (stated or 1.0))}."
-        return [Finding("fault" if ratio > _MIN_SCALE_FAULT else "doubt", "scale", text, (), sure, remedy)]
+        return [Finding("fault" if ratio > _MIN_SCALE_FAULT else "doubt", "scale", text, (), confidence, remedy)]
     if stated is None and not _MIN_STATURE <= height <= _MAX_STATURE:
         text = (
             f"The person would be {height:.3g} m tall: the calibration's unit or scale is wrong. People are "
@@ -164,8 +165,9 @@ def size_findings(height: float | None, stated: float | None) -> list[Finding]:
             f"{_unit_remedy(height / 1.75)}. Of a child, write height = ... into [take]."
         )
         return [Finding("fault", "scale", text, (), "Sure, unless it is a child, a doll or an animal.", remedy)]
-    if stated is None and not _MIN_ADULT <= height <= _MAX_ADULT:
-        text = f"The person would be {height:.2f} m tall. Few adults are below {_MIN_ADULT} m or above {_MAX_ADULT} m."
+    if stated is None and not _MIN_ADULT_STATURE <= height <= _MAX_ADULT_STATURE:
+        limits = f"below {_MIN_ADULT_STATURE} m or above {_MAX_ADULT_STATURE} m"
+        text = f"The person would be {height:.2f} m tall. Few adults are {limits}."
         remedy = (
             "Either the scale is wrong (check the size of the calibration's board squares; nothing measures it where "
             "cameras are not calibrated), or a child is in view. Write height = ... into [take]."
@@ -175,7 +177,7 @@ def size_findings(height: float | None, stated: float | None) -> list[Finding]:
 
 
 def _unit_remedy(ratio: float) -> str:
-    """The line of the take that mends lengths so many times too large, or how many times they are."""
+    """The line of the take that corrects lengths by this ratio, or the ratio if no unit explains it."""
     unit = min(_UNITS, key=lambda u: abs(abs(np.log(ratio)) - np.log(_UNITS[u])))
     if abs(abs(np.log(ratio)) - np.log(_UNITS[unit])) < _UNIT_TOLERANCE:
         right = f'unit = "{unit}"' if ratio > 1.0 else f'unit = "m", not "{unit}",'

@@ -1,4 +1,4 @@
-"""What `track` always looks at: faults of its inputs that a second of work shows."""
+"""Checks that `track` always runs: faults of its inputs that can be detected within a second."""
 
 from __future__ import annotations
 
@@ -20,36 +20,36 @@ from kinefit.readers.guess.views import nearest_axis
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
 
-_MIN_QUALITY = 0.5  # of a frame that shows how the person is placed
-_MIN_FRAMES = 10
-_MIN_INVERTED = 135.0  # [deg] median angle between trunk and vertical
-_MIN_LYING = 60.0  # [deg] the same: who bends comes back
-_MIN_WALK = 0.5  # [m] across the trunk: nobody goes so far lying
+_MIN_QUALITY = 0.5  # of frames that are used
+_MIN_FRAMES = 10  # of that quality
+_MIN_INVERTED_ANGLE = 135.0  # [deg] median angle between trunk and vertical
+_MIN_LYING_ANGLE = 60.0  # [deg] the same; a median, as bending is brief
+_MIN_LYING_TRAVEL = 0.5  # [m] across the trunk: a lying person does not move so far
 _MIN_LATE_S = 0.05  # of a camera's clock: a hand that gestures at 0.5 m/s is 2.5 cm off by that
-_LATE_STDS = 8.0  # standard errors of the same
-_STATED = ("scaled", "letterboxed")  # what the take may say of an image, and one image of the video can contradict
+_MIN_LATE_SIGMAS = 8.0  # standard errors of the same
+_STATED_IMAGES = ("scaled", "letterboxed")  # statements of the take that one image of the video can contradict
 
 
 def input_findings(take: Take, seen: Observations, keypoints: Sequence[Keypoints], body: Body) -> tuple[Finding, ...]:
-    """The faults of a take's images, cameras and keypoints, and doubts about clocks that displace a moving hand.
+    """Find faults of a take's images, cameras and keypoints, and clock errors that displace a moving hand.
 
-    Other doubts are for `kinefit check`.
+    `kinefit check` reports all other doubts.
 
     Parameters
     ----------
     take : Take
-    seen : what its sensors saw.
-    keypoints : of the person who is tracked.
+    seen : its observations.
+    keypoints : of the tracked person.
     body : of the person, generic.
     """
     rig, findings, late = seen.rig, list[Finding](), list[Finding]()
     if rig is None or take.calibration is None:
         return ()
     for entry in take.cameras:
-        if entry.image in _STATED:
+        if entry.image in _STATED_IMAGES:
             findings += fit_image(entry, rig[entry.name].size, take.rate, frames=1)[1]
-    everybody, here = _with_somebody(seen.keypoints), _with_somebody(keypoints)
-    shown = [k for k in keypoints if k.camera in here or k.camera not in everybody]  # a camera may see others alone
+    everybody, here = _cameras_with_people(seen.keypoints), _cameras_with_people(keypoints)
+    shown = [k for k in keypoints if k.camera in here or k.camera not in everybody]  # a camera may see others only
     cameras = tuple(name for name in rig.names if any(k.camera == name for k in shown))
     if len(cameras) > 1:
         begun = Check(take.name, take=take, observations=seen)
@@ -58,26 +58,27 @@ def input_findings(take: Take, seen: Observations, keypoints: Sequence[Keypoints
         )
         findings += check.findings
         if (t := check.times) is not None:
-            clear = np.abs(t.offsets) >= np.maximum(_MIN_LATE_S, _LATE_STDS * t.std)
+            clear = np.abs(t.offsets) >= np.maximum(_MIN_LATE_S, _MIN_LATE_SIGMAS * t.std)
             names = {name for name, is_late in zip(t.cameras, clear) if is_late}
             late = [f for f in check.findings if f.kind == "time" and f.severity == "doubt" and names & {*f.cameras}]
     return *faults_of(findings), *late
 
 
-def _with_somebody(keypoints: Sequence[Keypoints]) -> set[str]:
-    """The cameras in which anybody was detected."""
+def _cameras_with_people(keypoints: Sequence[Keypoints]) -> set[str]:
+    """Names of the cameras in which a person was detected."""
     return {k.camera for k in keypoints if np.any(k.confidence > 0.0)}
 
 
 def motion_findings(motion: Motion, height: float | None) -> tuple[Finding, ...]:
-    """The faults that a person's motion shows, where no two cameras do: who hangs upside down or walks lying, and size.
+    """Find a wrong vertical or scale from a person's motion, for takes without two cameras.
 
-    A person may lie still, or stand on the hands for a while.
+    The vertical is wrong if the trunk is inverted for most of the take, or lying while the person moves. A person may
+    lie still, or stand on the hands for a while.
 
     Parameters
     ----------
-    motion : Motion of a body whose root looks up along its y axis.
-    height : float [m] stature, where it is known: then the take's own.
+    motion : Motion of a body whose root has its y axis upwards.
+    height : float [m] stature as the take states it; None if unknown.
     """
     if not motion.body.stature:
         return ()
@@ -91,8 +92,8 @@ def motion_findings(motion: Motion, height: float | None) -> tuple[Finding, ...]
     places = motion.Ts_world_root[good, :3, 3]
     way = float(np.linalg.norm(np.ptp(places - (places @ middle)[:, None] * middle, axis=0)))
     findings = list(size_findings(motion.body.stature, height))
-    if lean > _MIN_INVERTED or (lean > _MIN_LYING and way > _MIN_WALK):
-        how = "hangs head down" if lean > _MIN_INVERTED else f"moves {way:.1f} m lying"
+    if lean > _MIN_INVERTED_ANGLE or (lean > _MIN_LYING_ANGLE and way > _MIN_LYING_TRAVEL):
+        how = "hangs head down" if lean > _MIN_INVERTED_ANGLE else f"moves {way:.1f} m lying"
         text = f'up = "{motion.up}" is wrong: the person {how}, with the trunk {lean:.0f} degrees off it.'
         remedy = f'Write up = "{nearest_axis(middle)[0]}" into [take].'
         findings.append(Finding("fault", "up", text, (), "Sure, unless that is what the person does.", remedy))
@@ -100,9 +101,11 @@ def motion_findings(motion: Motion, height: float | None) -> tuple[Finding, ...]
 
 
 def with_findings(motion: Motion, findings: Sequence[Finding], seen: Observations, height: float | None) -> Motion:
-    """The motion with faults, late clocks and a stature that few adults have in its `provenance`.
+    """Add faults, clock errors and an implausible stature to a motion's `provenance`.
 
-    The faults of `motion_findings` are among them where it has metric sensors.
+    With metric sensors the faults include those of `motion_findings`.
+
+    height [m]: stature as the take states it, or None.
     """
     late = [f"{found.text} {found.remedy}" for found in findings if found.severity == "doubt"]
     findings = faults_of(findings)
@@ -117,11 +120,11 @@ def with_findings(motion: Motion, findings: Sequence[Finding], seen: Observation
 
 
 def inverted_findings(provenance: Mapping[str, Any], up: str) -> list[Finding]:
-    """A fault where the fit of a person's size found that people hang head down in a depth camera.
+    """Find a depth camera that is upside down, as reported by the fit of the person's size.
 
     Parameters
     ----------
-    provenance : of a motion, or what `tracking.sizing.sized_by_depth` reports
+    provenance : of a motion, or the report of `tracking.sizing.sized_by_depth`
     up : vertical axis of the world, as the take states it
     """
     if INVERTED not in provenance:
@@ -133,7 +136,7 @@ def inverted_findings(provenance: Mapping[str, Any], up: str) -> list[Finding]:
 
 
 def with_cause(error: KinefitError, findings: Sequence[Finding]) -> KinefitError:
-    """An error of tracking, with the worst fault of the inputs as its cause."""
+    """Add the worst fault of the inputs to a tracking error, as its cause."""
     if not (findings := faults_of(findings)):
         return error
     first = findings[0]

@@ -1,4 +1,4 @@
-"""What the rig looks like: lenses, where the cameras stand, what each of them sees of the person."""
+"""Check a rig: lenses, placement of the cameras, and how much of the person each one sees."""
 
 from __future__ import annotations
 
@@ -13,31 +13,32 @@ from kinefit.diagnostics.views import KeypointViews
 from kinefit.findings import Finding, Severity, listed
 from kinefit.geometry.camera import Camera, Rig
 
-_VIEW = (15.0, 130.0)  # [deg] of the longer side: from a long tele lens to the widest that is not a fisheye
-_SQUARE = 0.03  # fx and fy of a sensor with square pixels differ by less
-_MIDDLE = 0.12  # of the picture's size, by which the principal point may be off its middle
-_LIKE = 0.15  # share by which focal lengths of pictures of one size differ where the lenses are alike
-_BESIDE, _OPPOSITE = 15.0, 165.0  # [deg] between two views: depth is then known 4 times worse than across
-_WEAK = 4.0
-_SMALL = 200  # [px] height of a person, about what pose detectors scale people to
-_CELLS = 6  # of the volume along each axis, for what a camera sees of it
+_FIELD_OF_VIEW_RANGE = (15.0, 130.0)  # [deg] of the longer side: from a long tele lens to the widest without fisheye
+_MAX_ASPECT_ERROR = 0.03  # log ratio of fx and fy of a sensor with square pixels
+_MAX_CENTRE_OFFSET = 0.12  # of the principal point from the middle, as a share of the image's size
+_MAX_FOCAL_DIFFERENCE = 0.15  # log ratio, of equal lenses and image sizes
+_MIN_ANGLE = 15.0  # [deg] between two views: below, depth is 4 times less certain than the lateral position
+_MAX_ANGLE = 165.0  # [deg] the same, of opposite views
+_MAX_ANISOTROPY = 4.0  # of a point's standard deviations
+_MIN_HEIGHT_PX = 200  # of a person: pose detectors scale people to about this
+_GRID_CELLS = 6  # of the volume along each axis, for a camera's coverage
 
 
 @dataclass(frozen=True, eq=False)
 class CameraCoverage:
-    """What one camera sees.
+    """Coverage of the person by one camera.
 
     Parameters
     ----------
     camera : str
-    volume : float
-        Share of the volume that the person used which lies in the picture.
-    seen : float
-        Share of the keypoints, over all frames, that the detector found in it.
+    volume : float in 0..1
+        Share of the person's volume of motion that lies in the image.
+    seen : float in 0..1
+        Share of the keypoints, over all frames, that were detected.
     height_px : float [px]
-        Median height of the person in the picture.
+        Median height of the person in the image.
     distance : float [m]
-        From the camera to the middle of the volume.
+        From the camera to the centre of the volume.
     """
 
     camera: str
@@ -48,7 +49,7 @@ class CameraCoverage:
 
 
 def lens_findings(rig: Rig) -> list[Finding]:
-    """Whether focal lengths, principal points and distortions can be those of real lenses."""
+    """Check that focal lengths, principal points and distortions are those of real lenses."""
     out = []
     for camera in rig:
         for problem, remedy in _lens_problems(camera):
@@ -57,20 +58,20 @@ def lens_findings(rig: Rig) -> list[Finding]:
     focal = np.array([camera.matrix[0, 0] for camera in rig])
     if len(sizes) == 1 and len(rig) > 2:
         off = np.abs(np.log(focal / np.median(focal)))
-        for c in np.flatnonzero(off > _LIKE):
+        for c in np.flatnonzero(off > _MAX_FOCAL_DIFFERENCE):
             text = f"{rig.names[c]}: focal length {focal[c]:.0f} px, that of the others {np.median(focal):.0f} px"
             remedy = "As it should be where its lens or zoom is another; else calibrate it anew."
             out.append(Finding("note", "lens", f"{text}.", (rig.names[c],), remedy=remedy))
     if not out:
         views = [_view(camera) for camera in rig]
-        told = f"{min(views):.0f} to {max(views):.0f}" if max(views) - min(views) > 1 else f"{views[0]:.0f}"
-        text = f"Lenses are plausible: fields of view of {told} degrees, distortion without folds."
+        angles = f"{min(views):.0f} to {max(views):.0f}" if max(views) - min(views) > 1 else f"{views[0]:.0f}"
+        text = f"Lenses are plausible: fields of view of {angles} degrees, distortion without folds."
         out.append(Finding("good", "lens", text))
     return out
 
 
 def _view(camera: Camera) -> float:
-    """[deg] field of view along the longer side."""
+    """Field of view [deg] along the longer side."""
     axis = int(np.argmax(camera.size))
     if camera.model == "fisheye":
         return float(np.degrees(camera.size[axis] / camera.matrix[axis, axis]))
@@ -81,22 +82,22 @@ def _lens_problems(camera: Camera) -> list[tuple[str, str]]:
     fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
     size, centre, view = np.array(camera.size), camera.matrix[:2, 2], _view(camera)
     again, out = "Calibrate its lens anew, or check the image size in the calibration.", []
-    if not _VIEW[0] <= view <= (_VIEW[1] if camera.model != "fisheye" else 220.0):
+    if not _FIELD_OF_VIEW_RANGE[0] <= view <= (_FIELD_OF_VIEW_RANGE[1] if camera.model != "fisheye" else 220.0):
         out.append((f"a field of view of {view:.0f} degrees (focal length {fx:.0f} px) is no common lens", again))
-    if abs(np.log(fx / fy)) > _SQUARE:
+    if abs(np.log(fx / fy)) > _MAX_ASPECT_ERROR:
         out.append(
             (f"its pixels would not be square (fx {fx:.0f}, fy {fy:.0f} px)", "Was its image stretched? " + again)
         )
     off = np.abs(centre - 0.5 * (size - 1)) / size
-    if np.any(off > _MIDDLE):
+    if np.any(off > _MAX_CENTRE_OFFSET):
         where = f"({centre[0]:.0f}, {centre[1]:.0f}) of {size[0]}x{size[1]} px"
         out.append(
             (f"its principal point {where} is far from the middle", "Was its image cropped or turned? " + again)
         )
     edge = np.linspace(0.0, 1.0, 9)
-    rim = np.array([(a, b) for a in edge for b in edge if a in (0, 1) or b in (0, 1)]) * (size - 1)
+    border = np.array([(a, b) for a in edge for b in edge if a in (0, 1) or b in (0, 1)]) * (size - 1)
     with np.errstate(invalid="ignore"):
-        rays = camera.ray(rim)
+        rays = camera.ray(border)
     lost = ~np.isfinite(rays).all(-1)
     if lost.any():
         share = f"{100 * lost.mean():.0f} % of the image's border"
@@ -107,7 +108,7 @@ def _lens_problems(camera: Camera) -> list[tuple[str, str]]:
 
 
 def placement_findings(rig: Rig, x: NDArray) -> list[Finding]:
-    """Whether the cameras stand so that depth can be told: x (N, 3) [m] points of the person."""
+    """Check that the angles between the cameras determine depth, for the person's points x (N, 3) [m]."""
     centres = np.stack([camera.centre_world for camera in rig])
     middle, out = np.median(x, axis=0), []
     ways = middle - centres
@@ -115,14 +116,14 @@ def placement_findings(rig: Rig, x: NDArray) -> list[Finding]:
     ways = ways / np.maximum(distance, 1e-9)[:, None]
     pairs = list(combinations(range(len(rig)), 2))
     angles = {(a, b): float(np.degrees(np.arccos(np.clip(ways[a] @ ways[b], -1, 1)))) for a, b in pairs}
-    across = [v for v in angles.values() if _BESIDE <= v <= _OPPOSITE]
-    weakness = _weakness(ways)
-    enough = bool(across) and weakness <= _WEAK
+    across = [v for v in angles.values() if _MIN_ANGLE <= v <= _MAX_ANGLE]
+    anisotropy = _anisotropy(ways)
+    enough = bool(across) and anisotropy <= _MAX_ANISOTROPY
     for (a, b), angle in angles.items():
         names = (rig.names[a], rig.names[b])
-        if _BESIDE <= angle <= _OPPOSITE:
+        if _MIN_ANGLE <= angle <= _MAX_ANGLE:
             continue
-        how = "stand beside each other" if angle < _BESIDE else "stand opposite each other"
+        how = "stand beside each other" if angle < _MIN_ANGLE else "stand opposite each other"
         gap = f"{angle:.0f} degrees and {np.linalg.norm(centres[a] - centres[b]):.2f} m apart"
         text = f"{listed(names)} {how} ({gap}): these two alone do not show how far away a point is"
         if enough:
@@ -133,24 +134,24 @@ def placement_findings(rig: Rig, x: NDArray) -> list[Finding]:
     if across:
         best = max(across, key=lambda v: min(v, 180 - v))
         severity: Severity = "good" if enough else "doubt"
-        text = f"The best angle between two views is {best:.0f} degrees; a point is known {weakness:.1f} times worse "
+        text = f"The best angle between two views is {best:.0f} degrees; a point is known {anisotropy:.1f} times worse "
         remedy = "" if enough else "Spread the cameras round the person."
         out.append(Finding(severity, "placement", text + "along its worst direction than its best.", remedy=remedy))
     return out
 
 
-def _weakness(ways: NDArray) -> float:
-    """How much worse [times] a point is known along its worst direction than along its best."""
+def _anisotropy(ways: NDArray) -> float:
+    """Ratio of a point's largest to its smallest standard deviation, from viewing directions (C, 3)."""
     information = sum(np.eye(3) - np.outer(w, w) for w in ways)
     values = np.linalg.eigvalsh(information)
     return float(np.sqrt(values[-1] / max(values[0], 1e-12)))
 
 
 def coverage(views: KeypointViews, x: NDArray) -> tuple[CameraCoverage, ...]:
-    """What every camera sees of the volume that the person used: x (F, K, 3) [m]."""
+    """Coverage of the person's volume of motion by every camera, from points x (F, K, 3) [m]."""
     known = x[np.isfinite(x).all(-1)]
     low, high = np.percentile(known, [1, 99], axis=0)
-    grid = np.stack(np.meshgrid(*np.linspace(low, high, _CELLS).T, indexing="ij"), -1).reshape(-1, 3)
+    grid = np.stack(np.meshgrid(*np.linspace(low, high, _GRID_CELLS).T, indexing="ij"), -1).reshape(-1, 3)
     out = []
     for c, camera in enumerate(views.rig):
         uv = camera.project(grid)
@@ -166,14 +167,14 @@ def coverage(views: KeypointViews, x: NDArray) -> tuple[CameraCoverage, ...]:
 
 
 def coverage_findings(seen: Sequence[CameraCoverage]) -> list[Finding]:
-    """Cameras that see little of the person."""
+    """Findings on cameras that see little of the person."""
     out = []
     for c in seen:
         if c.seen < 0.5 or c.volume < 0.5:
             text = f"{c.camera} saw {100 * c.seen:.0f} % of the keypoints; it has {100 * c.volume:.0f} % of the volume."
             remedy = "Turn it towards the person, or put it farther away."
             out.append(Finding("doubt", "coverage", text, (c.camera,), remedy=remedy))
-        elif c.height_px < _SMALL:
+        elif c.height_px < _MIN_HEIGHT_PX:
             text = f"The person is only {c.height_px:.0f} px tall in {c.camera}: keypoints are coarse."
             remedy = "Put it nearer, or record at a higher resolution."
             out.append(Finding("note", "coverage", text, (c.camera,), remedy=remedy))

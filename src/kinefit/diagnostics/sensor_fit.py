@@ -1,4 +1,4 @@
-"""How a sensor's frame lies against the world of the videos, and whether that may be written."""
+"""Alignment of a sensor's frame with the world of the videos, and whether its correction is reliable."""
 
 from __future__ import annotations
 
@@ -11,33 +11,35 @@ from numpy.typing import NDArray
 from kinefit.geometry import se3
 from kinefit.sensors.displaced import AXES, displacement
 
-SURE = 3.0
+MISFIT_SIGMAS = 3.0
 """Standard deviations, per degree of freedom, from which a sensor does not fit: chance alone exceeds it in fewer than
 one of 10^8 takes, and those of the benchmark without misfit reach half of it."""
 
-MATTERS = np.radians(0.5), 0.015
-"""[rad], [m] of which one must be exceeded: less is what calibrations usually are off by. Two cameras, each wrong by
-0.1 degree about and 3 mm along each axis, see a person 4 m away 8 mm off, and hardly ever 15 mm."""
+MIN_MISFIT = np.radians(0.5), 0.015
+"""[rad], [m] rotation and shift, of which one must be exceeded: smaller ones are common calibration errors. Two
+cameras, each with errors of 0.1 degree about and 3 mm along each axis, measure a person at 4 m with an error of 8 mm,
+and rarely 15 mm."""
 
-PRIOR = 0.1, float(np.radians(5.0))
-"""[m], [rad] standard deviations of what a sensor's stated pose is off by, about its own origin."""
+POSE_SIGMAS = 0.1, float(np.radians(5.0))
+"""[m], [rad] prior standard deviations of a sensor's stated pose, about its own origin."""
 
-_INSIDE, _DRAWS = 0.95, 4000  # share of errors within the bars that are stated; numbers drawn for that
+_COVERAGE = 0.95  # share of errors within the error bars
+_MONTE_CARLO_DRAWS = 4000  # for the error bars
 
 
 @dataclass(frozen=True, eq=False)
 class SensorAlignment:
-    """How a sensor's frame lies against the world of the videos.
+    """Correction that aligns a sensor's frame with the world of the videos.
 
     Parameters
     ----------
     sensor : name
     kind : "depth" or "markers"
-    twist : (7,) [m, rad, s] shift of the centre, rotation vector, and clock: what must be done to the sensor.
-    covariance : (7, 7) of them
-    centre : (3,) [m] about which it turns, the middle of where the person was
-    falls : whether the person's distance from what it measured clearly falls if that is done.
-    doubts : why it is not to be done, although the sensor does not fit; none where it may be done.
+    twist : (7,) [m, rad, s] correction: shift of the centre, rotation vector, and clock offset.
+    covariance : (7, 7) of the correction
+    centre : (3,) [m] of the rotation, the middle of the person's positions
+    falls : bool, whether the correction clearly reduces the person's distance from the measurements.
+    doubts : reasons not to apply the correction, although the sensor does not fit; empty if it may be applied.
     """
 
     sensor: str
@@ -50,39 +52,40 @@ class SensorAlignment:
 
     @property
     def T(self) -> NDArray:
-        """(4, 4) x_world = T x, of a point x as the sensor's frame is stated to place it."""
+        """Correction T (4, 4): x_world = T x, for a point x placed by the sensor's stated frame."""
         return displacement(dict(zip(AXES, self.twist)), self.centre)
 
     @property
     def shift(self) -> float:
-        """[m] in the middle of where the person was."""
+        """Shift [m] at the centre of the person's positions."""
         return float(np.linalg.norm(self.twist[:3]))
 
     @property
     def turn(self) -> float:
-        """[rad]."""
+        """Rotation angle [rad]."""
         return float(np.linalg.norm(self.twist[3:6]))
 
     @cached_property
     def bars(self) -> tuple[float, float]:
-        """[m], [rad] within which 95 % of the errors of shift and turn have their length."""
-        z = np.random.default_rng(0).standard_normal((_DRAWS, 7)) @ np.linalg.cholesky(self.covariance).T
+        """Error bars [m], [rad]: 95 % of the errors of shift and rotation are shorter."""
+        z = np.random.default_rng(0).standard_normal((_MONTE_CARLO_DRAWS, 7)) @ np.linalg.cholesky(self.covariance).T
         shift, turn = (np.linalg.norm(z[:, part], axis=1) for part in (slice(3), slice(3, 6)))
-        return float(np.quantile(shift, _INSIDE)), float(np.quantile(turn, _INSIDE))
+        return float(np.quantile(shift, _COVERAGE)), float(np.quantile(turn, _COVERAGE))
 
     @property
     def deviations(self) -> float:
-        """How many standard deviations the six of shift and turn are from none, per degree of freedom."""
+        """Distance of shift and rotation from zero, in standard deviations per degree of freedom; a number >= 0."""
         return per_freedom(self.twist, self.covariance)
 
     @property
     def misfit(self) -> bool:
-        """Whether the sensor surely does not fit, by more than is usual, or was found so and that is in doubt."""
-        return bool(self.doubts) or (self.deviations > SURE and (self.turn > MATTERS[0] or self.shift > MATTERS[1]))
+        """Whether the sensor does not fit: significantly and by more than common errors, or with doubts."""
+        is_large = self.turn > MIN_MISFIT[0] or self.shift > MIN_MISFIT[1]
+        return bool(self.doubts) or (self.deviations > MISFIT_SIGMAS and is_large)
 
 
 def per_freedom(twist: NDArray, covariance: NDArray) -> float:
-    """Standard deviations of shift and turn, per degree of freedom, of a twist (7,) with covariance (7, 7)."""
+    """Mahalanobis length, per degree of freedom, of shift and rotation of a twist (7,) with covariance (7, 7)."""
     moved, C = twist[:6], covariance[:6, :6]
     return float(np.sqrt(moved @ np.linalg.solve(C, moved) / 6.0))
 
@@ -93,14 +96,14 @@ def doubts_of(
     halves: tuple[SensorAlignment, SensorAlignment],
     rivals: tuple[NDArray, ...] = (),
 ) -> tuple[str, ...]:
-    """Why a sensor is not to be moved, in words that follow "because"; none where all is well.
+    """Reasons not to apply a sensor's correction, in words that follow "because"; empty if there are none.
 
     Parameters
     ----------
-    fit : SensorAlignment, with what the halves disagree by in its covariance.
+    fit : SensorAlignment, whose covariance includes the disagreement of the halves.
     origin : (3,) [m] of the sensor's frame: a camera's centre.
-    halves : as two halves of the frames have it, without what the surface leaves wrong.
-    rivals : twists (7,), from the lowest end to those of other starts that explain what was measured as well.
+    halves : fits of two halves of the frames, without the systematic error of the surface.
+    rivals : twists (7,) from the best solution to those of other starts that fit as well.
     """
     out = []
     shift, turn = fit.bars
@@ -113,12 +116,12 @@ def doubts_of(
     if not fit.falls:
         out.append("the person then lies no nearer to what it measured")
     moved = float(np.linalg.norm(se3.apply(fit.T, origin) - origin))
-    if moved > SURE * PRIOR[0] or fit.turn > SURE * PRIOR[1]:
-        usual = f"{1e2 * SURE * PRIOR[0]:.0f} cm or {np.degrees(SURE * PRIOR[1]):.0f}°"
-        out.append(f"it would move by {1e2 * moved:.0f} cm and turn by {np.degrees(fit.turn):.0f}°: more than {usual}")
+    if moved > MISFIT_SIGMAS * POSE_SIGMAS[0] or fit.turn > MISFIT_SIGMAS * POSE_SIGMAS[1]:
+        limit = f"{1e2 * MISFIT_SIGMAS * POSE_SIGMAS[0]:.0f} cm or {np.degrees(MISFIT_SIGMAS * POSE_SIGMAS[1]):.0f}°"
+        out.append(f"it would move by {1e2 * moved:.0f} cm and turn by {np.degrees(fit.turn):.0f}°: more than {limit}")
     a, b = halves
     between = per_freedom(a.twist - b.twist, a.covariance + b.covariance)
-    if between > SURE:
+    if between > MISFIT_SIGMAS:
         out.append(f"two halves of the frames disagree by {between:.1f} standard deviations")
     elif not fit.misfit:
         out.append("by what two halves of the frames disagree, it may fit")
@@ -126,6 +129,6 @@ def doubts_of(
 
 
 def marker_index(sensor: str) -> int:
-    """Which of the take's [[markers]] a sensor is."""
+    """Index of a sensor among the take's [[markers]]."""
     number = sensor.removeprefix("markers").strip()
     return int(number) - 1 if number else 0

@@ -1,4 +1,4 @@
-"""One person's keypoints as every camera sees them, left and right put right: what a calibration is checked by."""
+"""Keypoints of one person in all cameras, with left and right corrected: the input of the calibration checks."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from kinefit.multiview.association import choose_people
 from kinefit.observations import Keypoints
 from kinefit.sensors.channels import mirror_name
 
-AGREE = 0.03  # of the picture's diagonal: cameras that differ by more have not seen the same point
-_SURE = 0.3  # confidence from which a point counts; detectors give hidden points less
-_PAIRS = 3  # left-right pairs that must be seen to tell the sides
-_CLEARLY = 0.6  # exchanged, the pairs must fit to this share of their error, or the detector is believed
+MAX_ERROR_SHARE = 0.03  # of the image's diagonal: cameras that differ by more did not detect the same point
+_MIN_CONFIDENCE = 0.3  # of a point; detectors give occluded points less
+_MIN_PAIRS = 3  # left-right pairs needed to decide the sides
+_MAX_SWAPPED_ERROR = 0.6  # of swapped pairs, as a share of their error before; else the detector is believed
 
 
 @dataclass(frozen=True, eq=False)
 class KeypointViews:
-    """Pixels of one person's K points in F frames of the C cameras of a rig.
+    """Keypoints (pixels) of one person: K points in F frames of the C cameras of a rig.
 
     Parameters
     ----------
     rig : Rig
     names : (K,)
     partner : (K,) int
-        Point with left and right exchanged; itself for a point in the middle.
+        Index of the same point on the other side; its own for a point in the middle.
     rate : float [Hz]
     uv : (F, K, C, 2) [px]
-        In the calibration's image; NaN where unseen or unsure. Sides are as in `swapped`.
+        In the calibration's image; NaN where not detected or below the confidence limit.
     swapped : (F, C) bool
-        Where left and right were exchanged to make `uv`.
+        Where left and right were swapped to make `uv`.
     begins : (C,) [s]
         Time of every camera's first frame.
     """
@@ -52,19 +52,19 @@ class KeypointViews:
 
     @property
     def limit(self) -> float:
-        """[px] beyond which two cameras have not seen the same point."""
-        return AGREE * max(float(np.hypot(*camera.size)) for camera in self.rig)
+        """Largest reprojection error [px] of views of the same point."""
+        return MAX_ERROR_SHARE * max(float(np.hypot(*camera.size)) for camera in self.rig)
 
     def at(self, frames: NDArray) -> KeypointViews:
-        """Some frames."""
+        """The views of frames (N,) int."""
         return replace(self, uv=self.uv[frames], swapped=self.swapped[frames])
 
     def spread(self, count: int) -> KeypointViews:
-        """At most so many frames, spread over the recording."""
+        """At most `count` frames, spread over the recording."""
         return self.at(np.unique(np.linspace(0, len(self) - 1, min(count, len(self))).astype(int)))
 
     def select(self, cameras: Sequence[str]) -> KeypointViews:
-        """Only some cameras."""
+        """The views of some cameras."""
         at = [self.rig.index(name) for name in cameras]
         return replace(
             self, rig=self.rig.select(tuple(cameras)), uv=self.uv[:, :, at], swapped=self.swapped[:, at],
@@ -72,21 +72,23 @@ class KeypointViews:
         )  # fmt: skip
 
     def pixels(self) -> NDArray:
-        """(F · K, C, 2) [px] all points, frame after frame."""
+        """All points (F · K, C, 2) [px], frame after frame."""
         return self.uv.reshape(-1, len(self.rig), 2)
 
 
 def make_views(rig: Rig, keypoints: Sequence[Keypoints], *, filled: bool = False) -> KeypointViews:
-    """Views of the person whom most cameras agree on, as the detectors saw it.
+    """Select the detections of the person on which most cameras agree.
 
     Parameters
     ----------
-    filled : bool, whether the tallest detection stands in where the cameras agree on nobody.
+    rig : Rig
+    keypoints : records of the same number of frames and the same rate.
+    filled : bool, whether to use the tallest detection in frames where the cameras agree on no person.
 
     Raises
     ------
     TrackingError
-        Nobody is seen in any frame.
+        No person is detected in any frame.
     """
     people = choose_people(rig, keypoints)
     sets: dict[str, tuple[str, ...]] = {}
@@ -114,33 +116,33 @@ def make_views(rig: Rig, keypoints: Sequence[Keypoints], *, filled: bool = False
 
 
 def _of_person(record: Keypoints, chosen: NDArray, filled: bool) -> NDArray:
-    """(F, K, 2) [px] of the chosen person; of the tallest in all frames where the cameras agree on none in most.
+    """Points (F, K, 2) [px] of the chosen person; of the tallest one if the cameras agree on none in most frames.
 
-    With `filled`, of the tallest in single frames, too.
+    With `filled`, also of the tallest one in single frames without agreement.
     """
     frames = np.arange(len(chosen))
-    points = np.where((record.confidence > _SURE)[..., None], record.points, np.nan)[: len(chosen)]
+    points = np.where((record.confidence > _MIN_CONFIDENCE)[..., None], record.points, np.nan)[: len(chosen)]
     if not points.shape[1]:
         return np.full((len(chosen), len(record.names), 2), np.nan)
     seen = np.isfinite(points).all(-1)
-    anybody = np.any(seen, axis=(1, 2))
-    disagree = np.sum(chosen >= 0) < 0.5 * anybody.sum()
+    has_person = np.any(seen, axis=(1, 2))
+    disagree = np.sum(chosen >= 0) < 0.5 * has_person.sum()
     if disagree or filled:
         low, high = (np.where(seen, points[..., 1], fill) for fill in (np.inf, -np.inf))
         tall = np.where(seen.any(-1), high.max(-1) - low.min(-1), -1.0)
-        chosen = np.where(anybody & (disagree | (chosen < 0)), np.argmax(tall, axis=1), chosen)
+        chosen = np.where(has_person & (disagree | (chosen < 0)), np.argmax(tall, axis=1), chosen)
     return np.where((chosen >= 0)[:, None, None], points[frames, np.maximum(chosen, 0)], np.nan)
 
 
 def meet(views: KeypointViews) -> tuple[NDArray, NDArray]:
-    """Where the views of each point meet: x_world (F, K, 3) [m], and which of them do, (F, K, C) bool."""
+    """Triangulate each point: x_world (F, K, 3) [m], and the cameras (F, K, C) bool that agree on it."""
     x, agree, _ = triangulate_robust(views.rig, views.pixels(), max_residual_px=views.limit)
     shape = views.uv.shape[:2]
     return x.reshape(*shape, 3), agree.reshape(*shape, len(views.rig))
 
 
 def from_others(views: KeypointViews, c: int) -> NDArray:
-    """(F, K, 2) [px] where camera c should see the points, by all other cameras; NaN where these do not tell."""
+    """Predict the points (F, K, 2) [px] of camera c from all other cameras; NaN where these do not agree."""
     uv = views.pixels().copy()
     uv[:, c] = np.nan
     x, _, _ = triangulate_robust(views.rig, uv, max_residual_px=views.limit)
@@ -148,10 +150,10 @@ def from_others(views: KeypointViews, c: int) -> NDArray:
 
 
 def with_sides_right(views: KeypointViews) -> KeypointViews:
-    """The same with left and right exchanged in single cameras and frames where the others clearly want it.
+    """Correct left and right in single cameras and frames, where the other cameras clearly contradict the detector.
 
-    Needs three cameras; with two nobody can tell which one is wrong. In every frame the camera that gains most is put
-    right first, then the others are asked anew.
+    Needs three cameras: with two it is undecidable which one is wrong. In every frame the camera with the largest gain
+    is corrected first, then the others are compared again.
     """
     paired = np.flatnonzero(views.partner != np.arange(len(views.partner)))
     cameras = len(views.rig)
@@ -174,13 +176,13 @@ def with_sides_right(views: KeypointViews) -> KeypointViews:
 
 
 def _gain(views: KeypointViews, c: int, paired: NDArray) -> NDArray:
-    """(F,) [px] by how much the pairs of camera c fit better exchanged; 0 where not clearly."""
-    told, seen = from_others(views, c)[:, paired], views.uv[:, :, c]
-    as_is, turned = (
-        np.minimum(np.linalg.norm(seen[:, order] - told, axis=-1), views.limit)
+    """Error reduction (F,) [px] by swapping left and right in camera c; 0 where it is not clear."""
+    predicted, detected = from_others(views, c)[:, paired], views.uv[:, :, c]
+    error, swapped_error = (
+        np.minimum(np.linalg.norm(detected[:, order] - predicted, axis=-1), views.limit)
         for order in (paired, views.partner[paired])
     )
-    both = np.isfinite(as_is) & np.isfinite(turned)
+    both = np.isfinite(error) & np.isfinite(swapped_error)
     count = both.sum(axis=1)
-    before, after = (np.where(both, e, 0.0).sum(axis=1) / np.maximum(count, 1) for e in (as_is, turned))
-    return np.where((count >= 2 * _PAIRS) & (after < _CLEARLY * before), before - after, 0.0)
+    before, after = (np.where(both, e, 0.0).sum(axis=1) / np.maximum(count, 1) for e in (error, swapped_error))
+    return np.where((count >= 2 * _MIN_PAIRS) & (after < _MAX_SWAPPED_ERROR * before), before - after, 0.0)

@@ -1,4 +1,4 @@
-"""A result against the truth, as numbers."""
+"""Errors of results against ground truth."""
 
 from kinefit.evaluation.accuracy import (
     ErrorBarCoverage,

@@ -1,4 +1,4 @@
-"""How far a result is from the truth: joint centres, angles, turns of the segments, error bars."""
+"""Errors of a motion against the true one: joint centres, angles, orientations, coverage of error bars."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def joint_errors(truth: Motion, result: Motion) -> NDArray:
     Raises
     ------
     ObservationError
-        The motions differ in frames or in their bodies' segments; so also the other functions here.
+        The motions differ in frames or in their bodies' segments. All functions here raise it.
     """
     result = _comparable(truth, result)
     return np.linalg.norm(result.segment_poses()[..., :3, 3] - truth.segment_poses()[..., :3, 3], axis=-1)
@@ -27,9 +27,9 @@ def joint_errors(truth: Motion, result: Motion) -> NDArray:
 def angle_errors(truth: Motion, result: Motion) -> NDArray:
     """Differences (F, D) [deg] of all angles, result minus truth, between -180 and 180; of prismatic joints [m].
 
-    A ball joint with three axes at right angles has two triples (a, b, c) and (a + 180, 180 - b, c + 180) for every
-    turn; the one nearer to the truth counts. Near the pose in which two of its axes fall together, large errors of
-    both may still mean the same turn: see `orientation_errors`.
+    A ball joint with three orthogonal axes has two triples (a, b, c) and (a + 180, 180 - b, c + 180) for every
+    rotation; the one nearer to the truth is used. Near gimbal lock, large angle errors may belong to nearly equal
+    rotations: see `orientation_errors`.
     """
     result = _comparable(truth, result)
     tree = truth.body.tree
@@ -42,7 +42,7 @@ def angle_errors(truth: Motion, result: Motion) -> NDArray:
 
 
 def _wrapped(radians: NDArray) -> NDArray:
-    """Angles in degrees between -180 and 180."""
+    """Angles wrapped to -180..180 [deg]."""
     return np.degrees(np.angle(np.exp(1j * radians)))
 
 
@@ -60,7 +60,7 @@ def orientation_errors(truth: Motion, result: Motion, *, relative: bool = False)
 
 @dataclass(frozen=True)
 class ErrorBarCoverage:
-    """Share of the truth within the error bars, 0..1; NaN where no finite error bar is given.
+    """Share 0..1 of the true values within the error bars; NaN without finite error bars.
 
     Parameters
     ----------
@@ -73,15 +73,15 @@ class ErrorBarCoverage:
 
 
 def coverage(truth: Motion, result: Motion, *, sigmas: float = 2.0) -> ErrorBarCoverage:
-    """Share of joint centres and angles whose truth lies within so many standard deviations; 0.954 is right for two."""
+    """Share of joint centres and angles whose truth lies within `sigmas` standard deviations; 0.954 is ideal for 2."""
     (shift, joints), (angles, dofs) = _errors_and_bars(truth, result, sigmas)
     return ErrorBarCoverage(_share(shift, joints), _share(angles, dofs))
 
 
 def coverage_of_groups(truth: Motion, result: Motion, *, sigmas: float = 1.96) -> dict[str, ErrorBarCoverage]:
-    """The same for each group of joints (the body's scale groups: pelvis, trunk, ..., both sides together).
+    """Coverage (see `coverage`) for each group of joints: the body's scale groups, with both sides together.
 
-    A joint belongs to the group of the segment that it moves.
+    A joint belongs to the group of the segment that it moves. sigmas: a number of standard deviations.
     """
     (shift, joints), (angles, dofs) = _errors_and_bars(truth, result, sigmas)
     out = {}
@@ -94,7 +94,7 @@ def coverage_of_groups(truth: Motion, result: Motion, *, sigmas: float = 1.96) -
 
 
 def _errors_and_bars(truth: Motion, result: Motion, sigmas: float) -> tuple[tuple[NDArray, NDArray], ...]:
-    """Errors of joint centres (F, S, 3) [m] and of angles (F, D) [rad, m], each with its bars."""
+    """Errors of joint centres (F, S, 3) [m] and of angles (F, D) [rad, m], each with its error bars."""
     turned = _comparable(truth, result)
     shift = np.abs(turned.segment_poses()[..., :3, 3] - truth.segment_poses()[..., :3, 3])
     angles = angle_errors(truth, result)
@@ -108,7 +108,7 @@ def _share(errors: NDArray, bars: NDArray) -> float:
 
 
 def _comparable(truth: Motion, result: Motion) -> Motion:
-    """The result in the truth's world."""
+    """The result with the vertical axis of the truth; raises ObservationError for motions that do not match."""
     a, b = truth.body.tree, result.body.tree
     if a.segments != b.segments or a.coordinates != b.coordinates:
         raise ObservationError(

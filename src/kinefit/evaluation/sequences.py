@@ -1,4 +1,4 @@
-"""The hundred sequences of P2's experiment, simulated: ten movements by ten people, in depth and in 2D features."""
+"""Simulate the hundred sequences of P2's experiment: ten movements by ten people, in depth images and 2D features."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ Inputs = Literal["3d", "2d", "fusion"]
 INPUTS: tuple[Inputs, ...] = ("3d", "2d", "fusion")
 
 FEATURES = LANDMARKS
-"""Landmarks that the tracker of skin colour follows: the face and both hands."""
+"""Landmarks of the skin colour tracker: the face and both hands."""
 
-_HAND = 4.0 / 3.0  # how far from the elbow the middle of a hand is, in lengths of the forearm
+_HAND_RATIO = 4.0 / 3.0  # distance of the hand's centre from the elbow to the length of the forearm
 _HEAD_SIZE = (320, 240)  # [px] of one camera of P2's stereo head (P2 3.1)
 _BASELINE = 0.1  # [m] from the depth camera to the colour camera
-_FEATURE_NOISE = 4.0  # [px] of the middle of a patch of skin: a hand's half width at 3 m
+_FEATURE_SIGMA = 4.0  # [px] of the centre of a patch of skin: a hand's half width at 3 m
 _RATE = 10.0  # [Hz] P2: 10 to 14
 
 
 @dataclass(frozen=True, eq=False)
 class TruthSequence:
-    """One sequence: a known motion and what the sensors saw of it.
+    """One sequence: a known motion and its simulated observations.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class TruthSequence:
     sensor : DepthSensor
     depth : DepthFrame for each frame.
     features : KeypointFrame for each frame, of the body's landmarks in `FEATURES`, as `images.skin` finds them in
-        rendered pictures of the colour camera; the face of the first picture is told.
+        rendered images of the colour camera; the face of the first image is given.
     """
 
     number: int
@@ -59,7 +59,7 @@ class TruthSequence:
     features: tuple[KeypointFrame, ...]
 
     def seen(self, inputs: Inputs) -> list[tuple[Frame, ...]]:
-        """What the sensors of one experiment saw, for each time: depth (3D), face and hands (2D), or both."""
+        """Observations of one experiment, for each time: depth (3D), face and hands (2D), or both."""
         if inputs == "3d":
             return [(d,) for d in self.depth]
         if inputs == "2d":
@@ -68,9 +68,9 @@ class TruthSequence:
 
     @property
     def sigma(self) -> dict[str, float]:
-        """Standard deviations of the sensors: [m] of depth at the person's distance, [px] of features."""
+        """Standard deviations of the sensors: depth [m] at the person's distance, features [px]."""
         distance = float(np.linalg.norm(self.rig["depth"].centre_world - self.truth.Ts_world_root[0, :3, 3]))
-        return {"depth": float(self.sensor.sigma(distance)), "colour": _FEATURE_NOISE}
+        return {"depth": float(self.sensor.sigma(distance)), "colour": _FEATURE_SIGMA}
 
 
 def sequences(
@@ -82,12 +82,13 @@ def sequences(
     room: bool = True,
     seed: int = 0,
 ) -> Iterator[TruthSequence]:
-    """The first `count` of a hundred sequences; every ten hold each movement and each person once.
+    """The first `count` of a hundred sequences; each ten of them contain every movement and every person once.
 
     Parameters
     ----------
+    count : int
     body : Body, optional
-        That the people are made of; default the catalogue's "humanoid10".
+        From which the people are made; default the catalogue's "humanoid10".
     sensor : DepthSensor
     rate : float [Hz] of all sensors.
     room : bool, whether there are a floor, walls and a table.
@@ -101,10 +102,10 @@ def sequences(
 
 
 def with_hands(body: Body) -> Body:
-    """A body whose hands are part of its forearms, with the landmarks of their middles."""
+    """Add landmarks of the hands' centres to a body whose hands are part of its forearms."""
     names = [name for name in FEATURES if name not in body.landmarks.names]
     wrists = body.landmarks.select(tuple(f"{name[0]}_wrist" for name in names))
-    hands = PointSet(tuple(names), wrists.segments, _HAND * wrists.points)
+    hands = PointSet(tuple(names), wrists.segments, _HAND_RATIO * wrists.points)
     return replace(body, landmarks=joined([body.landmarks, hands])) if names else body
 
 
@@ -118,7 +119,7 @@ def sequence(
     seed: int = 0,
     number: int = 0,
 ) -> TruthSequence:
-    """One movement of one person as its sensors saw it; see `sequences`."""
+    """Simulate one movement of one person at a rate [Hz]; see `sequences`."""
     truth = movement(name, with_hands(person.body), rate=rate, speed=person.speed)
     return sequence_of(truth, person, sensor=sensor, room=room, seed=seed, number=number)
 
@@ -126,7 +127,7 @@ def sequence(
 def sequence_of(
     truth: Motion, person: Performer, *, sensor: DepthSensor = TOF, room: bool = True, seed: int = 0, number: int = 0
 ) -> TruthSequence:
-    """A known motion of a body `with_hands` as the sensors of the experiment saw it; see `sequences`."""
+    """Simulate the sensors for a known motion of a body `with_hands`; see `sequences`."""
     camera = in_front(truth, sensor.camera(name="depth"), azimuth=person.azimuth, near=sensor.near, far=sensor.far)
     head = ColourSensor("colour", _HEAD_SIZE, _HEAD_SIZE[1] / sensor.size[1] * sensor.focal, samples=1)
     colour = beside(head.camera().with_pose(camera.T_camera_world), "colour", _BASELINE)
@@ -142,7 +143,7 @@ def sequence_of(
 def features_of(
     scene: SimulatedScene, sensor: ColourSensor, camera: Camera, *, seed: int = 0
 ) -> tuple[KeypointFrame, ...]:
-    """Face and hands by the colour of the skin in rendered pictures of a scene; none where the first shows no face."""
+    """Track face and hands by skin colour in rendered images of a scene; no detections if the first shows no face."""
     motion, tracker, out = scene.motion, None, []
     face = _face(scene, camera)
     for frame, time in enumerate(motion.times):
@@ -156,7 +157,7 @@ def features_of(
 
 
 def _face(scene: SimulatedScene, camera: Camera) -> tuple[float, float, float, float] | None:
-    """Box [px] of the face in the first picture, as a detector's landmarks give it; None where it looks away."""
+    """Box [px] of the face in the first image, from a detector's landmarks; None if the person looks away."""
     body, state = scene.motion.body, scene.motion.state(0)
     points = body.keypoints("MEDIAPIPE_33")
     uv = np.full((33, 2), np.nan)

@@ -1,4 +1,4 @@
-"""P2's experiment, graded by the truth instead of by eye: 3D alone, 2D alone, and both (P2 5, table I)."""
+"""P2's experiment, graded by ground truth instead of by eye: 3D alone, 2D alone, and both (P2 5, table I)."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from kinefit.tracking.tracker import Tracker
 Method = Callable[[TruthSequence, Inputs, BodyState], Motion]
 """Tracks a sequence with some of its sensors from a given pose; its body has the true one's landmarks."""
 
-GOOD_MEAN = 0.060  # [m] half the width of a thigh: drawn over the picture, limbs cover their counterparts
-GOOD_POINT = 0.150  # [m] width of a thigh: beyond it, a drawn limb lies beside the one in the picture
-GOOD_SHARE = 0.05  # of the frames in which a point may be worse: less than a fifth of a second, nobody sees it
+GOOD_MEAN = 0.060  # [m] half the width of a thigh: limbs overlap the true ones in the image
+GOOD_POINT = 0.150  # [m] width of a thigh: beyond it, limbs lie next to the true ones in the image
+GOOD_SHARE = 0.05  # of the frames, in which a point may be worse: less than a fifth of a second is not visible
 LOST_POINT = 0.250  # [m] length of a forearm: the limb is somewhere else
-LOST_SHARE = 0.5  # of the frames: what is off for longer than it is not was not lost for a while
-_AT_THE_END = 0.2  # [s] what is off until the end has not been found again
-_NAMED = ("point", "walk", "wave", "shake_hands", "bow", "clap")
-_FLOOR = (0.0, 1.0, 0.0, 0.0)  # plane of the simulated room's
-_STRETCHED = np.radians(25.0)  # between an arm and the direction to the sensor
+LOST_SHARE = 0.5  # of the frames: a point lost for longer counts as lost, not as recovered
+_END_INTERVAL = 0.2  # [s] a point lost throughout it was not recovered
+_PAPER_MOVEMENTS = ("point", "walk", "wave", "shake_hands", "bow", "clap")
+_FLOOR_PLANE = (0.0, 1.0, 0.0, 0.0)  # of the simulated room
+_MAX_ARM_ANGLE = np.radians(25.0)  # between an arm and the direction to the sensor
 
 POINTS = (
     "neck", "skull_vertex", "l_shoulder", "r_shoulder", "l_elbow", "r_elbow", "l_wrist", "r_wrist", "l_hip", "r_hip",
     "l_knee", "r_knee", "l_ankle", "r_ankle",
 )  # fmt: skip
-"""Landmarks that are graded: joint centres, and the top of the head."""
+"""Graded landmarks: joint centres, and the top of the head."""
 
 
 class Grade(NamedTuple):
@@ -47,10 +47,10 @@ class Grade(NamedTuple):
 
 
 class Graded(NamedTuple):
-    """One sequence: its movement, its grade, how far the tracked parts (face and hands) are off, and stretched arms.
+    """One sequence: its movement, its grade, the errors of face and hands, and of stretched arms.
 
-    `parts` [m] is the mean error of face and hands across the colour camera's line of sight, NaN where none was seen;
-    `stretched` the share of frames with an arm stretched at the sensor that show it, NaN where no arm is.
+    `parts` [m]: mean error of face and hands across the colour camera's line of sight, NaN without detections.
+    `stretched`: share of the frames with an arm stretched towards the sensor in which it is tracked, NaN without such.
     """
 
     movement: str
@@ -80,7 +80,7 @@ class Summary:
 
     @property
     def mean_grade(self) -> float:
-        """Mean grade, P2's φ."""
+        """Mean grade, P2's φ: a number from 0 to 2."""
         return float(np.mean([g.grade.grade for g in self.graded]))
 
     def of(self, *movements: str) -> Summary:
@@ -89,23 +89,23 @@ class Summary:
 
     @property
     def named(self) -> Summary:
-        """Those of the six movements that the paper names; the other four are ours."""
-        return self.of(*_NAMED)
+        """The sequences of the six movements that the paper names; the other four are ours."""
+        return self.of(*_PAPER_MOVEMENTS)
 
     @property
     def parts(self) -> float:
-        """[m] mean error of face and hands across the line of sight."""
-        seen = [g.parts for g in self.graded if np.isfinite(g.parts)]
-        return float(np.mean(seen)) if seen else float("nan")
+        """Mean error [m] of face and hands across the line of sight."""
+        errors = [g.parts for g in self.graded if np.isfinite(g.parts)]
+        return float(np.mean(errors)) if errors else float("nan")
 
     @property
     def error(self) -> float:
-        """[m] mean error of all points in all sequences."""
+        """Mean error [m] of all points in all sequences."""
         return float(np.mean([g.grade.mean for g in self.graded]))
 
 
 def point_errors(truth: Motion, fitted: Motion) -> NDArray:
-    """(F, K) [m] distances of the points in `POINTS` that both bodies have.
+    """Distances (F, K) [m] of the points in `POINTS` that both bodies have.
 
     Raises
     ------
@@ -130,7 +130,7 @@ def grade(truth: Motion, fitted: Motion) -> Grade:
     1, acceptable: anything between, such as a forearm that was lost for a while and found again.
     """
     errors = point_errors(truth, fitted)
-    last = max(int(np.ceil(_AT_THE_END * truth.rate)), 1)
+    last = max(int(np.ceil(_END_INTERVAL * truth.rate)), 1)
     mean, worst = float(errors.mean()), float(errors.max())
     far = errors > LOST_POINT
     if (far.mean(axis=0) > LOST_SHARE).any() or far[-last:].all(axis=0).any():
@@ -153,7 +153,8 @@ def evaluate(
     ----------
     runs : see `evaluation.sequences.sequences`
     method : `voodoo_method`, `fusion_method` or another.
-    start : the pose to begin with; default: the truth's first.
+    inputs : choices of sensors.
+    start : gives the initial pose; default: the first true one.
     step : called with the number of sequences done.
     """
     chosen = tuple(inputs)
@@ -170,16 +171,17 @@ def evaluate(
 
 
 def stretched_share(run: TruthSequence, fitted: Motion) -> float:
-    """Share of the frames with an arm stretched at the depth sensor in which all such hands are found to 150 mm.
+    """Share 0..1 of the frames with an arm stretched towards the sensor in which such hands are tracked to 150 mm.
 
-    NaN where no arm is: within 25 degrees of the direction to the sensor, and no elbow bent by more than that.
+    An arm is stretched if it points to the sensor within 25 degrees, with the elbow bent by no more than that. NaN
+    without such a frame.
     """
     eye = run.rig["depth"].centre_world
     names = tuple(f"{side}_{joint}" for side in "lr" for joint in ("shoulder", "elbow", "wrist"))
     x, y = (m.positions(m.body.landmarks.select(names)).reshape(len(m), 2, 3, 3) for m in (run.truth, fitted))
     to_sensor = _unit(eye - x[:, :, 0])
-    arm = np.cos(_STRETCHED) < np.sum(_unit(x[:, :, 2] - x[:, :, 0]) * to_sensor, axis=-1)
-    straight = np.cos(_STRETCHED) < np.sum(_unit(x[:, :, 1] - x[:, :, 0]) * _unit(x[:, :, 2] - x[:, :, 1]), axis=-1)
+    arm = np.cos(_MAX_ARM_ANGLE) < np.sum(_unit(x[:, :, 2] - x[:, :, 0]) * to_sensor, axis=-1)
+    straight = np.cos(_MAX_ARM_ANGLE) < np.sum(_unit(x[:, :, 1] - x[:, :, 0]) * _unit(x[:, :, 2] - x[:, :, 1]), axis=-1)
     stretched = arm & straight
     found = np.linalg.norm(y[:, :, 2] - x[:, :, 2], axis=-1) <= GOOD_POINT
     frames = stretched.any(axis=1)
@@ -189,20 +191,20 @@ def stretched_share(run: TruthSequence, fitted: Motion) -> float:
 
 
 def parts_error(run: TruthSequence, fitted: Motion) -> float:
-    """[m] mean distance of face and hands from the true ones across the line of sight, over frames that show them."""
+    """Mean error [m] of face and hands across the line of sight, over the frames in which they were detected."""
     x, y = (m.positions(m.body.landmarks.select(FEATURES)) for m in (run.truth, fitted))
     ray = _unit(x - run.rig["colour"].centre_world)
-    off = y - x
-    across = np.linalg.norm(off - np.sum(off * ray, axis=-1, keepdims=True) * ray, axis=-1)
-    seen = np.array([np.isfinite(f.uv[:, 0]) for f in run.features])
-    return float(across[seen].mean()) if seen.any() else float("nan")
+    error = y - x
+    across = np.linalg.norm(error - np.sum(error * ray, axis=-1, keepdims=True) * ray, axis=-1)
+    detected = np.array([np.isfinite(f.uv[:, 0]) for f in run.features])
+    return float(across[detected].mean()) if detected.any() else float("nan")
 
 
 def conclusions(summaries: Mapping[Inputs, Summary]) -> dict[str, bool]:
-    """P2's own three conclusions (P2 5), each with whether it holds here.
+    """P2's three conclusions (P2 5), and whether each one holds here.
 
-    Well tracked is a mean grade of 1.5 or more with none lost: good as often as only acceptable. Face and hands are
-    where they are seen to half the width of a thigh. What no sequence shows does not hold.
+    Tracked well means a mean grade of 1.5 or more without a lost sequence. Face and hands are tracked if their error is
+    below half the width of a thigh. A conclusion without sequences does not hold.
     """
     alone, features, both = (summaries[i] for i in INPUTS)
 
@@ -222,23 +224,23 @@ def conclusions(summaries: Mapping[Inputs, Summary]) -> dict[str, bool]:
 def voodoo_method(
     run: TruthSequence, inputs: Inputs, start: BodyState, settings: Settings | None = None, model: Body | None = None
 ) -> Motion:
-    """P2's method: parts that move freely, tied by bands; `model` has the true body's tree, default: that body.
+    """P2's method: parts that move freely, connected by bands; `model` has the true body's tree, default: that body.
 
-    Unless `settings` say otherwise it has three helps that P2 does not: the room's floor is known, points in the boxes
-    of several limbs go to the nearest surface, and ICP's stop rule is off.
+    The default settings have three extensions of P2: the room's floor is given, points in the boxes of several limbs
+    are assigned to the nearest surface, and ICP's stop rule is off.
     """
     parts = free_parts(run.truth.body)
-    fits = voodoo(run.seen(inputs), model or run.truth.body, start, run.rig, settings or Settings(floor=_FLOOR))
+    fits = voodoo(run.seen(inputs), model or run.truth.body, start, run.rig, settings or Settings(floor=_FLOOR_PLANE))
     return _motion(run, parts, [parts_state(parts, fit.frames) for fit in fits])
 
 
 def fusion_method(run: TruthSequence, inputs: Inputs, start: BodyState) -> Motion:
-    """The fusion tracker: a tree of hard joints, limits, robust weights, visibility; smoothed, as `kinefit track`."""
+    """The fusion tracker: a tree of hard joints, limits, robust weights, visibility; smoothed as in `kinefit track`."""
     return _tracked(run, inputs, start).motion(name=run.truth.name)
 
 
 def live_method(run: TruthSequence, inputs: Inputs, start: BodyState) -> Motion:
-    """The fusion tracker as it goes, each frame from what was seen until then."""
+    """The fusion tracker without smoothing: each frame is estimated from the observations until then."""
     return _tracked(run, inputs, start).motion(smooth=False, name=run.truth.name)
 
 
@@ -254,7 +256,7 @@ METHODS: Mapping[str, Method] = {"voodoo": voodoo_method, "fusion": fusion_metho
 
 
 def found_start(run: TruthSequence) -> BodyState:
-    """Pose found in the first depth image with none given."""
+    """Estimate the initial pose from the first depth image."""
     from kinefit.initialization.from_depth import start_from_points
 
     depth = np.asarray(run.depth[0].depth)

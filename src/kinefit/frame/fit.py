@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.correspondences.closures import STIFF, hard_equations, looped, soft_closures
+from kinefit.correspondences.closures import HARD_SIGMA, hard_equations, looped, soft_closures
 from kinefit.correspondences.occupancy.collisions import CollisionPairs, collision_pairs, collision_rows
 from kinefit.correspondences.parameters import prior_rows
 from kinefit.frame.minimum import ROUGH_ITERATIONS, ROUGH_TOLERANCE, Minimum, minimum
@@ -222,7 +222,7 @@ class FrameFit:
         """Covariances and quality of a fit, without rows on contradicted segments and of surfaces that occlude one."""
         scene, tree, evidence = found.scene, self.body.tree, sum_evidence(found.scene, each)
         A = np.zeros((0, tree.n_dofs)) if self._hard is None else self._hard(scene.state)[1]
-        exact = A.T @ A / STIFF**2
+        exact = A.T @ A / HARD_SIGMA**2
         H = found.H + exact
         lost = evidence.lost if evidence.lost.any() else None
         off = [segments_not_shown(m, e) for m, e in zip(found.matched, each)]

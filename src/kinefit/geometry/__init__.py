@@ -1,1 +1,1 @@
-"""Space: twists, lines, cameras; knows no body."""
+"""Geometry in space: twists, lines, cameras; independent of bodies."""

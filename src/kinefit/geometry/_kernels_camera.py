@@ -1,4 +1,4 @@
-"""Compiled projection, its derivatives and inverse, and triangulation. Arrays in, arrays out; no allocation in loops.
+"""Compiled projection, its derivatives and inverse. Arrays in, arrays out; no allocation in loops.
 
 Layout of a packed camera (1-D float64, length `PACKED`)
     0 MODEL     0 radtan, 1 fisheye
@@ -18,7 +18,7 @@ from kinefit._jit import jit
 
 MODEL, FX, FY, CX, CY, SKEW = 0, 1, 2, 3, 4, 5
 DIST, ROT, TRANS, WIDTH, HEIGHT, LIMIT, PACKED = 6, 14, 23, 26, 27, 28, 29
-NEAREST = 1e-9  # a point closer to the image plane than this counts as behind it
+MIN_DEPTH = 1e-9  # [m] a point closer to the image plane counts as behind it
 _NAN = math.nan
 
 
@@ -54,10 +54,10 @@ def _fisheye_angle(camera, theta):
 
 @jit
 def project_jacobian(camera, x, y, z):
-    """Pixel of a world point and its derivatives by that point.
+    """Project a world point, with derivatives by it.
 
     Returns (ok, u, v, ux, uy, uz, vx, vy, vz), [px] and [px/m]. Not ok (all NaN) behind the camera or where the
-    distortion is no longer monotonic; points outside the image are ok.
+    distortion is not monotonic; points outside the image are ok.
     """
     r00, r01, r02 = camera[ROT], camera[ROT + 1], camera[ROT + 2]
     r10, r11, r12 = camera[ROT + 3], camera[ROT + 4], camera[ROT + 5]
@@ -66,7 +66,7 @@ def project_jacobian(camera, x, y, z):
     yc = r10 * x + r11 * y + r12 * z + camera[TRANS + 1]
     zc = r20 * x + r21 * y + r22 * z + camera[TRANS + 2]
     if camera[MODEL] == 0.0:
-        if not zc > NEAREST:
+        if not zc > MIN_DEPTH:
             return False, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN
         inverse = 1.0 / zc
         a, b = xc * inverse, yc * inverse
@@ -79,7 +79,7 @@ def project_jacobian(camera, x, y, z):
         rho2 = xc * xc + yc * yc
         rho = math.sqrt(rho2)
         theta = math.atan2(rho, zc)
-        if not (theta <= camera[LIMIT] and rho + abs(zc) > NEAREST):
+        if not (theta <= camera[LIMIT] and rho + abs(zc) > MIN_DEPTH):
             return False, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN, _NAN
         if rho < 1e-8 * zc:
             scale, slope, along = 1.0 / zc, 0.0, -1.0 / (zc * zc)
@@ -150,9 +150,9 @@ def _radial(camera, r):
 
 @jit
 def _inverse_radial(camera, distorted):
-    """Radius whose distorted radius is the one given (bracketed Newton); the largest valid one if there is none."""
+    """Radius with a given distorted radius (bracketed Newton); the largest valid one if there is none."""
     high = camera[LIMIT] if camera[MODEL] != 0.0 else math.sqrt(camera[LIMIT])
-    if high > 1e6:  # unlimited: look for a bracket
+    if high > 1e6:  # unlimited: search a bracket
         high = distorted
         for _ in range(40):
             if _radial(camera, high)[0] >= distorted:

@@ -1,10 +1,10 @@
-"""Products of multivectors over arrays, and points moved by motors."""
+"""Compiled products of multivectors over arrays, and motions of points by motors."""
 
 from __future__ import annotations
 
 from kinefit._jit import jit
 
-_BLOCK = 512  # elements at a time, so that all coefficients of a block stay in the nearest cache
+_BLOCK = 512  # elements at a time, whose coefficients fit into the nearest cache
 
 
 @jit
@@ -37,12 +37,12 @@ def product(a, b, terms, signs, out):
 
 @jit
 def operators(m, out):
-    """Matrices that do to vectors what M X M̃ does.
+    """Matrices of the map X -> M X M̃ of vectors.
 
     Parameters: m (8, N) motors by 1, e12, e13, e23, e1e, e2e, e3e, e123e. Out: out (5, 5, N) over e1, e2, e3, e, e0.
     """
     for i in range(m.shape[1]):
-        w, x, y, z = m[0, i], m[3, i], -m[2, i], m[1, i]  # R = w + I3 (x, y, z), the quaternion with its signs turned
+        w, x, y, z = m[0, i], m[3, i], -m[2, i], m[1, i]  # R = w + I3 (x, y, z), the quaternion with the opposite signs
         dx, dy, dz, d = m[4, i], m[5, i], m[6, i], m[7, i]
         s = w * w + x * x + y * y + z * z
         out[0, 0, i], out[1, 1, i] = w * w + x * x - y * y - z * z, w * w - x * x + y * y - z * z
@@ -64,7 +64,7 @@ def operators(m, out):
 
 @jit
 def moved(operator, x, out):
-    """Vectors moved: operator (5, 5, N or 1), x (5, N or 1). Out: out (5, N)."""
+    """Move vectors x (5, N or 1) by operators (5, 5, N or 1). Out: out (5, N)."""
     n = out.shape[1]
     one, single = operator.shape[2] == 1, x.shape[1] == 1
     if one and not single:

@@ -32,7 +32,7 @@ def _solve3(a00, a01, a02, a11, a12, a22, b0, b1, b2):
 
 @jit
 def _nearest_to_rays(centres, directions, weights):
-    """Point with the least weighted squared distance to rays: (ok, x, y, z); not ok where they are parallel."""
+    """Point of least weighted squared distance to rays: (ok, x, y, z); not ok if they are parallel."""
     a00 = a01 = a02 = a11 = a12 = a22 = b0 = b1 = b2 = 0.0
     for c in range(weights.shape[0]):
         w = weights[c]
@@ -119,9 +119,9 @@ def _centres(cameras, centres):
 
 @jit
 def _consensus(cameras, centres, directions, uv, usable, limit, chosen, residual):
-    """Point that the largest weight of cameras agrees on within limit [px]: (ok, x, y, z), its cameras in chosen.
+    """Point of the consensus of cameras with the largest weight, within limit [px]: (ok, x, y, z), cameras in chosen.
 
-    All cameras if they agree; else the pair whose point the cameras support best, grown to all that agree with it.
+    All cameras if they agree; else the pair whose point has most support, grown to all that agree with it.
     """
     count = usable.shape[0]
     ok, x, y, z = _triangulate(cameras, centres, directions, uv, usable, 20)
@@ -182,10 +182,10 @@ def _consensus(cameras, centres, directions, uv, usable, limit, chosen, residual
 
 @jit
 def triangulate_points(cameras, points, weights, limit, positions, inliers, residuals):
-    """Triangulate points (N, C, 2) [px] seen with weights (N, C); 0 where unseen.
+    """Triangulate points (N, C, 2) [px] with weights (N, C), 0 if not detected.
 
-    limit : largest pixel error of an inlier; infinite for plain least squares.
-    Fills positions (N, 3) [m], inliers (N, C) bool and residuals (N, C) [px]; NaN where there is no point.
+    limit : largest reprojection error of an inlier; infinite for plain least squares.
+    Writes positions (N, 3) [m], inliers (N, C) bool and residuals (N, C) [px]; NaN where there is no point.
     """
     count = cameras.shape[0]
     centres, directions = np.empty((count, 3)), np.empty((count, 3))

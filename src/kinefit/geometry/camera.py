@@ -1,6 +1,6 @@
-"""Cameras: pinhole with lens distortion, rigs of them, and images that differ from the calibration's.
+"""Cameras (pinhole with lens distortion), rigs of cameras, and image frames that differ from the calibration's.
 
-Pixels follow OpenCV: the centre of the first pixel is (0, 0). A camera looks along its z, x to the right, y down.
+Pixels follow OpenCV: the centre of the first pixel is (0, 0). A camera looks along its z axis, x to the right, y down.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from kinefit.geometry import _kernels_camera as kernels
 from kinefit.geometry.se3 import inverse
 
 MODELS = ("radtan", "fisheye")
-_COEFFICIENTS = {"radtan": (0, 4, 5, 8), "fisheye": (0, 4)}
-_MAX_DISTORTION = 1e9  # largest coefficient; those of lenses are far smaller
+_COEFFICIENT_COUNTS = {"radtan": (0, 4, 5, 8), "fisheye": (0, 4)}
+_MAX_DISTORTION = 1e9  # of a coefficient; those of lenses are far smaller
 
 
 def _read_only(array: ArrayLike) -> NDArray:
@@ -56,7 +56,7 @@ class Camera:
     Raises
     ------
     CalibrationError
-        Where a number is not finite, a focal length not positive, or the rotation no rotation.
+        A number that is not finite, a focal length that is not positive, or an invalid rotation.
     """
 
     name: str
@@ -95,10 +95,10 @@ class Camera:
             raise self._error(f"focal lengths {K[0, 0]:g}, {K[1, 1]:g} px", "Both must be positive.")
         if K[1, 0] != 0 or np.any(K[2] != (0, 0, 1)):
             raise self._error("matrix is not [[fx, s, cx], [0, fy, cy], [0, 0, 1]]", "Is it transposed?")
-        if k.size not in _COEFFICIENTS[self.model]:
+        if k.size not in _COEFFICIENT_COUNTS[self.model]:
             raise self._error(
                 f"{k.size} distortion coefficients for the model {self.model}",
-                f"Give {', '.join(map(str, _COEFFICIENTS[self.model]))} (no thin prism, no tilt).",
+                f"Give {', '.join(map(str, _COEFFICIENT_COUNTS[self.model]))} (no thin prism, no tilt).",
             )
         if np.abs(k).max(initial=0.0) > _MAX_DISTORTION:
             raise self._error(f"a distortion coefficient of {np.abs(k).max():.3g}", "Calibrate it again, or repair it.")
@@ -108,7 +108,7 @@ class Camera:
 
     @cached_property
     def packed(self) -> NDArray:
-        """(29,) the camera for kernels; its layout is told in `_kernels_camera`."""
+        """The camera as an array (29,) for kernels; `_kernels_camera` describes its layout."""
         out = np.zeros(kernels.PACKED)
         K, T = self.matrix, self.T_camera_world
         out[kernels.MODEL] = MODELS.index(self.model)
@@ -122,18 +122,18 @@ class Camera:
 
     @property
     def T_world_camera(self) -> NDArray:
-        """(4, 4) [m] pose of the camera in the world."""
+        """Pose (4, 4) [m] of the camera in the world."""
         return inverse(self.T_camera_world)
 
     @property
     def centre_world(self) -> NDArray:
-        """(3,) [m] optical centre."""
+        """Optical centre (3,) [m] in the world."""
         return -self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3]
 
     def project(self, x_world: ArrayLike) -> NDArray:
-        """Project points (..., 3) [m] to (..., 2) [px].
+        """Project points (N, 3) [m] of the world to pixels (N, 2) [px]; any leading axes.
 
-        NaN behind the camera and where the distortion is no longer monotonic; points beside the image are projected.
+        NaN behind the camera and where the distortion is not monotonic. Points outside of the image are projected too.
         """
         x = _points(x_world, 3)
         uv = np.empty((x.size // 3, 2))
@@ -141,14 +141,14 @@ class Camera:
         return uv.reshape(*x.shape[:-1], 2)
 
     def project_with_jacobian(self, x_world: ArrayLike) -> tuple[NDArray, NDArray]:
-        """As `project`, and its derivative by the world point: (..., 2) [px], (..., 2, 3) [px/m]."""
+        """Pixels (N, 2) [px] as of `project`, and their derivatives (N, 2, 3) [px/m] by the points (N, 3) [m]."""
         x = _points(x_world, 3)
         uv, jacobian = np.empty((x.size // 3, 2)), np.empty((x.size // 3, 2, 3))
         kernels.project_points_jacobian(self.packed, np.array(x.reshape(-1, 3), order="C"), uv, jacobian)
         return uv.reshape(*x.shape[:-1], 2), jacobian.reshape(*x.shape[:-1], 2, 3)
 
     def ray(self, uv: ArrayLike) -> NDArray:
-        """Unit directions (..., 3) in the world of the rays through pixels (..., 2); NaN where no ray reaches them."""
+        """Unit directions (N, 3) in the world of the rays through pixels (N, 2); NaN where there is none."""
         pixels = _points(uv, 2)
         directions = np.empty((pixels.size // 2, 3))
         kernels.rays(self.packed, np.array(pixels.reshape(-1, 2), order="C"), directions)
@@ -156,23 +156,23 @@ class Camera:
 
     @cached_property
     def ray_table(self) -> NDArray:
-        """(2, H, W) x/z and y/z of the ray through every pixel, in the camera's frame; NaN where no ray reaches it."""
+        """x/z and y/z (2, H, W) of the ray through every pixel, in the camera's frame; NaN where there is none."""
         u, v = np.meshgrid(np.arange(self.size[0], dtype=float), np.arange(self.size[1], dtype=float))
         rays = self.ray(np.stack([u, v], axis=-1)) @ self.T_camera_world[:3, :3].T
         return _read_only(np.ascontiguousarray(np.moveaxis(rays[..., :2] / rays[..., 2:], -1, 0)))
 
     def with_pose(self, T_camera_world: ArrayLike) -> Camera:
-        """Same camera elsewhere."""
+        """The camera with another pose (4, 4) [m]."""
         return replace(self, T_camera_world=np.asarray(T_camera_world, float))
 
     def scaled(self, size: tuple[int, int]) -> Camera:
-        """Same camera delivering its whole image at another size (width, height) [px]."""
+        """The camera with its whole image scaled to another size (width, height) [px]."""
         return replace(self, size=size, matrix=ImageFrame.scaled(self.size, size).T_image_calibration @ self.matrix)
 
 
-@lru_cache(maxsize=256)  # of a camera that moves it is asked for at every place
+@lru_cache(maxsize=256)  # a moving camera needs it at every pose
 def _monotonic_limit(k: tuple[float, ...], model: str) -> float:
-    """Largest r² (radtan) or θ [rad] (fisheye) up to which the radial distortion grows, a trifle inside."""
+    """Largest r² (radtan) or θ [rad] (fisheye) up to which the radial distortion is monotonic, minus a small margin."""
     if model == "fisheye":
         derivative = Polynomial([1, 3 * k[0], 5 * k[1], 7 * k[2], 9 * k[3]])
         return (1 - 1e-6) * min(np.pi, np.sqrt(_first_root(derivative)))
@@ -184,7 +184,7 @@ def _monotonic_limit(k: tuple[float, ...], model: str) -> float:
 
 def _first_root(polynomial: Polynomial) -> float:
     """Smallest positive root, infinite if there is none."""
-    roots = polynomial.trim(1e-100).roots()  # less is nothing in any image
+    roots = polynomial.trim(1e-100).roots()  # smaller ones have no effect in any image
     real = roots[np.abs(roots.imag) <= 1e-9 * np.abs(roots)].real
     return min((float(r) for r in real if r > 0), default=np.inf)
 
@@ -212,25 +212,25 @@ class ImageFrame:
 
     @classmethod
     def identity(cls) -> ImageFrame:
-        """The delivered image is the calibration's."""
+        """Frame of a delivered image that equals the calibration's."""
         return cls(np.eye(3))
 
     @classmethod
     def scaled(cls, calibration_size: tuple[int, int], image_size: tuple[int, int]) -> ImageFrame:
-        """The whole image, stretched to another size (width, height) [px]."""
+        """Frame of the whole image, stretched to another size (width, height) [px]."""
         sx, sy = _ratio(image_size, calibration_size)
         return cls(np.array([[sx, 0, 0.5 * (sx - 1)], [0, sy, 0.5 * (sy - 1)], [0, 0, 1]]))
 
     @classmethod
     def letterboxed(cls, calibration_size: tuple[int, int], image_size: tuple[int, int]) -> ImageFrame:
-        """The whole image, scaled alike in x and y to fit another size, in the middle of it between bars."""
+        """Frame of the whole image, scaled uniformly to fit another size (width, height) [px], centred between bars."""
         s = min(_ratio(image_size, calibration_size))
         offset = [0.5 * (image - s * calibrated) for image, calibrated in zip(image_size, calibration_size)]
         return cls(np.array([[s, 0, 0.5 * (s - 1) + offset[0]], [0, s, 0.5 * (s - 1) + offset[1]], [0, 0, 1]]))
 
     @classmethod
     def rotated(cls, calibration_size: tuple[int, int], degrees: int) -> ImageFrame:
-        """The delivered image is the calibration's, turned clockwise by 0, 90, 180 or 270 degrees."""
+        """Frame of the image rotated clockwise by 0, 90, 180 or 270 degrees; raises CalibrationError for others."""
         w, h = calibration_size[0] - 1.0, calibration_size[1] - 1.0
         turns = {
             0: np.eye(3),
@@ -243,22 +243,22 @@ class ImageFrame:
         return cls(turns[degrees % 360])
 
     def then(self, after: ImageFrame) -> ImageFrame:
-        """This change of the image, followed by another."""
+        """Compose two frames: this change of the image, followed by another."""
         return ImageFrame(after.T_image_calibration @ self.T_image_calibration)
 
     @property
     def scale(self) -> tuple[float, float]:
-        """Delivered pixels per pixel of the calibration, along the calibration's x and y."""
+        """Delivered pixels per pixel of the calibration, along its x and y; two numbers."""
         sx, sy = np.linalg.norm(self.T_image_calibration[:2, :2], axis=0)
         return float(sx), float(sy)
 
     def from_calibration(self, uv: ArrayLike) -> NDArray:
-        """Pixels (..., 2) of the calibration's image in the delivered one."""
+        """Map pixels (N, 2) from the calibration's image to the delivered one; any leading axes."""
         T = self.T_image_calibration
         return _points(uv, 2) @ T[:2, :2].T + T[:2, 2]
 
     def to_calibration(self, uv: ArrayLike) -> NDArray:
-        """Pixels (..., 2) of the delivered image in the calibration's."""
+        """Map pixels (N, 2) from the delivered image to the calibration's; any leading axes."""
         T = self.T_image_calibration
         return (_points(uv, 2) - T[:2, 2]) @ np.linalg.inv(T[:2, :2]).T
 
@@ -269,23 +269,21 @@ def _ratio(size: tuple[int, int], of: tuple[int, int]) -> tuple[float, float]:
     return size[0] / of[0], size[1] / of[1]
 
 
-_PACKED = 29  # numbers of a camera for kernels
-
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Cameras in one world; `rig["cam01"]` is one of them. Markers alone need none: `Rig(())`.
+    """Cameras in one world; `rig["cam01"]` is one of them. A take of markers alone has none: `Rig(())`.
 
     Raises
     ------
     CalibrationError
-        Where two cameras share a name, or a name is asked for that is not there.
+        Two cameras of one name, or an unknown name.
     """
 
     cameras: tuple[Camera, ...]
 
     def __post_init__(self) -> None:
-        if not isinstance(self.cameras, Sequence) or not all(isinstance(one, Camera) for one in self.cameras):
+        if not isinstance(self.cameras, Sequence) or not all(isinstance(c, Camera) for c in self.cameras):
             problem = f"a rig of a {type(self.cameras).__name__} that holds other things than cameras"
             raise CalibrationError(problem, remedy="Give a tuple of Camera; read_calibration reads some from a file.")
         object.__setattr__(self, "cameras", tuple(self.cameras))
@@ -300,12 +298,12 @@ class Rig:
 
     @cached_property
     def packed(self) -> NDArray:
-        """(C, 29) the cameras for kernels."""
+        """The cameras as an array (C, 29) for kernels."""
         packed = np.array([camera.packed for camera in self.cameras], float)
-        return _read_only(packed.reshape(len(self.cameras), _PACKED))
+        return _read_only(packed.reshape(len(self.cameras), kernels.PACKED))
 
     def project(self, x_world: NDArray, camera: NDArray) -> NDArray:
-        """Project points (N, 3) [m], each by its camera (N,) int, to (N, 2) [px]; NaN as of `Camera.project`."""
+        """Project points (N, 3) [m], each by its camera (N,) int, to pixels (N, 2) [px]; NaN as in `Camera.project`."""
         uv = np.empty((len(x_world), 2))
         if len(self.cameras):
             kernels.project_each(self.packed, camera, np.array(x_world, float, order="C"), uv)
@@ -313,14 +311,14 @@ class Rig:
 
     @property
     def distances(self) -> dict[tuple[str, str], float]:
-        """{(camera, camera): distance of their centres [m]}, of every two."""
+        """Distances {(camera, camera): [m]} between the centres of all pairs."""
         return {
             (a.name, b.name): float(np.linalg.norm(a.centre_world - b.centre_world))
             for a, b in combinations(self.cameras, 2)
         }
 
     def index(self, name: str) -> int:
-        """Place of a camera in the rig."""
+        """Index of a camera in the rig; raises CalibrationError for an unknown name."""
         if name not in self.names:
             raise CalibrationError(choices("camera", name, self.names), remedy="Use one of these names.")
         return self.names.index(name)
@@ -330,7 +328,7 @@ class Rig:
         return Rig(tuple(self[name] for name in names))
 
     def moved(self, T_new_world: ArrayLike) -> Rig:
-        """Same rig, told in another world frame."""
+        """The rig in another world frame, T_new_world (4, 4) [m]."""
         T_world_new = inverse(np.asarray(T_new_world, float))
         return Rig(tuple(camera.with_pose(camera.T_camera_world @ T_world_new) for camera in self.cameras))
 

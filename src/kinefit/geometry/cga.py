@@ -1,8 +1,10 @@
 """Points, lines, planes, circles, spheres, twists and motors as conformal multivectors (P1 2), over arrays.
 
-Elements are outer products of their points: L = e∧A∧B, P = e∧A∧B∧C, circle A∧B∧C, sphere A∧B∧C∧D; X lies on one
-exactly where X∧K = 0. What moves is a versor product M X M̃, the same for all of them. The library's fast path are the
-twists and matrices of `se3` and the lines of `lines`; this module says the same in the words of the paper, to 1e-12.
+Elements are outer products of their points: L = e∧A∧B, P = e∧A∧B∧C, circle A∧B∧C, sphere A∧B∧C∧D. X lies on an element
+K exactly where X∧K = 0. A motion is a versor product M X M̃ for all of them. The library's fast path is `se3` and
+`lines`; this module has the formulas of the paper, and agrees with them to 1e-12.
+
+Shapes are given for one leading axis (N,); all functions take any leading axes.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ _EPSILON = Multivector((15,), np.ones(1))  # I3 e: commutes with motors and has 
 
 
 def _first(x: ArrayLike, size: int, what: str) -> NDArray:
-    """Coordinates (..., size) with their axis moved to the front."""
+    """Coordinates (N, size) with their axis moved to the front."""
     array = np.asarray(x, float)
     if array.shape[-1:] != (size,) or not math.isfinite(array.sum()):
         raise ObservationError(f"{what} of shape {array.shape}, or not finite", remedy=f"Give (..., {size}) numbers.")
@@ -55,7 +57,7 @@ def _first(x: ArrayLike, size: int, what: str) -> NDArray:
 
 
 def _length(values: NDArray, what: str) -> NDArray:
-    """Lengths (...) of (K, ...) coefficients, none of them zero."""
+    """Lengths (N,) of coefficients (K, N); raises ObservationError for a zero length."""
     length = np.linalg.norm(values, axis=0)
     if not np.all((length > 1e-12) & (length < math.inf)):
         raise ObservationError(what, remedy="Give points that are apart.")
@@ -70,62 +72,62 @@ def _last(values: NDArray) -> NDArray:
 
 
 def vector(x: ArrayLike) -> Multivector:
-    """Euclidean vector x1 e1 + x2 e2 + x3 e3 of (..., 3)."""
+    """Euclidean vectors x1 e1 + x2 e2 + x3 e3 of x (N, 3)."""
     return Multivector(_VECTOR, _first(x, 3, "vectors"))
 
 
 def point(x: ArrayLike) -> Multivector:
-    """Conformal point X = x + ½ x² e + e0 of (..., 3) [m]: X² = 0, X·Y = −½ |x − y|²."""
+    """Conformal points X = x + ½ x² e + e0 of x (N, 3) [m]: X² = 0, X·Y = −½ |x − y|²."""
     x = _first(x, 3, "points")
     return Multivector(_POINT, np.concatenate([x, 0.5 * np.sum(x * x, 0)[None], np.ones((1, *x.shape[1:]))]))
 
 
 def coordinates(X: Multivector) -> NDArray:
-    """(..., 3) [m] of points of any weight."""
+    """Coordinates (N, 3) [m] of points of any weight."""
     values = X.select(_POINT).values
     return _last(values[:3] / values[4])
 
 
 def distance(X: Multivector, Y: Multivector) -> NDArray:
-    """(...) [m] between points of weight 1: √(−2 X·Y)."""
+    """Distances (N,) [m] between points of weight 1: √(−2 X·Y)."""
     return np.sqrt(np.maximum(-2.0 * (X | Y).scalar, 0.0))
 
 
 def dual(A: Multivector) -> Multivector:
-    """A I⁻¹: of a plane or sphere the vector, of a line or circle the bivector that annuls its points."""
+    """Dual A I⁻¹: for a plane or sphere a vector, for a line or circle a bivector, which annihilate its points."""
     return A * -I
 
 
 def line_of(line: ArrayLike) -> Multivector:
-    """L = e∧A∧B of Plücker lines (..., 6) = (n, m), as in `lines`: E n + e I3 m."""
+    """Lines L = e∧A∧B of Plücker lines (N, 6) = (n, m), as in `lines`: E n + e I3 m."""
     line = _first(line, 6, "lines")
     return E * Multivector(_VECTOR, line[:3]) + e * I3 * Multivector(_VECTOR, line[3:])
 
 
 def plucker(L: Multivector) -> NDArray:
-    """(..., 6) Plücker lines (n, m), n of length 1, of L = e∧A∧B."""
+    """Plücker lines (N, 6) = (n, m), with n of length 1, of L = e∧A∧B."""
     return np.roll(twist_coordinates(screw(L)), 3, axis=-1)
 
 
 def plane_of(plane: ArrayLike) -> Multivector:
-    """P = e∧A∧B∧C of planes (..., 4) = (n, d) with n·x = d [m]: (n + d e) I."""
+    """Planes P = e∧A∧B∧C of (N, 4) = (n, d) with n·x = d [m]: (n + d e) I."""
     plane = _first(plane, 4, "planes")
     return (Multivector(_VECTOR, plane[:3]) + Multivector((8,), plane[3:])) * I
 
 
 def plane_equation(P: Multivector) -> NDArray:
-    """(..., 4) = (n, d), n of length 1, of planes."""
+    """Equations (N, 4) = (n, d) [m] of planes, with n of length 1."""
     values = dual(P).select((*_VECTOR, 8)).values
     return _last(values / _length(values[:3], "a plane through points on one line"))
 
 
 def sphere_of(centre: ArrayLike, radius: ArrayLike) -> Multivector:
-    """S = A∧B∧C∧D about centres (..., 3) [m] with radii (...) [m]: (C − ½ r² e) I."""
+    """Spheres S = A∧B∧C∧D of centres (N, 3) [m] and radii (N,) [m]: (C − ½ r² e) I."""
     return (point(centre) - e * (0.5 * np.asarray(radius, float) ** 2)) * I
 
 
 def sphere_parameters(S: Multivector) -> tuple[NDArray, NDArray]:
-    """Centre (..., 3) [m] and radius (...) [m] of spheres A∧B∧C∧D."""
+    """Centres (N, 3) [m] and radii (N,) [m] of spheres A∧B∧C∧D."""
     s = dual(S)
     _length(s.select((16,)).values, "a sphere through points of one plane")
     s = s / s.along(e0)
@@ -134,10 +136,10 @@ def sphere_parameters(S: Multivector) -> tuple[NDArray, NDArray]:
 
 
 def circle_parameters(C: Multivector) -> tuple[NDArray, NDArray, NDArray]:
-    """Centre (..., 3) [m], unit normal (..., 3) and radius (...) [m] of circles A∧B∧C (right-handed through them)."""
+    """Centres (N, 3) [m], unit normals (N, 3) and radii (N,) [m] of circles A∧B∧C (right-handed through them)."""
     plane = e ^ C
     n = plane_equation(plane)[..., :3]
-    centre = coordinates((C * e * C).grade(1))  # the image of infinity when the circle inverts space
+    centre = coordinates((C * e * C).grade(1))  # the image of infinity under inversion in the circle
     square = (C * ~C).scalar / (plane * ~plane).scalar
     return centre, n, np.sqrt(np.abs(square))
 
@@ -146,32 +148,32 @@ def circle_parameters(C: Multivector) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def translator(t: ArrayLike | Multivector) -> Multivector:
-    """T = 1 + ½ e t of (..., 3) [m] or Euclidean vectors (P1 3.3)."""
+    """Translators T = 1 + ½ e t of t (N, 3) [m] or Euclidean vectors (P1 3.3)."""
     t = t if isinstance(t, Multivector) else vector(t)
     return 1.0 + e * t * 0.5
 
 
 def twist(xi: ArrayLike) -> Multivector:
-    """Ψ of twists ξ = (v, ω) (..., 6): Ψ = I3 ω + v∧e; `exp` of it moves as `se3.exp(ξ)` does."""
+    """Bivectors Ψ = I3 ω + v∧e of twists ξ = (v, ω) (N, 6) [m, rad]; `exp` of them moves as `se3.exp(ξ)` does."""
     xi = _first(xi, 6, "twists")
     signs = _SIGNS.reshape(3, *[1] * (xi.ndim - 1))
     return Multivector((*_TURN, *_SHIFT), np.concatenate([xi[3:] * signs, xi[:3]]))
 
 
 def twist_coordinates(Psi: Multivector) -> NDArray:
-    """ξ = (v, ω) (..., 6) of bivectors Ψ."""
+    """Twists ξ = (v, ω) (N, 6) [m, rad] of bivectors Ψ."""
     values = _last(Psi.select((*_SHIFT, *_TURN)).values)
     return values * np.concatenate([np.ones(3), _SIGNS])
 
 
 def screw(L: Multivector, theta: ArrayLike = 1.0) -> Multivector:
-    """Twist without pitch of a joint: Ψ = θ L (P1 2.1), with the line as the bivector L I, of length 1."""
+    """Twist without pitch of a joint: Ψ = θ L (P1 2.1), theta (N,) [rad], with the line as bivector L I of length 1."""
     psi = (L * I).select((*_TURN, *_SHIFT))
     return psi * (np.asarray(theta, float) / _length(psi.values[:3], "a line through one point alone"))
 
 
 def exp(Psi: Multivector) -> Multivector:
-    """Motor M = exp(−½ Ψ) of twists (P1 2.1), in closed form, exact near zero too.
+    """Motor M = exp(−½ Ψ) of twists (P1 2.1), in closed form, also exact near zero.
 
     −Ψ² = (θ + ε p)² with ε = I3 e, ε² = 0: a dual angle, so M = cos(½(θ + ε p)) − Ψ sin(½(θ + ε p)) / (θ + ε p).
     """
@@ -185,7 +187,7 @@ def exp(Psi: Multivector) -> Multivector:
 
 
 def log(M: Multivector) -> Multivector:
-    """Twist Ψ with M = exp(−½ Ψ) up to the sign of M, turned by at most π."""
+    """Twist Ψ with M = exp(−½ Ψ) up to the sign of M, with a rotation of at most π."""
     values = M.select(_MOTOR).values
     M = Multivector(_MOTOR, np.where(values[0] < 0.0, -values, values))
     plane = M.grade(2)
@@ -197,7 +199,13 @@ def log(M: Multivector) -> Multivector:
 
 
 def motor_of(T: ArrayLike) -> Multivector:
-    """Motor of rigid motions (..., 4, 4)."""
+    """Motors of rigid motions T (N, 4, 4).
+
+    Raises
+    ------
+    ObservationError
+        Motions of another shape, or not finite.
+    """
     T = np.asarray(T, float)
     if T.shape[-2:] != (4, 4) or not math.isfinite(T.sum()):
         raise ObservationError(f"motions of shape {T.shape}, or not finite", remedy="Give (..., 4, 4).")
@@ -207,14 +215,14 @@ def motor_of(T: ArrayLike) -> Multivector:
 
 
 def matrix(M: Multivector) -> NDArray:
-    """(..., 4, 4) rigid motions of motors of any length."""
+    """Rigid motions (N, 4, 4) of motors of any length."""
     op = operator(M)
     scale = op[..., 4, 4, None]
     return se3.transform(op[..., :3, :3] / scale[..., None], op[..., :3, 4] / scale)
 
 
 def operator(M: Multivector) -> NDArray:
-    """(..., 5, 5) matrices that move vectors over e1, e2, e3, e, e0 as M X M̃ does."""
+    """Matrices (N, 5, 5) of the map X -> M X M̃ of vectors over e1, e2, e3, e, e0."""
     values = M.select(_MOTOR).values
     out = np.empty((5, 5, math.prod(M.shape)))
     _kernels_cga.operators(np.ascontiguousarray(values.reshape(8, -1)), out)
@@ -222,7 +230,7 @@ def operator(M: Multivector) -> NDArray:
 
 
 def versor(M: Multivector, X: Multivector) -> Multivector:
-    """M X M̃ with the grades of X (the product as printed leaves zeros in others); points by their 5×5 operators."""
+    """Versor product M X M̃, restricted to the grades of X (rounding leaves others); points by their 5×5 operators."""
     if not set(X.blades) <= set(_POINT) or not set(M.blades) <= set(_MOTOR):
         return (M * X * ~M).grade(*X.grades)
     shape = np.broadcast_shapes(M.shape, X.shape)
@@ -235,13 +243,13 @@ def versor(M: Multivector, X: Multivector) -> Multivector:
 
 
 def inverse(A: Multivector) -> Multivector:
-    """A⁻¹ = Ã / (A Ã) of versors and blades that are not null."""
+    """Inverse A⁻¹ = Ã / (A Ã) of versors and blades that are not null."""
     reverse = ~A
     return reverse / (A * reverse).scalar
 
 
 def unit(M: Multivector) -> Multivector:
-    """Motors of length 1: M M̃ = 1, its ε-part too, so that products of many do not drift."""
+    """Normalise motors: M M̃ = 1 including its ε-part, so that products of many do not drift."""
     square = M * ~M
     s = square.scalar
     return (M * (1.0 - _EPSILON * (0.5 * square.along(_EPSILON) / s))).select(_MOTOR) / np.sqrt(s)
@@ -253,7 +261,7 @@ def between(Psi: Multivector, other: Multivector) -> Multivector:
     Raises
     ------
     ObservationError
-        Twists with pitch or of different angles, which no motion carries into each other.
+        Twists with pitch or of different angles, between which there is no motion; opposite lines.
     """
     squares = [as_multivector(p * p) for p in (Psi, other)]
     theta2, size = -squares[0].scalar, np.maximum(-squares[1].scalar, 1e-300)
@@ -269,5 +277,5 @@ def between(Psi: Multivector, other: Multivector) -> Multivector:
 
 
 def interpolate(M: Multivector, t: ArrayLike) -> Multivector:
-    """Mₜ = exp(−½ t Ψ) for M = exp(−½ Ψ): from 1 at t = 0 to M at t = 1 along one screw (P1 3.1)."""
+    """Interpolate a motor: Mₜ = exp(−½ t Ψ) for M = exp(−½ Ψ), t (N,), from 1 to M along one screw (P1 3.1)."""
     return exp(log(M) * np.asarray(t, float))

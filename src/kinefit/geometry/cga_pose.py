@@ -1,9 +1,9 @@
 """Pose estimation in conformal geometric algebra (P1 2.1, 2.4): points on rays, points and lines in planes.
 
-Each constraint is linear in what moves: X×L, X×P or L×P (commutator and anticommutators, zero where they meet). A motor
-M = exp(−½ Ψ) near 1 moves X by X×Ψ (the commutator), so the derivatives are nested products; the steps are rebuilt by
-the closed form of the motor (Rodrigues' formula) and repeated. The library's fast path for the same are
-`correspondences` and `solvers`; both have the same numbers.
+Each constraint is linear in the moving element: X×L, X×P or L×P (commutator and anticommutators, zero for incidence). A
+motor M = exp(−½ Ψ) near 1 moves X by X×Ψ (the commutator), so the derivatives are nested products. Steps use the closed
+form of the motor (Rodrigues' formula) and are iterated. The library's fast path is `correspondences` and `solvers`,
+with the same results.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ _BASIS = twist(np.eye(6))  # the six twists of a motion
 
 
 def point_line(X: Multivector, L: Multivector) -> NDArray:
-    """Error vector x × n − m (..., 3) [m] of points and lines of length 1, read from X×L; as `lines.point_line`."""
+    """Error vectors x × n − m (N, 3) [m] of points and lines of length 1, from X×L; as `lines.point_line`."""
     error = commutator(X, L)
     return np.stack([error.along(I3 * axis * E) for axis in (e1, e2, e3)], -1)
 
 
 def point_plane(X: Multivector, P: Multivector) -> NDArray:
-    """Signed distance n·x − d (...) [m] of points and planes of length 1, read from X×P; as `lines.point_plane`."""
+    """Signed distances n·x − d (N,) [m] of points and planes of length 1, from X×P; as `lines.point_plane`."""
     return anticommutator(X, P).along(I)
 
 
 def line_plane(L: Multivector, P: Multivector) -> NDArray:
-    """Tilt and offset (..., 4) of lines and planes of length 1, read from L×P; as `lines.line_plane`."""
+    """Tilt and offset (N, 4) [rad, m] of lines and planes of length 1, from L×P; as `lines.line_plane`."""
     tilt, offset = _tilt_offset(L, P)
     normal = dual(P).select((1, 2, 4)).values
     return np.concatenate([tilt[..., None], np.moveaxis(normal * offset, 0, -1)], -1)
 
 
 def _tilt_offset(L: Multivector, P: Multivector, along: Multivector | None = None) -> tuple[NDArray, NDArray]:
-    """Sine of the angle, and offset of the line's foot point, read from L×P along the line's direction."""
+    """Sine of the angle, and offset [m] of the line's foot point, from L×P along the line's direction."""
     error = anticommutator(L, P)
     tilt = error.along(I3)
     shift = np.stack([error.along(I3 * axis * e) for axis in (e1, e2, e3)])
@@ -50,12 +50,12 @@ def _tilt_offset(L: Multivector, P: Multivector, along: Multivector | None = Non
 
 @dataclass(frozen=True, eq=False)
 class Constraint:
-    """What a body's elements should lie on.
+    """Incidence of a body's elements with fixed elements.
 
     Parameters
     ----------
-    moved : (N,) points X, or lines L = e∧A∧B, where they are at rest.
-    fixed : (N,) lines e∧(O∧x) for points; planes for points or lines. Of any length: they are made unit.
+    moved : (N,) points X, or lines L = e∧A∧B, at rest.
+    fixed : (N,) lines e∧(O∧x) for points; planes for points or lines. Of any length: they are normalised.
     joints : indices of the joints that move them, in order from the root (P1's list 𝒥).
     sigma : scalar or (N,) standard deviation [m].
     """
@@ -68,15 +68,15 @@ class Constraint:
 
 @dataclass(frozen=True, eq=False)
 class CgaPose:
-    """What `estimate_pose` found.
+    """Result of `estimate_pose`.
 
     Parameters
     ----------
     M : motor of the body.
     angles : (J,) [rad]
-    rms : root of the mean square of all weighted errors.
+    rms : root mean square of all weighted errors.
     iterations : int
-    step : [m, rad] norm of the last step; it did not converge where that is larger than the tolerance.
+    step : [m, rad] norm of the last step; above the tolerance if not converged.
     """
 
     M: Multivector
@@ -95,28 +95,28 @@ def estimate_pose(
     iterations: int = 50,
     tolerance: float = 1e-12,
 ) -> CgaPose:
-    """Motor M and angles θ with (M (M1 … Mn X M̃n … M̃1) M̃) × (e∧(O∧x)) = 0 in least squares (P1 2.1, 2.4).
+    """Estimate motor M and angles θ: (M (M1 … Mn X M̃n … M̃1) M̃) × (e∧(O∧x)) = 0 in least squares (P1 2.1, 2.4).
 
     Parameters
     ----------
-    constraints : what should meet.
+    constraints : incidences of elements.
     joints : (J,) lines e∧A∧B of the joints at rest, or any twists Ψ_i there: each moves by M_i = exp(−½ θ_i Ψ_i).
-    start, angles : where to start; 1 and zero unless given.
-    iterations : int, at most.
+    start, angles : initial motor and angles (J,) [rad]; default 1 and zero.
+    iterations : int, largest number.
     tolerance : float [m, rad], norm of the last step.
 
     Raises
     ------
     ObservationError
-        Elements that no constraint is known for, or a pose that the constraints leave open.
+        Elements without a known constraint, or a pose that the constraints do not determine.
     """
     axes = screw(joints) if joints is not None and joints.grades == (3,) else joints
     count = 0 if axes is None else axes.shape[0]
     M = exp(twist(np.zeros(6))) if start is None else start
     theta = np.zeros(count) if angles is None else np.array(angles, float)
     prepared = [_prepared(c, count) for c in constraints]
-    taken, size, residual = 0, np.inf, np.empty(0)
-    while taken < iterations and size >= tolerance:
+    steps, size, residual = 0, np.inf, np.empty(0)
+    while steps < iterations and size >= tolerance:
         turns = exp(axes * theta) if axes is not None else M
         parts = [_linearised(c, M, axes, turns, count) for c in prepared]
         residual = np.concatenate([np.empty(0), *(part[0] for part in parts)])
@@ -127,8 +127,8 @@ def estimate_pose(
                 f"the constraints settle {rank} of {6 + count} unknowns", remedy="Give more points, or other rays."
             )
         M, theta = unit(exp(twist(step[:6])) * M), theta + step[6:]
-        taken, size = taken + 1, float(np.linalg.norm(step))
-    return CgaPose(M, theta, float(np.sqrt(np.mean(residual**2))), taken, size)
+        steps, size = steps + 1, float(np.linalg.norm(step))
+    return CgaPose(M, theta, float(np.sqrt(np.mean(residual**2))), steps, size)
 
 
 def _prepared(c: Constraint, joints: int) -> Constraint:
@@ -148,7 +148,7 @@ def _prepared(c: Constraint, joints: int) -> Constraint:
 
 
 def _of_one_grade(A: Multivector) -> Multivector:
-    """Without the grades that a versor product left by rounding (M X M̃ of a point has zeros of grades 3 and 5)."""
+    """Drop the grades that rounding left in a versor product (M X M̃ of a point has zeros of grades 3 and 5)."""
     sizes = {grade: float(np.abs(A.grade(grade).values).max(initial=0.0)) for grade in A.grades}
     return A.grade(*(grade for grade, size in sizes.items() if not size < 1e-9 * max(sizes.values())))
 
@@ -167,7 +167,7 @@ def _linearised(
     """Weighted errors and their derivatives by the six of the body's twist and the joints' angles."""
     chain, twists = M, {}
     for j in c.joints:
-        assert axes is not None  # `_prepared` has seen to it
+        assert axes is not None  # checked by `_prepared`
         twists[j] = (chain * axes[j] * ~chain).grade(2)  # Ψ' = M Ψ M̃ (P1 2.1)
         chain = chain * turns[j]
     element = (chain * c.moved * ~chain).grade(*c.moved.grades)
@@ -191,7 +191,7 @@ def _error(element: Multivector, fixed: Multivector) -> NDArray:
 
 
 def _derivative(element: Multivector, change: Multivector, fixed: Multivector) -> NDArray:
-    """Change of `_error` as the element changes by `change`."""
+    """Derivative of `_error` along `change` of the element."""
     if element.grades == (1,):
         return _error(change.grade(1), fixed)
     tilt, offset = _tilt_offset(change.grade(3), fixed, element)

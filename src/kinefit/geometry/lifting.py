@@ -1,4 +1,4 @@
-"""A shape of known size before one camera: where it stands."""
+"""Position of a shape of known size in front of one camera."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from kinefit.geometry.camera import Camera
 
 
 def placed(camera: Camera, x: NDArray, uv: NDArray) -> NDArray:
-    """Points of a shape in the world, where they are seen: (..., K, 3) [m].
+    """Place a shape in the world by its pixels: points (N, K, 3) [m]; any leading axes.
 
-    Only one shift of all points is sought: that with which their distances from their rays, squared, add up to the
-    least. NaN where fewer than two points are known.
+    Finds the common shift of all points that minimises the sum of squared distances from their rays. NaN where fewer
+    than two points are known.
 
     Parameters
     ----------
-    x : (..., K, 3) [m] along the image's u and v and away from the camera, from any origin; NaN where unknown
-    uv : (..., K, 2) [px] where they are seen; NaN where they are not
+    camera : Camera
+    x : (N, K, 3) [m] along the image's u and v and away from the camera, from any origin; NaN if unknown
+    uv : (N, K, 2) [px] detections; NaN for none
     """
     rays = camera.ray(uv) @ camera.T_camera_world[:3, :3].T
     across = np.eye(3) - rays[..., :, None] * rays[..., None, :]

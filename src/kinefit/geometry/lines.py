@@ -1,7 +1,7 @@
 """Plücker lines and planes: distances of points and lines to them, and their derivatives (P1 2.3, P3 eqs. 4-5).
 
 A line is (n, m): unit direction n and moment m = x × n of any of its points x [m]. A plane is (n, d): unit normal and
-n·x = d [m]. All functions take any leading shape.
+n·x = d [m]. Shapes are given for one leading axis (N,); all functions but `perpendiculars` take any leading axes.
 """
 
 from __future__ import annotations
@@ -20,53 +20,53 @@ def _unit(v: NDArray, what: str) -> NDArray:
 
 
 def perpendiculars(directions: NDArray) -> tuple[NDArray, NDArray]:
-    """Two unit directions (N, 3) each, at right angles to unit directions (N, 3) and to each other."""
+    """Two unit directions (N, 3) each, orthogonal to unit directions (N, 3) and to each other."""
     first = np.cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return first, np.cross(directions, first)
 
 
 def line_through(a: NDArray, b: NDArray) -> NDArray:
-    """Plücker line (..., 6) from point a to point b, both (..., 3) [m]."""
+    """Plücker lines (N, 6) from points a to points b, both (N, 3) [m]."""
     a, b = np.asarray(a, float), np.asarray(b, float)
     return line_along(a, b - a)
 
 
 def line_along(x: NDArray, direction: NDArray) -> NDArray:
-    """Plücker line (..., 6) through x (..., 3) [m] along a direction (..., 3) of any length."""
+    """Plücker lines (N, 6) through x (N, 3) [m] along directions (N, 3) of any length."""
     n = _unit(np.asarray(direction, float), "a line's direction")
     return np.concatenate([np.broadcast_to(n, np.broadcast_shapes(n.shape, np.shape(x))), np.cross(x, n)], -1)
 
 
 def plane_through(line: NDArray, x: NDArray) -> NDArray:
-    """Plane (..., 4) = (n, d) that holds a Plücker line (..., 6) and a point (..., 3) [m] off it."""
+    """Planes (N, 4) = (n, d) through Plücker lines (N, 6) and points (N, 3) [m] off them."""
     foot = np.cross(line[..., :3], line[..., 3:])
     n = _unit(np.cross(line[..., :3], np.asarray(x, float) - foot), "a plane's normal")
     return np.concatenate([n, np.sum(n * x, -1, keepdims=True)], -1)
 
 
 def move_line(T: NDArray, line: NDArray) -> NDArray:
-    """Line (..., 6) moved by T (..., 4, 4)."""
+    """Lines (N, 6) moved by T (N, 4, 4)."""
     n = (T[..., :3, :3] @ line[..., :3, None])[..., 0]
     m = (T[..., :3, :3] @ line[..., 3:, None])[..., 0] + np.cross(T[..., :3, 3], n)
     return np.concatenate([n, m], -1)
 
 
 def point_line(x: NDArray, line: NDArray) -> NDArray:
-    """Residual vector x × n − m (..., 3) [m] of a point and a line; its norm is the distance (P3 eq. 4)."""
+    """Residual vectors x × n − m (N, 3) [m] of points and lines; their norms are the distances (P3 eq. 4)."""
     return np.cross(x, line[..., :3]) - line[..., 3:]
 
 
 def point_plane(x: NDArray, plane: NDArray) -> NDArray:
-    """Signed distance n·x − d (...) [m] of a point to a plane; its derivative with respect to x is n."""
+    """Signed distances n·x − d (N,) [m] of points to planes; the derivative by x is n."""
     return np.sum(plane[..., :3] * x, -1) - plane[..., 3]
 
 
 def line_plane(line: NDArray, plane: NDArray) -> NDArray:
-    """Residual (..., 4) of a line that should lie in a plane: its tilt, and its offset along the normal.
+    """Residuals (N, 4) of lines that should lie in planes: tilt, and offset along the normal.
 
-    The first entry is the sine of the angle between them [rad]; the other three are the vector from the plane to the
-    line's foot point along the plane's normal [m]. All four vanish exactly when the line lies in the plane (P1 2.3).
+    The first entry is the sine of the angle between them [rad]; the other three are the vector [m] from the plane to
+    the line's foot point along the plane's normal. All four vanish exactly when the line lies in the plane (P1 2.3).
     """
     n_line, n_plane = line[..., :3], plane[..., :3]
     foot = np.cross(n_line, line[..., 3:])
@@ -75,7 +75,7 @@ def line_plane(line: NDArray, plane: NDArray) -> NDArray:
 
 
 def closest_points(line_a: NDArray, line_b: NDArray) -> tuple[NDArray, NDArray]:
-    """Points (..., 3) [m] of two lines that are nearest to each other (for parallel ones: the feet from the origin)."""
+    """Closest points (N, 3) [m] of two lines (N, 6) (of parallel ones: the feet from the origin)."""
     a, b = line_a[..., :3], line_b[..., :3]
     foot_a, foot_b = np.cross(a, line_a[..., 3:]), np.cross(b, line_b[..., 3:])
     gap, across = foot_b - foot_a, np.cross(a, b)

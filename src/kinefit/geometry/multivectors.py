@@ -1,8 +1,8 @@
 """Multivectors of conformal geometric algebra G(4,1) over arrays, with their products as operators (P1 2).
 
 The basis is e1, e2, e3 (squares 1), e (the point at infinity) and e0 (the origin), both null, e·e0 = −1. A blade is the
-outer product of basis vectors in that order, known by its bits: 1, 2, 4, 8, 16. A multivector holds the coefficients of
-the blades that it has, each an array of one shape: products broadcast over them like numpy's.
+outer product of basis vectors in that order, identified by its bits: 1, 2, 4, 8, 16. A multivector holds coefficients
+of its blades, arrays of one shape; products broadcast over them as in numpy.
 
     A * B   geometric product          A ^ B   outer product       ~A   reverse
     A | B   inner product (Hestenes')  commutator(A, B), anticommutator(A, B): ½ (A B ∓ B A)
@@ -81,7 +81,7 @@ Rule = Callable[[int, int], dict[int, float]]
 
 @lru_cache(maxsize=4096)
 def _plan(a: tuple[int, ...], b: tuple[int, ...], rule: Rule) -> tuple[tuple[int, ...], NDArray, NDArray]:
-    """Blades of a product, and its terms (i, j, k) with their signs."""
+    """Blades of a product, and its terms (T, 3) = (i, j, k) with their signs (T,)."""
     parts = [(i, j, k, s) for i, x in enumerate(a) for j, y in enumerate(b) for k, s in rule(x, y).items()]
     blades = tuple(sorted({k for _, _, k, _ in parts}, key=_order)) or (0,)
     terms = np.array([(i, j, blades.index(k)) for i, j, k, _ in parts], np.int64).reshape(-1, 3)
@@ -105,7 +105,7 @@ class Multivector:
     blades: tuple[int, ...]
     values: NDArray
 
-    __array_ufunc__ = None  # let `array * A` come to this class
+    __array_ufunc__ = None  # so that `array * A` calls this class
 
     def __post_init__(self) -> None:
         values = np.asarray(self.values, float)
@@ -120,7 +120,7 @@ class Multivector:
 
     @property
     def grades(self) -> tuple[int, ...]:
-        """Grades of the blades that it has."""
+        """Grades of its blades."""
         return tuple(sorted({grade_of(blade) for blade in self.blades}))
 
     def __getitem__(self, index: object) -> Multivector:
@@ -128,7 +128,7 @@ class Multivector:
         return Multivector(self.blades, self.values[(slice(None), *index)])
 
     def select(self, blades: tuple[int, ...]) -> Multivector:
-        """The part with the given blades, zero where it has none."""
+        """The part with the given blades, zero for missing ones."""
         out = np.zeros((len(blades), *self.shape))
         for row, blade in enumerate(blades):
             if blade in self.blades:
@@ -140,21 +140,21 @@ class Multivector:
         return self.select(tuple(blade for blade in self.blades if grade_of(blade) in grades) or (0,))
 
     def along(self, blade: Multivector) -> NDArray:
-        """Coefficient (...) of one blade of the basis, such as `e1 ^ e2`; order and sign count."""
+        """Coefficient, of the array's shape (N,), of one basis blade, such as `e1 ^ e2`, with its order and sign."""
         (row,) = np.flatnonzero(blade.values)
         return self.select((blade.blades[row],)).values[0] / blade.values[row]
 
     @property
     def scalar(self) -> NDArray:
-        """Coefficient (...) of 1."""
+        """Coefficient of 1, of the array's shape (N,)."""
         return self.select((0,)).values[0]
 
     def dense(self) -> NDArray:
-        """(..., 32) coefficients by the blades' bits."""
+        """Coefficients (N, 32) by the blades' bits."""
         return np.moveaxis(self.select(tuple(range(32))).values, 0, -1)
 
     def columns(self, shape: tuple[int, ...]) -> NDArray:
-        """(K, 1) contiguous coefficients where there is but one element, else (K, N) of the broadcast shape."""
+        """Contiguous coefficients: (K, 1) for a single element, else (K, N) of the broadcast shape."""
         values, own = self.values, self.shape
         if math.prod(own) == 1:
             return np.ascontiguousarray(values.reshape(-1, 1))
@@ -218,7 +218,7 @@ class Multivector:
         names = ["∧".join(name for i, name in enumerate(BASIS) if blade >> i & 1) for blade in self.blades]
         if self.shape:
             return f"<array {self.shape} over {', '.join(name or '1' for name in names)}>"
-        # what rounding left is not shown: below 1e-12 of the largest coefficient, or of 1
+        # rounding errors are not shown: below 1e-12 of the largest coefficient, or of 1
         least = 1e-12 * max(1.0, float(np.abs(self.values).max(initial=0.0)))
         text = ""
         for name, value in zip(names, self.values):
@@ -229,13 +229,13 @@ class Multivector:
 
 
 def _aligned(values: NDArray, axes: int) -> NDArray:
-    """(K, ...) coefficients with axes of length 1 put in so that the elements have so many."""
+    """Coefficients (K, N) with axes of length 1 inserted, so that the elements have `axes` axes."""
     own = values.shape[1:]
     return values if len(own) >= axes else values.reshape(len(values), *[1] * (axes - len(own)), *own)
 
 
 def as_multivector(value: Multivector | ArrayLike) -> Multivector:
-    """A multivector as it is; numbers as scalars."""
+    """Convert numbers (N,) to scalars; multivectors are returned unchanged."""
     return value if isinstance(value, Multivector) else Multivector((0,), np.asarray(value, float)[None])
 
 
@@ -250,7 +250,7 @@ def anticommutator(a: Multivector, b: Multivector) -> Multivector:
 
 
 def stack(elements: list[Multivector] | tuple[Multivector, ...]) -> Multivector:
-    """Elements of one shape as an array with one more axis, the last."""
+    """Stack elements of one shape along a new last axis."""
     blades = tuple(sorted({blade for a in elements for blade in a.blades}, key=_order))
     return Multivector(blades, np.stack([a.select(blades).values for a in elements], -1))
 

@@ -1,7 +1,8 @@
 """Rigid motions and twists: exp, log, adjoint, left Jacobian; batched, exact near identity and near π.
 
-A twist is ξ = (v, ω), spatial, in metres and radians: a point x moves by v + ω × x (P3, eqs. 1-4). All functions take
-any leading shape. The coefficients are series where closed forms cancel, so that nothing is lost for small angles.
+A twist is ξ = (v, ω), spatial, in metres and radians: a point x moves by v + ω × x (P3, eqs. 1-4). Shapes are given for
+one leading axis (N,); all functions but `aligned` take any leading axes. The coefficients are series where closed forms
+cancel, so that small angles keep full precision.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-_SMALL = 0.5  # [rad] below it the seven-term series are exact to machine precision
+_MAX_SERIES_ANGLE = 0.5  # [rad] below it the series are exact to machine precision
 _FACTORIALS = np.cumprod(np.concatenate([[1.0], np.arange(1.0, 25.0)]))
 
 
@@ -24,7 +25,7 @@ def _series(theta2: NDArray, first: int) -> NDArray:
 def _coefficients(theta: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """sin θ / θ, (1 − cos θ) / θ², (θ − sin θ) / θ³."""
     theta2 = theta * theta
-    small = theta < _SMALL
+    small = theta < _MAX_SERIES_ANGLE
     t = np.where(small, 1.0, theta)
     a = np.where(small, _series(theta2, 1), np.sin(t) / t)
     b = np.where(small, _series(theta2, 2), 2.0 * (np.sin(0.5 * t) / t) ** 2)
@@ -33,7 +34,7 @@ def _coefficients(theta: NDArray) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def hat(omega: NDArray) -> NDArray:
-    """Cross-product matrix: (..., 3) -> (..., 3, 3) with hat(ω) x = ω × x."""
+    """Cross-product matrices (N, 3, 3) of ω (N, 3): hat(ω) x = ω × x."""
     omega = np.asarray(omega, float)
     out = np.zeros((*omega.shape[:-1], 3, 3))
     x, y, z = omega[..., 0], omega[..., 1], omega[..., 2]
@@ -43,7 +44,7 @@ def hat(omega: NDArray) -> NDArray:
 
 
 def exp_so3(omega: NDArray) -> NDArray:
-    """Rodrigues' formula: rotation vector (..., 3) [rad] -> rotation matrix (..., 3, 3)."""
+    """Rotation matrices (N, 3, 3) of rotation vectors (N, 3) [rad], by Rodrigues' formula."""
     omega = np.asarray(omega, float)
     a, b, _ = _coefficients(np.linalg.norm(omega, axis=-1))
     w = hat(omega)
@@ -51,7 +52,7 @@ def exp_so3(omega: NDArray) -> NDArray:
 
 
 def quaternion(rotation: NDArray) -> NDArray:
-    """Unit quaternion (..., 4) as (w, x, y, z), w ≥ 0, of a rotation matrix (..., 3, 3); always stable (Shepperd)."""
+    """Unit quaternions (N, 4) as (w, x, y, z), w ≥ 0, of rotation matrices (N, 3, 3); always stable (Shepperd)."""
     r = np.asarray(rotation, float)
     m00, m11, m22 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     table = np.empty((*r.shape[:-2], 4, 4))
@@ -73,7 +74,7 @@ def quaternion(rotation: NDArray) -> NDArray:
 
 
 def rotation_from_quaternion(q: NDArray) -> NDArray:
-    """Rotation matrix (..., 3, 3) of a quaternion (..., 4) as (w, x, y, z), normalised first."""
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4) as (w, x, y, z), which are normalised first."""
     q = np.asarray(q, float)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     w, v = hat(q[..., 1:]), q[..., 0]
@@ -81,7 +82,7 @@ def rotation_from_quaternion(q: NDArray) -> NDArray:
 
 
 def log_so3(rotation: NDArray) -> NDArray:
-    """Rotation vector (..., 3) [rad], norm ≤ π, of a rotation matrix (..., 3, 3)."""
+    """Rotation vectors (N, 3) [rad], norm ≤ π, of rotation matrices (N, 3, 3)."""
     q = quaternion(rotation)
     sine = np.linalg.norm(q[..., 1:], axis=-1)
     half = np.arctan2(sine, q[..., 0])
@@ -90,7 +91,7 @@ def log_so3(rotation: NDArray) -> NDArray:
 
 
 def transform(rotation: NDArray, translation: NDArray) -> NDArray:
-    """Homogeneous matrix (..., 4, 4) of a rotation (..., 3, 3) and a translation (..., 3) [m]."""
+    """Homogeneous matrices (N, 4, 4) of rotations (N, 3, 3) and translations (N, 3) [m]."""
     rotation, translation = np.asarray(rotation, float), np.asarray(translation, float)
     shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     out = np.zeros((*shape, 4, 4))
@@ -99,26 +100,29 @@ def transform(rotation: NDArray, translation: NDArray) -> NDArray:
 
 
 def nearest_rotation(M: NDArray) -> NDArray:
-    """Rotations nearest to matrices (..., 3, 3) by least squares (W. Kabsch, 1978)."""
+    """Rotations (N, 3, 3) nearest to matrices (N, 3, 3) by least squares (W. Kabsch, 1978)."""
     u, _, vt = np.linalg.svd(M)
     u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
     return np.asarray(u @ vt)
 
 
 def shortest_turn(a: NDArray, b: NDArray) -> NDArray:
-    """Smallest rotations (..., 3, 3) that take directions a (..., 3) to b (..., 3); of opposite ones half a turn."""
+    """Smallest rotations (N, 3, 3) from directions a (N, 3) to b (N, 3); by π for opposite ones."""
     a, b = (v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12) for v in np.broadcast_arrays(a, b))
     axis, cosine = np.cross(a, b), np.sum(a * b, axis=-1, keepdims=True)
     sine = np.linalg.norm(axis, axis=-1, keepdims=True)
-    beside = np.eye(3)[np.argmin(np.abs(a), axis=-1)]
-    beside = beside - np.sum(beside * a, axis=-1, keepdims=True) * a
-    beside = beside / np.linalg.norm(beside, axis=-1, keepdims=True)
-    axis = np.where(sine > 1e-12, axis / np.maximum(sine, 1e-12), beside)
+    perpendicular = np.eye(3)[np.argmin(np.abs(a), axis=-1)]
+    perpendicular = perpendicular - np.sum(perpendicular * a, axis=-1, keepdims=True) * a
+    perpendicular = perpendicular / np.linalg.norm(perpendicular, axis=-1, keepdims=True)
+    axis = np.where(sine > 1e-12, axis / np.maximum(sine, 1e-12), perpendicular)
     return exp_so3(axis * np.arctan2(sine, cosine))
 
 
 def aligned(x: NDArray, y: NDArray, weight: NDArray | None = None) -> NDArray:
-    """T_y_x (4, 4) that lays points x (K, 3) onto y (K, 3) best, by least squares with weights (K,) (Kabsch)."""
+    """Rigid motion T_y_x (4, 4) that aligns points x (K, 3) with y (K, 3), by weighted least squares (Kabsch).
+
+    weight (K,): default equal.
+    """
     w = np.full(len(x), 1.0 / len(x)) if weight is None else weight / weight.sum()
     middle, aim = w @ x, w @ y
     R = nearest_rotation((w[:, None] * (y - aim)).T @ (x - middle))
@@ -126,25 +130,25 @@ def aligned(x: NDArray, y: NDArray, weight: NDArray | None = None) -> NDArray:
 
 
 def inverse(T: NDArray) -> NDArray:
-    """Inverse of rigid motions (..., 4, 4)."""
+    """Inverses (N, 4, 4) of rigid motions (N, 4, 4)."""
     R_t = np.swapaxes(T[..., :3, :3], -1, -2)
     return transform(R_t, -(R_t @ T[..., :3, 3:])[..., 0])
 
 
 def apply(T: NDArray, x: NDArray) -> NDArray:
-    """Move points: T (..., 4, 4), x (..., 3) [m] -> (..., 3) [m]."""
+    """Move points x (N, 3) [m] by T (N, 4, 4): (N, 3) [m]."""
     return (T[..., :3, :3] @ np.asarray(x, float)[..., None])[..., 0] + T[..., :3, 3]
 
 
 def exp(xi: NDArray) -> NDArray:
-    """Screw motion of a twist: ξ = (v, ω) (..., 6) [m, rad] -> T (..., 4, 4) (P3, eq. 3)."""
+    """Screw motions T (N, 4, 4) of twists ξ = (v, ω) (N, 6) [m, rad] (P3, eq. 3)."""
     xi = np.asarray(xi, float)
     v, omega = xi[..., :3], xi[..., 3:]
     return transform(exp_so3(omega), (left_jacobian_so3(omega) @ v[..., None])[..., 0])
 
 
 def log(T: NDArray) -> NDArray:
-    """Twist ξ = (v, ω) (..., 6) [m, rad], |ω| ≤ π, of a rigid motion (..., 4, 4)."""
+    """Twists ξ = (v, ω) (N, 6) [m, rad], |ω| ≤ π, of rigid motions (N, 4, 4)."""
     T = np.asarray(T, float)
     omega = log_so3(T[..., :3, :3])
     v = (_left_so3_inverse(omega) @ T[..., :3, 3:])[..., 0]
@@ -152,7 +156,7 @@ def log(T: NDArray) -> NDArray:
 
 
 def left_jacobian_so3(omega: NDArray) -> NDArray:
-    """Left Jacobian of SO(3): (..., 3) -> (..., 3, 3); exp(ω + δ) ≈ exp(J δ) exp(ω)."""
+    """Left Jacobians of SO(3) (N, 3, 3) at ω (N, 3) [rad]: exp(ω + δ) ≈ exp(J δ) exp(ω)."""
     omega = np.asarray(omega, float)
     _, b, c = _coefficients(np.linalg.norm(omega, axis=-1))
     w = hat(omega)
@@ -163,14 +167,15 @@ def _left_so3_inverse(omega: NDArray) -> NDArray:
     theta = np.linalg.norm(omega, axis=-1)
     _, b, c = _coefficients(theta)
     # 1/θ² − A/(2Bθ²) = (2B − A) / (2Bθ²), and 2B − A = θ² (c − 2e) with e = (½ − B) / θ²
-    e = np.where(theta < _SMALL, _series(theta**2, 4), (0.5 - b) / np.where(theta < _SMALL, 1.0, theta) ** 2)
+    small = theta < _MAX_SERIES_ANGLE
+    e = np.where(small, _series(theta**2, 4), (0.5 - b) / np.where(small, 1.0, theta) ** 2)
     d = (c - 2.0 * e) / (2.0 * b)
     w = hat(omega)
     return np.eye(3) - 0.5 * w + d[..., None, None] * (w @ w)
 
 
 def adjoint(T: NDArray) -> NDArray:
-    """Adjoint (..., 6, 6) of T (..., 4, 4): exp(Ad ξ) = T exp(ξ) T⁻¹, twists ordered (v, ω)."""
+    """Adjoints (N, 6, 6) of T (N, 4, 4): exp(Ad ξ) = T exp(ξ) T⁻¹, twists ordered (v, ω)."""
     T = np.asarray(T, float)
     R = T[..., :3, :3]
     out = np.zeros((*T.shape[:-2], 6, 6))

@@ -1,4 +1,4 @@
-"""Triangulation: pixels of one point in several cameras -> the point, by least squares on pixels."""
+"""Triangulate points from their pixels in several cameras, by least squares on pixels."""
 
 from __future__ import annotations
 
@@ -12,19 +12,25 @@ from kinefit.geometry.camera import Rig
 
 
 def triangulate(rig: Rig, points_px: ArrayLike, weights: ArrayLike | None = None) -> NDArray:
-    """Points of least weighted squared pixel error, using every camera that saw them.
+    """Triangulate points by least weighted squared pixel error, from all cameras.
 
     Parameters
     ----------
+    rig : Rig of C cameras
     points_px : (N, C, 2) [px]
-        In the image frame of each camera's calibration; NaN where unseen.
+        In the image frame of each camera's calibration; NaN if not detected.
     weights : (N, C), optional
-        Non-negative, multiplying the squared error; 0 where unseen.
+        Weights >= 0 of the squared errors; default 1.
 
     Returns
     -------
     x_world : (N, 3) [m]
-        NaN where fewer than two cameras saw the point or their rays are parallel.
+        NaN if fewer than two cameras detected the point or their rays are parallel.
+
+    Raises
+    ------
+    ObservationError
+        Arrays of other shapes, or weights that are negative or not finite.
     """
     return _run(rig, points_px, weights, np.inf)[0]
 
@@ -32,15 +38,15 @@ def triangulate(rig: Rig, points_px: ArrayLike, weights: ArrayLike | None = None
 def triangulate_robust(
     rig: Rig, points_px: ArrayLike, weights: ArrayLike | None = None, *, max_residual_px: float
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Points that the largest weight of cameras agrees on.
+    """Triangulate points from the consensus of cameras with the largest total weight.
 
-    All cameras if they agree; else the pair of cameras whose point most others support, and all that agree with it.
+    Uses all cameras if they agree; else the pair of cameras whose point has most support, and all that agree with it.
 
     Parameters
     ----------
-    points_px, weights : as in `triangulate`
+    rig, points_px, weights : as in `triangulate`
     max_residual_px : float [px]
-        Largest pixel error of a camera that agrees.
+        Largest reprojection error of an inlier.
 
     Returns
     -------
@@ -49,7 +55,12 @@ def triangulate_robust(
     inliers : (N, C) bool
         Cameras that agree.
     residual_px : (N, C) [px]
-        Pixel error in every camera that saw the point; infinite where the point is behind it, NaN where unseen.
+        Reprojection error in every camera that detected the point; infinite behind the camera, NaN if not detected.
+
+    Raises
+    ------
+    ObservationError
+        As `triangulate`, or a limit that is not positive.
     """
     if not max_residual_px > 0:
         raise ObservationError(f"largest pixel error {max_residual_px}", remedy="Give a positive number of pixels.")
@@ -58,15 +69,15 @@ def triangulate_robust(
 
 def _run(rig: Rig, points_px: ArrayLike, weights: ArrayLike | None, limit: float) -> tuple[NDArray, NDArray, NDArray]:
     points = np.array(shaped(points_px, ("points", len(rig), 2), "points"))
-    seen = np.isfinite(points).all(-1)
-    weight = np.ones(seen.shape) if weights is None else np.array(weights, dtype=float, order="C")
-    if weight.shape != seen.shape or np.any(weight[seen] < 0) or not np.isfinite(weight[seen]).all():
+    detected = np.isfinite(points).all(-1)
+    weight = np.ones(detected.shape) if weights is None else np.array(weights, dtype=float, order="C")
+    if weight.shape != detected.shape or np.any(weight[detected] < 0) or not np.isfinite(weight[detected]).all():
         raise ObservationError(
             f"weights have shape {weight.shape} or a negative or missing value",
-            remedy=f"Give {seen.shape}, finite and not negative.",
+            remedy=f"Give {detected.shape}, finite and not negative.",
         )
-    weight = np.where(seen, weight, 0.0)
+    weight = np.where(detected, weight, 0.0)
     x_world = np.empty((len(points), 3))
-    inliers, residual = np.empty(seen.shape, dtype=bool), np.empty(seen.shape)
+    inliers, residual = np.empty(detected.shape, dtype=bool), np.empty(detected.shape)
     triangulate_points(rig.packed, points, weight, limit, x_world, inliers, residual)
     return x_world, inliers, residual

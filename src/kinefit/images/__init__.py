@@ -1,1 +1,1 @@
-"""From pixels to measurements: people, their keypoints and their masks."""
+"""Images to measurements: detected people, keypoints, masks, depth points."""

@@ -11,9 +11,10 @@ from kinefit._jit import jit
 
 @jit
 def drop_flying(depth, near, far, noise, slope, out):
-    """Copy (H, W) `depth` to `out`, 0 outside of [near, far] and where two opposite neighbours both differ too much.
+    """Copy (H, W) `depth` [m] to `out`, with 0 outside of [near, far] and at flying pixels.
 
-    Too much is more than max(noise, slope * depth) [m]; a pixel beside nothing has no support from that side.
+    A pixel flies if both of two opposite neighbours differ from it by more than max(noise, slope * depth) [m]. A
+    missing neighbour counts as different.
     """
     height, width = depth.shape
     for v in range(height):
@@ -37,46 +38,46 @@ def drop_flying(depth, near, far, noise, slope, out):
 
 
 @jit
-def around(depth, out, v, u, noise, slope, most, beside):
-    """Mean depth [m] of the neighbours of a pixel that stay, where `most` of them are of one surface; 0 elsewhere.
+def around(depth, out, v, u, noise, slope, min_fill, neighbours):
+    """Mean depth [m] of a pixel's valid neighbours if at least `min_fill` of them lie on one surface; else 0.
 
-    beside (8,): room for them.
+    Neighbours that `drop_speckles` has set to 0 are not valid. neighbours (8,): work space for the valid ones.
     """
     height, width = depth.shape
     n = 0
     for i in range(v - 1 if v > 0 else v, v + 2 if v + 1 < height else v + 1):
         for j in range(u - 1 if u > 0 else u, u + 2 if u + 1 < width else u + 1):
             if out[i, j] > 0.0 and out[i, j] == depth[i, j]:
-                beside[n] = out[i, j]
+                neighbours[n] = out[i, j]
                 n += 1
-    if n >= most:
-        for k in range(n - most + 1):
+    if n >= min_fill:
+        for k in range(n - min_fill + 1):
             total, alike = np.float32(0.0), 0
             for m in range(n):
-                if abs(beside[m] - beside[k]) <= noise + slope * beside[k]:
-                    total += beside[m]
+                if abs(neighbours[m] - neighbours[k]) <= noise + slope * neighbours[k]:
+                    total += neighbours[m]
                     alike += 1
-            if alike >= most:
+            if alike >= min_fill:
                 return total / np.float32(alike)
     return np.float32(0.0)
 
 
 @jit
-def drop_speckles(depth, noise, slope, least, most, out):
-    """Copy (H, W) float32 `depth` to `out`, 0 where fewer than `least` of the eight neighbours are of its surface.
+def drop_speckles(depth, noise, slope, min_neighbours, min_fill, out):
+    """Copy (H, W) float32 `depth` [m] to `out` without isolated pixels; returns how many were measured and kept.
 
-    Of one surface: they differ by noise + slope * depth [m] at most. Beyond the image's edge there are none. Where
-    `most` neighbours that stay are of one surface, their mean takes the place of what goes. Returns how many pixels are
-    measured and how many of them stay. Two columns at least; row by row without branches, so that the compiler handles
-    many pixels at a time.
+    A pixel is isolated if it shares a surface with fewer than `min_neighbours` of its eight neighbours: they differ by
+    at most noise + slope * depth [m]. It becomes 0, or the mean of its valid neighbours if at least `min_fill` of them
+    lie on one surface. The image needs two columns. Rows are processed without branches, so that the compiler
+    vectorises them.
     """
     height, width = depth.shape
     none, one, empty = np.int32(0), np.int32(1), np.float32(0.0)
-    noise, slope, least = np.float32(noise), np.float32(slope), np.int32(least)
-    nothing = np.zeros(width, np.float32)
-    seen = kept = 0
+    noise, slope, min_neighbours = np.float32(noise), np.float32(slope), np.int32(min_neighbours)
+    empty_row = np.zeros(width, np.float32)
+    measured_count = kept = 0
     for v in range(height):
-        above, below = depth[v - 1] if v > 0 else nothing, depth[v + 1] if v + 1 < height else nothing
+        above, below = depth[v - 1] if v > 0 else empty_row, depth[v + 1] if v + 1 < height else empty_row
         own, line = depth[v], out[v]
         for u in range(width - 2):
             z = own[u + 1]
@@ -89,7 +90,7 @@ def drop_speckles(depth, noise, slope, least, most, out):
             n += one if abs(below[u] - z) <= t else none
             n += one if abs(below[u + 1] - z) <= t else none
             n += one if abs(below[u + 2] - z) <= t else none
-            line[u + 1] = z if n >= least else empty
+            line[u + 1] = z if n >= min_neighbours else empty
         for u in (0, width - 1):
             z, inner = own[u], 1 if u == 0 else u - 1
             t = noise + slope * z
@@ -97,27 +98,26 @@ def drop_speckles(depth, noise, slope, least, most, out):
             for row in (above, own, below):
                 n += one if abs(row[inner] - z) <= t else none
                 n += one if abs(row[u] - z) <= t else none
-            line[u] = z if n > least else empty  # it has counted itself
+            line[u] = z if n > min_neighbours else empty  # it has counted itself
         before = after = none
         for u in range(width):
             before += one if own[u] > empty else none
             after += one if line[u] > empty else none
-        seen, kept = seen + int(before), kept + int(after)
-    if seen > kept and most <= 8:
-        beside = np.empty(8, np.float32)
+        measured_count, kept = measured_count + int(before), kept + int(after)
+    if measured_count > kept and min_fill <= 8:
+        neighbours = np.empty(8, np.float32)
         for v in range(height):
             for u in range(width):
                 if depth[v, u] > empty and out[v, u] == empty:
-                    out[v, u] = around(depth, out, v, u, noise, slope, most, beside)
-    return seen, kept
+                    out[v, u] = around(depth, out, v, u, noise, slope, min_fill, neighbours)
+    return measured_count, kept
 
 
 @jit
 def points(depth, table, R, t, step, near, far, out):
-    """World points of every step-th pixel in [near, far]; returns how many of `out` (N, 3) are filled.
+    """Write the world points [m] of every step-th pixel in [near, far] to `out` (N, 3); returns their number.
 
-    `table` (2, H, W) holds x/z and y/z of every pixel's ray, NaN where there is none; R (3, 3), t (3,) take the
-    camera's frame to the world.
+    table (2, H, W): x/z and y/z of every pixel's ray, NaN where it has none. R (3, 3), t (3,) [m]: camera to world.
     """
     height, width = depth.shape
     r00, r01, r02, r10, r11, r12 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2]
@@ -139,9 +139,9 @@ def points(depth, table, R, t, step, near, far, out):
 
 @jit
 def normals(depth, table, R, step, reach, noise, slope, out):
-    """World normals of the pixels that `points` takes (with no range gate), zero where the surface breaks off.
+    """Write unit normals in the world to `out` (N, 3), for the pixels of `points` without range gate; 0 at edges.
 
-    Cross product of the chords between the neighbours `reach` pixels away; turned to the sensor.
+    A normal is the cross product of the chords between the neighbours `reach` [px] away. It points to the sensor.
     """
     height, width = depth.shape
     n = 0

@@ -1,7 +1,7 @@
-"""Compiled colour statistics of two regions, and the likelihood of a contour's place along its normals.
+"""Compiled colour histograms inside and outside of a contour, and the likelihood of its position along its normals.
 
-A pixel's colour is one of 32768 (five bits a channel); a table gives the bin of each, another the logarithm of the
-ratio of inside to outside of each bin.
+A pixel has one of 32768 colours (five bits a channel). A table maps each colour to its bin, another each bin to the
+logarithm of the ratio of the densities inside and outside.
 """
 
 from __future__ import annotations
@@ -13,35 +13,35 @@ import numpy as np
 from kinefit._jit import jit
 from kinefit.rendering._kernels import rasterise
 
-UNKNOWN = 1e6  # in a table of log ratios
+UNKNOWN = 1e6  # in a table of log ratios: not computed yet
 
 
 @jit
 def _colour(image, j, i):
-    """Number of a pixel's colour, five bits a channel."""
+    """Index of a pixel's colour, 0..32767, five bits a channel."""
     return ((image[j, i, 0] >> 3) << 10) | ((image[j, i, 1] >> 3) << 5) | (image[j, i, 2] >> 3)
 
 
 @jit
 def count(image, bins, face, label, left, top, scale, box, inside, near, far):
-    """Add pixels of an image (H, W, 3) uint8 to the histograms inside (G, B), near and far outside (B,): one in nine.
+    """Add pixels of an image (H, W, 3) uint8 to the histograms inside (G, B), and outside near and far (B,).
 
-    face (h, w) is the body as drawn in a window of the image, below 0 where it is not: pixel (x, y) of the image lies
-    at ((x - left + 0.5) scale, (y - top + 0.5) scale). label (T,) of each face: the part of the body that it belongs
-    to. Pixels at the edge of a part count for none. box: left, top, right, bottom [px] of what is near; of what is far
-    one pixel in 36 is looked at.
+    face (h, w): the rendered body in a window of the image, the index of a face or below 0. Pixel (x, y) of the image
+    lies at ((x - left + 0.5) scale, (y - top + 0.5) scale) of the window. label (T,): body part of each face. Pixels at
+    the boundary of a part are not counted. box: left, top, right, bottom [px] of the near region. One pixel in nine is
+    sampled inside of it, one in 36 outside.
     """
     height, width = image.shape[:2]
     for y in range(0, height, 6):
         for x in range(0, width, 6):
             if y < box[1] or y >= box[3] or x < box[0] or x >= box[2]:
                 far[bins[_colour(image, y, x)]] += 1.0
-    beside = math.ceil(2.0 * scale) + 1
+    margin = math.ceil(2.0 * scale) + 1
     for y in range(max(box[1], 0), min(box[3], height), 3):
         j = math.floor((y - top + 0.5) * scale)
         for x in range(max(box[0], 0), min(box[2], width), 3):
             i = math.floor((x - left + 0.5) * scale)
-            if not (-beside <= i < face.shape[1] + beside and -beside <= j < face.shape[0] + beside):
+            if not (-margin <= i < face.shape[1] + margin and -margin <= j < face.shape[0] + margin):
                 near[bins[_colour(image, y, x)]] += 1.0
                 continue
             here = part(face, label, x, y, left, top, scale)
@@ -63,8 +63,8 @@ def count(image, bins, face, label, left, top, scale, box, inside, near, far):
 def count_lines(image, bins, contour, anchor, reach, face, label, left, top, scale, joined, own, weight, counts):
     """Add the pixels along the normals of a contour (4, N) to the histograms (2, A, B) of its points' anchors (N,).
 
-    weight (2,) of a pixel inside and outside; reach [px] to either side; the pixel next to the contour counts for
-    neither. face, label, left, top, scale as of `count`, joined and own (N,) as of `profiles`.
+    weight (2,): of a pixel inside and outside. reach [px]: to either side; the pixel next to the contour is skipped.
+    face, label, left, top, scale: see `count`. joined, own (N,): see `profiles`.
     """
     height, width = image.shape[:2]
     for p in range(contour.shape[1]):
@@ -86,7 +86,7 @@ def count_lines(image, bins, contour, anchor, reach, face, label, left, top, sca
 
 @jit
 def part(face, label, x, y, left, top, scale):
-    """Part of the body that was drawn at a pixel (x, y) of the image: -1 where none was, -2 where something else is."""
+    """Body part that is rendered at a pixel (x, y) of the image: -1 for none, -2 for something in front of the body."""
     i, j = math.floor((x - left + 0.5) * scale), math.floor((y - top + 0.5) * scale)
     if not (0 <= i < face.shape[1] and 0 <= j < face.shape[0]):
         return -1
@@ -96,10 +96,10 @@ def part(face, label, x, y, left, top, scale):
 
 @jit
 def _found(table, own, total, general, inner, floor, most, a, b):
-    """Log ratio of a bin near an anchor, which a table (A, B) keeps from now on; see `profiles`."""
+    """Compute the log ratio of bin b at anchor a, and store it in `table` (A, B); see `profiles`."""
     inside = (own[0, a, b] + general[inner[a], b]) / total[0, a] + floor
-    told = math.log(inside / ((own[1, a, b] + general[len(general) - 1, b]) / total[1, a] + floor))
-    table[a, b] = most if told > most else -most if told < -most else told
+    ratio = math.log(inside / ((own[1, a, b] + general[len(general) - 1, b]) / total[1, a] + floor))
+    table[a, b] = most if ratio > most else -most if ratio < -most else ratio
     return table[a, b]
 
 
@@ -108,17 +108,19 @@ def profiles(
     image, bins, table, counts, total, general, inner, floor, most, logs, anchor, contour, face, label, left, top,
     scale, joined, own, beyond, half, step, guard, out,
 ):  # fmt: skip
-    """Log ratios of inside to outside along the normals of a contour: out (N, 2 half), from inside to outside.
+    """Sample log ratios of inside to outside along the normals of a contour: out (N, 2 half), from inside to outside.
 
-    Sample k is the sum over `step` pixels about (k + 0.5 - half) step [px] along the normal. table (A, B) of log
-    ratios between -most and most, of which a point has the row of its anchor (N,). What is UNKNOWN in it is found from
-    counts (2, A, B) of pixels inside and outside near each anchor, and general (G + 1, B) of each part of the body, and
-    last of what is outside, of which anchors have the parts inner (A,); both divided by total (2, A), and `floor` added
-    to both densities. Where the anchor is -1 the point lies before another part of the body, and the ratio is that of
-    both parts, of whose densities the logarithms are logs (G + 1, B). face (h, w) is the body as drawn, label (T,) the
-    part of each face, see `count`. Where a line leaves what is `joined` (G + 1, G + 1, the last one what is around the
-    body) with its point's part own (N,) inside, or beyond (N,) outside, it tells nothing any more (0); `guard` [px]
-    about the contour always tell.
+    Sample k is the sum over `step` pixels about (k + 0.5 - half) step [px] along the normal.
+
+    table (A, B): log ratios in -most..most at each anchor; a point uses the row of its anchor (N,).
+    counts (2, A, B): pixels inside and outside near each anchor, from which UNKNOWN entries of the table are computed.
+    general (G + 1, B): pseudo-counts of each body part and, last, of the outside; added to counts. inner (A,): the part
+    of each anchor. total (2, A): sum of both counts. floor: added to both densities.
+    logs (G + 1, B): logarithms of the parts' densities, used at anchor -1, where the point occludes another part.
+    face (h, w), label (T,): the rendered body, see `count`.
+    joined (G + 1, G + 1) bool: parts that may lie next to each other, the last index is the outside. A line ends where
+    it reaches a part that is not joined with own (N,) inside or beyond (N,) outside: samples behind are 0.
+    guard [px]: about the contour, where lines do not end.
     """
     height, width = image.shape[:2]
     for p in range(contour.shape[1]):
@@ -128,7 +130,7 @@ def profiles(
             ended, stays = False, beyond[p] if side else own[p]
             for q in range(half):
                 k = half + q if side else half - 1 - q
-                told = 0.0
+                ratio = 0.0
                 if not ended:
                     for r in range(step):
                         s = (k - half) * step + r + 0.5
@@ -147,20 +149,20 @@ def profiles(
                             t = table[a_, c]
                             if t == UNKNOWN:
                                 t = _found(table, counts, total, general, inner, floor, most, a_, c)
-                            told += t
+                            ratio += t
                         else:
                             t = logs[own[p], c] - logs[beyond[p], c]
-                            told += most if t > most else -most if t < -most else t
-                out[p, k] = told
+                            ratio += most if t > most else -most if t < -most else t
+                out[p, k] = ratio
 
 
 @jit
 def places(lines, step, heat, out):
-    """Where along each line (N, 2 half) of log ratios the contour is: out (3, N).
+    """Estimate the contour's position on each line (N, 2 half) of log ratios: out (3, N).
 
-    With the contour at boundary c the likelihood is exp(S(c)), S the sum of all log ratios inside of c; it is taken to
-    the power 1 / heat, as neighbouring pixels are alike. out: mean [px] and variance [px²] of the contour's offset, and
-    by how much (in logarithms) the best place explains the line better than no contour on it does.
+    The likelihood of a contour at boundary c is exp(S(c)), with S(c) the sum of the log ratios inside of c. It is
+    raised to the power 1 / heat, because neighbouring pixels are correlated. out: mean [px] and variance [px²] of the
+    contour's offset, and the log likelihood ratio of the best position to no contour on the line.
     """
     n = lines.shape[1]
     half = n // 2
@@ -186,10 +188,10 @@ def places(lines, step, heat, out):
 
 @jit
 def shifts(lines, step, out):
-    """The paper's rule on the same lines: out (2, N), by how much a point of the contour is shifted, and the variance.
+    """Shift each contour point by the rule of P3 2.4.2 on the same lines: out (2, N), offset [px] and variance [px²].
 
-    One step [px] outwards where the samples on both sides of it together look like the body, inwards where they do not,
-    none where they tell nothing; the variance is that of a step.
+    The offset is one step outwards where the two samples next to the contour together look like the body, one step
+    inwards where they do not, 0 where their log ratio is 0. The variance is step².
     """
     half = lines.shape[1] // 2
     for p in range(lines.shape[0]):
@@ -200,7 +202,7 @@ def shifts(lines, step, out):
 
 @jit
 def ratio_map(image, bins, ratio, left, top, step, out):
-    """Mean log ratio of cells of step x step pixels, from pixel (left, top) on: out (h, w); 0 outside of the image."""
+    """Mean log ratio in cells of step x step pixels, starting at pixel (left, top): out (h, w); 0 outside the image."""
     height, width = image.shape[:2]
     for j in range(out.shape[0]):
         for i in range(out.shape[1]):
@@ -215,10 +217,10 @@ def ratio_map(image, bins, ratio, left, top, step, out):
 
 @jit
 def explained(vertices, faces, poses, lens, ratios, room, depth, face, out):
-    """How much of a map of log ratios (h, w) lies inside of a body's silhouette, for M poses: out (M,), the sums.
+    """Sum a map of log ratios (h, w) inside the body's silhouette, for M poses: out (M,).
 
-    vertices (V, 3) [m] about the body's middle, in the camera's axes; poses (M, 4, 4) take them to the camera's frame;
-    lens fx, fy, cx, cy, near of the map; room, depth, face as of `rasterise`.
+    vertices (V, 3) [m]: about the body's centre, along the camera's axes. poses (M, 4, 4): take them to the camera.
+    lens: fx, fy, cx, cy, near of the map. room, depth, face: work space of `rasterise`.
     """
     for m in range(len(poses)):
         rasterise(vertices, poses[m], faces, lens[0], lens[1], lens[2], lens[3], lens[4], False, room, depth, face)
@@ -232,10 +234,10 @@ def explained(vertices, faces, poses, lens, ratios, room, depth, face, out):
 
 @jit
 def likelihood(image, bins, logs, face, label, left, top, scale):
-    """How much better a body as it was drawn explains an image than no body does: a sum of log ratios over pixels.
+    """Log likelihood ratio of an image with the rendered body to one without it: a sum over pixels.
 
-    logs (G + 1, B) of the densities of each part's colours and, last, of what is around; face, label and so on as of
-    `count`. A pixel of the drawing that is larger than the image's counts as many.
+    logs (G + 1, B): logarithms of each part's colour density and, last, of the background's. face, label, left, top,
+    scale: see `count`. A rendered pixel counts as many as the image pixels that it covers.
     """
     total, height, width = 0.0, image.shape[0], image.shape[1]
     around = len(logs) - 1

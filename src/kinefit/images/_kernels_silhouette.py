@@ -1,4 +1,4 @@
-"""Compiled contours: where an image crosses a level, to parts of a pixel."""
+"""Compiled contours: level crossings of an image, with sub-pixel positions."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from kinefit._jit import jit
 
 @jit
 def crossings(image, level, out):
-    """Where an image (H, W) crosses a level between neighbouring pixels: how many; out (4, N): u, v, a, b.
+    """Write the level crossings between neighbouring pixels of an image (H, W) to out (4, N); returns their number.
 
-    The normal points downhill; it comes from the gradient about the crossing.
+    Rows of out: position u, v [px] and unit normal a, b. The normal is the negative gradient at the crossing.
     """
     height, width = image.shape
     n, room = 0, out.shape[1]

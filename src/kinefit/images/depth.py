@@ -11,8 +11,8 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.images import _kernels_depth as kernels
 
-GRAZING = math.radians(85.0)  # a surface seen flatter than this has no measurable depth: it is an edge
-_NOISE = 0.01  # [m] below which a step of depth is noise, whatever the slope
+GRAZING = math.radians(85.0)  # between line of sight and normal: beyond it depth is not measurable, it is an edge
+_MIN_STEP = 0.01  # [m] below which a step of depth is noise, whatever the slope
 
 
 def _image(depth: NDArray, camera: Camera | None = None) -> NDArray:
@@ -26,9 +26,9 @@ def _image(depth: NDArray, camera: Camera | None = None) -> NDArray:
 
 
 def slope_of(camera: Camera, grazing: float = GRAZING) -> float:
-    """Largest step of depth from pixel to pixel, as share of the depth, on a surface seen at an angle `grazing` [rad].
+    """Largest depth step between neighbouring pixels, as a share of the depth, on a surface seen at `grazing` [rad].
 
-    The footprint of a pixel is z / f; a plane whose normal leans by θ from the line of sight recedes by z tan θ / f.
+    The footprint of a pixel is z / f. A plane whose normal leans by θ from the line of sight recedes by z tan θ / f.
     """
     return math.tan(grazing) / min(camera.matrix[0, 0], camera.matrix[1, 1])
 
@@ -39,29 +39,36 @@ def clean(
     *,
     near: float = 0.0,
     far: float = math.inf,
-    noise: float = _NOISE,
+    noise: float = _MIN_STEP,
     grazing: float = GRAZING,
 ) -> NDArray:
-    """Range gate and flying pixels: what is no surface becomes 0.
+    """Remove flying pixels and depths out of range from a depth image.
 
-    A pixel at an edge mixes the depths in front and behind; it stands between its neighbours across the edge and far
-    from both. Where two opposite neighbours (left and right, or above and below) both differ by more than the noise
-    and by more than a surface seen at `grazing` would, or are missing, it goes. Pixels beside an edge keep the support
-    of the other side. NaN counts as not measured.
+    A flying pixel mixes the depths in front of and behind an edge, so that it lies between its neighbours and far from
+    both. A pixel is removed if two opposite neighbours (left and right, or above and below) are missing or differ by
+    more than the noise and by more than a surface seen at `grazing` allows. Pixels adjacent to an edge are kept,
+    because the neighbour on the other side supports them. NaN counts as not measured.
 
     Parameters
     ----------
     depth : (H, W) [m] along the optical axis
     camera : Camera, optional
-        Of the sensor, for the size of its pixels; without it only the range is gated.
+        Of the sensor, for the angular size of its pixels. Without it only the range is gated.
     near, far : float [m]
+        Depths outside of this range are removed.
     noise : float [m]
-        Step between neighbours that noise alone explains: three deviations.
+        Step between neighbours that noise alone explains: three standard deviations.
     grazing : float [rad]
+        Largest angle between line of sight and normal of a surface that is kept.
 
     Returns
     -------
-    (H, W) float32 [m], 0 where there is nothing
+    (H, W) float32 [m], 0 where not measured or removed
+
+    Raises
+    ------
+    ObservationError
+        An image of another size than the camera's.
     """
     depth = _image(depth, camera)
     out = np.empty_like(depth)
@@ -78,7 +85,7 @@ def to_points(
     near: float = 0.0,
     far: float = math.inf,
 ) -> NDArray:
-    """World points of a depth image, with the lens's distortion undone.
+    """World points of a depth image, with lens distortion removed.
 
     Parameters
     ----------
@@ -87,11 +94,18 @@ def to_points(
     step : int [px]
         Every step-th pixel of every step-th row.
     mask : (H, W) bool, optional
+        Pixels that are used; default all.
     near, far : float [m]
+        Range of depths that are used.
 
     Returns
     -------
-    (N, 3) [m], row by row of the image
+    (N, 3) [m] in the world, row by row of the image
+
+    Raises
+    ------
+    ObservationError
+        An image of another size than the camera's.
     """
     depth = _image(depth, camera)
     if mask is not None:
@@ -103,12 +117,12 @@ def to_points(
 
 
 def normals(
-    depth: NDArray, camera: Camera, *, step: int = 1, reach: int = 2, noise: float = _NOISE, grazing: float = GRAZING
+    depth: NDArray, camera: Camera, *, step: int = 1, reach: int = 2, noise: float = _MIN_STEP, grazing: float = GRAZING
 ) -> NDArray:
-    """Unit normals (N, 3) in the world, turned to the sensor, of the points that `to_points` makes of the same image.
+    """Unit normals (N, 3) in the world, pointing to the sensor, of the points that `to_points` gives for this image.
 
-    From the chords between the pixels `reach` away on both sides; zero at edges, at holes and on what is seen flatter
-    than `grazing` [rad].
+    Each is the cross product of the chords between the pixels `reach` [px] away on both sides. It is zero at edges and
+    holes, and on surfaces seen at more than `grazing` [rad].
     """
     depth = _image(depth, camera)
     step = max(int(step), 1)
@@ -119,12 +133,19 @@ def normals(
 
 
 def downsample(points: NDArray, *, factor: float = 1.0, minimum: int = 0, maximum: int | None = None) -> NDArray:
-    """Evenly fewer points (P2 3.2): one of `factor`, but not below `minimum` nor above `maximum` of them.
+    """Keep one of `factor` points, but at least `minimum` and at most `maximum` of them (P2 3.2).
 
     Parameters
     ----------
     points : (N, ...)
-        Anything in an order; every n/m-th is kept, so that what was even over the image stays so.
+        In the order of the image. Every n/m-th is kept, so that the sample stays even over the image.
+    factor : float >= 1
+    minimum, maximum : int, numbers of points; default no bounds
+
+    Raises
+    ------
+    ObservationError
+        A factor below 1, or a minimum above the maximum.
     """
     n = len(points)
     if not factor >= 1.0 or minimum < 0 or (maximum is not None and maximum < max(minimum, 1)):

@@ -1,7 +1,7 @@
-"""Colours of a body and of what is around it: histograms in CIELab, of the whole and near each part of the contour.
+"""Colour histograms of the body and of the background in CIELab, global and near each part of the contour.
 
 P3 2.4 models both regions by densities p₁, p₂ of their colours. Here they are histograms, blended over time so that
-light may change. A pixel of colour c speaks for the body by log p₁(c) / p₂(c).
+light may change. A pixel of colour c supports the body by the log ratio log p₁(c) / p₂(c).
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from numpy.typing import NDArray
 
 from kinefit.images._kernels_regions import UNKNOWN
 
-_THIN = 10.0  # [counted pixels] that the whole body's colours weigh as much as in those of a part: few for a hand
-_FLOOR = 0.02  # share of both densities that is even over all colours: paint that was not seen yet, noise, reflections
+_PART_PIXELS = 10.0  # prior weight of the whole body's colours in those of a part: few for a hand
+_UNIFORM_SHARE = 0.02  # of both densities, even over all colours: for unobserved colours, noise, reflections
 
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """How a body is sought where it is not known well where to expect it; see `sensors.region_search`.
+    """Settings of the search for a body whose predicted pose is uncertain; see `sensors.region_search`.
 
     Parameters
     ----------
-    side : float [cells] of the map of log ratios, length of the body in it
-    rotations : int, tried with all places
-    best : int, of these that are improved
-    rounds, draws : int, how often, and with how many poses each
-    starts : int, that are handed out
-    doubt : float, share of what the body could explain by which half a variance off the prediction is worse
+    side : float [cells], length of the body in the map of log ratios
+    rotations : int, orientations that are tried at all positions
+    best : int, number of these that are refined
+    rounds, draws : int, rounds of refinement, and random poses in each
+    starts : int, poses that the search returns
+    doubt : float, cost of half a variance of deviation from the prediction, as a share of the largest possible score
     far : float, in lengths of the body, and turn : float [rad]
-        Standard deviations of the prediction from which a body is sought in any case.
-    poor : float, share of the contour that agrees below which it is sought too
+        Standard deviations of the prediction above which the search always runs.
+    poor : float in 0..1, share of the contour that agrees, below which the search runs too
     """
 
     side: float = 28.0
@@ -52,37 +52,38 @@ class SearchSettings:
 
 @dataclass(frozen=True)
 class RegionSettings:
-    """How regions are told apart, and how a contour is found between them.
+    """Settings of the colour statistics, and of the search for the contour between body and background.
 
     Parameters
     ----------
     space : "lab" or "rgb", in which colours are binned
     levels : int, bins along each of the three axes
     parts : bool
-        Whether colours are counted apart for every segment of the body, left and right together: skin, shirt,
-        trousers. Contours of one before another are then looked at, too, where their colours differ.
+        Whether each segment of the body has its own histogram, left and right together: skin, shirt, trousers. The
+        contour of a segment in front of another is then used too, where their colours differ.
     anchors : int
-        Points of the surface near which colours are counted apart; 0 for one statistic of each part alone.
+        Points of the surface with a histogram of their own; 0 for one histogram per part.
     spread : float [pixels]
-        The whole body's statistics weigh as much as so many pixels counted near an anchor.
+        Weight of the part's histogram in that of an anchor.
     rate, near_rate : float in 0..1
-        Share of a new image in the statistics of the body, and of what is around it; the first images count alike.
+        Share of a new image in the histograms of the body, and of its surroundings. The first images weigh equally.
     far : float in 0..1
-        Share of the whole image in what is around the body; the rest is counted near it.
+        Share of the whole image in the outside density; the rest comes from the body's surroundings.
     most : float
-        Largest logarithm of the ratio of two densities that a single pixel may have.
+        Largest absolute log ratio of a single pixel.
     rule : "likelihood" or "shift"
-        A line's place by the likelihood of all places along it; or the paper's rule: one step outwards where the
-        contour's own pixels look like the body, one step inwards where they do not (P3 2.4.2).
+        Position of the contour on a line by the likelihood of all positions; or by the rule of P3 2.4.2: one step
+        outwards where the pixels at the contour look like the body, one step inwards where they do not.
     half : int, samples of a line to either side: of one pixel each in the last iterations, of several before
     heat : float
-        Number of neighbouring pixels that tell as much as one, as they are alike.
+        Number of neighbouring pixels that count as one independent sample.
     tells : float
-        Logarithm by which the best place must explain a line better than no contour on it does.
-    alike : float [px] of the contour along which errors are alike: as many measurements count as there are such pieces
-    lines : int, contour points, about
+        Smallest log likelihood ratio of the best position to no contour on the line.
+    alike : float [px]
+        Correlation length of errors along the contour: each piece of this length counts as one measurement.
+    lines : int, approximate number of contour points
     loss : float [standard deviations] scale of the robust loss
-    flips : int, mirrored limbs that a fit is begun at, every `TrackSettings.search_every`
+    flips : int, mirrored limbs that fits start from, every `TrackSettings.search_every`
     search : SearchSettings
     """
 
@@ -108,10 +109,9 @@ class RegionSettings:
 
 @lru_cache(maxsize=8)
 def colour_bins(space: str, levels: int) -> tuple[NDArray, int]:
-    """Bin (32768,) int32 of every colour of five bits a channel, and how many bins there are.
+    """Bin (32768,) int32 of every colour of five bits a channel, and the number of bins.
 
-    Along each axis bins are as wide as fits `levels` of them into the range that sRGB has there; those that no colour
-    falls into are left out.
+    `levels` bins along each axis cover the range that sRGB has there. Bins without any colour are dropped.
     """
     c = np.arange(32768)
     rgb = np.stack([c >> 10, (c >> 5) & 31, c & 31], axis=1).astype(np.float32) * (8 / 255) + np.float32(4 / 255)
@@ -124,16 +124,16 @@ def colour_bins(space: str, levels: int) -> tuple[NDArray, int]:
 
 @dataclass(frozen=True, eq=False)
 class RegionColours:
-    """Densities of the colours inside and outside of a body's contour.
+    """Colour densities inside and outside of a body's contour.
 
     Parameters
     ----------
-    inside : (G, B) of each part of the body
-    near, far : (B,) of what is near the body, of the whole image but the body
-    own : (2, A, B) float32 pixels counted inside and outside near each anchor, older ones weighing less
-    pixels : (G,) counted of each part, a mean over time
-    times : (G,) int, in how many images each part was counted
-    images : int, how many went in
+    inside : (G, B) of each body part
+    near, far : (B,) of the body's surroundings, and of the whole image without the body
+    own : (2, A, B) float32 pixel counts inside and outside near each anchor, older ones with less weight
+    pixels : (G,) pixels of each part, averaged over time
+    times : (G,) int, number of images in which each part was counted
+    images : int, number of images that were blended in
     """
 
     inside: NDArray
@@ -145,9 +145,9 @@ class RegionColours:
     images: int = 1
 
     def blended(self, inside: NDArray, outside: NDArray, lines: CountLines, s: RegionSettings) -> RegionColours:
-        """With the pixels of each part (G, B) and outside (2, B) of a new image, and those `lines` counts near anchors.
+        """Blend in a new image: pixel counts of each part (G, B) and outside (2, B); `lines` adds those near anchors.
 
-        A part of which nothing was counted, as it is hidden, stays as it was.
+        The density of a part without pixels, as it is occluded, does not change.
         """
         share = 1.0 / (self.images + 1)
         rates = np.maximum(np.array([s.rate, s.near_rate]), share)
@@ -164,21 +164,21 @@ class RegionColours:
 
     @classmethod
     def none(cls, bins: int, s: RegionSettings, parts: int = 1) -> RegionColours:
-        """Before the first image."""
+        """Empty statistics, before the first image."""
         none, own = np.zeros(bins), np.zeros((2, s.anchors, bins), np.float32)
         return cls(np.zeros((parts, bins)), none, none, own, np.zeros(parts), np.zeros(parts, np.int64), 0)
 
     def ratios(self, s: RegionSettings, of: NDArray | None = None) -> Ratios:
-        """Log ratios inside to outside; `of` (A,) the part of the body that each anchor lies on, default the first."""
+        """Log ratios of inside to outside. of (A,) int: the body part that each anchor lies on, default the first."""
         n, outside = self.inside.shape[1], s.far * self.far + (1 - s.far) * self.near
         total = self.pixels.sum()
         body = self.pixels @ self.inside / total if total > 0.0 else np.full(n, 1.0 / n)
-        parts = (self.pixels[:, None] * self.inside + _THIN * body) / (self.pixels + _THIN)[:, None]
-        general, floor = np.concatenate([parts, outside[None]]), _FLOOR / n
+        parts = (self.pixels[:, None] * self.inside + _PART_PIXELS * body) / (self.pixels + _PART_PIXELS)[:, None]
+        general, floor = np.concatenate([parts, outside[None]]), _UNIFORM_SHARE / n
 
         def ratio(inside: NDArray) -> NDArray:
-            told = np.log((inside + floor) / (outside + floor))
-            return np.ascontiguousarray(np.clip(told, -s.most, s.most), np.float32)
+            ratios = np.log((inside + floor) / (outside + floor))
+            return np.ascontiguousarray(np.clip(ratios, -s.most, s.most), np.float32)
 
         whole, logs = ratio(body), np.log(general + floor).astype(np.float32)
         if not s.anchors:
@@ -192,19 +192,19 @@ class RegionColours:
 
 
 CountLines = Callable[[NDArray, NDArray], None]
-"""(2,) weights of a pixel inside and outside, (2, A, B) histograms that it is added to."""
+"""Adds pixels to histograms (2, A, B), with weights (2,) of a pixel inside and outside."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ratios:
-    """Log ratios of the densities inside and outside, each found when it is first looked up; see `kernels.profiles`.
+    """Log ratios of the densities inside and outside, computed at first use; see `kernels.profiles`.
 
     Parameters
     ----------
     whole : (B,) float32 of the body as a whole
-    table : (A, B) float32 at each anchor, UNKNOWN where it was not asked for yet
-    own, total, general, of, floor, most : what they are found from
-    logs : (G + 1, B) float32 logarithms of the densities of each part and, last, of what is around
+    table : (A, B) float32 at each anchor, UNKNOWN where not computed yet
+    own, total, general, of, floor, most : terms from which the table is computed
+    logs : (G + 1, B) float32 logarithms of the densities of each part and, last, of the outside
     """
 
     whole: NDArray
@@ -219,11 +219,11 @@ class Ratios:
 
     @property
     def packed(self) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray, float, float]:
-        """As `kernels.profiles` takes them."""
+        """Arguments of `kernels.profiles`: table (A, B), own (2, A, B), total (2, A), general (G + 1, B), of (A,)."""
         return self.table, self.own, self.total, self.general, self.of, self.floor, self.most
 
     def at(self, anchor: NDArray, bins: NDArray) -> NDArray:
-        """(N,) of bins (N,) at anchors (N,)."""
+        """Log ratios (N,) of bins (N,) at anchors (N,)."""
         if self.own.shape[2] == 1:
             return np.asarray(self.table[anchor, bins])
         rows = self.of[anchor], -1
@@ -233,17 +233,17 @@ class Ratios:
         return np.clip(np.log((inside + self.floor) / (outside + self.floor)), -self.most, self.most)
 
     def between(self, own: NDArray, beyond: NDArray, bins: NDArray) -> NDArray:
-        """(N,) of bins (N,) where parts own (N,) lie before parts beyond (N,)."""
+        """Log ratios (N,) of bins (N,) where parts own (N,) occlude parts beyond (N,)."""
         return np.clip(self.logs[own, bins] - self.logs[beyond, bins], -self.most, self.most)
 
     @classmethod
     def of_table(cls, table: NDArray) -> Ratios:
-        """Of a table (1, B) in which all is known."""
+        """Log ratios from a complete table (1, B)."""
         none = np.zeros((2, 1, 1), np.float32), np.ones((2, 1)), np.zeros((2, table.shape[1])), np.zeros(1, np.int64)
         return cls(table[0], table, *none, 0.0, 0.0, np.zeros_like(table))
 
 
 def _density(counts: NDArray) -> NDArray:
-    """Counts (B,) as a density; even where nothing was counted."""
+    """Counts (B,) as a density (B,); uniform where all are 0."""
     total = counts.sum()
     return counts / total if total > 0 else np.full(len(counts), 1.0 / len(counts))

@@ -1,4 +1,4 @@
-"""Silhouettes: which pixels are the body, and their outline to parts of a pixel."""
+"""Silhouettes: masks of the body, and their contours with sub-pixel positions."""
 
 from __future__ import annotations
 
@@ -10,18 +10,24 @@ from kinefit._arguments import rgb_image, shaped
 from kinefit.errors import ObservationError
 from kinefit.images import _kernels_silhouette as kernels
 
-_HALF = 127.5  # between a pixel of the body and one beside it
+_CONTOUR_LEVEL = 127.5  # of masks from 0 to 255
 
 
-def outline(mask: ArrayLike, *, level: float = _HALF) -> NDArray:
-    """Outline (4, N) of a mask: u, v [px] and the unit normal (a, b), away from the body, at every pixel's border.
+def outline(mask: ArrayLike, *, level: float = _CONTOUR_LEVEL) -> NDArray:
+    """Contour (4, N) of a mask: position u, v [px] and unit normal (a, b), pointing away from the body.
 
-    Where the mask has values between 0 and 255 the outline runs within pixels: a mask made smaller by averaging
-    (`cv2.INTER_AREA`) keeps its outline to a tenth of a pixel. At the image's own border there is no outline.
+    Where the mask has values between 0 and 255 the contour runs within pixels: a mask downscaled by averaging
+    (`cv2.INTER_AREA`) keeps its contour to a tenth of a pixel. The border of the image is no contour.
 
     Parameters
     ----------
     mask : (H, W) uint8
+    level : float in 0..255, value of the mask at the contour
+
+    Raises
+    ------
+    ObservationError
+        No mask.
     """
     image = _mask(mask)
     out = np.empty((4, 2 * image.size if image.size < 10000 else image.size // 2))
@@ -30,7 +36,13 @@ def outline(mask: ArrayLike, *, level: float = _HALF) -> NDArray:
 
 
 def colour_mask(image: ArrayLike, low: ArrayLike, high: ArrayLike) -> NDArray:
-    """(H, W) uint8, 255 where a picture (H, W, 3) has a colour between low and high (3,), without single pixels."""
+    """Threshold an image (H, W, 3) by colours low to high (3,), 0..255: (H, W) uint8, 0 or 255, without single pixels.
+
+    Raises
+    ------
+    ObservationError
+        No colour image, or thresholds in the wrong order.
+    """
     pixels, (low, high) = rgb_image(image), (shaped(v, (3,), "a threshold") for v in (low, high))
     if not np.all(low <= high):
         raise ObservationError(f"thresholds {low} to {high} leave no colour", remedy="Give the lower ones first.")
@@ -40,34 +52,45 @@ def colour_mask(image: ArrayLike, low: ArrayLike, high: ArrayLike) -> NDArray:
 def colour_silhouette(
     image: ArrayLike, low: ArrayLike, high: ArrayLike, *, smooth: float = 1.0
 ) -> tuple[NDArray, NDArray]:
-    """Silhouette by a threshold on colour, and its contour by the Laplace operator (P1 2.4).
+    """Silhouette by colour thresholds, and its contour by the Laplace operator (P1 2.4).
 
     Parameters
     ----------
     image : (H, W, 3) uint8
-    low, high : (3,) least and largest value of each channel that is the body's.
-    smooth : float [px] of the Gaussian before the Laplace operator.
+    low, high : (3,) smallest and largest value of the body in each channel, 0..255.
+    smooth : float [px], sigma of the Gaussian before the Laplace operator.
 
     Returns
     -------
     mask : (H, W) uint8, 0 or 255.
-    contour : (H, W) bool, pixels of the body at which the Laplace operator of the smoothed mask changes its sign.
+    contour : (H, W) bool, pixels of the body at which the Laplacian of the smoothed mask changes its sign.
+
+    Raises
+    ------
+    ObservationError
+        No colour image, or thresholds in the wrong order.
     """
     mask = colour_mask(image, low, high)
     curved = cv2.Laplacian(cv2.GaussianBlur(mask.astype(np.float32), (0, 0), smooth), cv2.CV_32F, ksize=3)
-    beside = cv2.dilate((curved > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return mask, (mask > 0) & (curved < 0) & beside
+    outside = cv2.dilate((curved > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return mask, (mask > 0) & (curved < 0) & outside
 
 
 def choose_person(mask: ArrayLike, near: ArrayLike | None = None, *, share: float = 0.3) -> NDArray:
-    """Of several blobs those that are the person: (H, W) uint8, the others emptied.
+    """Keep the blobs of a mask that belong to the person: (H, W) uint8, the others set to 0.
 
     Parameters
     ----------
     mask : (H, W) uint8
     near : (H, W) bool, optional
-        Where the person is thought to be, with the room that it may have moved through: blobs of which at least
-        `share` lies there are its, in one piece or several. Without it, or where no blob does, the largest one.
+        Region in which the person is expected, enlarged by the motion since then. Blobs with at least `share` of
+        their area in it are kept. Without it, or if there are none, the largest blob is kept.
+    share : float in 0..1
+
+    Raises
+    ------
+    ObservationError
+        No mask.
     """
     image = _mask(mask)
     if len(cv2.findContours(image, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]) <= 1:
@@ -75,13 +98,13 @@ def choose_person(mask: ArrayLike, near: ArrayLike | None = None, *, share: floa
     count, labels, stats, _ = cv2.connectedComponentsWithStats((image > 0).astype(np.uint8), connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA].astype(float)
     area[0] = 0.0
-    mine = np.zeros(count, bool)
+    chosen = np.zeros(count, bool)
     if near is not None:
         inside = np.bincount(labels[np.asarray(near, bool)], minlength=count)
-        mine = (inside >= share * area) & (area > 0)
-    if not mine.any():
-        mine[np.argmax(area)] = True
-    return np.where(mine[labels], image, 0).astype(np.uint8)
+        chosen = (inside >= share * area) & (area > 0)
+    if not chosen.any():
+        chosen[np.argmax(area)] = True
+    return np.where(chosen[labels], image, 0).astype(np.uint8)
 
 
 def _mask(mask: ArrayLike) -> NDArray:

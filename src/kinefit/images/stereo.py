@@ -1,4 +1,4 @@
-"""Stereo pairs to depth: rectified from the rig, matched by semi-global matching (Hirschmüller 2008, OpenCV's SGBM)."""
+"""Depth from a stereo pair: rectification by the calibration, then semi-global matching (Hirschmüller 2008, OpenCV)."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from kinefit.geometry.camera import Camera
 from kinefit.geometry.se3 import transform
 from kinefit.observations import DepthFrame
 
-_BLOCK = 5  # [px] OpenCV advises 3 to 11; below it noise matches, above it limbs grow at their edges
-_WIDEST = math.tan(math.radians(60.0))  # what a fisheye lens sees beyond that would fill a plane with few rays
-_LEAST_SHARED = 0.05  # of the first view, below which two cameras do not look at the same thing
+_BLOCK_PX = 5  # OpenCV advises 3 to 11; below it noise matches, above it limbs grow at their edges
+_MAX_TANGENT = math.tan(math.radians(60.0))  # of a ray's angle to the axis: beyond, few rays would fill a large plane
+_MIN_SHARED_VIEW = 0.05  # share of the first view that the second camera must see
 
 
 class StereoRectifier:
-    """Two cameras of a rig as one depth sensor.
+    """Rectifies and matches the images of two cameras: a stereo pair as a depth sensor.
 
-    The rectified view looks along the mean of both optical axes, its x along the line from the first camera to the
-    second, so pairs that stand above each other or were named the other way round work as well: their view is turned.
-    Maps are made once, through the cameras' own models, whatever their lenses.
+    The rectified view looks along the mean of both optical axes, its x axis along the baseline from the first camera to
+    the second. Pairs one above the other, or in the reverse order, work too: their view is rotated. The maps are made
+    once, by the cameras' own models, for any lens.
 
     Parameters
     ----------
     left, right : Camera
-    near, far : float [m] between which depth is sought: the range of disparities, so the cost, follows from it.
+    near, far : float [m], range of depths that are searched. The number of disparities, and so the cost, follows.
     name : str, of the depth sensor; default that of the first camera with "_stereo".
 
     Attributes
     ----------
-    camera : Camera, rectified view from the first camera's centre, without distortion: that of the depth images.
+    camera : Camera, rectified view from the first camera's centre, without distortion; the camera of the depth images.
     baseline : float [m]
 
     Raises
     ------
     CalibrationError
-        Cameras at one place, or that do not look at the same thing within the range.
+        Cameras at one position, or whose views do not overlap within the range.
     ObservationError
-        A range that is none, or that would need disparities of more than half of the image's width.
+        An empty range, or one that needs disparities of more than half of the image's width.
     """
 
     def __init__(self, left: Camera, right: Camera, *, near: float = 0.5, far: float = 5.0, name: str = "") -> None:
@@ -85,13 +85,19 @@ class StereoRectifier:
             if not inside.any():
                 continue
             shared = max(shared, float(np.mean(seen[0][:, inside] & seen[1][:, u[inside]])) * float(inside.mean()))
-        if shared < _LEAST_SHARED:
+        if shared < _MIN_SHARED_VIEW:
             problem = f"only {100 * shared:.0f} % of the first one's view is seen by the other"
             remedy = "Choose two that look at the same thing, or another range."
             raise CalibrationError(problem, place=place, remedy=remedy)
 
     def rectify(self, left: NDArray, right: NDArray) -> tuple[NDArray, NDArray]:
-        """Both images (h, w) or (h, w, 3) RGB uint8 as the rectified views see them, (H, W) or (H, W, 3)."""
+        """Rectify both images (h, w) or (h, w, 3) RGB uint8: (H, W) or (H, W, 3) each.
+
+        Raises
+        ------
+        ObservationError
+            Images of another size than the cameras', or not 8-bit.
+        """
         out = []
         for image, camera, maps in zip((left, right), (self.left, self.right), self._maps):
             if image.ndim not in (2, 3) or image.shape[1::-1] != camera.size or image.dtype != np.uint8:
@@ -102,19 +108,19 @@ class StereoRectifier:
         return out[0], out[1]
 
     def disparity(self, left: NDArray, right: NDArray) -> NDArray:
-        """(H, W) float32 [px] focal length · baseline / depth of every pixel of the rectified view; NaN for none.
+        """Disparity (H, W) float32 [px], focal length · baseline / depth, in the rectified view; NaN without a match.
 
-        Matches that differ from right to left by more than a pixel, that have a rival within 10 %, and patches of
-        fewer than 100 pixels are dropped (OpenCV's advice for all three).
+        Matches are rejected if left and right disagree by more than a pixel, if a second match is within 10 %, or in
+        patches of fewer than 100 pixels (OpenCV's advice for all three).
         """
         views = [v if v.ndim == 2 else cv2.cvtColor(v, cv2.COLOR_RGB2GRAY) for v in self.rectify(left, right)]
         matcher = cv2.StereoSGBM.create(
-            minDisparity=self._least, numDisparities=self._count, blockSize=_BLOCK, P1=8 * _BLOCK**2,
-            P2=32 * _BLOCK**2, disp12MaxDiff=1, preFilterCap=31, uniquenessRatio=10, speckleWindowSize=100,
+            minDisparity=self._least, numDisparities=self._count, blockSize=_BLOCK_PX, P1=8 * _BLOCK_PX**2,
+            P2=32 * _BLOCK_PX**2, disp12MaxDiff=1, preFilterCap=31, uniquenessRatio=10, speckleWindowSize=100,
             speckleRange=2, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )  # fmt: skip
         width = self.camera.size[0]
-        margins = max(self._least + self._count, 0), max(-self._least, 0)  # SGBM leaves out what may match outside
+        margins = max(self._least + self._count, 0), max(-self._least, 0)  # SGBM skips pixels that may match outside
         wide = [cv2.copyMakeBorder(v, 0, 0, *margins, cv2.BORDER_REPLICATE) for v in views]
         raw = matcher.compute(*wide)[:, margins[0] : margins[0] + width].astype(np.float32) / 16.0
         moved = raw - np.float32(self._offset)
@@ -123,7 +129,7 @@ class StereoRectifier:
         return np.where(lost, np.float32(np.nan), moved)
 
     def _seen(self, raw: NDArray) -> NDArray:
-        """(H, W) bool: the pixel lies in the first image, and its match in the second."""
+        """Pixels (H, W) bool that lie in the first image, and whose match lies in the second."""
         first, second = (np.isfinite(m).all(axis=-1) for m in self._maps)
         height, width = raw.shape
         match = np.rint(np.arange(width) - raw).astype(int)
@@ -131,21 +137,21 @@ class StereoRectifier:
         return first & inside & second[np.arange(height)[:, None], np.clip(match, 0, width - 1)]
 
     def depth(self, left: NDArray, right: NDArray) -> NDArray:
-        """(H, W) float32 [m] along the optical axis of `camera`; 0 where nothing matched."""
+        """Depth (H, W) float32 [m] along the optical axis of `camera`; 0 without a match."""
         moved = self.disparity(left, right)
         return np.nan_to_num(np.float32(self._focal * self.baseline) / moved, nan=0.0)
 
     def frame(self, left: NDArray, right: NDArray, time: float) -> DepthFrame:
-        """What the pair saw at a time [s], as a depth sensor whose camera is `camera`."""
+        """Depth frame of the pair's images (h, w) or (h, w, 3) uint8 at a time [s]; its camera is `camera`."""
         return DepthFrame(self.camera.name, time, self.depth(left, right))
 
     def deviation(self, depth: float, matching: float = 0.5) -> float:
-        """[m] standard deviation of a depth [m] where matches are off by `matching` [px]: z² / (f b) · matching."""
+        """Standard deviation [m] of a depth z [m] with matches of sigma `matching` [px]: z² / (f b) · matching."""
         return depth**2 / (self._focal * self.baseline) * matching
 
 
 def _rotation(left: Camera, right: Camera, x: NDArray) -> NDArray:
-    """(3, 3) world to rectified view: x along the baseline, z the mean optical axis as far as it is at right angles."""
+    """Rotation (3, 3) from world to rectified view: x along the baseline, z the part of the mean axis normal to x."""
     z = left.T_camera_world[2, :3] + right.T_camera_world[2, :3]
     z = z - (z @ x) * x
     length = float(np.linalg.norm(z))
@@ -158,7 +164,7 @@ def _rotation(left: Camera, right: Camera, x: NDArray) -> NDArray:
 
 
 def _view(camera: Camera, R: NDArray) -> tuple[NDArray, NDArray]:
-    """Lower and upper x/z and y/z (2,) of a camera's image in the rectified view."""
+    """Smallest and largest x/z and y/z (2,) of a camera's image in the rectified view."""
     w, h = camera.size
     u, v = np.linspace(0, w - 1, 33), np.linspace(0, h - 1, 33)
     border = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
@@ -168,14 +174,14 @@ def _view(camera: Camera, R: NDArray) -> tuple[NDArray, NDArray]:
     if not len(ray):
         remedy = "Choose two that look the same way, side by side."
         raise CalibrationError("it looks away from the other", place=f"camera {camera.name}", remedy=remedy)
-    tangents = np.clip(ray[:, :2] / ray[:, 2:], -_WIDEST, _WIDEST)
+    tangents = np.clip(ray[:, :2] / ray[:, 2:], -_MAX_TANGENT, _MAX_TANGENT)
     return tangents.min(axis=0), tangents.max(axis=0)
 
 
 def _map(camera: Camera, R: NDArray, matrix: NDArray, shift: float, size: NDArray) -> NDArray:
-    """(H, W, 2) float32 [px] where the rectified view's pixels lie in a camera's image; NaN outside of it.
+    """Positions (H, W, 2) float32 [px] of the rectified view's pixels in a camera's image; NaN outside of it.
 
-    `shift` [px] is by how much the view's principal point lies left of the matrix's.
+    `shift` [px]: how far the view's principal point lies left of the matrix's.
     """
     u, v = np.meshgrid(np.arange(size[0], dtype=float), np.arange(size[1], dtype=float))
     x, y = (u - matrix[0, 2] + shift) / matrix[0, 0], (v - matrix[1, 2]) / matrix[1, 1]

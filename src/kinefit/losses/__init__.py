@@ -1,4 +1,4 @@
-"""Robust losses: how much a measurement that does not fit may pull."""
+"""Robust losses: limit the influence of outliers."""
 
 from __future__ import annotations
 
@@ -13,13 +13,18 @@ from kinefit.losses import _kernels as kernels
 
 @dataclass(frozen=True)
 class Loss:
-    """ρ(s²) of a measurement s standard deviations off; make one with `huber`, `tukey`, `geman_mcclure`.
+    """Loss ρ(s²) of a residual of s standard deviations; made by `huber`, `tukey`, `geman_mcclure`.
 
     Parameters
     ----------
     kind : int, code of the kernel.
     scale : float or (N,) [standard deviations]
-        Where it starts to give way; one for all measurements, or one for each row.
+        Residual from which the influence decreases; one for all measurements, or one for each row.
+
+    Raises
+    ------
+    ObservationError
+        A scale that is not positive.
     """
 
     kind: int = kernels.NO_LOSS
@@ -30,7 +35,7 @@ class Loss:
             raise ObservationError(f"the scale of a loss must be positive, got {self.scale}")
 
     def weigh(self, s2: NDArray) -> tuple[NDArray, NDArray]:
-        """ρ and robust factors, in 0..1, of squared residuals (...) in variances."""
+        """Losses ρ (N,) and robust weights (N,) in 0..1 of squared residuals s2 (N,) [variances]; any shape."""
         flat = np.ascontiguousarray(s2, float).ravel()
         scale = np.ascontiguousarray(np.broadcast_to(np.asarray(self.scale, float), np.shape(s2))).ravel()
         rho, factor = np.empty((2, flat.size))
@@ -38,13 +43,13 @@ class Loss:
         return rho.reshape(np.shape(s2)), factor.reshape(np.shape(s2))
 
     def factor(self, s2: NDArray) -> NDArray:
-        """Robust factors, in 0..1, of squared residuals (...) in variances."""
+        """Robust weights (N,) in 0..1 of squared residuals s2 (N,) [variances]; any shape."""
         return self.weigh(s2)[1]
 
     def of_rows(self, data: NDArray, group: NDArray) -> tuple[NDArray, float]:
-        """Robust factor of every row, data (8, N) as `Rows` have it, and the cost Σ ρ; a group shares one factor.
+        """Robust weights (N,) of rows, data (8, N) as in `Rows`, and the cost Σ ρ; a group shares one weight.
 
-        With a scale for each row every row is a measurement by itself.
+        With a scale for each row, every row is a measurement of its own.
         """
         if np.ndim(self.scale) == 0:
             factor = np.empty(len(group))
@@ -57,15 +62,24 @@ SQUARED = Loss()
 
 
 def huber(scale: float | NDArray = 1.345) -> Loss:
-    """Quadratic, then linear: bounded influence, convex (95 % efficient for a normal error at the default)."""
+    """Huber loss: quadratic, then linear; bounded influence, convex.
+
+    scale [standard deviations], a number or (N,); the default is 95 % efficient for normal errors.
+    """
     return Loss(kernels.HUBER, scale)
 
 
 def tukey(scale: float | NDArray = 4.685) -> Loss:
-    """Biweight: no influence at all beyond `scale` (95 % efficient for a normal error at the default)."""
+    """Tukey's biweight: no influence beyond `scale`.
+
+    scale [standard deviations], a number or (N,); the default is 95 % efficient for normal errors.
+    """
     return Loss(kernels.TUKEY, scale)
 
 
 def geman_mcclure(scale: float | NDArray = 3.0) -> Loss:
-    """s² / (1 + s²/scale²): influence falls off smoothly and never quite to nothing."""
+    """Geman-McClure loss s² / (1 + s²/scale²): the influence decreases smoothly, but never to zero.
+
+    scale [standard deviations], a number or (N,).
+    """
     return Loss(kernels.GEMAN_MCCLURE, scale)

@@ -1,4 +1,4 @@
-"""Robust losses: ρ and its derivative, one by one and for all rows of a measurement together."""
+"""Compiled robust losses: ρ and its derivative, for single residuals and for groups of rows."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ NO_LOSS, HUBER, TUKEY, GEMAN_MCCLURE = 0, 1, 2, 3
 
 @jit
 def robust(kind, scale, s2):
-    """ρ(s²) and its derivative, the weight, of a squared residual in standard deviations."""
+    """ρ(s²) and its derivative, the weight, of a squared residual [variances]."""
     if kind == HUBER:
         if s2 <= scale * scale:
             return s2, 1.0
@@ -31,14 +31,14 @@ def robust(kind, scale, s2):
 
 @jit
 def robust_all(kind, scale, s2, rho, factor):
-    """ρ and robust factors of squared residuals s2 (N,) in variances, each with its own scale (N,)."""
+    """Write ρ and robust weights (N,) of squared residuals s2 (N,) [variances], each with its own scale (N,)."""
     for i in range(s2.size):
         rho[i], factor[i] = robust(kind, scale[i], s2[i])
 
 
 @jit
 def weigh(data, group, count, kind, scale, factor):
-    """Robust factor of every row, shared by the rows of one measurement; returns the cost Σ ρ(w r²)."""
+    """Write the robust weight of every row, shared by the rows of one measurement; returns the cost Σ ρ(w r²)."""
     cost = 0.0
     if kind == NO_LOSS:
         for i in range(count):

@@ -1,1 +1,1 @@
-"""Published methods, each short, over the parts of the library."""
+"""Published methods, each in a short file, built from the library's parts."""

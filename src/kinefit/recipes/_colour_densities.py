@@ -9,31 +9,39 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 
-_CELL, _GRID = 4.0, (26, 65, 65)  # [units of Lab] width of cells, and how many there are, in which colours are counted
-COLOURS = int(np.prod(_GRID))
-_FLOOR = 1e-8  # density that every colour has: a hundredth, spread over 1e6 units³ of Lab
-_WINDOW = 4.0  # [units of Lab] standard deviation of a Parzen window
-_GAUSSIANS, _ROUNDS = 5, 20  # of a mixture, and iterations of expectation and maximisation
+_CELL_WIDTH = 4.0  # [units of Lab] of the histogram
+_GRID_SHAPE = (26, 65, 65)  # cells along L, a and b
+COLOURS = int(np.prod(_GRID_SHAPE))
+_MIN_DENSITY = 1e-8  # of every colour: a hundredth, spread over 1e6 units³ of Lab
+_PARZEN_SIGMA = 4.0  # [units of Lab]
+_GAUSSIANS = 5  # of a mixture
+_EM_ITERATIONS = 20
 
 
 def colour_cells(image: ArrayLike, camera: Camera) -> NDArray:
-    """(H W,) number of the cell of CIELab that each pixel of an image (H, W, 3) uint8 RGB lies in."""
+    """Cell (H W,) in CIELab of each pixel of an image (H, W, 3) uint8 RGB.
+
+    Raises
+    ------
+    ObservationError
+        An image of another type, or of another size than the camera's.
+    """
     rgb = np.asarray(image)
     if rgb.shape != (*camera.size[::-1], 3) or rgb.dtype != np.uint8:
         problem = f"an image of shape {rgb.shape} and {rgb.dtype} of {camera.name}, whose size is {camera.size}"
         raise ObservationError(problem, remedy="Give (H, W, 3) uint8 RGB in the size of the calibration.")
     lab = cv2.cvtColor(rgb.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2Lab).reshape(-1, 3) + (0, 128, 128)
-    return np.ravel_multi_index(tuple((lab / _CELL).astype(np.int64).T), _GRID, mode="clip")
+    return np.ravel_multi_index(tuple((lab / _CELL_WIDTH).astype(np.int64).T), _GRID_SHAPE, mode="clip")
 
 
 def parzen_density(count: NDArray) -> NDArray:
-    """Logarithm (cells,) of the Parzen estimate of a density, of pixels counted in cells of CIELab (cells,)."""
-    density = _smoothed(count.reshape(_GRID), _WINDOW / _CELL).ravel()
-    return np.asarray(np.log(density / max(count.sum(), 1.0) / _CELL**3 + _FLOOR))
+    """Logarithm (N,) of the Parzen density estimate from pixel counts (N,) in the cells of CIELab."""
+    density = _smoothed(count.reshape(_GRID_SHAPE), _PARZEN_SIGMA / _CELL_WIDTH).ravel()
+    return np.asarray(np.log(density / max(count.sum(), 1.0) / _CELL_WIDTH**3 + _MIN_DENSITY))
 
 
 def _smoothed(grid: NDArray, sigma: float) -> NDArray:
-    """A grid, zero beyond its edges, convolved with a Gaussian of a standard deviation in cells."""
+    """Convolve a grid, zero outside, with a Gaussian of a standard deviation in cells."""
     reach = round(4.0 * sigma)
     kernel = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) / sigma))
     for axis in range(grid.ndim):
@@ -44,24 +52,24 @@ def _smoothed(grid: NDArray, sigma: float) -> NDArray:
 
 
 def mixture_density(count: NDArray) -> NDArray:
-    """The same of a mixture of Gaussians, fitted by expectation and maximisation."""
-    every = (np.indices(_GRID).reshape(3, -1).T + 0.5) * _CELL
+    """Logarithm (N,) of a Gaussian mixture density, fitted by EM to pixel counts (N,) in the cells of CIELab."""
+    every = (np.indices(_GRID_SHAPE).reshape(3, -1).T + 0.5) * _CELL_WIDTH
     used = np.flatnonzero(count)
     x, n, share = every[used], count[used][:, None], np.zeros((len(used), _GAUSSIANS))
-    of = np.minimum(np.cumsum(n) / max(n.sum(), 1.0), 0.999) * _GAUSSIANS  # to begin with equal numbers by lightness
+    of = np.minimum(np.cumsum(n) / max(n.sum(), 1.0), 0.999) * _GAUSSIANS  # initial classes of equal size by lightness
     share[np.arange(len(used)), of.astype(np.int64)] = 1.0
-    for _ in range(_ROUNDS):
+    for _ in range(_EM_ITERATIONS):
         weight = (n * share).sum(axis=0) + 1e-9
         mean = (n * share).T @ x / weight[:, None]
         off = x[:, None] - mean
-        C = np.einsum("nk,nki,nkj->kij", n * share, off, off) / weight[:, None, None] + _CELL**2 / 12 * np.eye(3)
+        C = np.einsum("nk,nki,nkj->kij", n * share, off, off) / weight[:, None, None] + _CELL_WIDTH**2 / 12 * np.eye(3)
         log = _gaussians(x, weight, mean, C)
         share = np.exp(log - np.logaddexp.reduce(log, axis=1, keepdims=True))
-    return np.logaddexp(np.logaddexp.reduce(_gaussians(every, weight, mean, C), axis=1), np.log(_FLOOR))
+    return np.logaddexp(np.logaddexp.reduce(_gaussians(every, weight, mean, C), axis=1), np.log(_MIN_DENSITY))
 
 
 def _gaussians(x: NDArray, weight: NDArray, mean: NDArray, C: NDArray) -> NDArray:
-    """(N, K) logarithms of each Gaussian's part of the density at x (N, 3)."""
+    """Logarithms (N, K) of each Gaussian's contribution to the density at x (N, 3)."""
     L = np.linalg.cholesky(np.linalg.inv(C))
     square = np.stack([np.square((x - m) @ l).sum(axis=1) for m, l in zip(mean, L)], axis=1)
     return np.asarray(np.log(weight / weight.sum()) - 0.5 * (square + np.linalg.slogdet(2.0 * np.pi * C)[1]))

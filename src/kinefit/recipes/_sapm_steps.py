@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 
 from kinefit.geometry.se3 import nearest_rotation
 
-MANY = 6
-"""Points from which a segment is matched by the coarse update (P5: "our threshold is 6")."""
+MIN_COARSE_POINTS = 6
+"""Points of a segment that is matched by the coarse update (P5: "our threshold is 6")."""
 
 
 @dataclass(frozen=True, eq=False)
 class CandidateTable:
-    """P5 3.1.1: for an assumed match of the pivot, candidates of all other points of the segment.
+    """Candidates of all points of a segment for an assumed match of the pivot (P5 3.1.1).
 
     Parameters
     ----------
-    order : indexes of the segment's points, the pivot first, then by distance from it
+    order : indices of the segment's points, the pivot first, then by distance from it
     columns : for each of `order` the candidates, best first; the pivot has one
     """
 
@@ -30,17 +30,17 @@ class CandidateTable:
 
     @property
     def size(self) -> int:
-        """Candidates in all."""
+        """Number of candidates."""
         return sum(len(c) for c in self.columns)
 
     @property
     def filled(self) -> int:
-        """Columns that have any."""
+        """Number of columns with candidates."""
         return sum(len(c) > 0 for c in self.columns)
 
 
 def mean_distance(x: NDArray) -> float:
-    """l of a segment [m]: the mean distance of its points."""
+    """Mean distance l [m] between the points (k, 3) [m] of a segment; at least (2, 3)."""
     i, j = np.triu_indices(len(x), 1)
     return float(np.linalg.norm(x[i] - x[j], axis=-1).mean())
 
@@ -48,13 +48,16 @@ def mean_distance(x: NDArray) -> float:
 def candidate_table(
     x: NDArray, points: NDArray, free: NDArray, pivot: int, place: NDArray, match: int, epsilon: float
 ) -> CandidateTable:
-    """(4): points whose distance from the assumed pivot differs by less than 2ε of the model's, best first.
+    """Candidates by (4): points whose distance from the assumed pivot differs from the model's by less than 2ε.
 
     Parameters
     ----------
-    x : (k, 3) the segment, or (k + 1, 3) with its virtual joint as the last
+    x : (k, 3) [m] the segment, or (k + 1, 3) with its virtual joint as the last
+    points : (N, 3) [m]
     free : (N,) bool, not identified yet
-    place : (3,) [m] of the pivot's assumed match, which is the point `match` (-1: a virtual joint)
+    pivot : int, index in x
+    place : (3,) [m] position of the pivot's assumed match, which is the point `match` (-1: a virtual joint)
+    epsilon : float, ε as a share of the distance
     """
     D = np.linalg.norm(x - x[pivot], axis=1)
     order = np.argsort(D, kind="stable")
@@ -69,25 +72,25 @@ def candidate_table(
 
 
 def motion(x: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
-    """(1): the rotation and translation of x onto y by SVD (Arun et al.)."""
+    """Rigid motion of points x (N, 3) onto y (N, 3) [m] by SVD, (1) (Arun et al.): R (3, 3), t (3,) [m]."""
     a, b = x.mean(0), y.mean(0)
     R = nearest_rotation((y - b).T @ (x - a))
     return R, b - R @ a
 
 
 def errors(x: NDArray, y: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """(n,) [m] of each point under the motion that fits all; R, t."""
+    """Errors (N,) [m] of points x (N, 3) against y (N, 3) under the best motion; R, t."""
     R, t = motion(x, y)
     return np.linalg.norm(y - x @ R.T - t, axis=1), R, t
 
 
 def coarse_updates(table: CandidateTable, x: NDArray, at: NDArray, limit: float) -> Iterator[tuple[NDArray, NDArray]]:
-    """First update rule: heads of all columns; the worst match is replaced by its next candidate. Yields motions.
+    """First update rule: start with all first candidates, and replace the worst match by its next. Yields motions.
 
     Parameters
     ----------
-    at : (N + 1, 3) [m] points, the last the pivot's place
-    limit : ε l [m] that the mean error stays below
+    at : (N + 1, 3) [m] points, the last one the pivot's position
+    limit : float [m], ε l, bound of the mean error
     """
     heads = [0] * len(table.columns)
     while True:
@@ -103,10 +106,11 @@ def coarse_updates(table: CandidateTable, x: NDArray, at: NDArray, limit: float)
 
 
 def triples(table: CandidateTable, x: NDArray, at: NDArray, limit: float) -> Iterator[tuple[NDArray, NDArray]]:
-    """Second update rule: the pivot with its nearest and its furthest neighbours, then the next. Yields motions.
+    """Second update rule: the pivot with its nearest and its farthest neighbours, then the next. Yields motions (R, t).
 
-    Of a point pair, or where only one neighbour has candidates, each of these with the pivot: its motion is known but
-    for a turn about the pair, and whether it is right the children's matches say (P5 3.2).
+    For a point pair, or if only one neighbour has candidates, each of these with the pivot: the rotation about the pair
+    is undetermined, and the children's matches confirm the motion (P5 3.2). at (N + 1, 3) [m], limit [m]: see
+    `coarse_updates`.
     """
     filled = [j for j in range(1, len(table.columns)) if len(table.columns[j])]
     if len(filled) == 1:
@@ -124,7 +128,7 @@ def triples(table: CandidateTable, x: NDArray, at: NDArray, limit: float) -> Ite
 
 
 def nearest(x: NDArray, R: NDArray, t: NDArray, points: NDArray, free: NDArray, limit: float) -> NDArray:
-    """(5): (k,) the closest free point of each moved model point within 2 l ε = `limit` [m], -1 where lost."""
+    """Closest free point (k,) of each moved model point within 2 l ε = `limit` [m], (5); -1 for none."""
     d = np.linalg.norm((x @ R.T + t)[:, None] - points, axis=-1)
     d[:, ~free] = np.inf
     found = d.argmin(1)

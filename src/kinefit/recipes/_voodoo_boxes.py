@@ -1,4 +1,4 @@
-"""Bounding boxes of the body and its limbs: which measured points may belong to what (P2 4.2.1 and 4.2.2)."""
+"""Bounding boxes of the body and its limbs, to assign measured points (P2 4.2.1 and 4.2.2)."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def boxes_of(body: Body) -> Boxes:
 
 
 def in_body_box(x: NDArray, boxes: Boxes, frames: NDArray, enlargement: float) -> NDArray:
-    """Step 1: (N,) bool, points (N, 3) within the box along the world's axes about the whole body, enlarged [m]."""
+    """Step 1: whether points (N, 3) [m] lie in the enlarged [m] axis-aligned box of the whole body: (N,) bool."""
     R, t = frames[boxes.limb, :9].reshape(-1, 3, 3), frames[boxes.limb, 9:]
     centre = (R @ boxes.centre[:, :, None])[..., 0] + t
     reach = np.einsum("bij,bkj,bk->bik", R, boxes.axes, boxes.half)  # (B, world axis, edge of the box)
@@ -66,7 +66,7 @@ def in_body_box(x: NDArray, boxes: Boxes, frames: NDArray, enlargement: float) -
 
 
 def depth_in_boxes(x: NDArray, boxes: Boxes, frames: NDArray, enlargement: float) -> NDArray:
-    """Step 2: (N, S) [m] how deep each point lies in each limb's enlarged box; negative outside, -inf without a box."""
+    """Step 2: depth (N, S) [m] of each point in each limb's enlarged box; negative outside, -inf without a box."""
     R, t = frames[boxes.limb, :9].reshape(-1, 3, 3), frames[boxes.limb, 9:]
     turn = R @ boxes.axes.swapaxes(1, 2)  # (B, 3, 3) from the box to the world
     middle = np.einsum("bij,bj->bi", R, boxes.centre) + t
@@ -80,10 +80,10 @@ def depth_in_boxes(x: NDArray, boxes: Boxes, frames: NDArray, enlargement: float
 
 
 def assigned(depth: NDArray, boxes: Boxes, overlap: Overlap) -> NDArray:
-    """Step 2: (N, S) bool, limbs that each point is a candidate of, by the rule for points in several boxes.
+    """Step 2: candidate limbs (N, S) bool of each point, by the rule for points in several boxes.
 
-    shared: all of them; exclusive: the one in whose box it lies deepest; adjacent: that one, and those of the others
-    that have a joint with it.
+    shared: all of them; exclusive: the limb in whose box the point lies deepest; adjacent: that limb, and those joined
+    to it.
     """
     inside = depth >= 0.0
     if overlap == "shared":

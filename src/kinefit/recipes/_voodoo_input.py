@@ -1,4 +1,4 @@
-"""The five inputs of VooDoo (P2 4.1) from what sensors saw."""
+"""The five inputs of VooDoo (P2 4.1) from sensor frames."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from kinefit.images.depth import to_points
 from kinefit.observations import DepthFrame, Frame, KeypointFrame, MarkerFrame, PointCloud, by_record
 from kinefit.recipes._voodoo_boxes import Boxes, in_body_box
 
-_COLUMNS = 160  # of a depth image that take part, about: those of the time-of-flight camera of P2
+_MAX_COLUMNS = 160  # of a depth image, approximately: those of P2's time-of-flight camera
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What all sensors saw at one time, by what is known of it; lengths [m] in the world, a weight for each.
+    """Observations at one time, sorted by what they are assigned to; lengths [m] in the world, a weight for each.
 
     Parameters
     ----------
     free : (N, 3) points on any surface
     on_body : (N, 3) points on the body, on any of its limbs
     on_limb : (N, 3) points on the limb `limb` (N,)
-    points, places : points of the body, and where they were measured (K, 3)
-    features, lines : points of the body, and the Plücker lines (K, 6) that they were seen on
+    points, places : points of the body, and their measured positions (K, 3)
+    features, lines : points of the body, and their Plücker lines (K, 6) of sight
     """
 
     free: NDArray
@@ -51,7 +51,10 @@ def near_body(
     sight: Sight, boxes: Boxes, frames: NDArray, reach: float, floor: tuple[float, float, float, float] | None,
     clear: float,
 ) -> Sight:  # fmt: skip
-    """Without free points farther [m] from the body's box, and without those less than `clear` [m] above the floor."""
+    """Drop free points outside of the body's box enlarged by `reach` [m], or less than `clear` [m] above the floor.
+
+    frames (S, 12); floor: plane a, b, c, d with a x + b y + c z = d [m].
+    """
     near = in_body_box(sight.free, boxes, frames, reach)
     if floor is not None:
         near &= sight.free @ np.array(floor[:3]) > floor[3] + clear
@@ -59,7 +62,7 @@ def near_body(
 
 
 def sight_of(frames: Sequence[Frame], body: Body, rig: Rig, weights: Mapping[str, float]) -> Sight:
-    """Sort what the sensors saw at one time, and weigh it: by a feature's name, else its sensor's, else 1.
+    """Sort the frames of one time, and weight them: by a feature's name, else its sensor's, else 1 (unitless).
 
     Raises
     ------
@@ -69,19 +72,19 @@ def sight_of(frames: Sequence[Frame], body: Body, rig: Rig, weights: Mapping[str
     for name, weight in weights.items():
         if not 0.0 <= weight < np.inf:
             raise ObservationError(f"the weight of {name} is {weight}", remedy="Give 0 or more.")
-    seen, of = by_record(frames), {f.sensor: weights.get(f.sensor, 1.0) for f in frames}
+    by_type, of = by_record(frames), {f.sensor: weights.get(f.sensor, 1.0) for f in frames}
     clouds: list[list] = [[], [], []]  # free, on the body, on a limb: (points, weight, limb)
-    for f in seen[DepthFrame]:
-        step = max(f.size[0] // _COLUMNS, 1)
+    for f in by_type[DepthFrame]:
+        step = max(f.size[0] // _MAX_COLUMNS, 1)
         clouds[0].append((to_points(f.depth, rig[f.sensor], step=step), of[f.sensor], -1))
-    for f in seen[PointCloud]:
+    for f in by_type[PointCloud]:
         limb = -1 if f.segment is None else body.tree.segment(f.segment)
         clouds[2 if limb >= 0 else int(f.on_body)].append((f.points, of[f.sensor], limb))
-    sets = [body.markers(f.marker_set) if f.marker_set else body.landmarks for f in seen[MarkerFrame]]
-    places = [_named(k, f.names, f.positions, weights, of[f.sensor]) for k, f in zip(sets, seen[MarkerFrame])]
-    sets = [body.keypoints(f.keypoint_set) if f.keypoint_set else body.landmarks for f in seen[KeypointFrame]]
+    sets = [body.markers(f.marker_set) if f.marker_set else body.landmarks for f in by_type[MarkerFrame]]
+    places = [_named(k, f.names, f.positions, weights, of[f.sensor]) for k, f in zip(sets, by_type[MarkerFrame])]
+    sets = [body.keypoints(f.keypoint_set) if f.keypoint_set else body.landmarks for f in by_type[KeypointFrame]]
     rays = [
-        _named(k, f.names, _rays(f, rig[f.sensor]), weights, of[f.sensor]) for k, f in zip(sets, seen[KeypointFrame])
+        _named(k, f.names, _rays(f, rig[f.sensor]), weights, of[f.sensor]) for k, f in zip(sets, by_type[KeypointFrame])
     ]
     x = [np.concatenate([p for p, _, _ in part] or [np.zeros((0, 3))]) for part in clouds]
     w = [np.concatenate([np.full(len(p), a) for p, a, _ in part] or [np.zeros(0)]) for part in clouds]
@@ -90,20 +93,20 @@ def sight_of(frames: Sequence[Frame], body: Body, rig: Rig, weights: Mapping[str
 
 
 def _rays(frame: KeypointFrame, camera: Camera) -> NDArray:
-    """(K, 6) Plücker lines in the world, NaN for keypoints that were not seen."""
+    """Plücker lines (K, 6) in the world, NaN for keypoints without detection."""
     directions, out = camera.ray(frame.uv), np.full((len(frame.names), 6), np.nan)
-    seen = np.isfinite(directions).all(axis=1) & (frame.confidence > 0.0)
-    if seen.any():
-        out[seen] = lines.line_along(camera.centre_world, directions[seen])
+    by_type = np.isfinite(directions).all(axis=1) & (frame.confidence > 0.0)
+    if by_type.any():
+        out[by_type] = lines.line_along(camera.centre_world, directions[by_type])
     return out
 
 
 def _named(
     known: PointSet, names: Sequence[str], values: NDArray, weights: Mapping[str, float], weight: float
 ) -> tuple[PointSet, NDArray, NDArray]:
-    here = [k for k, name in enumerate(names) if name in known.names]
-    chosen = tuple(names[k] for k in here)
-    return known.select(chosen), values[here], np.array([weights.get(name, weight) for name in chosen])
+    rows = [k for k, name in enumerate(names) if name in known.names]
+    chosen = tuple(names[k] for k in rows)
+    return known.select(chosen), values[rows], np.array([weights.get(name, weight) for name in chosen])
 
 
 def _all(parts: list, columns: int) -> tuple[PointSet, NDArray, NDArray]:

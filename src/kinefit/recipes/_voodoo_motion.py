@@ -12,15 +12,15 @@ from kinefit.solvers.limbs import absolute_orientation, move
 
 
 def band_ends(body: Body, frames: NDArray, bands: Bands) -> tuple[NDArray, NDArray]:
-    """Both ends (B, 3) [m] of every band, on the parent and on the child."""
+    """Ends (B, 3) [m] of every band on the parent, and on the child."""
     return steps.places(body, frames, bands.parent), steps.places(body, frames, bands.child)
 
 
 def band_weights(bands: Bands, measured: steps.Pairs, weight: float, least: int | None) -> tuple[NDArray, NDArray]:
-    """Step 6: weights (B,) of the bands at the parent and at the child.
+    """Step 6: weights (B,) of the bands at the parent and at the child, numbers without unit.
 
-    Where `least` is given, all bands of a limb together weigh `weight` times what is measured of it, at least so many
-    points; else every band weighs `weight`.
+    Without `least` every band has `weight`. Else all bands of a limb together have `weight` times the sum of its
+    measurements' weights, of which at least `least` is used.
     """
     if least is None:
         every = np.full(len(bands), weight)
@@ -35,7 +35,7 @@ def band_weights(bands: Bands, measured: steps.Pairs, weight: float, least: int 
 def band_pairs(
     bands: Bands, ends: tuple[NDArray, NDArray], own: NDArray, other: NDArray
 ) -> tuple[steps.Pairs, steps.Pairs]:
-    """Step 6: both ends of every band with its middle, where it pulls them."""
+    """Step 6: pairs of both ends (B, 3) of every band with its middle, which is their target; weights (B,)."""
     middle = 0.5 * (ends[0] + ends[1])
     return (
         steps.Pairs(ends[0], middle, own, bands.parent.segments),
@@ -47,7 +47,10 @@ def moved(
     body: Body, frames: NDArray, measured: steps.Pairs, bands: Bands, ends: tuple[NDArray, NDArray], own: NDArray,
     other: NDArray, stay: float,
 ) -> NDArray:  # fmt: skip
-    """Step 7: frames (S, 12) after each limb's own motion, all found at once in the world."""
+    """Step 7: frames (S, 12) after each limb's own motion, all estimated independently in the world.
+
+    own, other (B,): weights of the bands; stay [m²]: see `absolute_orientation`.
+    """
     pairs = steps.joined(measured, *band_pairs(bands, ends, own, other))
     return move(frames, *absolute_orientation(*pairs, count=len(frames), stay=stay))
 
@@ -58,7 +61,7 @@ def moved_down(
 ) -> NDArray:  # fmt: skip
     """Step 7: frames (S, 12) after each limb's own motion on top of its parent's, from the root on (P2 3.3).
 
-    What hangs on a limb goes with it before its own motion is found, and is pulled to where the parent's joint is now.
+    The descendants of a limb move with it before their own motion is estimated, and are pulled to its moved joint.
     """
     parents, count = body.tree.parents, len(frames)
     level = np.zeros(count, np.int64)
@@ -76,7 +79,7 @@ def moved_down(
                 R[s], t[s] = R[parents[s]], t[parents[s]]
         frames = move(frames, R, t)
         measured, pull, hold = (p._replace(source=_along(p.source, R, t, p.limb)) for p in (measured, pull, hold))
-        pull = pull._replace(target=_along(pull.target, R, t, pull.limb))  # both of its ends go along
+        pull = pull._replace(target=_along(pull.target, R, t, pull.limb))  # both ends move
         joint = _along(joint, R, t, bands.parent.segments)
     return frames
 

@@ -1,10 +1,10 @@
-"""Pose of a closed 3D contour from its contour in an image, as Rosenhahn and Klette print it (P1 2.2).
+"""Pose of a closed 3D contour from its contour in an image, as published by Rosenhahn and Klette (P1 2.2).
 
 1. The contour is a Fourier series; its low-pass approximation comes first, then higher frequencies.
-2. Each of its points is paired with the nearest point of the image's contour (ICP), which stands for a ray of
-   projection, or, with the contour's direction there, for a plane (P1 2.1: 3D point to 2D line).
-3. The twist of the pose follows from the linear constraints of all pairs at once, and Rodrigues' formula makes a motion
-   of it; again until nothing moves.
+2. Each of its points is paired with the nearest point of the image's contour (ICP), which defines a projection ray or,
+   with the contour's direction there, a plane (P1 2.1: 3D point to 2D line).
+3. The twist of the pose solves the linear constraints of all pairs, and Rodrigues' formula converts it to a motion;
+   this is iterated to convergence.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from kinefit.geometry.lines import perpendiculars
 
 __all__ = ["ContourFit", "pose_of_contour"]
 
-_GOOD = 2.0  # [px] mean distance of contours that belong together; Zhang's D
-_SAMPLES = 200  # points of the curve
+_GOOD_DISTANCE_PX = 2.0  # mean distance of matching contours; Zhang's D
+_CURVE_POINTS = 200
 _MAX_CYCLES = 30  # of each approximation
-_MIN_STEP = 1e-5  # [m, rad] of a cycle that ends those of one approximation
+_MIN_STEP = 1e-5  # [m, rad] at which the cycles of one approximation end
 
 By = Literal["rays", "planes"]
 
 
 class ContourFit(NamedTuple):
-    """A pose: T_world_object (4, 4), root mean square distance of the contours [px], and the cycles it took."""
+    """A pose: T_world_object (4, 4), root mean square distance of the contours [px], and the number of cycles."""
 
     T_world_object: NDArray
     error: float
@@ -49,42 +49,43 @@ def pose_of_contour(
     by: By = "planes",
     reach: float = 80.0,
 ) -> ContourFit:
-    """Pose of a closed curve whose contour in one image is known.
+    """Estimate the pose of a closed curve from its contour in one image.
 
     Parameters
     ----------
     curve : FourierCurve in the object's frame.
-    T_world_object : (4, 4) to begin with.
-    contour : (4, N) u, v [px] and the unit normal there, as `images.silhouette.outline` gives them.
+    T_world_object : (4, 4) initial pose.
+    camera : Camera
+    contour : (4, N) u, v [px] and the unit normal there, from `images.silhouette.outline`.
     orders : highest frequencies of the low-pass approximations that come first; then the whole curve.
-    by : "rays", a point to the ray of its partner, or "planes", to the plane through the contour's tangent there, so
-        that contours glide along each other.
-    reach : float [px] beyond which no points are paired at first; then it follows from the distances themselves.
+    by : "rays", a point to the ray of its partner, or "planes", to the plane through the contour's tangent there, along
+        which it may slide.
+    reach : float [px], largest distance of a pair at first; later limits follow from the distances.
 
     Raises
     ------
     ObservationError
-        A contour that is none; no point of it near the curve.
+        An invalid contour, or one without a point near the curve.
     """
-    seen = np.asarray(contour, float)
-    if seen.ndim != 2 or len(seen) != 4 or seen.shape[1] < 6 or not np.isfinite(seen).all():
-        raise ObservationError(f"a contour of shape {seen.shape}", remedy="Give (4, N): u, v and the normal there.")
-    fixed = _lines(camera, seen)
+    target = np.asarray(contour, float)
+    if target.ndim != 2 or len(target) != 4 or target.shape[1] < 6 or not np.isfinite(target).all():
+        raise ObservationError(f"a contour of shape {target.shape}", remedy="Give (4, N): u, v and the normal there.")
+    fixed = _lines(camera, target)
     T, done = np.array(T_world_object, float), 0
     levels = [*(order for order in orders if order < curve.order), curve.order]
     for order in levels:
-        points, bound = curve.low_pass(order).samples(_SAMPLES), reach
+        points, bound = curve.low_pass(order).samples(_CURVE_POINTS), reach
         for _ in range(_MAX_CYCLES):
             x = se3.apply(T, points)
-            near, distance = _nearest(camera.project(x), seen[:2])
-            pairs = distance < _kept(distance, bound)
+            near, distance = _nearest(camera.project(x), target[:2])
+            pairs = distance < _max_pair_distance(distance, bound)
             if pairs.sum() < 6:
                 raise ObservationError("no contour is near the curve", remedy="Start nearer to it, or widen the reach.")
             delta = _twist(x[pairs], camera.centre_world, *(part[near[pairs]] for part in fixed), by=by)
             T, done = se3.exp(delta) @ T, done + 1
             if np.linalg.norm(delta) < _MIN_STEP:
                 break
-    _, distance = _nearest(camera.project(se3.apply(T, curve.samples(_SAMPLES))), seen[:2])
+    _, distance = _nearest(camera.project(se3.apply(T, curve.samples(_CURVE_POINTS))), target[:2])
     return ContourFit(T, float(np.sqrt(np.mean(distance**2))), done)
 
 
@@ -105,26 +106,26 @@ def _nearest(uv: NDArray, contour: NDArray) -> tuple[NDArray, NDArray]:
     return near, np.sqrt(square[np.arange(len(near)), near])
 
 
-def _kept(distance: NDArray, bound: float) -> float:
-    """[px] up to which pairs count: the mean and so many deviations of their distances, fewer while they are far apart.
+def _max_pair_distance(distance: NDArray, bound: float) -> float:
+    """Largest distance [px] of a pair: the mean plus some standard deviations, fewer for distant contours.
 
-    Zhang, Iterative point matching for registration of free-form curves and surfaces (IJCV 13, 1994), 2.4.
+    Source: Zhang, Iterative point matching for registration of free-form curves and surfaces (IJCV 13, 1994), 2.4.
     """
     near = distance[distance < bound]
     if not near.size:
         return bound
     mean, deviation = float(near.mean()), float(near.std())
     for times, deviations in ((1.0, 3.0), (3.0, 2.0), (6.0, 1.0)):
-        if mean < times * _GOOD:
+        if mean < times * _GOOD_DISTANCE_PX:
             return min(mean + deviations * deviation, bound)
     return bound
 
 
 def _twist(x: NDArray, centre: NDArray, rays: NDArray, normals: NDArray, *, by: By) -> NDArray:
-    """(6,) twist (v, ω) in the world that brings points (K, 3) to lines through the centre, or to planes.
+    """Twist (v, ω) (6,) in the world that moves points (K, 3) to lines through the centre, or to planes.
 
-    Weighed by the distance along the ray, so that what counts is the angle at the camera; about the points' middle, so
-    that turns and shifts are of one size.
+    Weighted by the inverse distance along the ray, which gives the angle at the camera. Solved about the points'
+    centre, so that rotations and shifts have similar magnitudes.
     """
     far = np.linalg.norm(x - centre, axis=1)
     if by == "planes":

@@ -1,9 +1,9 @@
-"""What to take for depth, alone or with anything else: P2's fusion with hard joints instead of elastic bands.
+"""The recommended method for depth, alone or with other sensors: P2's fusion with hard joints instead of elastic bands.
 
-Beside the method as printed (`recipes.voodoo`) it has: a tree of joints with limits; measured points to the surface
-along its normal, and the surface that the camera can see to what was measured at its pixels; robust weights that
-tighten; free space; parts that keep out of each other; a prediction with its uncertainty; a background that is learnt;
-limbs that are noticed when they are lost, and sought; the person's own size; a start with no pose given.
+Compared with the published method (`recipes.voodoo`) it has: a tree of joints with limits; measured points to the
+surface along its normal, and the visible surface to the measurement at its pixel; robust weights that tighten; free
+space; self-collisions; a prediction with its uncertainty; background subtraction; detection of lost limbs, and a search
+for them; the person's own size; initialisation without a given pose.
 """
 
 from __future__ import annotations
@@ -35,26 +35,27 @@ def depth_fusion(
     settings: TrackSettings | None = None,
     progress: Progress | None = None,
 ) -> Motion:
-    """Motion of a person from what any sensors saw, step by step.
+    """Estimate the motion of a person from the frames of any sensors.
 
     Parameters
     ----------
-    steps : of frames: what the sensors saw at each time; depth images, clouds, keypoints and markers in any mix.
-    body : Body with surfaces; of the catalogue, where `size` fits it to the person.
-    rig : Rig of all cameras, depth cameras among them.
+    steps : frames of all sensors at each time: depth images, clouds, keypoints and markers in any mix.
+    body : Body with surfaces; of the catalogue if `size` fits it to the person.
+    rig : Rig of all cameras, including depth cameras.
     rate : float [Hz] of the steps
     sigma : {sensor: standard deviation}, [m] of depth, clouds and markers, [px] of keypoints.
     up : vertical axis of the world
-    start : state of the first step; default: sought.
-    size : whether the person's size is found from the first depth images (some seconds of one core each).
+    start : state of the first step; default: estimated.
+    size : bool, whether to estimate the person's size from the first depth images (some seconds of one core each).
     settings : TrackSettings
+    progress : callable
 
     Raises
     ------
     ObservationError
         No steps, or steps without any frame.
     TrackingError
-        The body is found in none of the first steps.
+        The body is detected in none of the first steps.
     """
     recording = Recording.of_frames(
         steps, rig, rate=rate, sigma=sigma, up=up, start=None if start is None else (0, start)

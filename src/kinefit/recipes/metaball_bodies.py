@@ -1,9 +1,9 @@
-"""P4's fit of a body of metaballs to points on a surface: shape and skeleton in turn (sections 3.3 and 4).
+"""P4's fit of a body of metaballs to points on a surface: alternating shape and skeleton (sections 3.3 and 4).
 
-Each observation belongs to the limb that is closest at the start (3.3) and asks that this limb's field is 1/2 there
-(eq. 15). Observations weigh by their standard deviations (eq. 12), and Σ vᵀ P v over all types is minimised (eqs. 10
-and 13). Steps of the skeleton, shape held, alternate with steps of the shape, skeleton held (4.2).
-`method="joint"` is the product's own fit: distances to the surface, shape and skeleton at once.
+Each observation belongs to the limb that is closest at the start (3.3), whose field should be 1/2 there (eq. 15).
+Observations are weighted by their standard deviations (eq. 12), and Σ vᵀ P v over all types is minimised (eqs. 10 and
+13). Steps of the skeleton with a fixed shape alternate with steps of the shape with a fixed skeleton (4.2).
+`method="joint"` is kinefit's own fit: joint optimisation of the distances to the surface over shape and skeleton.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ class MetaballBody:
 
     Parameters
     ----------
-    body : Body with the radii found.
+    body : Body with the estimated radii.
     states : K poses
-    radii_std : {segment: (p,)} standard deviations of the radii's logarithms; alternating: with the poses held.
-    rms : float [m] distance of the points from the surface.
+    radii_std : {segment: (p,)} standard deviations of the radii's logarithms; alternating: with fixed poses.
+    rms : float [m] root mean square distance of the points from the surface.
     iterations : int, of both steps.
     """
 
@@ -68,30 +68,29 @@ def metaball_bodies(
     iterations: int = 30, tolerance: float = 1e-4, weights: bool = False, locked: ArrayLike | None = None,
     others: OtherRows | None = None, helps: MetaballHelps = AS_PRINTED,
 ) -> MetaballBody:  # fmt: skip
-    """Radii and poses from points on the surface in K frames.
+    """Estimate radii and poses from points on the surface in K frames.
 
     Parameters
     ----------
     body : Body whose segments have metaballs.
     points : K arrays (N, 3) [m] in the world.
-    states : K poses to begin with, near enough that each point is nearest to its own limb.
+    states : K initial poses, near enough that each point is nearest to its own limb.
     sigma : [m] standard deviation of every point, or K of them: for all points, (N,), or (N, 3, 3) covariances [m²],
-        of which the part along the surface's normal at the start counts (eq. 12).
-    method : "alternating" as printed; "joint" minimises distances to the surface over poses and radii at once.
+        of which the component along the surface's normal at the start is used (eq. 12).
+    method : "alternating" as published; "joint" minimises distances to the surface over poses and radii together.
     iterations : of the alternation: one damped step of every pose and one of every limb's shape.
-    tolerance : change of poses [rad, m] and of radii (logarithm) below which it ends.
-    weights : whether the fields' weights are sought too (eq. 14).
-    locked : (6 + D,) bool, degrees of freedom that stay.
+    tolerance : change of poses [rad, m] and of radii (logarithm) at which it ends.
+    weights : bool, whether the fields' weights are estimated too (eq. 14).
+    locked : (6 + D,) bool, fixed degrees of freedom.
     others : rows of other types of observation, for the skeleton (eqs. 11 to 13).
     helps : MetaballHelps, for "alternating".
 
     Raises
     ------
     ObservationError
-        As many frames of points as poses are wanted; points of which none is near the body; arguments that "joint"
-        does not take.
+        Different numbers of frames and poses; no point near the body; arguments that "joint" does not take.
     BodyError
-        A ball that collapses; balls that do not melt into one.
+        A ball that collapses; balls that do not blend into one.
     """
     limbs = [s for s in body.surfaces if isinstance(s, Metaballs)]
     if len(points) != len(states) or not points or not limbs:
@@ -102,7 +101,7 @@ def metaball_bodies(
             remedy = "Give one sigma alone, or use subject.fit.fit_subject."
             raise ObservationError("the joint fit takes no locked, others or helps", remedy=remedy)
         return _joint(body, points, states, sigma, weights)
-    held = None if locked is None else np.asarray(locked, bool)
+    fixed = None if locked is None else np.asarray(locked, bool)
     closest = [nearest(body, s, x, max_distance=helps.max_distance) for s, x in zip(states, points)]
     of, sigmas = [n.segment for n in closest], sigma_of_fields(limbs, sigma, [n.normal for n in closest])
     check_influence(body, points, states, of)
@@ -114,14 +113,14 @@ def metaball_bodies(
         for k, x in enumerate(points):
             fit = levenberg_marquardt(
                 now, poses[k], partial(pose_rows, now, k, x, of[k], sigmas[k], others, helps), loss=helps.loss,
-                limits=helps.limits, locked=held, damping=damping[k], max_iterations=1)  # fmt: skip
+                limits=helps.limits, locked=fixed, damping=damping[k], max_iterations=1)  # fmt: skip
             moved = max(moved, float(np.abs(poses[k].difference(fit.state)).max()))
             poses[k], damping[k] = fit.state, fit.damping
         frames = [now.tree.forward(s.T_world_root, s.angles)[0] for s in poses]
         for limb in limbs:
             x, s = points_of_limb(body, limb.segment, frames, points, of, sigmas)
             if len(x) < shape[limb.segment].size:
-                continue  # too little is observed of it: it stays as it is
+                continue  # too few observations: the limb keeps its shape
             values, std[body.tree.segments[limb.segment]] = fit_field(
                 limb, x, s, shape[limb.segment], weights=weights, girth=helps.girth, loss=helps.loss,
             )  # fmt: skip
@@ -130,7 +129,7 @@ def metaball_bodies(
         now = shaped_body(body, lambda limb: unmeshed(limb, shape[limb.segment], weights))
         if moved < tolerance:
             break
-        if helps.reassign:  # without new meshes: on the way fields may be too weak to have one
+        if helps.reassign:  # without new meshes: fields may temporarily be too weak for one
             of = [nearest(now, s, x, max_distance=helps.max_distance).segment for s, x in zip(poses, points)]
     found = shaped_body(body, lambda limb: grown(limb, shape[limb.segment], weights=weights))
     return MetaballBody(found, tuple(poses), std, rms_distance(found, poses, points), rounds)
@@ -139,7 +138,7 @@ def metaball_bodies(
 def _joint(
     body: Body, points: Sequence[NDArray], states: Sequence[BodyState], sigma: float, weights: bool
 ) -> MetaballBody:
-    """Distances to the surface, poses and shape at once, as takes have it."""
+    """Joint fit of poses and shape to distances from the surface, as for takes."""
     sensor, shape = PointCloudSensor("points", sigma, TrackSettings()), MetaballShape(body, weights=weights)
     clouds = [PointCloud("points", 0.1 * k, x) for k, x in enumerate(points)]
     steps = [[sensor.prepare(cloud, Scene(body, s, Rig(())))] for cloud, s in zip(clouds, states)]

@@ -1,6 +1,6 @@
-"""Segment-based articulated point matching, as Holstein and Li print it (P5): candidate tables, then the hierarchy.
+"""Segment-based articulated point matching as published by Holstein and Li (P5): candidate tables, then the hierarchy.
 
-For names that can be relied on take `kinefit.identification.frame.identify`; this is the published method.
+For reliable labels use `kinefit.identification.frame.identify`; this is the published method.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import shaped
 from kinefit.identification.model.model import MarkerModel
-from kinefit.recipes._sapm_steps import MANY, candidate_table, coarse_updates, errors, mean_distance, nearest, triples
+from kinefit.recipes import _sapm_steps as steps
+from kinefit.recipes._sapm_steps import candidate_table, coarse_updates, errors, mean_distance, nearest, triples
 
-CORRECTIONS = 3
-"""Matches of a segment that are tried until its children can be found (backward correction)."""
+MAX_CORRECTIONS = 3
+"""Matches of a segment that are tried until its children can be matched (backward correction)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,18 +40,18 @@ class SapmProblem:
         return list(self.model.segments[s])
 
     def places(self, s: int) -> NDArray:
-        """(k, 3) [m] of the model."""
+        """Positions (k, 3) [m] of the model's points."""
         return np.asarray(self.model.reference, float)[self.markers(s)]
 
 
 def sapm(model: MarkerModel, points: ArrayLike, *, epsilon: float = 0.1, beta: float = 0.8) -> NDArray:
-    """(M,) int: the point of each label, -1 where none was found (P5 3).
+    """Match points to labels: point (M,) int of each label, -1 for none (P5 3).
 
     Parameters
     ----------
     points : (N, 3) [m]
-    epsilon : tolerated distortion, as a share of a segment's mean distance; the paper takes 0.10 to 0.15 for people
-    beta : share of a segment's points that a match has more of; the paper takes 0.8 to 0.9
+    epsilon : tolerated distortion, as a share of a segment's mean distance; 0.10 to 0.15 for people in the paper
+    beta : share of a segment's points that a match must exceed; 0.8 to 0.9 in the paper
 
     Raises
     ------
@@ -62,7 +63,7 @@ def sapm(model: MarkerModel, points: ArrayLike, *, epsilon: float = 0.1, beta: f
     size = [len(m) for m in model.segments]
     root = max(range(len(size)), key=lambda s: (size[s], sum(s in (j.parent, j.child) for j in model.joints)))
     found, broken = identify_below(subject, root, -1, np.full(len(model), -1))
-    for s in broken:  # those of broken chains come last, without a pivot
+    for s in broken:  # segments of broken chains come last, without a pivot
         if (found[subject.markers(s)] < 0).any():
             found, _ = identify_below(subject, s, -1, found, alone=True)
     return found
@@ -71,15 +72,15 @@ def sapm(model: MarkerModel, points: ArrayLike, *, epsilon: float = 0.1, beta: f
 def identify_below(
     subject: SapmProblem, s: int, parent: int, found: NDArray, alone: bool = False
 ) -> tuple[NDArray, list[int]]:
-    """A segment and all below it, depth first; what was found, and the segments of chains that broke (P5 3.2).
+    """Match a segment and all below it, depth first: point (M,) of each label, and segments of broken chains (P5 3.2).
 
-    A match is confirmed by its children's; where one cannot be found, the segment's next match is tried, and the one
-    with most points wins.
+    The matches of its children confirm a match. If a child has none, the segment's next match is tried, and the match
+    with most points is kept.
     """
     links = [(j.parent + j.child - s) for j in subject.model.joints if s in (j.parent, j.child)]
     children = [c for c in links if c != parent and not (alone and (found[subject.markers(c)] >= 0).all())]
     best, best_broken, most = found, children, -1
-    for match in islice(segment_matches(subject, s, parent, found), CORRECTIONS):
+    for match in islice(segment_matches(subject, s, parent, found), MAX_CORRECTIONS):
         now, broken = found.copy(), []
         now[subject.markers(s)] = match
         for child in children:
@@ -93,7 +94,7 @@ def identify_below(
 
 
 def below(subject: SapmProblem, s: int, parent: int) -> list[int]:
-    """A segment and all that hang on it, seen from its parent, nearest first."""
+    """A segment and all its descendants, as seen from its parent, nearest first."""
     found, above = [s], {parent}
     for a in found:
         above.add(a)
@@ -103,7 +104,7 @@ def below(subject: SapmProblem, s: int, parent: int) -> list[int]:
 
 
 def segment_matches(subject: SapmProblem, s: int, parent: int, found: NDArray) -> Iterator[NDArray]:
-    """(k,) each: matches of a segment that hold (2) and (3), from its tables in order of priority (P5 Fig. 1)."""
+    """Matches (k,) of a segment that satisfy (2) and (3), from its tables in order of priority (P5 Fig. 1)."""
     x, epsilon, points = subject.places(s), subject.epsilon, subject.points
     length, count = mean_distance(x), len(x)
     known = found[subject.markers(s)]
@@ -113,7 +114,7 @@ def segment_matches(subject: SapmProblem, s: int, parent: int, found: NDArray) -
     for tables, model, at in pivots(subject, s, parent, found, free):
         tables = [t for t in tables if t.filled > subject.beta * len(model)]
         for table in sorted(tables, key=lambda t: -t.size):
-            update = coarse_updates if count >= MANY else triples
+            update = coarse_updates if count >= steps.MIN_COARSE_POINTS else triples
             for R, t in update(table, model, at, epsilon * length):
                 match = nearest(x, R, t, points, free, 2 * length * epsilon)
                 here = match >= 0
@@ -126,7 +127,7 @@ def segment_matches(subject: SapmProblem, s: int, parent: int, found: NDArray) -
 
 
 def pivots(subject: SapmProblem, s: int, parent: int, found: NDArray, free: NDArray) -> Iterator[tuple]:
-    """Candidate tables of a segment, for one pivot after the other: its joint if known, seen or virtual; else any."""
+    """Candidate tables of a segment for each pivot: its joint if matched or virtual, else any point (k, 3)."""
     x, points, epsilon = subject.places(s), subject.points, subject.epsilon
     known = found[subject.markers(s)]
     at = np.vstack([points, np.zeros(3)])

@@ -1,14 +1,13 @@
-"""Pose from silhouettes as Rosenhahn and Klette print it (P1 2.4): contour, occluding contour, pairs, rays, again.
+"""Pose from silhouettes as published by Rosenhahn and Klette (P1 2.4): contour, occluding contour, pairs, rays.
 
 1. The image's silhouette comes from a threshold on colour and the Laplace operator.
-2. The model's 3D silhouette comes from its projection in a virtual image, anew in every cycle; of its low frequencies
-   first, where that is asked for. Skins and bodies that morph are posed as such.
-3. Each point of it is paired with the nearest contour point (ICP), which stands for a ray of projection.
-4. The motor of the pose and the joint angles follow from (M X M̃) × L = 0 for all pairs at once; until nothing moves.
+2. The model's 3D silhouette comes from its projection in a rendered image, in every cycle; optionally from its low
+   frequencies first. Skins and morphing bodies are posed as such.
+3. Each of its points is paired with the nearest contour point (ICP), which defines a projection ray.
+4. The motor of the pose and the joint angles solve (M X M̃) × L = 0 for all pairs; this is iterated to convergence.
 
-The tracker (`Tracker` with `SilhouetteFrame`) beside it lets outlines glide along each other, looks which way
-they face, pairs in both directions, weighs outliers down, predicts, judges every segment, and fits any other sensor
-along.
+The tracker (`Tracker` with `SilhouetteFrame`) lets contours slide along each other, compares their normals, pairs in
+both directions, and has robust weights, prediction, the quality of every segment, and other sensors.
 """
 
 from __future__ import annotations
@@ -33,19 +32,19 @@ from kinefit.solvers.least_squares import gauss_newton
 
 __all__ = ["PaperFit", "contour_points", "pose_from_contours", "track_contours"]
 
-_PIXELS = 2.0  # [px] standard deviation of a contour point
-_ANY_WAY = np.pi  # pairs are the nearest points, whichever way outlines face there
+_CONTOUR_SIGMA_PX = 2.0  # of a contour point
+_MAX_NORMAL_ANGLE = np.pi  # pairs are the nearest points, whatever their normals
 
 
 @dataclass(frozen=True, eq=False)
 class PaperFit:
-    """One frame.
+    """Result of one frame.
 
     Parameters
     ----------
     state : BodyState
-    error : float [m] root mean square distance of the contour's points from their rays.
-    cycles : int
+    error : float [m] root mean square distance of the rim's points from their rays.
+    cycles : int, number of iterations
     """
 
     state: BodyState
@@ -54,7 +53,7 @@ class PaperFit:
 
 
 def contour_points(image: ArrayLike, low: ArrayLike, high: ArrayLike) -> NDArray:
-    """Contour (4, N) of what has a colour between low and high (3,): u, v [px]; the normals are not used, so zero."""
+    """Contour (4, N) of pixels with colours between low and high (3,): u, v [px]; normals are not used and zero."""
     _, contour = colour_silhouette(image, low, high)
     v, u = np.nonzero(contour)
     return np.stack([u, v, np.zeros(len(u)), np.zeros(len(u))]).astype(float)
@@ -71,18 +70,18 @@ def pose_from_contours(
     cycles: int = 30,
     tolerance: float = 1e-4,
 ) -> PaperFit:
-    """Pose and joint angles from the contours in some cameras (P1 2.4).
+    """Estimate pose and joint angles from the contours in some cameras (P1 2.4).
 
     Parameters
     ----------
-    model : Body, with its skin and its morphs, or what was made of it once.
-    state : BodyState to begin with, the last frame's.
-    contours : camera -> (4, N) as `contour_points` gives them, in the image of the calibration.
-    levels : how many approximations of the model's surface follow each other, low frequencies first, the surface
-        itself last (`Morphing.levels`); 1 is the surface alone.
-    reach : float [px] beyond which no points are paired.
-    cycles : int, at most, of each approximation.
-    tolerance : float, of a step (metres and radians) that ends the cycles of one.
+    model : Body with its skin and its morphs, or a `Morphing` of it.
+    state : BodyState, initial: the last frame's.
+    contours : camera -> (4, N) from `contour_points`, in the image of the calibration.
+    levels : number of approximations of the model's surface, low frequencies first, the surface itself last
+        (`Morphing.levels`); 1 is the surface alone.
+    reach : float [px], largest distance of a pair.
+    cycles : int, largest number of iterations for each approximation.
+    tolerance : float [m, rad] of a step at which they end.
 
     Raises
     ------
@@ -112,17 +111,17 @@ def pose_from_contours(
 def _rows(
     pose: MorphedPose, camera: Camera, contour: NDArray, finder: RimFinder, reach: float
 ) -> list[Rows | DofRows]:
-    """Two rows a pair: a point of the rim should lie on the ray of the contour's point."""
+    """Two rows for each pair: a point of the rim should lie on the ray of the contour's point."""
     rim = finder.find(pose.vertices, camera)
     rim = rim.chosen(~rim.inner)
-    i, k = outline_pairs(rim.outline, np.ascontiguousarray(contour), reach=reach, angle=_ANY_WAY, both=False)
+    i, k = outline_pairs(rim.outline, np.ascontiguousarray(contour), reach=reach, angle=_MAX_NORMAL_ANGLE, both=False)
     if not len(i):
         return []
     chosen = rim.chosen(i)
     x, ray = chosen.on(pose.vertices), camera.ray(contour[:2, k].T)
     share = np.stack([1.0 - chosen.share, chosen.share], axis=1)
     depth = x @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
-    sigma = np.maximum(depth, 1e-3) * _PIXELS / np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
+    sigma = np.maximum(depth, 1e-3) * _CONTOUR_SIGMA_PX / np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
     return [
         morphed_rows(pose, chosen.vertices, n, np.sum((camera.centre_world - x) * n, axis=1), share=share, sigma=sigma)
         for n in perpendiculars(ray)
@@ -138,7 +137,7 @@ def track_contours(
     *,
     levels: int = 1,
 ) -> Iterator[PaperFit]:
-    """Frame after frame, each from the last one's pose: images camera -> (H, W, 3), colours camera -> (low, high)."""
+    """Track a body frame by frame, each from the last pose; images: camera -> (H, W, 3), colours: -> (low, high)."""
     model, state = Morphing(body), start
     for seen in images:
         contours = {name: contour_points(image, *colours[name]) for name, image in seen.items()}

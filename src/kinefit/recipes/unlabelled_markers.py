@@ -1,7 +1,7 @@
-"""Track from markers without names: identify a frame, fit the body to it with no pose given, go on (P5 5, tracking).
+"""Track unlabelled markers: identify each frame, and fit the body to it without a given pose (P5 5, tracking).
 
-A tracker that is fed with `name_frame` starts by itself in the first frame that shows enough, and again wherever it
-is lost: nothing but the frame itself is looked at. `start_from_markers` is the same first step alone.
+A tracker with input from `name_frame` initialises in the first sufficient frame, and again when it is lost, because
+each frame is identified by itself. `start_from_markers` is the initialisation alone.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from kinefit.initialization.from_points import pose_from_points
 from kinefit.markers.subject import MarkerSubject
 from kinefit.observations import MarkerFrame
 
-OFF = 0.05
-"""[m] median distance of named markers beyond which a pose explains none of them."""
+MAX_START_ERROR = 0.05
+"""[m] median distance of labelled markers from the body in an initial pose."""
 
 
 def name_frame(
     model: MarkerModel, points: ArrayLike, time: float, *, marker_set: str, sensor: str = "markers",
     settings: IdentifySettings | None = None,
 ) -> MarkerFrame:
-    """One frame of unlabelled points as the tracker takes it; a label that is missing or not certain is NaN.
+    """Label one frame of unlabelled points for the tracker; missing or uncertain labels are NaN.
 
     Parameters
     ----------
     model : of the subject, see `learn_model`
     points : (N, 3) [m], finite, in any order
-    time : [s]
-    marker_set : of the body that is tracked, its labels without the subject's name: `MarkerSubject.marker_set`
+    time : float [s]
+    marker_set : of the tracked body, with labels without the subject's name: `MarkerSubject.marker_set`
 
     Raises
     ------
@@ -46,12 +46,12 @@ def name_frame(
 
 
 def start_from_markers(subject: MarkerSubject, model: MarkerModel, points: ArrayLike) -> BodyState:
-    """State of a subject's body from one frame of unlabelled points (N, 3) [m], with no pose given.
+    """Estimate the state of a subject's body from one frame of unlabelled points (N, 3) [m], without an initial pose.
 
     Parameters
     ----------
-    subject : body and places of its markers, see `fit_marker_subject`
-    model : the same subject's, see `learn_model`
+    subject : body and positions of its markers, see `fit_marker_subject`
+    model : of the same subject, see `learn_model`
 
     Raises
     ------
@@ -65,9 +65,9 @@ def start_from_markers(subject: MarkerSubject, model: MarkerModel, points: Array
     for k, name in enumerate(subject.points.names):
         if name in frame.names:
             x[k] = frame.positions[frame.names.index(name)]
-    state, off = pose_from_points(subject.body, subject.points, x, sigma=0.01)
-    if not off < OFF:
+    state, error = pose_from_points(subject.body, subject.points, x, sigma=0.01)
+    if not error < MAX_START_ERROR:
         raise TrackingError(
-            f"no pose fits the markers: they are {1e3 * off:.0f} mm off", remedy="Are model and body of one subject?"
+            f"no pose fits the markers: they are {1e3 * error:.0f} mm off", remedy="Are model and body of one subject?"
         )
     return state

@@ -1,8 +1,8 @@
 """VooDoo: sensors fused in one fit of a body whose joints are elastic bands.
 
 Knoop, Vacek, Dillmann, "Sensor fusion for 3D human body tracking with an articulated 3D body model", ICRA 2006 (P2).
-Every limb moves by its own closed form (Horn) to what is nearest to it, and bands hold the limbs together.
-`recipes.depth_fusion` is what to use; this is what it is compared with.
+Every limb moves by its own closed form (Horn) towards its nearest measurements, and bands connect the limbs.
+Use `recipes.depth_fusion`; this is the method that it is compared with.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from kinefit.recipes import _voodoo_motion as motion
 from kinefit.recipes import _voodoo_steps as steps
 from kinefit.recipes._voodoo_input import Sight, near_body, sight_of
 
-_MOST = 0.5  # [m] by which no limb moves within a frame
+_MAX_MOTION = 0.5  # [m] of a limb from frame to frame
 _HANDS = ("l_wrist", "r_wrist", "l_metacarpal_phalanx_3", "r_metacarpal_phalanx_3")
 _WEIGHTS = {"nose_tip": 30.0, **dict.fromkeys(_HANDS, 20.0)}  # of the face and the hands (P2 5)
 
@@ -35,28 +35,28 @@ class Settings:
     Parameters
     ----------
     weights : sensor or feature -> weight
-        A feature's counts before its sensor's; 1 for what is not named.
+        A feature's weight overrides its sensor's; default 1.
     body_box, limb_box : float
-        Enlargement of the box of the whole body, and of every limb's: how far a limb moves from frame to frame.
+        Enlargement of the box of the whole body, and of every limb: the motion from frame to frame.
     overlap : "shared", "exclusive", "adjacent" or "nearest", for points in the boxes of several limbs.
         "exclusive" is by depth in the boxes; "nearest", by distance to the surface, is not in the paper.
-    factor, minimum, maximum : sampling factor, and points of a limb at least and at most.
+    factor, minimum, maximum : sampling factor, and smallest and largest number of points of a limb.
     bound : float
-        Pairs that are farther apart do not count.
+        Largest distance of a pair.
     band : float
-        Weight of each band; by the rule "points" of all bands of a limb, as a share of its points' (of `minimum` ones).
+        Weight of each band; with the rule "points", of all bands of a limb relative to its points (at least `minimum`).
     band_rule : "each" or "points"
     floor : (4,) plane a, b, c, d with a x + b y + c z = d [m], optional
-        Free points less than `clear` [m] above it are none of the body's.
+        Free points less than `clear` [m] above it are ignored.
     down : bool
-        Whether a limb's motion is handed to all limbs that hang on it, from the root on, before theirs are found.
+        Whether a limb's motion is applied to its descendants, from the root on, before theirs are estimated.
     stay : float [m²]
-        See `absolute_orientation`: a limb seen by one feature does not spin about it.
+        See `absolute_orientation`: keeps a limb with one feature from rotating about it.
     quality : float [m²]
-        Mean squared distance that is good enough.
+        Mean squared distance at which the iteration ends.
     stop : float [m²], optional
-        ICP's own rule: no further step where the last one lowered the mean squared distance by less (P2 3.2).
-    steps : (int, int) at least and at most.
+        ICP's own rule: end if the last step lowered the mean squared distance by less (P2 3.2).
+    steps : (int, int) smallest and largest number.
     """
 
     weights: Mapping[str, float] = field(default_factory=lambda: dict(_WEIGHTS))
@@ -79,7 +79,7 @@ class Settings:
 
 
 class LimbFit(NamedTuple):
-    """One frame: frames (S, 12) of the limbs, the mean squared distance [m²] left, and the steps that were done."""
+    """Result of one frame: frames (S, 12) of the limbs, the mean squared distance [m²], and the number of steps."""
 
     frames: NDArray
     quality: float
@@ -89,11 +89,11 @@ class LimbFit(NamedTuple):
 def voodoo(
     stream: Iterable[Sequence[Frame]], body: Body, start: BodyState, rig: Rig, settings: Settings | None = None
 ) -> Iterator[LimbFit]:
-    """Track a body from frame to frame; each starts where the one before ended.
+    """Track a body frame by frame, each from the last result.
 
     Parameters
     ----------
-    stream : for each time, what the sensors saw.
+    stream : frames of the sensors for each time.
     body : Body with surfaces.
     start : BodyState of the body (its joints closed) just before the first frame.
     rig : Rig of the cameras named in the frames.
@@ -108,8 +108,8 @@ def voodoo(
 
 
 def fit_frame(body: Body, frames: NDArray, sight: Sight, boxes: boxing.Boxes, bands: Bands, s: Settings) -> LimbFit:
-    """Steps 1 to 7, until the quality is met, ICP gains no more, or the steps are spent (P2 3.2 and 4.2, fig. 3)."""
-    sight = near_body(sight, boxes, frames, s.body_box + _MOST, s.floor, s.clear)
+    """Fit frames (S, 12) by steps 1 to 7, until quality, ICP's rule or the largest number of steps (P2 4.2, fig. 3)."""
+    sight = near_body(sight, boxes, frames, s.body_box + _MAX_MOTION, s.floor, s.clear)
     (least, most), step, before = s.steps, 0, np.inf
     measured, ends = _measured(body, frames, sight, boxes, s), motion.band_ends(body, frames, bands)
     while True:
@@ -124,7 +124,7 @@ def fit_frame(body: Body, frames: NDArray, sight: Sight, boxes: boxing.Boxes, ba
 
 
 def _measured(body: Body, frames: NDArray, sight: Sight, boxes: boxing.Boxes, s: Settings) -> steps.Pairs:
-    """Steps 1 to 5: all that sensors saw, with the points of the limbs that it pulls at."""
+    """Steps 1 to 5: pairs of all measurements with points of the limbs."""
     return steps.joined(
         _points(body, frames, sight, boxes, s),
         steps.points_on_points(body, frames, sight.points, sight.places, sight.places_weight),
@@ -133,11 +133,11 @@ def _measured(body: Body, frames: NDArray, sight: Sight, boxes: boxing.Boxes, s:
 
 
 def _points(body: Body, frames: NDArray, sight: Sight, boxes: boxing.Boxes, s: Settings) -> steps.Pairs:
-    """Steps 1 to 4 for free points, those on the body, and those on one limb, which skip what is known of them."""
+    """Steps 1 to 4 for free points, those on the body, and those on one limb, without steps that are known."""
     near = boxing.in_body_box(sight.free, boxes, frames, s.body_box)
     x = np.concatenate([sight.free[near], sight.on_body])
     weight = np.concatenate([sight.free_weight[near], sight.on_body_weight])
-    if s.overlap == "nearest":  # as near to a surface as its box is enlarged lies within its box
+    if s.overlap == "nearest":  # the enlarged box contains all points within limb_box of the surface
         member = steps.nearest_limb(body, frames, x, min(s.bound, s.limb_box))
     else:
         member = boxing.assigned(boxing.depth_in_boxes(x, boxes, frames, s.limb_box), boxes, s.overlap)

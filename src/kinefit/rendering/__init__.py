@@ -1,9 +1,8 @@
-"""What a camera would see of triangles: depth and which triangle, for every pixel.
+"""Render triangles in a camera: depth and triangle of every pixel, by a z-buffer.
 
-A z-buffer: every triangle is drawn row by row, the nearer one stays. Depth is z along the optical axis, exact at the
-pixel's centre (1/z is linear in the image). Triangles that cross the near plane are cut there; neighbouring triangles
-leave no gap. Lenses bend corners, not edges: with distortion an edge is the chord of its bent image, so large triangles
-should be divided (`subdivided`).
+Depth is z along the optical axis, exact at the pixel's centre (1/z is linear in the image). Triangles are clipped at
+the near plane; adjacent triangles leave no gap. Distortion is applied to corners only: an edge is rendered as the chord
+of its distorted image, so large triangles should be subdivided (`subdivided`).
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import _kernels as kernels
 
-NEAR = 0.05  # [m] nothing closer is drawn; nearer than any sensor measures, far enough for 1/z to stay small
+MIN_Z = 0.05  # [m] nothing closer is rendered; nearer than any sensor measures, far enough for 1/z to stay small
 
 _IDENTITY = np.eye(4)
 _IDENTITY.flags.writeable = False
@@ -29,16 +28,16 @@ _IDENTITY.flags.writeable = False
 
 @dataclass(frozen=True, eq=False)
 class Raster:
-    """What a camera sees.
+    """A rendered image.
 
     Parameters
     ----------
     depth : (H, W) float32 [m]
-        Along the optical axis; inf where nothing is.
+        Along the optical axis; inf for the background.
     face : (H, W) int32
-        Index of the triangle seen; -1 where nothing is.
+        Index of the visible triangle; -1 for the background.
     labels : (T,) int, optional
-        A label of every triangle: for a body its segment.
+        Label of every triangle: for a body its segment.
     """
 
     depth: NDArray
@@ -47,25 +46,30 @@ class Raster:
 
     @cached_property
     def segment(self) -> NDArray:
-        """(H, W) int16 label of the triangle seen; -1 where nothing is."""
+        """Label (H, W) int16 of the visible triangle, -1 for the background; raises ObservationError without labels."""
         if self.labels is None:
             raise ObservationError("the triangles drawn have no labels", remedy="Use render_body, or give labels.")
         return np.append(self.labels, -1).astype(np.int16)[self.face]
 
     @property
     def seen(self) -> NDArray:
-        """(H, W) bool, something is there."""
+        """Whether a pixel (H, W) shows a triangle; bool."""
         return self.face >= 0
 
 
 class Canvas:
-    """Room for drawing one image after another of the same size without making new arrays.
+    """Renders images of one size into reused buffers.
 
-    What `draw` returns is overwritten by the next call; copy what must last.
+    The next call overwrites the result of `draw`; copy it to keep it.
 
     Parameters
     ----------
     size : (width, height) [px]
+
+    Raises
+    ------
+    ObservationError
+        A size below 1 pixel.
     """
 
     def __init__(self, size: tuple[int, int]) -> None:
@@ -78,21 +82,21 @@ class Canvas:
 
     @property
     def face(self) -> NDArray:
-        """(H, W) int32, the triangles drawn last."""
+        """Triangle (H, W) int32 of every pixel of the last image, -1 for the background."""
         return self._face
 
     def draw(
-        self, vertices_camera: ArrayLike, faces: ArrayLike, lens: ArrayLike, *, near: float = NEAR, cull: bool = False
+        self, vertices_camera: ArrayLike, faces: ArrayLike, lens: ArrayLike, *, near: float = MIN_Z, cull: bool = False
     ) -> Raster:
-        """As `rasterise`, into this canvas."""
+        """Render vertices (V, 3) [m] and faces (T, 3) into this canvas; see `rasterise`."""
         return self._draw(vertices_camera, _IDENTITY, faces, np.append(lens, near), cull, None)
 
     def draw_for(
         self, camera: Camera, vertices_world: ArrayLike, faces: ArrayLike, *, cull: bool = False,
         labels: NDArray | None = None,
     ) -> Raster:
-        """Draw triangles of the world (V, 3) [m] as `camera`, of this canvas' size, sees them."""
-        lens = np.append(lens_of(camera), NEAR)
+        """Render vertices (V, 3) [m] of the world and faces (T, 3) in a camera of this canvas's size."""
+        lens = np.append(lens_of(camera), MIN_Z)
         if _is_straight(camera):
             return self._draw(vertices_world, camera.T_camera_world, faces, lens, cull, labels)
         return self._draw(in_camera(camera, vertices_world), _IDENTITY, faces, lens, cull, labels)
@@ -107,23 +111,23 @@ class Canvas:
         check_shape(f, ("T", 3), "faces")
         if self._room.shape[1] < len(x):
             self._room = np.empty((6, len(x)))
-        given = [array.view() for array in (x, T_camera_frame, f.astype(np.int32, copy=False))]
-        for array in given:  # read-only or not, they are of one type to the compiler
+        inputs = [array.view() for array in (x, T_camera_frame, f.astype(np.int32, copy=False))]
+        for array in inputs:  # one type for the compiler, read-only or not
             array.flags.writeable = False
-        told = kernels.rasterise(*given, *lens, bool(cull), self._room, self._depth, self._face)
-        if told == kernels.NOT_FINITE:
+        status = kernels.rasterise(*inputs, *lens, bool(cull), self._room, self._depth, self._face)
+        if status == kernels.NOT_FINITE:
             problem = "vertices to be drawn are not finite"
             raise ObservationError(problem, remedy="Leave out states that are not finite.")
-        if told == kernels.NO_VERTEX:
+        if status == kernels.NO_VERTEX:
             raise ObservationError("faces of vertices that are not there", remedy="Count vertices from 0.")
         return Raster(self._depth, self._face, labels)
 
 
 def rasterise(
-    vertices_camera: ArrayLike, faces: ArrayLike, lens: ArrayLike, size: tuple[int, int], *, near: float = NEAR,
+    vertices_camera: ArrayLike, faces: ArrayLike, lens: ArrayLike, size: tuple[int, int], *, near: float = MIN_Z,
     cull: bool = False,
 ) -> Raster:  # fmt: skip
-    """Depth and triangle seen by a pinhole camera.
+    """Render triangles in a pinhole camera: depth and triangle of every pixel.
 
     Parameters
     ----------
@@ -134,20 +138,20 @@ def rasterise(
         Focal lengths fx, fy and principal point cx, cy; the centre of the first pixel is (0, 0).
     size : (width, height) [px]
     near : float [m]
-        Nothing nearer than this is drawn.
+        Nothing nearer is rendered.
     cull : bool
-        Leave out triangles seen from behind (their corners clockwise): half the work for closed surfaces.
+        Whether to skip triangles seen from behind (clockwise corners): half the work for closed surfaces.
 
     Raises
     ------
     ObservationError
-        Vertices that are not finite, faces of vertices that are not there, a size or lens that cannot be.
+        Vertices that are not finite, indices out of range, an invalid size or lens.
     """
     return Canvas(size).draw(vertices_camera, faces, lens, near=near, cull=cull)
 
 
 def lens_of(camera: Camera) -> NDArray:
-    """(4,) [px] focal lengths fx, fy and principal point cx, cy of a camera."""
+    """Focal lengths fx, fy and principal point cx, cy (4,) [px] of a camera."""
     return camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
 
 
@@ -155,21 +159,21 @@ def render_body(
     body: Body, state: BodyState, camera: Camera, *, mesh: BodyMesh | None = None, scale: float = 1.0,
     canvas: Canvas | None = None,
 ) -> Raster:
-    """Depth, triangle and segment of a body as a camera sees it.
+    """Render a body in a camera: depth, triangle and segment of every pixel.
 
     Parameters
     ----------
     mesh : BodyMesh, optional
-        Of the body, made once; default: `body_mesh(body)`.
+        Of the body, to reuse it; default: `body_mesh(body)`.
     scale : float
-        Of the image: 0.25 draws it at a quarter of its width and height.
+        Of the image: 0.25 renders it at a quarter of its width and height.
     canvas : Canvas, optional
-        Reused, of the scaled image's size; the raster is then overwritten by the next call with it.
+        To reuse, of the scaled image's size; the next call with it overwrites the raster.
 
     Returns
     -------
     Raster
-        `segment` tells the segment of every pixel.
+        `segment` is the segment of every pixel.
 
     Raises
     ------
@@ -189,9 +193,9 @@ def render_body(
 
 @lru_cache(maxsize=32)
 def scaled(camera: Camera, scale: float) -> Camera:
-    """The same camera with an image `scale` times as wide and high, rounded to whole pixels.
+    """The camera with its image's width and height multiplied by a number `scale`, rounded to whole pixels.
 
-    Asked again for the same camera it gives the same one, which keeps its tables.
+    Cached, so that the scaled camera keeps its tables. Raises an ObservationError for a scale that is not positive.
     """
     if not 0.0 < scale < np.inf:
         raise ObservationError(f"an image scaled by {scale}", remedy="Give a positive number.")
@@ -202,10 +206,10 @@ def scaled(camera: Camera, scale: float) -> Camera:
 
 
 def in_camera(camera: Camera, x_world: ArrayLike) -> NDArray:
-    """Points (N, 3) [m] of the world where a pinhole with the camera's K would see them in the same pixel and depth.
+    """Transform points (N, 3) [m] of the world to where a pinhole with the camera's K has the same pixel and depth.
 
-    Without distortion and skew these are the points in the camera's frame. With them x and y are moved at the same z;
-    points that no ray reaches, or behind the camera, stay where they are.
+    Without distortion and skew these are the points in the camera's frame. Otherwise x and y are changed at the same z;
+    points that do not project are not changed.
     """
     R, t = camera.T_camera_world[:3, :3], camera.T_camera_world[:3, 3]
     x_world = np.asarray(x_world, float)
@@ -221,14 +225,14 @@ def in_camera(camera: Camera, x_world: ArrayLike) -> NDArray:
 
 
 def _is_straight(camera: Camera) -> bool:
-    """A pinhole, without distortion and skew."""
+    """Whether a camera is a pinhole without distortion and skew."""
     return camera.model == "radtan" and camera.matrix[0, 1] == 0.0 and not camera.distortion.any()
 
 
 def subdivided(vertices: NDArray, faces: NDArray, longest: float) -> tuple[NDArray, NDArray]:
-    """Triangles cut in four until no edge is longer than `longest` [m]: vertices (V', 3), faces (T', 3).
+    """Subdivide triangles (V, 3) [m], (T, 3) by four until no edge is longer than `longest` [m]: (V', 3), (T', 3).
 
-    All are cut alike, so that neighbours keep meeting in whole edges.
+    All are divided equally, so that neighbours share whole edges.
     """
     while True:
         edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])

@@ -14,7 +14,7 @@ import numpy as np
 from kinefit._jit import jit
 
 OK, NOT_FINITE, NO_VERTEX = 0, 1, 2
-_FLAT = 1e-12  # [px²] twice the area below which a triangle has no inside; float64 carries no more of a pixel's square
+_MIN_DOUBLE_AREA = 1e-12  # [px²] twice the area of a triangle; smaller ones are below the precision of float64
 
 
 @jit
@@ -25,10 +25,10 @@ def _clamped(v, size):
 
 
 @jit
-def _seen(u0, v0, u1, v1, u2, v2, width, height, cull):
-    """Whether a triangle of pixels may cover one: not turned away, not flat, not between the centres or beside all."""
+def _may_cover(u0, v0, u1, v1, u2, v2, width, height, cull):
+    """Whether a triangle may cover a pixel: it faces the camera, is not degenerate, and overlaps a pixel's centre."""
     area = (u1 - u0) * (v2 - v0) - (u2 - u0) * (v1 - v0)
-    if not (abs(area) > _FLAT and abs(area) < math.inf) or (cull and area > 0.0):
+    if not (abs(area) > _MIN_DOUBLE_AREA and abs(area) < math.inf) or (cull and area > 0.0):
         return False
     low, high = v0 if v0 < v1 else v1, v0 if v0 > v1 else v1
     if _clamped(low if low < v2 else v2, height) == _clamped(high if high > v2 else v2, height):
@@ -39,7 +39,7 @@ def _seen(u0, v0, u1, v1, u2, v2, width, height, cull):
 
 @jit
 def _triangle(depth, face, name, u0, v0, w0, u1, v1, w1, u2, v2, w2):
-    """Draw one triangle of pixels (u, v) and inverse depths w [1/m]."""
+    """Render one triangle with pixels (u, v) and inverse depths w [1/m]."""
     if v1 < v0:  # corners from the top down
         u0, v0, w0, u1, v1, w1 = u1, v1, w1, u0, v0, w0
     if v2 < v1:
@@ -52,7 +52,7 @@ def _triangle(depth, face, name, u0, v0, w0, u1, v1, w1, u2, v2, w2):
     a = ((w1 - w0) * (v2 - v0) - (w2 - w0) * (v1 - v0)) * inverse
     b = ((w2 - w0) * (u1 - u0) - (w1 - w0) * (u2 - u0)) * inverse
     c = w0 - a * u0 - b * v0
-    low, high = w0 if w0 < w1 else w1, w0 if w0 > w1 else w1  # rounding leads slivers astray
+    low, high = w0 if w0 < w1 else w1, w0 if w0 > w1 else w1  # bounds against rounding in slivers
     low, high = low if low < w2 else w2, high if high > w2 else w2
     width = depth.shape[1]
     slope, upper, lower = (u2 - u0) / (v2 - v0), (u1 - u0) / (v1 - v0), (u2 - u1) / (v2 - v1)
@@ -72,7 +72,7 @@ def _triangle(depth, face, name, u0, v0, w0, u1, v1, w1, u2, v2, w2):
 
 @jit
 def _clipped(depth, face, name, x, y, z, corners, fx, fy, cx, cy, near, cull):
-    """Draw what of the triangle of three corners lies beyond z = near: a triangle or a quadrilateral."""
+    """Render the part of a triangle with z >= near: a triangle or a quadrilateral."""
     u, v, w = np.empty(4), np.empty(4), np.empty(4)
     count = 0
     for k in range(3):
@@ -81,7 +81,7 @@ def _clipped(depth, face, name, x, y, z, corners, fx, fy, cx, cy, near, cull):
             u[count], v[count], w[count] = fx * x[p] / z[p] + cx, fy * y[p] / z[p] + cy, 1.0 / z[p]
             count += 1
         if (z[p] >= near) != (z[q] >= near):
-            r, s = (p, q) if z[p] < z[q] else (q, p)  # from the nearer end, whichever triangle asks
+            r, s = (p, q) if z[p] < z[q] else (q, p)  # from the nearer end, the same for both triangles
             t = (near - z[r]) / (z[s] - z[r])
             u[count] = fx * (x[r] + t * (x[s] - x[r])) / near + cx
             v[count] = fy * (y[r] + t * (y[s] - y[r])) / near + cy
@@ -89,17 +89,17 @@ def _clipped(depth, face, name, x, y, z, corners, fx, fy, cx, cy, near, cull):
             count += 1
     height, width = depth.shape
     for k in range(2, count):
-        if _seen(u[0], v[0], u[k - 1], v[k - 1], u[k], v[k], width, height, cull):
+        if _may_cover(u[0], v[0], u[k - 1], v[k - 1], u[k], v[k], width, height, cull):
             _triangle(depth, face, name, u[0], v[0], w[0], u[k - 1], v[k - 1], w[k - 1], u[k], v[k], w[k])
 
 
 @jit
 def rasterise(vertices, T, faces, fx, fy, cx, cy, near, cull, room, depth, face):
-    """Depth and face of every pixel; returns OK, NOT_FINITE or NO_VERTEX (then what was drawn is worth nothing).
+    """Write depth and face of every pixel; returns OK, NOT_FINITE or NO_VERTEX (the image is then invalid).
 
     vertices (V, 3) [m]; T (4, 4) takes them to the camera's frame (z forward, y down); faces (T, 3); room (6, V or
-    more) is for the work; depth (H, W) float32 [m] and face (H, W) int32 are overwritten: inf and -1 where nothing is.
-    With `cull`, triangles that turn their back (clockwise as seen from the camera) are left out.
+    more): work space; depth (H, W) float32 [m] and face (H, W) int32: overwritten, inf and -1 for the background.
+    cull: whether to skip triangles seen from behind (clockwise in the image).
     """
     x, y, z, u, v, w = room[0], room[1], room[2], room[3], room[4], room[5]
     count, size = len(vertices), 0.0
@@ -123,7 +123,7 @@ def rasterise(vertices, T, faces, fx, fy, cx, cy, near, cull, room, depth, face)
         if i < 0 or j < 0 or k < 0 or i >= count or j >= count or k >= count:
             return NO_VERTEX
         if w[i] > 0.0 and w[j] > 0.0 and w[k] > 0.0:
-            if _seen(u[i], v[i], u[j], v[j], u[k], v[k], width, height, cull):
+            if _may_cover(u[i], v[i], u[j], v[j], u[k], v[k], width, height, cull):
                 _triangle(depth, face, t, u[i], v[i], w[i], u[j], v[j], w[j], u[k], v[k], w[k])
         elif w[i] > 0.0 or w[j] > 0.0 or w[k] > 0.0:
             _clipped(depth, face, t, x, y, z, faces[t], fx, fy, cx, cy, near, cull)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, MeshSurface, TaperedCylinder
 from kinefit.bodies.surfaces import Metaballs
-from kinefit.bodies.surfaces.skins.body_skin import FOLLOWED, BodySkin, body_skins
+from kinefit.bodies.surfaces.skins.body_skin import MAX_OWNERS, BodySkin, body_skins
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh, strongest
 from kinefit.rendering.colours import side_colour
 from kinefit.rendering.person_skin import person_skin
@@ -52,7 +52,7 @@ def body_mesh(body: Body, *, cylinders: bool = False) -> TubeMesh:
     parts += [_rigid(body, c) if isinstance(c, MeshSurface) else _tube(body, c) for c in others]
     parts += [] if covered else [_metaballs(body, net) for net in body_skins(body)]
     if not parts:
-        columns = ((3, float), (3, float), (3, np.uint8), (3, int), (FOLLOWED, int), (FOLLOWED, float))
+        columns = ((3, float), (3, float), (3, np.uint8), (3, int), (MAX_OWNERS, int), (MAX_OWNERS, float))
         return TubeMesh(*(np.zeros((0, count), kind) for count, kind in columns))
     first = np.cumsum([0] + [len(p.vertices) for p in parts])
     return TubeMesh(
@@ -67,7 +67,7 @@ def body_mesh(body: Body, *, cylinders: bool = False) -> TubeMesh:
 
 def _four(columns: NDArray) -> NDArray:
     """(V, 4) with zeros for what is missing."""
-    return np.pad(columns, ((0, 0), (0, FOLLOWED - columns.shape[1])))
+    return np.pad(columns, ((0, 0), (0, MAX_OWNERS - columns.shape[1])))
 
 
 def is_last(body: Body, c: TaperedCylinder) -> bool:
@@ -98,7 +98,7 @@ def _rigid(body: Body, mesh: MeshSurface) -> TubeMesh:
 
 
 def _skinned(body: Body, skin: SkinnedMesh) -> TubeMesh:
-    which, weights = strongest(skin.weights, FOLLOWED)
+    which, weights = strongest(skin.weights, MAX_OWNERS)
     colours = np.array([side_colour(name) for name in body.tree.segments], np.uint8)
     return TubeMesh(
         vertices=skin.vertices, normals=_normals(skin.vertices, skin.faces), colours=colours[skin.segment],
@@ -109,7 +109,7 @@ def _skinned(body: Body, skin: SkinnedMesh) -> TubeMesh:
 def _metaballs(body: Body, skin: BodySkin) -> TubeMesh:
     there, faces, every = skin.mesh()
     vertices = skin.at_rest(there, every)
-    order = np.argsort(-every, axis=1)[:, :FOLLOWED]
+    order = np.argsort(-every, axis=1)[:, :MAX_OWNERS]
     weights = np.take_along_axis(every, order, axis=1)
     colours = np.array([side_colour(name) for name in body.tree.segments], np.uint8)
     return TubeMesh(

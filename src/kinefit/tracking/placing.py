@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
-from kinefit.diagnostics.sensor_fit import PRIOR, SURE
+from kinefit.diagnostics.sensor_fit import MISFIT_SIGMAS, POSE_SIGMAS
 from kinefit.frame.routing import Sensors
 from kinefit.geometry import se3
 from kinefit.observations import DepthFrame
@@ -50,7 +50,7 @@ class PlacedCamera:
     @property
     def usable(self) -> bool:
         """Whether it is so near to where it is stated that a person's surface tells where it belongs."""
-        return self.turn < SURE * PRIOR[1]
+        return self.turn < MISFIT_SIGMAS * POSE_SIGMAS[1]
 
 
 def placed_cameras(recording: Recording, subject: Subject, settings: TrackSettings) -> dict[str, PlacedCamera]:
@@ -81,7 +81,7 @@ def _placed(T_camera_world: NDArray, looks: Sequence[tuple[DepthFrame, Scene]], 
     centre = np.mean([_joints(scene).mean(axis=0) for _, scene in looks], axis=0)
     A = np.eye(6)
     A[:3, 3:] = se3.hat(centre - origin)
-    information = A.T @ np.diag(np.repeat(PRIOR, 3) ** -2.0) @ A
+    information = A.T @ np.diag(np.repeat(POSE_SIGMAS, 3) ** -2.0) @ A
 
     def seen_from(twist: NDArray) -> Registration:
         """What the camera measured about the person, if it belongs at a twist."""
@@ -94,7 +94,7 @@ def _placed(T_camera_world: NDArray, looks: Sequence[tuple[DepthFrame, Scene]], 
     stated = seen_from(np.zeros(7))
     best = stated.settled(np.zeros(7), FINE)
     if _size(best)[0] > _MAX_TURN or _size(best)[1] > _MAX_SHIFT:
-        best = Ends(stated, tuple(stated.settled(s, (*FAR, *FINE)) for s in starts(origin, centre, PRIOR))).best
+        best = Ends(stated, tuple(stated.settled(s, (*FAR, *FINE)) for s in starts(origin, centre, POSE_SIGMAS))).best
     nearer = stated.above(np.zeros(7), best)
     axis = np.pi * T_camera_world[2, :3]
     way = centre - origin

@@ -1,4 +1,4 @@
-"""The Anny body: a realistic person of any sex, age, height, build and proportions."""
+"""The Anny body: a parametric person of any sex, age, height, build and proportions."""
 
 from kinefit.bodies.anny.model import NAMES, AnnyFamily, AnnyModel, fetched_anny, load_anny
 

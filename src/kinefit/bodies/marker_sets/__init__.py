@@ -1,10 +1,10 @@
-"""The catalogue of marker sets: labels, segments, places on a body; and the rule by which labels agree."""
+"""The catalogue of marker sets: labels, segments, positions on a body; and the matching of labels."""
 
 from kinefit.bodies.marker_sets.labels import bare, matched, subject_of
 from kinefit.bodies.marker_sets.placement import MarkerPlacement, find_placement, known_set, placed_set_names, placement
 from kinefit.bodies.marker_sets.sets import (
-    FEWEST,
     GIVE,
+    MIN_COMMON_LABELS,
     RANGE,
     MarkerSet,
     SetSegment,
@@ -14,8 +14,8 @@ from kinefit.bodies.marker_sets.sets import (
 )
 
 __all__ = [
-    "FEWEST",
     "GIVE",
+    "MIN_COMMON_LABELS",
     "RANGE",
     "MarkerPlacement",
     "MarkerSet",

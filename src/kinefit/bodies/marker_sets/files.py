@@ -1,4 +1,4 @@
-"""Files of marker sets (TOML): segments for identification, places on a body for fitting, read and checked."""
+"""Read and check files of marker sets (TOML): segments for identification, positions on a body for fitting."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from kinefit.bodies.marker_sets.labels import plain
 from kinefit.errors import FileError, ObservationError, choices
 
 GIVE = 0.004
-"""[m] give of a marker where the set does not tell."""
+"""[m] default give of a marker: its deviation from a rigid segment."""
 
 RANGE = 1.5
-"""[rad] range of a joint where the set does not tell."""
+"""[rad] default range of a joint."""
 
 LANDMARK_SPREAD = 0.015
-"""[m] of a marker on a bony landmark, along each axis: a palpated landmark varies by about 1 cm between examiners
-(della Croce et al. 2005), and a marker's own radius and the body's average shape come on top."""
+"""[m] sigma of a marker on a bony landmark, along each axis: a palpated landmark varies by about 1 cm between examiners
+(della Croce et al. 2005); the marker's radius and the body's average shape add to that."""
 
 _Vector = tuple[float, float, float]
 _REMEDY = (
@@ -33,7 +33,7 @@ _REMEDY = (
 
 
 class MarkerSegmentRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """`[[segment]]`: labels that move as one, and the joint to its parent."""
+    """`[[segment]]`: labels that move rigidly, and the joint to its parent."""
 
     name: str
     markers: list[str]
@@ -45,7 +45,7 @@ class MarkerSegmentRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
 
 
 class MarkerRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A row of `[markers]`: on a landmark of the body, or on a segment at a place."""
+    """A row of `[markers]`: on a landmark of the body, or at a position on a segment."""
 
     landmark: str | None = None
     segment: str | None = None
@@ -55,7 +55,7 @@ class MarkerRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class SetRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A file: `[places]` and `[[segment]]` are of identification, `[markers]` are of fitting a body."""
+    """A file: `[places]` and `[[segment]]` for identification, `[markers]` for fitting a body."""
 
     name: str
     segment: list[MarkerSegmentRecord] = []
@@ -67,22 +67,23 @@ class SetRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     computed: list[str] = []
 
     def mirror(self, label: str) -> str | None:
-        """The label of the left side that a label of the right one has; None for one without."""
+        """Label of the left side for a label of the right side; None if there is none."""
         if label in self.single:
             return None
         return next((left + label[len(right) :] for right, left in self.sides if label.startswith(right)), None)
 
 
 def set_names(*, placed: bool = False) -> tuple[str, ...]:
-    """Names of the sets of the catalogue; `placed`: of those that tell where markers sit on a body."""
+    """Names of the sets of the catalogue; `placed`: of those with positions of markers on a body."""
     return tuple(sorted(n for n, record in catalogue().items() if record.markers or not placed))
 
 
 def find_record(name_or_file: str | PathLike[str], known: tuple[str, ...]) -> tuple[SetRecord, str]:
-    """A set of the catalogue by any of its names, or of a file (.toml), and where it came from.
+    """Find a set of the catalogue by any of its names, or read one from a file (.toml); and its source.
 
     Parameters
     ----------
+    name_or_file : str or path
     known : names to choose from, for the message
 
     Raises
@@ -90,7 +91,7 @@ def find_record(name_or_file: str | PathLike[str], known: tuple[str, ...]) -> tu
     ObservationError
         Unknown name.
     FileError
-        A file that cannot be read, or is no marker set: with the place.
+        A file that cannot be read, or is no marker set.
     """
     name = str(name_or_file)
     if name.lower().endswith(".toml"):
@@ -114,12 +115,12 @@ def catalogue() -> dict[str, SetRecord]:
 
 
 def parsed(text: str, source: str) -> SetRecord:
-    """A file's text as a record.
+    """Parse the text of a marker set's file.
 
     Raises
     ------
     FileError
-        No TOML, or no marker set: with the place.
+        No TOML, or no marker set.
     """
     try:
         record = msgspec.convert(parse_toml(text, source), SetRecord)

@@ -1,4 +1,4 @@
-"""The one rule for labels of markers: which name of a set, or of a body, a label of a recording stands for."""
+"""Match the marker labels of a recording to the names of a set or a body."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ def bare(label: str) -> str:
 
 
 def subject_of(label: str) -> str:
-    """A label's prefix, the subject's name: "Anna:LASI" -> "Anna"; "" where there is none."""
+    """A label's prefix, the subject's name: "Anna:LASI" -> "Anna"; "" for none."""
     return label.rpartition(":")[0].strip()
 
 
 def plain(label: str) -> str:
-    """What a label is compared by: without its prefix, letter case, and the marks . _ - and blank."""
+    """Normalise a label for comparison: no prefix, lower case, without . _ - and blanks."""
     return "".join(c for c in bare(label).lower() if c not in "._- ")
 
 
 def matched(labels: Iterable[str], names: Iterable[str]) -> tuple[str | None, ...]:
-    """The name that each label stands for; None where there is none.
+    """Match each label to a name; None without a match.
 
-    A name that is the label without its prefix comes first. Else prefix, letter case, and the marks . _ - and blank do
-    not count, unless two names differ by them alone.
+    A name equal to the label without its prefix is preferred. Else prefix, letter case, . _ - and blanks are ignored,
+    unless two names differ only by them.
     """
     names = tuple(names)
     exact, loose = set(names), dict[str, str | None]()

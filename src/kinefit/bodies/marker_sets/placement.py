@@ -1,4 +1,4 @@
-"""Where the markers of a set sit on a body, before a subject's own offsets are known."""
+"""Positions of a set's markers on a body, before a subject's own offsets are estimated."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.marker_sets.files import LANDMARK_SPREAD, MarkerRecord, SetRecord, find_record, set_names
 from kinefit.bodies.marker_sets.labels import matched
-from kinefit.bodies.marker_sets.sets import FEWEST
+from kinefit.bodies.marker_sets.sets import MIN_COMMON_LABELS
 from kinefit.errors import FileError, ObservationError
 
 
@@ -24,7 +24,7 @@ class MarkerPlacement:
     ----------
     name : str of the set.
     points : PointSet of K markers.
-    spread : (K,) [m] standard deviation of a marker about its place, along each axis.
+    spread : (K,) [m] standard deviation of each marker's position, along each axis.
     """
 
     name: str
@@ -39,21 +39,21 @@ class MarkerPlacement:
 
 
 def placed_set_names() -> tuple[str, ...]:
-    """Names of the marker sets of the catalogue that tell where their markers sit on a body."""
+    """Names of the marker sets of the catalogue with positions of markers on a body."""
     return set_names(placed=True)
 
 
 def placement(body: Body, marker_set: str | PathLike[str] | MarkerPlacement) -> MarkerPlacement:
-    """A marker set on a body: one of the catalogue, one of the body's own, a file of your own (.toml), or as given.
+    """Place a marker set on a body: a set of the body or of the catalogue, a file (.toml), or a placement as given.
 
-    Markers on segments or landmarks that the body does not have are left out.
+    Markers on segments or landmarks that the body does not have are dropped.
 
     Raises
     ------
     ObservationError
         Unknown name.
     FileError
-        A file that cannot be read, or is no marker set, or one that tells no places on a body.
+        A file that cannot be read, is no marker set, or has no positions on a body.
     """
     if isinstance(marker_set, MarkerPlacement):
         return marker_set
@@ -73,14 +73,14 @@ def placement(body: Body, marker_set: str | PathLike[str] | MarkerPlacement) -> 
 def find_placement(
     body: Body, labels: Iterable[str], marker_set: str | PathLike[str] | MarkerPlacement | None = None
 ) -> MarkerPlacement:
-    """The markers of a set that are among the labels; default: of the set that shares most labels.
+    """Select the markers of a set that match the labels; default: of the set with most matches.
 
-    `labels.matched` decides which label stands for which marker. A `MarkerPlacement` is a set, too.
+    `labels.matched` matches labels to markers. A `MarkerPlacement` is a set too.
 
     Raises
     ------
     ObservationError
-        Fewer than four labels are known to the set, or to any.
+        Fewer than four labels match the set, or any set.
     """
     labels = tuple(labels)
     names = [marker_set] if marker_set else [*body.marker_sets, *placed_set_names()]
@@ -96,7 +96,7 @@ def find_placement(
             f"{len(labels)} trajectories without names",
             remedy="Identify first: `kinefit markers identify TAKE SUBJECT.json`, or `fit --subject SUBJECT.json`.",
         )
-    if best is None or len(best.points) < FEWEST:
+    if best is None or len(best.points) < MIN_COMMON_LABELS:
         count = 0 if best is None else len(best.points)
         given = marker_set.name if isinstance(marker_set, MarkerPlacement) else marker_set
         sets = f"set '{given}'" if given else "any marker set"
@@ -109,14 +109,14 @@ def find_placement(
 
 
 def known_set(body: Body, labels: Iterable[str], marker_set: str | None = None) -> str:
-    """The body's own marker set that labels belong to; "" where they are landmarks of the body.
+    """Name of the body's marker set with most of the labels; "" if these are landmarks of the body.
 
     Raises
     ------
     ObservationError
-        The body knows none of them.
+        No label matches.
     BodyError
-        It has no such set.
+        The body has no such set.
     """
     labels = tuple(labels)
     sets = {marker_set: body.markers(marker_set)} if marker_set else {**body.marker_sets, "": body.landmarks}
@@ -135,7 +135,7 @@ def _listed(labels: tuple[str, ...]) -> str:
 
 
 def placed(body: Body, record: SetRecord) -> MarkerPlacement:
-    """A set's record on a body; markers on segments or landmarks that the body does not have are left out."""
+    """Place a set's record on a body; markers on segments or landmarks that the body does not have are dropped."""
     names, segments, at, spread = [], [], [], []
     for label, entry in record.markers.items():
         for name, mirrored in _with_image(label, record):

@@ -1,4 +1,4 @@
-"""Marker sets for identification: which labels belong to which segment, where on a body, and where segments meet."""
+"""Marker sets for identification: segments with their labels and joints, and the labels' positions on a body."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ from kinefit.bodies.marker_sets.labels import matched, plain
 from kinefit.errors import FileError, choices
 
 __all__ = [
-    "FEWEST", "GIVE", "RANGE", "MarkerSet", "SetSegment", "find_marker_set", "load_marker_set", "marker_set_names",
+    "GIVE", "MIN_COMMON_LABELS", "RANGE", "MarkerSet", "SetSegment", "find_marker_set", "load_marker_set",
+    "marker_set_names",
 ]  # fmt: skip
 
-FEWEST = 4
-"""Labels that a set and a take must have in common, and half of the take's or the set's: fewer agree by chance."""
+MIN_COMMON_LABELS = 4
+"""Of a set and a take, and half of the take's or the set's labels: fewer agree by chance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,13 +39,13 @@ class SetSegment:
     ----------
     name : str
     parent : int, index of its parent, -1 for the root
-    markers : labels that move with it; a label may be in two segments that meet there
-    joint : (3,) [m] where it meets its parent, in the frame of the set's places; None for the root
+    markers : labels that move with it; a label near a joint may be in both segments
+    joint : (3,) [m] joint to its parent, in the frame of the set's positions; None for the root
     give : (k,) [m]
-        How far each of its markers strays from the segment along one axis in vigorous motion: skin, soft parts. The
-        catalogue's are medians over seven takes of six subjects; a distance gives by both of its ends.
+        Deviation of each marker from the rigid segment along one axis in vigorous motion, by skin and soft tissue. The
+        catalogue has medians over seven takes of six subjects; in a distance, those of both ends add up.
     range : float [rad]
-        How far its joint turns at most, about any one axis, in vigorous motion.
+        Largest rotation of its joint about any one axis in vigorous motion.
     """
 
     name: str
@@ -57,18 +58,18 @@ class SetSegment:
 
 @dataclass(frozen=True, eq=False)
 class MarkerSet:
-    """Labels, their places on an average body, segments.
+    """A marker set: labels, their positions on an average body, segments.
 
     Parameters
     ----------
     name : str
     labels : (K,)
     places : (K, 3) [m]
-        On a body of 1.75 m standing upright with hanging arms, palms forward: x forward, y up, z to the right, from
-        the middle of the hips. NaN where the set leaves it to the laboratory (markers of a cluster).
+        Positions on a body of 1.75 m standing upright with hanging arms, palms forward: x forward, y up, z to the
+        right, from the middle of the hips. NaN where the set does not define them (markers of a cluster).
     segments : SetSegment, parents before children
     also : other names of the set
-    computed : labels that are no markers but computed points (joint centres); they are left out everywhere
+    computed : labels of computed points (joint centres), which are never used as markers
     """
 
     name: str
@@ -79,9 +80,9 @@ class MarkerSet:
     computed: tuple[str, ...] = ()
 
     def match(self, labels: Iterable[str]) -> tuple[str | None, ...]:
-        """What the set calls each of a take's labels; None where it does not know it.
+        """Match each of a take's labels to a label of the set; None without a match.
 
-        See `labels.matched`: the subject's prefix, letter case, and the marks . _ - and blank do not count.
+        See `labels.matched`: the subject's prefix, letter case, . _ - and blanks are ignored.
         """
         return matched(labels, self.labels)
 
@@ -96,26 +97,26 @@ def marker_set_names() -> tuple[str, ...]:
 
 
 def load_marker_set(name_or_file: str | PathLike[str]) -> MarkerSet:
-    """A marker set of the catalogue ("CMU_41", "HDM05_41", "PIG" ...), or from a TOML file.
+    """Load a marker set of the catalogue ("CMU_41", "HDM05_41", "PIG" ...), or from a TOML file.
 
     Raises
     ------
     ObservationError
         Unknown name.
     FileError
-        A file that cannot be read, or is no marker set with segments: with the place.
+        A file that cannot be read, or is no marker set with segments.
     """
     record, source = find_record(name_or_file, marker_set_names())
     return _sets()[source] if source in _sets() else _built(record, source)
 
 
 def find_marker_set(labels: Iterable[str]) -> MarkerSet | None:
-    """The set of the catalogue that knows most of the labels; None if none knows half of them, or half of its own.
+    """Find the set of the catalogue that matches most labels; None if none matches half of them, or half of its own.
 
-    Of sets that know as many, the one with fewest other labels.
+    Of sets with equal matches, the one with fewest other labels.
     """
     labels = tuple(labels)
-    best, best_key = None, (FEWEST - 1, 0)
+    best, best_key = None, (MIN_COMMON_LABELS - 1, 0)
     for found in _sets().values():
         known = sum(n is not None or found.is_computed(label) for label, n in zip(labels, found.match(labels)))
         key = (known, -len(found.labels))
@@ -130,7 +131,7 @@ def _sets() -> dict[str, MarkerSet]:
 
 
 def _built(record: SetRecord, source: str) -> MarkerSet:
-    """The set with its left side: labels of `sides`, segments that end in _r; z changes its sign."""
+    """Build a set with its mirrored left side: labels of `sides`, segments that end in _r; z changes its sign."""
     mirror = record.mirror
     segments: list[SetSegment] = []
     names: list[str] = []
@@ -143,7 +144,7 @@ def _built(record: SetRecord, source: str) -> MarkerSet:
             give |= {m: g for label, g in give.items() if (m := mirror(label)) and m not in give}
             own = [n for label in s.markers for n in (label, mirror(label)) if n] if side == "" else s.markers
             own = [m for label in s.markers if (m := mirror(label))] if side == "_l" else list(dict.fromkeys(own))
-            problem, remedy = _wrong(s, name, parent, own, names)
+            problem, remedy = _fault(s, name, parent, own, names)
             if problem:
                 raise FileError(problem, file=source, place=f"segment '{name}'", remedy=remedy)
             joint = None if s.joint is None else np.array(s.joint) * ([1, 1, -1] if side == "_l" else 1)
@@ -170,7 +171,7 @@ def _built(record: SetRecord, source: str) -> MarkerSet:
     return MarkerSet(record.name, labels, places, tuple(segments), tuple(record.also), tuple(dict.fromkeys(computed)))
 
 
-def _wrong(s: MarkerSegmentRecord, name: str, parent: str | None, own: list[str], names: list[str]) -> tuple[str, str]:
+def _fault(s: MarkerSegmentRecord, name: str, parent: str | None, own: list[str], names: list[str]) -> tuple[str, str]:
     """What is wrong with a segment, and what to do; empty if nothing is."""
     if name in names:
         return "a segment is there twice", "Give each its own name."
@@ -180,8 +181,8 @@ def _wrong(s: MarkerSegmentRecord, name: str, parent: str | None, own: list[str]
         return choices("segment", parent, names), "Parents come first."
     if not s.markers or len(set(own)) < len(own):
         return "no markers, or one twice", "List each label once."
-    if strangers := sorted(set(s.loose) - set(s.markers)):
-        return f"`loose` names {', '.join(strangers)}, which it does not have", "Give labels of its markers."
+    if unknown := sorted(set(s.loose) - set(s.markers)):
+        return f"`loose` names {', '.join(unknown)}, which it does not have", "Give labels of its markers."
     numbers = [s.give, s.range, *s.loose.values(), *(s.joint or ())]
     if not np.isfinite(numbers).all() or min(s.give, s.range, *s.loose.values()) <= 0:
         return "joint, give or range is not finite, or not positive", "Give metres, and degrees for the range."

@@ -1,4 +1,4 @@
-"""`[[morph]]` in a body file: what changes the body with its angles, read and written."""
+"""Read and write `[[morph]]` of a body file: shape changes that depend on angles."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from kinefit.geometry import se3
 
 Vector = tuple[float, float, float]
 KINDS = {
-    "joint": ({"segment"}, {"shift", "turn"}),  # what each needs, and may have
+    "joint": ({"segment"}, {"shift", "turn"}),  # required and optional keys
     "local": ({"segment", "centre", "radii", "shift"}, {"on", "moves"}),
     "surface": ({"segment", "surface"}, set[str]()),
     "global": ({"target"}, {"unit"}),
@@ -29,7 +29,7 @@ _COMMON = {"kind", "angle", "start", "end", "weight", "beyond"}
 
 
 class MorphRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One `[[morph]]`: what changes, and the angle that steers it from `start` to `end`."""
+    """One `[[morph]]`: the change, and the angle that controls it from `start` to `end`."""
 
     kind: str
     angle: str
@@ -50,11 +50,11 @@ class MorphRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     @property
     def place(self) -> str:
-        """Where it stands, in messages."""
+        """Description of the entry, for messages."""
         return f"{self.kind} morph of {self.segment or self.target or 'the surface'} by {self.angle}"
 
     def mirrored(self, name: Callable[[str], str]) -> MorphRecord:
-        """The same on the other side of the body's plane of symmetry; `name` makes a left name of a right one."""
+        """Mirror the morph to the other side of the body; `name` maps a right name to the left one."""
         flip = lambda v, signs: None if v is None else tuple(s * x for s, x in zip(signs, v))
         surface = self.surface
         other = [r.mirrored() for r in surface] if isinstance(surface, list) else surface and surface.mirrored()
@@ -71,7 +71,7 @@ class MorphRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 def with_images(records: Sequence[MorphRecord], name: Callable[[str], str]) -> list[MorphRecord]:
-    """Records, and the mirror image of each that is steered by an angle of the right; not of global ones."""
+    """Records, and the mirror image of each that depends on an angle of the right side; not of global ones."""
     out = []
     for record in records:
         out.append(record)
@@ -81,13 +81,13 @@ def with_images(records: Sequence[MorphRecord], name: Callable[[str], str]) -> l
 
 
 def morphs_of(records: Sequence[MorphRecord], tree: KinematicTree, source: str) -> tuple[Operator, ...]:
-    """Operators of a body.
+    """Operators of a body from its records.
 
     Raises
     ------
     BodyError
-        An unknown kind, angle, segment or weighting, keys that the kind does not have or lacks, two equal angles, a
-        target that cannot be read: with file and place.
+        An unknown kind, angle, segment or weighting, unknown or missing keys, two equal angles, a target that cannot be
+        read.
     """
     out = []
     for record in records:
@@ -140,15 +140,15 @@ def _check_keys(record: MorphRecord) -> None:
     if missing := needed - given:
         problem = f"a {record.kind} morph without {', '.join(sorted(missing))}"
         raise BodyError(problem, remedy="See docs/morphing.md for its keys.")
-    if odd := given - needed - allowed:
-        problem = f"a {record.kind} morph has no {', '.join(sorted(odd))}"
+    if unexpected := given - needed - allowed:
+        problem = f"a {record.kind} morph has no {', '.join(sorted(unexpected))}"
         raise BodyError(problem, remedy=f"It has {', '.join(sorted(needed | allowed))}.")
     if record.kind == "joint" and not given & {"shift", "turn"}:
         raise BodyError("a joint morph that moves nothing", remedy="Give `shift` [m], `turn` [deg] or both.")
 
 
 def _joint_motion(record: MorphRecord, segment: str, tree: KinematicTree, steering: Steering) -> JointMotion:
-    """A shift [m] and a turn [deg] about the joint; one screw."""
+    """One screw motion from a shift [m] and a rotation [deg] about the joint."""
     s = tree.segment(segment)
     if s == 0:
         raise BodyError("the root has no joint that could move", remedy="Name a segment beyond a joint.")
@@ -158,12 +158,12 @@ def _joint_motion(record: MorphRecord, segment: str, tree: KinematicTree, steeri
 
 
 def format_morphs(morphs: Sequence[Operator], tree: KinematicTree) -> str:
-    """`[[morph]]` entries of a body file that say the same; empty without morphs.
+    """Format morphs as `[[morph]]` entries of a body file; empty without morphs.
 
     Raises
     ------
     BodyError
-        A weighting by a function, a target of nodes or meshes: what a file can only name.
+        A weighting by a function, or a target of nodes or meshes, which a file cannot contain.
     """
     return "\n".join(_entry(morph, tree) for morph in morphs)
 

@@ -1,7 +1,7 @@
-"""Bodies in a pose with all that changes with it (P1 3): their skin, joints that move and surfaces that morph.
+"""Pose a body with its skin, moving joints and morphing surfaces (P1 3).
 
-What a body's operators are is told in `operators`; here they act. The derivative of every node includes what a morph
-adds to it, which P1 holds constant.
+`operators` defines a body's operators, this module applies them. The derivative of every node includes that of its
+morphs, which P1 treats as constant.
 """
 
 from __future__ import annotations
@@ -44,24 +44,24 @@ __all__ = [
     "radial_basis",
 ]
 
-_AROUND, _ALONG = 20, 6  # of cylinders, as `body_mesh` takes them
-_FADED = 1e-6  # of a radial basis function: less of a bulge moves no node
-_PASSES = 40  # of the coarsest low-pass approximation of a mesh
+_AROUND, _ALONG = 20, 6  # nodes of cylinders, see `body_mesh`
+_MIN_BULGE = 1e-6  # of a radial basis function: smaller values are ignored
+_MAX_LOW_PASSES = 40  # for the coarsest approximation of a mesh
 
 
 class Morphing:
-    """A body with its skin and the operators that change both.
+    """A body with its skin, and the operators that change both.
 
     Parameters
     ----------
     body : Body
     mesh : nodes in the root frame at rest with their segments; default: the body's skin, or else its surfaces.
     operators : any number of each kind; default: the body's own.
-    parameters : (V, n) of the nodes, where local morphs are given in the surface's own parameters.
+    parameters : (V, n) of the nodes, for local morphs in the surface's parameters.
 
     Attributes
     ----------
-    mesh : what is posed, its `faces`, `segment` and `face_segment`.
+    mesh : the posed mesh, with `faces`, `segment` and `face_segment`.
     skin : SkinnedMesh, the same.
 
     Raises
@@ -96,16 +96,16 @@ class Morphing:
         for o, s in motions:
             self._motions.setdefault(s, []).append(o)
         self._fields: list[tuple[Steering, NDArray]] = []
-        self._bulges: list[tuple[LocalMorph, NDArray, int]] = []  # that move: placed at rest, shares of nodes, segment
+        self._bulges: list[tuple[LocalMorph, NDArray, int]] = []  # moving ones: at rest, shares of nodes, segment
         for o in self.operators:
             if isinstance(o, GlobalMorph):
                 self._fields.append((o.steering, o.field(x, parameters)))
             elif isinstance(o, SegmentMorph):
                 self._fields.append((o.steering, self._segment_field(o)))
             elif isinstance(o, LocalMorph) and o.moves:
-                self._bulges.append((o.placed(tree), self._share(o)[:, 0], tree.segment(str(o.segment))))
+                self._bulges.append((o.placed(tree), self._node_shares(o)[:, 0], tree.segment(str(o.segment))))
             elif isinstance(o, LocalMorph):
-                self._fields.append((o.steering, self._share(o) * o.placed(tree).field(x, parameters)))
+                self._fields.append((o.steering, self._node_shares(o) * o.placed(tree).field(x, parameters)))
         above = np.eye(len(tree.segments), dtype=bool)
         for s in range(1, len(tree.segments)):
             above[s] |= above[tree.parents[s]]
@@ -113,30 +113,30 @@ class Morphing:
 
     @property
     def is_rigid(self) -> bool:
-        """Every node is owned by one segment, and nothing morphs: `Rows` can say all of it."""
+        """Whether every node belongs to one segment and nothing morphs, so that `Rows` describe the body."""
         return not self.operators and self.skin.owners.shape[1] == 1
 
     @property
     def moves_joints(self) -> bool:
-        """Some joint moves with an angle, so that frames are not those of the tree alone."""
+        """Whether a joint moves with an angle, so that frames differ from those of the tree alone."""
         return bool(self._motions)
 
     def levels(self, count: int) -> list[Morphing]:
-        """Low-pass approximations from coarse to fine, the last one itself: what a fit goes through (P1 2.4).
+        """Low-pass approximations from coarse to fine, the last one unchanged, for a coarse-to-fine fit (P1 2.4).
 
-        Of surfaces that are Fourier series by their orders, of all other meshes by `low_pass`.
+        Fourier surfaces are approximated by lower orders, all other meshes by `low_pass`.
         """
         skin, out = self.skin, []
         own = () if self.mesh is self.body.skin else self.body.surfaces
         sizes = [len(triangles(s, _AROUND, _ALONG)[0]) for s in own]
-        if sum(sizes) != len(skin.nodes):  # a mesh of other points than the surfaces'
+        if sum(sizes) != len(skin.nodes):  # the mesh is not that of the surfaces
             own = ()
         series = {
             sum(sizes[:k]): s.low_pass_shifts(count)
             for k, s in enumerate(own) if isinstance(s, MeshSurface) and s.series is not None
         }  # fmt: skip
         for k in range(count - 1):
-            passes = round(_PASSES * ((count - 1 - k) / (count - 1)) ** 2)
+            passes = round(_MAX_LOW_PASSES * ((count - 1 - k) / (count - 1)) ** 2)
             shift = low_pass(skin.vertices, skin.faces, passes) - skin.vertices
             for first, shifts in series.items():
                 shift[first : first + len(shifts[k])] = shifts[k]
@@ -145,15 +145,15 @@ class Morphing:
             out.append(smooth)
         return [*out, self]
 
-    def _share(self, morph: LocalMorph) -> NDArray:
-        """(V, 1) how much of each node belongs to segments that a local morph acts on."""
+    def _node_shares(self, morph: LocalMorph) -> NDArray:
+        """Share (V, 1) of each node that belongs to segments of a local morph."""
         if not morph.on:
             return np.ones((len(self.skin.nodes), 1))
         chosen = np.isin(self.skin.owners, [self.body.tree.segment(name) for name in morph.on])
         return np.sum(self.skin.weights * chosen, 1, keepdims=True)
 
     def _segment_field(self, morph: SegmentMorph) -> NDArray:
-        """(V, 3) from a segment's surfaces to their second shape; for the mesh of the body's own surfaces."""
+        """Shifts (V, 3) [m] from a segment's surfaces to their second shape, for the mesh of the body's surfaces."""
         here, body = self.body.tree.segment(morph.segment), self.body
         place, remedy = f"morph of {morph.segment}", "Give one for each of the segment's surfaces, of the same kind."
         meshes = [triangles(s, _AROUND, _ALONG) for s in body.surfaces]
@@ -173,26 +173,26 @@ class Morphing:
             first += len(v)
         return out
 
-    def _steered(self, steering: Steering, state: BodyState) -> tuple[int, float, float]:
+    def _weight_of(self, steering: Steering, state: BodyState) -> tuple[int, float, float]:
         d = self.body.tree.coordinate(steering.coordinate)
         return (d, *steering.at(float(state.angles[d])))
 
-    def _moved(self, state: BodyState) -> tuple[NDArray, NDArray, list[tuple[int, int, NDArray]]]:
-        """Frames (S, 12) and screws (D, 6) with the joints moved, and by how much angles move joints."""
+    def _with_joint_motions(self, state: BodyState) -> tuple[NDArray, NDArray, list[tuple[int, int, NDArray]]]:
+        """Frames (S, 12) and screws (D, 6) with the joints moved, and the derivatives of joint motions by angles."""
         tree, centre = self.body.tree, state.T_world_root[:3, 3]
         plain, screws = tree.forward(state.T_world_root, state.angles)
         drives: list[tuple[int, int, NDArray]] = []
         if not self._motions:
             return plain, screws, drives
         Ts = se3.transform(plain[:, :9].reshape(-1, 3, 3), plain[:, 9:])
-        moved: dict[int, NDArray] = {}  # by segments behind a joint that moves
+        moved: dict[int, NDArray] = {}  # of segments below a moving joint
         to_centre, back = se3.transform(np.eye(3), -centre), se3.transform(np.eye(3), centre)
         for s in range(1, len(Ts)):
             p = int(tree.parents[s])
             if p in moved:
                 moved[s] = moved[p]
             for motion in self._motions.get(s, ()):
-                d, weight, slope = self._steered(motion.steering, state)
+                d, weight, slope = self._weight_of(motion.steering, state)
                 at = moved.get(s, np.eye(4)) @ Ts[p]
                 if slope:
                     drives.append((6 + d, s, slope * (se3.adjoint(to_centre @ at) @ motion.twist)))
@@ -208,27 +208,27 @@ class Morphing:
 
     def pose(self, state: BodyState) -> MorphedPose:
         """Frames, screws and nodes of a state."""
-        frames, screws, drives = self._moved(state)
+        frames, screws, drives = self._with_joint_motions(state)
         shift: NDArray | None = None
         slopes: dict[int, NDArray] = {}
         for steering, field in self._fields:
-            d, weight, slope = self._steered(steering, state)
+            d, weight, slope = self._weight_of(steering, state)
             if weight:
                 shift = weight * field if shift is None else shift + weight * field
             if slope:
                 slopes[6 + d] = slopes[6 + d] + slope * field if 6 + d in slopes else slope * field
         out = MorphedPose(self, state, frames, screws, shift, slopes, tuple(drives))
         for bulge, share, segment in self._bulges:
-            out = self._bulged(out, bulge, share, segment)
+            out = self._with_bulge(out, bulge, share, segment)
         return out
 
-    def _bulged(self, pose: MorphedPose, bulge: LocalMorph, share: NDArray, bone: int) -> MorphedPose:
-        """The pose with a bulge that goes along with a bone: r(y) of nodes y as the bone sees them in this pose.
+    def _with_bulge(self, pose: MorphedPose, bulge: LocalMorph, share: NDArray, bone: int) -> MorphedPose:
+        """Add a bulge that moves with a bone: r(y) of nodes y in the bone's frame in this pose.
 
-        Of a node x at rest on segment n, y = T_bone⁻¹ T_n x, and s r(y) R_nᵀ R_bone d is added to x. An angle that
-        moves n against the bone with (v, ω) changes y by R_boneᵀ (v + ω × T_n x), and turns R_nᵀ R_bone d by −ω.
+        A node x at rest on segment n has y = T_bone⁻¹ T_n x, and is shifted by s r(y) R_nᵀ R_bone d. An angle that
+        moves n relative to the bone with (v, ω) changes y by R_boneᵀ (v + ω × T_n x), and rotates R_nᵀ R_bone d by −ω.
         """
-        d, weight, slope = self._steered(bulge.steering, pose.state)
+        d, weight, slope = self._weight_of(bulge.steering, pose.state)
         if not weight and not slope:
             return pose
         skin, f = self.skin, pose.frames
@@ -244,7 +244,7 @@ class Morphing:
         none = np.zeros_like(field)
         slopes[6 + d] = slopes.get(6 + d, none) + slope * field
         of_bone, centre = pose.segment_jacobian(bone), pose.state.T_world_root[:3, 3]
-        for n in np.unique(owner[r > _FADED]):
+        for n in np.unique(owner[r > _MIN_BULGE]):
             apart, own = pose.segment_jacobian(int(n)) - of_bone, owner == n
             for k in np.flatnonzero(np.abs(apart).max(axis=0) > 0.0):
                 v, w = apart[:3, k], apart[3:, k]
@@ -265,9 +265,9 @@ class MorphedPose:
     morphing : Morphing
     state : BodyState
     frames : (S, 12) and screws : (D, 6), like those of `KinematicTree.forward`.
-    shift : (V, 3) [m] of the nodes at rest, by all morphs; None where nothing acts.
-    slopes : degree of freedom -> (V, 3) change of the nodes at rest by it.
-    drives : (degree of freedom, segment, (6,) twist about the root's origin): what moves joints with angles.
+    shift : (V, 3) [m] of the nodes at rest, by all morphs; None without an active morph.
+    slopes : degree of freedom -> (V, 3) derivative of the nodes at rest by it.
+    drives : (degree of freedom, segment, (6,) twist about the root's origin): derivatives of joint motions by angles.
     """
 
     morphing: Morphing
@@ -279,24 +279,24 @@ class MorphedPose:
     drives: tuple[tuple[int, int, NDArray], ...]
 
     def positions(self, points: PointSet) -> NDArray:
-        """(K, 3) [m] points of segments in the world, on joints that move."""
+        """Points (K, 3) [m] in the world, with the motions of joints."""
         f = self.frames[points.segments]
         x = self.morphing.body.points_rest(points)
         return np.asarray((f[:, :9].reshape(-1, 3, 3) @ x[:, :, None])[..., 0] + f[:, 9:])
 
     @property
     def nodes(self) -> NDArray:
-        """(V, 3) [m] of the mesh, morphed, in the root frame at rest."""
+        """Morphed nodes (V, 3) [m] of the mesh in the root frame at rest."""
         x = self.morphing.mesh.vertices
         return x.copy() if self.shift is None else x + self.shift
 
     @cached_property
     def vertices(self) -> NDArray:
-        """(V, 3) [m] nodes in the world."""
+        """Nodes (V, 3) [m] in the world."""
         return self.morphing.skin.posed(self.frames, self.shift)
 
     def segment_jacobian(self, segment: int) -> NDArray:
-        """J_s (6, 6 + D), as `KinematicTree.segment_jacobian`, with the joints' motions by their angles."""
+        """Jacobian J_s (6, 6 + D), as `KinematicTree.segment_jacobian`, with the motions of joints."""
         out = self.morphing.body.tree.segment_jacobian(self.screws, segment)
         for d, s, twist in self.drives:
             if self.morphing._above[segment, s]:
@@ -304,13 +304,18 @@ class MorphedPose:
         return out
 
     def along(self, index: ArrayLike, direction: ArrayLike, share: ArrayLike | None = None) -> NDArray:
-        """n·∂x/∂δ (N, 6 + D) of points of the surface along directions n, the morph's own part included.
+        """Derivatives n·∂x/∂δ (N, 6 + D) of surface points along directions n, including those of the morphs.
 
         Parameters
         ----------
         index : (N,) int, nodes; or (N, C), the nodes that each point lies between.
         direction : (N, 3) in the world.
-        share : (N, C) of each of these nodes (barycentric coordinates).
+        share : (N, C) barycentric coordinates; default 1.
+
+        Raises
+        ------
+        BodyError
+            Arrays that do not match, or nodes out of range.
         """
         skin, tree = self.morphing.skin, self.morphing.body.tree
         n = np.ascontiguousarray(direction, float)
@@ -338,7 +343,7 @@ class MorphedPose:
         return out
 
     def jacobian(self, index: ArrayLike) -> NDArray:
-        """(K, 3, 6 + D) change of the nodes `index` (K,) in the world by δ, the morph's own included."""
+        """Derivatives (K, 3, 6 + D) of the nodes `index` (K,) in the world by δ, including those of the morphs."""
         chosen = np.repeat(np.asarray(index, np.int64), 3)
         axes = np.tile(np.eye(3), (len(chosen) // 3, 1))
         return self.along(chosen, axes).reshape(-1, 3, self.morphing.body.tree.n_dofs)

@@ -1,13 +1,13 @@
-"""Morphs and skin of a body as plain arrays, for `serial`.
+"""Convert morphs and skin of a body to plain arrays and back, for `serial`.
 
     morphs/K/kind ()                         "joint", "global", "surface" or "local"; K counts from 0
-    morphs/K/angle ()  span (2,)  beyond ()  coordinate; where nothing and all of it acts [rad] or [m]
-    morphs/K/weight () or (N, 2)             name of the weighting, or t and ω (functions are given as a table)
+    morphs/K/angle ()  span (2,)  beyond ()  coordinate; its values of weight 0 and 1 [rad] or [m]
+    morphs/K/weight () or (N, 2)             name of the weighting, or t and ω (functions are stored as a table)
     morphs/K/segment ()                      "" for none
     morphs/K/twist (6,)                      of a joint's motion
     morphs/K/target (V, 3)                   of a global morph [m]
     morphs/K/centre, radii (n,)  shift (3,)  on (N,)    of a local morph [m]
-    morphs/K/moves ()                        whether it goes along with its segment; older files lack it: false
+    morphs/K/moves ()                        whether it moves with its segment; default false, for older files
     morphs/K/surfaces/...                    of a segment's second shape, as those of a body
     skin/nodes (V, K, 3)  faces (T, 3)  owners, weights (V, K)
 
@@ -27,7 +27,7 @@ from kinefit.bodies.surfaces import Surface
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
 from kinefit.errors import BodyError
 
-_TABLE = 1025  # points at which a weighting by a function is written
+_TABLE_ROWS = 1025  # of a stored weighting function
 _SKIN = ("nodes", "faces", "owners", "weights")
 _KINDS = {JointMotion: "joint", GlobalMorph: "global", SegmentMorph: "surface", LocalMorph: "local"}
 _OWN = {"joint": ("twist",), "global": ("target",), "surface": (), "local": ("centre", "radii", "shift")}
@@ -37,7 +37,10 @@ FromArrays = Callable[[Mapping[str, NDArray]], tuple[Surface, ...]]
 
 
 def morphs_to_arrays(morphs: tuple[Operator, ...], surfaces: ToArrays) -> dict[str, NDArray]:
-    """Arrays of morphs; `surfaces` makes those of surfaces."""
+    """Convert morphs to arrays, with the keys and shapes such as span (2,) of the module's docstring.
+
+    surfaces: converts surfaces to arrays.
+    """
     out: dict[str, NDArray] = {}
     for k, morph in enumerate(morphs):
         kind, s = _KINDS[type(morph)], morph.steering
@@ -60,17 +63,17 @@ def _weight(steering: Steering) -> NDArray:
         return np.array(steering.weight)
     if not callable(steering.weight):
         return np.array(steering.weight, float)
-    t = np.linspace(0.0, 1.0, _TABLE)
+    t = np.linspace(0.0, 1.0, _TABLE_ROWS)
     return np.stack([t, [float(steering.weight(float(x))) for x in t]], 1)
 
 
 def morphs_from_arrays(arrays: Mapping[str, NDArray], surfaces: FromArrays) -> tuple[Operator, ...]:
-    """Morphs of such arrays.
+    """Morphs from arrays with the keys and shapes such as span (2,) of the module's docstring.
 
     Raises
     ------
     BodyError
-        An array that is missing, or a kind that is not known.
+        A missing array, or an unknown kind.
     """
     out: list[Operator] = []
     while f"morphs/{len(out)}/kind" in arrays:
@@ -86,11 +89,11 @@ def morphs_from_arrays(arrays: Mapping[str, NDArray], surfaces: FromArrays) -> t
 def _morph(own: Mapping[str, NDArray], surfaces: FromArrays) -> Operator:
     kind, segment, weight = str(own["kind"]), str(own["segment"]), own["weight"]
     start, end = (float(v) for v in own["span"])
-    told = str(weight) if weight.dtype.kind == "U" else weight
+    weighting = str(weight) if weight.dtype.kind == "U" else weight
     for name in _OWN.get(kind, ()):
-        if np.isnan(own[name]).any() or (name != "radii" and np.isinf(own[name]).any()):  # radii: inf for everywhere
+        if np.isnan(own[name]).any() or (name != "radii" and np.isinf(own[name]).any()):  # radii: inf means everywhere
             raise ValueError(f"{name} is not finite")
-    steering = Steering(str(own["angle"]), start, end, told, bool(own["beyond"]))
+    steering = Steering(str(own["angle"]), start, end, weighting, bool(own["beyond"]))
     if kind == "joint":
         return JointMotion(segment, own["twist"], steering)
     if kind == "global":
@@ -105,17 +108,17 @@ def _morph(own: Mapping[str, NDArray], surfaces: FromArrays) -> Operator:
 
 
 def skin_to_arrays(skin: SkinnedMesh | None) -> dict[str, NDArray]:
-    """Arrays of a skin; none without one."""
+    """Convert a skin to arrays nodes (V, K, 3) [m], faces (T, 3), owners and weights (V, K); empty without a skin."""
     return {f"skin/{name}": np.array(getattr(skin, name)) for name in _SKIN} if skin is not None else {}
 
 
 def skin_from_arrays(arrays: Mapping[str, NDArray], n_segments: int) -> SkinnedMesh | None:
-    """Skin of such arrays, None where there are none.
+    """Skin from the arrays of `skin_to_arrays`, such as nodes (V, K, 3) [m]; None without arrays.
 
     Raises
     ------
     BodyError
-        An array that is missing, a segment that is not there.
+        A missing array, or an index of a segment out of range.
     """
     if not any(key.startswith("skin/") for key in arrays):
         return None

@@ -1,4 +1,4 @@
-"""How much of a morph an angle calls for: weighting functions ω(t) (P1 3.2)."""
+"""Weight of a morph as a function of a joint angle: weighting functions ω(t) (P1 3.2)."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from numpy.typing import ArrayLike
 
 from kinefit.errors import BodyError, choices
 
-_LEAST = 1e-3  # √t counts as a straight line up to here: its slope at 0 has no bound
-_STEP = 1e-5  # of t, for slopes of functions that are given without
+_MIN_ROOT_T = 1e-3  # below, √t is replaced by a straight line: its slope at 0 is unbounded
+_DIFFERENCE_STEP = 1e-5  # of t, for numerical slopes
 
 Weight = Callable[[float], tuple[float, float]]
 
 
 def _root(t: float) -> tuple[float, float]:
-    if t < _LEAST:
-        return 1.0 - t / math.sqrt(_LEAST), -1.0 / math.sqrt(_LEAST)
+    if t < _MIN_ROOT_T:
+        return 1.0 - t / math.sqrt(_MIN_ROOT_T), -1.0 / math.sqrt(_MIN_ROOT_T)
     return 1.0 - math.sqrt(t), -0.5 / math.sqrt(t)
 
 
@@ -34,7 +34,7 @@ WEIGHTS: dict[str, Weight] = {
 
 
 def weight_function(weight: str | ArrayLike | Callable[[float], float]) -> Weight:
-    """ω(t) and its slope: of a name in `WEIGHTS`, a table (K, 2) of t and ω, or any function of t.
+    """Function t -> (ω, dω/dt), from a name in `WEIGHTS`, a table (K, 2) of t and ω, or any function ω(t).
 
     Raises
     ------
@@ -57,7 +57,7 @@ def weight_function(weight: str | ArrayLike | Callable[[float], float]) -> Weigh
         raise BodyError(f"a weighting with ω(0) = {ends[0]} and ω(1) = {ends[1]}", remedy="It must go from 1 to 0.")
 
     def with_slope(t: float) -> tuple[float, float]:
-        low, high = max(t - _STEP, 0.0), min(t + _STEP, 1.0)
+        low, high = max(t - _DIFFERENCE_STEP, 0.0), min(t + _DIFFERENCE_STEP, 1.0)
         return float(value(t)), (float(value(high)) - float(value(low))) / (high - low)
 
     return with_slope
@@ -65,15 +65,16 @@ def weight_function(weight: str | ArrayLike | Callable[[float], float]) -> Weigh
 
 @dataclass(frozen=True, eq=False)
 class Steering:
-    """How much of an operator a joint angle calls for.
+    """Weight of an operator as a function of a joint angle.
 
     Parameters
     ----------
     coordinate : str, name of the angle.
-    start, end : [rad] or [m], where nothing and all of the operator acts: t goes from 0 to 1 between them.
+    start, end : [rad] or [m], angles of weight 0 and 1: t goes from 0 to 1 between them.
     weight : name in `WEIGHTS`, table (K, 2) of t and ω, or function ω(t).
     beyond : bool
-        True: proportional without end, as P1 steers local morphs by λ θ; needs the weight "linear".
+        Whether the weight is proportional to the angle without limits, like λ θ of P1's local morphs; needs the weight
+        "linear".
     """
 
     coordinate: str
@@ -88,14 +89,14 @@ class Steering:
             raise BodyError(problem, remedy="Give two different angles.")
         if self.beyond and not (isinstance(self.weight, str) and self.weight == "linear"):
             raise BodyError("a weighting that goes on beyond its ends must be linear", remedy="Leave out `beyond`.")
-        self._function  # noqa: B018  its errors are told here
+        self._function  # noqa: B018  raises its errors at construction
 
     @cached_property
     def _function(self) -> Weight:
         return weight_function(self.weight)
 
     def at(self, angle: float) -> tuple[float, float]:
-        """s = 1 − ω, and ∂s/∂angle."""
+        """Weight s = 1 − ω (a number) at an angle [rad, m], and its derivative ∂s/∂angle."""
         span = self.end - self.start
         t = (angle - self.start) / span
         if not self.beyond and not 0.0 <= t <= 1.0:

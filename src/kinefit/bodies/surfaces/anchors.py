@@ -1,9 +1,9 @@
-"""Anchors: points of a body's surfaces in the surfaces' own coordinates, which every body of the same make has.
+"""Anchors: points of a body's surfaces in the surfaces' own coordinates, which transfer to bodies of other sizes.
 
-A tapered cylinder's are (ξ, η, t): shares of the two half axes at a height, and of the length, so that the point is
-(a(t) ξ, b(t) η, t L). A mesh's are a face, two barycentric coordinates and a height along the face's normal, in square
-roots of twice the face's area. Both hold of points beside the surface too. A surface that is another, longer or wider,
-takes its anchors along, and their normals as any surface's: by the inverse transpose of the map between the two.
+On a tapered cylinder they are (ξ, η, t): shares of the two half axes and of the length, so that the point is
+(a(t) ξ, b(t) η, t L). On a mesh they are a face, two barycentric coordinates and a height along the face's normal, in
+units of the square root of twice the face's area. Both also describe points near the surface. Normals are transferred
+by the inverse transpose of the map between the two surfaces.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class _SurfacePlaces(NamedTuple):
-    """Of N anchors: the surface, the face (0 for cylinders), three coordinates, and the normal as a covector."""
+    """Surface (N,), face (N,) (0 for cylinders), coordinates (N, 3) and normals (N, 3), as covectors, of N anchors."""
 
     surface: NDArray
     face: NDArray
@@ -39,15 +39,15 @@ class SurfaceAnchors:
 
     Parameters
     ----------
-    body : Body that they are given on.
+    body : Body on which they are defined.
     segment : (N,) int
-    points : (N, 3) [m] on a surface of that segment, or near it, in the root frame at rest.
+    points : (N, 3) [m] on or near a surface of that segment, in the root frame at rest.
     normals : (N, 3) outward there.
 
     Raises
     ------
     BodyError
-        A segment without a surface; told when the anchors are first asked for on another body.
+        A segment without a surface; raised at the first use on another body.
     """
 
     body: Body
@@ -59,18 +59,18 @@ class SurfaceAnchors:
         return len(self.segment)
 
     def on(self, body: Body) -> tuple[NDArray, NDArray]:
-        """Points and normals (N, 3) of the same anchors on a body of the same make, in its root frame at rest.
+        """Points and normals (N, 3) [m] of the anchors on a body with the same surfaces, in its root frame at rest.
 
         Raises
         ------
         BodyError
-            A body with other surfaces: another number, another kind, another segment, a mesh of other faces.
+            Surfaces that do not correspond: another number, kind or segment, or a mesh with other faces.
         """
         if body is self.body:
             return self.points, self.normals
         if self._latest and self._latest[0][0] is body:
             return self._latest[0][1]
-        _check_make(self.body, body)
+        _check_correspondence(self.body, body)
         places, points, J = self._places, np.empty((len(self), 3)), np.empty((len(self), 3, 3))
         table = _cylinders(body)
         round_ones = table.is_cylinder[places.surface]
@@ -81,18 +81,18 @@ class SurfaceAnchors:
         points += body.tree.rest[self.segment]
         normals = np.linalg.solve(np.swapaxes(J, 1, 2), places.normal[..., None])[..., 0]
         size = np.linalg.norm(self.normals, axis=1) / np.maximum(np.linalg.norm(normals, axis=1), 1e-30)
-        told = points, normals * size[:, None]
-        self._latest[:] = [(body, told)]
-        return told
+        placed = points, normals * size[:, None]
+        self._latest[:] = [(body, placed)]
+        return placed
 
     @cached_property
     def _latest(self) -> list[tuple[Body, tuple[NDArray, NDArray]]]:
-        """The other body that was asked for last, and what it was told."""
+        """Cache of the last other body, with its points and normals."""
         return []
 
     @cached_property
     def _places(self) -> _SurfacePlaces:
-        """Each anchor on the surface of its segment that is nearest."""
+        """Each anchor on the nearest surface of its segment."""
         body, count = self.body, len(self)
         out = _SurfacePlaces(np.full(count, -1), np.zeros(count, np.int64), np.zeros((count, 3)), np.zeros((count, 3)))
         best = np.full(count, np.inf)
@@ -114,7 +114,7 @@ class SurfaceAnchors:
 
 
 class _Cylinders(NamedTuple):
-    """A body's M surfaces as arrays; those that are no tapered cylinders hold zeros."""
+    """A body's M surfaces as arrays; rows of other surfaces than tapered cylinders are zero."""
 
     is_cylinder: NDArray
     start: NDArray
@@ -124,7 +124,7 @@ class _Cylinders(NamedTuple):
     growth: NDArray
 
     def mapped(self, surface: NDArray, at: NDArray) -> tuple[NDArray, NDArray]:
-        """As `_mapped`, of anchors on surfaces (N,)."""
+        """Points (N, 3) and derivatives (N, 3, 3) as of `_mapped`, for anchors on surfaces (N,)."""
         first, growth, axes, length = (v[surface] for v in (self.first, self.growth, self.axes, self.length))
         half, J = first + at[:, 2:] * growth, np.zeros((len(at), 3, 3))
         local = np.concatenate([half * at[:, :2], length[:, None] * at[:, 2:]], axis=1)
@@ -150,7 +150,7 @@ def _cylinders(body: Body) -> _Cylinders:
 
 
 def _mapped(surface: TaperedCylinder | MeshSurface, face: NDArray, at: NDArray) -> tuple[NDArray, NDArray]:
-    """Points (N, 3) [m] in the segment's frame of coordinates (N, 3), and the derivatives by these, (N, 3, 3)."""
+    """Points (N, 3) [m] in the segment's frame from coordinates (N, 3), and derivatives (N, 3, 3) by them."""
     if isinstance(surface, MeshSurface):
         corner, J = _face_axes(surface, face)
         return corner + np.einsum("nij,nj->ni", J, at), J
@@ -164,7 +164,7 @@ def _mapped(surface: TaperedCylinder | MeshSurface, face: NDArray, at: NDArray) 
 
 
 def _placed(surface: TaperedCylinder | MeshSurface, x: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Distance (N,) [m] to a surface, about; face (N,) and coordinates (N, 3) of points (N, 3) in its segment."""
+    """Approximate distance (N,) [m] to a surface, face (N,) and coordinates (N, 3) of points (N, 3) [m]."""
     if isinstance(surface, MeshSurface):
         corners = surface.vertices[surface.faces]
         twice = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -179,27 +179,27 @@ def _placed(surface: TaperedCylinder | MeshSurface, x: NDArray) -> tuple[NDArray
     t = local[:, 2:] / surface.length
     half = np.maximum(first + t * (last - first), 1e-6)
     at = np.concatenate([local[:, :2] / half, t], axis=1)
-    beside = (np.linalg.norm(at[:, :2], axis=1) - 1.0) * np.sqrt(half.prod(axis=1))
-    beyond = (np.abs(t[:, 0] - 0.5) - 0.5) * surface.length
-    return np.abs(np.maximum(beside, beyond)), np.zeros(len(x), np.int64), at
+    from_side = (np.linalg.norm(at[:, :2], axis=1) - 1.0) * np.sqrt(half.prod(axis=1))
+    from_ends = (np.abs(t[:, 0] - 0.5) - 0.5) * surface.length
+    return np.abs(np.maximum(from_side, from_ends)), np.zeros(len(x), np.int64), at
 
 
 def _face_axes(surface: MeshSurface, face: NDArray) -> tuple[NDArray, NDArray]:
-    """First corners (N, 3) of faces, and two sides and a normal as long as a side as columns (N, 3, 3)."""
+    """First corners (N, 3) of faces, and columns (N, 3, 3): two sides, and a normal of about a side's length."""
     a, b, c = np.moveaxis(surface.vertices[surface.faces[face]], 1, 0)
     normal = np.cross(b - a, c - a)
     size = np.sqrt(np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30))
     return a, np.stack([b - a, c - a, normal / size], axis=2)
 
 
-def _check_make(one: Body, other: Body) -> None:
-    """Whether the surfaces of two bodies correspond."""
-    a, b = one.surfaces, other.surfaces
+def _check_correspondence(body: Body, other: Body) -> None:
+    """Raise BodyError if the surfaces of two bodies do not correspond."""
+    a, b = body.surfaces, other.surfaces
     alike = len(a) == len(b) and all(
         type(s) is type(t) and s.segment == t.segment
         and (not isinstance(s, MeshSurface) or np.array_equal(s.faces, t.faces))  # type: ignore[union-attr]
         for s, t in zip(a, b)
     )  # fmt: skip
     if not alike:
-        problem = f"surfaces of body '{other.name}' do not correspond to those of '{one.name}'"
+        problem = f"surfaces of body '{other.name}' do not correspond to those of '{body.name}'"
         raise BodyError(problem, remedy="Take a body of the same make: other lengths and widths, the same surfaces.")

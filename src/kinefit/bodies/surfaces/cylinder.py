@@ -18,9 +18,9 @@ Radii = tuple[tuple[float, float], tuple[float, float]]
 
 @dataclass(frozen=True)
 class TaperedCylinder:
-    """Cylinder of a segment with an elliptical section that changes linearly from end to end, closed by flat caps.
+    """Cylinder with an elliptical cross-section that changes linearly from end to end, closed by flat caps.
 
-    Its five numbers are the length and two radii at each end; `start`, `end` and `side` say where it sits.
+    Its shape has five numbers, the length and two radii at each end; `start`, `end` and `side` give its pose.
 
     Parameters
     ----------
@@ -29,13 +29,13 @@ class TaperedCylinder:
     radii : ((a0, b0), (a1, b1)) [m]
         Half axes at the start and at the end: a along `side`, b along axis × side.
     side : (3,), optional
-        Direction of a; what of it is at right angles to the axis counts. Default: x (forward), or y (up) for a
-        cylinder that lies along x.
+        Direction of a, projected onto the plane normal to the axis. Default: x (forward), or y (up) for a cylinder
+        along x.
 
     Raises
     ------
     BodyError
-        No length, a radius that is not positive, a side along the axis, or numbers that are not finite.
+        Zero length, a radius that is not positive, a side along the axis, or numbers that are not finite.
     """
 
     segment: int
@@ -63,18 +63,18 @@ class TaperedCylinder:
     def round(
         cls, segment: int, end: ArrayLike, radii: tuple[float, float], *, start: ArrayLike = (0.0, 0.0, 0.0)
     ) -> TaperedCylinder:
-        """Cylinder with circles at its ends, from the segment's joint unless told otherwise."""
+        """Cylinder with circular ends of radii [m], from start (3,) [m], default the segment's joint, to end (3,)."""
         (first, last), (joint, tip) = radii, [tuple(np.asarray(v, float).tolist()) for v in (start, end)]
         return cls(segment, joint, tip, ((first, first), (last, last)))  # type: ignore[arg-type]
 
     @cached_property
     def length(self) -> float:
-        """[m] from end to end."""
+        """Length [m] from end to end."""
         return float(np.linalg.norm(np.subtract(self.end, self.start)))
 
     @cached_property
     def axes(self) -> NDArray:
-        """(3, 3) rows: unit directions of a, of b and of the axis, right-handed, in the segment's frame."""
+        """Unit directions of a, of b and of the axis as rows (3, 3), right-handed, in the segment's frame."""
         u = np.subtract(self.end, self.start) / self.length
         out = np.stack([np.array(self.side), np.cross(u, np.array(self.side)), u])
         out.flags.writeable = False
@@ -87,19 +87,19 @@ class TaperedCylinder:
 
     @property
     def mean_radii(self) -> tuple[float, float]:
-        """[m] radii of circles of the same area as both ends."""
+        """Radii [m] of circles with the areas of both ends."""
         first, last = (float(np.sqrt(a * b)) for a, b in self.radii)
         return first, last
 
-    @lru_cache(maxsize=4096)  # noqa: B019 (small, and those of one body are asked for again and again)
+    @lru_cache(maxsize=4096)  # noqa: B019 (small, and reused for one body)
     def scaled(self, factor: float) -> TaperedCylinder:
-        """The cylinder stretched about its segment's joint."""
+        """The cylinder scaled about its segment's joint by a factor, a number > 0."""
         start, end, radii = (tuple((factor * np.array(v)).tolist()) for v in (self.start, self.end, self.radii))
         return TaperedCylinder(self.segment, start, end, radii, self.side)
 
 
 def _side(side: Vector | None, axis: NDArray) -> NDArray:
-    """(3,) unit at right angles to the axis; one that is so already is left as it is, to the last digit."""
+    """Unit vector (3,) normal to the axis; one that is already is returned unchanged, to the last digit."""
     if side is None:
         side = (0.0, 1.0, 0.0) if abs(axis[0]) > 0.8 else (1.0, 0.0, 0.0)
     out = np.array(side, float)
@@ -122,7 +122,7 @@ class Box(NamedTuple):
     half: NDArray
 
     def contains(self, points: NDArray) -> NDArray:
-        """(N,) bool for points (N, 3) [m] in the segment's frame."""
+        """Whether points (N, 3) [m] in the segment's frame lie inside: (N,) bool."""
         inside: NDArray = np.all(np.abs((points - self.centre) @ self.axes.T) <= self.half, axis=1)
         return inside
 

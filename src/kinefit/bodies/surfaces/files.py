@@ -1,4 +1,4 @@
-"""Surfaces in a body file."""
+"""Read the surfaces of a body file."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from kinefit.bodies.surfaces.obj import mesh_surface, surface_of_file
 from kinefit.errors import BodyError
 from kinefit.geometry.se3 import exp_so3
 
-_CURVE_POINTS = 256  # along a contour: of a sheet of A4 one every 4 mm
+_CURVE_POINTS = 256  # along a contour: one every 4 mm for a sheet of A4
 Vector = tuple[float, float, float]
 Section = float | tuple[float, float]
 
 
 class BallRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A metaball: an ellipsoid's centre and radii [m] in the segment's frame, its weight, its turn [deg]."""
+    """A metaball: an ellipsoid's centre and radii [m] in the segment's frame, its weight, its rotation [deg]."""
 
     at: Vector
     radii: Vector
@@ -32,12 +32,12 @@ class BallRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class SurfaceRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """`surface` of a segment: a tapered cylinder, its sections circles (one radius) or ellipses (two half axes).
+    """`surface` of a segment, one of five kinds.
 
-    Or a mesh: the path of an OBJ file, seen from the body file's folder, with its unit. Or a Fourier series: the path
-    of a file of points, their grid, which parameters are closed, the orders kept, and the nodes of the mesh. Or a
-    closed curve, the contour of a thin plate: the path of a file of points, and the order kept. Or metaballs, from one
-    end of the limb to the other.
+    A tapered cylinder, with circles (one radius) or ellipses (two half axes) as sections. A mesh: the path of an OBJ
+    file, relative to the body file's folder, with its unit. A Fourier series: the path of a file of points, their grid,
+    closed parameters, orders, and nodes of the mesh. A closed curve, the contour of a thin plate: the path of a file of
+    points, and the order. Metaballs, from one end of the limb to the other.
     """
 
     end: Vector | None = None
@@ -57,7 +57,7 @@ class SurfaceRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     balls: tuple[BallRecord, ...] = ()
 
     def mirrored(self) -> SurfaceRecord:
-        """The surface on the other side of the body's plane of symmetry."""
+        """Mirror the surface to the other side of the body."""
         places = {name: _mirrored(value) for name in ("start", "end", "side") if (value := getattr(self, name))}
         return msgspec.structs.replace(self, **places, mirror=not self.mirror)
 
@@ -65,12 +65,12 @@ class SurfaceRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 def surfaces_of(
     records: SurfaceRecord | Sequence[SurfaceRecord] | None, segment: int, source: str, place: str
 ) -> list[TaperedCylinder | MeshSurface]:
-    """Surfaces of the segment with that index; `source` and `place` are named in messages.
+    """Surfaces of a segment, given by its index; `source` and `place` are named in messages.
 
     Raises
     ------
     BodyError
-        A surface that cannot be: see `TaperedCylinder`, `mesh_surface`.
+        An invalid surface: see `TaperedCylinder`, `mesh_surface`.
     """
     out: list[TaperedCylinder | MeshSurface] = []
     for record in [records] if isinstance(records, SurfaceRecord) else records or ():
@@ -101,7 +101,7 @@ def surfaces_of(
 
 
 def _series(record: SurfaceRecord, segment: int, source: str, place: str) -> MeshSurface:
-    """Free form (P1 2.2, 2.3) as a Fourier series of a file of points x,y,z: a closed curve, or a grid row by row."""
+    """Fourier series (P1 2.2, 2.3) from a file of points x,y,z: of a closed curve, or of a grid row by row."""
     path, grid = Path(source).parent / str(record.contour or record.fourier), record.grid
 
     def read() -> tuple[FourierCurve | FourierSurface, Any]:

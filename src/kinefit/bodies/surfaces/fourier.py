@@ -1,8 +1,8 @@
 """Free-form contours and surfaces as Fourier series (P1 2.2, 2.3): three signals x, y, z, periodic in their parameters.
 
-Parameters u run from 0 to 1 once around (P1's φ is (2N + 1) u). A coefficient p_k of a signal is a complex number; P1
-has it as a phase vector in a plane l_m of its own, with l_m² = −1 for the imaginary unit: `conformal` is that form.
-Leaving out high frequencies gives the smooth shapes that a fit starts with.
+Parameters u run from 0 to 1 once around (P1's φ is (2N + 1) u). A coefficient p_k of a signal is a complex number. P1
+writes it as a phase vector in a plane l_m of its own, with l_m² = −1 as the imaginary unit; `conformal` is that form.
+Low-pass approximations are the smooth shapes with which a fit starts.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from kinefit.errors import BodyError
 from kinefit.geometry.cga import exp
 from kinefit.geometry.multivectors import Multivector
 
-_HALF_PLATE = 0.0005  # [m] half the thickness of the plate that a curve bounds: paper and tin, far below a pixel
-# l_1 = e1∧e2, l_2 = e2∧e3, l_3 = e3∧e1: each holds e_m, so that the part along e_m is the signal
+_HALF_THICKNESS = 0.0005  # [m] of the plate that a curve bounds: paper and tin, far below a pixel
+# l_1 = e1∧e2, l_2 = e2∧e3, l_3 = e3∧e1: each contains e_m, so that the component along e_m is the signal
 PLANES = tuple(Multivector((blade,), np.array([sign])) for blade, sign in ((3, 1.0), (6, 1.0), (5, -1.0)))
 
 
 def _spectrum(samples: NDArray, axis: int) -> NDArray:
-    """Coefficients −N..N of real signals along an axis; an even count's highest frequency is shared by ±N."""
+    """Coefficients −N..N of real signals along an axis; with an even count, ±N share the highest frequency."""
     count = samples.shape[axis]
     p = np.fft.fftshift(np.fft.fft(samples, axis=axis), axes=axis) / count
     if count % 2:
@@ -34,7 +34,7 @@ def _spectrum(samples: NDArray, axis: int) -> NDArray:
 
 
 def _waves(u: NDArray, order: int) -> NDArray:
-    """exp(2π i k u) (..., 2N+1) of k = −N..N."""
+    """exp(2π i k u) (..., 2N+1) for k = −N..N."""
     return np.exp(2j * math.pi * u[..., None] * np.arange(-order, order + 1))
 
 
@@ -59,7 +59,7 @@ def _cut(p: NDArray, axis: int, order: int) -> NDArray:
 
 
 def _phase_vectors(p: NDArray) -> Multivector:
-    """p (3, ...) complex as vectors, each in the plane l_m of its signal."""
+    """Complex p (3, ...) as vectors, each in the plane l_m of its signal."""
     values = np.zeros((3, *p.shape))
     for m in range(3):
         values[m, m], values[(m + 1) % 3, m] = p[m].real, p[m].imag
@@ -79,7 +79,7 @@ class FourierCurve:
 
     @classmethod
     def of(cls, points: ArrayLike, order: int | None = None) -> FourierCurve:
-        """Curve through points (M, 3) [m], evenly spaced in u, in turn; up to an order, at most M/2."""
+        """Curve through points (M, 3) [m], in order and evenly spaced in u; up to an order, at most M/2."""
         p = _spectrum(_checked(points, 1), 0).T
         return cls(p if order is None else _cut(p, 1, order))
 
@@ -89,34 +89,34 @@ class FourierCurve:
         return self.coefficients.shape[1] // 2
 
     def low_pass(self, order: int) -> FourierCurve:
-        """The curve without frequencies above `order`: 0 its centre, 1 an ellipse."""
+        """The curve without frequencies above `order`: 0 gives its centre, 1 an ellipse."""
         return FourierCurve(_cut(self.coefficients, 1, order))
 
     def at(self, u: ArrayLike, derivative: int = 0) -> NDArray:
-        """(..., 3) [m] points at u (...), or their derivatives by u."""
+        """Points (N, 3) [m] at parameters u (N,), or their derivatives by u; any shape of u."""
         factor = (2j * math.pi * np.arange(-self.order, self.order + 1)) ** derivative
         return (_waves(np.asarray(u, float), self.order) @ (self.coefficients * factor).T).real
 
     def samples(self, count: int) -> NDArray:
-        """(count, 3) [m] points at u = 0, 1/count, ...; by FFT."""
+        """Points (N, 3) [m] at u = 0, 1/N, ..., for N = count; by FFT."""
         return _grid(self.coefficients[:, None], (1, count))[0]
 
     @property
     def phase_vectors(self) -> Multivector:
-        """(3, 2N+1) vectors p_k^m of P1, each in the plane l_m."""
+        """Vectors p_k^m (3, 2N+1) of P1, each in the plane l_m."""
         return _phase_vectors(self.coefficients)
 
     def triangles(self, count: int) -> tuple[NDArray, NDArray]:
         """Vertices (2 count + 2, 3) [m] and faces (4 count, 3) of a thin plate that the curve bounds.
 
-        Both of its sides are fans from `count` points of the curve to their middle, half a millimetre to either side of
-        the curve; so its occluding contour is the curve, wherever the fans do not fold over.
+        Both sides are fans from `count` points of the curve to their centre, half a millimetre to either side of the
+        curve. So the plate's occluding contour is the curve, where the fans do not fold over.
         """
         ring = self.samples(count)
         ring = np.concatenate([ring, ring.mean(axis=0, keepdims=True)])
         spokes = ring[:-1] - ring[-1]
         area = np.cross(spokes, np.roll(spokes, -1, axis=0)).sum(axis=0)
-        side = _HALF_PLATE * area / max(float(np.linalg.norm(area)), 1e-12)
+        side = _HALF_THICKNESS * area / max(float(np.linalg.norm(area)), 1e-12)
         j, back = np.arange(count), count + 1
         after, middle = (j + 1) % count, np.full(count, count)
         faces = [(j, after, middle), (back + after, back + j, back + middle)]  # front, back, and the edge in two halves
@@ -131,7 +131,7 @@ class FourierSurface:
     Parameters
     ----------
     coefficients : (3, 2 N1 + 1, 2 N2 + 1) complex [m], k = −N..N along both.
-    closed : whether each parameter runs around (a ring) or to and fro: then u from 0 to ½ goes from end to end.
+    closed : whether each parameter is periodic (a ring); an open one runs from end to end for u from 0 to ½.
     """
 
     coefficients: NDArray
@@ -146,9 +146,9 @@ class FourierSurface:
         Parameters
         ----------
         closed : (bool, bool)
-            False for a parameter with two ends, such as the height on a trunk: the samples are followed by their mirror
-            image, so that the series does not swing where the ends would meet.
-        orders : highest frequencies, at most half of the samples (all of them, less one, where there are two ends).
+            False for a parameter with two ends, such as the height on a trunk: the samples are continued by their
+            mirror image, so that the series has no jump between the ends.
+        orders : highest frequencies, at most half of the samples (all samples less one for an open parameter).
         """
         grid = _checked(points, 2)
         for axis in (0, 1):
@@ -171,7 +171,7 @@ class FourierSurface:
         return FourierSurface(_cut(p, 2, first if second is None else second), self.closed)
 
     def at(self, u1: ArrayLike, u2: ArrayLike, derivatives: tuple[int, int] = (0, 0)) -> NDArray:
-        """(..., 3) [m] points at u1 and u2 (...), or their partial derivatives."""
+        """Points (N, 3) [m] at u1 and u2 (N,), or their partial derivatives; any shape of u1 and u2."""
         u1, u2 = np.broadcast_arrays(np.asarray(u1, float), np.asarray(u2, float))
         p = self.coefficients
         for axis, (order, times) in enumerate(zip(self.orders, derivatives)):
@@ -182,34 +182,34 @@ class FourierSurface:
         return out.reshape(*u1.shape, 3)
 
     def normals(self, u1: ArrayLike, u2: ArrayLike) -> NDArray:
-        """(..., 3) unit ∂F/∂u1 × ∂F/∂u2; zero where the surface has none (poles)."""
+        """Unit normals ∂F/∂u1 × ∂F/∂u2 (N, 3) at u1 and u2 (N,); zero at poles. Any shape of u1 and u2."""
         cross = np.cross(self.at(u1, u2, (1, 0)), self.at(u1, u2, (0, 1)))
         size = np.linalg.norm(cross, axis=-1, keepdims=True)
         return np.where(size > 1e-12, cross / np.maximum(size, 1e-12), 0.0)
 
     def parameters(self, counts: tuple[int, int]) -> tuple[NDArray, NDArray]:
-        """u1 and u2 of a grid: around where closed, from end to end where not."""
-        first, second = (np.arange(n) / n for n in self._whole(counts))
+        """Parameters u1 (M1,) and u2 (M2,) of a grid: around if closed, else from end to end."""
+        first, second = (np.arange(n) / n for n in self._full_period(counts))
         return first[: counts[0]], second[: counts[1]]
 
     def samples(self, counts: tuple[int, int]) -> NDArray:
-        """(count1, count2, 3) [m] points on the grid `parameters(counts)`; by FFT."""
-        return _grid(self.coefficients, self._whole(counts))[: counts[0], : counts[1]]
+        """Points (M1, M2, 3) [m] on the grid `parameters(counts)`; by FFT."""
+        return _grid(self.coefficients, self._full_period(counts))[: counts[0], : counts[1]]
 
-    def _whole(self, counts: tuple[int, int]) -> tuple[int, int]:
-        """Samples of a grid with the way back."""
+    def _full_period(self, counts: tuple[int, int]) -> tuple[int, int]:
+        """Numbers of samples of a full period."""
         first, second = (n if ring else 2 * max(n - 1, 1) for n, ring in zip(counts, self.closed))
         return first, second
 
     @property
     def phase_vectors(self) -> Multivector:
-        """(3, 2 N1 + 1, 2 N2 + 1) vectors p^i of P1, each in the plane l_i."""
+        """Vectors p^i (3, 2 N1 + 1, 2 N2 + 1) of P1, each in the plane l_i."""
         return _phase_vectors(self.coefficients)
 
     def triangles(self, counts: tuple[int, int]) -> tuple[NDArray, NDArray]:
         """Vertices (V, 3) [m], those of `samples` in order first, and faces (T, 3), outward counter-clockwise.
 
-        Where one parameter is closed and the other is not, both ends are shut by a fan about their middle.
+        If one parameter is closed and the other is open, a fan closes each end.
         """
         grid = self.samples(counts)
         index = np.arange(counts[0] * counts[1]).reshape(counts)
@@ -232,7 +232,7 @@ class FourierSurface:
 
 
 def levels(shape: FourierCurve | FourierSurface, count: int, lowest: int = 2) -> list:
-    """Low-pass approximations from coarse to fine, the last one whole: what a fit goes through (P1 2.4)."""
+    """Low-pass approximations from coarse to fine, the last one unchanged, for a coarse-to-fine fit (P1 2.4)."""
     orders = (shape.order,) if isinstance(shape, FourierCurve) else shape.orders
     out = []
     for step in np.linspace(0.0, 1.0, count) if count > 1 else [1.0]:
@@ -242,7 +242,13 @@ def levels(shape: FourierCurve | FourierSurface, count: int, lowest: int = 2) ->
 
 
 def by_length(points: ArrayLike, count: int) -> NDArray:
-    """(count, 3) [m] points evenly spaced along the closed polygon of (M, 3), as `FourierCurve.of` likes them."""
+    """Resample a closed polygon (M, 3) [m] evenly by arc length: (N, 3) [m], N = count, for `FourierCurve.of`.
+
+    Raises
+    ------
+    BodyError
+        Fewer than three points, points that are not finite, or all in one position.
+    """
     x = _checked(points, 1)
     ring = np.concatenate([x, x[:1]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1))])
@@ -253,7 +259,7 @@ def by_length(points: ArrayLike, count: int) -> NDArray:
 
 
 def conformal(shape: FourierCurve | FourierSurface, *u: ArrayLike) -> Multivector:
-    """Points (...) as Euclidean vectors, by P1's sum of phase vectors turned in planes l_m; slow, but as printed."""
+    """Points as Euclidean vectors, by P1's sum of phase vectors rotated in planes l_m: slow, but as published."""
     at = np.broadcast_arrays(*(np.asarray(v, float) for v in u))
     axes = len(at)
     total = np.zeros((3, *at[0].shape))
@@ -271,7 +277,7 @@ def conformal(shape: FourierCurve | FourierSurface, *u: ArrayLike) -> Multivecto
 
 
 def _grid(p: NDArray, counts: tuple[int, int]) -> NDArray:
-    """Points (M1, M2, 3) at even steps of both parameters; frequencies above the steps' fall onto lower ones."""
+    """Points (M1, M2, 3) at even steps of both parameters; frequencies above those of the steps are aliased."""
     k1, k2 = (np.arange(-(n // 2), n // 2 + 1) for n in p.shape[1:])
     spread = np.zeros((3, *counts), complex)
     for signal, sum_of in zip(p, spread):

@@ -13,26 +13,26 @@ from kinefit.bodies.surfaces.closest.grid import DistanceGrid, cell_size, distan
 from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface, levels
 from kinefit.errors import BodyError
 
-WELD = 1e-6  # [m] corners as near as that are one: what six decimals in a file leave apart
+WELD = 1e-6  # [m] distance below which corners are merged: the rounding of six decimals in a file
 
 
 @dataclass(frozen=True, eq=False)
 class MeshSurface:
-    """Closed triangle mesh of a segment; it may consist of several closed parts that run into each other.
+    """Closed triangle mesh of a segment; it may consist of several closed parts that intersect.
 
     Parameters
     ----------
     segment : int
     vertices : (V, 3) [m] in the segment's frame.
     faces : (T, 3) int, counter-clockwise as seen from outside.
-    series : FourierCurve or FourierSurface [m] that the mesh was made of, if it was.
-    nodes : of the series' `triangles`, whose vertices are those of the mesh.
+    series : FourierCurve or FourierSurface [m] from which the mesh was made, or None.
+    nodes : argument of the series' `triangles` that gives the vertices of the mesh.
 
     Raises
     ------
     BodyError
-        Vertices that are not finite, faces that name vertices that are not there, neighbours of which one is flipped,
-        a part that is inside out, a hole that is wider than a cell of the distance grid.
+        Vertices that are not finite, indices out of range, faces with opposite orientations, a part that is inside out,
+        a hole that is wider than a cell of the distance grid.
     """
 
     segment: int
@@ -63,52 +63,52 @@ class MeshSurface:
 
     @cached_property
     def grid(self) -> DistanceGrid:
-        """Signed distances around the mesh, made when they are first asked for."""
+        """Grid of signed distances around the mesh, computed at first use."""
         return distance_grid(self.vertices, self._welded)
 
     @property
     def open_edges(self) -> int:
-        """How many edges have a face on one side only: 0 for a watertight mesh."""
+        """Number of edges with a face on one side only: 0 for a watertight mesh."""
         return len(self._open_edges)
 
     def scaled(self, factor: float) -> MeshSurface:
-        """The mesh stretched about the origin of its segment."""
-        return self._like(self.segment, factor * self.vertices, factor)
+        """The mesh scaled about the origin of its segment by a factor, a number > 0."""
+        return self._with_vertices(self.segment, factor * self.vertices, factor)
 
     def on(self, segment: int) -> MeshSurface:
-        """The same mesh on another segment; both share one distance grid."""
-        return self._like(segment, self.vertices, 1.0)
+        """The mesh on another segment; both share one distance grid."""
+        return self._with_vertices(segment, self.vertices, 1.0)
 
     def mirrored(self) -> MeshSurface:
-        """The mesh on the other side of the plane z = 0: a left limb's from the right one's."""
+        """The mesh mirrored at the plane z = 0: a left limb from a right one."""
         flip = (1.0, 1.0, -1.0)
-        series = self._series_times(flip)
+        series = self._scaled_series(flip)
         return MeshSurface(
             self.segment, self.vertices * flip, self.faces[:, ::-1], series=series, nodes=self.nodes
         )
 
     def low_pass_shifts(self, count: int) -> list[NDArray]:
-        """(V, 3) [m] from its vertices to those of low-pass approximations of its series, coarse to fine (P1 2.4)."""
+        """Shifts (V, 3) [m] of the vertices to low-pass approximations of the series, coarse to fine (P1 2.4)."""
         assert self.series is not None
         vertices = [shape.triangles(self.nodes)[0] for shape in levels(self.series, count)]
         return [v - vertices[-1] for v in vertices]
 
-    def _series_times(self, factor: ArrayLike) -> FourierCurve | FourierSurface | None:
-        """The series with its three signals multiplied by a factor, or by (3,)."""
+    def _scaled_series(self, factor: ArrayLike) -> FourierCurve | FourierSurface | None:
+        """The series with its three signals multiplied by a factor or by factors (3,)."""
         if self.series is None:
             return None
         p = self.series.coefficients
         return replace(self.series, coefficients=p * np.broadcast_to(factor, 3).reshape(3, *[1] * (p.ndim - 1)))
 
-    def _like(self, segment: int, vertices: NDArray, factor: float) -> MeshSurface:
-        out = MeshSurface(segment, vertices, self.faces, series=self._series_times(factor), nodes=self.nodes)
+    def _with_vertices(self, segment: int, vertices: NDArray, factor: float) -> MeshSurface:
+        out = MeshSurface(segment, vertices, self.faces, series=self._scaled_series(factor), nodes=self.nodes)
         if "grid" in self.__dict__:
             out.__dict__["grid"] = self.grid if factor == 1.0 else self.grid.scaled(factor)
         return out
 
     @cached_property
     def _welded(self) -> NDArray:
-        """(T', 3) faces with one index for each place, without those that have no area left."""
+        """Faces (T', 3) with merged corners, without degenerate ones."""
         _, first, same = np.unique(np.round(self.vertices / WELD), axis=0, return_index=True, return_inverse=True)
         faces = first[same.ravel()][self.faces]
         flat = np.any(faces == np.roll(faces, 1, axis=1), axis=1)
@@ -116,13 +116,13 @@ class MeshSurface:
 
     @cached_property
     def _open_edges(self) -> NDArray:
-        """(E, 2) edges that an odd number of faces share."""
+        """Edges (E, 2) of an odd number of faces."""
         edges, count, _ = _edges(self._welded)
         return edges[count % 2 == 1]
 
 
 def _edges(faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Edges (E, 2), how many faces share each, and how many more run along it upwards than downwards."""
+    """Edges (E, 2), the number of faces of each, and the balance of faces in both directions (0 if consistent)."""
     ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
     edges, which, count = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
     balance = np.bincount(which.ravel(), np.sign(ends[:, 1] - ends[:, 0]), len(edges))
@@ -130,7 +130,7 @@ def _edges(faces: NDArray) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def check_triangles(vertices: NDArray, faces: NDArray) -> None:
-    """Refuse triangles that do not enclose something, as `MeshSurface` does."""
+    """Raise BodyError for vertices (V, 3) [m] and faces (T, 3) that enclose no volume, see `MeshSurface`."""
     edges, count, _ = _edges(np.asarray(faces, np.int64))
     _check(vertices, np.asarray(faces, np.int64), edges[count % 2 == 1])
 
@@ -146,10 +146,10 @@ def _check(vertices: NDArray, faces: NDArray, open_edges: NDArray) -> None:
         raise BodyError(problem, remedy="Make them all face outwards (in Blender: Mesh, Normals, Recalculate Outside).")
     cell = cell_size(vertices[faces])
     for hole in parts(open_edges) if len(open_edges) else []:
-        rim = vertices[open_edges[hole]].reshape(-1, 3)
-        width = float(np.linalg.norm(np.ptp(rim, axis=0)))
-        if width > cell:  # what is inside of a wider one cannot be told from what is outside
-            at = np.round(rim.mean(0), 4).tolist()
+        border = vertices[open_edges[hole]].reshape(-1, 3)
+        width = float(np.linalg.norm(np.ptp(border, axis=0)))
+        if width > cell:  # beyond that, inside and outside are ambiguous
+            at = np.round(border.mean(0), 4).tolist()
             problem = f"a mesh has a hole of {width:.3f} m near {at} ({len(open_edges)} open edges in all)"
             raise BodyError(problem, remedy="Fill it (in Blender: Mesh, Clean Up, Fill Holes).")
     for part in parts(faces):
@@ -162,7 +162,7 @@ def _check(vertices: NDArray, faces: NDArray, open_edges: NDArray) -> None:
 
 @cache
 def tube_faces(along: int, around: int) -> NDArray:
-    """(T, 3) faces of `along` rings of `around` quads, and a fan on each end; its two middles are the last vertices."""
+    """Faces (T, 3) of `along` rings of `around` quads, with a fan at each end, whose centres are the last vertices."""
     j = np.arange(around)
     following, bottom, top = (j + 1) % around, (along + 1) * around, (along + 1) * around + 1
     rows = np.arange(along)[:, None] * around

@@ -1,8 +1,7 @@
-"""Metaballs: ellipsoids on a segment whose fields melt into one surface, Σ w exp(-2 d) = 1/2 (P4, eqs. 7, 8 and 15).
+"""Metaballs: ellipsoids on a segment whose fields blend into one surface, Σ w exp(-2 d) = 1/2 (P4, eqs. 7, 8 and 15).
 
-They stand and lie in the segment's frame in shares of its length, so that a longer bone takes them along. The surface
-is exact where the body is fitted (`nearest`); where it is drawn, anchored or exported it is a closed mesh, made of
-cross-sections by ray casting (P4, section 3.1), whose faces stay the same when radii change.
+They scale with the segment. Fits use the exact surface (`nearest`). Rendering, anchors and exports use a closed mesh of
+cross-sections, made by ray casting (P4, section 3.1), whose faces do not change with the radii.
 """
 
 from __future__ import annotations
@@ -14,20 +13,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies.surfaces.mesh import MeshSurface, tube_faces
-from kinefit.bodies.surfaces.obj import LONGEST
+from kinefit.bodies.surfaces.obj import MAX_LENGTH
 from kinefit.errors import BodyError
 
 LEVEL = 0.5  # of the field on the surface (P4, w_t)
-_THINNEST = 1e-4  # [m] of a radius: thinner than any sensor sees
-_HEAVIEST = 12.0  # logarithm of a weight: such a ball is seen at 2.5 of its radii, and is as good as a solid one
+_MIN_RADIUS = 1e-4  # [m] below what any sensor resolves
+_MAX_LOG_WEIGHT = 12.0  # such a ball's surface is at 2.5 of its radii, and nearly solid
 _AROUND, _RINGS = 32, 24  # corners of a cross-section, and cross-sections
-_SCANNED, _HALVED, _NEWTON = 12, 7, 4  # steps outwards to below the level, halvings of the last one, then secants
+_SCAN_STEPS = 12  # outwards along a ray, to below the level
+_BISECTIONS = 7  # of the last step
+_SECANT_STEPS = 4  # after that
 
 
 class Derivatives(NamedTuple):
     """A field (N,) and its exact derivatives: by the point (N, 3), radii (N, K, 3), weights (N, K) and length (N,).
 
-    That by the length is by the logarithm of a factor on places and radii alike.
+    The last one is by the logarithm of a common factor of centres and radii.
     """
 
     value: NDArray
@@ -37,7 +38,7 @@ class Derivatives(NamedTuple):
     by_length: NDArray
 
 
-def _nothing() -> NDArray:
+def _empty() -> NDArray:
     return np.zeros(0)
 
 
@@ -49,18 +50,18 @@ class Metaballs(MeshSurface):
     ----------
     segment, vertices, faces : as of a mesh: the surface's cross-sections.
     centres : (K, 3) [m] in the segment's frame.
-    radii : (K, 3) [m] at which d = 1 along the axes; one ball of weight 1 alone is seen at 0.589 of them.
-    weights : (K,) of the fields; larger ones have sharper edges.
+    radii : (K, 3) [m] at which d = 1 along the axes; the surface of a single ball of weight 1 is at 0.589 of them.
+    weights : (K,) of the fields; larger ones give sharper edges.
     axes : (K, 3, 3) directions of the ellipsoids' axes, as rows.
     """
 
-    centres: NDArray = field(default_factory=_nothing)
-    radii: NDArray = field(default_factory=_nothing)
-    weights: NDArray = field(default_factory=_nothing)
-    axes: NDArray = field(default_factory=_nothing)
+    centres: NDArray = field(default_factory=_empty)
+    radii: NDArray = field(default_factory=_empty)
+    weights: NDArray = field(default_factory=_empty)
+    axes: NDArray = field(default_factory=_empty)
 
     def __post_init__(self) -> None:
-        """Nothing is checked: cross-sections between two poles are closed and face outwards as they are made."""
+        """Skip the checks of a mesh: cross-sections between two poles are closed and oriented by construction."""
         for value in (self.vertices, self.faces):
             value.flags.writeable = False
 
@@ -69,12 +70,12 @@ class Metaballs(MeshSurface):
         cls, segment: int, centres: ArrayLike, radii: ArrayLike, weights: ArrayLike | None = None,
         axes: ArrayLike | None = None,
     ) -> Metaballs:  # fmt: skip
-        """The surface of some ellipsoids.
+        """Surface of ellipsoids: centres, radii (K, 3) [m], weights (K,), default 1, axes (K, 3, 3), default aligned.
 
         Raises
         ------
         BodyError
-            Numbers that are not finite, radii or weights that are not positive, balls that do not melt into one.
+            Numbers that are not finite, radii or weights that are not positive, balls that do not blend into one.
         """
         c = np.array(centres, float)
         r = np.array(radii, float)
@@ -88,12 +89,12 @@ class Metaballs(MeshSurface):
             k = int(np.argmin(np.minimum(r.min(axis=1), w)))
             problem = f"ball {k + 1} has radii {np.round(r[k], 4).tolist()} m, weight {w[k]:g}"
             raise BodyError(problem, remedy="Give positive numbers; radii that collapse need more points.")
-        odd = (np.maximum(np.abs(c), r).max(axis=1) > LONGEST) | (r.min(axis=1) < _THINNEST)
-        odd |= np.abs(np.log(w)) > _HEAVIEST
-        if odd.any():
-            k = int(np.argmax(odd))
+        out_of_range = (np.maximum(np.abs(c), r).max(axis=1) > MAX_LENGTH) | (r.min(axis=1) < _MIN_RADIUS)
+        out_of_range |= np.abs(np.log(w)) > _MAX_LOG_WEIGHT
+        if out_of_range.any():
+            k = int(np.argmax(out_of_range))
             problem = f"ball {k + 1} at {c[k].tolist()} m has radii {r[k].tolist()} m, weight {w[k]:g}"
-            remedy = f"Give metres below {LONGEST:.0f}, radii above {_THINNEST:g}, and weights near 1."
+            remedy = f"Give metres below {MAX_LENGTH:.0f}, radii above {_MIN_RADIUS:g}, and weights near 1."
             raise BodyError(problem, remedy=remedy)
         vertices, faces = _mesh(c, r, w, A)
         for value in (c, r, w, A):
@@ -101,25 +102,25 @@ class Metaballs(MeshSurface):
         return cls(segment, vertices, faces, c, r, w, A)
 
     def changed(self, radii: ArrayLike, weights: ArrayLike | None = None) -> Metaballs:
-        """With other radii (K, 3) [m] and weights (K,)."""
+        """The metaballs with other radii (K, 3) [m] and weights (K,)."""
         return Metaballs.of(self.segment, self.centres, radii, self.weights if weights is None else weights, self.axes)
 
     def mirrored(self) -> Metaballs:
-        """On the other side of the plane z = 0."""
+        """The metaballs mirrored at the plane z = 0."""
         flip = np.array([1.0, 1.0, -1.0])
         return Metaballs.of(self.segment, self.centres * flip, self.radii, self.weights, self.axes * flip)
 
-    def _like(self, segment: int, vertices: NDArray, factor: float) -> Metaballs:
+    def _with_vertices(self, segment: int, vertices: NDArray, factor: float) -> Metaballs:
         return Metaballs(
             segment, vertices, self.faces, self.centres * factor, self.radii * factor, self.weights, self.axes
         )
 
     def field(self, x: ArrayLike) -> NDArray:
-        """(N,) at points (N, 3) [m] of the segment's frame: above 1/2 inside, below it outside."""
+        """Field (N,) at points (N, 3) [m] in the segment's frame: above 1/2 inside, below it outside."""
         return _field(np.asarray(x, float), self.centres, self.radii, self.weights, self.axes)
 
     def derivatives(self, x: ArrayLike) -> Derivatives:
-        """The field and its derivatives at points (N, 3) [m] of the segment's frame."""
+        """The field and its derivatives at points (N, 3) [m] in the segment's frame."""
         x = np.asarray(x, float)
         count = len(self.radii)
         value, by_point, by_length = np.zeros(len(x)), np.zeros((len(x), 3)), np.zeros(len(x))
@@ -147,14 +148,14 @@ def _field(x: NDArray, centres: NDArray, radii: NDArray, weights: NDArray, axes:
 
 
 def _log_field(x: NDArray, centres: NDArray, radii: NDArray, weights: NDArray, axes: NDArray) -> NDArray:
-    """Logarithm of the field, finite also where the field is less than the smallest number."""
+    """Logarithm of the field, finite also where the field underflows."""
     logs = np.stack([np.log(w) - 2.0 * (((x - c) @ (A / r[:, None]).T) ** 2).sum(-1)
                      for c, r, w, A in zip(centres, radii, weights, axes)])  # fmt: skip
     return np.logaddexp.reduce(logs, axis=0)
 
 
 def _mesh(centres: NDArray, radii: NDArray, weights: NDArray, axes: NDArray) -> tuple[NDArray, NDArray]:
-    """Vertices and faces: two poles, and cross-sections between them, each by rays from the line through the balls."""
+    """Vertices and faces of two poles and the cross-sections between them, by rays from the line through the balls."""
     along, spine = _spine(centres, radii, axes)
     balls = centres, radii, weights, axes
     reach = float(np.ptp(centres @ along) + 3.0 * radii.max())
@@ -183,7 +184,7 @@ def _mesh(centres: NDArray, radii: NDArray, weights: NDArray, axes: NDArray) -> 
 
 
 def _spine(centres: NDArray, radii: NDArray, axes: NDArray) -> tuple[NDArray, NDArray]:
-    """Direction of a limb, and its balls' centres in their order along it."""
+    """Direction (3,) of a limb, and its balls' centres (K, 3) in their order along it."""
     if len(centres) == 1:
         return axes[0, int(np.argmax(radii[0]))], centres
     along = centres[-1] - centres[0]
@@ -198,17 +199,17 @@ def _spine(centres: NDArray, radii: NDArray, axes: NDArray) -> tuple[NDArray, ND
 
 
 def _first_outside(starts: NDArray, ways: NDArray, reach: float, balls: tuple[NDArray, ...]) -> NDArray:
-    """(N,) [m] along rays, where the field first falls below the level; zero where it is below it at the start."""
-    steps = reach * (np.arange(1, _SCANNED + 1) / _SCANNED) ** 2  # finer near the middle, where thin limbs end
+    """Distance (N,) [m] along rays at which the field first falls below the level; zero if it starts below it."""
+    steps = reach * (np.arange(1, _SCAN_STEPS + 1) / _SCAN_STEPS) ** 2  # finer near the start, where thin limbs end
     values = _field(starts[:, None] + steps[:, None] * ways[:, None], *balls)
     first = np.argmax(values < LEVEL, axis=1)
     low, high = np.where(first > 0, steps[first - 1], 0.0), steps[first]
-    for _ in range(_HALVED):
+    for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
         inside = _field(starts + middle[:, None] * ways, *balls) >= LEVEL
         low, high = np.where(inside, middle, low), np.where(inside, high, middle)
     at, step = 0.5 * (low + high), 1e-6 * reach
-    for _ in range(_NEWTON):
+    for _ in range(_SECANT_STEPS):
         here, there = (_log_field(starts + s[:, None] * ways, *balls) - np.log(LEVEL) for s in (at, at + step))
         at = np.clip(at - step * here / np.where(np.abs(there - here) > 1e-15, there - here, -1e-15), low, high)
     return at
@@ -219,9 +220,9 @@ class BallTable(NamedTuple):
 
     Parameters
     ----------
-    limbs : (G, 7) segment, first ball, one after the last, centre (3) and radius of a sphere about all of the surface;
-        [m] in the root frame at rest.
-    balls : (B, 13) centre (3) there, axes over radii (9) row by row [1/m], weight.
+    limbs : (G, 7) segment, first ball, one after the last, centre (3) and radius of a sphere around the surface; [m] in
+        the root frame at rest.
+    balls : (B, 13) centre (3) [m] in that frame, axes over radii (9) row by row [1/m], weight.
     """
 
     limbs: NDArray

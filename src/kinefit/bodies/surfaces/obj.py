@@ -1,4 +1,4 @@
-"""Triangle meshes from Wavefront OBJ files."""
+"""Read triangle meshes from Wavefront OBJ files."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.errors import BodyError, choices
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-LONGEST = 10.0  # [m] no single segment of anything that is tracked is as long
+MAX_LENGTH = 10.0  # [m] of a segment's mesh; a longer one is in another unit
 
 
 def read_obj(path: str | PathLike[str]) -> tuple[NDArray, NDArray]:
-    """Vertices (V, 3) in the file's unit and triangles (T, 3) of an OBJ file; polygons are split into fans.
+    """Read vertices (V, 3) in the file's unit and triangles (T, 3) of an OBJ file; polygons are split into fans.
 
-    Of `v` lines the first three numbers count, of `f` lines (`1`, `1/2`, `1//3`, `1/2/3`, or counted back from the
-    end by negative numbers) the vertices; everything else is passed over.
+    Uses the first three numbers of `v` lines and the vertices of `f` lines (`1`, `1/2`, `1//3`, `1/2/3`, or negative
+    numbers from the end). All other lines are ignored.
 
     Raises
     ------
     BodyError
-        A file that cannot be read, a line that is not what it says, a file without faces.
+        A file that cannot be read, an invalid line, or a file without faces.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
@@ -68,14 +68,16 @@ def mesh_surface(
 
     Parameters
     ----------
+    path : of the file.
+    segment : int
     unit : "m", "cm" or "mm", of the file.
-    mirror : bool, its image on the other side of z = 0.
+    mirror : bool, whether it is mirrored at z = 0.
     place : str, named in messages.
 
     Raises
     ------
     BodyError
-        See `read_obj` and `MeshSurface`; an unknown unit; a mesh that is longer than 10 m: taken for metres?
+        See `read_obj` and `MeshSurface`; an unknown unit; a mesh longer than 10 m, which is probably in another unit.
     """
     return surface_of_file(path, segment, lambda: read_obj(path), unit=unit, mirror=mirror, place=place)
 
@@ -84,11 +86,16 @@ def surface_of_file(
     path: str | PathLike[str], segment: int, read: Callable[[], tuple[Any, Any]], *, unit: str, mirror: bool,
     place: str | None,
 ) -> MeshSurface:  # fmt: skip
-    """Surface of a segment from vertices and triangles that a file gives in its unit; arguments as of `mesh_surface`.
+    """Surface of a segment from vertices and triangles of a file; arguments as of `mesh_surface`.
 
     Parameters
     ----------
-    read : gives vertices (V, 3) in the file's unit, and triangles (T, 3); or a Fourier series in it, and its nodes.
+    read : returns vertices (V, 3) in the file's unit, and triangles (T, 3); or a Fourier series, and its nodes.
+
+    Raises
+    ------
+    BodyError
+        As `mesh_surface`.
     """
     if unit not in UNITS:
         raise BodyError(choices("unit", unit, UNITS), file=path, place=place, remedy="Give one of these.")
@@ -101,7 +108,7 @@ def surface_of_file(
             series = replace(shape, coefficients=UNITS[unit] * shape.coefficients)
             vertices, faces = series.triangles(nodes)
         length = float(np.ptp(vertices, axis=0).max())
-        if length > LONGEST:
+        if length > MAX_LENGTH:
             remedy = 'State the unit of its file, such as unit = "mm".'
             raise BodyError(f"the mesh is {length:.4g} m long", remedy=remedy)
         surface = MeshSurface(segment, vertices, faces, series=series, nodes=series and nodes)

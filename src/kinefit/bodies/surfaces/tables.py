@@ -21,9 +21,9 @@ class SurfaceTables(NamedTuple):
     ----------
     cylinders : (C, 18)
         segment, start (3) [m] in the root frame at rest, directions of a, b and the axis (9), length [m],
-        a0, b0 and how much they grow along the axis (4).
-    grids : GridTable of its meshes, None where it has none.
-    balls : BallTable of its metaballs, None where it has none.
+        a0, b0 and their growth along the axis (4).
+    grids : GridTable of its meshes, None without meshes.
+    balls : BallTable of its metaballs, None without metaballs.
     """
 
     cylinders: NDArray
@@ -32,7 +32,7 @@ class SurfaceTables(NamedTuple):
 
 
 def tables(surfaces: Sequence[TaperedCylinder | MeshSurface], rest: NDArray) -> SurfaceTables:
-    """Tables of surfaces; rest (S, 3) [m] joint centres in the root frame at rest."""
+    """Pack surfaces into tables; rest (S, 3) [m]: joint centres in the root frame at rest."""
     cylinders = [s for s in surfaces if isinstance(s, TaperedCylinder)]
     melted = [s for s in surfaces if isinstance(s, Metaballs)]
     meshes = [s for s in surfaces if isinstance(s, MeshSurface) and not isinstance(s, Metaballs)]

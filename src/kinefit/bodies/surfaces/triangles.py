@@ -1,4 +1,4 @@
-"""Surfaces as triangles, to be drawn or rendered, and as points spread evenly over them."""
+"""Triangulate surfaces for rendering, and sample points evenly on them."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class BodyMesh:
     face_segment: NDArray
 
     def posed(self, frames: NDArray) -> NDArray:
-        """(V, 3) [m] vertices in the world; frames (S, 12) of `KinematicTree.forward`."""
+        """Vertices (V, 3) [m] in the world, for frames (S, 12) of `KinematicTree.forward`."""
         out = np.empty_like(self.vertices)
         starts = np.flatnonzero(np.diff(self.segment, prepend=-1))  # one product for each run of a segment's vertices
         for start, end in zip(starts, [*starts[1:], len(out)]):
@@ -46,16 +46,21 @@ class BodyMesh:
 
 
 def segment_middles(vertices: NDArray, segment: NDArray, count: int) -> NDArray:
-    """(S, 3) [m] mean of the vertices (V, 3) of each of so many segments, (V,) of which; 0 where there is none."""
+    """Mean vertex (S, 3) [m] of each of S = count segments, from vertices (V, 3) [m] and segment (V,); 0 for none."""
     number = np.maximum(np.bincount(segment, minlength=count), 1)
     return np.stack([np.bincount(segment, x, count) / number for x in vertices.T], axis=1)
 
 
 def triangles(surface: TaperedCylinder | MeshSurface, around: int = 20, along: int = 6) -> tuple[NDArray, NDArray]:
-    """Vertices (V, 3) [m] in the segment's frame and faces (T, 3), closed, outward counter-clockwise.
+    """Triangulate a surface: vertices (V, 3) [m] in the segment's frame and faces (T, 3), outward counter-clockwise.
 
-    A cylinder has `along` rings of `around` quads and a fan on each cap. Its sections are polygons of the ellipses'
-    areas, so their corners stand out a little (0.8 % of the radius with 20). A mesh is given as it is.
+    A cylinder has `along` rings of `around` quads and a fan on each cap. Its sections are polygons with the ellipses'
+    areas, so that corners lie slightly outside (0.8 % of the radius with 20). A mesh is returned as it is.
+
+    Raises
+    ------
+    BodyError
+        Fewer than 3 corners or 1 ring.
     """
     if isinstance(surface, MeshSurface):
         return surface.vertices, surface.faces
@@ -99,7 +104,13 @@ def body_mesh(body: Body, *, around: int = 20, along: int = 6) -> BodyMesh:
 
 
 def sample(body: Body, count: int, *, seed: int = 0) -> tuple[NDArray, NDArray, NDArray]:
-    """Points spread over all surfaces of a body, equally many for equal areas; also those inside of other surfaces.
+    """Sample points on all surfaces of a body, uniformly by area, including those inside of other surfaces.
+
+    Parameters
+    ----------
+    body : Body
+    count : int, number of points
+    seed : int, of the random numbers
 
     Returns
     -------
@@ -134,7 +145,7 @@ def sample(body: Body, count: int, *, seed: int = 0) -> tuple[NDArray, NDArray, 
 
 
 def _onto_side(cylinder: TaperedCylinder, points: NDArray) -> tuple[NDArray, NDArray]:
-    """Points (N, 3) near a cylinder's side put on it at the same height and eccentric angle, and the normals there."""
+    """Project points (N, 3) [m] onto a cylinder's side at the same height and eccentric angle; points and normals."""
     p, q, h = ((points - cylinder.start) @ cylinder.axes.T).T
     first, last = np.array(cylinder.radii)
     growth = (last - first) / cylinder.length

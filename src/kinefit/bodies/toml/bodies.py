@@ -1,4 +1,4 @@
-"""Bodies from TOML text: the catalogue's, and a user's own file."""
+"""Read bodies from TOML: of the catalogue, and from a user's file."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from kinefit.errors import BodyError, choices
 JOINT_TYPES = {"fixed": 0, "revolute": 1, "prismatic": 1, "universal": 2, "ball": 3, "free": 6}
 _AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 _AXES |= {f"-{name}": [-v for v in axis] for name, axis in _AXES.items()}
-_MAX_SEGMENTS = 1000  # and couplings ...; detailed skeletons have 200, and tables of all pairs grow by the square
+_MAX_SEGMENTS = 1000  # and couplings etc.; detailed skeletons have 200, and tables of all pairs grow by the square
 _CHOOSE = "Use one of these, or add it."
 
 
@@ -44,7 +44,7 @@ def read_toml_body(name_or_file: str | Path) -> Body:
 
 
 def _text(name_or_file: str | Path) -> tuple[str, str]:
-    """Text of a body file, and how it is named in messages."""
+    """Text of a body file, and its name for messages."""
     path = Path(name_or_file)
     if path.suffix == ".toml":
         try:
@@ -70,7 +70,7 @@ def catalogue() -> tuple[str, ...]:
 
 
 def catalogue_text(name: str) -> str:
-    """The TOML of a body of the catalogue, for a copy of one's own.
+    """TOML text of a body of the catalogue, as a template for a user's file.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def catalogue_text(name: str) -> str:
 
 @checked
 def parse_body(text: str, source: str = "body") -> Body:
-    """Body from TOML text; `source` names it in messages."""
+    """Parse a body from TOML text; `source` names it in messages. Raises a BodyError as `load_body` does."""
     record = _record(text, source)
     mirror = bool(record.body.mirror)
     segments = _in_order(_mirrored(record.segment) if mirror else list(record.segment), source)
@@ -124,7 +124,7 @@ def parse_body(text: str, source: str = "body") -> Body:
 
 
 def _record(text: str, source: str, above: tuple[str, ...] = ()) -> FileRecord:
-    """The record of a body file, with what its base says."""
+    """Record of a body file, merged with its base."""
     try:
         record = msgspec.convert(parse_toml(text, source, BodyError), FileRecord)
     except msgspec.ValidationError as error:
@@ -181,14 +181,14 @@ def _mirrored(segments: list[SegmentRecord]) -> list[SegmentRecord]:
 
 
 def _axes(joint: JointRecord) -> tuple[list[str | Vector], list[bool]]:
-    """Axes of a joint, and which of them it slides along."""
+    """Axes of a joint, and whether it slides along each."""
     if joint.type == "free":
         return list(joint.axes) or ["x", "y", "z", "x", "y", "z"], [True] * 3 + [False] * 3
     return list(joint.axes), [joint.type == "prismatic"] * len(joint.axes)
 
 
 def _mirrored_axis(axis: str | Vector, slides: bool) -> str | Vector:
-    """A turn about z looks the same in the mirror, about x and y it is reversed; a slide the other way round."""
+    """Mirror an axis at z = 0: rotations about x and y and slides along z change their sign."""
     if isinstance(axis, str) and axis not in _AXES:
         return axis
     x, y, z = _AXES[axis] if isinstance(axis, str) else axis
@@ -196,7 +196,7 @@ def _mirrored_axis(axis: str | Vector, slides: bool) -> str | Vector:
 
 
 def _in_order(segments: list[SegmentRecord], source: str) -> list[SegmentRecord]:
-    """Depth first from the root, so that parents come before children and limbs stay together."""
+    """Sort segments depth first from the root: parents before children, limbs contiguous."""
     children: dict[str | None, list[SegmentRecord]] = {s.name: [] for s in segments}
     _refuse_repeated("segment", [s.name for s in segments], source)
     _refuse_repeated("joint", [s.joint.name for s in segments], source)

@@ -1,4 +1,4 @@
-"""`[[closure]]` and `[[dimension]]` of a body file."""
+"""Read `[[closure]]` and `[[dimension]]` of a body file."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 Vector = tuple[float, float, float]
 ESTIMATE = "estimate"
 _NAMED = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_LARGEST = 1e4  # [m] or [deg] of a dimension
-_CLOSE = {"line": "axis", "plane": "axis"}
+_MAX_DIMENSION = 1e4  # [m] or [deg]
+_KINDS_WITH_AXIS = ("line", "plane")
 
 
 class ClosureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -55,7 +55,7 @@ class DimensionRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
 
 def with_closure_images(records: Sequence[ClosureRecord], left: Callable[[str], str]) -> list[ClosureRecord]:
-    """Closures whose names end in `_r`, with their images."""
+    """Closures, and the mirror images of those whose names end in `_r`."""
     out = list(records)
     for r in records:
         if left(r.name) == r.name or any(other.name == left(r.name) for other in records):
@@ -73,13 +73,13 @@ def with_closure_images(records: Sequence[ClosureRecord], left: Callable[[str], 
 def closed(
     body: Body, closures: Sequence[ClosureRecord], dimensions: Sequence[DimensionRecord], source: str
 ) -> Body:
-    """The body with the closures and dimensions of a file.
+    """Add the closures and dimensions of a file to a body.
 
     Raises
     ------
     BodyError
-        Two of one name; points, segments, kinds that are not there; a closure of a segment with itself; deviations
-        that are not positive; what says nothing or too much: with file, place and remedy.
+        A duplicate name; an unknown point, segment or kind; a closure of a segment with itself; a standard deviation
+        that is not positive; missing or contradictory keys.
     """
     if body.morphs:
         problem = "closures of a body whose joints or surfaces morph"
@@ -114,7 +114,7 @@ def _closure(body: Body, r: ClosureRecord, source: str) -> Closure:
         raise wrong("`to` and `at`: one of them is needed", "Give `to` a landmark, or `at` a place in the world.")
     if isinstance(r.at, str) and r.at != ESTIMATE:
         raise wrong(f"at = {r.at!r}", 'Give three numbers in metres, or "estimate".')
-    if (r.kind in _CLOSE) != (r.axis is not None):
+    if (r.kind in _KINDS_WITH_AXIS) != (r.axis is not None):
         raise wrong(f"a {r.kind} closure with axis {r.axis}", "Give an axis to lines and planes, and to no other.")
     if r.turn is not None and r.kind != "rigid":
         raise wrong(f"a {r.kind} closure with a turn", "Leave it out: only rigid closures hold turns.")
@@ -143,7 +143,7 @@ def _closure(body: Body, r: ClosureRecord, source: str) -> Closure:
 
 
 def _unit(axis: str | Vector | None) -> Vector | None:
-    """A direction of length 1; up where none is asked for, None for what is none."""
+    """Unit vector (3,) of an axis, default up; None if it has no direction."""
     v = np.array(_NAMED["y"] if axis is None else _NAMED.get(axis, (np.nan,) * 3) if isinstance(axis, str) else axis)
     length = float(np.linalg.norm(v))
     if not 1e-9 < length < np.inf:
@@ -152,7 +152,7 @@ def _unit(axis: str | Vector | None) -> Vector | None:
 
 
 def _dimension(body: Body, r: DimensionRecord, source: str) -> tuple[Dimension, float]:
-    """A dimension as it is drawn, and its value [m] or [rad]."""
+    """A dimension at its drawn value, and its actual value [m] or [rad]."""
     place = f"dimension {r.name}"
 
     def wrong(problem: str, remedy: str) -> BodyError:
@@ -177,9 +177,9 @@ def _dimension(body: Body, r: DimensionRecord, source: str) -> tuple[Dimension, 
             raise wrong(f"an angle that moves '{name}'", "Angles turn rigid closures, and nothing else.")
         if kinds[0] and r.along is not None and closures[name].to:
             raise wrong(f"it shifts closure '{name}' between two landmarks", "Name one of the landmarks.")
-    told = [r.mean, None if isinstance(r.value, str) else r.value]
-    numbers = [r.drawn, *(r.along or r.about or ()), *(number for number in told if number is not None)]
-    if not (np.abs(numbers) < _LARGEST).all():
+    stated = [r.mean, None if isinstance(r.value, str) else r.value]
+    numbers = [r.drawn, *(r.along or r.about or ()), *(number for number in stated if number is not None)]
+    if not (np.abs(numbers) < _MAX_DIMENSION).all():
         raise wrong("numbers that are not finite, or no dimensions of anything", "Give metres and degrees.")
     axis = (0.0, 0.0, 0.0)
     if r.about is not None:

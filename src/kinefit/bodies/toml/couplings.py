@@ -1,4 +1,4 @@
-"""The usual posture, and departures from it that go together, as a body file states them."""
+"""Read the posture prior of a body file: its mean, and the couplings of deviations from it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kinefit.errors import BodyError, choices
 
 
 def with_coupling_images(records: Sequence[CouplingRecord], left: Callable[[str], str]) -> list[CouplingRecord]:
-    """Couplings whose names end in `_r`, with their images."""
+    """Couplings, and the mirror images of those whose names end in `_r`."""
     images = [
         msgspec.structs.replace(r, name=left(r.name), of={left(c): weight for c, weight in r.of.items()})
         for r in records if left(r.name) not in {other.name for other in records}
@@ -23,13 +23,13 @@ def with_coupling_images(records: Sequence[CouplingRecord], left: Callable[[str]
 
 
 def coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord], source: str) -> KinematicTree:
-    """The tree with the couplings of a file, whose weights have no unit and whose spreads are in degrees.
+    """Add the couplings of a file to a tree; weights have no unit, spreads are in degrees.
 
     Raises
     ------
     BodyError
-        A coordinate that is not there or slides, nothing or no number as weights, a spread that is not positive, or a
-        coordinate that cannot be coupled, see `KinematicTree`.
+        A coordinate that is unknown, slides or cannot be coupled (see `KinematicTree`), weights that are all zero or
+        not finite, a spread that is not positive.
     """
     lines = np.zeros((len(couplings), len(tree.coordinates)))
     for line, c in zip(lines, couplings):
@@ -53,12 +53,12 @@ def coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord], source: st
 
 
 def with_posture(tree: KinematicTree, usual: Mapping[str, float], source: str) -> KinematicTree:
-    """The tree with another usual posture: values [deg] or [m] of some coordinates.
+    """Change the mean posture of a tree: values [deg] or [m] of some coordinates.
 
     Raises
     ------
     BodyError
-        A coordinate that is not there, or a value beyond its range.
+        An unknown coordinate, or a value out of its range.
     """
     out = np.array(tree.usual)
     for name, value in usual.items():

@@ -1,4 +1,4 @@
-"""What a body file may hold, and a body that is told as a change of another."""
+"""Records of a body file, and the merge of a body file with its base."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class PointRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class HeadRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """`[body]`; what is not given comes from the `base`, if there is one."""
+    """`[body]`; missing values come from the `base`, if there is one."""
 
     name: str
     base: str | None = None
@@ -64,7 +64,7 @@ class HeadRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 def stature_of(value: float, source: str | PathLike[str] | None = None) -> float:
-    """[m] as a file states it; 0 where it does not.
+    """Check a stature [m] as stated in a file; 0 if not stated.
 
     Raises
     ------
@@ -103,9 +103,9 @@ class FileRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 def merged(base: FileRecord, own: FileRecord) -> FileRecord:
-    """`base` with what `own` says: segments and entries of the same name are replaced, all others added."""
-    mine = {s.name: s for s in own.segment}
-    segments = [mine.pop(s.name, s) for s in base.segment]
+    """Merge a file into its base: segments and entries of the same name are replaced, all others added."""
+    new = {s.name: s for s in own.segment}
+    segments = [new.pop(s.name, s) for s in base.segment]
     couplings = {c.name: c for c in base.coupling + own.coupling}
     closures = {c.name: c for c in base.closure + own.closure}
     dimensions = {d.name: d for d in base.dimension + own.dimension}
@@ -117,7 +117,7 @@ def merged(base: FileRecord, own: FileRecord) -> FileRecord:
     )
     return FileRecord(
         body=head,
-        segment=segments + list(mine.values()),
+        segment=segments + list(new.values()),
         usual=base.usual | own.usual,
         coupling=list(couplings.values()),
         closure=list(closures.values()),
@@ -131,9 +131,9 @@ def merged(base: FileRecord, own: FileRecord) -> FileRecord:
 
 
 _EXTENDS = {"MEDIAPIPE_75": "MEDIAPIPE_33", "BODY_25_HANDS": "BODY_25", "COCO_WHOLEBODY_133": "COCO_17"}
-"""Keypoint sets with hands, and those whose points they begin with."""
+"""Keypoint sets with hands, and the sets that they extend."""
 
 
 def extended(sets: dict[str, dict[str, str]]) -> dict[str, dict[str, str]]:
-    """Keypoint sets of a file, and those that extend them; a body without fingers knows all but the hands."""
+    """Keypoint sets of a file, and the sets that extend them, without hands if the body has no fingers."""
     return sets | {name: sets[of] | sets.get(name, {}) for name, of in _EXTENDS.items() if of in sets}

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from kinefit.diagnostics.sensor_fit import SURE, SensorAlignment, marker_index
+from kinefit.diagnostics.sensor_fit import MISFIT_SIGMAS, SensorAlignment, marker_index
 from kinefit.errors import command
 from kinefit.findings import Finding
 from kinefit.geometry import se3
@@ -54,7 +54,7 @@ def sensor_findings(fits: Sequence[SensorAlignment], take: Take) -> list[Finding
             told = f"{np.degrees(fit.turn):.2f}° and {1e3 * fit.shift:.0f} mm at the person"
             out.append(Finding("good", "sensor", f"{fit.sensor} fits the videos to {told}."))
         late, std = fit.twist[6], float(np.sqrt(fit.covariance[6, 6]))
-        if abs(late) > max(SURE * std, _LATE):
+        if abs(late) > max(MISFIT_SIGMAS * std, _LATE):
             text = f"The clock of {fit.sensor} is off by {1e3 * late:+.0f} ± {1e3 * std:.0f} ms against the videos."
             entry = next((e for e in take.depth if e.name == fit.sensor), None) or marker_entry(fit, take)
             table = "depth" if fit.kind == "depth" else "markers"

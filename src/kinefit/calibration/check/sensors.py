@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.surfaces import TaperedCylinder
-from kinefit.diagnostics.sensor_fit import PRIOR, SURE, SensorAlignment, doubts_of
+from kinefit.diagnostics.sensor_fit import MISFIT_SIGMAS, POSE_SIGMAS, SensorAlignment, doubts_of
 from kinefit.errors import ObservationError
 from kinefit.frame.routing import Sensors
 from kinefit.geometry import se3
@@ -110,8 +110,9 @@ def _elsewhere(sensor: str, placed: PlacedCamera, motion: Motion) -> SensorAlign
     """A depth camera that belongs too far from where it is stated to be moved there, such as upside down."""
     T, centre = placed.T, motion.positions().mean(axis=(0, 1))
     twist = np.array([*(se3.apply(T, centre) - centre), *se3.log_so3(T[:3, :3]), 0.0])
-    std = np.array([*np.repeat(PRIOR, 3), _CLOCK])
-    doubts = (f"it would turn by {np.degrees(placed.turn):.0f}°: more than {np.degrees(SURE * PRIOR[1]):.0f}°",)
+    std = np.array([*np.repeat(POSE_SIGMAS, 3), _CLOCK])
+    limit = np.degrees(MISFIT_SIGMAS * POSE_SIGMAS[1])
+    doubts = (f"it would turn by {np.degrees(placed.turn):.0f}°: more than {limit:.0f}°",)
     return SensorAlignment(sensor, "depth", twist, np.diag(std**2), centre, True, doubts)
 
 
@@ -168,7 +169,7 @@ class _PlacementProblem:
         self.names = tuple(dict.fromkeys(f.sensor for look in looks for f in look.seen))
         self.centre = np.mean([self.motion.positions()[f].mean(axis=0) for f in chosen], axis=0)
         self.place = SensorFrames(
-            self.names, (*PRIOR, _CLOCK), {name: self.origins[name] - self.centre for name in self.names}
+            self.names, (*POSE_SIGMAS, _CLOCK), {name: self.origins[name] - self.centre for name in self.names}
         )
         near, ends = self.coarse(looks)
         out = [self.with_surface(fit) for fit in self.fitted(looks, near)]
@@ -206,7 +207,7 @@ class _PlacementProblem:
         for sensor in self.names:
             if sensor in self.depth:
                 own = self.registration(sensor, looks)
-                first = starts(self.origins[sensor], self.centre, PRIOR)
+                first = starts(self.origins[sensor], self.centre, POSE_SIGMAS)
                 rest = [own.settled(twist, (*FAR, *FINE)) for twist in first]
                 ends[sensor] = Ends(own, tuple(own.height(twist, self.recording.up_axis) for twist in rest))
         near = {sensor: end.best for sensor, end in ends.items()}

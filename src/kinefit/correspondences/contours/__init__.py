@@ -1,1 +1,1 @@
-"""Rows of contours in images: outlines of a body against edges."""
+"""Rows of contours: the occluding contour of a body against silhouettes in images."""

@@ -1,6 +1,6 @@
-"""Compiled outlines: rim points of a mesh in a virtual image, and which points of two outlines belong together.
+"""Compiled contours: rim points of a mesh in a rendered image, and correspondences between two contours.
 
-An outline is told by points (u, v) [px] with unit normals (a, b) that point away from the body.
+A contour consists of points (u, v) [px] with unit normals (a, b) that point away from the body.
 """
 
 from __future__ import annotations
@@ -11,22 +11,21 @@ from kinefit._jit import jit
 from kinefit.geometry._kernels_camera import CX, CY, DIST, FX, FY, MODEL, ROT, SKEW, TRANS, project_jacobian
 
 OUTER, INNER = 0, 1
-_REACH = 1.0  # [px] from the rim to the two pixels that tell what is on both sides of it
+_SIDE_OFFSET_PX = 1.0  # from the rim to the pixels that are tested on both sides of it
 
 
 @jit
 def _pixel(v, size):
-    """Nearest pixel, or -1 beside the image."""
+    """Nearest pixel, or -1 outside of the image."""
     i = math.floor(v + 0.5)
     return i if 0 <= i < size else -1
 
 
 @jit
 def seen(camera, vertices, x, uv):
-    """Vertices (V, 3) [m] of the world in a camera (packed): pixels uv (V, 2), and x (V, 3) [m].
+    """Project vertices (V, 3) [m] of the world into a camera (packed): pixels uv (V, 2), and x (V, 3) [m].
 
-    x is where a pinhole with the same lens but no distortion would see them in the same pixel and depth; those that no
-    ray reaches lie at z = 0.
+    x has the same pixels and depths in a pinhole camera without distortion; vertices that do not project have z = 0.
     """
     c = camera
     bent = c[MODEL] != 0.0 or c[SKEW] != 0.0
@@ -55,7 +54,7 @@ def seen(camera, vertices, x, uv):
 
 @jit
 def shift(a, b, together):
-    """How far points (N, 2) have moved together since b, if they may, and how far any coordinate has beyond that."""
+    """Common shift [px] of points (N, 2) from b to a, if `together`, and the largest remaining change [px]."""
     x, y, largest = 0.0, 0.0, 0.0
     if together:
         for i in range(len(a)):
@@ -81,16 +80,16 @@ def bounds(uv):
 
 @jit
 def rims(x, uv, faces, label, edges, sides, depth, face, spacing, near, apart, inner, front, out, place, kind):
-    """Rim points of a mesh that was drawn: how many were written.
+    """Write the rim points of a rendered mesh; returns their number.
 
-    Edges between a face that looks at the camera and one that does not are the rims; points are put on them `spacing`
-    [px] apart. The images of depth and faces tell whether such a point is seen, and what lies behind: nothing (OUTER),
-    or something farther away than `apart` [m] (INNER). Beside what is not the body, face below -1, there are none.
+    Rims are edges between a face towards the camera and one away from it, sampled `spacing` [px] apart. The images of
+    depth and faces show whether a point is visible, and what is behind: nothing (OUTER), or the body, by more than
+    `apart` [m] (INNER). Next to another body (face below -1) there are none.
 
-    x (V, 3) [m] in the camera's frame and uv (V, 2) [px] of the vertices; faces (T, 3) with label (T,); edges (E, 2)
-    with the faces on both sides (E, 2), -1 for none; depth, face (H, W) as drawn; near [m] by which the surface just
-    inside of the rim may differ in depth from it; inner: whether INNER points are wanted; front (T,) int8 room.
-    out (4, N): u, v, a, b; place (N, 2): vertex pair's number and share of its second vertex; kind (N,).
+    x (V, 3) [m] in the camera's frame, uv (V, 2) [px]: the vertices. faces (T, 3) with label (T,). edges (E, 2) with
+    the faces on both sides (E, 2), -1 for none. depth, face (H, W): as rendered. near [m]: largest depth difference of
+    the surface just inside of the rim. inner: whether to write INNER points. front (T,) int8: work space.
+    out (4, N): u, v, a, b. place (N, 2): edge, and weight of its second vertex. kind (N,).
     """
     height, width = depth.shape
     nearest = math.inf
@@ -131,8 +130,8 @@ def rims(x, uv, faces, label, edges, sides, depth, face, spacing, near, apart, i
                 return n
             t = (s + 0.5) / count
             u, v = uv[i, 0] + t * du, uv[i, 1] + t * dv
-            p, q = _pixel(u - _REACH * a, width), _pixel(v - _REACH * b, height)
-            r, w = _pixel(u + _REACH * a, width), _pixel(v + _REACH * b, height)
+            p, q = _pixel(u - _SIDE_OFFSET_PX * a, width), _pixel(v - _SIDE_OFFSET_PX * b, height)
+            r, w = _pixel(u + _SIDE_OFFSET_PX * a, width), _pixel(v + _SIDE_OFFSET_PX * b, height)
             if p < 0 or q < 0 or r < 0 or w < 0 or face[q, p] < 0:
                 continue
             z = 1.0 / ((1.0 - t) / x[i, 2] + t / x[j, 2])
@@ -151,9 +150,9 @@ def rims(x, uv, faces, label, edges, sides, depth, face, spacing, near, apart, i
 
 @jit
 def match(model, image, reach, cosine, to_image, to_model):
-    """For every point of each outline (4, N), (4, M) the nearest one of the other that looks the same way, else -1.
+    """For every point of each contour (4, N), (4, M), the nearest point of the other with a similar normal, else -1.
 
-    reach [px]; cosine of the largest angle between normals. A turned normal counts as farther away: d² (2 - cos).
+    reach [px]: largest distance; cosine: of the largest angle between normals. The distance is d² (2 - cos).
     """
     most = reach * reach
     best = to_model[1]
@@ -180,10 +179,10 @@ def match(model, image, reach, cosine, to_image, to_model):
 
 @jit
 def tangent_rows(camera, vertices, ends, share, owner, image, weight, data, segment, group):
-    """One row a pair: the pixel of a rim point should lie on the tangent of the outline's point; how many were written.
+    """One row for each pair: the pixel of a rim point should lie on the contour point's tangent. Returns their number.
 
-    camera packed; vertices (V, 3) [m] in the world; of N rim points ends (N, 2), share (N,), owner (N,); image (4, N),
-    the outline's point of each; weight [1/px²]; row buffers as in `_kernels`.
+    camera packed; vertices (V, 3) [m] in the world; of N rim points ends (N, 2), share (N,), owner (N,); image (4, N):
+    the contour's point of each; weight [1/px²]; row buffers as in `_kernels`.
     """
     n = 0
     for i in range(len(share)):

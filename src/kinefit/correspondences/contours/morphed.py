@@ -1,4 +1,4 @@
-"""Points of a body's skin along directions: blended between segments, moved by morphs (P1 2.4, 3)."""
+"""Rows of a body's skin points, which are blended between segments and moved by morphs (P1 2.4, 3)."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def morphed_rows(
     share: ArrayLike | None = None,
     sigma: ArrayLike = 0.01,
 ) -> Rows | DofRows:
-    """One row a point, r ≈ n·∂x/∂δ δ, with all that a morph adds to the derivative.
+    """One row for each skin point, r ≈ n·∂x/∂δ δ, with the derivative of morphs.
 
-    Plain `Rows` where every node has one owner and nothing morphs, which are faster.
+    Returns plain `Rows`, which are faster, if every node has one owner and nothing morphs.
 
     Parameters
     ----------
@@ -34,6 +34,11 @@ def morphed_rows(
     residual : (K,) [m] how much further along it each point should lie; NaN for none.
     share : (K, C) barycentric coordinates.
     sigma : scalar or (K,) [m]
+
+    Raises
+    ------
+    ObservationError
+        Arrays of other shapes, or a sigma that is not positive.
     """
     chosen = np.asarray(index, np.int64)
     chosen = chosen[:, None] if chosen.ndim == 1 else chosen
@@ -42,9 +47,9 @@ def morphed_rows(
     if not np.all(deviation > 0):
         raise ObservationError("a standard deviation that is not positive", remedy="Give metres above 0.")
     part = np.ones(chosen.shape) if share is None else np.asarray(share, float)
-    seen = np.isfinite(r) & np.isfinite(n).all(1)
-    chosen, n, r, part, ids = chosen[seen], n[seen], r[seen], part[seen], np.flatnonzero(seen)
-    weight = 1.0 / deviation[seen] ** 2
+    known = np.isfinite(r) & np.isfinite(n).all(1)
+    chosen, n, r, part, ids = chosen[known], n[known], r[known], part[known], np.flatnonzero(known)
+    weight = 1.0 / deviation[known] ** 2
     skin = pose.morphing.skin
     if pose.morphing.is_rigid and (skin.owners[chosen, 0] == skin.owners[chosen[:, :1], 0]).all():
         x = np.einsum("kc,kci->ki", part, pose.vertices[chosen])
@@ -53,7 +58,7 @@ def morphed_rows(
 
 
 def on_moved_joints(pose: MorphedPose, rows: Rows) -> DofRows:
-    """Rows of points on segments, made with `pose.frames`, with the derivative that moving joints have."""
+    """Convert rows of points on segments, made with `pose.frames`, to rows with the derivative of moving joints."""
     arm = rows.point - pose.state.T_world_root[:3, 3]
     a = np.concatenate([rows.direction, np.cross(arm, rows.direction)], axis=1)
     J = np.empty((len(rows), pose.morphing.body.tree.n_dofs))
@@ -71,14 +76,20 @@ def morphed_outline_rows(
     *,
     sigma: float = 2.0,
 ) -> Rows | DofRows:
-    """As `outline_rows` by pixels, of a skin that is blended or morphs.
+    """Rows as of `outline_rows` by pixels, for a skin that is blended or morphs.
 
     Parameters
     ----------
     pose : MorphedPose
     rim : Rim of `pose.vertices` in this camera, N points.
-    image : (4, N) the point of the silhouette's outline that each belongs to: u, v [px], normal.
+    camera : Camera
+    image : (4, N) the matched point of the silhouette's contour for each: u, v [px], normal.
     sigma : float [px] standard deviation of a pair.
+
+    Raises
+    ------
+    ObservationError
+        A sigma that is not positive.
     """
     if not sigma > 0:
         raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive one.")
@@ -88,12 +99,12 @@ def morphed_outline_rows(
 
 
 def toward_tangents(x_world: NDArray, camera: Camera, image: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Which way points (N, 3) [m] must move for their pixels to lie on the tangents of an outline (4, N).
+    """Displacement of points (N, 3) [m] that moves their pixels to the tangents of a contour (4, N).
 
     Returns
     -------
     direction : (N, 3) unit, in the world, along which the pixel moves fastest across the tangent.
-    residual : (N,) [m] how far; size : (N,) [px/m] how fast.
+    residual : (N,) [m] distance along it; size : (N,) [px/m] speed of the pixel.
     """
     u, v, a, b = image
     pixel, J = camera.project_with_jacobian(x_world)

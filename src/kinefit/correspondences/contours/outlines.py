@@ -1,4 +1,4 @@
-"""Outline to outline: rim points of the body towards the contour of its silhouette (P1 2.3)."""
+"""Contour to contour: rim points of the body towards the contour of its silhouette (P1 2.3)."""
 
 from __future__ import annotations
 
@@ -18,16 +18,19 @@ from kinefit.rows import Rows
 def outline_pairs(
     rim: NDArray, image: NDArray, *, reach: float, angle: float = 1.0, both: bool = True
 ) -> tuple[NDArray, NDArray]:
-    """Points of two outlines (4, N) and (4, M) that belong together: indices (K,) of the first and of the second.
+    """Match two contours (4, N) and (4, M): indices (K,) of the points in the first and in the second.
 
-    Each point of the body's rim gets the nearest point of the image's outline that looks the same way; with `both`,
-    each point of the image's the nearest of the rim too: that draws parts of the body to where the image shows
-    something that nothing explains.
+    Each point of the body's rim is matched to the nearest point of the image's contour with a similar normal. With
+    `both`, each point of the image's contour is matched to the rim too, which pulls the body to unexplained parts of
+    the silhouette.
 
     Parameters
     ----------
-    reach : float [px] beyond which no points are paired.
-    angle : float [rad] beyond which two normals do not look the same way.
+    rim : (4, N) u, v [px] and unit normal of the body's contour.
+    image : (4, M) the same of the silhouette's contour.
+    reach : float [px], largest distance of a pair.
+    angle : float [rad], largest angle between two normals.
+    both : bool
     """
     to_image = np.empty(rim.shape[1], np.int64)
     to_model = np.empty((2, image.shape[1]))
@@ -52,19 +55,25 @@ def outline_rows(
     sigma: float = 2.0,
     by: str = "pixels",
 ) -> Rows:
-    """Rows that draw the rim of a body onto the outline of its silhouette.
+    """Rows that pull the rim of a body onto the contour of its silhouette.
 
-    By "pixels", one row a pair: the rim point's pixel should lie on the tangent of the outline, so that outlines glide
-    along each other. By "rays", two rows a pair: the rim point should lie on the ray of the outline's point (P1's
-    constraint). The rows of one pair bear its number as their measurement id. `outline_pairs` finds pairs.
+    By "pixels", one row for each pair: the rim point's pixel should lie on the tangent of the contour, along which it
+    may slide. By "rays", two rows for each pair: the rim point should lie on the ray of the contour's point (P1's
+    constraint). The `group` of a row is the index of its pair. `outline_pairs` finds pairs.
 
     Parameters
     ----------
     rim : Rim of the body at this state in this camera, N points.
     vertices_world : (V, 3) [m] of the mesh at this state.
     camera : Camera, of the image's size.
-    image : (4, N) the point of the silhouette's outline that each belongs to: u, v [px], normal.
+    image : (4, N) the matched point of the silhouette's contour for each: u, v [px], normal.
     sigma : float [px] standard deviation of a pair.
+    by : "pixels" or "rays"
+
+    Raises
+    ------
+    ObservationError
+        Another `by`, or a sigma that is not positive.
     """
     if by not in ("pixels", "rays"):
         raise ObservationError(f"rows by '{by}'", remedy='Write by="pixels" or by="rays".')

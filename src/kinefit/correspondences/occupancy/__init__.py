@@ -1,1 +1,1 @@
-"""Rows of what is full and what is empty: depth images, free space, bodies that collide."""
+"""Rows of occupied and free space: depth images, free space, collisions."""

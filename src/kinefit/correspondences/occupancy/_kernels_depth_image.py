@@ -1,4 +1,4 @@
-"""Samples of the body's surface against a depth image: which of them the sensor saw, and where."""
+"""Compiled rows of the body's surface samples against a depth image."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ def depth_image_rows(
     frames, owner, rest, normal, camera, depth, rays, shown, ratio, skin, reach, facing, weight,
     data, segment, group, start,
 ):  # fmt: skip
-    """One row for each sample that the sensor saw, along the sample's normal; the next free line.
+    """One row for each visible sample, along its normal; returns the next free line.
 
     owner (N,), rest and normal (3, N) in the root frame at rest; camera packed; depth (H, W) [m], 0 for none; rays
-    (2, H, W): x/z and y/z of every pixel in the camera; shown (h, w) [m]: the body's own depth at `ratio` of the size,
-    inf for none; skin [m]: how far a sample may lie behind it; reach [m]: how far the measurement may lie on either
-    side; facing: least cosine between normal and line of sight; weight [1/m²].
+    (2, H, W): x/z and y/z of every pixel in the camera; shown (h, w) [m]: the body's rendered depth at `ratio` of the
+    size, inf for none; skin [m]: how far a visible sample may lie behind it; reach [m]: correspondence distance;
+    facing: smallest cosine between normal and line of sight; weight [1/m²].
     """
     r00, r01, r02 = camera[ROT], camera[ROT + 1], camera[ROT + 2]
     r10, r11, r12 = camera[ROT + 3], camera[ROT + 4], camera[ROT + 5]
@@ -61,7 +61,7 @@ def depth_image_rows(
         qx = r00 * mx + r10 * my + r20 * mz
         qy = r01 * mx + r11 * my + r21 * mz
         qz = r02 * mx + r12 * my + r22 * mz
-        data[0, i], data[1, i], data[2, i] = qx, qy, qz  # q moved with the body: then n may turn with it to first order
+        data[0, i], data[1, i], data[2, i] = qx, qy, qz  # at q, so that to first order n rotates with it
         data[3, i], data[4, i], data[5, i] = nx, ny, nz
         data[6, i] = nx * (qx - x) + ny * (qy - y) + nz * (qz - z)
         data[7, i] = weight

@@ -1,4 +1,4 @@
-"""Where the body cannot be: space that a depth sensor saw through, and space that other parts of it fill."""
+"""Compiled rows of space where the body cannot be: seen through by a depth sensor, or occupied by other parts."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 from kinefit._jit import jit
 from kinefit.geometry._kernels_camera import HEIGHT, ROT, TRANS, WIDTH, project_jacobian
 
-OUTLINE = 3  # [cells] by which outlines of body and picture differ anyway
+CONTOUR_TOLERANCE = 3  # [cells] between contours of the body and of the depth image
 
 
 @jit
 def nearest_cells(depth, farthest, cell, shown, tolerance, nearest):
-    """Nearest cell that the body could stand in, for every cell of `cell` x `cell` pixels.
+    """Nearest possible cell of the body, for every cell of `cell` x `cell` pixels.
 
-    A cell can hold the body where at least half of its pixels (of every second row and column) measured something up
-    to `farthest` [m]: an unbiased edge. shown (h', w') [m]: the body's own depth at any size, inf for none; where that
-    explains a pixel within `tolerance`, there is no need for more of the body, nor beside such a cell, as outlines
-    never agree; (0, 0) for none. nearest (h, w) int32: row * w + column, -1 where there is none at all. Exact: nearest
-    in each column, then the lower envelope of parabolas along each row (Felzenszwalb & Huttenlocher 2012).
+    A cell is possible if at least half of its pixels (of every second row and column) measured a depth up to `farthest`
+    [m], which gives an unbiased edge. shown (h', w') [m]: the body's rendered depth at any size, inf for none; cells
+    that it explains within `tolerance` [m], and their neighbours, are excluded; (0, 0) for none. nearest (h, w) int32:
+    row * w + column, -1 for none at all. Exact: nearest in each column, then the lower envelope of parabolas along each
+    row (Felzenszwalb & Huttenlocher 2012).
     """
     h, w = nearest.shape
     rows, columns = depth.shape
@@ -89,11 +89,11 @@ def free_space_rows(
     frames, owner, rest, normal, camera, depth, nearest, missing, cell, tolerance, reach, weight, chosen,
     data, segment, group, start,
 ):  # fmt: skip
-    """One row for each sample that faces the camera and that the sensor saw through, towards the nearest cell.
+    """One row for each sample that faces the camera in seen-through space, towards the nearest possible cell.
 
     owner (N,), rest and normal (3, N) in the root frame at rest; camera packed; depth (H, W) [m], 0 for none; nearest
-    and missing (h, w) from `nearest_cells`, of all cells and of those that the body does not explain yet: a sample
-    more than `OUTLINE` cells astray goes to the latter, where there are any within reach; tolerance, reach [m]; weight
+    and missing (h, w) from `nearest_cells`, of all cells and of those that the body does not explain yet: a sample more
+    than `CONTOUR_TOLERANCE` cells away goes to the latter, if there are any within reach; tolerance, reach [m]; weight
     [1/px²]. Out: chosen (N,) the cell of every sample, -1 for none. Returns the next free line.
     """
     r00, r01, r02 = camera[ROT], camera[ROT + 1], camera[ROT + 2]
@@ -127,7 +127,7 @@ def free_space_rows(
         gap, gx, gy, gz, g2, g, goal = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1
         for place in range(2):
             target = nearest[iv // cell, iu // cell] if place == 0 else missing[iv // cell, iu // cell]
-            if target < 0 or (place == 1 and gap <= OUTLINE * cell):
+            if target < 0 or (place == 1 and gap <= CONTOUR_TOLERANCE * cell):
                 break
             du = (target % columns) * cell + half - 0.5 - u
             dv = (target // columns) * cell + half - 0.5 - v
@@ -153,7 +153,7 @@ def free_space_rows(
 
 @jit
 def closest_on_segments(p0, p1, p2, d0, d1, d2, q0, q1, q2, e0, e1, e2):
-    """Where (s, t in 0..1) the segments p + s d and q + t e are nearest to each other (Ericson 2005, 5.1.9)."""
+    """Closest points (s, t in 0..1) of the segments p + s d and q + t e (Ericson 2005, 5.1.9)."""
     r0, r1, r2 = p0 - q0, p1 - q1, p2 - q2
     a, e, f = d0 * d0 + d1 * d1 + d2 * d2, e0 * e0 + e1 * e1 + e2 * e2, e0 * r0 + e1 * r1 + e2 * r2
     c, b = d0 * r0 + d1 * r1 + d2 * r2, d0 * e0 + d1 * e1 + d2 * e2
@@ -182,7 +182,7 @@ def capsule_gaps(frames, owner, starts, ends, pairs, point_a, point_b, direction
     """Distance between the axes of pairs (P, 2) of capsules.
 
     owner (C,) segments; starts, ends (C, 3) in the root frame at rest.
-    Out: point_a, point_b (P, 3) in the world, where they are nearest; direction (P, 3) unit from b to a; distance (P,).
+    Out: closest points point_a, point_b (P, 3) in the world; direction (P, 3) unit from b to a; distance (P,) [m].
     """
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
@@ -203,7 +203,7 @@ def capsule_gaps(frames, owner, starts, ends, pairs, point_a, point_b, direction
         n0, n1, n2 = p0 - q0, p1 - q1, p2 - q2
         length = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
         distance[k] = length
-        if length < 1e-9:  # the axes cross: apart is along their common perpendicular
+        if length < 1e-9:  # the axes intersect: use their common perpendicular
             n0, n1, n2 = d1 * e2 - d2 * e1, d2 * e0 - d0 * e2, d0 * e1 - d1 * e0
             length = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
             if length < 1e-12:

@@ -1,4 +1,4 @@
-"""Parts of one body do not run into each other: capsules along their surfaces, pushed apart while they overlap."""
+"""Self-collisions of a body: capsules along its surfaces are pushed apart where they overlap."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from kinefit.rows import PairRows
 
 @dataclass(frozen=True, eq=False)
 class CollisionPairs:
-    """Capsules of a body, and which of them must keep apart; make it with `collision_pairs`.
+    """Capsules of a body, and the pairs that must not overlap; made by `collision_pairs`.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ class CollisionPairs:
     starts, ends : (C, 3) [m] of its axis, in the root frame at rest
     radius : (C,) [m]
     pairs : (P, 2) int, capsules
-    apart : (P,) [m] least distance of their axes: the sum of the radii, less where they overlap in usual posture
+    apart : (P,) [m] smallest distance of their axes: the sum of the radii, less if they overlap in default posture
     """
 
     segment: NDArray
@@ -45,18 +45,23 @@ def collision_rows(
     margin: float = -0.02,
     sigma: float = 0.01,
 ) -> PairRows:
-    """One pair row for each two capsules that overlap: n·(x_a − x_b) should grow by what is missing.
+    """One pair row for each overlapping pair of capsules: n·(x_a − x_b) should grow by the overlap.
 
-    x_a and x_b are the closest points of the axes and n the unit vector from b to a, so that ∂|x_a − x_b| = n·(∂x_a −
-    ∂x_b) also where the closest points slide along (envelope theorem). Nothing acts on parts that do not touch.
+    x_a and x_b are the closest points of the axes and n is the unit vector from b to a, so that ∂|x_a − x_b| = n·(∂x_a
+    − ∂x_b) also while the closest points slide (envelope theorem). Parts that do not touch make no row.
 
     Parameters
     ----------
-    pairs : CollisionPairs, by default those of all segments that are not neighbours (kept for each body).
+    pairs : CollisionPairs, default those of all segments that are not adjacent (cached for each body).
     margin : float [m]
-        To keep between the capsules. Less than zero, because flesh gives way and capsules are no more exact: in five
+        Smallest distance between the capsules. Negative, because flesh is soft and capsules are approximate: in five
         recorded motions, retargeted, they overlap by 5 mm in 37 % of the frames, and by 2 cm in 9 %.
-    sigma : float [m] softness of flesh and of the capsules' likeness to the body.
+    sigma : float [m] standard deviation by soft flesh and the approximation by capsules.
+
+    Raises
+    ------
+    ObservationError
+        A sigma that is not positive.
     """
     if not sigma > 0:
         raise ObservationError(f"the standard deviation of collisions is {sigma} m", remedy="Give a positive one.")
@@ -69,14 +74,15 @@ def collision_rows(
 
 
 def collision_pairs(body: Body, between: Sequence[tuple[str, str]] | None = None) -> CollisionPairs:
-    """Which parts of a body must keep apart.
+    """Find the pairs of a body's parts that must not overlap.
 
-    Parts that overlap at rest or in usual posture (thighs at the crotch, an arm that hangs beside the trunk) may go on
-    to do so, just as deep.
+    Parts that overlap at rest or in default posture (thighs at the crotch, an arm hanging at the trunk) may keep
+    overlapping to the same depth.
 
     Parameters
     ----------
-    between : pairs of segments' names, by default all that are not parent and child; gear may touch anything.
+    body : Body
+    between : pairs of segments' names, default all that are not parent and child; gear may touch anything.
 
     Raises
     ------
@@ -86,15 +92,16 @@ def collision_pairs(body: Body, between: Sequence[tuple[str, str]] | None = None
     segment, starts, ends, radius = _capsules(body)
     parents = body.tree.parents
     index = np.array(np.triu_indices(len(segment), 1)).T.reshape(-1, 2)
-    one, other = segment[index].T
-    gear = body.gear_scale[body.segment_scale]  # which is held, sat and stood on
-    keep = (one != other) & (parents[one] != other) & (parents[other] != one) & ~gear[one] & ~gear[other]
+    first, second = segment[index].T
+    gear = body.gear_scale[body.segment_scale]  # may touch the body
+    keep = (first != second) & (parents[first] != second) & (parents[second] != first) & ~gear[first] & ~gear[second]
     if between is not None:
         wanted = {frozenset((body.tree.segment(i), body.tree.segment(j))) for i, j in between}
         bare = sorted(body.tree.segments[s] for s in frozenset().union(*wanted) - set(segment.tolist()))
         if bare:
             raise BodyError(f"no surface of {', '.join(bare)}", remedy="Give it one, or leave it out of the pairs.")
-        keep = np.array([frozenset(p) in wanted for p in zip(one.tolist(), other.tolist())], bool) & (one != other)
+        pairs = zip(first.tolist(), second.tolist())
+        keep = np.array([frozenset(p) in wanted for p in pairs], bool) & (first != second)
     index = np.ascontiguousarray(index[keep], np.int64)
     apart = radius[index].sum(axis=1)
     for state in (body.usual_state(), body.rest_state()):
@@ -125,7 +132,7 @@ def _capsules(body: Body) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     radius = np.array([f[2] for f in found], float)
     along = end - start
     length = np.linalg.norm(along, axis=1)
-    inset = np.minimum(radius, 0.5 * length)  # so that the round ends stay within the surface
+    inset = np.minimum(radius, 0.5 * length)  # keeps the round ends inside of the surface
     step = along * np.divide(inset, length, out=np.zeros_like(length), where=length > 0)[:, None]
     at = body.tree.rest[segment]
     return segment, start + step + at, end - step + at, radius

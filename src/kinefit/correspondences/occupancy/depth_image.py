@@ -1,7 +1,7 @@
-"""Surface samples against a depth image: each visible one should lie in the surface that was measured at its pixel.
+"""Surface samples against a depth image: each visible sample should lie on the surface measured at its pixel.
 
-From the model to the data, as `surface_rows` goes from the data to the model: together they leave neither a measured
-point without a surface nor a visible surface without a measurement.
+These rows go from the model to the data, `surface_rows` from the data to the model. Together they explain every
+measured point and every visible part of the surface.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.rows import Rows
 
-_SKIN = 0.015  # [m] by which a sample may lie behind the body's own depth and still count as visible
+_VISIBILITY_MARGIN = 0.015  # [m] by which a visible sample may lie behind the body's rendered depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ def depth_image_rows(
     facing: float = 0.2,
     sigma: float = 0.01,
 ) -> Rows:
-    """One row for each sample p that the sensor saw, at x: r = n·(x − p), point to plane along the model's normal n.
+    """One row for each visible sample p, measured at x: r = n·(x − p), point to plane along the model's normal n.
 
     Parameters
     ----------
@@ -66,11 +66,11 @@ def depth_image_rows(
     samples : SurfaceSamples
     camera : Camera of the depth sensor, depth (H, W) [m] its image, 0 where nothing was measured.
     shown : (h, w) [m]
-        The body's own depth in that camera at any size, inf where it is not: what it hides itself makes no row.
+        The body's rendered depth in that camera at any size, inf for none. Samples occluded by the body make no row.
     reach : float [m]
-        How far in front of a sample, or behind it, a measurement may lie to be the sample's.
+        Correspondence distance: a measurement may lie this far in front of a sample or behind it.
     facing : float
-        Least cosine between a sample's normal and the line of sight.
+        Smallest cosine between a sample's normal and the line of sight.
     sigma : float [m]
 
     Raises
@@ -84,6 +84,6 @@ def depth_image_rows(
     data, segment, group = _kernels.buffers(len(samples))
     end = _kernels_depth_image.depth_image_rows(
         frames, samples.segment, samples.point, samples.normal, camera.packed, depth, camera.ray_table, shown,
-        shown.shape[1] / camera.size[0], _SKIN, reach, facing, 1.0 / sigma**2, data, segment, group, 0,
+        shown.shape[1] / camera.size[0], _VISIBILITY_MARGIN, reach, facing, 1.0 / sigma**2, data, segment, group, 0,
     )  # fmt: skip
     return Rows(np.ascontiguousarray(data[:, :end]), segment[:end], group[:end])

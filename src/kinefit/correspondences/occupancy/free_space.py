@@ -1,4 +1,4 @@
-"""Free space: where a depth sensor saw through to something behind, the body is not."""
+"""Free space: the body cannot be where a depth sensor measured something farther away."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.rows import Rows
 
-COLUMNS = 160  # of the map of cells: a person at 2 to 4 m is then some 20 to 40 cells wide, at any resolution
+GRID_COLUMNS = 160  # cells across the image: a person at 2 to 4 m is some 20 to 40 cells wide, at any resolution
 
 
 @dataclass(frozen=True, eq=False)
 class FreeSpace:
-    """A depth image with, for every cell of pixels, the nearest one that the body could stand in.
+    """A depth image with, for every cell of pixels, the nearest cell where the body can be.
 
     Parameters
     ----------
     depth : (H, W) [m]
-        Along the optical axis; 0 where nothing was measured, negative where it is known to be something else's.
-    nearest : (h, w) int32, row * w + column of that cell; -1 where the body cannot be in the picture at all
-    missing : (h, w) int32, the same among the cells that the body as it stands does not explain; -1 for none
+        Along the optical axis; 0 where nothing was measured, negative where another object was.
+    nearest : (h, w) int32, row * w + column of that cell; -1 if the body cannot be in the image
+    missing : (h, w) int32, the same among the cells that the body's present pose does not explain; -1 for none
     cell : int [px] width and height of a cell
     """
 
@@ -44,28 +44,29 @@ class FreeSpace:
         farthest: float,
         shown: NDArray | None = None,
         tolerance: float = 0.1,
-        columns: int = COLUMNS,
+        columns: int = GRID_COLUMNS,
     ) -> FreeSpace:
         """Free space of one depth image.
 
         Parameters
         ----------
         depth : (H, W) [m]
-            0 where nothing was measured, negative where it is known to be something else's.
+            0 where nothing was measured, negative where another object was.
         farthest : float [m]
-            What lies farther along the optical axis cannot be the body: the back of its predicted box. What lies
-            nearer may hide it, so it counts as a place for it.
+            Largest depth of the body along the optical axis: the back of its predicted box. Nearer objects may occlude
+            it, so the body can be there.
         shown : (h', w') [m], optional
-            The body's own depth in that camera at any size, inf where it is not. What it explains within `tolerance`
-            [m] is no place for the rest of it: a limb astray then goes to where one is missing, not to the head or
-            the trunk because they are nearer. Leave it out only where the body is all but right.
+            The body's rendered depth in that camera at any size, inf for none. Cells that it explains within
+            `tolerance` [m] are excluded for the rest of the body: a misplaced limb then goes to where one is missing,
+            not to the nearer head or trunk. Leave it out only if the pose is nearly correct.
+        tolerance : float [m]
         columns : int
-            Cells across the image, at least; more cost more and follow an outline more finely.
+            Smallest number of cells across the image; more cost more and resolve contours better.
 
         Raises
         ------
         ObservationError
-            An image that is none, or a `farthest` that is not positive.
+            No depth image, or a `farthest` that is not positive.
         """
         if np.ndim(depth) != 2 or not np.size(depth):
             problem = f"a depth image has shape {np.shape(depth)}"
@@ -82,7 +83,7 @@ class FreeSpace:
         return cls(depth, nearest, missing, cell)
 
     def middle(self, cells: NDArray) -> NDArray:
-        """(N, 2) [px] middles of cells (N,), row * w + column."""
+        """Centres (N, 2) [px] of cells (N,), given as row * w + column."""
         row, column = np.divmod(np.asarray(cells), self.nearest.shape[1])
         return np.stack([column, row], axis=1) * float(self.cell) + (0.5 * self.cell - 0.5)
 
@@ -98,11 +99,11 @@ def free_space_rows(
     reach: float = 0.5,
     chosen: NDArray | None = None,
 ) -> Rows:
-    """One row for each sample in space that the sensor saw through: sideways to the edge of the nearest cell that fits.
+    """One row for each sample in free space: sideways to the edge of the nearest possible cell.
 
     With g = −∂(distance in the image)/∂x: n = g/|g|, r = distance/|g|, w = |g|²/σ², the exact linearisation, as in
-    `pixel_rows`. A sample that is turned away from the camera, lies beside its image, where nothing was measured, or
-    behind what was measured makes no row.
+    `pixel_rows`. A sample makes no row if it faces away from the camera, or lies outside of its image, at a pixel
+    without measurement, or behind the measured surface.
 
     Parameters
     ----------
@@ -111,15 +112,20 @@ def free_space_rows(
     space : FreeSpace of the camera's image
     camera : Camera
     sigma : float [px]
-        By default ten cells: samples beside each other tell the same, and the nearest place is often not the right
-        one; measured points should decide where they can.
+        Default ten cells: adjacent samples are correlated, and the nearest cell is often not the correct one, so
+        measured points should dominate.
     tolerance : float [m]
-        How far behind a sample a measurement must lie to speak against it: more than three deviations of the sensor
-        and what a surface of simple shapes is off.
+        How far behind a sample a measurement must lie to contradict it: above three sigmas of the sensor plus the error
+        of a surface of simple shapes.
     reach : float [m]
-        Beyond it no row: so far sideways lies another part, or another person.
+        Largest sideways distance: farther away lies another part, or another person.
     chosen : (N,) int64, optional
-        To be filled with the cell that every sample is drawn to, -1 for none; see `FreeSpace.middle`.
+        Output: the target cell of every sample, -1 for none; see `FreeSpace.middle`.
+
+    Raises
+    ------
+    ObservationError
+        An image of another size than the camera's, or a sigma that is not positive.
     """
     check_depth_image(space.depth, camera)
     sigma = 10.0 * space.cell if sigma is None else sigma

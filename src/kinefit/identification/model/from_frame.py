@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked, shaped
-from kinefit.bodies.marker_sets import FEWEST, GIVE, MarkerSet
+from kinefit.bodies.marker_sets import GIVE, MIN_COMMON_LABELS, MarkerSet
 from kinefit.errors import ObservationError
 from kinefit.geometry.se3 import nearest_rotation
 from kinefit.identification.model.model import MarkerJoint, MarkerModel
@@ -65,7 +65,7 @@ def skeleton_of(labels: Sequence[str], marker_set: MarkerSet) -> Skeleton:
     """
     known = marker_set.match(labels)
     number = {name: i for i, name in enumerate(known) if name is not None}
-    if len(number) < FEWEST or (2 * len(number) < len(labels) and 2 * len(number) < len(marker_set.labels)):
+    if len(number) < MIN_COMMON_LABELS or (2 * len(number) < len(labels) and 2 * len(number) < len(marker_set.labels)):
         raise ObservationError(
             f"marker set {marker_set.name} knows {len(number)} of {len(labels)} labels "
             f"({', '.join(labels[:6])}{' ...' if len(labels) > 6 else ''})",

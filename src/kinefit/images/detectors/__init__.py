@@ -1,1 +1,1 @@
-"""Detection of people in images: networks, regions of interest, people over time, skin."""
+"""Detection and tracking of people in images: networks, regions of interest, skin colour."""

@@ -1,4 +1,4 @@
-"""Single-shot detectors of BlazeFace's family: people, faces and palms in a whole image, by anchors of one size.
+"""Single-shot detectors of the BlazeFace family: people, faces and palms in a whole image, by anchors of one size.
 
 Source: Bazarevsky et al., BlazeFace, 2019 (anchors, weighted suppression); BlazePose, 2020.
 """
@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-_MAX_OVERLAP = 0.3  # boxes whose intersection is a larger share of their union show the same thing
+_MAX_OVERLAP = 0.3  # intersection over union of two boxes; boxes that overlap more show the same object
 _MAX_LOGIT = 100.0  # beyond it the exponential overflows
 
 
@@ -27,17 +27,17 @@ class DetectedBox:
 
 
 class BoxDetector:
-    """Boxes with points in a whole image.
+    """Detects boxes with points in a whole image.
 
     Parameters
     ----------
     interpreter
-        Of a network with an input (1, S, S, 3) and outputs (1, N, 4 + 2 K), the boxes and points in pixels from their
-        anchors, and (1, N, 1), the logits.
+        Of a network with input (1, S, S, 3) and outputs (1, N, 4 + 2 K): boxes and points in pixels from their anchors,
+        and (1, N, 1): logits.
     cells : ((stride [px], anchors in a cell), ...)
         Feature maps in the order of the network's anchors.
     low : float
-        Value of black at the input; white is 1.
+        Input value of black; white is 1.
     """
 
     def __init__(self, interpreter: Any, cells: Sequence[tuple[int, int]], low: float = -1.0) -> None:
@@ -61,7 +61,7 @@ class BoxDetector:
 
 
 def anchors(size: int, cells: Sequence[tuple[int, int]]) -> NDArray:
-    """(N, 2) centres of the anchors, in sides of the network's image of `size` px; see `BoxDetector`."""
+    """Centres (N, 2) of the anchors, in units of the side `size` [px] of the network's image; see `BoxDetector`."""
     maps = []
     for stride, count in cells:
         at = (np.arange(size // stride) + 0.5) * stride / size
@@ -73,7 +73,9 @@ def anchors(size: int, cells: Sequence[tuple[int, int]]) -> NDArray:
 def decode(
     raw: NDArray, logits: NDArray, centres: NDArray, size: int, min_score: float = 0.5
 ) -> list[tuple[NDArray, float]]:
-    """Detections from the network's numbers: corners and points (2 + K, 2) in sides of its image, and their scores.
+    """Decode the network's output: corners and points (2 + K, 2) in units of its image's side, and scores.
+
+    Overlapping boxes are merged by a mean that is weighted with their scores.
 
     Parameters
     ----------
@@ -82,6 +84,7 @@ def decode(
     logits : (N,)
     centres : (N, 2) of the anchors
     size : int [px] side of the network's image
+    min_score : float in 0..1
     """
     kept = np.flatnonzero(logits > np.log(min_score / (1 - min_score)))
     kept = kept[np.argsort(-logits[kept], kind="stable")]
@@ -97,15 +100,15 @@ def decode(
         low, high = values[:, 0], values[:, 1]
         inner = np.prod(np.clip(np.minimum(high, high[0]) - np.maximum(low, low[0]), 0, None), axis=1)
         areas = np.prod(high - low, axis=1)
-        same = inner > _MAX_OVERLAP * (areas + areas[0] - inner)
-        same[0] = True
-        found.append((np.average(values[same], axis=0, weights=scores[same]), float(scores[0])))
-        values, scores = values[~same], scores[~same]
+        duplicate = inner > _MAX_OVERLAP * (areas + areas[0] - inner)
+        duplicate[0] = True
+        found.append((np.average(values[duplicate], axis=0, weights=scores[duplicate]), float(scores[0])))
+        values, scores = values[~duplicate], scores[~duplicate]
     return found
 
 
 def letterboxed(image: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], float, NDArray]:
-    """The whole image in the middle of a black square of `size` px; the square's side and offset in the image [px]."""
+    """Letterbox an image (H, W, 3): (size, size, 3) with black bars; and the square's side and offset (2,) [px]."""
     height, width = image.shape[:2]
     side = max(height, width)
     offset = np.array([side - width, side - height]) / 2

@@ -1,7 +1,7 @@
-"""People in a video: found, followed from picture to picture, each in a column of its own.
+"""Detect and track the people in a video; each has a column of its own.
 
-The detector looks at the whole picture at the start, every half second, and when somebody is lost; in between everybody
-is followed by the region that the last landmarks tell.
+The detector searches the whole image at the start, every half second, and when a person is lost. In between, each
+person is tracked: the last landmarks give the region of the next image in which the network looks for landmarks.
 """
 
 from __future__ import annotations
@@ -20,36 +20,40 @@ from kinefit.images.detectors.pose_model import SIZE
 from kinefit.images.detectors.roi import Roi, Steady
 from kinefit.observations import Detections
 
-_THERE = 0.5  # least probability of a person in a region
-_VISIBLE = 0.65  # least mean confidence of landmarks in the picture: 0.71 and more for people, 0.62 for a pile of boxes
-_SURE, _CLEAR = 0.9, 0.75  # the same two of those who were searched for: small people 0.78, machines 0.71
-_MOST = 0.5  # share of a mask
-_SAME_PERSON = 0.05  # two who are followed are one where their heads, or all of them, differ by less (in sides)
-_NEAR = 0.3  # somebody comes back where the head is no further from where it was (in sides)
-_FEW, _BRIEF = 3, 0.2  # [frames], [s]: who is seen for less in all is a deception of the networks
-_SMALLEST, _LARGEST = 16, 8  # [px], [sides of the picture]: regions beyond show nothing that could be recognised
+_MIN_PROBABILITY = 0.5  # of a person in a region
+_MIN_VISIBILITY = 0.65  # mean confidence of landmarks inside the image: people 0.71 and more, a pile of boxes 0.62
+_MIN_SEARCH_PROBABILITY = 0.9  # of detections from the tiled search
+_MIN_SEARCH_VISIBILITY = 0.75  # of detections from the tiled search: small people 0.78, machines 0.71
+_MAX_MASK_OVERLAP = 0.5  # share of a new person's mask that a tracked person may cover
+_MAX_DUPLICATE_DISTANCE = 0.05  # [sides of the region] median over the head, or all landmarks, of one person
+_MAX_RETURN_DISTANCE = 0.3  # [sides of the region] of the head from where the person was lost
+_MIN_FRAMES = 3  # that a person must be detected in; fewer are a false positive
+_MIN_DURATION = 0.2  # [s] the same
+_MIN_ROI_PX = 16  # smaller regions show too little to recognise a person
+_MAX_ROI_SIDES = 8  # of the image; larger regions show too little as well
 _HEAD = slice(0, 11)  # the landmarks of the face
-_LOOK, _SOON = 0.5, 0.1  # [s] between looks at the whole picture; while somebody is missing
-_MEMORY = 2.0  # [s] somebody who is lost may come back near the same place under the same number
+_SEARCH_INTERVAL = 0.5  # [s] between searches of the whole image
+_LOST_INTERVAL = 0.1  # [s] the same, while a person is lost
+_MAX_TIME_LOST = 2.0  # [s] for which a lost person keeps the column
 
 
 @dataclass(frozen=True, eq=False)
 class _DetectionTrack:
-    """One person: where to look next, and what was seen last."""
+    """Track of one person: the next region, and the last detection."""
 
     column: int
     steady: Steady
     points: NDArray | None = None  # (33, 2) [px]
     last: int = -1  # frame
-    shape: tuple[Roi, NDArray] | None = None  # where they were last, and the mask in there
+    shape: tuple[Roi, NDArray] | None = None  # last region, and the mask in it
 
 
 @dataclass(frozen=True, eq=False)
 class PersonDetection:
-    """One person in one picture: column, landmarks (33, 2) [px], confidence, runs of the mask, lifted (33, 3) [m].
+    """One person in one image: column, landmarks (33, 2) [px], confidence (33,), runs of the mask, lifted (33, 3) [m].
 
-    And points (2, 21, 2) [px] and confidence (2, 21) of the left and the right hand, points (478, 2) [px] and
-    confidence (478,) of the face, where they were looked for.
+    hands: points (2, 21, 2) [px] and confidence (2, 21) of the left and the right hand; face: points (478, 2) [px] and
+    confidence (478,); None unless they were looked for.
     """
 
     column: int
@@ -66,16 +70,16 @@ _Adder = Callable[[NDArray[np.uint8], list[PersonDetection]], list[PersonDetecti
 
 @dataclass
 class Follower:
-    """Follows people through the pictures of one camera.
+    """Detects and tracks people in the images of one camera.
 
     Parameters
     ----------
     models : Models
     rate : float [Hz]
     people : int
-        How many at most at a time.
+        Largest number of people at a time.
     masks : bool
-        Whether outlines are wanted.
+        Whether masks are computed.
     """
 
     models: Models
@@ -88,27 +92,27 @@ class Follower:
     _columns: int = 0
 
     def update(self, image: NDArray[np.uint8]) -> list[PersonDetection]:
-        """Everybody in the next picture (H, W, 3) RGB."""
+        """Detect the people in the next image (H, W, 3) uint8 RGB."""
         self._frame += 1
-        self._lost = [t for t in self._lost if self._frame - t.last <= _MEMORY * self.rate]
-        crowd = len(self._tracks) > 1 or (self.people > 1 and self._is_due)  # somebody is to be painted over
-        seen = self._follow(image, self.masks or crowd)
+        self._lost = [t for t in self._lost if self._frame - t.last <= _MAX_TIME_LOST * self.rate]
+        crowd = len(self._tracks) > 1 or (self.people > 1 and self._is_due)  # their masks are needed
+        detected = self._follow(image, self.masks or crowd)
         due = self._is_due
-        look = due or len(seen) < len(self._tracks) or not seen
-        self._tracks = [track for track, _ in seen]
-        if look and len(seen) < self.people:
-            seen += self._find(image, thorough=due)
-            self._tracks = [track for track, _ in seen]
-        return [sighting for _, sighting in seen]
+        look = due or len(detected) < len(self._tracks) or not detected
+        self._tracks = [track for track, _ in detected]
+        if look and len(detected) < self.people:
+            detected += self._find(image, thorough=due)
+            self._tracks = [track for track, _ in detected]
+        return [sighting for _, sighting in detected]
 
     @property
     def _is_due(self) -> bool:
-        """Whether the whole picture is looked at whatever is seen."""
-        return self._frame % max(round((_SOON if self._lost else _LOOK) * self.rate), 1) == 0
+        """Whether a search of the whole image is due."""
+        return self._frame % max(round((_LOST_INTERVAL if self._lost else _SEARCH_INTERVAL) * self.rate), 1) == 0
 
     def _follow(self, image: NDArray[np.uint8], mask: bool) -> list[tuple[_DetectionTrack, PersonDetection]]:
-        """Those who are still there; two that have become one are the one that moved less."""
-        seen: list[tuple[_DetectionTrack, PersonDetection, float]] = []
+        """Update the tracks. Of two tracks of the same person, the one that moved less is kept."""
+        detected: list[tuple[_DetectionTrack, PersonDetection, float]] = []
         for track in self._tracks:
             others = [t.shape for t in self._tracks if t is not track and t.shape]
             found = self._look_at(image, track, others=others, mask=mask)
@@ -117,19 +121,19 @@ class Follower:
                 continue
             assert track.points is not None
             moved = float(np.median(np.linalg.norm(found[1].points - track.points, axis=1)))
-            twin = next((k for k, s in enumerate(seen) if _is_same(s[0], found[0])), None)
-            if twin is None:
-                seen.append((*found, moved))
+            duplicate = next((k for k, s in enumerate(detected) if _is_same(s[0], found[0])), None)
+            if duplicate is None:
+                detected.append((*found, moved))
                 continue
-            if moved < seen[twin][2]:
-                self._lost.append(next(t for t in self._tracks if t.column == seen[twin][0].column))
-                seen[twin] = (*found, moved)
+            if moved < detected[duplicate][2]:
+                self._lost.append(next(t for t in self._tracks if t.column == detected[duplicate][0].column))
+                detected[duplicate] = (*found, moved)
             else:
                 self._lost.append(track)
-        return [s[:2] for s in seen]
+        return [s[:2] for s in detected]
 
     def _find(self, image: NDArray[np.uint8], *, thorough: bool) -> list[tuple[_DetectionTrack, PersonDetection]]:
-        """Those whom nobody follows yet, the surest first, as many as there is room for."""
+        """Detect people without a track, in order of decreasing score, up to the largest number."""
         found: list[tuple[_DetectionTrack, PersonDetection]] = []
         covered = image
         while len(self._tracks) + len(found) < self.people:
@@ -152,34 +156,35 @@ class Follower:
         *,
         searched: bool = False,
     ) -> tuple[_DetectionTrack, PersonDetection] | None:
-        """The first who is a person at a second look too, and nobody known; more is asked of who was searched for."""
-        score, clear = (_SURE, _CLEAR) if searched else (_THERE, _VISIBLE)
+        """The first new person that the landmark network confirms twice. The tiled search needs higher scores."""
+        score = _MIN_SEARCH_PROBABILITY if searched else _MIN_PROBABILITY
+        visibility = _MIN_SEARCH_VISIBILITY if searched else _MIN_VISIBILITY
         for person in people:
-            once = self._look_at(image, _DetectionTrack(-1, Steady.at(person.points)), score, mask=False)
-            new = once and self._look_at(image, once[0], score, mask=self.masks or self.people > 1)
-            if new and _clearness(new[1], image) >= clear and not any(_is_part(new[0], t) for t in known):
+            first = self._look_at(image, _DetectionTrack(-1, Steady.at(person.points)), score, mask=False)
+            new = first and self._look_at(image, first[0], score, mask=self.masks or self.people > 1)
+            if new and _mean_visibility(new[1], image) >= visibility and not any(_is_tracked(new[0], t) for t in known):
                 return new
         return None
 
     def _column_of(self, new: _DetectionTrack) -> int:
-        """That of whoever was lost about here not long ago; else a column of its own."""
-        back = min(self._lost, key=lambda t: _apart(t, new, _HEAD), default=None)
-        if back is not None and _apart(back, new, _HEAD) < _NEAR:
-            self._lost.remove(back)
-            return back.column
+        """Column of the nearest lost person, if close enough; else a new column."""
+        lost = min(self._lost, key=lambda t: _distance(t, new, _HEAD), default=None)
+        if lost is not None and _distance(lost, new, _HEAD) < _MAX_RETURN_DISTANCE:
+            self._lost.remove(lost)
+            return lost.column
         self._columns += 1
         return self._columns - 1
 
     def _look_at(
-        self, image: NDArray[np.uint8], track: _DetectionTrack, score: float = _THERE, *,
+        self, image: NDArray[np.uint8], track: _DetectionTrack, score: float = _MIN_PROBABILITY, *,
         mask: bool, others: Sequence[tuple[Roi, NDArray]] = (),
     ) -> tuple[_DetectionTrack, PersonDetection] | None:  # fmt: skip
-        """Landmarks of a person in the region where they are expected; None where there is nobody.
+        """Detect a person's landmarks in the predicted region; None where there is no person.
 
-        Others in the region, where they were last, are painted over: the network draws a person's limbs towards them.
+        The last masks of other people in the region are painted over: they attract the person's landmarks.
         """
         roi = track.steady.roi
-        if not _SMALLEST < roi.side < _LARGEST * max(image.shape[:2]):
+        if not _MIN_ROI_PX < roi.side < _MAX_ROI_SIDES * max(image.shape[:2]):
             return None
         pose = self.models.pose(without_others(roi.crop(image, SIZE), roi, track.shape, others), mask=mask)
         if pose.score < score:
@@ -197,27 +202,27 @@ class Follower:
         return replace(track, steady=steady, points=points, last=self._frame, shape=shape), sighting
 
 
-def _clearness(seen: PersonDetection, image: NDArray) -> float:
-    """Mean confidence of the landmarks that lie in the picture."""
-    inside = ((seen.points >= 0) & (seen.points < image.shape[1::-1])).all(axis=1)
-    return float(seen.confidence[inside].mean()) if inside.any() else 0.0
+def _mean_visibility(detected: PersonDetection, image: NDArray) -> float:
+    """Mean confidence of the landmarks inside the image."""
+    inside = ((detected.points >= 0) & (detected.points < image.shape[1::-1])).all(axis=1)
+    return float(detected.confidence[inside].mean()) if inside.any() else 0.0
 
 
 def _is_same(a: _DetectionTrack, b: _DetectionTrack) -> bool:
-    return min(_apart(a, b, _HEAD), _apart(a, b, slice(None))) < _SAME_PERSON
+    return min(_distance(a, b, _HEAD), _distance(a, b, slice(None))) < _MAX_DUPLICATE_DISTANCE
 
 
-def _is_part(new: _DetectionTrack, known: _DetectionTrack) -> bool:
-    """Whether most of what looks like another person is somebody who is known."""
+def _is_tracked(new: _DetectionTrack, known: _DetectionTrack) -> bool:
+    """Whether a new detection is a tracked person: most of its mask lies in theirs, or the landmarks agree."""
     assert new.shape and known.shape
     (roi, mask), (other_roi, other) = new.shape, known.shape
     moved = moved_mask((roi, mask), other_roi) > 0
     area = float((mask > MIN_MASK).sum()) * (roi.side / other_roi.side) ** 2
-    return bool((moved & (other > MIN_MASK)).sum() > _MOST * area) or _is_same(new, known)
+    return bool((moved & (other > MIN_MASK)).sum() > _MAX_MASK_OVERLAP * area) or _is_same(new, known)
 
 
-def _apart(a: _DetectionTrack, b: _DetectionTrack, points: slice) -> float:
-    """Median distance of some landmarks, in sides of the smaller region."""
+def _distance(a: _DetectionTrack, b: _DetectionTrack, points: slice) -> float:
+    """Median distance of selected landmarks, in sides of the smaller region."""
     assert a.points is not None and b.points is not None
     side = min(a.steady.roi.side, b.steady.roi.side)
     return float(np.median(np.linalg.norm(a.points[points] - b.points[points], axis=1))) / side
@@ -228,7 +233,7 @@ def detect_people(
     masks: bool = True, source: str = "",
     with_hands: _Adder | None = None, with_faces: _Adder | None = None,
 ) -> Detections:
-    """Keypoints and masks of the people in a video.
+    """Detect and track people in a video: keypoints and masks.
 
     Parameters
     ----------
@@ -237,29 +242,31 @@ def detect_people(
     camera : str
     rate : float [Hz]
     people : int
-        How many are followed at most at a time.
+        Largest number of people at a time.
     masks : bool
-        Whether outlines are wanted.
+        Whether masks are computed.
+    source : str
+        Name of the video.
     with_hands, with_faces : callable, optional
         Adds hands, or faces, to the people in an image: a `HandFollower`, a `FaceFinder`.
 
     Returns
     -------
     Detections
-        One column for each person; who leaves and comes back later may get another, who is seen for less than a fifth
-        of a second has none. No column where nobody is seen.
+        One column for each person. A person who returns later than two seconds after leaving gets a new column.
+        Detections of less than 0.2 s in total are dropped as false positives.
     """
     follower = Follower(models, rate, people, masks)
     frames: list[list[PersonDetection]] = []
     size = (0, 0)
     for image in images:
         size = (image.shape[1], image.shape[0])
-        seen = follower.update(image)
+        detected = follower.update(image)
         for add in filter(None, (with_hands, with_faces)):
-            seen = add(image, seen)
-        frames.append(seen)
+            detected = add(image, detected)
+        frames.append(detected)
     times = Counter(s.column for frame in frames for s in frame)
-    least = min(max(_FEW, round(_BRIEF * rate)), len(frames) // 2)
+    least = min(max(_MIN_FRAMES, round(_MIN_DURATION * rate)), len(frames) // 2)
     column = {c: k for k, c in enumerate(sorted(c for c in times if times[c] >= least))}
     points = np.full((len(frames), len(column), 33, 2), np.nan)
     confidence = np.zeros((len(frames), len(column), 33))

@@ -1,4 +1,4 @@
-"""Finding the heads of everybody in an image, near and far, to hide their faces: recall counts, precision does not.
+"""Detect all heads in an image, near and far, to hide the faces: high recall matters more than precision.
 
 Source: Bazarevsky et al., BlazeFace, 2019; BlazePose, 2020, whose person detector gives a point of the face.
 """
@@ -17,34 +17,37 @@ from kinefit.images.detectors.person_detector import DetectedPerson
 from kinefit.images.detectors.pose_model import SIZE
 
 FACES_NEAR, FACES_FAR = "face_detection_short_range.tflite", "face_detection_full_range_sparse.tflite"
-_CELLS_NEAR, _CELLS_FAR = ((8, 2), (16, 6)), ((4, 1),)  # stride [px] of the feature maps, anchors in a cell
+_CELLS_NEAR = ((8, 2), (16, 6))  # stride [px] of the feature maps, anchors in a cell
+_CELLS_FAR = ((4, 1),)
 _MIN_FACE_SCORE = 0.5
-_MIN_NEAR_SCORE = 0.7  # of the network for near faces in large parts of an image: it takes bellies for faces
-_MIN_SMALL_SCORE = 0.4  # of both in the smallest parts, where what they take for a face is small
+_MIN_NEAR_SCORE = 0.7  # of the near-face network in large tiles of an image, where it mistakes bellies for faces
+_MIN_SMALL_SCORE = 0.4  # of both networks in the smallest tiles: a false positive there hides little
 _MIN_PERSON_SCORE = 0.5
-_MIN_LANDMARK_SCORE = 0.5  # of a person: the head is where nose, eyes and ears are
-_MIN_UNCONFIRMED_SCORE = 0.8  # of a person of whom no landmarks are found: the head is where the detector says
-_PART_STEP = 0.65  # of a part's side from one to the next: each face lies whole in one of them
-_MIN_PART_PX = 250  # side of the smallest parts: faces of 15 px are found in them
-_MAX_SHARE = 0.2  # of a part's side: larger faces are found in larger parts
-_MAX_RATIO, _MIN_LARGE_SCORE = 1.5, 0.85  # a face on somebody's body is no larger than the head there, or scores high
-_FACE_REACH = 0.9  # radius of what is hidden, in sides of the box of a face
-_PERSON_REACH = 0.25  # the same, in radii of the circle around a person
-_POINTS_REACH, _MIN_RADIUS_PX = 2.2, 12.0  # the same, in distances of the outermost of nose, eyes, ears; and at least
-_OUTLIER_SHARE = 8.0  # of the median distance from the median: a point further away is not on the head; ears are nearer
+_MIN_LANDMARK_SCORE = 0.5  # of a person whose head is given by nose, eyes and ears
+_MIN_UNCONFIRMED_SCORE = 0.8  # of a person without landmarks, whose head is given by the detector
+_TILE_STEP = 0.65  # of a tile's side from one tile to the next: each face lies wholly in one of them
+_MIN_TILE_PX = 250  # side: faces of 15 px are detected in it
+_MAX_FACE_SHARE = 0.2  # of a tile's side: larger faces are detected in larger tiles
+_MAX_HEAD_RATIO = 1.5  # of a face on a body to that body's head
+_MIN_LARGE_SCORE = 0.85  # of a larger face
+_FACE_RADIUS = 0.9  # of the hidden circle, in sides of the face's box
+_PERSON_RADIUS = 0.25  # the same, in radii of the circle around a person
+_LANDMARK_RADIUS = 2.2  # the same, in distances of the outermost of nose, eyes and ears from their middle
+_MIN_RADIUS_PX = 12.0  # of the hidden circle
+_MAX_OUTLIER_RATIO = 8.0  # distance of a landmark of the head from the median, to the median distance; ears are nearer
 HEAD = slice(0, 11)
 """Landmarks of MEDIAPIPE_33 on the face."""
 
 
 class FaceDetector:
-    """Circles around the heads in an image; not to be shared between threads.
+    """Detects circles around the heads in an image. Not thread-safe.
 
     Parameters
     ----------
     folder : path
-        With the networks' files.
+        Of the networks' files.
     threads : int
-        That each network runs on.
+        For each network.
 
     Raises
     ------
@@ -60,17 +63,17 @@ class FaceDetector:
         self._people = Models(folder, threads)
 
     def __call__(self, image: NDArray[np.uint8], *, small: bool = False) -> NDArray:
-        """(N, 4) [px] middle (u, v) and radius of what hides each head in an RGB image (H, W, 3), and 1 of small ones.
+        """Circles (N, 4) around the heads in an RGB image (H, W, 3): centre u, v and radius [px], 1 for small heads.
 
-        The image is looked at as a whole and in squares of its shorter side; with `small`, in the parts, too, that
-        heads of a hundredth of its height need, which takes several times as long.
+        The networks search the whole image and squares of its shorter side. With `small` they also search smaller tiles
+        for heads down to a hundredth of the image's height, which takes several times as long.
         """
         found, shorter = [np.zeros((0, 4))], min(image.shape[:2])
         bodies = list[tuple[NDArray, float]]()  # landmarks (33, 2) [px], radius of the head [px]
         for left, top, side in parts(image.shape[1], image.shape[0], small=small):
             part, corner = np.ascontiguousarray(image[top : top + side, left : left + side]), np.array([left, top])
             whole, in_part, circles = side >= max(image.shape[:2]), side < shorter, list[list[float]]()
-            for person in self._people.find_people(part) if side >= shorter // 2 else ():  # whole in no smaller part
+            for person in self._people.find_people(part) if side >= shorter // 2 else ():  # smaller ones hold no person
                 if in_part and any(_is_inside(person.points[0] + corner, body) for body, _ in bodies):
                     continue
                 circle, points = self._head(part, person)
@@ -81,40 +84,40 @@ class FaceDetector:
                 near = far = _MIN_SMALL_SCORE
             for box in self._near(part, near) + self._far(part, far):
                 middle, size = box.corners.mean(axis=0), float(np.ptp(box.corners, axis=0).max())
-                radius = _FACE_REACH * size
-                if (whole or size < _MAX_SHARE * side) and (box.score > _MIN_LARGE_SCORE or not any(
-                    _is_inside(middle + corner, body) and radius > _MAX_RATIO * head for body, head in bodies
+                radius = _FACE_RADIUS * size
+                if (whole or size < _MAX_FACE_SHARE * side) and (box.score > _MIN_LARGE_SCORE or not any(
+                    _is_inside(middle + corner, body) and radius > _MAX_HEAD_RATIO * head for body, head in bodies
                 )):  # fmt: skip
                     circles.append([*middle, radius])
             found += [np.array([[u + left, v + top, radius, in_part]]) for u, v, radius in circles]
         return np.concatenate(found)
 
     def _head(self, part: NDArray[np.uint8], person: DetectedPerson) -> tuple[list[list[float]], NDArray]:
-        """Circle, or none, around the head of somebody found in a part of an image, and landmarks (33 or 0, 2) [px]."""
-        seen = self._people.pose(person.roi.crop(part, SIZE), mask=False)
-        if seen.score >= _MIN_LANDMARK_SCORE:
-            points = person.roi.to_image(seen.points, SIZE)
+        """Circle around the head of a person in a tile of an image, if any, and landmarks (33 or 0, 2) [px]."""
+        pose = self._people.pose(person.roi.crop(part, SIZE), mask=False)
+        if pose.score >= _MIN_LANDMARK_SCORE:
+            points = person.roi.to_image(pose.points, SIZE)
             return head_circles(points[None, HEAD]).tolist(), points
         if person.head is None or person.score < _MIN_UNCONFIRMED_SCORE:
             return [], np.zeros((0, 2))
         body = float(np.linalg.norm(np.diff(person.points, axis=0)))
-        return [[*person.head.mean(axis=0), _PERSON_REACH * body]], np.zeros((0, 2))
+        return [[*person.head.mean(axis=0), _PERSON_RADIUS * body]], np.zeros((0, 2))
 
 
 def _is_inside(point: NDArray, body: NDArray) -> bool:
-    """Whether a point [px] is in the box around somebody's landmarks (33, 2) [px]: in a part a belly is a person."""
+    """Whether a point [px] lies in the box of a body (33, 2) [px], such as a belly that is mistaken for a face."""
     return bool((point > body.min(axis=0)).all() and (point < body.max(axis=0)).all())
 
 
 def parts(width: int, height: int, *, small: bool) -> list[tuple[int, int, int]]:
-    """Squares (left, top, side) [px] that an image is looked at in: all of it, the largest, and ever smaller ones."""
+    """Tiles (left, top, side) [px] of an image: the whole image, the largest squares, then smaller ones if `small`."""
     shorter, found = min(width, height), [(0, 0, max(width, height))]
     sides = [shorter]
-    while small and sides[-1] // 2 >= min(_MIN_PART_PX, shorter // 2) > 0:
+    while small and sides[-1] // 2 >= min(_MIN_TILE_PX, shorter // 2) > 0:
         sides.append(sides[-1] // 2)
     for side in sides:
         lefts, tops = (
-            np.linspace(0, n - side, int(np.ceil((n - side) / (_PART_STEP * side))) + 1).astype(int)
+            np.linspace(0, n - side, int(np.ceil((n - side) / (_TILE_STEP * side))) + 1).astype(int)
             for n in (width, height)
         )
         found += [(int(u), int(v), side) for v in tops for u in lefts]
@@ -122,12 +125,12 @@ def parts(width: int, height: int, *, small: bool) -> list[tuple[int, int, int]]
 
 
 def head_circles(points: NDArray) -> NDArray:
-    """(N, 3) [px] circles around heads of which points (P, K, 2) [px] are seen: nose, eyes, ears; NaN: not seen."""
+    """Circles (N, 3) [px] around heads with landmarks (P, K, 2) [px] of nose, eyes and ears; NaN: not detected."""
     points = points[np.isfinite(points).all(axis=2).any(axis=1)]
     if not points.size:
         return np.zeros((0, 3))
-    off = np.linalg.norm(points - np.nanmedian(points, axis=1, keepdims=True), axis=2, keepdims=True)
-    points = np.where(off > _OUTLIER_SHARE * np.nanmedian(off, axis=1, keepdims=True), np.nan, points)
+    distance = np.linalg.norm(points - np.nanmedian(points, axis=1, keepdims=True), axis=2, keepdims=True)
+    points = np.where(distance > _MAX_OUTLIER_RATIO * np.nanmedian(distance, axis=1, keepdims=True), np.nan, points)
     middle = np.nanmean(points, axis=1)
     spread = np.nanmax(np.linalg.norm(points - middle[:, None], axis=2), axis=1)
-    return np.column_stack([middle, np.maximum(_POINTS_REACH * spread, _MIN_RADIUS_PX)])
+    return np.column_stack([middle, np.maximum(_LANDMARK_RADIUS * spread, _MIN_RADIUS_PX)])

@@ -1,7 +1,7 @@
-"""Hands in the images of one camera: 21 points of each, found from people's wrists, or alone where nobody is in view.
+"""Detect and track hands in the images of one camera: 21 landmarks each, from people's wrists or from palms alone.
 
 Source: Zhang et al., MediaPipe Hands: on-device real-time hand tracking, 2020 (palms, then landmarks in a region that
-is turned with the hand, then the region of the next image from the landmarks).
+is rotated with the hand, then the region of the next image from the landmarks).
 """
 
 from __future__ import annotations
@@ -21,25 +21,28 @@ from kinefit.images.detectors.roi import Roi, is_inside
 
 PALMS, HANDS = "palm_detection_full.tflite", "hand_landmark_full.tflite"
 ALONE = -1
-"""Column of hands of whoever is not in view."""
+"""Column of hands of a person whose body is not in view."""
 
 _PALM_CELLS = ((8, 2), (16, 6))  # stride [px] of the feature maps, anchors in a cell
-_SIZE = 224  # [px] side of the landmark network's image
-_MIN_PALM_SCORE, _MIN_PRESENCE = 0.5, 0.5
-_MIN_ROI_PX = 12.0  # a hand smaller than half of it shows no fingers
-_PALM_SIDES, _PALM_SHIFT = 2.6, 0.5  # side of a region in sides of the palm's box, and its shift towards the fingers
-_POSE_SIDES, _POSE_CENTRE = 4.0, 1.2  # the same, from a person's wrist, in distances from it to the knuckles
-_FOREARM_SIDES = 0.9  # the same in forearms, where the hand points to the camera
-_LANDMARK_SIDES = 1.6  # side of a region in the extent of the landmarks
-_MAX_WRIST_SHIFT = 0.5  # between the pose's wrist and the hand's, in sides of the region
-_SAME_HAND = 0.25  # two hands whose points are nearer in the median, in sides of the region, are one
+_INPUT_PX = 224  # side of the landmark network's image
+_MIN_PALM_SCORE = 0.5
+_MIN_PRESENCE = 0.5
+_MIN_ROI_PX = 12.0  # side: a hand smaller than half of it shows no fingers
+_PALM_ROI_SIDES = 2.6  # side of a region, in sides of the palm's box
+_PALM_ROI_SHIFT = 0.5  # of the region towards the fingers, in sides of the palm's box
+_PALM_LENGTHS = 4.0  # side of a region from a person's pose, in distances from wrist to knuckles
+_PALM_CENTRE = 1.2  # of that region from the wrist, in the same unit
+_MIN_FOREARMS = 0.9  # side of that region in lengths of the forearm, for hands that point to the camera
+_LANDMARK_EXTENTS = 1.6  # side of a region, in the extent of the landmarks
+_MAX_WRIST_DISTANCE = 0.5  # between the pose's wrist and the hand's, in sides of the region
+_MAX_DUPLICATE_DISTANCE = 0.25  # median over the landmarks of one hand detected twice, in sides of the region
 _ELBOWS, _WRISTS, _PINKIES, _INDEXES = (13, 14), (15, 16), (17, 18), (19, 20)  # of MEDIAPIPE_33, left and right
 _WRIST, _MIDDLE = 0, 9  # wrist and knuckle of the middle finger, of MEDIAPIPE_HAND_21
 
 
 @dataclass(frozen=True, eq=False)
 class HandLandmarks:
-    """A hand in an image: points (21, 2) [px], probabilities of a hand and of a left one, and the region it lies in."""
+    """Landmarks (21, 2) [px] of a hand, probabilities 0..1 of a hand and of a left hand, and the next region."""
 
     points: NDArray
     presence: float
@@ -48,14 +51,14 @@ class HandLandmarks:
 
 
 class HandModels:
-    """Networks that find palms in an image and a hand's landmarks in a region; not to be shared between threads.
+    """Networks that detect palms in an image and a hand's landmarks in a region. Not thread-safe.
 
     Parameters
     ----------
     folder : path
-        With the networks' files.
+        Of the networks' files.
     threads : int
-        That each network runs on.
+        For each network.
 
     Raises
     ------
@@ -73,58 +76,61 @@ class HandModels:
         self._input = self._hand.get_input_details()[0]["index"]
 
     def find_palms(self, image: NDArray[np.uint8]) -> list[Roi]:
-        """Regions of the hands in an RGB image (H, W, 3), in order of decreasing score."""
+        """Detect palms in an RGB image (H, W, 3): regions of the hands, in order of decreasing score."""
         found = []
         for palm in self._palms(image, _MIN_PALM_SCORE):
             du, dv = palm.points[2] - palm.points[0]  # from the wrist to the knuckle of the middle finger
             turn, side = float(np.arctan2(du, -dv)), float(np.ptp(palm.corners, axis=0).max())
-            centre = palm.corners.mean(axis=0) + _PALM_SHIFT * side * np.array([np.sin(turn), -np.cos(turn)])
-            found.append(Roi(centre, _PALM_SIDES * side, turn))
+            centre = palm.corners.mean(axis=0) + _PALM_ROI_SHIFT * side * np.array([np.sin(turn), -np.cos(turn)])
+            found.append(Roi(centre, _PALM_ROI_SIDES * side, turn))
         return found
 
     def landmarks(self, image: NDArray[np.uint8], roi: Roi) -> HandLandmarks:
-        """The hand in a region of an RGB image (H, W, 3)."""
-        crop = roi.crop(image, _SIZE) * np.float32(1 / 255)
+        """Landmarks of the hand in a region of an RGB image (H, W, 3)."""
+        crop = roi.crop(image, _INPUT_PX) * np.float32(1 / 255)
         self._hand.set_tensor(self._input, crop[None])
         self._hand.invoke()
         points, presence, right = (self._hand.get_tensor(index)[0] for index in self._outputs)
-        uv = roi.to_image(points.reshape(21, 3)[:, :2].astype(float), _SIZE)
+        uv = roi.to_image(points.reshape(21, 3)[:, :2].astype(float), _INPUT_PX)
         return HandLandmarks(uv, float(presence[0]), 1 - float(right[0]), around_hand(uv))
 
 
 def around_hand(points: NDArray) -> Roi:
-    """The region around a hand's points (21, 2) [px], its fingers upwards."""
-    return Roi.around_points(points, points[_MIDDLE] - points[_WRIST], _LANDMARK_SIDES)
+    """Region around a hand's landmarks (21, 2) [px], rotated so that the fingers point upwards."""
+    return Roi.around_points(points, points[_MIDDLE] - points[_WRIST], _LANDMARK_EXTENTS)
 
 
 def around_wrist(points: NDArray, side: int) -> Roi:
-    """The region of a person's left (0) or right (1) hand by the pose's landmarks (33, 2) [px]."""
+    """Region of a person's left (0) or right (1) hand from the landmarks (33, 2) [px] of the body."""
     wrist, elbow = points[_WRISTS[side]], points[_ELBOWS[side]]
     palm, forearm = (points[_PINKIES[side]] + points[_INDEXES[side]]) / 2 - wrist, wrist - elbow
     du, dv = palm if np.linalg.norm(palm) > 0.15 * np.linalg.norm(forearm) else forearm
-    width = max(_POSE_SIDES * np.linalg.norm(palm), _FOREARM_SIDES * np.linalg.norm(forearm))
-    return Roi(wrist + _POSE_CENTRE * palm, float(width), float(np.arctan2(du, -dv)))
+    width = max(_PALM_LENGTHS * np.linalg.norm(palm), _MIN_FOREARMS * np.linalg.norm(forearm))
+    return Roi(wrist + _PALM_CENTRE * palm, float(width), float(np.arctan2(du, -dv)))
 
 
 @dataclass
 class HandFollower:
-    """Follows the hands of people through the images of one camera; call it with an image and the people in it.
+    """Tracks the hands of people in the images of one camera: call it with an image and the people in it.
 
-    The pose's wrist says which hand is left. The network's own opinion of that is a factor of the confidence.
+    The side of a hand is that of the body's wrist. The network's probability of that side multiplies the confidence.
     """
 
     models: HandModels
     _before: dict[tuple[int, int], HandLandmarks] = field(default_factory=dict)
 
     def __call__(self, image: NDArray[np.uint8], people: Sequence[PersonDetection]) -> list[PersonDetection]:
-        """The people with their hands; where these have none, one more in column `ALONE` with those in view, if any."""
+        """Add hands to the people in an image (H, W, 3).
+
+        If no person has hands, one person more in column `ALONE` holds the hands that the palm detector finds, if any.
+        """
         now: dict[tuple[int, int], HandLandmarks] = {}
         for person in people:
             for side in (0, 1):
                 found = self._of_wrist(image, person, side)
                 other = now.get((person.column, 0))
                 if found and other and side and _is_same(found, other):
-                    if found.left < 0.5:  # it is the right one, to which both wrists led
+                    if found.left < 0.5:  # both wrists lead to the right hand
                         del now[person.column, 0]
                     else:
                         continue
@@ -133,21 +139,21 @@ class HandFollower:
         alone = self._alone(image) if not now else {}
         now |= alone
         self._before = now
-        people = [*people, *([_nobody()] if alone else [])]
+        people = [*people, *([_unseen_person()] if alone else [])]
         return [replace(person, hands=hands_of(now, person.column, image.shape)) for person in people]
 
     def _of_wrist(self, image: NDArray[np.uint8], person: PersonDetection, side: int) -> HandLandmarks | None:
-        """A hand near a person's wrist: where it was in the image before, else where the pose says."""
+        """Detect a hand near a person's wrist: in the region of the last image, else in that of the body's wrist."""
         before, wrist = self._before.get((person.column, side)), person.points[_WRISTS[side]]
         pose = around_wrist(person.points, side)
         for roi in (before.roi, pose) if before else (pose,):
             found = self._look(image, roi, twice=roi is pose)
-            if found and np.linalg.norm(found.points[_WRIST] - wrist) < _MAX_WRIST_SHIFT * max(pose.side, roi.side):
+            if found and np.linalg.norm(found.points[_WRIST] - wrist) < _MAX_WRIST_DISTANCE * max(pose.side, roi.side):
                 return found
         return None
 
     def _alone(self, image: NDArray[np.uint8]) -> dict[tuple[int, int], HandLandmarks]:
-        """A left and a right hand at most, followed or found by their palms."""
+        """Track or detect at most one left and one right hand, by their palms."""
         now: dict[tuple[int, int], HandLandmarks] = {}
         for before in [hand for (column, _), hand in self._before.items() if column == ALONE]:
             if found := self._look(image, before.roi):
@@ -159,7 +165,7 @@ class HandFollower:
         return now
 
     def _look(self, image: NDArray[np.uint8], roi: Roi, *, twice: bool = False) -> HandLandmarks | None:
-        """The hand in a region, None where there is none; looked at again in its own region where that was a guess."""
+        """Detect the hand in a region, None if there is none; `twice`: once more in the region of its landmarks."""
         if not _MIN_ROI_PX < roi.side < 4 * max(image.shape[:2]):
             return None
         found = self.models.landmarks(image, roi)
@@ -168,15 +174,15 @@ class HandFollower:
         return self._look(image, found.roi) if twice else found
 
 
-def _is_same(one: HandLandmarks, other: HandLandmarks) -> bool:
-    apart = float(np.median(np.linalg.norm(one.points - other.points, axis=1)))
-    return apart < _SAME_HAND * min(one.roi.side, other.roi.side)
+def _is_same(a: HandLandmarks, b: HandLandmarks) -> bool:
+    distance = float(np.median(np.linalg.norm(a.points - b.points, axis=1)))
+    return distance < _MAX_DUPLICATE_DISTANCE * min(a.roi.side, b.roi.side)
 
 
 def hands_of(
     found: dict[tuple[int, int], HandLandmarks], column: int, shape: tuple[int, ...]
 ) -> tuple[NDArray, NDArray]:
-    """Points (2, 21, 2) [px] and confidence (2, 21) of somebody's left and right hand; NaN and 0 where not seen."""
+    """Points (2, 21, 2) [px] and confidence (2, 21) of a person's left and right hand; NaN and 0 if not detected."""
     points, confidence = np.full((2, 21, 2), np.nan), np.zeros((2, 21))
     for side in (0, 1):
         if hand := found.get((column, side)):
@@ -186,7 +192,7 @@ def hands_of(
     return points, confidence
 
 
-def _nobody() -> PersonDetection:
-    """A person who is not in view."""
+def _unseen_person() -> PersonDetection:
+    """A person whose body is not in view."""
     unseen = np.full((33, 2), np.nan), np.zeros(33), np.zeros(0, np.uint32), np.full((33, 3), np.nan)
     return PersonDetection(ALONE, *unseen)

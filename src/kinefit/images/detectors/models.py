@@ -1,4 +1,4 @@
-"""The two networks of the built-in detector, run by LiteRT on the processor (extra `detect`)."""
+"""The two networks of the built-in detector, run by LiteRT on the CPU (extra `detect`)."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ _LAYOUT = (
 
 
 class Models:
-    """Networks that find people in a picture and their landmarks in a region; not to be shared between threads.
+    """Networks that detect people in an image and a person's landmarks in a region. Not thread-safe.
 
     Parameters
     ----------
     folder : path
-        With the two files.
+        Of the two files.
     threads : int
-        That each network runs on; the answers are the same.
+        For each network; results do not depend on it.
     landmarks : path
-        Of another landmark network than the folder's, with the same inputs and outputs.
+        Of another landmark network with the same inputs and outputs; default that of the folder.
     mirrored : bool
-        Whether each crop is looked at a second time, mirrored, and the mean of both counts.
+        Each crop is evaluated a second time, mirrored, and both results are averaged.
 
     Raises
     ------
@@ -57,23 +57,24 @@ class Models:
         self._detect = PersonDetector(interpreter(Path(folder) / DETECTOR, threads))
 
     @cached_property
-    def _outlines(self) -> PoseModel:
+    def _with_mask(self) -> PoseModel:
         return _pose_model(self._landmarks, self._threads)
 
     def pose(self, crop: NDArray[np.uint8], *, mask: bool = True) -> PersonLandmarks:
-        """Pose of the person in an RGB crop (256, 256, 3); its mask takes nearly as long as all the rest."""
-        network = self._outlines if mask else self._points
+        """Landmarks of the person in an RGB crop (256, 256, 3). The mask nearly doubles the time."""
+        network = self._with_mask if mask else self._points
         seen = network(crop)
         return mean_with_mirrored(seen, network(crop[:, ::-1])) if self._mirrored else seen
 
     def find_people(self, image: NDArray[np.uint8]) -> list[DetectedPerson]:
-        """People in a picture (H, W, 3) RGB, the surest first; a quarter of the picture's height or more."""
+        """Detect people in an image (H, W, 3) RGB who fill a quarter of its height, in order of decreasing score."""
         return self._detect(image)
 
     def search(self, image: NDArray[np.uint8]) -> list[DetectedPerson]:
-        """Those who are small or lie, the surest first: in parts of the picture, or in the picture turned by quarters.
+        """Detect small or lying people in an image (H, W, 3) RGB, in order of decreasing score.
 
-        There is more in a picture that looks like a person when it is looked at so closely.
+        The detector runs on tiles of the image and, if these show none, on the image rotated by quarter turns. This
+        search gives more false positives than `find_people`.
         """
         people = []
         for u, v, side in squares(image.shape[1], image.shape[0]):
@@ -86,7 +87,7 @@ class Models:
 
 
 def squares(width: int, height: int) -> list[tuple[int, int, int]]:
-    """Squares (left, top, side) [px] as high as the picture's shorter side and half of it, each half over the next."""
+    """Tiles (left, top, side) [px], as high as the image's shorter side and half of it, which overlap by half."""
     found = []
     for side in (min(width, height), min(width, height) // 2):
         lefts, tops = (np.linspace(0, n - side, max(round(2 * n / side) - 1, 1)).astype(int) for n in (width, height))
@@ -118,7 +119,15 @@ def _pose_model(path: Path, threads: int, without: tuple[int, ...] = ()) -> Pose
 
 
 def interpreter(path: Path, threads: int, without: tuple[int, ...] = ()) -> Any:
-    """A network, ready to run; `without` the output of a shape, and what makes it alone."""
+    """Load a network; `without` the output of that shape, and the operators that only it needs.
+
+    Raises
+    ------
+    ObservationError
+        The extra `detect` is not installed.
+    FileError
+        The file is missing or not a network.
+    """
     runtime, remedy = _runtime(), _REMEDY if path.is_relative_to(cache_directory()) else _LAYOUT
     if not path.is_file():
         raise FileError("no such network", file=path, remedy=remedy)
@@ -133,7 +142,7 @@ def interpreter(path: Path, threads: int, without: tuple[int, ...] = ()) -> Any:
 
 @lru_cache(maxsize=2)
 def _reduced(path: Path, without: tuple[int, ...]) -> bytes:
-    """A network's file without one of its outputs, told by its shape: its other answers are the same, bit for bit."""
+    """A network's file without the output of that shape; its other outputs stay the same, bit for bit."""
     import flatbuffers
     from ai_edge_litert import schema_py_generated as schema
 

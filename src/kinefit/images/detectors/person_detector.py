@@ -1,4 +1,4 @@
-"""Finding people in a whole picture.
+"""Detect people in a whole image.
 
 Source: Bazarevsky et al., BlazePose, 2020.
 """
@@ -15,12 +15,12 @@ from kinefit.images.detectors.box_detector import BoxDetector
 from kinefit.images.detectors.roi import Roi
 
 CELLS = ((8, 2), (16, 2), (32, 6))  # stride [px] of the feature maps, anchors in a cell
-_MIN_PERSON_SCORE = 0.5  # at 0.25 machines in an empty room are taken for a person
+_MIN_PERSON_SCORE = 0.5  # at 0.25 machines in an empty room are false positives
 
 
 @dataclass(frozen=True, eq=False)
 class DetectedPerson:
-    """Somebody in a picture.
+    """A person detected in an image.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class DetectedPerson:
         Middle of the hips, and a point above it on the circle around the body.
     score : float, 0..1
     head : (2, 2) [px], optional
-        Corners, upper left and lower right, of a box around the face, or where it would be.
+        Upper left and lower right corner of a box around the face, visible or not.
     """
 
     points: NDArray
@@ -37,11 +37,11 @@ class DetectedPerson:
 
     @property
     def roi(self) -> Roi:
-        """Region around the whole body."""
+        """Region around the whole body [px]."""
         return Roi.around_person(*self.points)
 
     def turned_back(self, quarters: int, shape: tuple[int, int]) -> DetectedPerson:
-        """The person in a picture (height, width) who was found in `numpy.rot90` of it by so many quarter turns."""
+        """Rotate a detection back: from `numpy.rot90` by some quarter turns to the image of shape (height, width)."""
         points, (height, width) = self.points, shape
         if quarters % 2:
             height, width = width, height
@@ -52,17 +52,17 @@ class DetectedPerson:
 
 
 class PersonDetector:
-    """People in a whole picture.
+    """Detects people in a whole image.
 
     Parameters
     ----------
     interpreter
-        Of `pose_detection.tflite`: (1, 224, 224, 3) in -1..1 to 2254 boxes with four points each, and their scores.
+        Of `pose_detection.tflite`: from (1, 224, 224, 3) in -1..1 to 2254 boxes with four points each, and scores.
     """
 
     def __init__(self, interpreter: Any) -> None:
         self._boxes = BoxDetector(interpreter, CELLS)
 
     def __call__(self, image: NDArray[np.uint8]) -> list[DetectedPerson]:
-        """People in an RGB picture (H, W, 3), the surest first."""
+        """People in an RGB image (H, W, 3), in order of decreasing score."""
         return [DetectedPerson(b.points[:2], b.score, b.corners) for b in self._boxes(image, _MIN_PERSON_SCORE)]

@@ -1,4 +1,4 @@
-"""Regions of interest: squares, turned upright with the person, that are cut out of a picture for a network."""
+"""Regions of interest: squares, rotated with the person, that are cropped from an image for a network."""
 
 from __future__ import annotations
 
@@ -9,21 +9,23 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-_MARGIN = 1.25  # of the published method: the square is that much larger than the circle around the person
-_SLOWEST, _HURRY, _CHANGE = 0.01, 10.0, 1.0  # [Hz], [s], [Hz] of the filter, as published with the network
-_STEP = 1 / 30  # [s] the rate they are meant for
+_ROI_SCALE = 1.25  # of the published method: the square's side to the diameter of the circle around the person
+_MIN_CUTOFF_HZ = 0.01  # of the filter, at rest; all three as published with the network
+_CUTOFF_SLOPE = 10.0  # [s] growth of the cutoff with speed
+_SPEED_CUTOFF_HZ = 1.0  # of the filtered speed
+_PERIOD = 1 / 30  # [s] that these constants are meant for
 
 
 @dataclass(frozen=True, eq=False)
 class Roi:
-    """A square in a picture.
+    """A square region of an image.
 
     Parameters
     ----------
     centre : (2,) [px]
     side : float [px]
     turn : float [rad]
-        Clockwise in the picture (u right, v down): 0 for a person upright, π/2 for one whose head is to the right.
+        Rotation, clockwise in the image (u right, v down): 0 for an upright person, π/2 if the head is to the right.
     """
 
     centre: NDArray
@@ -32,13 +34,13 @@ class Roi:
 
     @classmethod
     def around_person(cls, middle: ArrayLike, rim: ArrayLike) -> Roi:
-        """Square around a person, given the middle of the hips and a point above it on the circle around all [px].
+        """Square around a person, from the middle (2,) [px] of the hips and a point (2,) [px] above it on the circle.
 
         Source: Bazarevsky et al., BlazePose: On-device real-time body pose tracking, 2020.
         """
         middle, rim = np.asarray(middle, float), np.asarray(rim, float)
         du, dv = rim - middle
-        return cls(middle, 2 * _MARGIN * float(np.hypot(du, dv)), float(np.arctan2(du, -dv)))
+        return cls(middle, 2 * _ROI_SCALE * float(np.hypot(du, dv)), float(np.arctan2(du, -dv)))
 
     @classmethod
     def around_points(cls, points: NDArray, up: NDArray, sides: float) -> Roi:
@@ -50,31 +52,31 @@ class Roi:
         return cls(R @ (low + high) / 2, sides * float((high - low).max()), turn)
 
     def A_image_crop(self, size: int) -> NDArray:
-        """(2, 3) map of the pixels of a crop of `size` px to those of the picture."""
+        """Affine map (2, 3) from the pixels of a crop of `size` px to those of the image."""
         scale = self.side / size
         c, s = scale * np.cos(self.turn), scale * np.sin(self.turn)
         linear = np.array([[c, -s], [s, c]])
         return np.column_stack([linear, self.centre - linear @ [size / 2, size / 2]])
 
     def crop(self, image: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
-        """The region as (size, size, 3) uint8; beyond the picture's rim its outermost pixels are repeated."""
+        """Crop the region from an image (H, W, 3): (size, size, 3) uint8; outside, the image's border is repeated."""
         return cv2.warpAffine(
             image, self.A_image_crop(size), (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,
         )
 
     def to_image(self, points_crop: NDArray, size: int) -> NDArray:
-        """Points (..., 2) of the crop of `size` px in the picture [px]."""
+        """Points (N, 2) [px] in the image, from points of the crop of `size` px; any leading axes."""
         A = self.A_image_crop(size)
         return points_crop @ A[:, :2].T + A[:, 2]
 
     def to_upright(self, points_crop: NDArray) -> NDArray:
-        """Points in space (..., 3), along the crop's u and v and away from the camera, along those of the picture."""
+        """Rotate points (N, 3) [m] from the crop's axes u, v and viewing direction to those of the image."""
         c, s = np.cos(self.turn), np.sin(self.turn)
         return points_crop @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
 
     def corners(self) -> NDArray:
-        """(4, 2) [px]."""
+        """Corners (4, 2) [px] in the image."""
         return self.to_image(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), 1)
 
 
@@ -85,15 +87,15 @@ def is_inside(points: NDArray, shape: Sequence[int]) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class Steady:
-    """The two points of a region, steadied over time: a region that trembles makes the landmarks in it tremble.
+    """The two points of a region, filtered over time: jitter of the region causes jitter of the landmarks in it.
 
-    A low pass whose cutoff rises with the speed, so that it stands still with the person and follows without lag.
+    A low-pass filter whose cutoff rises with speed: no jitter at rest, no lag in motion.
     Source: Casiez et al., 1€ filter, CHI 2012, with the constants published with BlazePose.
 
     Parameters
     ----------
     value, raw : (2, 2) [px]
-        Middle and rim, filtered, and as they came last.
+        Middle and point on the circle (see `Roi.around_person`), filtered, and as last given.
     speed : (2, 2) [1/s] in sides of the region
     """
 
@@ -103,23 +105,23 @@ class Steady:
 
     @classmethod
     def at(cls, points: NDArray) -> Steady:
-        """Begin with the points as they are."""
+        """Start the filter at points (2, 2) [px]."""
         return cls(points, points, np.zeros_like(points))
 
     def follow(self, points: NDArray) -> Steady:
-        """The points of the next picture."""
+        """Filter the points (2, 2) [px] of the next image."""
         radius = max(float(np.linalg.norm(points[1] - points[0])), 1e-6)
-        speed = self.speed + _share(_CHANGE) * ((points - self.raw) / (2 * radius * _STEP) - self.speed)
-        value = self.value + _share(_SLOWEST + _HURRY * np.abs(speed)) * (points - self.value)
+        speed = self.speed + _share(_SPEED_CUTOFF_HZ) * ((points - self.raw) / (2 * radius * _PERIOD) - self.speed)
+        value = self.value + _share(_MIN_CUTOFF_HZ + _CUTOFF_SLOPE * np.abs(speed)) * (points - self.value)
         return Steady(value, points, speed)
 
     @property
     def roi(self) -> Roi:
-        """The region."""
+        """Region [px] of the filtered points."""
         return Roi.around_person(*self.value)
 
 
 def _share(cutoff: ArrayLike) -> NDArray:
-    """Weight of the new value in a low pass of the first order [Hz]."""
-    turns = 2 * np.pi * _STEP * np.asarray(cutoff)
+    """Weight 0..1 of the new value in a first-order low-pass filter with a cutoff [Hz]."""
+    turns = 2 * np.pi * _PERIOD * np.asarray(cutoff)
     return turns / (1 + turns)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import parse_toml
-from kinefit.bodies.joint_names import FAMILIES, FINGERS, MORE, SEGMENTS, VRM0_FINGERS, VRM1_FINGERS
+from kinefit.bodies.joint_names import ENDS, FAMILIES, FINGERS, SEGMENTS, VRM0_FINGERS, VRM1_FINGERS
 from kinefit.bodies.limbs import FACE
 from kinefit.errors import FileError, choices
 from kinefit.motion import rotation_between_up
@@ -97,7 +97,7 @@ def read_names(path: str | PathLike[str]) -> dict[str, str]:
 
     Returns
     -------
-    segment (of `SEGMENTS`, `FINGERS`, `FACE` or `MORE`) -> name of a joint
+    segment (of `SEGMENTS`, `FINGERS`, `FACE` or `ENDS`) -> name of a joint
 
     Raises
     ------
@@ -109,7 +109,7 @@ def read_names(path: str | PathLike[str]) -> dict[str, str]:
     except (OSError, UnicodeDecodeError) as error:
         raise FileError(f"cannot be read ({error})", file=path, remedy="Give a TOML file.") from error
     for segment, name in table.items():
-        if segment not in (known := (*SEGMENTS, *FINGERS, *FACE, *MORE)):
+        if segment not in (known := (*SEGMENTS, *FINGERS, *FACE, *ENDS)):
             remedy = 'A line is: thigh_l = "LeftUpLeg".'
             raise FileError(choices("segment", segment, known), file=path, remedy=remedy)
         if not isinstance(name, str):

@@ -19,7 +19,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 from kinefit.images import _kernels_regions as kernels
 from kinefit.images.regions import SearchSettings
-from kinefit.rendering import NEAR
+from kinefit.rendering import MIN_Z
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.regions.region_image import Coloured
 from kinefit.sensors.scene import Scene
@@ -94,7 +94,7 @@ def region_starts(
     if right and not rough:
         return []
     x = x @ R.T + t
-    if x[:, 2].min() < NEAR:
+    if x[:, 2].min() < MIN_Z:
         return []
     low, high = (np.repeat([length * size, angle], 3) for length, angle in (_LEAST, _MOST))
     spread = np.clip(spread, low, high)
@@ -110,7 +110,7 @@ def region_starts(
     kernels.ratio_map(seen.image, seen.bins, seen.ratios.whole, left, top, step, cells)
     K, half = camera.matrix, 0.5 * (step - 1)
     lens = np.array([K[0, 0] / step, K[1, 1] / step, (K[0, 2] - left - half) / step, (K[1, 2] - top - half) / step,
-                     NEAR])  # fmt: skip
+                     MIN_Z])  # fmt: skip
     T = camera.T_camera_world
     moved = [np.linalg.inv(T) @ m @ T @ scene.state.T_world_root for m in seek(seeker, x, cells, lens, spread, s)]
     return [BodyState(T_world_root, scene.state.angles) for T_world_root in moved]

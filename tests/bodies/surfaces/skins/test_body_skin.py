@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from kinefit.bodies import load_body
-from kinefit.bodies.surfaces.skins.body_skin import FOLLOWED, body_skins
+from kinefit.bodies.surfaces.skins.body_skin import MAX_OWNERS, body_skins
 from kinefit.bodies.surfaces.skins.skin_tubes import field
 from kinefit.bodies.surfaces.skins.subdivision import check_closed, limit, subdivided
 from kinefit.errors import BodyError
@@ -103,7 +103,7 @@ def test_the_skin_is_where_the_fields_end_but_for_the_joins():
 def test_weights_are_few_and_smooth_over_every_joint():
     x, triangles, weights = SKIN.mesh()
     assert weights.sum(axis=1) == pytest.approx(1) and weights.min() >= 0
-    assert (weights > 0).sum(axis=1).max() <= FOLLOWED
+    assert (weights > 0).sum(axis=1).max() <= MAX_OWNERS
     edges = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
     assert np.abs(weights[edges[:, 0]] - weights[edges[:, 1]]).max() < 0.25
     for parent, children in BRANCHES.items():

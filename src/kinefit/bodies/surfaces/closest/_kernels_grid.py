@@ -1,4 +1,4 @@
-"""Signed distance grids of closed triangle meshes: how they are built, and the nearest surface looked up in them."""
+"""Compiled signed distance grids of closed triangle meshes: construction, and search for the nearest surface."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def closest_on_triangle(px, py, pz, a, b, c):
 
 @jit
 def seed(corners, origin, cell, reach, squared, owner):
-    """Exact squared distances in the boxes around every triangle, enlarged by `reach` [m], and the triangle of each.
+    """Exact squared distances [m²] in boxes around all triangles, enlarged by `reach` [m], and the nearest triangle.
 
     corners (T, 3, 3), squared (X, Y, Z) to start from inf, owner (X, Y, Z) to start from -1.
     """
@@ -69,7 +69,7 @@ def seed(corners, origin, cell, reach, squared, owner):
 
 @jit
 def improve(corners, t, origin, cell, i, j, k, squared, owner):
-    """Let triangle t own a node where it is nearer than the present owner."""
+    """Make triangle t the owner of a node if it is nearer than the present owner."""
     px, py, pz = origin[0] + i * cell, origin[1] + j * cell, origin[2] + k * cell
     x, y, z, _ = closest_on_triangle(px, py, pz, corners[t, 0], corners[t, 1], corners[t, 2])
     d2 = (px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2
@@ -80,7 +80,7 @@ def improve(corners, t, origin, cell, i, j, k, squared, owner):
 
 @jit
 def sweep(corners, origin, cell, squared, owner):
-    """Hand the nearest triangles on from node to node in eight sweeps (Zhao 2005; Tsai 2002 for the exact distance)."""
+    """Propagate the nearest triangles from node to node in eight sweeps (Zhao 2005; Tsai 2002 for exact distances)."""
     nx, ny, nz = owner.shape
     for direction in range(8):
         sx = 1 if direction & 1 == 0 else -1
@@ -105,10 +105,10 @@ def sweep(corners, origin, cell, squared, owner):
 
 @jit
 def walk(corners, across, origin, cell, squared, owner):
-    """From each node's owner go over to neighbouring triangles as long as they are nearer.
+    """Refine each node's owner by walking to neighbouring triangles as long as they are nearer.
 
-    Sweeps alone are off by up to a cell along the surface where triangles are smaller than cells.
-    across (T, 3): the triangle beyond edges ab, bc, ca.
+    Sweeps alone have errors of up to a cell along the surface where triangles are smaller than cells.
+    across (T, 3): the triangles across edges ab, bc, ca.
     """
     nx, ny, nz = owner.shape
     for i in range(nx):
@@ -123,7 +123,7 @@ def walk(corners, across, origin, cell, squared, owner):
 
 @jit
 def finish(corners, features, origin, cell, owner, values):
-    """Signed distance and its gradient at every node, where that is smaller than what is there (union of parts).
+    """Write signed distance and gradient of every node to `values`, where smaller than the present (union of parts).
 
     features (T, 7, 3): normal of the face, angle-weighted normals of its corners and edges, whose side of p is the
     sign of the distance (Baerentzen & Aanaes 2005). values (X, Y, Z, 4): distance and gradient, to start from inf.
@@ -180,15 +180,15 @@ def nearest_faces(corners, x, face, squared):
 
 @jit
 def nearest_on_grids(x, frames, values, layout, boxes, only, best, normal, segment):
-    """Improve `best`, `normal`, `segment` where a mesh is nearer than what they hold.
+    """Update `best`, `normal`, `segment` where a mesh is nearer than the present surface.
 
     Parameters: x (3, N) [m] in the world; frames (S, 12); values, layout, boxes of a `GridTable`; only (N,) the segment
     that a point may belong to, -1 for any; best (N,) signed distance [m]; normal (3, N) outward at the closest point,
     which is x - best * normal; segment (N,).
 
     With the distances d_i and gradients g_i of a cell's eight nodes x_i and their trilinear weights w_i,
-    d(x) = sum w_i (d_i + g_i·(x - x_i) / 2), which is exact for quadratic fields. Points outside of a grid take the
-    closest point of the grid's nearest place.
+    d(x) = sum w_i (d_i + g_i·(x - x_i) / 2), which is exact for quadratic fields. Points outside of a grid get the
+    closest point of the nearest position in the grid.
     """
     for g in range(layout.shape[0]):
         s, start, nx, ny, nz = layout[g, 0], layout[g, 1], layout[g, 2], layout[g, 3], layout[g, 4]

@@ -1,4 +1,4 @@
-"""Nearest points of surfaces of metaballs, Σ w exp(-2 d) = 1/2."""
+"""Compiled nearest points of metaballs, Σ w exp(-2 d) = 1/2."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import math
 
 from kinefit._jit import jit
 
-_STEPS, _DONE = 30, 1e-9  # at most, and [m] of the last one
-_LONGEST = 0.1  # [m] of one step: far out and at the middle of a limb the field is nearly flat
+_MAX_ITERATIONS = 30
+_MIN_STEP = 1e-9  # [m] at which the iteration ends
+_MAX_STEP = 0.1  # [m] far outside and at the middle of a limb the field is nearly flat
 
 
 @jit
 def field(balls, first, last, x, y, z):
-    """Field and gradient at a point: balls (B, 13) as of `BallTable`."""
+    """Field and gradient at a point; balls (B, 13): see `BallTable`."""
     f, gx, gy, gz = 0.0, 0.0, 0.0, 0.0
     for i in range(first, last):
         b = balls[i]
@@ -31,17 +32,17 @@ def field(balls, first, last, x, y, z):
 
 @jit
 def closest(balls, first, last, x, y, z):
-    """Foot of a point on the surface: y with F(y) = 1/2 and x - y along the gradient.
+    """Closest point y on the surface to a point x: F(y) = 1/2 and x - y along the gradient.
 
-    Each step goes along the gradient to where the field's logarithm, outside the root of it, linearly meets the level
-    (exact for one ellipsoid along its axes), and along the tangent plane towards the point. Returns the signed
-    distance, outside positive, the outward normal, and whether it converged.
+    Each step goes along the gradient to where a linear model of the field's logarithm (outside: of its root) meets the
+    level, which is exact for one ellipsoid along its axes, and along the tangent plane towards the point. Returns the
+    signed distance, positive outside, the outward normal, and whether it converged.
     """
     level, root = math.log(0.5), math.sqrt(0.5 * math.log(2.0))
     px, py, pz = x, y, z
     nx, ny, nz = 0.0, 0.0, 0.0
     slide = 1.0
-    for step in range(_STEPS):
+    for step in range(_MAX_ITERATIONS):
         f, gx, gy, gz = field(balls, first, last, px, py, pz)
         size = math.sqrt(gx * gx + gy * gy + gz * gz)
         if not (f > 1e-280 and size > 1e-280):
@@ -53,7 +54,7 @@ def closest(balls, first, last, x, y, z):
             out = (h - root) * 4.0 * h / slope
         else:
             out = (level - math.log(f)) / slope
-        out = min(max(out, -_LONGEST), _LONGEST)
+        out = min(max(out, -_MAX_STEP), _MAX_STEP)
         wx, wy, wz = x - px, y - py, z - pz
         across = wx * nx + wy * ny + wz * nz
         tx, ty, tz = wx - across * nx, wy - across * ny, wz - across * nz
@@ -63,14 +64,14 @@ def closest(balls, first, last, x, y, z):
             slide = 0.5
         mx, my, mz = slide * tx - out * nx, slide * ty - out * ny, slide * tz - out * nz
         px, py, pz = px + mx, py + my, pz + mz
-        if step > 0 and mx * mx + my * my + mz * mz < _DONE * _DONE:
+        if step > 0 and mx * mx + my * my + mz * mz < _MIN_STEP * _MIN_STEP:
             return (x - px) * nx + (y - py) * ny + (z - pz) * nz, nx, ny, nz, True
     return (x - px) * nx + (y - py) * ny + (z - pz) * nz, nx, ny, nz, abs(out) < 1e-4
 
 
 @jit
 def nearest_on_metaballs(x, frames, limbs, balls, wanted, distance, normal, segment):
-    """Nearest points among all limbs, where they are nearer than what is there.
+    """Update the nearest points where a limb is nearer than the present surface.
 
     x (3, N) [m] in the world, frames (S, 12), limbs (G, 7) and balls (B, 13) as of `BallTable`, wanted (N,) segment or
     -1. Out: distance (N,), normal (3, N), segment (N,).

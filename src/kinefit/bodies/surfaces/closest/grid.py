@@ -1,4 +1,4 @@
-"""Signed distance grids of meshes, and all grids of a body packed for the kernel that searches them."""
+"""Signed distance grids of meshes, and a table of all grids of a body for the search kernel."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from kinefit.bodies.surfaces.closest import _kernels_grid as kernels
 if TYPE_CHECKING:
     from kinefit.bodies.surfaces.mesh import MeshSurface
 
-CELLS = 64  # along the longest side; a limb's then measure 1 cm. Finer ones gain less than a sensor's noise
+GRID_CELLS = 64  # along the longest side: 1 cm for a limb. Finer ones gain less than a sensor's noise
 MARGIN = 0.15  # [m] around the surface; farther points are extrapolated
 
 
 @dataclass(frozen=True, eq=False)
 class DistanceGrid:
-    """Signed distance to a surface at the nodes of a grid: outside positive, inside negative.
+    """Signed distance to a surface at the nodes of a grid: positive outside, negative inside.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class DistanceGrid:
     upper: NDArray
 
     def scaled(self, factor: float) -> DistanceGrid:
-        """Grid of the surface stretched about its frame's origin."""
+        """Grid of the surface scaled about its frame's origin by a factor, a number > 0."""
         values = self.values.copy()
         values[..., 0] *= factor
         return DistanceGrid(
@@ -46,13 +46,13 @@ class DistanceGrid:
 
 
 def distance_grid(
-    vertices: NDArray, faces: NDArray, *, cells: int = CELLS, margin: float = MARGIN
+    vertices: NDArray, faces: NDArray, *, cells: int = GRID_CELLS, margin: float = MARGIN
 ) -> DistanceGrid:
-    """Signed distance grid of a closed mesh; parts that run into each other count as their union.
+    """Signed distance grid of a closed mesh; intersecting parts count as their union.
 
-    Distances are exact near the surface; elsewhere the nearest triangle is handed on by sweeps and bettered among its
+    Distances are exact near the surface. Elsewhere sweeps propagate the nearest triangle, which is refined among its
     neighbours. The sign is that of the angle-weighted normal of the closest face, edge or corner (Baerentzen & Aanaes
-    2005), so small holes are bridged.
+    2005), so that small holes are bridged.
 
     Parameters
     ----------
@@ -78,14 +78,14 @@ def distance_grid(
     return DistanceGrid(origin, cell, values, lower, upper)
 
 
-def cell_size(corners: NDArray, cells: int = CELLS, margin: float = MARGIN) -> float:
-    """[m] side of the cells of `distance_grid` around corners (..., 3) [m]."""
+def cell_size(corners: NDArray, cells: int = GRID_CELLS, margin: float = MARGIN) -> float:
+    """Side [m] of the cells of `distance_grid` around corners (T, 3, 3) [m]."""
     x = corners.reshape(-1, 3)
     return float((x.max(0) - x.min(0)).max() + 2.0 * margin) / cells
 
 
 def parts(faces: NDArray) -> list[NDArray]:
-    """Indices of the faces (or edges) of each connected part: those that share a corner hang together."""
+    """Connected parts of faces (T, 3) or edges (E, 2): indices of each; faces that share a corner are connected."""
     label = np.arange(int(faces.max()) + 1)
     while True:
         least = label[faces].min(1)
@@ -101,9 +101,9 @@ def parts(faces: NDArray) -> list[NDArray]:
 
 
 def features_of(vertices: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
-    """Normals (T, 7, 3) of each face, its three corners and edges ab, bc, ca; faces (T, 3) beyond these edges.
+    """Normals (T, 7, 3) of each face, its three corners and edges ab, bc, ca; and the faces (T, 3) across these edges.
 
-    Those of corners are weighted by angles (Baerentzen & Aanaes 2005); beyond an open edge there is the face itself.
+    Normals of corners are weighted by angles (Baerentzen & Aanaes 2005). Across an open edge is the face itself.
     """
     corners = vertices[faces]
     sides = np.roll(corners, -1, 1) - corners  # ab, bc, ca
@@ -117,7 +117,7 @@ def features_of(vertices: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
     _, edge = np.unique(ends, axis=0, return_inverse=True)
     at_edge = np.zeros((int(edge.max()) + 1, 3))
     np.add.at(at_edge, edge.ravel(), np.repeat(normal, 3, axis=0))
-    half = np.argsort(edge.ravel(), kind="stable")  # sides of faces, those of one edge side by side
+    half = np.argsort(edge.ravel(), kind="stable")  # sides of faces, those of one edge adjacent
     pairs = np.flatnonzero(np.diff(edge.ravel()[half]) == 0)
     across = np.repeat(np.arange(len(faces)), 3)
     across[half[pairs]], across[half[pairs + 1]] = half[pairs + 1] // 3, half[pairs] // 3
@@ -126,7 +126,7 @@ def features_of(vertices: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
 
 
 class GridTable(NamedTuple):
-    """All meshes of a body as `nearest_on_grids` takes them; left and right limbs of one shape share its nodes.
+    """All meshes of a body, for `nearest_on_grids`; limbs of equal shape share their nodes.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ class GridTable(NamedTuple):
 
 
 def pack_grids(surfaces: Sequence[MeshSurface], rest: NDArray) -> GridTable:
-    """Table of a body's meshes; rest (S, 3) [m], joint centres in the root frame at rest."""
+    """Pack a body's meshes into a table; rest (S, 3) [m]: joint centres in the root frame at rest."""
     starts: dict[tuple[bytes, bytes], int] = {}
     grids: dict[tuple[bytes, bytes], DistanceGrid] = {}
     values, layout, boxes, total = [], [], [], 0

@@ -1,4 +1,4 @@
-"""The point of a body's surface that is nearest to a measured one."""
+"""Nearest points of a body's surface to measured points."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Nearest(NamedTuple):
 
     Parameters
     ----------
-    distance : (N,) [m] outside positive, inside negative; `max_distance` where nothing is as near.
-    point : (N, 3) [m] in the world, on the surface; x itself where nothing is as near.
-    normal : (N, 3) unit, outward there, in the world; zero where nothing is as near.
-    segment : (N,) int, -1 where nothing is as near.
+    distance : (N,) [m] positive outside, negative inside; `max_distance` if no surface is as near.
+    point : (N, 3) [m] in the world, on the surface; x itself if no surface is as near.
+    normal : (N, 3) unit, outward at that point, in the world; zero if no surface is as near.
+    segment : (N,) int, -1 if no surface is as near.
     """
 
     distance: NDArray
@@ -44,21 +44,24 @@ def nearest(
     only: ArrayLike | None = None,
     exact: bool = False,
 ) -> Nearest:
-    """Nearest points of all surfaces of a body (P2 2.3).
+    """Find the nearest points of all surfaces of a body (P2 2.3).
 
     Parameters
     ----------
+    body : Body
+    state : BodyState
     x_world : (N, 3) [m]
-    max_distance : float [m], beyond which nothing is sought.
+    max_distance : float [m], radius of the search.
     only : (N,) int, or one for all, optional
         Segment that each point may belong to, -1 for any.
     exact : bool
-        Closest points of cylinders to 1e-4 mm instead of a fraction of a millimetre; takes three times as long.
+        Whether closest points of cylinders are found to 1e-4 mm instead of a fraction of a millimetre, in three times
+        the time.
 
     Raises
     ------
     ObservationError
-        Points of the wrong shape or not finite, a bound that is not positive, a segment that is not there.
+        Points of the wrong shape or not finite, a radius that is not positive, a segment out of range.
     """
     x = shaped(x_world, ("N", 3), "points")
     lines = np.ascontiguousarray(x.T)
@@ -71,7 +74,13 @@ def nearest(
 def nearest_lines(
     body: Body, frames: NDArray, x: NDArray, max_distance: float, only: ArrayLike | None = None, *, exact: bool = False
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Distance (N,), normal (3, N) and segment (N,) for points (3, N) and frames (S, 12); see `nearest`."""
+    """Distance (N,) [m], normal (3, N) and segment (N,) for points x (3, N) [m] and frames (S, 12); see `nearest`.
+
+    Raises
+    ------
+    ObservationError
+        As `nearest`.
+    """
     count = x.shape[1]
     if not abs(float(x.sum())) < np.inf:
         raise ObservationError("points are not finite", remedy="Leave out what was not measured.")

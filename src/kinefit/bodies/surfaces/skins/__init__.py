@@ -1,1 +1,1 @@
-"""Skins: meshes blended between segments, made from tubes, subdivided, in files."""
+"""Skins: meshes blended between segments; made from tubes, subdivided, read from files."""

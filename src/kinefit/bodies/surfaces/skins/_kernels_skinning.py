@@ -1,4 +1,4 @@
-"""Nodes of a skinned mesh in the world, and how far they move along directions."""
+"""Nodes of a skinned mesh in the world, and their derivatives along directions."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def moves(
     nodes, owners, weights, index, share, direction, centre, frames, screws, dof_parent, last_dof,
     drive_dof, drive_segment, drive_twist, above, out,
 ):  # fmt: skip
-    """How far points along directions move by every degree of freedom: Σ_j b_j Σ_k w_k (n, (y_k − c) × n) J_k.
+    """Derivatives of points along directions by every degree of freedom: Σ_j b_j Σ_k w_k (n, (y_k − c) × n) J_k.
 
-    index, share (N, C): the nodes that a point lies between, and its part of each; direction (N, 3). drive_dof,
-    drive_segment (M,) and drive_twist (M, 6): what moves joints with an angle. above (S, S) bool: above[s, p] where p
-    is s or stands above it. out (N, 6 + D).
+    index, share (N, C): the nodes that a point lies between, and its barycentric coordinates; direction (N, 3).
+    drive_dof, drive_segment (M,) and drive_twist (M, 6): motions of joints with an angle. above (S, S) bool: above[s,
+    p] where p is s or an ancestor of it. out (N, 6 + D).
     """
     for i in range(index.shape[0]):
         n0, n1, n2 = direction[i, 0], direction[i, 1], direction[i, 2]

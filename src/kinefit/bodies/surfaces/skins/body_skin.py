@@ -1,9 +1,9 @@
-"""One seamless skin over a whole body of metaballs: tubes about its limbs, joined where they branch (P4, section 3.1).
+"""One seamless skin over a whole body of metaballs: tubes around its limbs, joined at branches (P4, section 3.1).
 
-Where a limb leaves another, as an arm the trunk, a block of the other's net is cut out whose border has as many
-corners as the limb's cross-sections, and rows of quadrilaterals join both. All of it is one closed net, and the skin is
-the bicubic B-spline surface over it (`subdivision`). It is made in a pose with the limbs apart, in which arms do not
-touch the trunk, and brought to rest by the way in which its vertices follow the segments.
+Where a limb branches off another, such as an arm from the trunk, a block of the other's net is cut out whose border has
+as many corners as the limb's cross-sections, and rows of quadrilaterals join both. The result is one closed net, and
+the skin is the bicubic B-spline surface over it (`subdivision`). It is built in a pose with separated limbs, in which
+the arms do not touch the trunk, and transformed to the rest pose by its skin weights.
 """
 
 from __future__ import annotations
@@ -23,25 +23,26 @@ from kinefit.bodies.surfaces.skins.subdivision import check_closed, interpolated
 from kinefit.errors import BodyError
 from kinefit.geometry import se3
 
-AROUND, TRUNK = 16, 32  # corners of a limb's cross-section, and of one that limbs branch off
-FOLLOWED = 4  # segments that a vertex follows at most, as files of skins have it
-_BEND = np.cos(np.deg2rad(60.0))  # of directions, beyond which a limb does not go on but leaves the other
-_ASIDE = np.deg2rad(12.0)  # from rest to the middle of a joint's limits, beyond which limbs are held apart there
-_SOFT = 8  # rounds in which weights spread: over about a limb's radius to either side of a joint
-_FILLET = 4  # rounds in which the rows of a join spread
+LIMB_CORNERS = 16  # of a limb's cross-section
+TRUNK_CORNERS = 32  # of the cross-section of one with branches
+MAX_OWNERS = 4  # segments that a vertex follows, the default of skin files
+_MIN_BEND_COSINE = np.cos(np.deg2rad(60.0))  # of directions, of a child that continues the limb
+_MIN_SPREAD = np.deg2rad(12.0)  # angle from rest to the middle of a joint's limits, of limbs that are separated
+_WEIGHT_ROUNDS = 8  # of smoothing the weights: over about a limb's radius to either side of a joint
+_JOIN_ROUNDS = 4  # of smoothing the rows of a join
 
 
 @dataclass(frozen=True, eq=False)
 class BodySkin:
-    """The closed net of one skin, in a pose with the limbs apart.
+    """The closed net of one skin, in a pose with separated limbs.
 
     Parameters
     ----------
     control : (V, 3) [m] control points, in the root's frame
     faces : (Q, 4) facing outwards
-    weights : (V, S) how much each follows the segments; they sum to 1
-    joined : (V,) bool, at a join, where no field says where the skin is
-    tubes : limbs that it is about, as they are posed, tube by tube
+    weights : (V, S) skin weights of the segments; they sum to 1
+    joined : (V,) bool, whether a vertex is at a join, where no field defines the skin
+    tubes : posed limbs inside the skin, tube by tube
     Ts : (S, 4, 4) from the rest pose to this one, of all segments
     """
 
@@ -54,39 +55,39 @@ class BodySkin:
 
     @property
     def limbs(self) -> tuple[PosedLimb, ...]:
-        """All of them."""
+        """The limbs of all tubes."""
         return tuple(limb for limbs in self.tubes for limb in limbs)
 
     def mesh(self, times: int = 1) -> tuple[NDArray, NDArray, NDArray]:
-        """Vertices (V', 3) [m] on the skin, triangles (T, 3), weights (V', S), after so many subdivisions."""
+        """Vertices (V', 3) [m] on the skin, triangles (T, 3), weights (V', S), after some subdivisions."""
         x, weights, faces = self.control, self.weights, self.faces
         for _ in range(times):
             both, faces = subdivided(np.concatenate([x, weights], axis=1), faces)
             x, weights = both[:, :3], both[:, 3:]
         x, weights = limit(x, faces), limit(weights, faces)
         triangles = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]])
-        return x, triangles, _followed(weights)
+        return x, triangles, _largest_weights(weights)
 
     def at_rest(self, x: NDArray, weights: NDArray) -> NDArray:
-        """(V, 3) [m] vertices in the rest pose, from which weights (V, S) bring them where they are here."""
+        """Transform vertices x (V, 3) [m] with weights (V, S) from this pose to the rest pose: (V, 3) [m]."""
         T = np.einsum("vs,sij->vij", weights, self.Ts)
         return np.asarray(np.linalg.solve(T[:, :3, :3], (x - T[:, :3, 3])[..., None])[..., 0])
 
 
-def _followed(weights: NDArray) -> NDArray:
-    """(V, S) the largest few weights of each, which sum to 1."""
-    least = np.sort(weights, axis=1)[:, -min(FOLLOWED, weights.shape[1])]
+def _largest_weights(weights: NDArray) -> NDArray:
+    """Keep the largest weights (V, S) of each vertex, normalised."""
+    least = np.sort(weights, axis=1)[:, -min(MAX_OWNERS, weights.shape[1])]
     kept = np.where((weights >= least[:, None]) & (weights > 1e-3), weights, 0.0)
     return np.asarray(kept / kept.sum(axis=1, keepdims=True))
 
 
 def body_skins(body: Body) -> list[BodySkin]:
-    """Skins of all metaballs of a body; one, where its limbs hang together.
+    """Skins of all metaballs of a body; one if its limbs are connected.
 
     Raises
     ------
     BodyError
-        Limbs that do not meet; one for which there is no room where it branches off.
+        Limbs that do not meet, or without room at a branch.
     """
     balls = {s.segment: s for s in body.surfaces if isinstance(s, Metaballs)}
     out = []
@@ -98,7 +99,7 @@ def body_skins(body: Body) -> list[BodySkin]:
 
 @dataclass(eq=False)
 class _TubePart:
-    """A tube to be, with what it is joined to: the part that its start, or its end, is let into."""
+    """Segments of a tube, and the parts that its start and its end are joined to."""
 
     segments: list[int]
     start: int | None = None
@@ -106,14 +107,14 @@ class _TubePart:
 
 
 def _skin(body: Body, balls: dict[int, Metaballs], first: int) -> BodySkin:
-    frames = body.tree.forward(np.eye(4), _apart(body, balls, first).angles)[0]
+    frames = body.tree.forward(np.eye(4), _separated_pose(body, balls, first).angles)[0]
     Ts = np.tile(np.eye(4), (len(frames), 1, 1))
     Ts[:, :3, :3] = frames[:, :9].reshape(-1, 3, 3)
     Ts[:, :3, 3] = frames[:, 9:]
     posed = {s: PosedLimb(limb, Ts[s] @ se3.transform(np.eye(3), body.tree.rest[s])) for s, limb in balls.items()}
     parts = _parts(body, posed, first)
     hosts = {part.start for part in parts}
-    around = [TRUNK if k in hosts else AROUND for k in range(len(parts))]
+    around = [TRUNK_CORNERS if k in hosts else LIMB_CORNERS for k in range(len(parts))]
     tubes = [
         tube([posed[s] for s in part.segments], n, (part.start is None, part.end is None))
         for part, n in zip(parts, around)
@@ -121,8 +122,8 @@ def _skin(body: Body, balls: dict[int, Metaballs], first: int) -> BodySkin:
     return _joined(body, parts, tubes, Ts)
 
 
-def _apart(body: Body, balls: dict[int, Metaballs], first: int) -> BodyState:
-    """The rest pose with limbs that branch off held away: the middle of their joints' limits about the front's axis."""
+def _separated_pose(body: Body, balls: dict[int, Metaballs], first: int) -> BodyState:
+    """The rest pose with branching limbs separated: at the middle of their joints' limits about the forward axis."""
     tree, state = body.tree, body.usual_state()
     angles = np.zeros_like(state.angles)
     several = {s for s in balls if sum(int(tree.parents[c]) == s for c in balls) > 1}
@@ -132,22 +133,22 @@ def _apart(body: Body, balls: dict[int, Metaballs], first: int) -> BodyState:
             above = int(tree.parents[above])
         for d in np.flatnonzero((tree.owners == s) & ~tree.prismatic):
             middle = 0.5 * (tree.lower[d] + tree.upper[d])
-            if above in balls and abs(tree.axes[d, 0]) > 0.95 and abs(middle) > _ASIDE and np.isfinite(middle):
+            if above in balls and abs(tree.axes[d, 0]) > 0.95 and abs(middle) > _MIN_SPREAD and np.isfinite(middle):
                 angles[d] = middle
     return BodyState(np.eye(4), angles)
 
 
 def _parts(body: Body, posed: dict[int, PosedLimb], first: int) -> list[_TubePart]:
-    """Tubes of a body: a limb goes on in its child that bends least, the others branch off."""
+    """Tubes of a body: the child that bends least continues a limb, the others branch off."""
     parents, parts = body.tree.parents, [_TubePart([first])]
     for number, part in ((k, p) for k in range(len(posed)) if k < len(parts) for p in [parts[k]]):
         while True:
             last = part.segments[-1]
             children = [c for c in posed if int(parents[c]) == last]
             straight = [float(posed[c].way @ posed[last].way) for c in children]
-            on = int(np.argmax(straight)) if children and max(straight) > _BEND else None
+            on = int(np.argmax(straight)) if children and max(straight) > _MIN_BEND_COSINE else None
             for k, child in enumerate(children):
-                if k != on and len(children) == 1:  # as the foot: the limb ends in it
+                if k != on and len(children) == 1:  # such as a foot: the limb ends in it
                     part.end = len(parts)
                     parts.append(_TubePart([child]))
                 elif k != on:
@@ -159,7 +160,7 @@ def _parts(body: Body, posed: dict[int, PosedLimb], first: int) -> list[_TubePar
 
 
 def _joined(body: Body, parts: Sequence[_TubePart], tubes: list[Tube], Ts: NDArray) -> BodySkin:
-    """One net of all tubes."""
+    """Join all tubes into one net."""
     joints = [(k, part.start, 0) for k, part in enumerate(parts) if part.start is not None]
     joints += [(k, part.end, -1) for k, part in enumerate(parts) if part.end is not None]
     for k, host, end in joints:
@@ -193,17 +194,17 @@ def _joined(body: Body, parts: Sequence[_TubePart], tubes: list[Tube], Ts: NDArr
     net = net.reshape(-1, 4)
     x, weights, joined = x[kept], weights[kept], joined[kept]
     check_closed(net)
-    x = np.where(joined[:, None], spread(x, net, _FILLET), x)
+    x = np.where(joined[:, None], spread(x, net, _JOIN_ROUNDS), x)
     limbs = tuple(t.limbs for t in tubes)
-    return BodySkin(interpolated(x, net), net, spread(weights, net, _SOFT), joined, limbs, Ts)
+    return BodySkin(interpolated(x, net), net, spread(weights, net, _WEIGHT_ROUNDS), joined, limbs, Ts)
 
 
 def _shortened(body: Body, limb: Tube, host: Tube, end: int) -> Tube:
-    """A tube without the cross-sections that the one into which it is let covers."""
-    hidden = np.flatnonzero((field(host.limbs, limb.vertices[limb.rings]) >= LEVEL).any(axis=1))
+    """Remove the cross-sections of a tube that lie inside its host."""
+    covered = np.flatnonzero((field(host.limbs, limb.vertices[limb.rings]) >= LEVEL).any(axis=1))
     rings = limb.rings
-    if len(hidden):
-        rings = rings[1 + int(hidden.max()) :] if end == 0 else rings[: int(hidden.min())]
+    if len(covered):
+        rings = rings[1 + int(covered.max()) :] if end == 0 else rings[: int(covered.min())]
     if len(rings) < 2:
         name = body.tree.segments[limb.limbs[0].limb.segment]
         problem = f"limb of segment '{name}' lies within the one that it branches off"
@@ -214,22 +215,21 @@ def _shortened(body: Body, limb: Tube, host: Tube, end: int) -> Tube:
 def _hole(
     body: Body, host: Tube, faces: NDArray, free: NDArray, ring: NDArray, limbs: Sequence[PosedLimb]
 ) -> tuple[NDArray, NDArray]:
-    """Faces of a tube to be cut out for a limb whose ring (A, 3) [m] is given, and the border (A,) that fits it best.
+    """Faces of a tube to cut out for a limb with a ring (A, 3) [m], and the border (A,) that fits the ring best.
 
-    Blocks of the wall and of the caps whose border has as many corners; none reaches a face that is cut out, nor one
-    beside such.
+    Candidates are blocks of the wall and of the caps with a border of A corners that touch no face cut out before.
     """
-    taken = np.zeros(len(host.vertices), bool)
-    taken[faces[~free]] = True
+    blocked = np.zeros(len(host.vertices), bool)
+    blocked[faces[~free]] = True
     covered = field(limbs, host.vertices) >= LEVEL
     best, out = np.inf, None
     turns = (np.arange(len(ring)) + np.arange(len(ring))[:, None]) % len(ring)
     for block, loop in _blocks(host, len(ring)):
-        if taken[loop].any() or not free[block].all():
+        if blocked[loop].any() or not free[block].all():
             continue
         border = host.vertices[loop]
         if len(ring) * float(np.sum((border.mean(axis=0) - ring.mean(axis=0)) ** 2)) >= best:
-            continue  # however it is turned
+            continue  # a lower bound for all rotations
         inside = np.zeros(len(host.vertices), bool)
         inside[faces[block]] = True
         squares = np.sum((border[turns] - ring) ** 2, axis=(1, 2))
@@ -244,7 +244,7 @@ def _hole(
 
 
 def _blocks(host: Tube, corners: int) -> list[tuple[NDArray, NDArray]]:
-    """Blocks of a tube's faces, each with its border, counterclockwise from outside."""
+    """Blocks of a tube's faces, each with its border, counter-clockwise from outside."""
     (R, A), out = host.rings.shape, []
     sizes = [(h, corners // 2 - h) for h in range(2, corners // 2 - 1)]
     wall = np.concatenate([host.rings, host.rings], axis=1)
@@ -269,5 +269,5 @@ def _blocks(host: Tube, corners: int) -> list[tuple[NDArray, NDArray]]:
 
 
 def _border(grid: NDArray) -> NDArray:
-    """Vertices about a grid: along its first row, then up its last column, back along the last row, and down."""
+    """Border of a grid: along its first row, up its last column, back along the last row, and down."""
     return np.concatenate([grid[0, :-1], grid[:-1, -1], grid[-1, :0:-1], grid[:0:-1, 0]])

@@ -1,25 +1,25 @@
-"""Low-pass approximations of a triangle mesh: what a Fourier series without high ones is to a surface (P1 2.3)."""
+"""Low-pass filter of a triangle mesh: the counterpart of a truncated Fourier series (P1 2.3)."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-_DOWN, _UP = 0.5, -0.525  # Taubin's λ and μ: frequencies below 1/λ + 1/μ = 0.095 of the mesh's highest stay
+_LAMBDA, _MU = 0.5, -0.525  # of Taubin: frequencies below 1/λ + 1/μ = 0.095 of the mesh's highest pass
 
 
 def low_pass(vertices: NDArray, faces: NDArray, passes: int) -> NDArray:
-    """(V, 3) [m] vertices without the high frequencies of the mesh; the more passes, the steeper the filter.
+    """Remove the high frequencies of a mesh: vertices (V, 3) [m]; more passes make a steeper filter.
 
-    Taubin, A signal processing approach to fair surface design (SIGGRAPH 1995): eigenvectors of the mesh's Laplacian
-    are its frequencies, and alternating steps of positive and negative weight keep the low ones, so that nothing
-    shrinks.
+    Source: Taubin, A signal processing approach to fair surface design (SIGGRAPH 1995). Eigenvectors of the mesh's
+    Laplacian are its frequencies; alternating steps of positive and negative weight keep the low ones without
+    shrinking.
 
     Parameters
     ----------
     vertices : (V, 3) [m]
     faces : (T, 3) int
-    passes : int; 0 leaves the mesh as it is.
+    passes : int; 0 returns the mesh unchanged.
     """
     edges = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
     a, b = edges.T
@@ -29,5 +29,5 @@ def low_pass(vertices: NDArray, faces: NDArray, passes: int) -> NDArray:
         total = np.zeros_like(x)
         for axis in range(3):
             total[:, axis] = np.bincount(a, x[b, axis], len(x)) + np.bincount(b, x[a, axis], len(x))
-        x += (_UP if k % 2 else _DOWN) * np.where(count > 0, total / count - x, 0.0)
+        x += (_MU if k % 2 else _LAMBDA) * np.where(count > 0, total / count - x, 0.0)
     return x

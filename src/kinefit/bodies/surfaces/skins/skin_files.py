@@ -1,4 +1,4 @@
-"""`[skin]` in a body file: one mesh over all segments, with weights."""
+"""Read `[skin]` of a body file: one mesh over all segments, with weights."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies.surfaces.obj import LONGEST, UNITS, read_obj
+from kinefit.bodies.surfaces.obj import MAX_LENGTH, UNITS, read_obj
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError, choices
@@ -18,7 +18,7 @@ _PLACE = "skin"
 
 
 class SkinRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """`[skin]`: an OBJ file in the root's frame at rest, and a CSV file of weights, beside the body file."""
+    """`[skin]`: an OBJ file in the root's frame at rest, and a CSV file of weights, relative to the body file."""
 
     mesh: str
     weights: str
@@ -27,13 +27,13 @@ class SkinRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 def skin_of(record: SkinRecord | None, tree: KinematicTree, source: str) -> SkinnedMesh | None:
-    """The skin that a body file names; `source` is the body file.
+    """Read the skin of a body file; `source` is the body file. None without a record.
 
     Raises
     ------
     BodyError
-        Files that cannot be read, an unknown unit, segment or vertex, a weight given twice; a mesh with holes or
-        flipped faces, weights that do not sum to one (see `SkinnedMesh`).
+        Files that cannot be read, an unknown unit, segment or vertex, a duplicate weight; a mesh with holes or flipped
+        faces, weights that do not sum to one (see `SkinnedMesh`).
     """
     if record is None:
         return None
@@ -44,7 +44,7 @@ def skin_of(record: SkinRecord | None, tree: KinematicTree, source: str) -> Skin
     mesh, table = Path(source).parent / record.mesh, Path(source).parent / record.weights
     vertices, faces = read_obj(mesh)
     vertices = UNITS[record.unit] * vertices
-    if (size := float(np.ptp(vertices, axis=0).max())) > LONGEST:
+    if (size := float(np.ptp(vertices, axis=0).max())) > MAX_LENGTH:
         problem = f"the skin is {size:.4g} m long"
         raise BodyError(problem, file=mesh, place=_PLACE, remedy='State the unit of its file, such as unit = "mm".')
     weights = read_weights(table, len(vertices), tree)
@@ -56,14 +56,14 @@ def skin_of(record: SkinRecord | None, tree: KinematicTree, source: str) -> Skin
 
 
 def read_weights(path: Path, count: int, tree: KinematicTree) -> NDArray:
-    """Weights (V, S) of a CSV file: lines of vertex (counted from 1, as in OBJ files), segment, weight.
+    """Read weights (V, S) from a CSV file: lines of vertex (counted from 1, as in OBJ files), segment, weight.
 
-    Without a weight the segment owns the vertex alone: P1's joint list. A first line of words is passed over.
+    Without a weight the segment owns the vertex alone, as in P1's joint list. A header line is skipped.
 
     Raises
     ------
     BodyError
-        A file that cannot be read, a line that is not what it says, an unknown segment or vertex, a weight given twice.
+        A file that cannot be read, an invalid line, an unknown segment or vertex, a duplicate weight.
     """
     try:
         lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))

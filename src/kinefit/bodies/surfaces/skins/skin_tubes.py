@@ -1,8 +1,8 @@
-"""Tubes about limbs of metaballs: cross-sections by ray casting, and caps over their ends (P4, section 3.1).
+"""Tubes around limbs of metaballs: cross-sections by ray casting, and caps over their ends (P4, section 3.1).
 
-Limbs that go on in about one direction, such as upper arm, forearm and hand, are one tube. Rays from the line through
-its balls, at right angles to it, end where they leave the last limb that they are in; at a closed end rays over half a
-sphere do. All of a tube are quadrilaterals: a grid of rings and columns, and on each cap a grid of its own.
+Limbs in about one direction, such as upper arm, forearm and hand, form one tube. Rays from the line through its balls,
+normal to it, end where they leave the last limb; at a closed end, rays over half a sphere form the cap. All faces are
+quadrilaterals: a grid of rings and columns, and a grid on each cap.
 """
 
 from __future__ import annotations
@@ -16,20 +16,21 @@ from numpy.typing import NDArray
 from kinefit.bodies.surfaces.metaballs import LEVEL, Metaballs
 from kinefit.errors import BodyError
 
-_SCANNED, _HALVED = 48, 24  # steps along a ray from its far end, halvings: to a millionth of a limb's width
-_FAR = 1.2  # of a ball's radius: beyond, its field alone is below a tenth of the level
-_LINE = 200  # points of the line through a tube's balls
-_FIRST = 24  # rings with which a tube is measured, before it gets as many as make its faces about square
+_SCAN_STEPS = 48  # along a ray from its far end
+_BISECTIONS = 24  # to a millionth of a limb's width
+_MAX_RADIUS_RATIO = 1.2  # to a ball's radius: beyond, its field alone is below a tenth of the level
+_LINE_POINTS = 200  # of the line through a tube's balls
+_TRIAL_RINGS = 24  # to measure a tube's width, before rings are chosen that make its faces nearly square
 
 
 @dataclass(frozen=True, eq=False)
 class PosedLimb:
-    """A limb of metaballs where a pose has it.
+    """A limb of metaballs in a pose.
 
     Parameters
     ----------
     limb : Metaballs
-    T : (4, 4) from its segment's frame
+    T : (4, 4) from its segment's frame to that of the pose
     """
 
     limb: Metaballs
@@ -37,26 +38,26 @@ class PosedLimb:
 
     @property
     def centres(self) -> NDArray:
-        """(K, 3) [m] of its balls."""
+        """Centres (K, 3) [m] of its balls."""
         return np.asarray(self.limb.centres @ self.T[:3, :3].T + self.T[:3, 3])
 
     @property
     def way(self) -> NDArray:
-        """(3,) unit direction from its first ball to its last one."""
+        """Unit direction (3,) from its first ball to its last one."""
         if len(self.limb.centres) == 1:
             return np.asarray(self.T[:3, :3] @ self.limb.axes[0, int(np.argmax(self.limb.radii[0]))])
         gap = self.centres[-1] - self.centres[0]
         return np.asarray(gap / np.linalg.norm(gap))
 
     def field(self, x: NDArray) -> NDArray:
-        """(...) of its balls at points (..., 3) [m]."""
+        """Field (N,) of its balls at points x (N, 3) [m]; any leading axes."""
         return self.limb.field((x - self.T[:3, 3]) @ self.T[:3, :3])
 
 
 def field(limbs: Sequence[PosedLimb], x: NDArray) -> NDArray:
-    """(...) of some limbs at points (..., 3) [m]: the root of the sum of their fields' squares.
+    """Field (N,) of several limbs at points x (N, 3) [m], any leading axes: the root of the sum of squared fields.
 
-    Their sum would make a joint, where two limbs end in each other, thicker than both; the largest of them a groove.
+    At a joint of two limbs, the plain sum would make a bulge, the maximum a groove.
     """
     return np.asarray(np.sqrt(np.sum([limb.field(x) ** 2 for limb in limbs], axis=0)))
 
@@ -69,9 +70,9 @@ class Tube:
     ----------
     limbs : in their order
     rings : (R, A) vertices of its cross-sections
-    caps : for each end a grid (n + 1, n + 1) of vertices, whose border is the ring there, or None where it is open
+    caps : for each end a grid (n + 1, n + 1) of vertices, whose border is the last ring, or None if it is open
     vertices : (V, 3) [m]
-    segment : (V,) that each belongs to
+    segment : (V,) segment of each vertex
     """
 
     limbs: tuple[PosedLimb, ...]
@@ -81,7 +82,7 @@ class Tube:
     segment: NDArray
 
     def faces(self) -> NDArray:
-        """(Q, 4) facing outwards; those of the walls first, ring by ring, then the caps', row by row."""
+        """Faces (Q, 4), facing outwards: first those of the wall, ring by ring, then those of the caps, row by row."""
         after = np.roll(self.rings, -1, axis=1)
         walls = np.stack([self.rings[:-1], after[:-1], after[1:], self.rings[1:]], axis=-1).reshape(-1, 4)
         out = [walls]
@@ -93,7 +94,7 @@ class Tube:
 
     @property
     def cut(self) -> Tube:
-        """Without vertices that no ring and no cap has, renumbered."""
+        """The tube without unused vertices, renumbered."""
         parts = [self.rings.ravel(), *(cap.ravel() for cap in self.caps if cap is not None)]
         kept, number = np.unique(np.concatenate(parts)), np.zeros(len(self.vertices), int)
         number[kept] = np.arange(len(kept))
@@ -102,7 +103,7 @@ class Tube:
 
 
 def tube(limbs: Sequence[PosedLimb], around: int, closed: tuple[bool, bool]) -> Tube:
-    """The net about limbs, with so many corners around (a multiple of 8), closed at the start or the end or open.
+    """Net around limbs, with `around` corners a ring (a multiple of 8); closed: whether start and end have caps.
 
     Raises
     ------
@@ -120,7 +121,7 @@ def tube(limbs: Sequence[PosedLimb], around: int, closed: tuple[bool, bool]) -> 
         slopes = np.gradient(middles, way, axis=0)
     else:
         way, middles, slopes = balls, middles[:1], limbs[0].way[None]
-    reach = 2.0 * _FAR * max(float(limb.limb.radii.max()) for limb in limbs)
+    reach = 2.0 * _MAX_RADIUS_RATIO * max(float(limb.limb.radii.max()) for limb in limbs)
 
     def sections(at: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         centre = np.stack([np.interp(at, way, middles[:, k]) for k in range(3)], axis=1)
@@ -132,7 +133,7 @@ def tube(limbs: Sequence[PosedLimb], around: int, closed: tuple[bool, bool]) -> 
         rays = np.cos(angle)[:, None] * side[:, None] + np.sin(angle)[:, None] * across[:, None]
         return centre, rays, np.stack([side, across, along], axis=1)
 
-    middle = np.linspace(0.0, way[-1], _FIRST)
+    middle = np.linspace(0.0, way[-1], _TRIAL_RINGS)
     centre, rays, _ = sections(middle)
     radius = float(np.mean(_exits(centre.repeat(around, axis=0), rays.reshape(-1, 3), reach, limbs)))
     count = max(4, 1 + round(way[-1] * around / (2.0 * np.pi * radius)))
@@ -158,10 +159,10 @@ def tube(limbs: Sequence[PosedLimb], around: int, closed: tuple[bool, bool]) -> 
 
 
 def _smooth(way: NDArray, middles: NDArray, wide: float) -> tuple[NDArray, NDArray]:
-    """(M,), (M, 3) [m] a line through balls, its bends spread over so much [m], so that cross-sections do not cross."""
-    at = np.linspace(0.0, way[-1], _LINE)
+    """Smooth the line through balls over `wide` [m], so that cross-sections do not intersect: (M,), (M, 3) [m]."""
+    at = np.linspace(0.0, way[-1], _LINE_POINTS)
     line = np.stack([np.interp(at, way, middles[:, k]) for k in range(3)], axis=1)
-    half = min(int(np.ceil(wide / at[1])), _LINE - 1)
+    half = min(int(np.ceil(wide / at[1])), _LINE_POINTS - 1)
     before, after = 2.0 * line[0] - line[half:0:-1], 2.0 * line[-1] - line[-2 : -half - 2 : -1]
     weight = np.hanning(2 * half + 3)[1:-1]
     longer = np.concatenate([before, line, after])
@@ -169,14 +170,14 @@ def _smooth(way: NDArray, middles: NDArray, wide: float) -> tuple[NDArray, NDArr
 
 
 def _owners(at: NDArray, way: NDArray, owner: NDArray) -> NDArray:
-    """(R,) segments of places along a tube: those of the nearest balls."""
+    """Segments (R,) of positions along a tube: those of the nearest balls."""
     return np.asarray(owner[np.argmin(np.abs(at[:, None] - way), axis=1)])
 
 
 def _cap(ring: NDArray, first: int) -> tuple[NDArray, NDArray]:
-    """Grid (n + 1, n + 1) of vertices with a ring (4 n,) as its border, and directions of the new ones.
+    """Grid (n + 1, n + 1) of vertices with a ring (4 n,) as its border, and directions (M, 3) of the new vertices.
 
-    These are numbered from `first` on; directions (M, 3) are along side, across and outwards.
+    New vertices are numbered from `first` on. Directions are along side, across and outwards.
     """
     n, ways = len(ring) // 4, list[tuple[float, float, float]]()
     half, grid = n // 2, np.full((n + 1, n + 1), -1)
@@ -196,7 +197,7 @@ def _cap(ring: NDArray, first: int) -> tuple[NDArray, NDArray]:
 
 
 def _sides(along: NDArray) -> NDArray:
-    """(R, 3) directions at right angles to each tangent (R, 3), turned as little as can be from one to the next."""
+    """Directions (R, 3) normal to each tangent (R, 3), with minimal rotation from one to the next."""
     side = np.cross(along[0], np.eye(3)[np.argmin(np.abs(along[0]))])
     out = np.empty_like(along)
     for k, t in enumerate(along):
@@ -207,27 +208,27 @@ def _sides(along: NDArray) -> NDArray:
 
 
 def _exits(starts: NDArray, ways: NDArray, reach: float, limbs: Sequence[PosedLimb]) -> NDArray:
-    """(N,) [m] along rays, where they leave the last limb.
+    """Distances (N,) [m] along rays at which they leave the last limb.
 
     Raises
     ------
     BodyError
-        A ray that is in none: limbs with a gap between them.
+        A ray outside of all limbs: there is a gap between them.
     """
 
     def inside(steps: NDArray) -> NDArray:
         x = starts[:, None] + steps[..., None] * ways[:, None]
         return np.asarray(field(limbs, x) >= LEVEL)
 
-    steps = np.linspace(0.0, reach, _SCANNED + 1)
-    within = inside(np.broadcast_to(steps, (len(starts), _SCANNED + 1)))
+    steps = np.linspace(0.0, reach, _SCAN_STEPS + 1)
+    within = inside(np.broadcast_to(steps, (len(starts), _SCAN_STEPS + 1)))
     if not within.any(axis=1).all():
         place = np.round(starts[int(np.argmin(within.any(axis=1)))], 3).tolist()
         remedy = "Give larger radii along the limbs, or another ball between them."
         raise BodyError(f"limbs of metaballs do not meet near {place} m", remedy=remedy)
-    last = _SCANNED - np.argmax(within[:, ::-1], axis=1)
-    low, high = steps[last], steps[np.minimum(last + 1, _SCANNED)]
-    for _ in range(_HALVED):
+    last = _SCAN_STEPS - np.argmax(within[:, ::-1], axis=1)
+    low, high = steps[last], steps[np.minimum(last + 1, _SCAN_STEPS)]
+    for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
         there = inside(middle[:, None])[:, 0]
         low, high = np.where(there, middle, low), np.where(there, high, middle)

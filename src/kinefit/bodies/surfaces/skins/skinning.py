@@ -1,6 +1,6 @@
-"""Skinned triangle meshes: every node is carried by one segment, or blended between several (linear blend skinning).
+"""Skinned triangle meshes: every node follows one segment, or several (linear blend skinning).
 
-x_world = Σ_k w_k (R_k x_k + t_k). Where one segment owns a node, its joints are P1's joint list 𝒥 (2.4).
+x_world = Σ_k w_k (R_k x_k + t_k). If one segment owns a node, its joints are P1's joint list 𝒥 (2.4).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from kinefit.errors import BodyError
 if TYPE_CHECKING:
     from kinefit.bodies.tree import KinematicTree
 
-_ONE = 1e-3  # weights that sum to one within this are rounded ones; they are made to
+_MAX_WEIGHT_ERROR = 1e-3  # of a sum of weights, by rounding; they are then normalised
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,16 +30,15 @@ class SkinnedMesh:
     Parameters
     ----------
     nodes : (V, K, 3) [m]
-        Each node as each of its K owners carries it, in the root frame at rest; all the same where it is modelled at
-        rest.
+        Position of each node in the root frame at rest, for each of its K owners; all equal if modelled at rest.
     faces : (T, 3) int32, outward counter-clockwise.
     owners : (V, K) int32, segments.
-    weights : (V, K), 0 for owners that a node does not need; those of a node sum to 1.
+    weights : (V, K), 0 for unused owners; those of a node sum to 1.
 
     Raises
     ------
     BodyError
-        Weights below zero, not finite, or that do not sum to one; arrays that do not fit together.
+        Weights below zero, not finite, or that do not sum to one; arrays that do not match.
     """
 
     nodes: NDArray
@@ -60,7 +59,7 @@ class SkinnedMesh:
             bad = int(np.flatnonzero(~np.isfinite(nodes).all((1, 2)))[0])
             raise BodyError(f"node {bad} of a skin is not finite", remedy="Leave out it and its faces.")
         total = weights.sum(1)
-        wrong = np.flatnonzero(~((np.abs(total - 1.0) < _ONE) & (weights >= 0.0).all(1)))
+        wrong = np.flatnonzero(~((np.abs(total - 1.0) < _MAX_WEIGHT_ERROR) & (weights >= 0.0).all(1)))
         if len(wrong):
             problem = f"weights of {len(wrong)} nodes do not sum to one or are below zero, the first "
             problem += f"{np.round(weights[wrong[0]], 4).tolist()} of node {wrong[0]}"
@@ -79,16 +78,16 @@ class SkinnedMesh:
     def of(
         cls, vertices: ArrayLike, faces: ArrayLike, weights: ArrayLike, tree: KinematicTree, *, owners: int = 4
     ) -> SkinnedMesh:
-        """Skin of vertices (V, 3) [m] in the root frame at rest with weights (V, S) of all segments, checked.
+        """Skin from vertices (V, 3) [m] in the root frame at rest, faces (T, 3) and weights (V, S) of all segments.
 
         Parameters
         ----------
-        owners : int, the most that a node keeps, the largest ones.
+        owners : int, largest number of segments of a node; those with the largest weights are kept.
 
         Raises
         ------
         BodyError
-            As the class; neighbours of which one is flipped, parts inside out, holes.
+            As the class; faces with opposite orientations, parts inside out, holes.
         """
         x, w = np.asarray(vertices, float), np.asarray(weights, float)
         if x.ndim != 2 or x.shape[1] != 3 or w.shape != (len(x), len(tree.segments)):
@@ -101,28 +100,28 @@ class SkinnedMesh:
 
     @classmethod
     def of_mesh(cls, mesh: BodyMesh) -> SkinnedMesh:
-        """A mesh each node of which one segment owns."""
+        """Skin from a mesh whose nodes each have one owner."""
         weights = np.ones((len(mesh.vertices), 1))
         return cls(mesh.vertices[:, None], mesh.faces, mesh.segment[:, None], weights)
 
     @cached_property
     def vertices(self) -> NDArray:
-        """(V, 3) [m] in the root frame at rest."""
+        """Nodes (V, 3) [m] in the root frame at rest."""
         return np.einsum("vk,vki->vi", self.weights, self.nodes)
 
     @cached_property
     def segment(self) -> NDArray:
-        """(V,) int32 segment that carries most of each node."""
+        """Segment (V,) int32 with the largest weight of each node."""
         return np.take_along_axis(self.owners, self.weights.argmax(1)[:, None], 1)[:, 0]
 
     @cached_property
     def face_segment(self) -> NDArray:
-        """(T,) int32 segment of each face: that of two of its corners, or of the first."""
+        """Segment (T,) int32 of each face: that of two of its corners, or of the first."""
         a, b, c = self.segment[self.faces].T
         return np.where(b == c, b, a)
 
     def joint_list(self, node: int, tree: KinematicTree) -> tuple[int, ...]:
-        """𝒥 (P1 2.4): the coordinates that move a node, from the root on; of all its owners."""
+        """Joint list 𝒥 (P1 2.4): the coordinates that move a node, from the root on; of all its owners."""
         wanted: set[int] = set()
         for segment in self.owners[node][self.weights[node] > 0]:
             s = int(segment)
@@ -132,20 +131,20 @@ class SkinnedMesh:
         return tuple(sorted(wanted))
 
     def posed(self, frames: NDArray, shift: NDArray | None = None) -> NDArray:
-        """(V, 3) [m] in the world; frames (S, 12) of `KinematicTree.forward`, shift (V, 3) [m] of nodes at rest."""
+        """Nodes (V, 3) [m] in the world; frames (S, 12) of `KinematicTree.forward`, shift (V, 3) [m] of rest nodes."""
         nodes = self.nodes if shift is None else self.nodes + shift[:, None]
         out = np.empty((len(nodes), 3))
         kernels.posed(nodes, self.owners, self.weights, frames, out)
         return out
 
     def stretched(self, old: NDArray, new: NDArray, factors: NDArray) -> SkinnedMesh:
-        """The skin on segments stretched by factors (S,), their joints moved from old to new (S, 3)."""
+        """The skin on segments scaled by factors (S,), with joints moved from old to new (S, 3) [m]."""
         k = self.owners
         return SkinnedMesh(new[k] + factors[k][..., None] * (self.nodes - old[k]), self.faces, k, self.weights)
 
 
 def strongest(weights: NDArray, owners: int) -> tuple[NDArray, NDArray]:
-    """The most important owners (V, K) of weights (V, S) and their weights, which sum to what they did."""
+    """The owners (V, K) with the largest of weights (V, S), and their weights (V, K), scaled to the same sum."""
     count = min(max(owners, 1), weights.shape[1])
     which = np.argsort(-weights, axis=1, kind="stable")[:, :count]
     share = np.take_along_axis(weights, which, 1)
