@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from kinefit.readers.video import Video
 
 PEOPLE = 3
-"""How many people are followed at most in one camera, unless told otherwise."""
+"""How many people are followed at most in one camera, by default."""
 
 QUALITIES = {"balanced": "pose_landmark_full.tflite", "best": "pose_landmark_heavy.tflite"}
 """Landmark networks: the larger, the nearer to the joints, and the slower."""
@@ -229,20 +229,20 @@ def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced"
     check_runtime()
     fetched: list[int] = []
 
-    def told(done: int, total: int) -> None:
+    def report(done: int, total: int) -> None:
         if not fetched:
             tell(f"Fetching the networks of the built-in detector, once: {MODELS_CREDIT}.")
         fetched.append(done)
         if progress:
             progress("fetching MB", done // 10**6, total // 10**6)
 
-    folder = detector_models(told)
+    folder = detector_models(report)
     if isinstance(quality, Path):
         return Networks(folder, quality, _name_of(quality))
     if QUALITIES[quality] == LANDMARKS:
         return Networks(folder, folder / LANDMARKS, quality)
     try:
-        return Networks(folder, landmark_models(told) / QUALITIES[quality], quality)
+        return Networks(folder, landmark_models(report) / QUALITIES[quality], quality)
     except AssetError as error:
         tell(f"{error} Until then people are seen by the network of quality 'balanced'.")
         return Networks(folder, folder / LANDMARKS, "balanced")

@@ -136,8 +136,8 @@ def somebody(jobs: Sequence[DetectionJob], tell: Tell = warn) -> dict[str, Path]
     empty = {job.camera: len(found) for job in jobs if not (found := read_detections(job.file)).seen.any()}
     remedy = "It wants at least half a body, a tenth of the picture high or more, in a picture that is not too dark."
     if len(empty) == len(jobs):
-        told = ", ".join(f"{camera} ({frames} pictures)" for camera, frames in empty.items())
-        raise ObservationError(f"the detector finds nobody in {told}", file=jobs[0].video, remedy=remedy)
+        empty_videos = ", ".join(f"{camera} ({frames} pictures)" for camera, frames in empty.items())
+        raise ObservationError(f"the detector finds nobody in {empty_videos}", file=jobs[0].video, remedy=remedy)
     for camera, frames in empty.items():
         tell(f"The detector finds nobody in camera {camera} ({frames} pictures): left out. {remedy}")
     return {job.camera: job.file for job in jobs if job.camera not in empty}

@@ -1,4 +1,4 @@
-"""Serve a page and WebSockets at one port, in a thread of its own, to those whom `Access` admits."""
+"""Serve a page and WebSockets at one port, in a thread of its own, to clients that `Access` admits."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ class PageServer:
     Parameters
     ----------
     access : who may connect
-    port : 0 for any; the next free one is not taken, since clients are told one port
+    port : 0 for any; the next free one is not taken, since clients are given one port
     page : what a browser gets at a path behind the token, such as "/"; None where there is nothing
     talk : what is said with a WebSocket client, until it returns or the connection ends
 

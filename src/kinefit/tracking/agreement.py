@@ -41,8 +41,8 @@ def contradictions(scenes: Sequence[Scene], matched: Sequence[Sequence[Matched]]
             kept.setdefault(m.sensor, []).extend(r for r in rows_at(m, scene) if isinstance(r, Rows))
     if len(kept) < 2:
         return {}
-    told = {sensor: _told(rows) for sensor, rows in kept.items() if rows}
-    far = {sensor: t for sensor, t in told.items() if t["deviations"] > FAR}
+    summaries = {sensor: _summary(rows) for sensor, rows in kept.items() if rows}
+    far = {sensor: t for sensor, t in summaries.items() if t["deviations"] > FAR}
     return dict(sorted(far.items(), key=lambda one: -one[1]["deviations"]))
 
 
@@ -87,7 +87,7 @@ def sentences(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
     ]
 
 
-def _told(rows: Sequence[Rows]) -> dict[str, Any]:
+def _summary(rows: Sequence[Rows]) -> dict[str, Any]:
     data = np.concatenate([np.zeros((8, 0)), *(r.data for r in rows)], axis=1)
     size, square = (np.concatenate([np.zeros(0), *parts]) for parts in zip(*(_points(r) for r in rows)))
     direction, residual, weight = data[3:6], data[6], data[7]

@@ -58,7 +58,7 @@ class Estimation:
 
 def motion_of(
     frames: TrackedFrames, subject: Subject, settings: TrackSettings, how: Estimation, *, up: str = "z",
-    name: str = "motion", told: Mapping[str, Any] | None = None, found: Sequence[SubjectFit] = (),
+    name: str = "motion", more: Mapping[str, Any] | None = None, found: Sequence[SubjectFit] = (),
 ) -> Motion:  # fmt: skip
     """The motion of what was tracked.
 
@@ -68,12 +68,12 @@ def motion_of(
     subject : Subject, with the body; its lengths are taken for exact where it does not tell how sure they are.
     settings : TrackSettings
     up, name : of the motion
-    told : what else there is to tell, for `Motion.provenance`
+    more : further entries of `Motion.provenance`
     found : what all sensors were fitted with together, with its covariance
     """
     body, rate, results = subject.body, frames.rate, frames.results
     smooth, lag, eye = how.smooth, how.lag, how.eye
-    provenance: dict[str, Any] = dict(told or {})
+    provenance: dict[str, Any] = dict(more or {})
     shared = None
     matched: Sequence[tuple[Matched, ...]] | None = None  # of all sensors but the keypoints
     if smooth:

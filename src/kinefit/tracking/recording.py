@@ -148,8 +148,8 @@ class Recording:
             raise ObservationError("there are no keypoints to track", remedy=remedy)
         lengths, rates = {len(k) for k in keypoints}, {k.rate for k in keypoints}
         if len(lengths) > 1 or len(rates) > 1:
-            told = ", ".join(f"{k.camera}: {len(k)} frames at {k.rate:g} Hz" for k in keypoints)
-            raise ObservationError(f"keypoint streams differ ({told})", remedy="Set frames or rate in the take.")
+            streams = ", ".join(f"{k.camera}: {len(k)} frames at {k.rate:g} Hz" for k in keypoints)
+            raise ObservationError(f"keypoint streams differ ({streams})", remedy="Set frames or rate in the take.")
         sigmas = _sigmas(sigma, len(keypoints))
         one = follow(rig, keypoints, person, people)
         records, times = person_records(one.keypoints, choose_people(rig, one.keypoints)), keypoints[0].times
@@ -207,13 +207,14 @@ class Recording:
         if not (is_number(rate) and 0.0 < rate < np.inf):
             raise ObservationError(f"steps at {rate} Hz", remedy="Give a positive rate.")
         by_source = frames_by_source(steps)
-        told = [float(np.mean([f.time for f in seen])) if len(seen) else np.nan for seen in steps]
-        timed = np.flatnonzero(np.isfinite(told))
+        mean_times = [float(np.mean([f.time for f in seen])) if len(seen) else np.nan for seen in steps]
+        timed = np.flatnonzero(np.isfinite(mean_times))
         if not len(timed):
             raise ObservationError("no step with a frame", remedy="Give what the sensors saw, a list of frames a step.")
-        times = np.interp(np.arange(len(told)), timed, np.array(told)[timed])
-        if len(timed) < len(told):  # evenly beyond the ends
-            times = np.where(np.isfinite(told), times, times[timed[0]] + (np.arange(len(told)) - timed[0]) / rate)
+        times = np.interp(np.arange(len(mean_times)), timed, np.array(mean_times)[timed])
+        if len(timed) < len(mean_times):  # evenly beyond the ends
+            even = times[timed[0]] + (np.arange(len(mean_times)) - timed[0]) / rate
+            times = np.where(np.isfinite(mean_times), times, even)
         sigma = dict(sigma or {})
         worn = tuple(
             NamedMarkers(source[0], Markers(names, rate, x, source=source[0]), source[1])

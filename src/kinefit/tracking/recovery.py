@@ -89,8 +89,8 @@ class Recovery:
         for m in result.measurements:
             m.doubt(doubtful)
         scene = tracker.scene_of(result.state, time)
-        told = sum_evidence(scene, evidence_of(scene, result.matched))
-        return replace(result, segment_quality=told.segment_quality(self.body.tree))
+        evidence = sum_evidence(scene, evidence_of(scene, result.matched))
+        return replace(result, segment_quality=evidence.segment_quality(self.body.tree))
 
     def _best(
         self, tracker: Tracker, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],

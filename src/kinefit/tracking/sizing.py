@@ -38,14 +38,14 @@ from kinefit.tracking.run import OtherPeople, TrackedSteps, run, tracker_of
 from kinefit.tracking.session import KeptFrame
 from kinefit.tracking.unknowns import Unknowns, of_all, of_points
 
-_TRIED = 100  # steps that are tracked to find the person's shape ...
-_TRIED_ALONE = 600  # of one camera's keypoints: lengths are told apart by poses that differ
+_MAX_STEPS = 100  # steps that are tracked to find the person's shape ...
+_MAX_STEPS_ONE_CAMERA = 600  # of one camera's keypoints: poses that differ distinguish the lengths
 _POSES = 8  # and how many of them it is found from: twice as many change no half axis by more than its deviation
-_MANY = 16  # of markers alone, whose places are found by how they move; a frame of them costs little
+_MARKER_POSES = 16  # of markers alone, whose places are found by how they move; a frame of them costs little
 _MATCHES = 3  # rounds of matching and solving
 _PLACES = 2  # fits with a better spread of the markers' places; it changes by less than a tenth from then on
 _MOVES = 3  # times that cameras are moved to where a subject fit has found them
-_SEEN = 0.5  # quality of a frame that the shape may be found from
+_MIN_FRAME_QUALITY = 0.5  # quality of a frame that the shape may be found from
 
 _MIN_UPRIGHT = 0.65  # mean score of starts of people who stand as the take says: 0.7 and more of drawn ones
 _MIN_INVERTED_GAIN = 0.04  # of the score: 0.06 to 0.07 of two drawn people upside down, -0.24 and -0.02 of upright ones
@@ -63,7 +63,7 @@ class SizedPerson:
     subject : Subject with the body
     start : step and state to begin with
     values : {sensor: {name: value}} of the sensors' own unknowns
-    told : what there is to report of it, for `Motion.provenance`
+    provenance : what the fits report, for `Motion.provenance`
     poses : {step: state} of steps that were fitted, where images are so far apart that none holds the next
     joint : what fits of several kinds of sensors together found, in their order
     calibrated : Rig as its calibration has it
@@ -73,7 +73,11 @@ class SizedPerson:
     subject: Subject
     start: KnownStart | None = None
     values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    told: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def reporting(self, **entries: Any) -> SizedPerson:
+        """The same with more entries of `provenance`."""
+        return replace(self, provenance={**self.provenance, **entries})
     poses: Mapping[int, BodyState] = field(default_factory=dict)
     joint: tuple[SubjectFit, ...] = ()
     calibrated: Rig = field(default_factory=lambda: Rig(()))
@@ -118,7 +122,7 @@ def fitted_to_person(
     person = SizedPerson(recording, Subject.as_is(body), recording.start, calibrated=recording.rig)
     unknown = any(s.unknowns for s in recording.sensors) or has_unknown_gear(body if subject is None else subject.body)
     if subject is not None:
-        person = _wearing(person, subject)
+        person = replace(person, subject=subject)
         return _by_all(person, body, settings, progress, size=False) if unknown else person
     if cameras >= 2:
         moved: CameraExtrinsics | None = None
@@ -132,7 +136,8 @@ def fitted_to_person(
                 break
             moved = by_keypoints.cameras and replace(by_keypoints.cameras, calibrated=recording.rig)
             person = _with_cameras(person, moved_rig(person.recording.rig, errors))
-        person = _with_depth_cameras(_wearing(person, by_keypoints, **_gear_of(body, by_keypoints)), settings)
+        person = replace(person, subject=by_keypoints).reporting(**_gear_of(body, by_keypoints))
+        person = _with_depth_cameras(person, settings)
     elif recording.markers and recording.markers[0].marker_set:
         person, found = _by_markers(person, height, progress)
         if recording.markers_alone and not unknown:
@@ -140,7 +145,7 @@ def fitted_to_person(
     else:
         if height:
             scales = np.full(len(body.scale_groups), height / body.stature)
-            person = _wearing(person, Subject(body.scaled(scales), scales), size="as stated")
+            person = replace(person, subject=Subject(body.scaled(scales), scales)).reporting(size="as stated")
         if recording.depth:
             person = sized_by_depth(person, progress)
     unknown = unknown and (bool(recording.sensors) or has_unknown_gear(person.subject.body))
@@ -149,9 +154,8 @@ def fitted_to_person(
 
 def _with_cameras(person: SizedPerson, rig: Rig) -> SizedPerson:
     """With cameras where they belong in place of where their calibration has them."""
-    recording = replace(person.recording, rig=rig)
-    told = {**person.told, CAMERAS: composed(person.told.get(CAMERAS, {}), between(person.recording.rig, rig))}
-    return replace(person, recording=recording, told=told)
+    moved = composed(person.provenance.get(CAMERAS, {}), between(person.recording.rig, rig))
+    return replace(person, recording=replace(person.recording, rig=rig)).reporting(**{CAMERAS: moved})
 
 
 def _with_depth_cameras(person: SizedPerson, settings: TrackSettings) -> SizedPerson:
@@ -164,19 +168,14 @@ def _with_depth_cameras(person: SizedPerson, settings: TrackSettings) -> SizedPe
             rig = moved_rig(rig, {camera.name: twist})
         elif not placed.fits:
             gone[name] = [placed.shift, placed.turn]
-    if rig is not person.recording.rig:
-        person = _with_cameras(person, rig)
-    if gone:
-        person = replace(person, recording=person.recording.without(gone), told={**person.told, LEFT_OUT: gone})
-    return person
-
-
-def _wearing(person: SizedPerson, subject: Subject, **told: Any) -> SizedPerson:
-    return replace(person, subject=subject, told={**person.told, **told})
+    person = person if rig is person.recording.rig else _with_cameras(person, rig)
+    if not gone:
+        return person
+    return replace(person, recording=person.recording.without(gone)).reporting(**{LEFT_OUT: gone})
 
 
 def _gear_of(body: Body, found: Subject) -> dict[str, Any]:
-    """What keypoints told of a body's gear, with standard deviations."""
+    """What keypoints show of a body's gear, with standard deviations."""
     names = Gear(body).names
     if not names or found.fit is None or found.covariance is None:
         return {}
@@ -184,9 +183,7 @@ def _gear_of(body: Body, found: Subject) -> dict[str, Any]:
     return {"shape": {n: [round(found.fit.value(n)[0], 4), round(float(std[n]), 4)] for n in names}}
 
 
-def _by_markers(
-    person: SizedPerson, height: float | None, progress: Progress | None
-) -> tuple[SizedPerson, SubjectFit]:
+def _by_markers(person: SizedPerson, height: float | None, progress: Progress | None) -> tuple[SizedPerson, SubjectFit]:
     """Lengths, the markers' own places and how far each moves on its segment, from one marker system alone."""
     r, body, worn = person.recording, person.subject.body, person.recording.markers[0]
     name, points = worn.marker_set, body.markers(worn.marker_set)
@@ -195,11 +192,12 @@ def _by_markers(
     subject = Subject(found.body, found.scales, length_share=found.scale_std / found.scales)
     each = {f"{worn.sensor} {name}": float(s) for name, s in zip(found.points.names, found.sigma)}
     person = replace(person, recording=replace(r, sigma={**r.sigma, **each}))
-    return _wearing(person, subject, markers={"rms_m": round(found.rms, 4), "frames": found.frames}), found.fit
+    markers = {"rms_m": round(found.rms, 4), "frames": found.frames}
+    return replace(person, subject=subject).reporting(markers=markers), found.fit
 
 
 def sized_by_depth(person: SizedPerson, progress: Progress | None = None) -> SizedPerson:
-    """The body in the size of the person in some depth images, if found; INVERTED is `told` of people head down."""
+    """Scale the body to the person in some depth images, if found; `provenance` has INVERTED for people head down."""
     r, body = person.recording, person.subject.body
     frames = r.depth
     camera = r.rig[next(iter(frames.values())).sensor]
@@ -209,15 +207,15 @@ def sized_by_depth(person: SizedPerson, progress: Progress | None = None) -> Siz
     try:
         fit, starts = sized_start(body, [f.depth for f in frames.values()], camera, background=empty, up=r.up_axis)
     except KinefitError as error:
-        return replace(person, told={**person.told, "size": f"not found: {error.problem}"})
+        return person.reporting(size=f"not found: {error.problem}")
     finally:
         if progress:
             progress("size", 1, 1)
     step, best = max(zip(frames, starts), key=lambda found: found[1].score)
     if _is_inverted(fit.body, [f.depth for f in frames.values()], camera, empty, r.up_axis, starts):
-        person = replace(person, told={**person.told, INVERTED: camera.name})
-    told = {n: [round(float(m), 4), round(float(s), 4)] for n, m, s in zip(fit.names, fit.mean, fit.std)}
-    person = replace(_by_joint(person, fit), told={**person.told, "size": told})
+        person = person.reporting(**{INVERTED: camera.name})
+    size = {n: [round(float(m), 4), round(float(s), 4)] for n, m, s in zip(fit.names, fit.mean, fit.std)}
+    person = _by_joint(person, fit).reporting(size=size)
     if is_rare(r.rate):
         person = replace(person, poses={i: found.state for i, found in zip(frames, starts)})
     return person if person.start is not None else replace(person, start=(step, best.state))
@@ -248,7 +246,7 @@ def _by_all(
     """
     r, body = person.recording, person.subject.body
     first = 0 if person.start is None else person.start[0]
-    tried, many = (_TRIED_ALONE, _MANY) if r.alone is not None else (_TRIED, _POSES)
+    tried, many = (_MAX_STEPS_ONE_CAMERA, _MARKER_POSES) if r.alone is not None else (_MAX_STEPS, _POSES)
     stretch = slice(first, min(first + tried, len(r)))
     start = None if person.start is None else (0, person.start[1])
     counted = None
@@ -262,13 +260,13 @@ def _by_all(
                 r.part(stretch), body, settings, start=start, view_bias=person.subject.view_bias, progress=counted
             )
     except TrackingError as error:
-        return replace(person, told={**person.told, "shape": f"not found: {error.problem}"})
+        return person.reporting(shape=f"not found: {error.problem}")
     shown = [bool(measured) or bool(r.keypoints) for measured in tracked.measurements]
-    good = [k for k, result in enumerate(tracked.results) if result.quality > _SEEN and shown[k]]
+    good = [k for k, result in enumerate(tracked.results) if result.quality > _MIN_FRAME_QUALITY and shown[k]]
     if not good and person.recording.markers:  # a body of another size agrees with few of them
         good = [k for k, measured in enumerate(tracked.measurements) if measured]
     surfaces = any(not m.settled for k in good for m in tracked.measurements[k])
-    poses = many if surfaces or r.keypoints else _MANY
+    poses = many if surfaces or r.keypoints else _MARKER_POSES
     chosen = [good[k] for k in spread(len(good), poses)]
     if not chosen:
         return person
@@ -337,7 +335,8 @@ def _by_joint(person: SizedPerson, found: SubjectFit) -> SizedPerson:
             length_share=found.std[:count],
         )  # fmt: skip
     shape = {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in zip(found.names, found.mean, found.std)}
-    person = _wearing(person, replace(subject, body=found.body), shape={**person.told.get("shape", {}), **shape})
+    shape = {**person.provenance.get("shape", {}), **shape}
+    person = replace(person, subject=replace(subject, body=found.body)).reporting(shape=shape)
     if found.cameras is not None:
         person = replace(person, recording=replace(person.recording, rig=found.rig))
     values = {**person.values, **found.values}

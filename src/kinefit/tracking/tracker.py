@@ -197,8 +197,8 @@ class Tracker:
             raise ObservationError("contacts without smoothing", remedy="Leave smooth as it is: contacts need it.")
         frames = self._session.frames(self.body, self.scene_of, self.apart)
         subject, how = Subject.as_is(self.body), Estimation(smooth=smooth, contacts=contacts)
-        told = {"frames": {"dropped": self.dropped, "late": self.late}}
-        return motion_of(frames, subject, self.settings, how, up=axis_of(self.up), name=name, told=told)
+        more = {"frames": {"dropped": self.dropped, "late": self.late}}
+        return motion_of(frames, subject, self.settings, how, up=axis_of(self.up), name=name, more=more)
 
     def update(
         self, frames: Sequence[Any], time: float | None = None, *, others: Sequence[Scene] = (),

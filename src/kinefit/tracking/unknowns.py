@@ -123,7 +123,7 @@ def of_all(
     ----------
     body : as sized as it is already
     size : whether anything of the body is sought
-    lengths : whether neither points nor a few depth images have told them: nearest points of a surface of simple
+    lengths : whether neither points nor a few depth images have determined them: nearest points of a surface of simple
         shapes, frame after frame, are surer of lengths than they are right
     surfaces : whether any sensor sees them
     states : some poses of the body, which tell where gear begins

@@ -51,7 +51,7 @@ def track(
     lag : float [s]
         Instead of smoothing the whole take: each frame as a live session has it so much later (`FixedLag`).
     noise : KnownNoise
-        With a lag: process noise and the sensors' noise, as another take told them (`KnownNoise.of_take`); default:
+        With a lag: process noise and the sensors' noise, of another take (`KnownNoise.of_take`); default:
         `KnownNoise.usual`.
     shape_frames : int, how many frames bone lengths are found from by keypoints of several cameras; default 25.
     progress : called with (what, done, total).
@@ -99,16 +99,16 @@ def track(
     )  # fmt: skip
     tracker = tracked.tracker
     others = {} if recording.followed is None else recording.followed.as_told()
-    told = {**person.told, **others, "frames": {"dropped": tracker.dropped, "late": tracker.late}}
+    more = {**person.provenance, **others, "frames": {"dropped": tracker.dropped, "late": tracker.late}}
     if (family := person.subject.body.family) is not None:
-        told["body shape"] = {name: round(value, 3) for name, value in family.shape.items()}
+        more["body shape"] = {name: round(value, 3) for name, value in family.shape.items()}
     how = Estimation(
         smooth and lag is None and tracked.complete, contacts,
         None if recording.alone is None else recording.alone.centre_world, recording.level,
         lag if tracked.complete else None, noise,
     )  # fmt: skip
     motion = motion_of(
-        tracked, person.subject, settings, how, up=recording.up, name=recording.name, told=told, found=person.joint
+        tracked, person.subject, settings, how, up=recording.up, name=recording.name, more=more, found=person.joint
     )
     if not tracked.complete:
         raise TrackingInterrupted(motion, len(recording))

@@ -104,7 +104,7 @@ def _of_depth_alone(take: Take, seen: Observations) -> list[Finding]:
         person = sized_by_depth(SizedPerson(recording, Subject.as_is(body)))
     except KinefitError as error:
         return [*found, finding_of(error)]
-    return [*found, *inverted_findings(person.told, take.up)]
+    return [*found, *inverted_findings(person.provenance, take.up)]
 
 
 def _with_sensors(check: Check, progress: Progress | None) -> Check:

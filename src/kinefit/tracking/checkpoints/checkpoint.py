@@ -134,7 +134,7 @@ class Checkpoint:
         """Let others in."""
         for file in (self._frames, self._lock):
             if file is not None:
-                with suppress(OSError):  # of a full disk, that was told before
+                with suppress(OSError):  # of a full disk, which was reported before
                     file.close()
 
     def clear(self) -> None:
