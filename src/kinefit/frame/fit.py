@@ -250,7 +250,7 @@ class FrameFit:
     def _seen(self, scene: Scene, matched: Sequence[Matched], now: NDArray, without: Without) -> NDArray:
         """(n,) bool: what measurements observe, with the information of one time, the prior included.
 
-        Keypoints observe no joint that hardly moves them, see `SHORTEST`: others must.
+        Keypoints observe no joint that hardly moves them, see `MIN_LEVER`: others must.
         """
         seen = observed(self.body.tree, now)
         pixels = pixels_of(matched)

@@ -30,7 +30,16 @@ from kinefit.sensors.base import Measurement
 from kinefit.sensors.displaced import AXES, Displaced, displacement
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surfaces.registration import FAR, FINE, Ends, Registration, apart, starts, twist_of, values_of
+from kinefit.sensors.surfaces.registration import (
+    COARSE_DISTANCES,
+    FINE_DISTANCES,
+    Ends,
+    Registration,
+    apart,
+    starts,
+    twist_of,
+    values_of,
+)
 from kinefit.subject.fit import fit_subject
 from kinefit.subject.keypoints import fit_subject as fit_person
 from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets
@@ -207,7 +216,7 @@ class _PlacementProblem:
             if sensor in self.depth:
                 own = self.registration(sensor, looks)
                 first = starts(self.origins[sensor], self.centre, PRIOR)
-                rest = [own.settled(twist, (*FAR, *FINE)) for twist in first]
+                rest = [own.settled(twist, (*COARSE_DISTANCES, *FINE_DISTANCES)) for twist in first]
                 ends[sensor] = Ends(own, tuple(own.height(twist, self.recording.up_axis) for twist in rest))
         near = {sensor: end.best for sensor, end in ends.items()}
         named = tuple(name for name in self.names if name not in near)
@@ -235,7 +244,7 @@ class _PlacementProblem:
         twists = dict(near)
         for sensor in self.depth & set(self.names):
             own = self.registration(sensor, looks)
-            twists[sensor] = own.height(own.settled(twists[sensor], FINE), self.recording.up_axis)
+            twists[sensor] = own.height(own.settled(twists[sensor], FINE_DISTANCES), self.recording.up_axis)
         parameters = [*self.parameters([look.seen for look in looks]), self.place]
         start = np.concatenate([*(p.mean for p in parameters[:-1]), *(twists[name] for name in self.names)])
         values = {name: values_of(twist) for name, twist in twists.items()}
