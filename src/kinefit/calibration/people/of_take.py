@@ -90,7 +90,7 @@ def _find(take: Take, made_from: str, progress: Step | None) -> FoundCameras:
         up=take.up, sigma=median(entry.sigma for entry in take.keypoints), progress=progress,
     )
     changes = found.cameras.values()
-    first, *lines = found.told()
+    first, *lines = found.summary_lines()
     notes = [f"Nothing tells where the cameras stand: found from the people in view. {first}", "; ".join(lines)]
     if take.height is None:
         notes.append("No height is stated: all lengths are as unsure as the person's size, about 5 %. Write height.")
