@@ -96,7 +96,7 @@ class LiveSize:
             self.outcome = f"the person's size was found ({listed} cm)" if listed else "the person's size was found"
             return body
         except KinefitError as error:
-            self.outcome = f"the person's size was not found, it is taken to be as usual ({error.problem})"
+            self.outcome = f"the person's size was not found, the default is used ({error.problem})"
         except BrokenProcessPool:
             self._give_up()
         finally:
@@ -105,7 +105,7 @@ class LiveSize:
 
     def _give_up(self) -> None:
         """Go on without a fit after its process has ended."""
-        self.outcome = "the person's size was not found, it is taken to be as usual (its process ended)"
+        self.outcome = "the person's size was not found, the default is used (its process ended)"
         self.close()
 
 

@@ -225,7 +225,7 @@ def _size(entry: CameraEntry, rig: Rig | None, take: Take) -> tuple[int, int]:
     size = entry.size or (rig[entry.name].size if rig is not None else None)
     if size is None:
         remedy = "Write size = [width, height], or a calibration."
-        raise TakeError("nothing tells the size of its image", file=take.path, place=f"camera {entry.name}",
+        raise TakeError("the size of its image is unknown", file=take.path, place=f"camera {entry.name}",
                         remedy=remedy)  # fmt: skip
     return size
 

@@ -64,7 +64,7 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
 
 def _metres(unit: str | None, path: Path) -> float:
     if not unit:
-        raise ObservationError("the file tells no unit", file=path, place="units", remedy=_STATE)
+        raise ObservationError("the file states no unit", file=path, place="units", remedy=_STATE)
     metres = worth(unit, LENGTHS)
     if metres is None:
         problem = choices("unit", unit, LENGTHS)

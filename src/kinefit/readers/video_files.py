@@ -89,7 +89,7 @@ class VideoFile:
         stated, span = float(self._stream.average_rate or 0), self.times[-1]
         measured = (len(self) - 1) / span if span > 0 else 0.0
         if not (stated or measured):
-            raise FileError("the video tells no frame rate", file=self.path, remedy="Give it: ffmpeg -r RATE -i ...")
+            raise FileError("the video states no frame rate", file=self.path, remedy="Give it: ffmpeg -r RATE -i ...")
         even = (rate for rate in (stated, measured) if rate and is_even(self.times, rate))
         return next(even, 0.0) or nominal_rate(self.times)
 

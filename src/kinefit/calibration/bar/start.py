@@ -105,7 +105,7 @@ def first_pairs(cameras: Sequence[Camera], uv: NDArray, known: bool, length: flo
         worst = max(reasons, key=reasons.__getitem__, default="no two cameras see it from sides that differ")
         flatness = "plane" in worst
         raise CalibrationError(
-            f"the targets do not tell how the cameras stand: {worst}",
+            f"the targets do not determine how the cameras stand: {worst}",
             remedy="Wave the bar near and far, high and low, in all directions." if flatness
             else "Are the videos in step, and the two targets the brightest spots? Set the cameras farther apart.",
         )  # fmt: skip

@@ -90,7 +90,7 @@ def _others(person: PersonKeypoints, asked: bool) -> list[Finding]:
     """A note on other people in view."""
     if len(person.people) < 2:
         return []
-    why = "" if asked else ", who moves most and so tells most of the cameras"
+    why = "" if asked else ", who moves most and so shows most of the cameras' errors"
     text = f"{len(person.people)} people are in view; the check is by person {person.number}{why}."
     return [Finding("note", "people", text, remedy="Another: write person = 2 to [take], or whichever it is.")]
 

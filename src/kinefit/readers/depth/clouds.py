@@ -216,7 +216,7 @@ def camera_of(cloud: FileCloud, name: str, path: str | PathLike[str] | None = No
         ray = x[ok, axis] / x[ok, 2]
         A = np.stack([ray, np.ones(len(ray))], axis=1)
         if len(ray) < 100 or np.ptp(ray) < 1e-3:
-            raise CalibrationError("too few points to tell the camera", file=path, remedy="Give its intrinsics.")
+            raise CalibrationError("too few points to determine the camera", file=path, remedy="Give its intrinsics.")
         if not np.abs(A).max() < 1e6:
             raise CalibrationError("points that no camera sees", file=path, remedy="Give its intrinsics.")
         (K[axis, axis], K[axis, 2]), *_ = np.linalg.lstsq(A, pixel[ok], rcond=None)

@@ -209,7 +209,7 @@ def _depth(file: Path) -> NDArray:
 
 
 def _times(
-    source: DepthSource, rate: float | None, usual: float | None, time_unit: float | None, time_offset: float,
+    source: DepthSource, rate: float | None, default_rate: float | None, time_unit: float | None, time_offset: float,
     path: Path,
 ) -> tuple[NDArray, float]:
     """Times (F,) [s] and rate [Hz]; the caller's values come before the file's."""
@@ -225,7 +225,7 @@ def _times(
     if rate is not None and not 0 < rate < 1e6:
         raise ObservationError(f"rate {rate:g} Hz", file=path, remedy="Give frames per second.")
     if times is None:
-        rate = rate or source.rate or (usual if source.count > 1 else _DEFAULT_RATE)
+        rate = rate or source.rate or (default_rate if source.count > 1 else _DEFAULT_RATE)
         if rate is None:
             raise ObservationError("nothing tells its rate", file=path, remedy="Give rate = ... in frames per second.")
         return np.arange(source.count) / rate + time_offset, rate
@@ -238,7 +238,7 @@ def _times(
         )  # fmt: skip
     if source.rate and measured and abs(source.rate / measured - 1.0) < 0.1:
         measured = source.rate  # times are rounded to milliseconds
-    return times + time_offset, rate or measured or source.rate or usual or _DEFAULT_RATE
+    return times + time_offset, rate or measured or source.rate or default_rate or _DEFAULT_RATE
 
 
 def _factor(unit: float, path: Path) -> float:

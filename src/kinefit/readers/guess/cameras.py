@@ -263,7 +263,7 @@ def _rate(draft: Draft, opened: Mapping[str, Video], records: Sequence[Mapping[s
         return Value(rate, "likely", f"the highest of the videos ({listed} Hz); points are interpolated between frames")
     if tables:
         return Value(round(min(tables), 3), "likely", "median of the table's own times")
-    return Value(None, "open", "nothing here tells the frames per second: write it")
+    return Value(None, "open", "nothing here states the frames per second: write it")
 
 
 def _world(
@@ -272,7 +272,7 @@ def _world(
     """Enter unit and vertical axis of the calibration's world."""
     person: NDArray | None = None
     spread = calibration.spread
-    size = Value(None, "open", f"the cameras would stand {2 * spread:.3g} m apart, no keypoints tell more")
+    size = Value(None, "open", f"the cameras would stand {2 * spread:.3g} m apart, and no keypoints show the person's size")
     if _MIN_SPREAD < spread < _MAX_SPREAD:
         size = Value("m", "likely", f"the cameras stand about {2 * spread:.2g} m apart")
     if len(records) > 1:

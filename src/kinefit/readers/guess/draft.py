@@ -17,7 +17,7 @@ _COMMENT_COLUMN = 40
 _HEAD = """\
 # A first take file, made by kinefit init from what lies in the folder.
 # A comment begins with how sure its line is: sure, likely, guess, or open (for you to decide). Then:
-#   kinefit check THIS_FILE      tells whether cameras, keypoints and calibration agree
+#   kinefit check THIS_FILE      checks whether cameras, keypoints and calibration agree
 #   kinefit track THIS_FILE      fits the body
 """
 

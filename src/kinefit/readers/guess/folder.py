@@ -254,7 +254,7 @@ def _depth(draft: Draft, path: Path, topics: Sequence[Shown], rig: Rig | None) -
             entry["intrinsics"] = Value(None, "open", "[fx, fy, cx, cy] in pixels: the topic has no camera_info")
         draft.depth.append((t in used, entry))
         why = "" if t in used else (
-            ": a comment, the same once more" if t not in plain else ": a comment, nothing tells where it stands"
+            ": a comment, the same once more" if t not in plain else ": a comment, its pose is unknown"
         )  # fmt: skip
         draft.note(f"depth {t.name}", "sure" if t in used else "guess", f"{t.topic}, {count}{why}")
 
@@ -262,7 +262,7 @@ def _depth(draft: Draft, path: Path, topics: Sequence[Shown], rig: Rig | None) -
 def _colour(draft: Draft, path: Path, topics: Sequence[Shown], rig: Rig | None, *, beside_depth: bool) -> None:
     for t in topics:
         if rig is None or t.camera not in rig.names:
-            draft.note("camera", "open", f"{t.topic}: left out, nothing tells its lens and where it stands")
+            draft.note("camera", "open", f"{t.topic}: left out, its lens and pose are unknown")
             continue
         draft.cameras[t.name] = {
             "video": Value(path), "topic": Value(t.topic, "sure", f"{t.frames} images, {t.rate:g} Hz"),

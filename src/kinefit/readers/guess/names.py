@@ -17,7 +17,7 @@ HOW = {
     "number": ("likely", "by the number in its name"),
     "shifted": ("guess", "by the number in its name, which counts from another start"),
     "size": ("likely", "by the size of its picture"),
-    "order": ("guess", "by order only: nothing in the names tells it"),
+    "order": ("guess", "by order only: its name has no camera"),
 }
 """{way of matching: (confidence level, its text in a message)}, in order of decreasing confidence."""
 

@@ -241,7 +241,7 @@ def guess_unit(x: NDArray, names: Sequence[str]) -> Value:
                 ratios += (np.linalg.norm(x[:, i] - x[:, j], axis=-1) / length).tolist()
     seen = np.array(ratios)[np.isfinite(ratios)]
     if len(seen) < 20:
-        return Value(None, "open", "too few points meet in space to tell the person's size")
+        return Value(None, "open", "too few points meet in space to estimate the person's size")
     ratio = float(np.median(seen))
     unit = min(_UNITS, key=lambda u: abs(np.log(ratio / _UNITS[u])))
     if abs(np.log(ratio / _UNITS[unit])) < np.log(_MAX_SIZE_RATIO):

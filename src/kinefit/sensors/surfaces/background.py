@@ -71,7 +71,7 @@ class Background:
         known = z > 0.0
         if self._variance is None:
             self._variance = self._prior_variance(float(np.median(z[known])) if known.any() else 2.0)
-        self._mean[known], self._count[known] = z[known], 4.0  # images: as many weigh an empty scene
+        self._mean[known], self._count[known] = z[known], 4.0  # as much weight as four images
         self._spread[:] = self._variance[0] + self._variance[1] * z**4
         self._bound[known] = (z - _OUTLIER_SIGMAS * np.sqrt(self._spread))[known]
         self._empty = False

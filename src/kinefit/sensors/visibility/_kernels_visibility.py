@@ -65,11 +65,11 @@ def judge(
             bound = slack + constant + quadratic * z * z
             agrees = abs(m - z) <= bound
             if not agrees:
-                beside = int(slack * focal / z + 0.5)
-                above = iv - beside if iv >= beside else 0
-                below = iv + beside if iv + beside < height else height - 1
-                left = iu - beside if iu >= beside else 0
-                right = iu + beside if iu + beside < width else width - 1
+                offset = int(slack * focal / z + 0.5)
+                above = iv - offset if iv >= offset else 0
+                below = iv + offset if iv + offset < height else height - 1
+                left = iu - offset if iu >= offset else 0
+                right = iu + offset if iu + offset < width else width - 1
                 agrees = abs(depth[above, iu] - z) <= bound or abs(depth[below, iu] - z) <= bound
                 agrees = agrees or abs(depth[iv, left] - z) <= bound or abs(depth[iv, right] - z) <= bound
             s = owner[v, u]

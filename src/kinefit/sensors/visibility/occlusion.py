@@ -75,7 +75,7 @@ def hidden_points(scene: Scene, points: PointSet, camera: NDArray, visible: NDAr
         return
     root = scene.state.T_world_root[:3, 3]
     for c in np.unique(camera[visible]):
-        near = beside(scene.rig.cameras[c], [d.camera for d in seen], root)
+        near = adjacent_cameras(scene.rig.cameras[c], [d.camera for d in seen], root)
         if not near:
             continue
         index = np.flatnonzero(visible & (camera == c))
@@ -109,7 +109,7 @@ def depth_behind(x_world: NDArray, seen: DepthSeen) -> NDArray:
     return behind
 
 
-def beside(camera: Camera, others: Sequence[Camera], x_world: NDArray) -> list[int]:
+def adjacent_cameras(camera: Camera, others: Sequence[Camera], x_world: NDArray) -> list[int]:
     """Indices of the other cameras whose view of a point (3,) [m] differs by at most `MAX_VIEW_ANGLE`."""
     sights = np.array([c.centre_world - x_world for c in (camera, *others)])
     sights /= np.linalg.norm(sights, axis=1, keepdims=True)
