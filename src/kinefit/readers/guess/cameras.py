@@ -272,7 +272,7 @@ def _world(
     """Enter unit and vertical axis of the calibration's world."""
     person: NDArray | None = None
     spread = calibration.spread
-    size = Value(None, "open", f"the cameras would stand {2 * spread:.3g} m apart, and no keypoints show the person's size")
+    size = Value(None, "open", f"the cameras would stand {2 * spread:.3g} m apart, no keypoints show a person's size")
     if _MIN_SPREAD < spread < _MAX_SPREAD:
         size = Value("m", "likely", f"the cameras stand about {2 * spread:.2g} m apart")
     if len(records) > 1:
