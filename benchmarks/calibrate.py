@@ -67,7 +67,7 @@ def real_trial(folder: Path, where: Path) -> None:
         began = time.process_time()
         found = refine(shipped, trial.keypoints, body)
         seconds = time.process_time() - began
-        for line in found.told():
+        for line in found.summary_lines():
             print(f"# {detector}: {line}")
         after = track(Recording.of_keypoints(found.rig, trial.keypoints), body)
         old, new = agreement(shipped, before, trial.keypoints), agreement(found.rig, after, trial.keypoints)

@@ -61,7 +61,7 @@ def _tracked(trial: Path, folder: Path, keep: dict[str, Keep]) -> Motion:
         _copy(trial / "videos" / f"{camera}.mp4", folder / f"{camera}.mp4", keep.get(camera, lambda i, n: True))
     guess = guess_take(folder)
     for note in guess.notes:
-        print(f"  {folder.name}: {note.sure} {note.about}: {note.told}")
+        print(f"  {folder.name}: {note.sure} {note.about}: {note.text}")
     (folder / "take.toml").write_text(guess.text, "utf-8")
     return track_take(folder / "take.toml")[0]
 

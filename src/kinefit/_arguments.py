@@ -1,4 +1,4 @@
-"""Arguments of public functions, held against their annotations: a wrong type is told by name before any work."""
+"""Arguments of public functions, held against their annotations: a wrong type is reported by name before any work."""
 
 from __future__ import annotations
 

@@ -26,9 +26,9 @@ BACKSLASHES = "A backslash in double quotes begins a special character: use forw
 
 def no_column(missing: Iterable[str], names: Iterable[str] | None) -> str:
     """What to say of a table that lacks columns; `names` are those of its first line."""
-    told = f"no column {', '.join(missing)}"
+    reason = f"no column {', '.join(missing)}"
     other = next((mark for mark in (";", "\t") if any(mark in name for name in names or ())), None)
-    return told if other is None else f"{told}: its columns are separated by {other!r}, not by commas"
+    return reason if other is None else f"{reason}: its columns are separated by {other!r}, not by commas"
 
 
 def read_table(
@@ -96,8 +96,8 @@ def read_bytes(path: Path) -> bytes:
             raise FileError("is no file", file=path, remedy="Check the path.")
         return path.read_bytes()
     except (OSError, ValueError) as problem:
-        told = getattr(problem, "strerror", None) or str(problem)
-        raise FileError(f"cannot be read ({told})", file=path, remedy="Check the path.") from problem
+        reason = getattr(problem, "strerror", None) or str(problem)
+        raise FileError(f"cannot be read ({reason})", file=path, remedy="Check the path.") from problem
 
 
 def parse_toml(text: str, file: str | os.PathLike[str], error: type[KinefitError] = FileError) -> dict[str, Any]:
@@ -124,8 +124,8 @@ def parse_toml(text: str, file: str | os.PathLike[str], error: type[KinefitError
     except tomllib.TOMLDecodeError as problem:
         raise error(f"not TOML: {problem}", file=file, remedy=_remedy(text, str(problem))) from problem
     except (RecursionError, ValueError) as problem:
-        told = "not TOML: nested too deep, or a number too long"
-        raise error(told, file=file, remedy="Correct it there.") from problem
+        reason = "not TOML: nested too deep, or a number too long"
+        raise error(reason, file=file, remedy="Correct it there.") from problem
 
 
 def _remedy(text: str, problem: str) -> str:
@@ -181,7 +181,7 @@ def read_npz(
     except _Refused as problem:
         raise error(str(problem), file=path, remedy=remedy) from problem
     except Exception as problem:  # zipfile, zlib and numpy have a dozen kinds of errors for what is damaged
-        raise error(f"no numpy archive, or damaged ({_told(problem)})", file=path, remedy=remedy) from problem
+        raise error(f"no numpy archive, or damaged ({_reason(problem)})", file=path, remedy=remedy) from problem
 
 
 def read_npy(file: str | os.PathLike[str], *, remedy: str) -> NDArray:
@@ -193,8 +193,8 @@ def read_npy(file: str | os.PathLike[str], *, remedy: str) -> NDArray:
     except FileNotFoundError as problem:
         raise FileError("no such file", file=path, remedy="Check the path.") from problem
     except Exception as problem:
-        told = str(problem) if isinstance(problem, _Refused) else _told(problem)
-        raise FileError(f"not a numpy array, or damaged ({told})", file=path, remedy=remedy) from problem
+        reason = str(problem) if isinstance(problem, _Refused) else _reason(problem)
+        raise FileError(f"not a numpy array, or damaged ({reason})", file=path, remedy=remedy) from problem
 
 
 def npy_header(file: str | os.PathLike[str]) -> tuple[_Shape, np.dtype] | None:
@@ -211,7 +211,7 @@ class _Refused(Exception):
     """What a message says of an archive."""
 
 
-def _told(problem: Exception) -> str:
+def _reason(problem: Exception) -> str:
     return f"{type(problem).__name__}: {problem}" if str(problem) else type(problem).__name__
 
 

@@ -30,7 +30,7 @@ from numba.core import caching
 _PACKAGE = Path(__file__).parent
 # Sums may be reordered. Tests for NaN by x - x or isfinite are compiled away; abs(x) < math.inf works.
 _FAST = {"contract", "reassoc", "nsz", "arcp"}
-_NOBODY = 65534  # whom the system shows as owner of folders outside a container
+_NOBODY = 65534  # that the system shows as owner of folders outside a container
 _CHECKSUM = hashlib.sha256().digest_size  # bytes
 
 
@@ -138,7 +138,7 @@ def _of_one(group: int) -> bool:
 
 @cache
 def _told() -> list[str]:
-    """What has been told, one list for the process."""
+    """Notes that were printed, one list for the process."""
     return []
 
 

@@ -26,7 +26,7 @@ def room(shape: tuple[int, ...], dtype: Any = float) -> NDArray:
         return np.zeros(shape, dtype)
     try:
         with tempfile.TemporaryFile() as file:
-            os.posix_fallocate(file.fileno(), 0, size)  # so that a full disk is told here, not by a signal later
+            os.posix_fallocate(file.fileno(), 0, size)  # so that a full disk is noticed here, not by a signal later
             return np.ndarray(shape, dtype, buffer=mmap.mmap(file.fileno(), size))
     except OSError:
         return np.zeros(shape, dtype)

@@ -37,10 +37,10 @@ class KinefitError(Exception):
         remedy: str | None = None,
     ) -> None:
         self.file, self.problem, self.place = file, shortened(problem), shortened(str(place), 120) if place else place
-        told = shortened(str(file), _PATH) if file else ""
-        room = _ALL - len(self.problem) - len(self.place or "") - max(len(told) - _USUAL, 0)
+        file_text = shortened(str(file), _PATH) if file else ""
+        room = _ALL - len(self.problem) - len(self.place or "") - max(len(file_text) - _USUAL, 0)
         self.remedy = shortened(remedy, max(room, _LEAST)) if remedy else remedy
-        where = ", ".join(part for part in (told, self.place) if part)
+        where = ", ".join(part for part in (file_text, self.place) if part)
         text = f"{where}: {self.problem}" if where else self.problem
         super().__init__(f"{text.rstrip('.')}. {self.remedy}" if remedy else text)
 
@@ -107,10 +107,10 @@ def spelled(text: str, valid: Iterable[str]) -> str:
 def command(*words: str | PathLike[str]) -> str:
     """A line that works when it is pasted where the user is: `kinefit`, then words and paths, quoted for the shell.
 
-    A path is told from the current folder on, where it lies below it.
+    A path counts from the current folder on, where it lies below it.
     """
-    told = ["kinefit", *(nearest(word) if isinstance(word, PathLike) else word for word in words)]
-    return subprocess.list2cmdline(told) if os.name == "nt" else shlex.join(told)
+    command = ["kinefit", *(nearest(word) if isinstance(word, PathLike) else word for word in words)]
+    return subprocess.list2cmdline(command) if os.name == "nt" else shlex.join(command)
 
 
 def nearest(path: str | PathLike[str]) -> str:

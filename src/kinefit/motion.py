@@ -188,8 +188,8 @@ class Motion:
         """Five lines that tell what it is."""
         tree, worst = self.body.tree, int(np.argmin(self.quality)) if len(self) else 0
         stature = f", {self.body.stature:.2f} m tall" if self.body.stature else ""
-        told = [f"{name} ({_middle(r)})" for name, r in self.residuals.items()]
-        sensors = ", ".join(told[:6]) + (f" and {len(told) - 6} more" if len(told) > 6 else "")
+        parts = [f"{name} ({_middle(r)})" for name, r in self.residuals.items()]
+        sensors = ", ".join(parts[:6]) + (f" and {len(parts) - 6} more" if len(parts) > 6 else "")
         quality = f"{self.quality.mean():.2f} of 1 on average, lowest {self.quality[worst]:.2f} in frame {worst}"
         return [
             f"Motion {self.name}: {len(self)} frames at {self.rate:g} Hz ({len(self) / self.rate:.2f} s), {self.up} up",

@@ -41,7 +41,7 @@ class Webcam:
 def test_a_webcam_that_goes_away_is_opened_again(monkeypatch):
     monkeypatch.setattr(Webcam, "opened", 0)
     monkeypatch.setattr(cameras.cv2, "VideoCapture", Webcam)
-    monkeypatch.setattr(cameras, "_AGAIN", 0.01)
+    monkeypatch.setattr(cameras, "_RECONNECT_INTERVAL_S", 0.01)
     inbox = Inbox(["cam"], patience=0.0)
     stream = CameraStream("cam", "0", (64, 48), SessionClock())
     stream.start(inbox)

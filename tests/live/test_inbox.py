@@ -70,7 +70,7 @@ def test_an_error_of_a_source_reaches_who_takes():
 
 
 def test_a_silent_sensor_is_told_and_not_waited_for(monkeypatch):
-    monkeypatch.setattr("kinefit.live.inbox.SILENT", 0.05)
+    monkeypatch.setattr("kinefit.live.inbox.SILENT_AFTER_S", 0.05)
     inbox = Inbox(["a", "b"], patience=0.02)
     inbox.put(frame("a", 0))
     inbox.take(1.0)

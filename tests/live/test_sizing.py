@@ -42,7 +42,7 @@ def test_a_process_that_was_ended_holds_no_session_up(broken):
         result = tracker.update(frames)
         assert isinstance(result, FrameResult)
         assert size.after(frames, result) is None
-        if size.told:
+        if size.outcome:
             break
-    assert "its process ended" in size.told
+    assert "its process ended" in size.outcome
     assert size.after(frames, result) is None  # and it is not tried again

@@ -6,13 +6,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from kinefit.bodies import load_body
-from kinefit.sensors.evidence import BELIEVED, SHOWN, Evidence
+from kinefit.sensors.evidence import BELIEVED, MIN_VISIBLE_OUTLINE, Evidence
 
 S = 10
 
 
 def test_evidence_at_its_bounds():
-    told = Evidence(np.array([0.0, SHOWN, 0.1, 0.5, 0.49, 3.0]), np.array([0.0, 0.0, 0.1, 0.5, 0.51, 1.0]))
+    agreeing = np.array([0.0, MIN_VISIBLE_OUTLINE, 0.1, 0.5, 0.49, 3.0])
+    told = Evidence(agreeing, np.array([0.0, 0.0, 0.1, 0.5, 0.51, 1.0]))
     assert told.hidden.tolist() == [True, False, True, False, False, False]
     assert told.lost.tolist() == [False, False, False, False, True, False]
     np.testing.assert_allclose(told.quality, [0.0, 1.0, 0.5, 0.5, 0.49, 0.75])
@@ -63,9 +64,10 @@ def test_an_unplaced_segment_has_no_quality_unless_another_sensor_supports_it():
     unplaced = np.arange(n) == elbow
     hidden = np.where(unplaced, 0.0, 1.0)  # what is beside it agrees
     depth, silent = Evidence(hidden, np.zeros(n), unplaced=unplaced), Evidence.none(n)
-    for told in (depth, silent + depth, depth + silent, depth + Evidence(np.zeros(n), np.ones(n) * SHOWN)):
+    against = Evidence(np.zeros(n), np.ones(n) * MIN_VISIBLE_OUTLINE)
+    for told in (depth, silent + depth, depth + silent, depth + against):
         assert told.segment_quality(tree)[elbow] == 0.0 < told.segment_quality(tree)[hand]
-    seen = Evidence(np.full(n, SHOWN), np.zeros(n))
+    seen = Evidence(np.full(n, MIN_VISIBLE_OUTLINE), np.zeros(n))
     for told in (depth + seen, seen + depth):
         assert told.segment_quality(tree)[elbow] == 1.0
     assert (depth + depth).segment_quality(tree)[elbow] == 0.0

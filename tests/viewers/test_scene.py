@@ -182,7 +182,7 @@ def test_a_course_has_its_band_and_where_it_is_unknown_the_band_fills_all(motion
 
 
 def test_a_frame_is_told(motion):
-    text = player.told(motion, 4)
+    text = player.summary(motion, 4)
     norms = motion.residuals["cam 0"].norms[4]
     assert f"cam 0: {np.nanmedian(norms):.1f} px" in text and f"{motion.quality[4]:.2f}" in text
     lost = np.flatnonzero(motion.segment_quality[4] <= 0)

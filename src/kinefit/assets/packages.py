@@ -1,4 +1,4 @@
-"""Which packages are fetched, which of their files, and whom to credit."""
+"""Which packages are fetched, which of their files, and their authors."""
 
 from __future__ import annotations
 

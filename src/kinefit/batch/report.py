@@ -104,8 +104,8 @@ def provenance(take: Take, **more: Any) -> dict[str, Any]:
     ]  # fmt: skip
     if take.height:
         out["height"] = take.height
-    if take.session.told:
-        out["session"] = take.session.told
+    if take.session.stated:
+        out["session"] = take.session.stated
     return out | more
 
 

@@ -140,12 +140,12 @@ def _cells(ranges: dict[str, Range], sides: Sequence[str]) -> list[str]:
     def cell(r: Range | None) -> str:
         if r is None or r.span is None or r.twice is None:
             return "not observed"
-        return report_ranges.told(r.span, r.twice) + ("" if r.share > 0.995 else "*")
+        return report_ranges.with_error(r.span, r.twice) + ("" if r.share > 0.995 else "*")
 
     out = [cell(ranges.get(side)) for side in sides]
     if len(sides) == 2:
         difference = _difference(ranges)
-        out.append("–" if difference is None else report_ranges.told(*difference))
+        out.append("–" if difference is None else report_ranges.with_error(*difference))
     return out
 
 

@@ -120,7 +120,7 @@ def _silent(*arguments: object) -> None:
 
 
 def _of_session(row: Row, take: Take) -> Row:
-    entries = take.session.told
+    entries = take.session.stated
     keys = ("subject", "visit", "date", "movement")
     return msgspec.structs.replace(row, **{key: entries.get(key, "") for key in keys})
 

@@ -1,1 +1,1 @@
-"""Where the cameras stand: refined with the body, from people alone, from boards; and what is wrong with it."""
+"""Calibration of cameras: with boards, bars or people, refined with the body; and checks of a calibration."""

@@ -1,4 +1,4 @@
-"""Intrinsics that are given to a calibration."""
+"""Known intrinsics as input of a calibration."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from kinefit.geometry.camera import Camera, Rig
 
 
 def known_camera(interiors: Rig, name: str, size: tuple[int, int]) -> Camera:
-    """A camera whose intrinsics are known, at the world's origin.
+    """The camera of known intrinsics, at the world's origin.
 
     Parameters
     ----------
-    size : width, height [px] of the images that it took now
+    size : (width, height) [px] of its new images
 
     Raises
     ------
     CalibrationError
-        No camera of this name, or one whose images are of another size.
+        No camera of this name, or one with another image size.
     """
     if name not in interiors:
         problem = choices("intrinsics of camera", name, interiors.names)

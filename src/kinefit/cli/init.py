@@ -104,7 +104,7 @@ def show(notes: tuple) -> None:
     console = _screen.console()
     wide = max((len(note.about) for note in notes), default=0)
     for note in notes:
-        line = Text.assemble((f"{note.sure:<7}", _COLOURS[note.sure]), f" {note.about:<{wide}}  {note.told}")
+        line = Text.assemble((f"{note.sure:<7}", _COLOURS[note.sure]), f" {note.about:<{wide}}  {note.text}")
         console.print(line, soft_wrap=True)
     open_ones = sum(note.sure == "open" for note in notes)
     guesses = sum(note.sure == "guess" for note in notes)

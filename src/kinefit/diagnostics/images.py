@@ -15,14 +15,14 @@ from kinefit.errors import KinefitError
 from kinefit.findings import Finding, Severity, listed, runs_of
 from kinefit.geometry.camera import ImageFrame
 from kinefit.observations import DepthVideo
-from kinefit.readers.guess.draft import Told
+from kinefit.readers.guess.draft import Value
 from kinefit.readers.guess.views import black_bars, picture
 from kinefit.readers.take.file import CameraEntry, Take
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.readers.take.pictures import TakePictures
 from kinefit.readers.video import Video
 
-_EITHER = Told(90, "guess", "clockwise or counter-clockwise: try 90, then 270")
+_EITHER = Value(90, "guess", "clockwise or counter-clockwise: try 90, then 270")
 _MAX_DARK_BORDER = 0.02  # of the image: narrower bars may be a camera's own dark border
 _MIN_BAR_ERROR_PX = 2.0  # video codecs smear edges
 _MIN_BAR_ERROR = 0.2  # of a bar's width, the same

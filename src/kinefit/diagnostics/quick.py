@@ -112,11 +112,11 @@ def with_findings(motion: Motion, findings: Sequence[Finding], seen: Observation
     if len({k.camera for k in seen.keypoints}) < 2 and (seen.markers or seen.depth or seen.clouds):
         inverted = inverted_findings(motion.provenance, motion.up)
         findings = [*findings, *motion_findings(motion, height), *inverted]
-    told: dict[str, Any] = {CLOCKS: late} if late else {}
+    entries: dict[str, Any] = {CLOCKS: late} if late else {}
     sizes = size_findings(motion.body.stature, height) if motion.body.stature and height is None else []
     if any(f.severity == "doubt" for f in sizes) and not any(f.kind == "scale" for f in findings):
-        told[STATURE] = [f"{f.text} {f.remedy}" for f in sizes]
-    return replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings), **told})
+        entries[STATURE] = [f"{f.text} {f.remedy}" for f in sizes]
+    return replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings), **entries})
 
 
 def inverted_findings(provenance: Mapping[str, Any], up: str) -> list[Finding]:

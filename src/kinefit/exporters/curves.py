@@ -59,11 +59,11 @@ def curves(motion: Motion) -> list[Curve]:
 
 
 def _speeds(motion: Motion) -> NDArray:
-    """(6 + D,) [m/s, rad/s] standard deviations of rates of change, as smoothing told them; NaN without."""
+    """(6 + D,) [m/s, rad/s] standard deviations of rates of change, as smoothing reports them; NaN without."""
     smoothing = motion.provenance.get("smoothing")
-    told = smoothing.get("speed_std") if isinstance(smoothing, Mapping) else None
-    told = told if isinstance(told, Mapping) else {}
-    return np.array([float(told.get(name, np.nan)) for name in motion.body.dof_names])
+    speed_std = smoothing.get("speed_std") if isinstance(smoothing, Mapping) else None
+    speed_std = speed_std if isinstance(speed_std, Mapping) else {}
+    return np.array([float(speed_std.get(name, np.nan)) for name in motion.body.dof_names])
 
 
 def _side(name: str) -> str:

@@ -44,7 +44,7 @@ def write_mcap(motion: Motion, path: str | PathLike[str], *, up: str = "z", name
     - `/joint_states` (sensor_msgs/JointState): all coordinates under the body's names.
     - `/joint_std` (sensor_msgs/JointState): their standard deviations, as positions; inf where nothing observed one.
 
-    Stamps are the motion's times, from 0 on; a negative time cannot be told.
+    Stamps are the motion's times, from 0 on; ROS has no negative time.
 
     Parameters
     ----------
@@ -67,8 +67,8 @@ def write_mcap(motion: Motion, path: str | PathLike[str], *, up: str = "z", name
         remedy = "Install it: pip install 'kinefit[ros]'."
         raise ExportError("MCAP needs the package mcap-ros2-support", file=path, remedy=remedy) from error
     if not len(motion) or motion.times[0] < 0:
-        told = "a motion without frames" if not len(motion) else "a motion that begins before 0 s"
-        raise ExportError(f"{told} has no stamps in ROS", file=path, remedy="Cut it to frames of time 0 and later.")
+        problem = "a motion without frames" if not len(motion) else "a motion that begins before 0 s"
+        raise ExportError(f"{problem} has no stamps in ROS", file=path, remedy="Cut it to frames of time 0 and later.")
     bones, world = bone_names(motion.body, names, path), turned(motion, up, path)
     with writing(path) as temporary, temporary.open("wb") as file, Writer(file) as out:
         state = out.register_msgdef("sensor_msgs/msg/JointState", _STATE)

@@ -82,8 +82,8 @@ def confidence(std: NDArray) -> NDArray:
 
 
 def _file(pynwb: Any, motion: Motion) -> Any:
-    told = motion.provenance.get("session")
-    session = told if isinstance(told, Mapping) else {}
+    stated = motion.provenance.get("session")
+    session = stated if isinstance(stated, Mapping) else {}
     start, said = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC), " The date of the recording is not known."
     try:
         start = datetime.datetime.fromisoformat(str(session["date"])).replace(tzinfo=datetime.UTC)

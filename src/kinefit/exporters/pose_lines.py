@@ -76,11 +76,11 @@ def _lines(motion: Motion) -> Iterator[str]:
     for part in motion.parts():
         poses, lost = part.segment_poses(), part.lost
         for f in range(len(part)):
-            told = pose(
+            entries = pose(
                 poses[f], part.angles[f], part.dof_std[f], part.joint_std[f], part.segment_quality[f],
                 quality=part.quality[f], lost=lost[f],
             )  # fmt: skip
-            packet = {"type": "pose", "number": number, "time": round(float(part.times[f]), 6), **told}
+            packet = {"type": "pose", "number": number, "time": round(float(part.times[f]), 6), **entries}
             yield msgspec.json.encode(packet).decode()
             number += 1
 

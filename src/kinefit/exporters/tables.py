@@ -8,7 +8,7 @@
     residuals   long form, one row a sensor, frame and point that was seen: measured, measured minus fitted, weight; of
                 depth, clouds and silhouettes one a segment: signed median, RMS and number of its residuals
 
-Every table starts with `frame` (from 0) and `time [s]`; metres and the motion's own world unless told otherwise. A
+Every table starts with `frame` (from 0) and `time [s]`; metres and the motion's own world by default. A
 deviation "inf" means that nothing observed it.
 """
 

@@ -267,7 +267,7 @@ class FrameFit:
     def _observed_dofs(self, scene: Scene, matched: Sequence[Matched], now: NDArray, without: Without) -> NDArray:
         """(n,) bool: degrees of freedom that this frame's measurements observe; `now` is their information with prior.
 
-        A joint that moves keypoints by less than `SHORTEST` is observed only if other sensors observe it.
+        A joint that moves keypoints by less than `MIN_LEVER` is observed only if other sensors observe it.
         """
         seen = observed(self.body.tree, now)
         pixels = pixels_of(matched)

@@ -13,7 +13,7 @@ from kinefit.bodies.tree import KinematicTree
 from kinefit.frame.results import ROOT_PRIOR_STD, UNOBSERVED_STD_RATIO
 from kinefit.rows import AnyRows, PairRows, ParameterRows, Rows
 from kinefit.sensors.base import Matched
-from kinefit.sensors.evidence import AGREES, Evidence
+from kinefit.sensors.evidence import AGREEMENT_SIGMAS, Evidence
 from kinefit.sensors.observability import moves_points, near
 from kinefit.sensors.points.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
@@ -37,7 +37,7 @@ def moves_keypoints(scene: Scene, pixels: Iterable[KeypointMatched]) -> NDArray:
     """(D,) bool: coordinates that move a keypoint whose detection agrees with the fit."""
     out, state = np.zeros(len(scene.body.tree.coordinates), bool), scene.state
     for m in pixels:
-        inside = (m.weight > 0) & (m.squares(scene.at_time(m.time)) < AGREES**2)
+        inside = (m.weight > 0) & (m.squares(scene.at_time(m.time)) < AGREEMENT_SIGMAS**2)
         points = m.measurement.layout.points_of(scene.body)
         out |= moves_points(scene.body, points, inside[None], state.T_world_root[None], state.angles[None])[0]
     return out

@@ -1,1 +1,1 @@
-"""Live sessions: sources that bring frames as they are seen, a tracker, and receivers of its poses."""
+"""Live sessions: sources of frames, a tracker, and receivers of its poses."""

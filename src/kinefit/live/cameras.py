@@ -1,4 +1,4 @@
-"""Cameras as sources: webcams and network streams, and videos at their own speed."""
+"""Cameras as live sources: webcams, network streams, and videos at their own speed."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from kinefit.errors import FileError, KinefitError, ObservationError
 from kinefit.live.inbox import Arrived, Inbox
 from kinefit.readers.video import Video
 
-_AGAIN = 1.0  # [s] between attempts to open a camera that went away
+_RECONNECT_INTERVAL_S = 1.0
 
 
 class SessionClock:
-    """The session's: 0 when its first source starts."""
+    """Clock of a session: 0 when its first source starts."""
 
     def __init__(self) -> None:
         self._start: float | None = None
         self._lock = threading.Lock()
 
     def now(self) -> float:
-        """Time since then [s]."""
+        """Time [s] since the first call of any source."""
         with self._lock:
             if self._start is None:
                 self._start = time.monotonic()
@@ -34,7 +34,7 @@ class SessionClock:
 
 
 class ThreadSource:
-    """A source of one sensor, in a thread of its own."""
+    """A source of one sensor, in its own thread."""
 
     def __init__(self, name: str, clock: SessionClock) -> None:
         self.name, self.clock = name, clock
@@ -44,12 +44,12 @@ class ThreadSource:
         self._thread: threading.Thread | None = None
 
     def start(self, inbox: Inbox) -> None:
-        """Bring what is seen from now on."""
+        """Start putting frames into the inbox."""
         self._thread = threading.Thread(target=self._guarded, args=(inbox,), daemon=True, name=self.name)
         self._thread.start()
 
     def stop(self) -> None:
-        """Bring nothing more."""
+        """Stop putting frames into the inbox."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(timeout=2.0)
@@ -58,8 +58,8 @@ class ThreadSource:
         error = None
         try:
             self._run(inbox)
-        except KinefitError as wrong:
-            error = wrong
+        except KinefitError as raised:
+            error = raised
         finally:
             inbox.end(self.name, error)
 
@@ -74,7 +74,7 @@ class CameraSource(ThreadSource):
         super().__init__(name, clock)
         self.size = size
 
-    def _bring(self, inbox: Inbox, image: NDArray[np.uint8], when: float, *, wait: bool = False) -> bool:
+    def _put(self, inbox: Inbox, image: NDArray[np.uint8], when: float, *, wait: bool = False) -> bool:
         if image.shape[1::-1] != self.size:
             raise ObservationError(
                 f"images of {image.shape[1]}x{image.shape[0]} px, expected are {self.size[0]}x{self.size[1]}",
@@ -84,7 +84,7 @@ class CameraSource(ThreadSource):
 
 
 class CameraStream(CameraSource):
-    """A webcam by its number, or a network stream by its address; one that goes away is opened again when it is back.
+    """A webcam by its number, or a network stream by its address; reconnects after an interruption.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class CameraStream(CameraSource):
     Raises
     ------
     FileError
-        It cannot be opened to begin with.
+        It cannot be opened at the start.
     """
 
     def __init__(self, name: str, stream: str, size: tuple[int, int], clock: SessionClock) -> None:
@@ -119,14 +119,14 @@ class CameraStream(CameraSource):
 
     def _run(self, inbox: Inbox) -> None:
         while not self._stop.is_set():
-            there, image = self._capture.read() if self._capture is not None else (False, None)
-            if there:
-                if not self._bring(inbox, cv2.cvtColor(image, cv2.COLOR_BGR2RGB), self.clock.now()):
+            received, image = self._capture.read() if self._capture is not None else (False, None)
+            if received:
+                if not self._put(inbox, cv2.cvtColor(image, cv2.COLOR_BGR2RGB), self.clock.now()):
                     break
                 continue
             if self._capture is not None:
                 self._capture.release()
-            if self._stop.wait(_AGAIN):
+            if self._stop.wait(_RECONNECT_INTERVAL_S):
                 break
             self._capture = self._opened()
         if self._capture is not None:
@@ -134,15 +134,15 @@ class CameraStream(CameraSource):
 
 
 class VideoReplay(CameraSource):
-    """A recorded video at its own speed, or as fast as its images are taken.
+    """A recorded video at its own speed, or as fast as the session takes its images.
 
     Parameters
     ----------
     name : of the camera
-    video : path, and its `rate` where it is a folder of images
-    offset : float [s] of its first frame on the take's clock
-    speed : 1 for its own; 0 as fast as they are taken, and none is dropped
-    frames : (start, stop) of the video that are shown; default: all
+    video, rate : path; rate [Hz] of a folder of images
+    offset : float [s] time of its first frame on the take's clock
+    speed : float, 1 for its own; 0: as fast as the session takes the images, without drops
+    frames : (start, stop) of the video; default: all
     """
 
     def __init__(
@@ -156,7 +156,7 @@ class VideoReplay(CameraSource):
 
     @property
     def rate(self) -> float:
-        """Frames a second [Hz]."""
+        """Frame rate [Hz]."""
         return self._video.rate
 
     def _run(self, inbox: Inbox) -> None:
@@ -168,5 +168,5 @@ class VideoReplay(CameraSource):
                 due = (time - first + max(self.offset, 0.0)) / self.speed if self.speed else 0.0
                 if self._stop.wait(max(due - self.clock.now(), 0.0)):
                     return
-                if not self._bring(inbox, image, when, wait=not self.speed):
+                if not self._put(inbox, image, when, wait=not self.speed):
                     return

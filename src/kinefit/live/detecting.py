@@ -1,4 +1,4 @@
-"""The built-in detector on images as they come: side by side over cameras."""
+"""Run the built-in detector on live images, in parallel over cameras."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ SET = "MEDIAPIPE_33"
 
 
 class LiveDetector:
-    """Keypoints of everybody in the newest images of some cameras.
+    """Detector of the keypoints of all people in the newest images of some cameras.
 
     Parameters
     ----------
-    networks : their files
-    images : {camera: ImageFrame} from the calibration's image to what the camera shows
-    rate : float [Hz] at which images are looked through, about
-    people : how many are followed at most in each camera
-    threads : that work side by side
+    networks : files of the networks
+    images : {camera: ImageFrame} from the calibration's image to the camera's
+    rate : float [Hz] of images, about
+    people : largest number of tracked people in each camera
+    threads : int, in parallel
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class LiveDetector:
 def as_keypoints(
     seen: Sequence[PersonDetection], camera: str, time: float, rate: float, image: ImageFrame
 ) -> Keypoints:
-    """Everybody seen in one image, in the calibration's image frame."""
+    """Keypoints of all people in one image, in the calibration's image frame; time [s], rate [Hz]."""
     count = len(seen), len(MEDIAPIPE_33)
     uv = np.array([s.points for s in seen]).reshape(*count, 2)
     confidence = np.array([s.confidence for s in seen]).reshape(count)

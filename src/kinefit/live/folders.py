@@ -1,4 +1,4 @@
-"""Folders that fill up as sources: images of a camera, depth images, OpenPose's JSON files, one a frame."""
+"""Folders as live sources: another program adds images, depth images or OpenPose's JSON files, one a frame."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from kinefit.observations import DepthFrame
 from kinefit.readers.depth.images import PICTURES, counts_of, depth_picture, natural
 from kinefit.readers.keypoints import read_openpose
 
-_LOOK = 0.005  # [s] between looks at a folder
-_SETTLED = 0.05  # [s] for which a file must not have changed before it is taken for whole
-_TICK = 0.1  # [s] within which a folder may change twice under one time
-_MILLIMETRE = 0.001  # [m] of a count of 16 bits that nothing is said of
+_POLL_INTERVAL_S = 0.005
+_MIN_FILE_AGE_S = 0.05  # since the last change, of a complete file
+_FOLDER_TIME_RESOLUTION_S = 0.1  # within which a folder may change twice under one time
+_DEFAULT_COUNT = 0.001  # [m] of a 16-bit count
 
 
 class FolderSource(ThreadSource):
-    """A folder into which another program puts one file a frame: each new name is taken once, in the order of numbers.
+    """Source of a folder to which another program adds one file a frame, read in the order of their numbers.
 
-    What lies there to begin with is not looked at. Of several new files the last alone is read; the others, and files
-    that cannot be read, count as dropped.
+    Files that exist at the start are ignored. Of several new files only the last is read; the others, and unreadable
+    ones, count as dropped.
 
     Parameters
     ----------
     name : of the sensor
     folder : Path
-    endings : of the files, ".png"
+    endings : of the files, such as ".png"
     clock : SessionClock of the session
 
     Raises
@@ -53,11 +53,17 @@ class FolderSource(ThreadSource):
         self._changed, self._waiting = -1.0, True
 
     def read(self, path: Path, when: float) -> Any:
-        """What a file holds, for the tracker; None where it cannot be read."""
+        """The content of a file, for the tracker; None if it cannot be read. Subclasses implement it.
+
+        Raises
+        ------
+        NotImplementedError
+            In this base class.
+        """
         raise NotImplementedError
 
     def _run(self, inbox: Inbox) -> None:
-        while not self._stop.wait(_LOOK):
+        while not self._stop.wait(_POLL_INTERVAL_S):
             fresh = self._new()
             for _ in fresh[:-1]:
                 inbox.lose(self.name)
@@ -70,11 +76,11 @@ class FolderSource(ThreadSource):
                     return
 
     def _new(self) -> list[Path]:
-        """Whole files that were not there before; the folder is listed where it has changed, or some are not whole."""
-        now, fresh, there = time.time(), list[str](), set[str]()
+        """New complete files; lists the folder only if it has changed, or has incomplete files."""
+        now, fresh, present = time.time(), list[str](), set[str]()
         try:
             changed = os.stat(self.folder).st_mtime
-            if changed == self._changed and not self._waiting and now - changed > _TICK:
+            if changed == self._changed and not self._waiting and now - changed > _FOLDER_TIME_RESOLUTION_S:
                 return []
             entries = list(os.scandir(self.folder))
         except OSError as error:
@@ -82,29 +88,29 @@ class FolderSource(ThreadSource):
             raise FileError(problem, file=self.folder, place=self.name, remedy=remedy) from error
         self._changed, self._waiting = changed, False
         for entry in entries:
-            there.add(entry.name)
+            present.add(entry.name)
             if entry.name in self._known or not entry.name.lower().endswith(self.endings):
                 continue
             try:
-                whole = now - entry.stat().st_mtime >= _SETTLED
-            except FileNotFoundError:  # taken away meanwhile
+                complete = now - entry.stat().st_mtime >= _MIN_FILE_AGE_S
+            except FileNotFoundError:  # deleted meanwhile
                 continue
-            if whole:
+            if complete:
                 fresh.append(entry.name)
-            self._waiting |= not whole
-        self._known = (self._known & there) | set(fresh)
+            self._waiting |= not complete
+        self._known = (self._known & present) | set(fresh)
         return [self.folder / name for name in sorted(fresh, key=natural)]
 
 
 class ImageFolderStream(FolderSource):
-    """Images (PNG, JPEG) of a camera of a size (width, height) [px], for the detector."""
+    """Source of images (PNG, JPEG) of a camera of a size (width, height) [px], for the detector."""
 
     def __init__(self, name: str, folder: Path, size: tuple[int, int], clock: SessionClock) -> None:
         super().__init__(name, folder, (".png", ".jpg", ".jpeg"), clock)
         self.size = size
 
     def read(self, path: Path, when: float) -> Any:
-        """(H, W, 3) uint8 RGB.
+        """(H, W, 3) uint8 RGB image.
 
         Raises
         ------
@@ -120,13 +126,13 @@ class ImageFolderStream(FolderSource):
 
 
 class DepthFolderStream(FolderSource):
-    """Depth images of one sensor: PNG or TIFF of 16 bits, or float TIFF in metres.
+    """Source of depth images of one sensor: PNG or TIFF of 16 bits, or float TIFF in metres.
 
     Parameters
     ----------
-    unit : float [m] of a count; default: 0.001 of 16 bits, 1 of float
+    unit : float [m] of a count; default: 0.001 for 16 bits, 1 for float
     size : (width, height) [px]
-    near, far : [m] what is measured outside of them is dropped
+    near, far : [m] range of depths; measurements outside are discarded
     """
 
     def __init__(
@@ -137,32 +143,32 @@ class DepthFolderStream(FolderSource):
         self.size, self.unit, self.near, self.far = size, unit, near, far
 
     def read(self, path: Path, when: float) -> Any:
-        """A list of one `DepthFrame`.
+        """A list of one `DepthFrame`, image (H, W) [m]; `when` [s].
 
         Raises
         ------
         ObservationError
-            An image of another size, or that is no depth.
+            An image of another size, or no depth image.
         """
         try:
-            picture = depth_picture(path)
+            image = depth_picture(path)
         except FileError:
             return None
-        check_size(picture.shape[::-1], self.size, path, f"depth {self.name}")
-        counts = _MILLIMETRE if picture.dtype == np.uint16 else 1.0
-        depth = counts_of(picture) * np.float32(self.unit or counts)
+        check_size(image.shape[::-1], self.size, path, f"depth {self.name}")
+        counts = _DEFAULT_COUNT if image.dtype == np.uint16 else 1.0
+        depth = counts_of(image) * np.float32(self.unit or counts)
         depth[~((depth >= self.near) & (depth <= self.far))] = 0.0
         return [DepthFrame(self.name, when, depth)]
 
 
 class KeypointFolderStream(FolderSource):
-    """OpenPose's JSON files of one camera.
+    """Source of OpenPose's JSON files of one camera.
 
     Parameters
     ----------
     keypoint_set : of `readers.keypoint_sets.KEYPOINT_SETS`
     rate : float [Hz], about
-    image : ImageFrame of their coordinates, where it is not the calibration's
+    image : ImageFrame of their coordinates, if it is not the calibration's
     """
 
     def __init__(
@@ -179,7 +185,7 @@ class KeypointFolderStream(FolderSource):
         self.keypoint_set, self.rate, self.image = keypoint_set, rate, image
 
     def read(self, path: Path, when: float) -> Any:
-        """A list of one record of keypoints, of everybody in view.
+        """A list of one record of keypoints, of all people in view; `when` [s].
 
         Raises
         ------
@@ -200,11 +206,12 @@ class KeypointFolderStream(FolderSource):
 
 
 def check_size(size: tuple[int, ...], wanted: tuple[int, int], path: Path, place: str) -> None:
-    """Refuse an image of another size (width, height) [px].
+    """Check the size (width, height) [px] of an image.
 
     Raises
     ------
     ObservationError
+        Another size.
     """
     if tuple(size) != tuple(wanted):
         problem = f"images of {size[0]}x{size[1]} px, expected are {wanted[0]}x{wanted[1]}"

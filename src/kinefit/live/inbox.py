@@ -1,4 +1,4 @@
-"""What waits to be processed: of each sensor the newest frame alone, so that nothing queues and latency is bounded."""
+"""Inbox of a session: the newest frame of each sensor only, so that the latency is bounded."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import Any
 
 from kinefit.errors import KinefitError
 
-SILENT = 1.0
-"""[s] without a frame after which nobody waits for a sensor, and it is told as silent."""
+SILENT_AFTER_S = 1.0
+"""Time without a frame after which a sensor is reported as silent, and the session no longer waits for it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Arrived:
-    """Something that one sensor saw.
+    """A frame of one sensor.
 
     Parameters
     ----------
     sensor : str
-    time : float [s] when it was seen, on the session's clock
-    at : float [s] when it arrived, of `time.monotonic`
+    time : float [s] of the measurement, on the session's clock
+    at : float [s] of the arrival, on the clock `time.monotonic`
     seen : frames for the tracker, records of keypoints of one frame, or an image (H, W, 3) uint8 RGB
     """
 
@@ -33,17 +33,17 @@ class Arrived:
 
 
 class Inbox:
-    """One slot a sensor: what nobody took before the next frame came is dropped, and counted.
+    """One slot for each sensor: a new frame replaces one that was not taken, which is counted as dropped.
 
     Parameters
     ----------
-    sensors : names of all that will come
-    patience : float [s] how long the frames of other sensors are waited for once one has come: half a frame
+    sensors : names of all sensors
+    patience : float [s] to wait for the other sensors after the first frame: half a frame interval
 
     Attributes
     ----------
-    dropped : {sensor: int}, frames that were replaced before they were taken
-    came : {sensor: int}, frames that arrived
+    dropped : {sensor: int}, frames replaced before they were taken
+    came : {sensor: int}, arrived frames
     """
 
     def __init__(self, sensors: Sequence[str], *, patience: float) -> None:
@@ -51,41 +51,41 @@ class Inbox:
         self.dropped, self.came = dict.fromkeys(sensors, 0), dict.fromkeys(sensors, 0)
         self._slots: dict[str, Arrived] = {}
         self._last: dict[str, float] = dict.fromkeys(sensors, -float("inf"))
-        self._open = set(sensors)  # that may still bring something
+        self._open = set(sensors)  # sensors that have not ended
         self._error: KinefitError | None = None
         self._changed = threading.Condition()
 
-    def put(self, one: Arrived, *, wait: bool = False) -> bool:
-        """Bring a frame; `wait` until the slot is free instead of dropping what is in it. False when all is over."""
+    def put(self, frame: Arrived, *, wait: bool = False) -> bool:
+        """Put a frame into its slot; `wait` for a free slot instead of replacing. False if the inbox is closed."""
         with self._changed:
             if wait:
-                self._changed.wait_for(lambda: one.sensor not in self._slots or one.sensor not in self._open)
-            if one.sensor not in self._open:
+                self._changed.wait_for(lambda: frame.sensor not in self._slots or frame.sensor not in self._open)
+            if frame.sensor not in self._open:
                 return False
-            if one.sensor in self._slots:
-                self.dropped[one.sensor] += 1
-            if not any(self.came.values()):  # to begin with, all are waited for
-                self._last = dict.fromkeys(self._last, one.at)
-            self._slots[one.sensor], self._last[one.sensor] = one, one.at
-            self.came[one.sensor] += 1
+            if frame.sensor in self._slots:
+                self.dropped[frame.sensor] += 1
+            if not any(self.came.values()):  # at the start, wait for all sensors
+                self._last = dict.fromkeys(self._last, frame.at)
+            self._slots[frame.sensor], self._last[frame.sensor] = frame, frame.at
+            self.came[frame.sensor] += 1
             self._changed.notify_all()
             return True
 
     def lose(self, sensor: str) -> None:
-        """Count a frame that came and was not brought."""
+        """Count a frame that arrived and was discarded by its source."""
         with self._changed:
             self.came[sensor] += 1
             self.dropped[sensor] += 1
 
     def end(self, sensor: str, error: KinefitError | None = None) -> None:
-        """Nothing more will come of a sensor; an error ends the session."""
+        """End a sensor; an error ends the session."""
         with self._changed:
             self._open.discard(sensor)
             self._error = self._error or error
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Nobody takes anything more: those who wait to bring something go on."""
+        """Close the inbox, and release the sources that wait for a free slot."""
         with self._changed:
             self._open.clear()
             self._slots.clear()
@@ -93,30 +93,30 @@ class Inbox:
 
     @property
     def over(self) -> bool:
-        """Whether nothing is there and nothing more can come."""
+        """Whether the inbox is empty and all sensors have ended."""
         with self._changed:
             return not (self._open or self._slots or self._error)
 
     def silent(self) -> list[str]:
-        """Sensors that may still bring something and have brought nothing for a while."""
+        """Sensors that have not ended, without a frame for `SILENT_AFTER_S`."""
         now = time.monotonic()
         with self._changed:
-            return [name for name in self._last if name in self._open and now - self._last[name] > SILENT]
+            return [name for name in self._last if name in self._open and now - self._last[name] > SILENT_AFTER_S]
 
     def take(self, timeout: float) -> list[Arrived]:
-        """What has come: when all sensors that are not silent have brought something, or patience is over.
+        """Take all frames, once each active sensor has one, or after `patience`; `timeout` [s] for the first.
 
         Raises
         ------
         KinefitError
-            With which a sensor ended.
+            The error with which a sensor ended.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._slots or not self._open or self._error, max(timeout, 0.0))
             if self._error is not None:
                 raise self._error
             if self._slots:
-                first = min(one.at for one in self._slots.values())
+                first = min(frame.at for frame in self._slots.values())
                 until = max(first + self.patience, time.monotonic())
                 while self._awaited() and (left := until - time.monotonic()) > 0.0:
                     self._changed.wait(left)
@@ -127,6 +127,6 @@ class Inbox:
 
     def _awaited(self) -> bool:
         now = time.monotonic()
-        long = max(SILENT, self.patience)
-        lively = (name for name in self._open if now - self._last[name] <= long)
-        return any(name not in self._slots for name in lively)
+        longest = max(SILENT_AFTER_S, self.patience)
+        active = (name for name in self._open if now - self._last[name] <= longest)
+        return any(name not in self._slots for name in active)

@@ -1,4 +1,4 @@
-"""What a live session tells its receivers of each step; docs/live.md describes the packets."""
+"""Packets that a live session sends to its receivers; docs/live.md describes them."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from kinefit.frame.results import FrameResult
 
 @dataclass(frozen=True, eq=False)
 class PosePacket:
-    """A pose as receivers get it.
+    """The pose of one step, for receivers.
 
     Parameters
     ----------
     number : int, of the processed step, from 0
     body : Body
-    result : FrameResult, None while the person is not found
-    Ts_world_segment : (S, 4, 4) [m]; of no result empty
+    result : FrameResult; None while the person is not found
+    Ts_world_segment : (S, 4, 4) [m]; empty without a result
     time : float [s] of the step
-    latency : float [s] from the arrival of the newest frame that took part to this packet
-    dropped : {sensor: int} frames that were dropped so far
-    silent : sensors that bring nothing
+    latency : float [s] from the arrival of the newest frame in the step to this packet
+    dropped : {sensor: int} frames dropped so far
+    silent : sensors without new frames
     """
 
     number: int
@@ -41,7 +41,7 @@ class PosePacket:
     silent: Sequence[str] = ()
 
     def to_json(self) -> bytes:
-        """The packet."""
+        """The packet as JSON."""
         r = self.result
         out: dict[str, Any] = {
             "type": "pose" if r is not None else "waiting", "number": self.number, "time": round(self.time, 6),

@@ -1,4 +1,4 @@
-"""Who of all that detectors see now is the person who is followed."""
+"""Choose the tracked person among all detections of a live session."""
 
 from __future__ import annotations
 
@@ -16,45 +16,46 @@ from kinefit.observations import KeypointFrame, Keypoints, LiftedFrame
 from kinefit.observations.person import PersonChoice
 from kinefit.sensors.channels import known_points
 
-_NEAR = 0.35  # median distance of a person's points from where the body is expected, as a share of their height: in a
-# tenth of a second of detector's time nobody goes farther, and two who stand side by side are half a height apart
-_FEW = 4  # points that tell
-_WAYS = "first", "nearest", "largest"
+# Median distance of a person's points from the predicted body, as a share of their height: the largest motion during a
+# detection of 0.1 s; two people side by side are half a height apart.
+_MAX_DISTANCE = 0.35
+_MIN_POINTS = 4
+_LIVE_WAYS = "first", "nearest", "largest"
 
 
 class LivePerson:
-    """Chooses, frame by frame, one person's keypoints among those of everybody.
+    """Chooses one person's keypoints in every frame.
 
-    Who is followed is whoever fits the body's last pose; where no camera shows that person, and to begin with, whoever
-    the cameras agree on: of whom most is seen, who is largest, or nearest to a place.
+    The tracked person is the one that fits the body's last pose. At the start, and if no camera shows that person, it
+    is the one that the cameras agree on: with most visible points, the largest, or the nearest to a point.
 
     Parameters
     ----------
     rig : Rig
-    person : "first" (the default), "largest" or "nearest X Y Z" [m]: what needs the whole take is refused
+    person : "first" (the default), "largest" or "nearest X Y Z" [m]
 
     Raises
     ------
     TakeError
-        A person who is told apart only by a whole recording: "moving", or a number.
+        A choice that needs a whole recording: "moving", or a number.
     """
 
     def __init__(self, rig: Rig, person: int | str | None = None) -> None:
         self.rig, self.wanted = rig, PersonChoice.of(person)
-        if self.wanted.way not in _WAYS:
+        if self.wanted.way not in _LIVE_WAYS:
             problem = f'person = "{person}" is known only when all is over'
             raise TakeError(problem, place="person", remedy='Live: "first", "largest" or "nearest X Y Z".')
 
     def frames(
         self, records: Sequence[Keypoints], body: Body, state: BodyState | None
     ) -> list[KeypointFrame | LiftedFrame]:
-        """That person's keypoints; nothing of cameras that do not show the person. A camera alone is lifted to space.
+        """The tracked person's keypoints of all cameras that show the person, with lifted ones of a single camera.
 
         Parameters
         ----------
         records : of one frame each, of any number of people
         body : Body
-        state : its last pose, None before a start
+        state : its last pose; None before the start
         """
         seen = [k for k in records if confidences(k, 1).any()]
         chosen = [-1] * len(seen)
@@ -70,22 +71,22 @@ class LivePerson:
         return out
 
     def _fitting(self, record: Keypoints, names: tuple[str, ...], places: NDArray) -> int:
-        """Who of a record is where the body was last, its points by name and place (K, 3) [m]; -1 for none."""
-        own, mine = _columns(tuple(record.names), names)
-        if len(own) < _FEW:
+        """Index of the person at the body's last pose, with points by name and position (K, 3) [m]; -1 for none."""
+        own, of_body = _columns(tuple(record.names), names)
+        if len(own) < _MIN_POINTS:
             return 0 if record.points.shape[1] == 1 else -1
-        expected = self.rig[record.camera].project(places[mine])
+        expected = self.rig[record.camera].project(places[of_body])
         cost = [
             _apart(uv[own], confidence[own], expected) for uv, confidence in zip(record.points[0], record.confidence[0])
         ]
         best = int(np.argmin(cost)) if cost else -1
-        return best if best >= 0 and cost[best] < _NEAR else -1
+        return best if best >= 0 and cost[best] < _MAX_DISTANCE else -1
 
     def _anew(self, records: Sequence[Keypoints]) -> list[int]:
-        """Whoever the cameras agree on."""
+        """Choose the person that the cameras agree on: an index for each record, -1 for none."""
         several = any(k.points.shape[1] > 1 for k in records)
         if several and self.wanted.way == "largest":
-            return [int(np.argmax([_height(one) for one in k.points[0]])) for k in records]
+            return [int(np.argmax([_height(uv) for uv in k.points[0]])) for k in records]
         if several and self.wanted.place is not None:
             return self._nearest(records, self.wanted.place)
         try:
@@ -94,11 +95,11 @@ class LivePerson:
             return [-1] * len(records)
 
     def _nearest(self, records: Sequence[Keypoints], place: NDArray) -> list[int]:
-        """Of each record the one who is in the group of two whose middle is nearest to a place."""
+        """Choose the person nearest to a point (3,) [m] by pairs of cameras: an index for each record, -1 for none."""
         meetings = meeting_points(self.rig, records, [confidences(k, 1) for k in records], 1)
         apart = {pair: float(np.linalg.norm(x[0] - place)) for pair, x in meetings.items() if np.isfinite(x[0, 0])}
         out = [-1] * len(records)
-        for pair in sorted(apart, key=lambda one: apart[one]):
+        for pair in sorted(apart, key=lambda pair: apart[pair]):
             first = out if all(p < 0 for p in out) else None
             if first is not None or any(out[q] == p for q, p in pair):
                 for q, p in pair:
@@ -120,28 +121,28 @@ def _lifted(record: Keypoints, lifted: NDArray, person: int) -> LiftedFrame:
 
 @lru_cache(maxsize=64)
 def _columns(has: tuple[str, ...], names: tuple[str, ...]) -> tuple[NDArray, NDArray]:
-    """(K,), (K,) places of the same names in two lists."""
+    """(K,), (K,) indices of the common names in two lists."""
     at = {name: k for k, name in enumerate(has)}
     both = [(at[n], k) for k, n in enumerate(names) if n in at]
-    own, mine = np.array(both, np.int64).reshape(-1, 2).T
-    return own, mine
+    first, second = np.array(both, np.int64).reshape(-1, 2).T
+    return first, second
 
 
 def _apart(uv: NDArray, confidence: NDArray, expected: NDArray) -> float:
-    """Median distance of points (K, 2), as a share of their height; inf where too few are seen."""
+    """Median distance of points (K, 2), as a share of their height; inf if too few are detected."""
     gap = uv - expected
     far = np.sqrt(gap[:, 0] ** 2 + gap[:, 1] ** 2)
     seen = np.isfinite(far) & (confidence > 0.1)
     far = far[seen]
-    if len(far) < _FEW:
+    if len(far) < _MIN_POINTS:
         return np.inf
-    there = expected[seen]
-    height = float((there.max(axis=0) - there.min(axis=0)).max())
-    far.sort()  # in place of np.median: a tenth of its time
+    visible = expected[seen]
+    height = float((visible.max(axis=0) - visible.min(axis=0)).max())
+    far.sort()  # ten times as fast as np.median
     return 0.5 * float(far[(len(far) - 1) // 2] + far[len(far) // 2]) / max(height, 1.0)
 
 
 def _height(uv: NDArray) -> float:
-    """[px] of one person's points (K, 2); 0 for nobody."""
+    """Height [px] of one person's points (K, 2); 0 without a person."""
     seen = np.isfinite(uv).all(axis=1)
-    return float(np.ptp(uv[seen, 1])) if seen.sum() >= _FEW else 0.0
+    return float(np.ptp(uv[seen, 1])) if seen.sum() >= _MIN_POINTS else 0.0

@@ -1,6 +1,6 @@
-"""What a live session leaves on disk: its motion as it was followed.
+"""Record the motion of a live session on disk.
 
-It is written as it comes, a row of fixed size a step, so that memory does not grow; at the end it becomes a motion.
+Each step is written as a row of fixed size, so that memory does not grow; at the end the rows become a motion.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ _SPOOL = "poses.unfinished"
 
 
 class MotionRecord:
-    """A receiver that keeps poses, and makes them a motion at the end.
+    """A receiver that records poses, and writes them as a motion at the end.
 
-    Steps that were dropped are frames without tracking between their neighbours. Where the body changed, the motion has
-    the last one's lengths: what was followed with the usual ones before is posed on it.
+    Dropped steps become untracked frames. If the body changed, the motion has the last body's lengths, for earlier
+    poses, too.
 
     Parameters
     ----------
-    folder : Path, made where it is not there
+    folder : Path, created if missing
     rate : float [Hz]
     up : vertical axis
     name : of the motion
 
     Attributes
     ----------
-    path : of the motion, written by `close`; None where the person was never found
+    path : of the motion, written by `close`; None if the person was never found
     """
 
     def __init__(self, folder: Path, *, rate: float, up: str, name: str) -> None:
@@ -53,7 +53,7 @@ class MotionRecord:
         self.dropped = 0
 
     def hello(self, body: Body, packet: bytes) -> None:
-        """The body; one with other coordinates begins anew."""
+        """Set the body; one with other coordinates restarts the record."""
         if self._body is not None and body.tree.coordinates != self._body.tree.coordinates:
             self._file.seek(0)
             self._file.truncate()
@@ -61,7 +61,7 @@ class MotionRecord:
         self._body = body
 
     def pose(self, posed: PosePacket, packet: bytes) -> None:
-        """Keep a pose at the step of its time."""
+        """Record a pose at the step of its time."""
         r = posed.result
         self.dropped = sum(posed.dropped.values())
         if r is None or self._body is None:
@@ -74,7 +74,7 @@ class MotionRecord:
             self._first = posed.time
         else:
             ahead = round((posed.time - self._first) * self.rate) - round((self._last[0] - self._first) * self.rate)
-            if ahead < 1:  # within the step that is kept already
+            if ahead < 1:  # within the latest recorded step
                 return
             for k in range(1, min(ahead, round(600.0 * self.rate))):
                 gap = self._last.copy()
@@ -107,7 +107,7 @@ class MotionRecord:
 
 
 def _motion(rows: NDArray, body: Body, rate: float, up: str, name: str) -> Motion:
-    """Rows as `MotionRecord` keeps them, as a motion with even times."""
+    """Convert rows of `MotionRecord` to a motion with even times."""
     D, S = len(body.tree.coordinates), len(body.tree.segments)
     ends = np.cumsum([1, 16, D, 6 + D, 3 * S, 1, S])
     time, T, angles, dof_std, joint_std, quality, segment_quality = np.split(rows, ends[:-1], axis=1)

@@ -1,4 +1,4 @@
-"""A recorded take as a source: everything comes at the time at which it was seen, or as fast as it is taken."""
+"""A recorded take as a source: at its own speed, or as fast as the session takes the steps."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from kinefit.observations import Keypoints
 from kinefit.tracking.recording import Recording
 
 REPLAY = "replay"
-"""Name of the sensor under which a replayed take brings whole steps."""
+"""Name of the sensor that stands for all sensors of a replayed take."""
 
 
 class Replay:
-    """Brings the steps of a recording, each with all that its sensors saw.
+    """Source of the steps of a recording, each with the frames of all sensors.
 
     Parameters
     ----------
     recording : Recording of all sensors but the keypoints' detectors
     keypoints : records of all people in view, of as many frames as the recording has steps
-    speed : float, 1 for the recording's own; 0 as fast as steps are taken, and none is dropped
+    speed : float, 1 for the recording's own; 0: as fast as the session takes the steps, without drops
     """
 
     def __init__(self, recording: Recording, keypoints: Sequence[Keypoints], *, speed: float = 1.0) -> None:
@@ -34,18 +34,18 @@ class Replay:
         self._thread: threading.Thread | None = None
 
     def start(self, inbox: Inbox) -> None:
-        """Bring steps from now on."""
+        """Start putting steps into the inbox."""
         self._thread = threading.Thread(target=self._run, args=(inbox,), daemon=True, name=REPLAY)
         self._thread.start()
 
     def stop(self) -> None:
-        """Bring nothing more."""
+        """Stop putting steps into the inbox."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(timeout=2.0)
 
     def seen(self, step: int) -> list[Any]:
-        """What all sensors saw at a step."""
+        """The frames of all sensors at a step."""
         own = [k.rows(slice(step, step + 1), float(k.times[step])) for k in self.keypoints]
         return [*self.recording.steps(step), *own]
 
@@ -61,7 +61,7 @@ class Replay:
                     Arrived(REPLAY, float(times[step]), time.monotonic(), self.seen(step)), wait=not self.speed
                 ):
                     return
-        except KinefitError as wrong:
-            error = wrong
+        except KinefitError as raised:
+            error = raised
         finally:
             inbox.end(REPLAY, error)

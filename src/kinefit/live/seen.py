@@ -1,4 +1,4 @@
-"""What a live session's cameras saw of the person, left as a take: to be fitted as a whole afterwards."""
+"""Record the detections of a live session as a take, for a fit of the whole session afterwards."""
 
 from __future__ import annotations
 
@@ -18,29 +18,30 @@ from kinefit.observations import MEDIAPIPE_33, Detections, KeypointFrame, Lifted
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.take.file import Take
 
-_TAKE, _HEAD = "take.toml", "# What a live session saw: kinefit track fits it as a whole."
+_TAKE_FILE = "take.toml"
+_TAKE_HEAD = "# What a live session saw: kinefit track fits it as a whole."
 _K = len(MEDIAPIPE_33)
-_ROW = 1 + 2 * _K + _K + 3 * _K  # time, pixels, confidence, lifted
-_NEAR = 1.5  # frames between two images within which a step between them is seen
+_ROW_LENGTH = 1 + 2 * _K + _K + 3 * _K  # time, pixels, confidence, lifted
+_MAX_IMAGE_GAP = 1.5  # frames between two images, up to which a step between them is interpolated
 
 
 class SeenRecord:
-    """Keeps the detector's keypoints of the person who is followed; at the end a take that `kinefit track` takes.
+    """Record of the tracked person's keypoints; at the end it writes a take for `kinefit track`.
 
-    Cameras of a live session are not in step. In the take each has a frame at every step of one rate: what lies between
-    two of its images, no more than a frame and a half apart, is on a straight line between them.
+    Cameras of a live session are not synchronised. In the take each has a frame at every step of one rate, interpolated
+    linearly between two of its images that are at most a frame and a half apart.
 
     Parameters
     ----------
-    folder : Path, made where it is not there
-    take : that the session is of
+    folder : Path, created if missing
+    take : of the session
     rig : Rig
     rate : float [Hz] of the steps
-    alone : whether the one camera's place was assumed: the take has no calibration then, either
+    alone : whether the pose of the only camera is an assumption: then the take has no calibration
 
     Attributes
     ----------
-    path : of the take file, written by `close`; None where nobody was seen
+    path : of the take file, written by `close`; None without detections
     """
 
     def __init__(self, folder: Path, take: Take, rig: Rig, *, rate: float, alone: bool) -> None:
@@ -49,15 +50,15 @@ class SeenRecord:
         self._files: dict[str, BinaryIO] = {}
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            other = self.folder / _TAKE
-            if other.exists() and not other.read_text(errors="replace").startswith(_HEAD):
+            other = self.folder / _TAKE_FILE
+            if other.exists() and not other.read_text(errors="replace").startswith(_TAKE_HEAD):
                 remedy = "Name another folder by --out."
                 raise ExportError("this take would be written over", file=other, remedy=remedy)
         except OSError as error:
-            raise self._unwritten(error) from error
+            raise self._write_error(error) from error
 
     def keep(self, frames: Sequence[Any]) -> None:
-        """Keep what the person's cameras saw in one step."""
+        """Record the person's keypoints of one step; raises ExportError if they cannot be written."""
         seen = by_record(frames)
         lifted = {f.sensor: f.x for f in seen[LiftedFrame]}
         for f in seen[KeypointFrame]:
@@ -69,13 +70,13 @@ class SeenRecord:
                         self._files[f.sensor] = open(self._spool(f.sensor), "wb")
                     self._files[f.sensor].write(row.tobytes())
                 except OSError as error:
-                    raise self._unwritten(error) from error
+                    raise self._write_error(error) from error
 
     def close(self) -> None:
-        """Write detections, calibration and take."""
+        """Write detections, calibration and take file."""
         for file in self._files.values():
             file.close()
-        rows = {name: np.fromfile(self._spool(name)).reshape(-1, _ROW) for name in self._files}
+        rows = {name: np.fromfile(self._spool(name)).reshape(-1, _ROW_LENGTH) for name in self._files}
         if rows:
             first = min(float(own[0, 0]) for own in rows.values())
             last = max(float(own[-1, 0]) for own in rows.values())
@@ -84,7 +85,7 @@ class SeenRecord:
                 write_detections(self._detections(name, on_grid(own, grid, self.rate)), self.folder / f"{name}.npz")
             if not self.alone:
                 write_calibration(self.rig, self.folder / "calibration.toml")
-            self.path = self.folder / _TAKE
+            self.path = self.folder / _TAKE_FILE
             write_text(self.path, self._text(list(rows)))
         for name in rows:
             self._spool(name).unlink(missing_ok=True)
@@ -92,7 +93,7 @@ class SeenRecord:
     def _spool(self, camera: str) -> Path:
         return self.folder / f"{camera}.unfinished"
 
-    def _unwritten(self, error: OSError) -> ExportError:
+    def _write_error(self, error: OSError) -> ExportError:
         remedy = "Free some space, or name another folder by --out."
         return ExportError(f"cannot be written ({error.strerror})", file=self.folder, remedy=remedy)
 
@@ -108,9 +109,9 @@ class SeenRecord:
         )  # fmt: skip
 
     def _text(self, cameras: Sequence[str]) -> str:
-        """The take file."""
+        """Text of the take file."""
         take, quoted = self.take, json.dumps
-        lines = [_HEAD, "", "[take]"]
+        lines = [_TAKE_HEAD, "", "[take]"]
         lines += [f"name = {quoted(take.name)}", f"rate = {self.rate:g}", f"up = {quoted(take.up)}"]
         lines += [f"body = {quoted(take.body)}"] + ([f"height = {take.height:g}"] if take.height else [])
         lines += [] if self.alone else ["", "[calibration]", 'file = "calibration.toml"']
@@ -127,14 +128,14 @@ class SeenRecord:
 
 
 def on_grid(rows: NDArray, grid: NDArray, rate: float) -> NDArray:
-    """Rows (N, M) whose first column are times, at other times (F,): between two near ones straight, else NaN."""
+    """Rows (N, M), times [s] in the first column, interpolated at times (F,) [s] between near rows; else NaN."""
     times = rows[:, 0]
     after = np.minimum(np.searchsorted(times, grid), len(times) - 1)
     before = np.maximum(after - 1, 0)
     low, high = times[before], times[after]
     s = np.clip((grid - low) / np.maximum(high - low, 1e-9), 0.0, 1.0)[:, None]
     out = (1.0 - s) * rows[before] + s * rows[after]
-    inside = (high - low <= _NEAR / rate) & (grid >= low - 1e-9) & (grid <= high + 1e-9)
+    inside = (high - low <= _MAX_IMAGE_GAP / rate) & (grid >= low - 1e-9) & (grid <= high + 1e-9)
     nearest = np.where(s[:, 0] < 0.5, before, after)
     exact = np.abs(times[nearest] - grid) <= 0.05 / rate  # alone, but in step
     out[exact & ~inside] = rows[nearest[exact & ~inside]]

@@ -1,4 +1,4 @@
-"""A live session: what sources bring is fitted at once, and each pose goes to all receivers."""
+"""A live session: fit the frames of all sources as they arrive, and send each pose to all receivers."""
 
 from __future__ import annotations
 
@@ -29,58 +29,58 @@ from kinefit.observations import Keypoints
 from kinefit.tracking.session import axis_of
 from kinefit.tracking.tracker import Tracker
 
-_LATEST = 10_000  # steps whose latency is kept
-_PATIENT = 10.0  # [s] for which the other sensors are waited for, where none may be dropped
-_WAIT = 0.25  # [s] at most between looks at what clients ask for
-_MAX_WAITING_WISHES = 64  # of all clients: two seconds of wishes, as one is done a step
+_MAX_LATENCIES = 10_000  # that are stored
+_PATIENCE_WITHOUT_DROPS_S = 10.0  # wait for the other sensors, if no frame may be dropped
+_MAX_WAIT_S = 0.25  # between two checks of the clients' wishes
+_MAX_WAITING_WISHES = 64  # of all clients: two seconds, at one a step
 
 
 class Source(Protocol):
-    """Brings frames in a thread of its own."""
+    """Puts frames into an inbox, from its own thread."""
 
     sensors: tuple[str, ...]
-    patient: bool  # whether it waits until its frames are taken, so that none is dropped
+    patient: bool  # whether it waits for a free slot, so that no frame is dropped
 
     def start(self, inbox: Inbox) -> None:
-        """Bring frames from now on."""
+        """Start putting frames into the inbox."""
 
     def stop(self) -> None:
-        """Bring nothing more."""
+        """Stop putting frames into the inbox."""
 
 
 class Receiver(Protocol):
-    """Takes poses, and must not keep the session waiting."""
+    """Receives poses; its methods must return at once."""
 
     def hello(self, body: Body, packet: bytes) -> None:
-        """The body that follows, with its packet."""
+        """Handle a new body, with its packet."""
 
     def pose(self, posed: PosePacket, packet: bytes) -> None:
-        """A pose, with its packet."""
+        """Handle a pose, with its packet."""
 
     def close(self) -> None:
-        """Nothing more comes."""
+        """Handle the end of the session."""
 
 
 class LiveSession:
-    """Follows one person in what sources bring.
+    """Tracks one person in the frames of live sources.
 
     Parameters
     ----------
     tracker : Tracker
-    sources : that bring frames
+    sources : of frames
     receivers : of poses
-    detector : of images, where sources bring any
-    person : who of all is followed; default: of whom most is seen
-    size : finds the person's lengths in the first seconds; None where they are known
-    seen : keeps what cameras saw of the person
+    detector : for sources of images
+    person : choice of the tracked person; default: the one with most visible points
+    size : fit of the person's lengths in the first seconds; None if they are known
+    seen : record of the person's detections
     name : str of the session
 
     Attributes
     ----------
     inbox : Inbox
-    processed, found : int, steps, and those in which the person was found
-    latencies : [s] of the latest steps, from the arrival of the newest frame until all receivers had the pose
-    wishes : queue of what clients ask for, see `ask`
+    processed, found : int, number of steps, and of those in which the person was found
+    latencies : [s] of the latest steps, from the arrival of the newest frame until all receivers have the pose
+    wishes : queue of clients' requests, see `ask`
     """
 
     def __init__(
@@ -92,41 +92,41 @@ class LiveSession:
         self.detector, self.size, self.seen, self.name = detector, size, seen, name
         self.person = person or LivePerson(tracker.rig)
         self.sensors = tuple(sensor for source in self.sources for sensor in source.sensors)
-        patience = _PATIENT if any(source.patient for source in self.sources) else 0.5 / tracker.rate
+        patience = _PATIENCE_WITHOUT_DROPS_S if any(source.patient for source in self.sources) else 0.5 / tracker.rate
         self.inbox = Inbox(self.sensors, patience=patience)
         self.processed = self.found = 0
-        self.latencies: deque[float] = deque(maxlen=_LATEST)
+        self.latencies: deque[float] = deque(maxlen=_MAX_LATENCIES)
         self.wishes: queue.Queue[tuple[Wish, Answer]] = queue.Queue(_MAX_WAITING_WISHES)
-        self._replaced: tuple[Body, Wish, Answer] | None = None  # until a step was fitted with the body asked for
+        self._replaced: tuple[Body, Wish, Answer] | None = None  # until a step is fitted with the requested body
         self._off: set[str] = set()
         self._over = False
 
     @property
     def names(self) -> list[str]:
-        """Sensors that a client may leave out or weigh: cameras, and what else sources bring by name."""
+        """Sensors that a client may disable or weigh: cameras, and named sensors of the sources."""
         return sorted({*self.sensors, *self.tracker.rig.names} - {REPLAY})
 
     def stop(self) -> None:
-        """End the session after the step that is being fitted."""
+        """End the session after the current step."""
         self._over = True
 
     def run(self, seconds: float | None = None) -> None:
-        """Until the sources end, `stop`, or so many seconds are over.
+        """Run until the sources end, `stop` is called, or after a time [s].
 
         Raises
         ------
         KinefitError
-            A source that cannot go on, or frames that do not belong to the body or its cameras.
+            A failed source, or frames that do not match the body or its cameras.
         """
         until = None if seconds is None else time.monotonic() + seconds
         self._hello()
         gc.collect()
-        gc.freeze()  # what is there lasts: looking through it again and again would hold up poses
+        gc.freeze()  # existing objects live as long as the session: repeated collection would delay poses
         try:
             for source in self.sources:
                 source.start(self.inbox)
             while not (self._over or self.inbox.over) and (until is None or time.monotonic() < until):
-                arrived = self.inbox.take(_WAIT)
+                arrived = self.inbox.take(_MAX_WAIT_S)
                 self._listen()
                 if arrived:
                     self.step(arrived)
@@ -149,12 +149,12 @@ class LiveSession:
             self.seen.close()
 
     def step(self, arrived: Sequence[Arrived]) -> FrameResult | None:
-        """Fit what arrived, and tell receivers."""
+        """Fit the arrived frames, and send the pose to all receivers."""
         frames, result = self._fit(*self._sort(arrived))
         if self.seen is not None:
             self.seen.keep(frames)
-        at = max(one.at for one in arrived)
-        now = result.time if result is not None else max(one.time for one in arrived)
+        at = max(frame.at for frame in arrived)
+        now = result.time if result is not None else max(frame.time for frame in arrived)
         poses = np.zeros((0, 4, 4))
         if result is not None:
             state = result.state
@@ -172,15 +172,15 @@ class LiveSession:
             self.change_body(body)
         return result
 
-    def ask(self, wish: bytes | Mapping[str, Any], answer: Answer = lambda told: None) -> None:
-        """Have something changed before one of the next steps; from any thread.
+    def ask(self, wish: bytes | Mapping[str, Any], answer: Answer = lambda content: None) -> None:
+        """Request a change before one of the next steps; callable from any thread.
 
         Parameters
         ----------
         wish : as JSON or as a mapping
-            {"sensor": name, "use": bool}: whether a sensor takes part; {"sensor": name, "sigma": value}: its standard
+            {"sensor": name, "use": bool}: whether to use a sensor; {"sensor": name, "sigma": value}: its standard
             deviation [px, m]; {"body": name}: another body of the catalogue; {"stop": true}.
-        answer : takes {"type": "done"} or {"type": "refused", "why": text}, with the wish as "asked"
+        answer : called with {"type": "done"} or {"type": "refused", "why": text}, with the wish as "asked"
         """
         try:
             self.wishes.put_nowait((read_wish(wish), answer))
@@ -190,12 +190,12 @@ class LiveSession:
             answer({"type": "refused", "why": f"{_MAX_WAITING_WISHES} wishes wait already. Ask again later."})
 
     def change_body(self, body: Body) -> None:
-        """Go on with another body.
+        """Continue with another body.
 
         Raises
         ------
         KinefitError
-            Of a receiver that cannot show it: the session goes on with the body before.
+            From a receiver that does not support it: the session continues with the previous body.
         """
         before = self.tracker.body
         self.tracker.change_body(body)
@@ -207,22 +207,22 @@ class LiveSession:
             raise
 
     def _fit(self, frames: list[Any], records: list[Keypoints]) -> tuple[list[Any], FrameResult | None]:
-        """Fit one person's frames; with the body before, where they do not suit the one that a client asked for."""
+        """Fit one person's frames; restores the previous body if they do not fit the one that a client requested."""
         try:
-            of_person, result = self._follow(frames, records)
+            of_person, result = self._track(frames, records)
         except KinefitError as error:
             if self._replaced is None:
                 raise
             (before, wish, answer), self._replaced = self._replaced, None
             answer(_refused(wish, error))
             self.change_body(before)
-            return self._follow(frames, records)
+            return self._track(frames, records)
         if of_person:
             self._replaced = None
         return of_person, result
 
-    def _follow(self, frames: list[Any], records: list[Keypoints]) -> tuple[list[Any], FrameResult | None]:
-        """Frames with the keypoints of one person of all records, and what they were fitted to."""
+    def _track(self, frames: list[Any], records: list[Keypoints]) -> tuple[list[Any], FrameResult | None]:
+        """Add the tracked person's keypoints to the frames, and fit them; returns both."""
         frames = frames + self.person.frames(records, self.tracker.body, self.tracker.state)
         return frames, self.tracker.update(frames, float(np.mean([f.time for f in frames]))) if frames else None
 
@@ -234,11 +234,11 @@ class LiveSession:
 
     def _sort(self, arrived: Sequence[Arrived]) -> tuple[list[Any], list[Keypoints]]:
         """Frames for the tracker, and keypoints of all people."""
-        images = [one for one in arrived if isinstance(one.seen, np.ndarray) and one.sensor not in self._off]
+        images = [a for a in arrived if isinstance(a.seen, np.ndarray) and a.sensor not in self._off]
         records = self.detector(images) if self.detector is not None and images else []
         frames: list[Any] = []
-        for one in arrived:
-            for seen in one.seen if isinstance(one.seen, list) else ():
+        for frame in arrived:
+            for seen in frame.seen if isinstance(frame.seen, list) else ():
                 if isinstance(seen, Keypoints):
                     records += [seen] if seen.camera not in self._off else []
                 elif seen.sensor not in self._off:
@@ -246,7 +246,7 @@ class LiveSession:
         return frames, records
 
     def _listen(self) -> None:
-        """Do one thing that a client asked for: more would hold up poses."""
+        """Fulfil one wish of a client: more would delay poses."""
         with contextlib.suppress(queue.Empty):
             wish, answer = self.wishes.get_nowait()
             try:

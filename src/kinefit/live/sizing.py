@@ -1,4 +1,4 @@
-"""The person's lengths, from the first seconds of a live session: found beside it, in a process of its own."""
+"""Fit the person's lengths to the first seconds of a live session, in a separate process."""
 
 from __future__ import annotations
 
@@ -22,11 +22,13 @@ from kinefit.simulation.warm import warm_keypoints
 from kinefit.tracking.recording import Recording, keypoint_records
 from kinefit.tracking.sizing import fitted_to_person
 
-_STEPS, _BETWEEN, _SEEN = 40, 0.2, 0.5  # steps that are kept, [s] between them, quality of a frame that counts
+_FITTED_STEPS = 40
+_STEP_INTERVAL_S = 0.2
+_MIN_SUPPORT = 0.5  # share of agreeing evidence, of a step that counts
 
 
 class LiveSize:
-    """Keeps some steps of the beginning, has the body fitted to them, and gives it when it is there.
+    """Collects the first steps, starts a fit of the body to them, and returns it when it is done.
 
     Parameters
     ----------
@@ -34,12 +36,12 @@ class LiveSize:
     rig : Rig
     sigma : {camera: float} [px]
     settings : TrackSettings
-    height : float [m] of the person, where it is known
+    height : float [m] of the person, if known
     up : vertical axis
 
     Attributes
     ----------
-    told : what became of it, for the user; "" while it is not over
+    outcome : text for the user; "" until the fit is over
     """
 
     def __init__(
@@ -53,23 +55,23 @@ class LiveSize:
         self._next = -float("inf")
         self._pool: ProcessPoolExecutor | None = None
         self._future: Future[Body] | None = None
-        self.told = ""
+        self.outcome = ""
 
     def after(self, frames: Sequence[Any], result: FrameResult | None) -> Body | None:
-        """After a step: the fitted body, once, when it is there."""
-        if self.told:
+        """Handle a step; returns the fitted body once, after the fit is done."""
+        if self.outcome:
             return None
         if self._future is not None:
             return self._found() if self._future.done() else None
         kinds = by_record(frames)
         seen = [*kinds[KeypointFrame], *kinds[LiftedFrame]]
-        if seen and result is not None and result.support > _SEEN and result.time >= self._next:
+        if seen and result is not None and result.support > _MIN_SUPPORT and result.time >= self._next:
             self._steps.append(seen)
-            self._next = result.time + _BETWEEN
-            if self._pool is None:  # its start takes seconds, and is over when the steps are there
-                self._pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_behind)
+            self._next = result.time + _STEP_INTERVAL_S
+            if self._pool is None:  # it starts while steps are collected
+                self._pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_lower_priority)
                 self._pool.submit(warm_keypoints)
-        if len(self._steps) == _STEPS:
+        if len(self._steps) == _FITTED_STEPS:
             assert self._pool is not None
             try:
                 self._future = self._pool.submit(fitted_body, self._steps, **self._task)
@@ -79,7 +81,7 @@ class LiveSize:
         return None
 
     def close(self) -> None:
-        """Give up what is not there yet."""
+        """Cancel an unfinished fit."""
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
             self._pool = None
@@ -90,11 +92,11 @@ class LiveSize:
             body = self._future.result()
             lengths = body.segment_lengths()
             bones = {"thigh": "thigh_r-shank_r", "shank": "shank_r-foot_r", "forearm": "forearm_r-hand_r"}
-            told = ", ".join(f"{what} {100 * lengths[bone]:.1f}" for what, bone in bones.items() if bone in lengths)
-            self.told = f"the person's size was found ({told} cm)" if told else "the person's size was found"
+            listed = ", ".join(f"{what} {100 * lengths[bone]:.1f}" for what, bone in bones.items() if bone in lengths)
+            self.outcome = f"the person's size was found ({listed} cm)" if listed else "the person's size was found"
             return body
         except KinefitError as error:
-            self.told = f"the person's size was not found, it is taken to be as usual ({error.problem})"
+            self.outcome = f"the person's size was not found, the default is used ({error.problem})"
         except BrokenProcessPool:
             self._give_up()
         finally:
@@ -102,13 +104,13 @@ class LiveSize:
         return None
 
     def _give_up(self) -> None:
-        """The session goes on without: a process that was ended, by whomever, holds up no pose."""
-        self.told = "the person's size was not found, it is taken to be as usual (its process ended)"
+        """Go on without a fit after its process has ended."""
+        self.outcome = "the person's size was not found, the default is used (its process ended)"
         self.close()
 
 
-def _behind() -> None:
-    """Let the session go before this process."""
+def _lower_priority() -> None:
+    """Give this process a lower priority than the session."""
     if hasattr(os, "nice"):
         os.nice(10)
 
@@ -117,16 +119,16 @@ def fitted_body(
     steps: Sequence[Sequence[Any]], *, body: Body, rig: Rig, sigma: dict[str, float],
     settings: TrackSettings, height: float | None, up: str,
 ) -> Body:  # fmt: skip
-    """The body with the person's lengths, from keypoints of some steps."""
-    records = [_with_lifted(k, steps) for k in keypoint_records(steps, 1.0 / _BETWEEN)]
+    """Fit the body's lengths to keypoints of some steps; sigma [px] by camera, height [m]."""
+    records = [_with_lifted(k, steps) for k in keypoint_records(steps, 1.0 / _STEP_INTERVAL_S)]
     sigmas = [sigma.get(k.camera, KEYPOINT_SIGMA) for k in records]
     recording = Recording.of_keypoints(rig, records, sigma=sigmas, up=up)
-    settings = replace(settings, view_bias=False)  # which the session's own frames do without, too
+    settings = replace(settings, view_bias=False)  # the session's own frames have none, either
     return fitted_to_person(recording, body, settings, height=height).subject.body
 
 
 def _with_lifted(record: Keypoints, steps: Sequence[Sequence[Any]]) -> Keypoints:
-    """The same with its points lifted to space, where there are any."""
+    """The record with lifted points, if the steps have some."""
     lifted = np.full((*record.points.shape[:3], 3), np.nan)
     for i, step in enumerate(steps):
         for f in by_record(step)[LiftedFrame]:

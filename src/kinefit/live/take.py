@@ -1,4 +1,4 @@
-"""From a take file to a live session: its streams, or what it recorded, replayed."""
+"""Make a live session of a take: its streams, or a replay of its recording."""
 
 from __future__ import annotations
 
@@ -44,25 +44,25 @@ def live_session(
     take: Take, receivers: Sequence[Receiver] = (), *, speed: float = 1.0, threads: int | None = None,
     folder: Path | None = None, tell: Tell = warn,
 ) -> LiveSession:
-    """A session of a take: live where its sensors have a `stream`, else what it recorded at its own speed.
+    """Make a session of a take: live if its sensors have a `stream`, else a replay at its own speed.
 
-    Videos without keypoints are looked through by the built-in detector as they come.
+    The built-in detector runs on videos without keypoints.
 
     Parameters
     ----------
     receivers : of the poses
-    speed : of a replay; 0 as fast as it can be followed, and no frame is dropped
+    speed : of a replay; 0: as fast as possible, without drops
     threads : of the detector; default: all cores
-    folder : where what the detector saw of the person is left as a take; None for nowhere
-    tell : called with what is worth saying
+    folder : for a take of the person's detections; None writes none
+    tell : called with messages for the user
 
     Raises
     ------
     TakeError
-        Some cameras have streams and others none; sensors that only a recording has beside streams; a person who is
-        known only when all is over.
+        Streams of some cameras only; streams together with sensors that need a recording; a choice of person that needs
+        the whole recording.
     KinefitError
-        What opening and reading raise.
+        As opening and reading.
     """
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
     threads = threads or cores()
@@ -93,14 +93,14 @@ def live_session(
 
 
 def _recorded(take: Take, body: Body, speed: float) -> Opened:
-    """Everything that a take recorded, step by step."""
+    """Replay of a take's recording, step by step."""
     seen = with_names(take, load_observations(take))
     recording, body = recording_of(take, replace(seen, keypoints=()), body)
     return Opened(recording, body, (Replay(recording, seen.keypoints, speed=speed),))
 
 
 def _videos(take: Take, body: Body, speed: float, threads: int, tell: Tell) -> Opened:
-    """Videos, looked through as they are shown."""
+    """Videos with the built-in detector."""
     entries = [entry for entry in take.cameras if entry.video is not None]
     if not entries:
         remedy = "Give its cameras a stream or a video."
@@ -117,17 +117,17 @@ def _videos(take: Take, body: Body, speed: float, threads: int, tell: Tell) -> O
 
 
 def folder_of(take: Take) -> Path:
-    """Where a session of a take leaves its files, unless told otherwise."""
+    """Default folder for the files of a session of a take."""
     return take.path.with_name(f"{take.path.stem}-live")
 
 
-_RATE = 30.0  # [Hz] of streams that nothing states a rate of
-_EMPTY = 30  # images of an empty scene that are looked at: more add nothing
+_DEFAULT_RATE = 30.0  # [Hz] of streams
+_MAX_BACKGROUND_IMAGES = 30  # of an empty scene: more add nothing
 
 
 @dataclass(frozen=True, eq=False)
 class Opened:
-    """What a session is made of."""
+    """The parts of a session."""
 
     recording: Recording
     body: Body
@@ -136,16 +136,16 @@ class Opened:
 
 
 def opened_streams(take: Take, body: Body, threads: int, tell: Tell) -> Opened:
-    """Every stream of a take, as it comes.
+    """Open every stream of a take.
 
     Raises
     ------
     TakeError, CalibrationError
-        Nothing tells an image's size, or where a camera or depth sensor stands.
+        An unknown image size, or an unknown pose of a camera or depth sensor.
     KinefitError
-        What opening streams raises.
+        As opening streams.
     """
-    rig, clock, rate = read_rig(take), SessionClock(), take.rate or _RATE
+    rig, clock, rate = read_rig(take), SessionClock(), take.rate or _DEFAULT_RATE
     cameras = [entry for entry in take.cameras if entry.stream is not None]
     if cameras:
         sizes = {entry.name: _size(entry, rig, take) for entry in cameras}
@@ -180,7 +180,7 @@ def opened_streams(take: Take, body: Body, threads: int, tell: Tell) -> Opened:
         sigma[depth.name] = depth.sigma
         if depth.background is not None:
             video = read_depth(depth.background, sensor=depth.name, unit=depth.unit)
-            empty_scene = [video.frame(i).depth for i in range(min(len(video), _EMPTY))]
+            empty_scene = [video.frame(i).depth for i in range(min(len(video), _MAX_BACKGROUND_IMAGES))]
             backgrounds[depth.name] = background_model(empty_scene, share=0.5)
     recording = replace(
         seen.recording, rig=Rig(tuple(rig_of_all)), sigma=sigma, backgrounds=backgrounds,
@@ -193,7 +193,13 @@ def with_detector(
     take: Take, body: Body, sources: Sequence[Source], sizes: dict[str, tuple[int, int]], rate: float, threads: int,
     tell: Tell,
 ) -> Opened:  # fmt: skip
-    """Sources of images, with the detector that looks through them."""
+    """Sources of images with the built-in detector; sizes (width, height) [px], rate [Hz].
+
+    Raises
+    ------
+    TakeError
+        Cameras without calibration.
+    """
     rig = read_rig(take)
     if is_alone(take):
         rig = Rig((assumed_camera(take.cameras[0], sizes.get(take.cameras[0].name), take),))
@@ -215,17 +221,17 @@ def with_detector(
 
 
 def _size(entry: CameraEntry, rig: Rig | None, take: Take) -> tuple[int, int]:
-    """[px] of a camera's image."""
+    """(width, height) [px] of a camera's image."""
     size = entry.size or (rig[entry.name].size if rig is not None else None)
     if size is None:
         remedy = "Write size = [width, height], or a calibration."
-        raise TakeError("nothing tells the size of its image", file=take.path, place=f"camera {entry.name}",
+        raise TakeError("the size of its image is unknown", file=take.path, place=f"camera {entry.name}",
                         remedy=remedy)  # fmt: skip
     return size
 
 
 def _camera(entry: CameraEntry, size: tuple[int, int], take: Take, clock: SessionClock) -> Source:
-    """The images of one camera, as they come."""
+    """Source of the images of one camera: a folder or a stream."""
     assert entry.stream is not None
     folder = take.path.parent / entry.stream
     if folder.is_dir():
@@ -234,7 +240,7 @@ def _camera(entry: CameraEntry, size: tuple[int, int], take: Take, clock: Sessio
 
 
 def _depth_camera(entry: DepthEntry, rig: Rig | None, take: Take) -> Camera:
-    """The sensor's camera as it is stated; errors name the take and the sensor."""
+    """The sensor's stated camera; errors name the take and the sensor."""
     remedy = "Write intrinsics = [fx, fy, cx, cy] and size = [width, height] [px], or add [calibration]."
     try:
         camera = stated_camera(entry, entry.size, rig)

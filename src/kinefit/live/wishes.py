@@ -1,4 +1,4 @@
-"""Read what a client asks of a session: flat JSON objects of bounded size, each with one wish."""
+"""Read the requests ("wishes") of a client to a session: flat JSON objects of limited size, one request each."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ import msgspec
 from kinefit.errors import ObservationError
 
 Answer = Callable[[Mapping[str, Any]], None]
-"""Takes the answer to a wish, from any thread."""
+"""Callback for the answer to a wish, called from any thread."""
 
 MAX_WISH_BYTES = 4096
-"""Of a wish as JSON: those that a session fulfils have less than 300."""
+"""Largest size of a wish as JSON; valid ones have less than 300 bytes."""
 
 _Name = Annotated[str, msgspec.Meta(max_length=200)]
 _FORM = 'Ask for {"sensor": ..., "use": true or false}, {"sensor": ..., "sigma": ...}, {"body": ...} or {"stop": true}.'
 
 
 class Wish(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """One wish; the fields of others are None.
+    """One request; the fields of other requests are None.
 
     Parameters
     ----------
-    sensor : name of the sensor that `use` or `sigma` is of
-    use : whether the sensor takes part
+    sensor : name of the sensor of `use` or `sigma`
+    use : whether the session uses the sensor
     sigma : standard deviation of the sensor, [px] or [m]
-    body : name of a body of the catalogue
+    body : name of a body in the catalogue
     stop : True to end the session
     """
 
@@ -39,14 +39,14 @@ class Wish(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
 
 
 def read_wish(given: bytes | Mapping[str, Any]) -> Wish:
-    """The wish of a JSON text or of a mapping.
+    """Parse a wish from a JSON text or a mapping.
 
-    The record has no nested part, so that no depth of brackets is ever followed.
+    The record has no nested fields, so deep nesting in the input has no effect.
 
     Raises
     ------
     ObservationError
-        Too long, no JSON, not of the form of a wish, or of two wishes at once.
+        Too long, no JSON, no valid wish, or two wishes at once.
     """
     try:
         if isinstance(given, Mapping):

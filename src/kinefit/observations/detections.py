@@ -122,13 +122,13 @@ class Detections:
         if lifted is not None:
             what = f"lifted landmarks of camera {self.camera}"
             lifted = frozen(lifted, float, what, (*points.shape[:3], 3), self.source)
-        for part, surety, count in (("hands", "hand_confidence", (2, 21)), ("face", "face_confidence", (478,))):
-            values, confidences = getattr(self, part), getattr(self, surety)
+        for part, confidence_of, count in (("hands", "hand_confidence", (2, 21)), ("face", "face_confidence", (478,))):
+            values, confidences = getattr(self, part), getattr(self, confidence_of)
             if values is not None or confidences is not None:
                 what, shape = f"{part} of camera {self.camera}", (*points.shape[:2], *count)
                 values = frozen(values, float, what, (*shape, 2), self.source)
                 confidences = frozen(confidences, float, f"the confidence of {what}", shape, self.source)
-            freeze(self, **{part: values, surety: confidences})
+            freeze(self, **{part: values, confidence_of: confidences})
         ends = np.concatenate([[0], np.cumsum(runs, dtype=np.int64)])[starts]
         sizes, pixels = np.diff(ends)[np.diff(starts) > 0], math.prod(self.size)
         if min(self.size) < 1 or pixels > MAX_IMAGE_PIXELS or np.any(sizes != pixels):

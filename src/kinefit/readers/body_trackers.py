@@ -1,4 +1,4 @@
-"""Trackers fixed on the body: a table of times, names, places and, where they were measured, quaternions."""
+"""Read body-worn trackers: a table of times, names, positions and optional quaternions."""
 
 from __future__ import annotations
 
@@ -13,39 +13,40 @@ from kinefit.errors import FileError, ObservationError, choices
 from kinefit.geometry import se3
 from kinefit.observations import BodyTrackerVideo
 
-_PLACE, _TURN = ("time_s", "x", "y", "z"), ("qw", "qx", "qy", "qz")
+_POSITION_COLUMNS = ("time_s", "x", "y", "z")
+_QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
 _REMEDY = "Give a table with the columns time_s, tracker, x, y, z [s, m] and, for orientations, qw, qx, qy, qz."
-_MIN_QUATERNION_NORM = 0.5  # of a unit quaternion that was rounded, there is more
+_MAX_NORM_ERROR = 0.5  # of a unit quaternion; rounding changes it by much less
 
 
 def read_body_trackers(
     path: Path, names: Iterable[str], sensor: str = "trackers", *, time_offset: float = 0.0,
     T_world_file: ArrayLike | None = None,
 ) -> BodyTrackerVideo:  # fmt: skip
-    """Named trackers of a table with the columns time_s, tracker, x, y, z [s, m], and qw, qx, qy, qz where measured.
+    """Read named trackers of a table with the columns time_s, tracker, x, y, z [s, m], and optional qw, qx, qy, qz.
 
     Parameters
     ----------
-    names : of the trackers that are read; rows of others are not
+    names : of the trackers to read; other rows are skipped
     time_offset : float [s] added to the times
     T_world_file : (4, 4) [m] from the frame of the table to the world; default: they are the same
 
     Raises
     ------
     FileError
-        No such table, other columns, a number that is none, a quaternion that is none, a tracker twice at one time.
+        No such table, other columns, an invalid number or quaternion, a tracker twice at one time.
     ObservationError
-        A name that the table does not have; a single time, of which no rate follows.
+        A name that the table lacks; a single time, which gives no rate.
     """
     names, T = tuple(names), np.eye(4) if T_world_file is None else np.asarray(T_world_file, float)
-    labels, values = read_table(path, _PLACE, _REMEDY, text="tracker", optional=_TURN)
+    labels, values = read_table(path, _POSITION_COLUMNS, _REMEDY, text="tracker", optional=_QUATERNION_COLUMNS)
     for name in names:
         if name not in labels:
             remedy = "Correct the name in `points` of this [[tracker]]."
             raise ObservationError(choices("tracker", name, list(dict.fromkeys(labels))), file=path, remedy=remedy)
     turned = np.isfinite(values[:, 4:]).all(axis=1)
     norm = np.linalg.norm(values[:, 4:], axis=1)
-    odd = ~np.isnan(values[:, 4:]).all(axis=1) & ~(turned & (np.abs(norm - 1.0) < _MIN_QUATERNION_NORM))
+    odd = ~np.isnan(values[:, 4:]).all(axis=1) & ~(turned & (np.abs(norm - 1.0) < _MAX_NORM_ERROR))
     for bad, problem in (
         (~np.isfinite(values[:, :4]).all(axis=1), "a number that is not finite"),
         (odd, "qw, qx, qy, qz are no unit quaternion"),
@@ -59,7 +60,7 @@ def read_body_trackers(
     times, frame = np.unique(values[:, 0], return_inverse=True)
     x, R = np.full((len(times), len(names), 3), np.nan), np.full((len(times), len(names), 3, 3), np.nan)
     for k, name in enumerate(names):
-        own = np.array([other == name for other in labels])
+        own = np.array([label == name for label in labels])
         x[frame[own], k] = se3.apply(T, values[own, 1:4])
         R[frame[own & turned], k] = T[:3, :3] @ se3.rotation_from_quaternion(values[own & turned, 4:])
     rate = rate_of(times, path, _REMEDY)

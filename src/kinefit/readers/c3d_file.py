@@ -1,7 +1,7 @@
-"""C3D files as they lie on disk: header, parameters and 3D points, every offset checked against the file.
+"""Parser of C3D files: header, parameters and 3D points, every offset checked against the file's size.
 
-Written here rather than taken from ezc3d, which crashes on some damaged files, reads truncated ones as if they were
-whole, and refuses big-endian ones and unexpected types. Format: C3D User Guide, Motion Lab Systems, 2008.
+ezc3d is no alternative: it crashes on some damaged files, reads truncated ones without an error, and rejects big-endian
+ones and unexpected types. Source: C3D User Guide, Motion Lab Systems, 2008.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from kinefit.errors import FileError
 
-_BLOCK = 512
+_BLOCK_BYTES = 512
 _REMEDY = "Export the file again, or repair it with a C3D editor such as Mokka."
-_EVENTS, _MOST_EVENTS = 12345, 18  # key and room of the header's events
+_EVENT_KEY = 12345  # of the header's events
+_MAX_EVENTS = 18  # in the header
 _PROCESSORS = {84: "intel", 85: "dec", 86: "mips"}
-_SIZES = {-1: 1, 1: 1, 2: 2, 4: 4}
+_SIZES = {-1: 1, 1: 1, 2: 2, 4: 4}  # [bytes] of the parameter types
 
 Values = list[str] | NDArray
 
@@ -27,9 +28,12 @@ Values = list[str] | NDArray
 class C3d:
     """Content of a C3D file, in the file's own units.
 
-    points : (F, N, 3); missing : (F, N) bool; residual : (F, N); parameters : {"GROUP:NAME": list of str or array};
-    analog : (F, A) raw samples of every frame, channel by channel for each of `samples` times; events : of the header,
-    (label, seconds).
+    Parameters
+    ----------
+    points, missing, residual : (F, N, 3), (F, N) bool, (F, N)
+    parameters : {"GROUP:NAME": list of str or array}
+    analog : (F, A) raw samples of every frame, channel by channel for each of `samples` times
+    events : (label, time [s]) of the header
     """
 
     points: NDArray
@@ -44,16 +48,16 @@ class C3d:
 
 
 def read_c3d(path: Path) -> C3d:
-    """Read the points and all parameters; FileError for whatever is damaged, and what could be read."""
+    """Read the points and all parameters; raises FileError for a damaged or truncated file."""
     try:
         raw = path.read_bytes()
     except FileNotFoundError as error:
         raise FileError("no such file", file=path) from error
     except OSError as error:
         raise FileError(f"cannot be read ({error})", file=path) from error
-    if len(raw) < 2 * _BLOCK or raw[1] != 0x50 or raw[0] == 0:
+    if len(raw) < 2 * _BLOCK_BYTES or raw[1] != 0x50 or raw[0] == 0:
         raise FileError(f"not a C3D file ({len(raw)} bytes)", file=path, remedy="Name a C3D file of your system.")
-    section = (raw[0] - 1) * _BLOCK
+    section = (raw[0] - 1) * _BLOCK_BYTES
     processor = _PROCESSORS.get(raw[section + 3]) if section + 4 <= len(raw) else None
     if processor is None:
         raise FileError("no parameter section where the header points to", file=path, place="header", remedy=_REMEDY)
@@ -78,8 +82,8 @@ def _numbers(raw: bytes, kind: int, processor: str) -> NDArray:
 def _read_parameters(raw: bytes, section: int, processor: str, path: Path) -> dict[str, Values]:
     groups: dict[int, str] = {}
     records: list[tuple[int, str, bytes]] = []
-    data_start = (int(np.frombuffer(raw[16:18], ">u2" if processor == "mips" else "<u2")[0]) - 1) * _BLOCK
-    end = min(len(raw), max(section + raw[section + 2] * _BLOCK, data_start))  # some writers state too few blocks
+    data_start = (int(np.frombuffer(raw[16:18], ">u2" if processor == "mips" else "<u2")[0]) - 1) * _BLOCK_BYTES
+    end = min(len(raw), max(section + raw[section + 2] * _BLOCK_BYTES, data_start))  # some writers state too few blocks
     at, last = section + 4, "the first record"
     while at + 2 <= end and raw[at]:
         length = abs(int(np.int8(raw[at] - 256 if raw[at] > 127 else raw[at])))
@@ -122,7 +126,7 @@ def _values(record: bytes, processor: str, key: str, path: Path) -> Values:
     if kind != -1:
         try:
             return _numbers(data, kind, processor).reshape(shape, order="F")
-        except ValueError as error:  # of no numbers, in dimensions beyond all bounds
+        except ValueError as error:  # no numbers, in impossible dimensions
             raise FileError(f"dimensions that cannot be ({error})", file=path, place=key, remedy=_REMEDY) from error
     width = shape[0] if shape else 1
     cells = [data[i : i + width] for i in range(0, size, width)] if size else []
@@ -153,7 +157,7 @@ def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path
         raise FileError(f"scale {scale:g}, rate {rate:g} Hz", file=path, place="header", remedy=_REMEDY)
     width = 4 if scale < 0 else 2
     step = (4 * count + analog) * width
-    begin = (start - 1) * _BLOCK
+    begin = (start - 1) * _BLOCK_BYTES
     room = (len(raw) - begin) // step if step and start > 1 else 0
     first, frames = _frames(parameters, first, last, room)
     if count == 0 or frames <= 0:
@@ -179,18 +183,18 @@ def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path
 
 
 def _header_events(raw: bytes, processor: str) -> tuple[tuple[str, float], ...]:
-    """Labels and times [s] of the header's events, of four characters each; none where its key is not there."""
+    """Labels (four characters) and times [s] of the header's events; none without the key."""
     key, count = np.frombuffer(raw[298:302], ">u2" if processor == "mips" else "<u2")
-    if key != _EVENTS or not 0 < count <= _MOST_EVENTS:
+    if key != _EVENT_KEY or not 0 < count <= _MAX_EVENTS:
         return ()
     with np.errstate(invalid="ignore"):
-        times = _numbers(raw[304 : 304 + 4 * _MOST_EVENTS], 4, processor)[:count].astype(float)
+        times = _numbers(raw[304 : 304 + 4 * _MAX_EVENTS], 4, processor)[:count].astype(float)
     labels = [_text(raw[396 + 4 * i : 400 + 4 * i]) for i in range(count)]
     return tuple((label, float(t)) for label, t in zip(labels, times, strict=True) if np.isfinite(t))
 
 
 def _frames(parameters: dict[str, Values], first: int, last: int, room: int) -> tuple[int, int]:
-    """First frame and count of frames: of the header, POINT:FRAMES or TRIAL, whichever the file can hold."""
+    """First frame and number of frames: of the header, POINT:FRAMES or TRIAL, the largest that fits the file."""
     counts = [last - first + 1]
     stated = _number(parameters, "POINT:FRAMES")
     if stated is not None and np.isfinite(stated):

@@ -1,4 +1,4 @@
-"""Joints that somebody clicked in the images of one time or of several, as JSON."""
+"""Manual annotations: joints that a user clicked in the images of one or several times, as JSON."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from kinefit._files import read_bytes, repeated
 from kinefit.errors import FileError
 
-_MAX_NUMBER = 1e9  # frames and pixels; no recording has as many
+_MAX_NUMBER = 1e9  # of a frame or a pixel; no recording has as many
 _FORM = 'Write {"step": 0, "points": {"CAMERA": {"r_knee": [812.0, 401.5], ...}, ...}}, or a list of these.'
 
 
 @dataclass(frozen=True)
 class Clicks:
-    """Clicked points of one step.
+    """Manually annotated points of one step.
 
     Parameters
     ----------
@@ -34,23 +34,23 @@ class Clicks:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Landmarks that were clicked in two images or more, in the order of the first clicks."""
+        """Landmarks clicked in two or more images, in the order of the first clicks."""
         return tuple(repeated(name for points in self.points.values() for name in points))
 
     def places(self, camera: str) -> NDArray:
-        """(N, 2) [px] of `names` in a camera's image; NaN where not clicked."""
-        told = self.points.get(camera, {})
-        return np.array([told.get(name, (np.nan, np.nan)) for name in self.names], float).reshape(-1, 2)
+        """(N, 2) [px] of `names` in a camera's image; NaN if not clicked."""
+        points = self.points.get(camera, {})
+        return np.array([points.get(name, (np.nan, np.nan)) for name in self.names], float).reshape(-1, 2)
 
 
 def clicks_text(steps: Sequence[Clicks]) -> str:
-    """Clicks of one step or of several as JSON, as `read_clicks` takes it."""
+    """Clicks of one or several steps as JSON, the format of `read_clicks`."""
     content = [{"step": of.step, "points": {c: dict(points) for c, points in of.points.items()}} for of in steps]
     return json.dumps(content if len(content) > 1 else content[0], indent=1) + "\n"
 
 
 def read_clicks(path: str | PathLike[str]) -> tuple[Clicks, ...]:
-    """Clicked points of every step in a JSON file, in the order of the steps; one at least.
+    """Read the clicked points of every step in a JSON file, at least one, in the order of the steps.
 
     Raises
     ------
@@ -58,11 +58,12 @@ def read_clicks(path: str | PathLike[str]) -> tuple[Clicks, ...]:
         Not readable, not JSON, of another form, or a step twice.
     """
     try:
-        told = json.loads(read_bytes(Path(path)))
+        content = json.loads(read_bytes(Path(path)))
     except (ValueError, RecursionError) as error:
         raise FileError(f"is no JSON ({error})", file=path, remedy=_FORM) from error
     try:
-        steps = sorted(map(clicks_of, told if isinstance(told, list) and told else [told]), key=lambda of: of.step)
+        several = content if isinstance(content, list) and content else [content]
+        steps = sorted(map(clicks_of, several), key=lambda of: of.step)
     except FileError as error:
         raise FileError(error.problem, file=path, place=error.place, remedy=error.remedy) from error
     if twice := repeated(str(of.step) for of in steps):
@@ -70,15 +71,15 @@ def read_clicks(path: str | PathLike[str]) -> tuple[Clicks, ...]:
     return tuple(steps)
 
 
-def clicks_of(told: Any) -> Clicks:
-    """Clicked points of a JSON value; FileError where it has another form."""
-    if not isinstance(told, dict) or not isinstance(told.get("points"), dict):
+def clicks_of(value: Any) -> Clicks:
+    """Clicked points of a JSON value; raises FileError if it has another form."""
+    if not isinstance(value, dict) or not isinstance(value.get("points"), dict):
         raise FileError("holds no points", remedy=_FORM)
-    step = told.get("step", 0)
+    step = value.get("step", 0)
     if not isinstance(step, int) or isinstance(step, bool) or not 0 <= step < _MAX_NUMBER:
         raise FileError(f"step {step!r} is no number of a frame", remedy=_FORM)
     points: dict[str, dict[str, tuple[float, float]]] = {}
-    for camera, of in told["points"].items():
+    for camera, of in value["points"].items():
         if not isinstance(of, dict):
             raise FileError("holds no points", place=f"camera {camera}", remedy=_FORM)
         points[camera] = {}

@@ -1,24 +1,24 @@
 """The file of the built-in detector, `*.npz`, version 1: people of one video, their landmarks and masks.
 
 A compressed archive of numpy arrays (`numpy.load(path, allow_pickle=False)` reads it); F frames, P people, pixels of
-the video's picture, the centre of the first pixel is (0, 0):
+the video's image, the centre of the first pixel is (0, 0):
 
     format ()                  text "kinefit detections"
     version ()                 1
-    key ()                     text that tells the video, the networks and the settings: another key, another result
+    key ()                     text that identifies the video, networks and settings: another key, another result
     camera ()                  text
     rate ()                    [Hz]
     size (2,)                  width, height [px]
-    points (F, P, 33, 2)       float32 [px], landmarks of MEDIAPIPE_33; NaN where a person is not seen
-    confidence (F, P, 33)      float32, 0..1; 0 where a person is not seen
-    mask_runs (N,)             uint32, run lengths down the columns, beginning outside of the person (COCO's code)
-    lifted (F, P, 33, 3)       float32 [m], optional: landmarks in space, see Detections; NaN where a person is not seen
+    points (F, P, 33, 2)       float32 [px], landmarks of MEDIAPIPE_33; NaN where a person is not detected
+    confidence (F, P, 33)      float32, 0..1; 0 where a person is not detected
+    mask_runs (N,)             uint32, run lengths down the columns, beginning outside of the person (COCO's RLE)
+    lifted (F, P, 33, 3)       float32 [m], optional: landmarks in space, see Detections; NaN where not detected
     hands (F, P, 2, 21, 2)     float32 [px], optional: landmarks of MEDIAPIPE_HAND_21 of the left and the right hand
-    hand_confidence (F, P, 2, 21)   float32, 0..1, with hands; 0 where a hand is not seen
-    face (F, P, 478, 2)        float32 [px], optional: points of MEDIAPIPE_478; NaN where a face is not seen
-    face_confidence (F, P, 478)     float32, 0..1, with face; 0 where a face is not seen
+    hand_confidence (F, P, 2, 21)   float32, 0..1, with hands; 0 where a hand is not detected
+    face (F, P, 478, 2)        float32 [px], optional: points of MEDIAPIPE_478; NaN where a face is not detected
+    face_confidence (F, P, 478)     float32, 0..1, with face; 0 where a face is not detected
     times (F,)                 float64 [s], optional: when each frame is shown, from the first on; without: at the rate
-    mask_starts (F * P + 1,)   where each mask begins in mask_runs, by frame, then person; the same twice: no mask
+    mask_starts (F * P + 1,)   start of each mask in mask_runs, by frame, then person; two equal starts: no mask
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _DAMAGE = (OSError, ValueError, KeyError, TypeError)
 
 
 def detections_file(take: str | PathLike[str], camera: str) -> Path:
-    """Where `kinefit detect` leaves what it saw in a camera of a take: TAKE-detect/CAMERA.npz beside the take file."""
+    """Path of the detections of one camera of a take, as `kinefit detect` writes them: TAKE-detect/CAMERA.npz."""
     take = Path(take)
     safe = "".join(c if c.isalnum() or c in " ._-" else "_" for c in camera)
     return take.with_name(f"{take.stem}-detect") / f"{safe}.npz"
@@ -48,7 +48,7 @@ def detections_file(take: str | PathLike[str], camera: str) -> Path:
 
 @checked
 def read_detections(path: str | PathLike[str]) -> Detections:
-    """Read what the built-in detector saw in one video.
+    """Read the detections of one video, as the built-in detector wrote them.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def read_detections(path: str | PathLike[str]) -> Detections:
 
 
 def detections_key(path: str | PathLike[str]) -> str | None:
-    """What a file of detections was made from and how; None where there is no such file, or it is damaged."""
+    """The key of a file of detections (its video, networks and settings); None if it is missing or damaged."""
     try:
         return str(_load(Path(path), "key")["key"])
     except (FileError, *_DAMAGE):
@@ -87,7 +87,7 @@ def detections_key(path: str | PathLike[str]) -> str | None:
 
 
 def _anew(file: Path, *options: str) -> str:
-    """The command that makes a file of detections."""
+    """The command that makes a file of detections, for a message."""
     folder = file.parent if file.parent.name else file.absolute().parent
     take = folder.with_name(f"{folder.name.removesuffix('-detect')}.toml")
     video = next((p for p in folder.glob(f"{escape(file.stem.removesuffix('-detect'))}.*") if p.suffix != ".npz"), None)
@@ -95,7 +95,7 @@ def _anew(file: Path, *options: str) -> str:
 
 
 def _load(file: Path, *names: str) -> dict[str, NDArray]:
-    """Arrays of these names, default all, of a file that is whole and of the right kind."""
+    """Arrays of these names, default all, of a complete file of this format and version."""
     wanted = {*names, "format", "version"} if names else ()
     try:
         arrays = read_npz(file, *wanted, remedy="")

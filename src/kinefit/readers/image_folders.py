@@ -14,24 +14,24 @@ from kinefit.errors import FileError, ObservationError
 from kinefit.readers.depth.images import listed
 
 ENDINGS = (".png", ".jpg", ".jpeg")
-_MISSING = 1.5  # times the usual step of the numbers in the names, from which an image between two is missing
+_MAX_NUMBER_STEP = 1.5  # of the numbers in two names, in median steps: with more an image is missing
 
 
 class ImageFolder:
-    """Images of a folder, or of a pattern of names, as the frames of a video; each is read when it is asked for.
+    """Images of a folder, or of a pattern of names, as the frames of a video; read on demand.
 
     Parameters
     ----------
     path : Path
     rate : float [Hz]
-        Images state none: None is refused.
+        Images state none; None raises.
 
     Raises
     ------
     FileError
         No images; an image that cannot be decoded.
     ObservationError
-        No rate; numbers in the names that leave some out.
+        No rate; numbers in the names with a gap.
     """
 
     def __init__(self, path: Path, rate: float | None) -> None:
@@ -43,14 +43,14 @@ class ImageFolder:
             raise ObservationError(problem, file=path, remedy="Write rate = ... (frames per second) into [take].")
         _check_numbers(files)
         self._files, self.rate = files, float(rate)
-        self._picture: tuple[int, NDArray[np.uint8]] = (0, read_picture(files[0]))
-        self.size: tuple[int, int] = self._picture[1].shape[1::-1]
+        self._latest: tuple[int, NDArray[np.uint8]] = (0, read_picture(files[0]))
+        self.size: tuple[int, int] = self._latest[1].shape[1::-1]
 
     def __len__(self) -> int:
         return len(self._files)
 
     def close(self) -> None:
-        """Nothing stays open."""
+        """Do nothing: no file stays open."""
 
     @property
     def times(self) -> NDArray:
@@ -58,19 +58,19 @@ class ImageFolder:
         return np.arange(len(self)) / self.rate
 
     def image(self, i: int) -> NDArray[np.uint8]:
-        """Frame `i` as (H, W, 3) uint8 RGB."""
-        if self._picture[0] != i:
+        """Frame `i` as (H, W, 3) uint8 RGB; raises FileError for a damaged image, or one of another size."""
+        if self._latest[0] != i:
             picture = read_picture(self._files[i])
             if picture.shape[1::-1] != self.size:
                 sizes = [f"{width}x{height}" for width, height in (picture.shape[1::-1], self.size)]
                 problem = f"{sizes[0]} px, but the first image has {sizes[1]}"
                 raise FileError(problem, file=self._files[i], remedy="All images of a camera are of one size.")
-            self._picture = i, picture
-        return self._picture[1].copy()
+            self._latest = i, picture
+        return self._latest[1].copy()
 
 
 def images_in(path: Path, endings: Sequence[str] = ENDINGS) -> list[Path]:
-    """Files of a folder or a pattern that end so (PNG and JPEG), in the order of the numbers in their names."""
+    """Image files of a folder or a pattern, in the order of the numbers in their names."""
     return [file for file in listed(path) if file.suffix.lower() in endings]
 
 
@@ -85,7 +85,7 @@ def _check_numbers(files: list[Path]) -> None:
             f"two images of one number, as {files[i].name} and {files[i + 1].name}", file=files[0].parent,
             remedy="Name those of this camera by a pattern: video = \"folder/left_*.png\".",
         )  # fmt: skip
-    if len(steps) and (steps > _MISSING * np.sort(steps)[(len(steps) - 1) // 2]).any():
+    if len(steps) and (steps > _MAX_NUMBER_STEP * np.sort(steps)[(len(steps) - 1) // 2]).any():
         i = int(np.argmax(steps))
         raise ObservationError(
             f"images are missing between {files[i].name} and {files[i + 1].name}", file=files[0].parent,

@@ -1,4 +1,4 @@
-"""Arrays of keypoints, as files of all formats come to them, and their records."""
+"""Arrays of keypoints, the common form of all file formats, and their records."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ if TYPE_CHECKING:
 FACE_POINTS = 468, 478
 """Points of a face mesh without and with irises."""
 
-_MAX_NORMALISED = 2.0  # of coordinates in shares of an image, which may lie beyond its border
+_MAX_NORMALISED = 2.0  # coordinate as a share of the image size, which may lie outside of the image
 
 
 def cut_frames(items: Any, frames: tuple[int, int] | None, file: Path) -> tuple[Any, int]:
-    """Slice of the frames [start, stop) and its start; ObservationError where there are not so many."""
+    """Slice of the frames [start, stop) and its start; raises ObservationError if there are fewer."""
     if frames is None:
         return items, 0
     if not 0 <= frames[0] < frames[1] <= len(items):
@@ -36,7 +36,7 @@ def cut_frames(items: Any, frames: tuple[int, int] | None, file: Path) -> tuple[
 
 
 def face_mesh(data: NDArray, path: Path) -> NDArray:
-    """(F, 478, 3) x, y [px] and 1 where seen, of a face mesh (F, 468 or 478, 3) whose third column is a depth.
+    """(F, 478, 3) x, y [px] and 1 where detected, of a face mesh (F, 468 or 478, 3) whose third column is a depth.
 
     Raises
     ------
@@ -55,7 +55,10 @@ def keypoint_record(
     data: NDArray, camera: str, keypoint_set: str, rate: float, time_offset: float, start: int, source: Path,
     image_frame: ImageFrame | None,
 ) -> Keypoints:  # fmt: skip
-    """Record from (F, P, K, 3) x, y, confidence with zeros where unseen; ObservationError for a rate that is none."""
+    """Make a record of (F, P, K, 3) x, y [px], confidence 0..1; zeros where a point was not detected.
+
+    rate [Hz], time_offset [s]; raises ObservationError for a rate that is not positive.
+    """
     if not rate > 0 or not np.isfinite(rate):
         raise ObservationError(f"rate {rate} Hz", file=source, remedy="Give a positive frame rate.")
     confidence = np.clip(data[..., 2], 0, 1)

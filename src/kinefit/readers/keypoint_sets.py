@@ -41,10 +41,10 @@ KEYPOINT_SETS: dict[str, tuple[str, ...]] = {
 }  # names in each detector's own order; of OpenPose both hands come after the body, left first
 
 HAND_POINTS = 21
-"""Points of one hand of every detector."""
+"""Number of points of one hand, the same for every detector."""
 
 OPENPOSE_HANDS = "BODY_25_HANDS"
-"""The set whose hands OpenPose's files have apart from the body."""
+"""The set whose hands OpenPose writes separately from the body."""
 
 MEDIAPIPE_SETS = ("MEDIAPIPE_33", "MEDIAPIPE_75")
 """Sets of MediaPipe, without and with hands."""
@@ -57,7 +57,7 @@ SETS_WITH_HANDS = (OPENPOSE_HANDS, "COCO_WHOLEBODY_133", "MEDIAPIPE_75")
 
 
 def keypoint_names(keypoint_set: str) -> tuple[str, ...]:
-    """Names of a keypoint set in the detector's order; ObservationError lists the sets that exist."""
+    """Names of a keypoint set in the detector's order; raises ObservationError for an unknown set."""
     if keypoint_set not in KEYPOINT_SETS:
         raise ObservationError(choices("keypoint set", keypoint_set, KEYPOINT_SETS))
     return KEYPOINT_SETS[keypoint_set]

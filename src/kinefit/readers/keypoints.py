@@ -1,4 +1,4 @@
-"""2D keypoints of detectors: OpenPose json folders, MediaPipe arrays, caliscope tables."""
+"""Read 2D keypoints of detectors: OpenPose json folders, MediaPipe arrays, caliscope tables."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from kinefit.readers.keypoint_sets import HAND_POINTS, KEYPOINT_SETS, MEDIAPIPE_
 if TYPE_CHECKING:
     from kinefit.geometry.camera import ImageFrame
 
-_NO_HAND = [0.0] * (3 * HAND_POINTS)
-_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.IGNORECASE)
+_MISSING_HAND = [0.0] * (3 * HAND_POINTS)
+_FRAME_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.IGNORECASE)
 
 
 class OpenPosePerson(msgspec.Struct):
-    """One person of a frame: x, y, confidence of point after point; hands where the detector was asked for them."""
+    """One person of a frame: x, y [px], confidence of each point; hands if the detector ran on them."""
 
     pose_keypoints_2d: list[float]
     hand_left_keypoints_2d: list[float] = []
     hand_right_keypoints_2d: list[float] = []
 
     def with_hands(self) -> list[float]:
-        """The body, then the left and the right hand; zero where a hand was not looked for."""
-        left, right = (hand or _NO_HAND for hand in (self.hand_left_keypoints_2d, self.hand_right_keypoints_2d))
+        """Numbers (x, y [px], confidence) of the body, the left and the right hand; zeros without a hand."""
+        left, right = (hand or _MISSING_HAND for hand in (self.hand_left_keypoints_2d, self.hand_right_keypoints_2d))
         return [*self.pose_keypoints_2d, *left, *right]
 
 
@@ -52,22 +52,22 @@ def read_openpose(
     folder: str | PathLike[str], *, camera: str, rate: float, keypoint_set: str = "BODY_25B",
     frames: tuple[int, int] | None = None, time_offset: float = 0.0, image_frame: ImageFrame | None = None,
 ) -> Keypoints:  # fmt: skip
-    """Read a folder with one json file per frame, as OpenPose and its followers write them.
+    """Read a folder with one json file per frame, in the format of OpenPose.
 
     Parameters
     ----------
     folder : path
-        Files are taken in the order of the frame number that ends their name; the first one is frame 0. Or one file, of
-        one frame, in which there may be nobody.
+        Files are read in the order of the frame number at the end of their name; the first one is frame 0. Or one file
+        of one frame, which may have no people.
     camera : str
     rate : float [Hz]
     keypoint_set : str
-        One of `KEYPOINT_SETS`; the files do not tell it.
+        One of `KEYPOINT_SETS`; the files do not state it.
     frames : (start, stop), optional
-        Only these; their times stay what they were.
+        Only these; their times are kept.
     time_offset : float [s]
     image_frame : ImageFrame, optional
-        The image frame the coordinates are in, if it is not the calibration's.
+        Image frame of the coordinates, if it is not the calibration's.
 
     Returns
     -------
@@ -77,7 +77,7 @@ def read_openpose(
     Raises
     ------
     ObservationError
-        A frame number that is missing or there twice, broken json, NaN, another number of keypoints, nobody at all.
+        A missing or repeated frame number, broken json, NaN, a wrong number of keypoints, no people.
     FileError
         No such folder, or no json in it.
     """
@@ -107,8 +107,8 @@ def read_mediapipe(
     ----------
     path : path
         (F, 33, 3), or (F, 75, 3) with the left and the right hand after the pose: x, y [px] in the video's image
-        frame, visibility; frames with nobody are all NaN or all zero, as is a hand that is not seen.
-        (F, 478, 3), or (F, 468, 3) without irises, is a face mesh: x, y [px], and a depth that is not used.
+        frame, visibility; all NaN or all zero in frames without a person, or without a hand. (F, 478, 3), or
+        (F, 468, 3) without irises, is a face mesh: x, y [px], and a depth, which is ignored.
     camera, rate, frames, time_offset
         As in `read_openpose`.
     image_frame : ImageFrame, optional
@@ -117,7 +117,7 @@ def read_mediapipe(
     Raises
     ------
     ObservationError
-        Another shape, single NaNs, nobody at all; a face mesh in shares of the image's size in place of pixels.
+        Another shape, single NaNs, no person; a face mesh in shares of the image size.
     FileError
         Missing or not an array file.
     """
@@ -158,8 +158,8 @@ _GAPS, _PORTS = 20, 100  # indices for each that is there, and cameras, beyond w
 def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) -> dict[str, Keypoints]:
     """Read MediaPipe's landmarks of all cameras from a table of caliscope (pyxy3d): xy_*.csv.
 
-    Those of the pose are `MEDIAPIPE_33`; with hands, whose indices begin at 100 (right) and 200 (left), `MEDIAPIPE_75`.
-    Points of the face, from 500 on, are left out.
+    The pose alone is `MEDIAPIPE_33`; with hands, whose indices begin at 100 (right) and 200 (left), `MEDIAPIPE_75`.
+    Points of the face, from 500 on, are skipped.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
     Returns
     -------
     {"cam_0": Keypoints, ...}
-        One entry per port; frames are sync indices from the smallest on; confidence is 1 where seen.
+        One entry per port; frames are sync indices from the smallest on; confidence is 1 where detected.
 
     Raises
     ------
@@ -259,7 +259,7 @@ def _caliscope_camera(
 
 
 def _numbered_files(folder: Path) -> list[Path]:
-    """Json files of a folder by frame number, without gaps."""
+    """Json files of a folder in the order of their frame numbers; raises for a gap."""
     if folder.suffix.lower() == ".json" and folder.is_file():
         return [folder]
     if not folder.is_dir():
@@ -269,7 +269,7 @@ def _numbered_files(folder: Path) -> list[Path]:
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() != ".json":
             continue
-        match = _NUMBER.search(path.name)
+        match = _FRAME_NUMBER.search(path.name)
         if not match:
             raise ObservationError("no frame number in this name", file=path, remedy="Expected NAME_0012.json.")
         number = int(match[1])
@@ -295,7 +295,7 @@ def _numbered_files(folder: Path) -> list[Path]:
 
 
 def _read_people(path: Path, count: int, keypoint_set: str) -> NDArray:
-    """(P, K, 3): x, y, confidence of all people of one frame."""
+    """(P, K, 3) x, y [px], confidence of all people of one frame."""
     raw = path.read_bytes()
     try:
         people = decode_openpose(raw).people

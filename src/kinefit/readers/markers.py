@@ -1,4 +1,4 @@
-"""Marker recordings: C3D and TRC, plainly read into metres."""
+"""Read marker recordings, C3D and TRC, in metres."""
 
 from __future__ import annotations
 
@@ -15,36 +15,36 @@ from kinefit.observations import MarkerEvent, Markers
 from kinefit.readers.c3d_file import C3d, read_c3d
 from kinefit.readers.units import LENGTHS, worth
 
-_TINY = 0.01  # [m] from the origin: no further is who moves in metres that are read as millimetres
-_COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  # points of a C3D that are no positions
+_MAX_NEAR_ORIGIN = 0.01  # [m] from the origin, of a person in metres that are read as millimetres
+_COMPUTED_POINTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  # of a C3D: no positions
 _STATE = 'State it: --unit mm on the command line, unit="mm" from Python, unit = "mm" in a take.'
 _TRC_REMEDY = "Expected: PathFileType, names and values of DataRate NumFrames NumMarkers Units, marker names, rows."
 
 
 @checked
 def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Markers:
-    """Read a C3D or TRC file, told apart by its content.
+    """Read a C3D or TRC file; its content decides which.
 
     Parameters
     ----------
     path : path
     unit : str, optional
-        "m", "cm", "mm", "in" ...: only for files that do not tell it, or tell it wrongly.
+        "m", "cm", "mm", "in" ...: only for files that do not state it, or state a wrong one.
 
     Returns
     -------
     Markers
-        Positions [m] in the file's own world. Not seen (NaN) is what has a negative residual, an empty cell, or lies
-        exactly at the origin. Angles, forces and the like that a C3D keeps among its points are left out. Points
-        without a label are called "*1", "*2" ...; a label that is there twice gets the suffix "_2". Events of a C3D are
-        kept.
+        Positions [m] in the file's own world; NaN for a negative residual, an empty cell, or a point exactly at the
+        origin. Computed points of a C3D (angles, forces ...) are skipped. Points without a label are called "*1",
+        "*2" ...; a repeated label gets the suffix "_2". Events of a C3D are kept.
 
     Raises
     ------
     FileError
-        Missing, damaged or truncated (the message tells how many frames can be read), or neither C3D nor TRC.
+        Missing, damaged or truncated (the message has the number of readable frames), or neither C3D nor TRC.
     ObservationError
-        No or unknown unit, or two in one file; no marker, or none seen in any frame; a rate that the times contradict.
+        No or unknown unit, or two in one file; no marker, or none visible in any frame; a rate that contradicts the
+        times.
     """
     path = Path(path)
     try:
@@ -64,16 +64,16 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
 
 def _metres(unit: str | None, path: Path) -> float:
     if not unit:
-        raise ObservationError("the file tells no unit", file=path, place="units", remedy=_STATE)
+        raise ObservationError("the file states no unit", file=path, place="units", remedy=_STATE)
     metres = worth(unit, LENGTHS)
     if metres is None:
-        told = choices("unit", unit, LENGTHS)
-        raise ObservationError(told, file=path, place="units", remedy=_STATE)
+        problem = choices("unit", unit, LENGTHS)
+        raise ObservationError(problem, file=path, place="units", remedy=_STATE)
     return metres
 
 
 def _unique(names: list[str]) -> tuple[str, ...]:
-    """The same names, with "*1" for empty ones and a suffix for repeated ones."""
+    """Unique names: "*1" ... for empty ones, a suffix for repeated ones."""
     taken: Counter[str] = Counter()
     unique: list[str] = []
     for i, name in enumerate(names):
@@ -93,14 +93,15 @@ def _unseen(markers: int, frames: int, path: Path) -> ObservationError:
 
 
 def _of_one_unit(markers: Markers, path: Path) -> Markers:
-    """The same; three markers that never leave the origin by more than _TINY are of a larger unit than others."""
+    """The markers; raises ObservationError if three to half of them stay near the origin: these have another unit."""
     away = np.nan_to_num(np.linalg.norm(markers.positions, axis=-1)).max(axis=0)
-    tiny = [name for name, far in zip(markers.names, away, strict=True) if 0 < far < _TINY]
-    if 3 <= len(tiny) <= len(away) // 2 and away.max() > 10 * _TINY:  # most are of the unit that the file states
-        listed = ", ".join(tiny[:4]) + (" ..." if len(tiny) > 4 else "")
+    near = [name for name, far in zip(markers.names, away, strict=True) if 0 < far < _MAX_NEAR_ORIGIN]
+    if 3 <= len(near) <= len(away) // 2 and away.max() > 10 * _MAX_NEAR_ORIGIN:
+        listed = ", ".join(near[:4]) + (" ..." if len(near) > 4 else "")
         raise ObservationError(
-            f"{len(tiny)} of {len(away)} markers stay within {1e3 * _TINY:.0f} mm of the origin ({listed}), others go "
-            f"{away.max():.3g} m away: two units in one file", file=path, remedy="Export all markers in one unit.",
+            f"{len(near)} of {len(away)} markers stay within {1e3 * _MAX_NEAR_ORIGIN:.0f} mm of the origin ({listed}), "
+            f"others go {away.max():.3g} m away: two units in one file",
+            file=path, remedy="Export all markers in one unit.",
         )
     return markers
 
@@ -119,7 +120,7 @@ def _texts(c3d: C3d, key: str) -> list[str]:
 def _markers_of_c3d(c3d: C3d, path: Path, unit: str | None) -> Markers:
     count = c3d.points.shape[1]
     labels = (_texts(c3d, "POINT:LABELS") + [""] * count)[:count]
-    computed = {name for kind in _COMPUTED for name in _texts(c3d, f"POINT:{kind}")} - {""}
+    computed = {name for kind in _COMPUTED_POINTS for name in _texts(c3d, f"POINT:{kind}")} - {""}
     keep = [i for i, label in enumerate(labels) if label not in computed]
     if not keep:
         raise ObservationError("all points of this file are computed quantities, none is a marker", file=path)
@@ -208,7 +209,7 @@ def _trc_rows(lines: list[str], ended: bool, count: int, path: Path) -> tuple[ND
         short = width - len(cells)
         cut = number == len(lines) and not ended
         if "\t" in line and short > 0 and short % 3 == 0 and not cut:
-            cells += [""] * short  # trailing markers not seen
+            cells += [""] * short  # trailing markers without data
         elif short > 0 and cut:
             problem = f"the file is truncated: {len(rows)} frames can be read"
             raise FileError(problem, file=path, place=f"line {number}", remedy="Copy or export it again.")

@@ -1,24 +1,24 @@
 """The motion file of kinefit, `*.npz`, version 1: all of a `Motion`, its fitted body and its residuals, exactly.
 
 An uncompressed or compressed archive of numpy arrays (`numpy.load(path, allow_pickle=False)` reads it); no pickle.
-F frames, S segments, D coordinates; metres, radians, seconds, pixels; float64 unless told otherwise:
+F frames, S segments, D coordinates; metres, radians, seconds, pixels; float64 unless stated otherwise:
 
     format ()                        text "kinefit motion"
     version ()                       1
     name ()  up ()                   text; up is "x", "y", "z", "-x", "-y" or "-z", the world's vertical axis
     rate ()  times (F,)              [Hz], [s]
-    provenance ()                    JSON text: what was done with which settings; may be absent
+    provenance ()                    JSON text: processing steps and settings; optional
     Ts_world_root (F, 4, 4)          pose of the root
     angles (F, D)                    joint coordinates, named in body/coordinates
-    dof_std (F, 6 + D)               standard deviation of the root's twist (v, ω), then the angles; inf: not observed
+    dof_std (F, 6 + D)               standard deviation of the root's twist (v, ω), then the angles; inf: unobserved
     joint_std (F, S, 3)              of every joint centre along the world's axes
     quality (F,)  segment_quality (F, S)              0..1
-    body/...                         the fitted body, as `kinefit.bodies.serial` tells
+    body/...                         the fitted body, in the format of `kinefit.bodies.serial`
     residuals/SENSOR/names (K,)  segments (K,)        points of a sensor, and the segment of each
     residuals/SENSOR/unit ()         "px" or "m"
-    residuals/SENSOR/values (F, K, N)                 measured minus fitted, NaN where unseen; N = 2 or 3
+    residuals/SENSOR/values (F, K, N)                 measured minus fitted, NaN if unobserved; N = 2 or 3
     residuals/SENSOR/measured (F, K, N)  weights (F, K)
-    residuals/SENSOR/swapped (F,)    bool, left taken for right by the detector and put right
+    residuals/SENSOR/swapped (F,)    bool, the detector swapped left and right, corrected
 
 Sensor names are percent-encoded in keys.
 """
@@ -47,14 +47,14 @@ _REMEDY = "Write it again with kinefit, or copy it again from its source."
 
 
 def find_motion(path: str | PathLike[str]) -> Path:
-    """A motion file, or the one in a folder of results."""
+    """The motion file in a folder of results; any other path unchanged."""
     inside = Path(path) / "motion.npz"
     return inside if inside.is_file() else Path(path)
 
 
 @checked
 def read_motion(path: str | PathLike[str]) -> Motion:
-    """Read a motion file, or that in a folder of results.
+    """Read a motion file, or the one in a folder of results.
 
     Raises
     ------

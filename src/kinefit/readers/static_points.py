@@ -1,4 +1,4 @@
-"""Static points for a calibration: places in the pictures of things that did not move.
+"""Static points for a calibration: pixels of objects that did not move.
 
 A TOML file with one table a point, and in it the pixel of each camera that sees it, in the calibration's image:
 
@@ -20,14 +20,14 @@ from kinefit.errors import FileError, ObservationError, choices
 def read_static_points(
     path: str | PathLike[str], cameras: Sequence[str]
 ) -> dict[str, dict[str, tuple[float, float]]]:
-    """{point: {camera: (u, v)}} [px] of points that two or more of the cameras see.
+    """Read {point: {camera: (u, v)}} [px] of points that two or more cameras see.
 
     Raises
     ------
     FileError
         No such file, or not TOML.
     ObservationError
-        An unknown camera, a pixel that is not two finite numbers, a point in fewer than two cameras, no point at all.
+        An unknown camera, a pixel that is not two finite numbers, a point in fewer than two cameras, no points.
     """
     file = Path(path)
     try:

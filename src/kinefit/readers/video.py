@@ -1,4 +1,4 @@
-"""Videos, frame-exact: files, folders of images, topics of ROS 2; one (`Video`) or several in step (`VideoSet`)."""
+"""Frame-exact videos: files, image folders, topics of ROS 2; one (`Video`) or several in step (`VideoSet`)."""
 
 from __future__ import annotations
 
@@ -21,25 +21,24 @@ from kinefit.readers.video_files import VideoFile
 class Video:
     """One video, read by frame number in order of presentation: a file, or images in a folder.
 
-    The frames of a file are counted by walking through it, not taken from its header; the display rotation that phones
-    write beside the picture is applied. Images are taken in the order of the numbers in their names. `times` (N,) [s]
-    are when each frame is shown, from the first frame on; uneven where the rate varies or frames were dropped, and
-    `rate` [Hz] is then the nominal one.
+    The frames of a file are counted by reading all of it, not from its header; the display rotation that phones state
+    is applied. Images are in the order of the numbers in their names. `times` (N,) [s] are the presentation times from
+    the first frame on. They are uneven if the rate varies or frames were dropped; `rate` [Hz] is then nominal.
 
     Parameters
     ----------
     path : path
-        Whatever FFmpeg decodes; a folder of PNG or JPEG images, or a pattern of them ("cam01/img_*.png"); or a topic of
-        an MCAP recording of ROS 2 ("session.mcap/front/color/image_raw"; extra `ros`).
+        A file that FFmpeg decodes; a folder of PNG or JPEG images, or a pattern ("cam01/img_*.png"); or a topic of an
+        MCAP recording of ROS 2 ("session.mcap/front/color/image_raw"; extra `ros`).
     rate : float [Hz], optional
-        Of images, which state none: it is needed there. A file states its own, which counts.
+        Required for images, which state none; ignored for files, which state their own.
 
     Raises
     ------
     FileError
-        No such file, no video in it, or less in it than its header says; the message tells how many frames can be read.
+        No such file, no video in it, or a truncated one; the message has the number of readable frames.
     ObservationError
-        Images without a rate, or some of which are missing.
+        Images without a rate, or with a gap in their numbers.
     """
 
     def __init__(self, path: str | PathLike[str], *, rate: float | None = None) -> None:
@@ -76,45 +75,44 @@ class Video:
 
     @property
     def unevenness(self) -> str:
-        """How its frame rate varies, such as "variable frame rate, 60 Hz nominal, ..."; "" where it does not."""
+        """Description of a varying frame rate, such as "variable frame rate, 60 Hz nominal, ..."; "" if constant."""
         return unevenness(self.times, self.rate)
 
     def frame_at(self, time: float) -> int | None:
-        """Frame nearest to a time [s] from the first frame; None where that is half a frame or more outside."""
+        """Number of the frame nearest to a time [s] from the first frame; None if half a frame or more outside."""
         if not -0.5 <= time * self.rate <= self.times[-1] * self.rate + 0.5:
             return None
         return int(np.searchsorted((self.times[1:] + self.times[:-1]) / 2.0, time))
 
     def read(self, i: int) -> NDArray[np.uint8]:
-        """Frame `i` as (H, W, 3) uint8 RGB, upright."""
+        """Frame `i` as (H, W, 3) uint8 RGB, upright; raises ObservationError for a frame that is not there."""
         if not 0 <= i < len(self):
             raise ObservationError(f"no frame {i}; there are 0 to {len(self) - 1}", file=self.path)
         return self._source.image(i)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[NDArray[np.uint8]]:
-        """Frames `start` up to and without `stop` (default: the end), each as `read` gives them."""
+        """Yield frames `start` to `stop`, exclusive (default: the end), as (H, W, 3) uint8 RGB."""
         for i in range(start, len(self) if stop is None else stop):
             yield self.read(i)
 
 
 class VideoSet:
-    """Several cameras at common times: for each the image that every camera showed then.
+    """Several videos at common times: for each time, the nearest frame of every camera.
 
     Parameters
     ----------
     paths : {camera: path}
     time_offsets : {camera: float [s]}, optional
-        Added to the times of a video's frames to get the common time; 0 where not given. Each time takes the nearest
-        frame.
+        Common time minus the video's own time; default 0.
     rate : float [Hz], optional
-        Of folders of images, which state none.
+        Of image folders, which state none.
     frames : (start, stop), optional
-        Steps of the common time to use, t = step / rate, of the highest rate; default is all that every camera saw.
+        Steps of the common time to use, t = step / rate, of the highest rate; default: all that every camera recorded.
 
     Raises
     ------
     ObservationError
-        Streams of different length without `frames`; the message tells each camera's.
+        Streams of different length without `frames`; the message lists all lengths.
     """
 
     def __init__(
@@ -162,7 +160,7 @@ class VideoSet:
             video.close()
 
     def read(self, i: int) -> dict[str, NDArray[np.uint8]]:
-        """{camera: (H, W, 3) uint8 RGB} at `times[i]`."""
+        """{camera: (H, W, 3) uint8 RGB} at `times[i]`; raises ObservationError for a step that is not there."""
         if not 0 <= i < len(self):
             raise ObservationError(f"no step {i}; there are 0 to {len(self) - 1}", place="videos")
         return {camera: video.read(self._frames[camera][i]) for camera, video in self.videos.items()}
@@ -176,22 +174,22 @@ def common_frames(
     overlap: bool = False,
     file: str | PathLike[str] | None = None,
 ) -> tuple[int, int]:
-    """Steps (start, stop) of the common time t = step / rate that the frames of every stream reach.
+    """Steps (start, stop) of the common time t = step / rate that every stream covers.
 
-    Streams whose own rate is another one, or varies, may end at times that differ by up to two of their frames.
+    Streams with another or a varying rate may differ in length by up to two of their frames.
 
     Parameters
     ----------
     clocks : {stream: (N,) [s]} times of its frames in the take
     rate : float [Hz] of the take
-    frames : (start, stop), optional, steps that are asked for
-    overlap : bool, streams began and ended when they liked: without `frames`, what all saw
+    frames : (start, stop), optional, requested steps
+    overlap : bool, streams may start and end independently: without `frames`, their overlap
     file : path, optional, of the take, for messages
 
     Raises
     ------
     ObservationError
-        Streams of different length come without `frames`, or `frames` exceeds what all saw.
+        Streams of different length without `frames`, or `frames` outside of their overlap.
     """
     spans = {name: steps_of(times, rate) for name, times in clocks.items()}
     start, stop = max(begin for begin, _ in spans.values()), min(end for _, end in spans.values())

@@ -1,4 +1,4 @@
-"""Video files as FFmpeg decodes them, frame-exact: what `Video` reads a file with."""
+"""Frame-exact decoding of video files by FFmpeg; the reader of `Video` for files."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from kinefit._pictures import check_image_size
 from kinefit.errors import FileError
 from kinefit.observations.clocks import is_even, nominal_rate
 
-_FORWARD = 64  # frames that are decoded and dropped rather than sought over
-_HIDDEN = ("vp8",)  # codecs with packets that show nothing, so that packets cannot be counted
+_MAX_SKIPPED_FRAMES = 64  # decoded and dropped; over more, seeking is faster
+_CODECS_WITH_HIDDEN_FRAMES = ("vp8",)  # their packets cannot be counted: some show nothing
 _REMEDY = "Copy the file again from its source, or re-encode it."
 
 
 class VideoFile:
-    """One video file: the frames are counted by walking through it, not taken from its header."""
+    """One video file, whose frames are counted by reading all packets, as headers may be wrong."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -54,7 +54,7 @@ class VideoFile:
         return np.ascontiguousarray(np.rot90(image, self._quarter_turns)) if self._quarter_turns else image
 
     def _restart(self, i: int = 0) -> None:
-        """Let the decoder continue at or before frame `i`."""
+        """Restart the decoder at or before frame `i`."""
         if i:
             self._container.seek(self._pts[i], stream=self._stream, backward=True)
         else:
@@ -66,7 +66,7 @@ class VideoFile:
         self._next = 0  # lower bound of the frame that comes next
 
     def _decode(self, i: int) -> Any:
-        if not self._next <= i <= self._next + _FORWARD:
+        if not self._next <= i <= self._next + _MAX_SKIPPED_FRAMES:
             self._restart(i)
         for attempt in ("here", "from the start"):
             try:
@@ -89,18 +89,18 @@ class VideoFile:
         stated, span = float(self._stream.average_rate or 0), self.times[-1]
         measured = (len(self) - 1) / span if span > 0 else 0.0
         if not (stated or measured):
-            raise FileError("the video tells no frame rate", file=self.path, remedy="Give it: ffmpeg -r RATE -i ...")
+            raise FileError("the video states no frame rate", file=self.path, remedy="Give it: ffmpeg -r RATE -i ...")
         even = (rate for rate in (stated, measured) if rate and is_even(self.times, rate))
         return next(even, 0.0) or nominal_rate(self.times)
 
 
 def open_container(path: Path) -> Any:
-    """A container opened by FFmpeg, whose decoders refuse frames of more than `MAX_IMAGE_PIXELS`.
+    """Open a container by FFmpeg, with decoders limited to frames of `MAX_IMAGE_PIXELS`.
 
     Raises
     ------
     FileError
-        Not readable, or a video in it states frames that are too large.
+        Not readable, or a video with frames that are too large.
     """
     try:
         container = av.open(str(path), options={"max_pixels": str(MAX_IMAGE_PIXELS)})
@@ -132,14 +132,14 @@ def _open(path: Path) -> Any:
 
 
 def _reason(error: Exception) -> str:
-    """What FFmpeg says, without its error number and the path."""
-    if isinstance(error, MemoryError):  # also of counts in a file that cannot be
+    """FFmpeg's message, without its error number and the path."""
+    if isinstance(error, MemoryError):  # also for impossible counts in a file
         return "it claims more than there is memory for"
     return str(getattr(error, "strerror", None) or error)
 
 
 def _presentation_times(path: Path) -> list[int]:
-    """Times of all frames that are shown, sorted, in the stream's time base."""
+    """Presentation times of all frames, sorted, in the stream's time base."""
     pts: list[int | None] = []
     packets, problem = 0, ""
     with _open(path) as container:
@@ -157,21 +157,21 @@ def _presentation_times(path: Path) -> list[int]:
                         pts.append(packet.pts)
         except (av.FFmpegError, ValueError) as error:
             problem = str(error)
-        hidden = stream.codec_context.name in _HIDDEN
+        hidden = stream.codec_context.name in _CODECS_WITH_HIDDEN_FRAMES
     last = base * max((time for time in pts if time is not None), default=0)
     if not stated and last < 0.98 * duration - 3.0 / (rate or np.inf):  # the duration is rounded
         stated = int(duration * rate * 0.98) - 2
     if problem or packets < stated:
-        told = f" of {stated}" if stated > packets else ""
+        total = f" of {stated}" if stated > packets else ""
         raise FileError(
-            f"the video is truncated: {packets}{told} frames can be read" + (f" ({problem})" if problem else ""),
+            f"the video is truncated: {packets}{total} frames can be read" + (f" ({problem})" if problem else ""),
             file=path, remedy="Copy the file again, or keep its readable part: ffmpeg -i IN -c copy OUT.",
         )
     if hidden or None in pts or not base:
         pts = _decoded_times(path)
     if not pts:
         raise FileError("no frame of this video can be decoded", file=path, remedy=_REMEDY)
-    return sorted(set(pts))  # type: ignore[type-var,arg-type]  # of two frames at one time the first is shown
+    return sorted(set(pts))  # type: ignore[type-var,arg-type]  # of two frames at one time, the first counts
 
 
 def _decoded_times(path: Path) -> list[int | None]:
@@ -186,7 +186,7 @@ def _decoded_times(path: Path) -> list[int | None]:
 
 
 def _rotation(frame: Any) -> float:
-    """Counterclockwise rotation [deg] that the file asks for."""
+    """Counterclockwise display rotation [deg] that the file states."""
     data = frame.side_data.get("DISPLAYMATRIX")  # by name: PyAV up to 18 iterates over values, from 19 on over keys
     if data is None:
         return 0.0

@@ -1,4 +1,4 @@
-"""Whether rows can be used, in one pass."""
+"""Check of rows in one pass."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from kinefit._jit import jit
 
 @jit
 def sound(data, segment, count):
-    """Whether data (8, N) are finite, of weights that are not negative, on segments (N,) of so many."""
+    """Whether data (8, N) are finite, weights at least 0 and segments (N,) below `count`."""
     total, good = 0.0, True
     for q in range(8):
         line = data[q]

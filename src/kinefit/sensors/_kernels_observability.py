@@ -1,4 +1,4 @@
-"""How far the degrees of freedom of a tree move points that are seen."""
+"""Levers of the degrees of freedom of a tree on observed points."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from kinefit._jit import jit
 
 @jit
 def longest_levers(frames, screws, segments, rest, seen, root, last_dof, dof_parent, out):
-    """out (D,) [m/rad]: how far each coordinate moves the point, of those seen, that it moves furthest."""
+    """Write to out (D,) [m/rad] the longest lever of each coordinate on an observed point; seen (K,) bool."""
     out[:] = 0.0
     for k in range(segments.size):
         if seen[k]:

@@ -1,14 +1,13 @@
-"""What every kind of sensor is to the tracker, the smoother and the subject fit: three short classes.
+"""Base classes of all sensors, as the tracker, the smoother and the subject fit use them.
 
-A `Sensor` lives for a whole take. At one time it makes a `Measurement` of what it saw; the measurement is matched to
-the body (correspondences, visibility, sides: discrete, then frozen), and what is `Matched` gives rows at any state:
+A `Sensor` lives for a whole take. It turns each frame into a `Measurement`. `match` decides everything discrete
+(correspondences, visibility, sides) and freezes it; the resulting `Matched` gives linearised rows at any state:
 
     sensor.prepare(frame, scene) -> measurement.match(scene, reach) -> matched.rows(scene)
 
-`rows` is a pure function of the scene. That is what lets a solver compare costs of trial states, and a subject fit
-differentiate by anything of the body: it asks for the rows of the same match again, with a body that is a little
-different. So whatever a match refers to must have a meaning on any body of the same make: a landmark's name, a
-surface's own coordinates.
+`rows` is a pure function of the scene. So a solver can compare the costs of trial states, and a subject fit can
+differentiate with respect to the body: it asks for the rows of the same match with a slightly different body. A match
+must therefore refer to what every body with the same segments has: a landmark's name, a surface's own coordinates.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.rows import AnyRows, PairRows, ParameterRows
 from kinefit.sensors.checks import check_rows, named, of_kind
-from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
+from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.surfaces.depth_view import DepthView
 
@@ -36,11 +35,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Unknown:
-    """Something of a sensor that is not known beforehand, such as a rope's length.
+    """A sensor's own unknown, such as a rope's length, with its prior.
 
     Parameters
     ----------
-    mean, std : float, what is thought of it before anything is measured: in metres, radians, seconds, pixels.
+    mean, std : float, of the prior: in metres, radians, seconds or pixels.
     """
 
     mean: float
@@ -49,13 +48,13 @@ class Unknown:
 
 @dataclass(frozen=True, eq=False)
 class Hints:
-    """What a measurement shows of the body where nothing is known of its pose.
+    """Points and views from which a pose can be found without a prediction.
 
     Parameters
     ----------
     points, x_world : PointSet of K points of the body, and where they are (K, 3) [m]; NaN where that is unknown.
     rays : (K, 2, 3) origin [m] and unit direction in the world of the ray on which each point lies; NaN where unknown.
-    view : what a limb, or a person, can be sought in.
+    view : DepthView in which to search for a person or a limb.
     """
 
     points: PointSet | None = None
@@ -66,15 +65,15 @@ class Hints:
 
 @dataclass(frozen=True, eq=False)
 class Leftover:
-    """What the fit leaves over of one measurement, point by point or segment by segment.
+    """Residuals of one measurement after the fit, of each point or of each segment.
 
     Parameters
     ----------
     label : name under which a report has it: a camera's, a marker system's
     names : (K,) of the points, or of the segments
     segments : (K,) int
-    values : (K, N) measured minus fitted, N = 2 [px] or 3 [m]; of segments the signed median, N = 1; NaN where unseen
-    weights : (K,) robust weight in 0..1; 0 where unseen
+    values : (K, N) measured minus fitted, N = 2 [px] or 3 [m]; of segments the signed median, N = 1; NaN if unobserved
+    weights : (K,) robust weight in 0..1; 0 if unobserved
     unit : "px" or "m"
     measured : (K, N) the measurements as used; NaN for segments
     swapped : whether left and right were exchanged
@@ -99,15 +98,15 @@ class Matched(ABC):
     Attributes
     ----------
     sensor, time : name of the sensor, and when [s] it measured; those of the measurement where they are not set
-    of_points : whether its rows are single points, each with errors of its own; else those of one segment err alike.
-    shows_surface : whether it shows a surface as a whole, and so what is not where it should be.
-    lasts : share 0..1 of a point's stated variance that lasts, and so does not average out over time
-    independent : whether each channel errs by itself in it, so that residuals show how much lasts
-    turns : {segment: (3,) [rad] in its frame}, one standard deviation by which all that it says of a segment's surface
-        is turned against the bone, for as long as the take lasts
-    places : (M,) set and name of the body's points that these channels are of, "" for landmarks, where every row
-        says how far its point is off and depends on the body by that point alone; a subject fit is quicker with it.
-    cameras : (M,) number in the rig of the camera that sees each of these points; empty where none does.
+    of_points : whether rows are single points with independent errors; else the rows of one segment err alike.
+    shows_surface : whether it shows a surface as a whole, so that a missing surface contradicts the body.
+    lasts : share 0..1 of a point's stated variance that is systematic, and so does not average out over time
+    independent : whether channels err independently, so that residuals show the systematic share
+    turns : {segment: (3,) [rad] in its frame}, standard deviation of the rotation of a segment's measured surface about
+        its bone, the same for the whole take
+    places : (M,) set and name of the body's points that these channels are of, "" for landmarks. Give it only if each
+        row is the offset of its point and depends on the body by that point alone: a subject fit is faster with it.
+    cameras : (M,) number in the rig of the camera that sees each of these points; empty if none does.
     """
 
     sensor: str = ""
@@ -122,19 +121,19 @@ class Matched(ABC):
 
     @property
     def pixels(self) -> KeypointMatched | None:
-        """Its points in images as one packed block, or None: compiled fits and the smoother take such a block whole."""
+        """Its image points as one packed block for compiled fits and the smoother; None if it has none."""
         return None
 
     @property
     def key(self) -> bytes:
-        """The same for matches that make the same rows: what shows a fit that nothing discrete changes any more."""
+        """Equal for matches that make the same rows: a fit has converged once it no longer changes."""
         return b""
 
     @property
     def channels(self) -> Sequence[str] | None:
         """(M,) names, each once, of what the measurement ids of its rows (`Rows.group`; without ids, each row) are of.
 
-        Such as a marker, or a keypoint in a camera: a name means the same all through the take, whatever else is seen.
+        Such as a marker, or a keypoint in a camera: a name means the same channel in every frame.
         By default those of `places`. None numbers the channels: ids then must be the same whenever there are rows.
         Where `of_points` is False, segments are the channels.
         """
@@ -142,14 +141,14 @@ class Matched(ABC):
 
     @abstractmethod
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
-        """Rows at a scene's state: a pure function of the scene, not softened, each kind with its loss."""
+        """Rows at a scene's state, a pure function of the scene; weights without the loss, which each kind carries."""
 
     def squares(self, scene: Scene) -> NDArray:
-        """(M,) squared residual of each of its points, in variances; by default of each group of rows."""
+        """(M,) squared residual of each point, in variances; by default of each group of rows."""
         return np.concatenate([np.zeros(0), *(np.array([s for _, s in _groups(r)]) for r in self.rows(scene))])
 
     def leftovers(self, scene: Scene) -> list[Leftover]:
-        """What the fit leaves over; by default of each segment the rows' signed median, RMS and number [m]."""
+        """Residuals after the fit; by default the signed median, RMS and number of rows of each segment [m]."""
         residual, segment = [np.zeros(0)], [np.zeros(0, np.int64)]
         for rows in self.rows(scene):
             for segments in _segments(rows):
@@ -158,11 +157,11 @@ class Matched(ABC):
         return [by_segments(self.sensor, scene.body, np.concatenate(residual), np.concatenate(segment), "m")]
 
     def evidence(self, scene: Scene) -> Evidence:
-        """What it says of each segment; by default every group of rows speaks for its segments, or against them."""
+        """Evidence on each segment; by default every group of rows supports its segments or contradicts them."""
         out = np.zeros((2, len(scene.body.tree.segments)))
         for rows in self.rows(scene):
             for segments, square in _groups(rows):
-                out[int(square >= AGREES**2), list(segments)] += SHOWN
+                out[int(square >= AGREEMENT_SIGMAS**2), list(segments)] += MIN_VISIBLE_OUTLINE
         return Evidence(*out)
 
 
@@ -174,8 +173,8 @@ class Measurement(ABC):
     sensor : name of the sensor
     time : float [s]
     settled : whether a match depends on the state only in what is discrete (labels, sides), so that the fit may go to
-        its minimum under one match. False for nearest points, which are sought anew at every step.
-    within : float [m] how far at most the body is from where it is expected, as far as the sensor knows
+        its minimum under one match. False for nearest points, which change at every step.
+    within : float [m] bound on the distance of the body from its prediction; inf if the sensor knows none
     """
 
     sensor: str
@@ -185,52 +184,49 @@ class Measurement(ABC):
 
     @abstractmethod
     def match(self, scene: Scene, reach: float) -> Matched:
-        """Correspondences at a scene's state, within a distance [m]."""
+        """Correspondences at a scene's state, up to a correspondence distance [m]."""
 
     def hints(self, scene: Scene) -> Hints:
-        """What it shows where no pose is known."""
+        """Points and views for a search without a predicted pose."""
         return Hints()
 
-    def starts(self, scene: Scene, information: NDArray | None, told: Evidence) -> Sequence[BodyState]:
-        """Other states that a fit may as well begin at; a sensor that searches gives some where they are of use.
+    def starts(self, scene: Scene, information: NDArray | None, evidence: Evidence) -> Sequence[BodyState]:
+        """Alternative start states for a fit, from a sensor that searches; none by default.
 
         Parameters
         ----------
-        scene : where the body is expected
-        information : (n, n) of that, None where nothing was known
-        told : what this measurement says of the state that was found from there
+        scene : at the predicted state
+        information : (n, n) of the prediction; None without one
+        evidence : of this measurement on the state that the fit found from the prediction
         """
         return ()
 
     def better(self, new: Scene, old: Scene) -> bool | None:
-        """Whether a fit that began at one of the `starts` is to be taken in place of what was found.
-
-        None for a sensor that knows no better than the sum of what all sensors' evidence says.
-        """
+        """Whether a fit from one of the `starts` replaces the state found before; None: the evidence decides."""
         return None
 
     def depth_image(self) -> DepthSeen | None:
-        """A depth image that other sensors may ask what is in front of something."""
+        """A depth image in which other sensors look up occlusions; None without one."""
         return None
 
     def doubt(self, segments: NDArray) -> None:  # noqa: B027
-        """Know of segments (S,) bool that may be what no part of the body explains; see `Evidence.unplaced`."""
+        """Mark segments (S,) bool that an unexplained object may be; see `Evidence.unplaced`."""
 
     def compact(self) -> Measurement:
-        """What a smoother keeps of it: no whole images."""
+        """A small copy for the smoother, without whole images."""
         return self
 
 
 class Sensor(ABC):
-    """A sensor for the whole of a take: its noise, its clock, what it has learnt.
+    """A source of measurements for a whole take: its noise, its clock, its learnt state.
 
     Attributes
     ----------
     name : as frames name it in `sensor`
     unknowns : {name: Unknown} of its own that a subject fit estimates
     together : whether `prepare` takes a list of all its frames of one time, in place of one frame
-    places_points : whether a measurement says in its `hints` where named points of the body are, whatever the pose
-    shows_person : whether it shows a person as a whole, so that a search for one in it takes long
+    places_points : whether a measurement's `hints` locate named points of the body in any pose
+    shows_person : whether it shows a whole person, so that a search in it takes long
     state_attributes : names of the attributes that change while it tracks; checkpoints keep those of kinefit's sensors
     """
 
@@ -243,25 +239,25 @@ class Sensor(ABC):
 
     @abstractmethod
     def prepare(self, frame: Any, scene: Scene) -> Measurement:
-        """What it saw at one time, ready to be matched; the scene has the body where it is expected."""
+        """The measurement of one frame, ready to be matched; the scene has the body at its prediction."""
 
     def learn(self, measurement: Any, scene: Scene, sure: bool) -> None:  # noqa: B027
-        """Learn from a step that was accepted; `sure` where no segment is lost.
+        """Learn from an accepted step; `sure` if no segment is lost.
 
-        Replace what was learnt, rather than change it in place: where another sensor of the step fails, the attributes
-        of this one are set back. What a later match needs belongs into the measurement: smoothing sees it as it was.
+        Replace learnt attributes, do not change them in place: if another sensor of the step fails, the attributes of
+        this one are set back. Put what a later match needs into the measurement: smoothing matches it again.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class RowsOf(Matched):
-    """A match that is no more than a function from scenes to rows.
+    """A match made of one function from scenes to rows.
 
     Parameters
     ----------
     make : scene -> rows
-    about : further arguments of it
-    labels : array, optional; what is discrete of the match, such as which point has which name: its `key`
+    about : its further arguments
+    labels : array, optional; the discrete part of the match, such as the name of each point: its `key`
     channels : names of the rows' measurement ids, see `Matched`
     """
 
@@ -272,27 +268,27 @@ class RowsOf(Matched):
 
     @property
     def key(self) -> bytes:
-        """The same for the same labels."""
+        """Equal for equal labels."""
         return b"" if self.labels is None else np.asarray(self.labels).tobytes()
 
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
-        """As the function makes them."""
+        """Rows as the function returns them."""
         made: AnyRows | Sequence[AnyRows] = self.make(scene, **self.about)
         return [made] if isinstance(made, AnyRows) else made
 
 
 def pixels_of(matched: Iterable[Matched]) -> list[KeypointMatched]:
-    """The packed blocks of those matches that offer one."""
+    """The packed blocks of all matches that have one; see `Matched.pixels`."""
     return [block for m in matched if (block := m.pixels) is not None]
 
 
 def matched_by(measurement: Measurement, scene: Scene, reach: float) -> Matched:
-    """A measurement, matched; a match that names no sensor is the measurement's.
+    """Match a measurement at the time at which it was taken, up to a correspondence distance `reach` [m].
 
     Raises
     ------
     ObservationError
-        What a sensor's `match` gave is no match.
+        The sensor's `match` returned no `Matched`.
     """
     with named(measurement.sensor):
         matched = measurement.match(scene.at_time(measurement.time), reach)
@@ -305,19 +301,19 @@ def matched_by(measurement: Measurement, scene: Scene, reach: float) -> Matched:
 
 
 def rows_at(matched: Matched, scene: Scene) -> list[AnyRows]:
-    """Rows of a match, with the body where it is at the time of the measurement; see `check_rows` for errors."""
+    """Checked rows of a match, the body moved to the time of the measurement; see `check_rows` for errors."""
     with named(matched.sensor):
         rows = matched.rows(scene.at_time(matched.time))
     return check_rows(rows, matched.sensor, scene.body)
 
 
 def leftovers_at(matched: Matched, scene: Scene) -> list[Leftover]:
-    """What the fit leaves over of a match, with the body where it is at the time of the measurement."""
+    """Residuals of a match after the fit, the body moved to the time of the measurement."""
     return matched.leftovers(scene.at_time(matched.time))
 
 
 def by_segments(label: str, body: Body, residual: NDArray, segment: NDArray, unit: str) -> Leftover:
-    """Residuals (N,) of points on segments (N,), segment by segment."""
+    """Median, RMS and number of residuals (N,) [unit] of points on segments (N,), for each segment."""
     count = np.bincount(segment, minlength=len(body.tree.segments))
     some, before = count > 0, np.cumsum(count) - count
     line = residual[np.lexsort((residual, segment))]

@@ -1,4 +1,4 @@
-"""Which channel each row is of: the identity that lets a take know a sensor's errors from frame to frame."""
+"""The channel of each row: the identity by which a sensor's errors are tracked from frame to frame."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from kinefit.errors import ObservationError
 from kinefit.rows import AnyRows, DofRows, Rows
 from kinefit.sensors.base import Matched
 
-_MIN_FRAMES = 10  # named measurements of a sensor; in fewer it may be that no channel was seen twice
+_MIN_FRAMES = 10  # named measurements of a sensor; in fewer, no channel may have been seen twice
 
 Channel = tuple[str | int, ...]
 """Part of the match (of numbered channels only), name or measurement id, number of rows; of a surface: the segment."""
 
 
 class ChannelNames:
-    """The channels of every sensor of a take, and whether the sensors keep to them."""
+    """The channels of every sensor of a take; checks that their names stay the same from frame to frame."""
 
     def __init__(self) -> None:
         self._named: dict[str, bool] = {}
@@ -26,11 +26,11 @@ class ChannelNames:
         self._names: dict[str, tuple[set[str], int, int]] = {}
 
     def channels(self, matched: Matched, parts: Sequence[AnyRows]) -> list[tuple[list[Channel], NDArray]]:
-        """Of every part of a match its channels, and (2, N) which of these each row is of, and along which axis.
+        """Channels of every part of a match, and (2, N) the channel and axis of each row.
 
         Parameters
         ----------
-        matched : Matched; where its rows are no single points, their segments are the channels
+        matched : Matched; unless its rows are single points, their segments are the channels
         parts : its rows
 
         Raises
@@ -69,7 +69,7 @@ class ChannelNames:
         return out
 
     def check_names(self, matched: Matched) -> Sequence[str] | None:
-        """The names of a match's channels; an error where they are none, or its sensor has some at some times only."""
+        """The names of a match's channels; raises ObservationError if no text, not unique or not always given."""
         names, sensor = matched.channels, matched.sensor
         if self._named.setdefault(sensor, names is not None) != (names is not None):
             raise ObservationError(
@@ -84,7 +84,7 @@ class ChannelNames:
         return names
 
     def check_step(self, matched: Sequence[Matched]) -> None:
-        """An error where two measurements of one time and sensor have a channel in common: two sensors use one name."""
+        """Raise ObservationError if two measurements of one time share a channel: two sensors use one name."""
         seen = set[tuple[str, float, str]]()
         for m in matched:
             if m.of_points:

@@ -1,4 +1,4 @@
-"""Residuals of every sensor of a take, arranged by channel: what the variance of its errors is estimated from."""
+"""Residuals of every sensor of a take by channel, from which the variances of its errors are estimated."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class ChannelResiduals:
     """Residuals of the sensors of a take, frame by frame.
 
     A point's rows are the axes of its channel. All rows of a segment's surface are one axis of that segment's channel:
-    their errors last over a patch.
+    their errors are alike over a patch.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class ChannelResiduals:
         matched : Matched
         parts : its rows
         values : of each part (N,) residuals
-        weights : of each part (N,) by which the mean of several rows of one axis is taken; 0 for rows not to count
+        weights : of each part (N,) for the mean of several rows of one axis; 0 excludes a row
 
         Raises
         ------
@@ -52,7 +52,7 @@ class ChannelResiduals:
         return out
 
     def arrays(self, frames: int) -> dict[str, tuple[NDArray, NDArray]]:
-        """{sensor: residuals (F, C, A), NaN where unseen, and how many rows each is the mean of}."""
+        """{sensor: residuals (F, C, A), NaN if unobserved, and (F, C, A) the number of rows of each mean}."""
         out = {}
         for sensor, parts in self._entries.items():
             found = np.concatenate(parts, axis=1)

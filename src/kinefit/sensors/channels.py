@@ -30,11 +30,10 @@ class Channels:
     partner : (N,) int
         Channel of the same source with left and right exchanged; itself for a point in the middle.
     sigma : (N,) [px] standard deviation at full confidence.
-    uv : (F, N, 2) [px], NaN where unseen.
+    uv : (F, N, 2) [px], NaN where unobserved.
     confidence : (F, N) in 0..1
-    view_bias : (N, 5, 3) [m] how far beside their points keypoints are seen from each side, see `ViewBias`; None for
-        nothing known of it.
-    view_followed : (N,) share of a channel's lasting errors that was taken for such a bias, and hides from residuals.
+    view_bias : (N, 5, 3) [m] bias of keypoints seen from each side of the body, see `ViewBias`; None if unknown.
+    view_followed : (N,) share of a channel's systematic error that the bias has absorbed, and residuals no longer show.
     """
 
     rig: Rig
@@ -53,7 +52,7 @@ class Channels:
 
     @property
     def weight(self) -> NDArray:
-        """(F, N) [1/px²] confidence / σ², 0 where unseen: a point half as sure has twice the variance."""
+        """(F, N) [1/px²] confidence / σ², 0 where unobserved: half the confidence is twice the variance."""
         seen = np.isfinite(self.uv).all(axis=-1)
         return np.where(seen, self.confidence / np.square(self.sigma), 0.0)
 
@@ -81,7 +80,7 @@ class Channels:
 
 
 def known_points(body: Body, keypoint_set: str) -> PointSet:
-    """Where a keypoint set's points sit on a body; the body's landmarks for no set."""
+    """Points of a keypoint set on a body; the body's landmarks for no set ("")."""
     return body.keypoints(keypoint_set) if keypoint_set else body.landmarks
 
 
@@ -104,7 +103,7 @@ def mirror_name(name: str) -> str:
 
 
 def known_names(body: Body, rig: Rig, keypoints: Sequence[Keypoints]) -> dict[str, list[str]]:
-    """{keypoint set: points of the body that some record has}; errors as of `make_channels`."""
+    """{keypoint set: points of the body in some record}; raises as `make_channels`."""
     names: dict[str, list[str]] = {}
     for record in keypoints:
         if record.camera not in rig:
@@ -151,7 +150,7 @@ def make_channels(
     for q, record in enumerate(keypoints):
         span, chosen = sets[record.keypoint_set], names[record.keypoint_set]
         first = len(source)
-        mine = slice(first, first + len(chosen))
+        own = slice(first, first + len(chosen))
         mirrored = [mirror_name(n) for n in chosen]
         partner += [first + (chosen.index(m) if m in chosen else i) for i, m in enumerate(mirrored)]
         source += [q] * len(chosen)
@@ -160,8 +159,8 @@ def make_channels(
         spread += [float(sigma[q])] * len(chosen)
         lacking = np.array([n not in record.names for n in chosen], bool)
         columns = [0 if none else record.names.index(n) for n, none in zip(chosen, lacking)]
-        uv[:, mine] = np.where(lacking[:, None], np.nan, record.points[:, 0, columns])
-        confidence[:, mine] = np.where(lacking, 0.0, np.nan_to_num(record.confidence[:, 0, columns]))
+        uv[:, own] = np.where(lacking[:, None], np.nan, record.points[:, 0, columns])
+        confidence[:, own] = np.where(lacking, 0.0, np.nan_to_num(record.confidence[:, 0, columns]))
         release(record.points, record.confidence, uv, confidence)
     twice = {r.camera for r in keypoints if sum(o.camera == r.camera for o in keypoints) > 1}
     labels = tuple(f"{r.camera} {r.keypoint_set}" if r.camera in twice else r.camera for r in keypoints)
@@ -172,12 +171,12 @@ def make_channels(
 
 
 def fitted_pixels(body: Body, channels: Channels, state: BodyState) -> NDArray:
-    """(N, 2) [px] where every channel's point of a body is seen at a state; NaN where it cannot be."""
+    """(N, 2) [px] projections of every channel's point at a state; NaN behind the camera."""
     x = body.positions(state, channels.points)[channels.column]
     out = np.empty((len(x), 2))
     for c, camera in enumerate(channels.rig):
-        mine = channels.camera == c
-        out[mine] = camera.project(x[mine])
+        in_camera = channels.camera == c
+        out[in_camera] = camera.project(x[in_camera])
     return out
 
 

@@ -1,4 +1,4 @@
-"""What a sensor of someone's own can do wrong, told with its name."""
+"""Checks of the values that a user's own sensor returns; errors name the sensor."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from kinefit.sensors import _kernels_checks
 
 
 def of_kind(value: object, kind: type, what: str, remedy: str, *, each: type | None = None) -> None:
-    """ObservationError where an argument, called `what`, is of another type, or one of its values is; or is a text."""
+    """Raise ObservationError if a value, called `what`, is text or not of a kind, or an item not of `each`."""
     if not isinstance(value, kind) or isinstance(value, str):
         raise ObservationError(f"{what} is a {type(value).__name__}, not a {kind.__name__}", remedy=remedy)
     if each is not None:
-        for one in value.values() if isinstance(value, Mapping) else value:  # type: ignore[attr-defined]
-            of_kind(one, each, f"one of {what}", remedy)
+        for item in value.values() if isinstance(value, Mapping) else value:  # type: ignore[attr-defined]
+            of_kind(item, each, f"one of {what}", remedy)
 
 
 @contextmanager
 def named(sensor: str) -> Iterator[None]:
-    """Within it, errors in what was measured name the sensor."""
+    """Context in which every ObservationError raised names the sensor."""
     try:
         yield
     except ObservationError as error:
@@ -34,7 +34,7 @@ def named(sensor: str) -> Iterator[None]:
 
 
 def check_rows(rows: Any, sensor: str, body: Body) -> list[AnyRows]:
-    """Rows as a sensor of someone's own made them, or an error that names the sensor.
+    """Check the rows of a user's own sensor; errors name the sensor.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A sensor whose frame is not quite the world's: its measurements, compared with the body where that frame has it."""
+"""Measurements of a sensor with an uncertain pose and clock, compared with the body in the sensor's frame."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CLOCK = "clock"
 
 
 def displacement(values: Mapping[str, float], centre: ArrayLike) -> NDArray:
-    """(4, 4) x_world = T x as the sensor's frame has it; turned about `centre` (3,) [m], which is shifted."""
+    """(4, 4) transform from the sensor's frame to the world: a rotation about `centre` (3,) [m], and its shift."""
     c = np.asarray(centre, float)
     twist = np.array([values.get(axis, 0.0) for axis in AXES])
     R = se3.exp_so3(twist[3:])
@@ -31,15 +31,15 @@ def displacement(values: Mapping[str, float], centre: ArrayLike) -> NDArray:
 
 
 class Displaced(Measurement):
-    """What a sensor saw, in a frame that a subject fit moves against the world.
+    """A measurement in a frame whose pose in the world and clock a subject fit estimates.
 
-    The body moves the other way instead of the sensor: so any sensor that has its place in the world is displaced
-    without knowing of it. The scene's values of the sensor are those of `AXES` and `CLOCK`.
+    The body is moved the opposite way instead of the sensor, so this works for every sensor. The scene's values of the
+    sensor are those of `AXES` and `CLOCK`.
 
     Parameters
     ----------
     seen : Measurement
-    centre : (3,) [m] about which its frame is turned; in the middle of what was seen, shift and turn vary apart.
+    centre : (3,) [m] centre of rotation; shift and turn are least correlated if it is in the middle of the points.
     """
 
     def __init__(self, seen: Measurement, centre: NDArray) -> None:
@@ -47,12 +47,12 @@ class Displaced(Measurement):
         self.seen, self.centre = seen, centre
 
     def match(self, scene: Scene, reach: float) -> Matched:
-        """As the sensor itself matches."""
+        """Correspondences of the sensor itself, up to a distance [m]."""
         there, _ = self.scene(scene)
         return DisplacedMatched(self, matched_by(self.seen, there, reach))
 
     def scene(self, scene: Scene) -> tuple[Scene, NDArray]:
-        """The scene as the sensor's frame has it, at the time of the measurement, and x_world = T x (4, 4)."""
+        """The scene in the sensor's frame at the time of the measurement, and (4, 4) x_world = T x_sensor."""
         values = scene.values.get(self.sensor, {})
         now = scene.at_time(self.time + values.get(CLOCK, 0.0))
         T = displacement(values, self.centre)
@@ -99,7 +99,7 @@ class DisplacedMatched(Matched):
 
     @property
     def turns(self) -> Mapping[int, NDArray]:  # type: ignore[override]
-        """As of the sensor, in the frames of the segments."""
+        """{segment: (3,) [rad]} as of the sensor, in the frames of the segments."""
         return self.matched.turns
 
     @property
@@ -113,7 +113,7 @@ class DisplacedMatched(Matched):
         return [_moved(rows, T) for rows in rows_at(self.matched, there)]
 
     def squares(self, scene: Scene) -> NDArray:
-        """As of the sensor."""
+        """(M,) in variances, as of the sensor."""
         return self.matched.squares(self.measurement.scene(scene)[0])
 
     def leftovers(self, scene: Scene) -> list[Leftover]:
@@ -126,7 +126,7 @@ class DisplacedMatched(Matched):
 
 
 def _moved(rows: AnyRows, T: NDArray) -> AnyRows:
-    """Rows of a body in the sensor's frame as those of the body in the world: each turns with what it is about."""
+    """Rows on a body in the sensor's frame, transformed to the world."""
     R = T[:3, :3]
     if isinstance(rows, Rows):
         data = np.array(rows.data)

@@ -1,4 +1,4 @@
-"""What all sensors together say of each segment: it is where it is thought to be, it is not, or nothing sees it."""
+"""Evidence of all sensors for and against the place of each segment: it agrees, is contradicted, or is unobserved."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from numpy.typing import NDArray
 from kinefit.bodies import KinematicTree
 from kinefit.motion import BELIEVED
 
-# On a rendered body tracked into 260 lost part-frames, 99 % are flagged at 0.03 % false alarms with it and BELIEVED;
-# 0.2 to 0.3 and 0.5 to 0.7 give 97 to 100 % at 0.01 to 0.1 %.
-SHOWN = 0.25  # of a segment's outline that must be seen: with less nothing holds it but prediction and prior
-AGREES = 3.0  # standard deviations within which a measurement speaks for its segment
+# Of 260 lost part-frames of a rendered body, this and BELIEVED flag 99 % at 0.03 % false alarms; values of 0.2 to 0.3
+# and 0.5 to 0.7 flag 97 to 100 % at 0.01 to 0.1 %.
+MIN_VISIBLE_OUTLINE = 0.25  # share of a segment's contour: with less only prediction and prior constrain it
+AGREEMENT_SIGMAS = 3.0  # a measurement within as many standard deviations supports its segment
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """For and against each segment's place; what several sensors say adds up.
+    """Support for and contradiction of each segment's place; evidence of several sensors adds up.
 
     Parameters
     ----------
     agreeing, contrary : (S,), or (F, S) of many frames
-        In outlines of the segment: 1 where a depth image shows all of it. A keypoint or a marker counts `SHOWN`, which
-        is just enough to call a segment seen.
+        In contours of the segment, 0 or more: 1 where a depth image shows all of it. A keypoint or a marker counts
+        `MIN_VISIBLE_OUTLINE`, just enough for a segment to be observed.
     elsewhere : (S,) bool, optional
-        Segments that several cameras together show to be at another place, however much speaks for a part of them.
+        Segments that several cameras together locate at another place, even if a part of them is supported.
     unplaced : (S,) bool, optional
-        Segments that may be centimetres away though what is seen of them agrees: they could be slid along themselves,
-        or something as large is seen elsewhere. Their quality is 0 where no other sensor supports them.
+        Segments that may be centimetres off although their visible part agrees: they can slide along their own axis,
+        or the sensor sees an object of their size elsewhere. Their quality is 0 unless another sensor supports them.
     """
 
     agreeing: NDArray
@@ -38,37 +38,38 @@ class Evidence:
     unplaced: NDArray | None = None
 
     def __add__(self, other: Evidence) -> Evidence:
-        told = [e for e in (self.elsewhere, other.elsewhere) if e is not None]
-        elsewhere = np.logical_or.reduce(told) if told else None
+        displaced = [e for e in (self.elsewhere, other.elsewhere) if e is not None]
+        elsewhere = np.logical_or.reduce(displaced) if displaced else None
         doubts = [a.unplaced & ~b._supported for a, b in ((self, other), (other, self)) if a.unplaced is not None]
         unplaced = np.logical_or.reduce(doubts) if doubts else None
         return Evidence(self.agreeing + other.agreeing, self.contrary + other.contrary, elsewhere, unplaced)
 
     @property
     def _supported(self) -> NDArray:
-        supported = (self.agreeing >= SHOWN - 1e-9) & (self.agreeing > self.contrary)
+        supported = (self.agreeing >= MIN_VISIBLE_OUTLINE - 1e-9) & (self.agreeing > self.contrary)
         return np.asarray(supported if self.unplaced is None else supported & ~self.unplaced)
 
     @classmethod
     def none(cls, segments: int) -> Evidence:
-        """Nothing was seen."""
+        """No evidence on a number of segments."""
         return cls(np.zeros(segments), np.zeros(segments))
 
     @property
     def balance(self) -> float:
-        """How much more speaks for the body's place than against it, in outlines."""
+        """Support minus contradiction, summed over all segments: a number of contours."""
         return float(self.agreeing.sum() - self.contrary.sum())
 
     @property
     def quality(self) -> NDArray:
-        """(S,) in 0..1: share of what is seen of a segment that speaks for it; 0 where nothing is."""
+        """(S,) in 0..1: share of a segment's evidence that supports it; 0 where there is none."""
         seen = self.agreeing + self.contrary
         return self.agreeing / np.where(seen > 0.0, seen, 1.0)
 
     def segment_quality(self, tree: KinematicTree) -> NDArray:
-        """`quality`, (..., S); an unobserved segment has the lower one of its parent and its best child.
+        """(..., S) in 0..1: `quality`, filled in for unobserved segments from their neighbours.
 
-        Of an unplaced one it is 0: what is beside it may agree as well where it is not.
+        An unobserved segment has the lower quality of its parent and its best child. An unplaced segment has 0: it may
+        agree wherever it is along its axis.
         """
         own, hidden = self.quality, self.hidden
         out = own.copy()
@@ -81,12 +82,12 @@ class Evidence:
 
     @property
     def hidden(self) -> NDArray:
-        """(S,) bool: no sensor sees enough of the segment to say anything; the prediction and the prior hold it."""
-        return self.agreeing + self.contrary < SHOWN - 1e-9
+        """(S,) bool: too little of the segment is observed; only the prediction and the prior constrain it."""
+        return self.agreeing + self.contrary < MIN_VISIBLE_OUTLINE - 1e-9
 
     @property
     def lost(self) -> NDArray:
-        """(S,) bool: it is seen, and less than half of that speaks for it, or cameras agree that it is elsewhere."""
+        """(S,) bool: observed, and less than half of the evidence agrees, or several cameras locate it elsewhere."""
         contradicted = self.quality < BELIEVED
         if self.elsewhere is not None:
             contradicted |= self.elsewhere

@@ -28,7 +28,7 @@ class Layout:
     ----------
     channels : Channels, of which the measurements are not used
     body : Body
-    streams : of every source what a detector gives, frame after frame, where it was made of that
+    streams : the detector's stream of every source; empty unless made from streams
     """
 
     channels: Channels
@@ -47,7 +47,7 @@ class Layout:
 
     @cached_property
     def informs(self) -> NDArray:
-        """(S, N) 0 or 1: channels that show where a segment is."""
+        """(S, N) 0 or 1: channels that constrain a segment; see `informing`."""
         return informing(self.body, self.channels)
 
     @cached_property
@@ -57,18 +57,18 @@ class Layout:
 
     @cached_property
     def parts(self) -> list[tuple[str, NDArray, tuple[str, ...], NDArray]]:
-        """Of each source its label, its channels, and their names and segments."""
+        """Of each source its label, its channels (K,), and their names and segments (K,)."""
         points, sources = self.points, self.channels.sources
         of = [np.flatnonzero(self.channels.source == q) for q in range(len(sources))]
         return [(s, k, tuple(points.names[i] for i in k), points.segments[k]) for s, k in zip(sources, of)]
 
     @cached_property
     def trunk(self) -> NDArray:
-        """(N,) segment in whose axes a channel's bias by view is."""
+        """(N,) segment in whose frame a channel's view bias is given."""
         return trunks(self.body.tree)[self.points.segments]
 
     def beside(self, scene: Scene) -> NDArray | None:
-        """(N, 2) [px] how far beside its point each keypoint is seen at a scene's state; None for nothing known."""
+        """(N, 2) [px] bias of each keypoint in the image at a scene's state; None without a `view_bias`."""
         bias = self.channels.view_bias
         if bias is None:
             return None
@@ -76,7 +76,7 @@ class Layout:
         return beside(bias, self.trunk, x, scene.frames, scene.rig, self.channels.camera)
 
     def points_of(self, body: Body) -> PointSet:
-        """The same of another body of this make; those of the body that was asked for last are kept."""
+        """`points` of another body with the same segments; cached for the latest body."""
         if body is self.body:
             return self.points
         if self._latest.get("body") is not body:
@@ -114,16 +114,16 @@ class Layout:
 
 
 def projected(scene: Scene, layout: Layout) -> NDArray:
-    """(N, 2) [px] where every channel's point is seen at a scene's state; NaN where it cannot be."""
+    """(N, 2) [px] projections of every channel's point at a scene's state; NaN behind the camera."""
     return scene.once(
         layout, lambda: scene.rig.project(scene.positions(layout.points_of(scene.body)), layout.channels.camera)
     )
 
 
 def informing(body: Body, channels: Channels) -> NDArray:
-    """(S, N) 0 or 1: channels that show where a segment is: those on it and those at its children's joints.
+    """(S, N) 0 or 1: channels that constrain a segment: those on it and those at its children's joints.
 
-    A segment without any is known through its children.
+    A segment without any has those of its children.
     """
     tree = body.tree
     owner, place = channels.points.segments[channels.column], channels.points.points[channels.column]

@@ -1,4 +1,4 @@
-"""What measurements can observe of a joint at all: how far a seen point moves when the joint turns."""
+"""Observability of joints: how far an observed point moves when a joint turns."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, PointSet
 from kinefit.sensors import _kernels_observability
 
-# A detector's point stands about a centimetre away from where the body has it, the same way in every frame: a joint
-# that moves no point by more than twice that for a radian only follows this error.
-SHORTEST = 0.02  # [m/rad]
+# A detector's point is about a centimetre off the body's, the same way in every frame: a joint that moves no point by
+# more than twice that for a radian only follows this error.
+MIN_LEVER = 0.02  # [m/rad]
 
 
 def levers(body: Body, points: PointSet, seen: NDArray, Ts_world_root: NDArray, angles: NDArray) -> NDArray:
-    """(F, D) [m/rad] how far each coordinate moves the point that it moves furthest, of those seen; inf if it slides.
+    """(F, D) [m/rad] longest lever of each coordinate on the points seen in a frame; inf for prismatic joints.
 
     Parameters
     ----------
@@ -31,13 +31,13 @@ def levers(body: Body, points: PointSet, seen: NDArray, Ts_world_root: NDArray, 
 
 
 def moves_points(body: Body, points: PointSet, seen: NDArray, Ts_world_root: NDArray, angles: NDArray) -> NDArray:
-    """(F, D) bool: coordinates that move some point seen by more than detectors err; arguments as of `levers`."""
-    shortest = SHORTEST * body.offset_shares[body.tree.owners]
+    """(F, D) bool: coordinates that move a visible point by more than detectors err; arguments as of `levers`."""
+    shortest = MIN_LEVER * body.offset_shares[body.tree.owners]
     return np.asarray(levers(body, points, seen, Ts_world_root, angles) > shortest)
 
 
-def near(told: NDArray, frames: int) -> NDArray:
-    """(F, D) bool: coordinates that are observed, (F, D) bool, in this frame or at most so many frames away."""
-    count = np.cumsum(np.concatenate([np.zeros((1, told.shape[1]), int), told]), axis=0)
-    f = np.arange(len(told))
-    return np.asarray(count[np.minimum(f + frames + 1, len(told))] > count[np.maximum(f - frames, 0)])
+def near(observed: NDArray, frames: int) -> NDArray:
+    """(F, D) bool: coordinates observed in this frame or within a number of frames; observed (F, D) bool."""
+    count = np.cumsum(np.concatenate([np.zeros((1, observed.shape[1]), int), observed]), axis=0)
+    f = np.arange(len(observed))
+    return np.asarray(count[np.minimum(f + frames + 1, len(observed))] > count[np.maximum(f - frames, 0)])

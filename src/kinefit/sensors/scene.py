@@ -1,4 +1,4 @@
-"""Scene: what a measurement is compared with, a body in a pose, the cameras, and what else was measured then."""
+"""Scene: what a measurement is compared with: a body in a pose, the cameras, other measurements of that time."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from kinefit.sensors.visibility.surface import TrackedSurface
 if TYPE_CHECKING:
     from kinefit.sensors.base import Measurement
 
-SAMPLES = 600  # points of a body's surface that look for their measurement
+SURFACE_SAMPLES = 600  # points of a body's surface that are compared with depth images
 
 
 class Scene:
     """A body at a state, with the cameras that see it.
 
-    Scenes of one body share what was made for it once (its surface, its morphs), so that another state costs nothing
-    before something is asked of it.
+    Scenes of one body share its surface and its morphs, and compute everything else on demand: a scene at another
+    state costs next to nothing.
 
     Parameters
     ----------
@@ -36,20 +36,20 @@ class Scene:
     rig : Rig of all cameras
     time : float [s] of the state
     velocity : (6 + D,) [m/s, rad/s], optional
-        How the body moves, for measurements of another time than the scene's.
+        Of the body, for measurements of another time than the scene's.
     values : {sensor: {name: value}}, optional
-        What is thought of a sensor's own unknowns, such as the length of a rope.
-    measurements : what all sensors measured at this time, for those that ask each other
+        Estimates of the sensors' own unknowns, such as the length of a rope; see `Unknown`.
+    measurements : of all sensors at this time, for sensors that use each other's
     surface : TrackedSurface of the body, made when it is first needed
     others : scenes of other bodies at the same time
     covariance : (6 + D, 6 + D) [m, rad], optional
-        Of the state, where a fit gave it.
+        Of the state, if a fit has estimated it.
     """
 
     def __init__(
         self, body: Body, state: BodyState, rig: Rig, *, time: float = 0.0, velocity: NDArray | None = None,
         values: Mapping[str, Mapping[str, float]] | None = None, measurements: Sequence[Measurement] = (),
-        surface: TrackedSurface | None = None, others: Sequence[Scene] = (), samples: int = SAMPLES,
+        surface: TrackedSurface | None = None, others: Sequence[Scene] = (), samples: int = SURFACE_SAMPLES,
         covariance: NDArray | None = None,
     ) -> None:  # fmt: skip
         self.covariance = covariance
@@ -71,22 +71,22 @@ class Scene:
         return out
 
     def at_time(self, time: float) -> Scene:
-        """The scene with the body where it is, by its velocity, at a time [s] beside the scene's own.
+        """The scene at another time [s]: the body moves with its velocity.
 
-        Velocities hold for about a frame: a clock that is farther off must be set right beforehand.
+        A velocity holds for about one frame: correct larger clock offsets beforehand.
         """
         if self.velocity is None or not abs(time - self.time) > 1e-9:
             return self
         return self.at(self.state.retract((time - self.time) * self.velocity), time=time)
 
     def value(self, sensor: str, name: str, default: float) -> float:
-        """What is thought of a sensor's own unknown: the default where nothing is."""
+        """The estimate of a sensor's own unknown, in its unit [m, rad, s or px]; the default without one."""
         return self.values.get(sensor, {}).get(name, default)
 
     def placed(self, camera: Camera) -> Camera:
-        """A sensor's camera where the scene's rig has it; where it is if the rig has none of its name.
+        """A sensor's camera with the extrinsics that the scene's rig has for its name; unchanged if the rig has none.
 
-        So rows of every sensor follow a rig whose extrinsics are estimated. Asked again it gives the same camera.
+        So rows of every sensor follow a rig whose extrinsics are estimated. Repeated calls return the same object.
         """
         if any(c is camera for c in self.rig.cameras) or camera.name not in self.rig:
             return camera
@@ -94,7 +94,7 @@ class Scene:
 
     @property
     def surface(self) -> TrackedSurface:
-        """The body's surface, with room to draw it.
+        """The body's surface, with buffers to render it.
 
         Raises
         ------
@@ -107,7 +107,7 @@ class Scene:
 
     @property
     def morphing(self) -> Morphing | None:
-        """Of a body whose joints move with its angles; None where the tree alone places the segments."""
+        """Morphing of a body whose joint centres move with its angles; None if the tree alone places the segments."""
         if "morphing" not in self._shared:
             moving = None
             if self.body.morphs:
@@ -123,7 +123,7 @@ class Scene:
 
     @property
     def frames(self) -> NDArray:
-        """(S, 12) of the segments: rotation times a point at rest, then shift; see `KinematicTree.forward`."""
+        """(S, 12) of the segments: rotation (row-major), then translation [m]; see `KinematicTree.forward`."""
         if self._frames is None:
             if self.morphing is not None:
                 self._frames = self.morphing.pose(self.state).frames
@@ -132,7 +132,7 @@ class Scene:
         return self._frames
 
     def once(self, key: Any, make: Callable[[], NDArray]) -> NDArray:
-        """What is made at this state, the first time that it is asked for under a key; not to be changed."""
+        """The array that `make` returns, cached for this state under a key, of any shape (...,); do not change it."""
         if key not in self._made:
             self._made[key] = make()
         return self._made[key]
@@ -148,7 +148,7 @@ class Scene:
         return self.segment_jacobians([segment])[0]
 
     def segment_jacobians(self, segments: Iterable[int]) -> list[NDArray]:
-        """Of each of several segments, as `segment_jacobian` of one."""
+        """(6, 6 + D) of each of several segments; see `segment_jacobian`."""
         if self.morphing is not None:
             pose = self.morphing.pose(self.state)
             return [pose.segment_jacobian(int(s)) for s in segments]
@@ -161,7 +161,7 @@ class Scene:
         return self.positions(self.body.landmarks.select((name,)))[0]
 
     def rows_of(self, kernel: Any, lines: int, points: PointSet, *given: Any) -> Rows | DofRows:
-        """Rows of a compiled row maker for points of the body, on joints that move where they do."""
+        """Rows of a compiled row kernel for points of the body, with the derivatives of moving joint centres."""
         if self.morphing is None:
             return targets.fill(kernel, lines, self.body, self.state, points, *given)
         pose = self.morphing.pose(self.state)
@@ -171,9 +171,9 @@ class Scene:
     def along(
         self, points: PointSet, direction: NDArray, residual: NDArray, sigma: NDArray | float, **options: Any
     ) -> Rows | DofRows:
-        """One row a point of the body: it should lie further along a direction (K, 3) by a residual (K,) [m].
+        """One row for each of K points: it should lie further along a direction (K, 3) by a residual (K,) [m].
 
-        The short way for a sensor of one's own. `options` are `group` and `loss` of `Rows.of`.
+        The short way for your own sensor; sigma [m]. `options` are `group` and `loss` of `Rows.of`.
         """
         x, n = self.positions(points), np.broadcast_to(np.asarray(direction, float), (len(points), 3))
         weight = np.broadcast_to(1.0 / np.square(np.asarray(sigma, float)), len(points))

@@ -1,4 +1,4 @@
-"""How a track runs: every number in one place, with its reason."""
+"""Settings of tracking and smoothing, each with its reason."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ MARKER_LOSS = geman_mcclure(5.0)
 
 @dataclass(frozen=True)
 class CameraErrors:
-    """How far each camera may stand from where its calibration has it, one standard deviation along each axis.
+    """Standard deviations of the cameras' calibrated extrinsics, along each axis.
 
     Parameters
     ----------
     position, direction : float [m], [rad]
-    own_world : bool, nothing but the cameras says where the world is: what they are off by in common is no error.
+    own_world : bool, only the cameras define the world: an error that they have in common is none.
     """
 
     position: float
@@ -34,88 +34,88 @@ class TrackSettings:
     Parameters
     ----------
     points : int
-        Measured points of a depth image that take part, about.
+        Measured points of a depth image in a fit, about.
     samples : int
-        Points of the body's surface that look for their measurement.
+        Points of the body's surface that are compared with a depth image.
     reach : float [m]
-        How far outside of the predicted body's box a measured point may lie: what a hand moves between two frames.
+        Margin about the predicted body's box in which measured points count: what a hand moves between two frames.
     far, near : float [m]
-        Bound of a correspondence in the first iteration and in the last: from what a prediction may be off to three
-        deviations of a sensor of a centimetre.
+        Correspondence distance of the first and the last iteration: from the error of a prediction to three standard
+        deviations of a sensor of 1 cm.
     shrink : float
-        By which the bound shrinks from iteration to iteration.
+        Factor 0..1 on the correspondence distance from iteration to iteration.
     iterations : int, at most
     tolerance : float [standard deviations]
-        Of each degree of freedom, on average: a smaller step ends a frame.
+        Step of a degree of freedom, on average, below which a frame's fit ends.
     patch : float [m]
         Size of a patch of surface over which the errors of depth are alike (shape, and the sensor's own): as many
         measurements count as there are patches.
     render_every : int
-        Iterations after which the body's own hidden parts are found anew.
+        Iterations between two renderings that find the body's self-occlusions.
     depth, pixel, marker, silhouette, region, line : float [m], [px], [m], [px], [px], [px]
-        Standard deviation of a sensor that none is given for.
-        `region` is that of a mesh of the very body.
+        Default standard deviation of each kind of sensor.
+        `region` holds for a scanned mesh of the body itself.
     lifted : float [m]
-        Standard deviation of how far a network tells a landmark to be behind the hips. It errs by 7 and 10 cm on the
-        two trials of one person before one telephone that have markers, for as long as a pose lasts. Of 20, 30 and
+        Standard deviation of a landmark's depth relative to the hips, as a network estimates it. It errs by 7 and 10 cm
+        on the two trials of one person before one phone that have markers, for as long as a pose lasts. Of 20, 30 and
         40 cm, 30 left each camera of the balancing trial nearest to all four.
     shape : float [m]
         Standard deviation of the contour of a body of simple shapes where colours show it: on the balancing trial
         half of the contour is within 0.8 cm of it, once its girths are fitted.
     regions : RegionSettings, of colours inside and outside of a body
     outline : int [px]
-        Longer side, about, of the image in which silhouettes are compared: at 320 a pixel is a centimetre of a person
-        and the room about. Outlines are found to parts of a pixel.
+        Longer side, about, of the image in which silhouettes are compared: at 320 a pixel is about 1 cm at the person.
+        Contours are located to fractions of a pixel.
     angle : float [rad]
-        Largest angle between normals of two outlines of which points are paired.
+        Largest angle between the normals of two paired contour points.
     background : float [s]
-        How long a thing near the body must be seen, and not be taken for the body, to count as background; see
-        `Background`. inf for depth cameras that move.
+        Time after which an object near the body that is no part of it counts as background; see `Background`.
+        inf for moving depth cameras.
     through : float [px]
-        Standard deviation, in cells of 1/160 of an image's width, of rows that draw what the sensor saw through to
-        where something was measured; see `free_space_rows`. inf for none.
+        Standard deviation, in cells of 1/160 of an image's width, of rows that pull surface out of observed free space
+        to the nearest measurement; see `free_space_rows`. inf disables them.
     collision, flesh : float [m]
-        Softness of what parts that run into each other are kept apart with, and how far they may. See
+        Standard deviation of collision rows between body parts, and the penetration that they allow; see
         `collision_rows`.
     skin_shift, skin_turn : float [m], [rad]
-        Standard deviations by which a segment's surface is shifted and turned about its bone: beside points that hold
-        the body, surfaces tell of joints no better, however much of them is seen; see `rows_of` in `kinefit.frame.fit`.
+        Standard deviations of a surface's offset and rotation about its bone: where points constrain the body too, they
+        limit how well a surface constrains a joint; see `rows_of` in `kinefit.frame.fit`.
         Shift: with silhouettes of the balancing trial's first 30 frames, 0 left keypoints 1.25 times as far off as
         without silhouettes, 0.01 1.07 times, 0.02 1.02 times, on a trunk that lay 1 to 1.5 cm further forward than the
-        catalogue's; on the catalogue's 0.02 leaves 1.03 times. Turn: not swept. 0 takes surfaces for exact everywhere.
+        catalogue's; on the catalogue's 0.02 leaves 1.03 times. Turn: not swept. 0 takes surfaces as exact.
     camera_std : (2,) [m] and [rad], or None; own_world : bool, see `CameraErrors`
-        Standard deviations of each camera's calibrated position and of its direction, before a take shows how large
-        they are; of three cameras or more one that is surely three of them off is moved. None takes calibrations for
+        Prior standard deviations of each camera's calibrated position and direction; the take refines them. Of three
+        cameras or more, one that is significantly more than three of them off is moved. None takes calibrations as
         exact.
     view_bias : bool
-        Whether it is found from the take how far beside its point a detector puts each keypoint, seen from each side,
-        see `ViewBias`. It takes three cameras that show a point, and keypoints alone: beside other sensors cameras
-        are found, whose errors it would follow.
+        Whether to estimate a detector's bias of each keypoint by side of view, see `ViewBias`. Needs three cameras that
+        see a point, and keypoints alone: with other sensors the camera extrinsics are estimated, and the bias would
+        absorb their errors.
     angle_acceleration, root_acceleration : float [rad/s²], [m/s²]
-        How abruptly a body moves: one standard deviation.
+        Standard deviation of the process noise.
     velocity_memory : float [s]
-        How long a velocity lasts that nothing confirms.
+        Time constant with which an unobserved velocity decays.
     loss : Loss of keypoints, in their standard deviations.
     marker_loss : Loss of markers, likewise.
     pause : float [s]
-        A longer gap between frames leaves the velocity unknown; a clock that goes back further was set.
+        A longer gap between frames resets the velocity; a clock that steps back further has been reset.
     search : bool
-        Whether what is lost is sought: a limb takes 30 ms of one core, a whole body 1 s. Without it every frame takes
-        as long as any other, and `start_at` is the only start.
+        Whether to search for what is lost: a limb takes 30 ms of one core, a whole body 1 s. Without it every frame
+        takes the same time, and `start_at` is the only start.
     support : float in 0..1
-        Share of the evidence that agrees below which a start from points that are known in space is tried.
+        Agreeing share of the evidence below which a start from triangulated points is tried.
     poor : float in 0..1
-        Mean quality of what is seen, below which the whole body counts as lost, and is sought as at the start.
+        Mean quality of the observed segments below which the whole body counts as lost and is searched for.
     doubtful : float in 0..1
-        Quality of a segment below which its limb is sought together with one that is lost.
+        Quality of a segment below which its limb is searched for together with a lost one.
     search_after, search_every : float [s]
-        How long something must have been lost, and how long to wait between two searches.
+        Time lost before the first search, and time between two searches.
     smooth_memory : float [s]
-        Time constant of a velocity that nothing confirms, where a whole take is smoothed.
+        Time constant of an unobserved velocity when a whole take is smoothed.
     acceleration_memory : float [s]
-        Time constant of an acceleration, where a whole take is smoothed.
+        Time constant of an acceleration when a whole take is smoothed.
     smooth_rounds : int
-        How often process noise and the sensors' noise are estimated anew, at most.
+        Largest number of estimates of the process noise and the sensors' noise.
     """
 
     points: int = 1000
@@ -166,5 +166,5 @@ class TrackSettings:
 
     @property
     def camera_errors(self) -> CameraErrors | None:
-        """Of the calibration; None where it is taken for exact."""
+        """Standard deviations of the calibration; None if it is taken as exact."""
         return None if self.camera_std is None else CameraErrors(*self.camera_std, self.own_world)

@@ -16,7 +16,15 @@ from kinefit.observations import DepthFrame
 from kinefit.sensors.displaced import Displaced, displacement
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surfaces.registration import FAR, FINE, Ends, Registration, clearly_above, starts, values_of
+from kinefit.sensors.surfaces.registration import (
+    COARSE_DISTANCES,
+    FINE_DISTANCES,
+    Ends,
+    Registration,
+    clearly_above,
+    starts,
+    values_of,
+)
 from kinefit.subject.subject import Subject
 from kinefit.tracking.recording import Recording, spread
 
@@ -92,15 +100,16 @@ def _placed(T_camera_world: NDArray, looks: Sequence[tuple[DepthFrame, Scene]], 
         return Registration(looks[0][0].sensor, steps, [scene for _, scene in looks], centre, information)
 
     stated = seen_from(np.zeros(7))
-    best = stated.settled(np.zeros(7), FINE)
+    best = stated.settled(np.zeros(7), FINE_DISTANCES)
     if _size(best)[0] > _MAX_TURN or _size(best)[1] > _MAX_SHIFT:
-        best = Ends(stated, tuple(stated.settled(s, (*FAR, *FINE)) for s in starts(origin, centre, POSE_SIGMAS))).best
+        reach = *COARSE_DISTANCES, *FINE_DISTANCES
+        best = Ends(stated, tuple(stated.settled(s, reach) for s in starts(origin, centre, POSE_SIGMAS))).best
     nearer = stated.above(np.zeros(7), best)
     axis = np.pi * T_camera_world[2, :3]
     way = centre - origin
     over = np.concatenate([se3.exp_so3(axis) @ way - way, axis, [0.0]])
     rolled = seen_from(over)
-    over = rolled.settled(over, FINE)
+    over = rolled.settled(over, FINE_DISTANCES)
     if clearly_above(stated.costs(best), rolled.costs(over)):
         best, nearer = over, True
     turn, shift = _size(best)

@@ -65,7 +65,7 @@ class Recording:
     on_body : depth cameras whose images show nothing but the body
     backgrounds : {depth camera: (H, W) [m]} of the empty scene
     start : step and state to begin with
-    others : motions of other people in view, in the same world and time, by whom depth images, masks and colours are
+    others : motions of other people in view, in the same world and time, by which depth images, masks and colours are
         parted
     up : vertical axis of the world
     level : whether that was measured; otherwise the floor is the plane on which the feet rest
@@ -130,7 +130,7 @@ class Recording:
         rig : Rig
         keypoints : records of the same number of frames and the same rate.
         sigma : [px] standard deviation of a keypoint of confidence 1, one for all records or one for each.
-        person : "first" (of whom most is seen, the default), "moving", "largest", "nearest X Y Z" [m], or a number
+        person : "first" (with most visible points, the default), "moving", "largest", "nearest X Y Z" [m], or a number
         people : everybody in view, where `people_in_view` has found them; default: they are looked for
         more : other arguments of a recording
 

@@ -80,7 +80,7 @@ class ClickPage:
             async with self._taking:  # files are written
                 answer, taken = await asyncio.to_thread(self._answer, text)
             try:
-                await connection.send(msgspec.json.encode({"taken": taken, "told": answer}).decode())
+                await connection.send(msgspec.json.encode({"taken": taken, "answer": answer}).decode())
             finally:  # also where the browser is gone
                 if taken:
                     self.done.set()

@@ -33,7 +33,7 @@ class Figure:
         Of the node, unique in the scene.
     body : Body
     colour : (r, g, b), optional
-        One for all; by default left and right are told apart.
+        One for all; by default left and right differ.
     """
 
     def __init__(self, scene: Any, name: str, body: Body, *, colour: content.RGB | None = None) -> None:

@@ -69,8 +69,8 @@ class Player:
         self.show = Show(server, recording)
         self.clock = PlaybackClock(len(recording.times), recording.rate)
         self._shown: tuple[int, Choice] | None = None
-        self._told: tuple[Any, ...] = ()
-        self._since_told = 0.0
+        self._sent: tuple[Any, ...] = ()
+        self._since_sent = 0.0
         self._through = NONE
         self._before: dict[int, tuple[NDArray, NDArray, NDArray, float]] = {}  # each browser's own view
         self._slider_shows = 0
@@ -111,10 +111,10 @@ class Player:
         if (frame, choice) != self._shown:
             self.show.frame(frame, choice)
             self._shown = frame, choice
-        self._since_told += elapsed
-        told = frame, *(plot.box.value for plot in self._plots)
-        if told != self._told and (not self.clock.playing or self._since_told > _TELL):
-            self._told, self._since_told = told, 0.0
+        self._since_sent += elapsed
+        state = frame, *(plot.box.value for plot in self._plots)
+        if state != self._sent and (not self.clock.playing or self._since_sent > _TELL):
+            self._sent, self._since_sent = state, 0.0
             self._tell(frame)
 
     def run(self, stopped: Callable[[], bool] = lambda: False) -> None:
@@ -188,10 +188,10 @@ class Player:
         for plot in self._plots:
             plot.tell(frame)
         if self.recording.motions:
-            self._text.content = told(self.recording.motions[0], frame)
+            self._text.content = summary(self.recording.motions[0], frame)
 
 
-def told(motion: Motion, frame: int) -> str:
+def summary(motion: Motion, frame: int) -> str:
     """Words about one frame (Markdown): quality, lost segments, residuals of every sensor."""
     lines = [f"quality **{motion.quality[frame]:.2f}** of 1"]
     lost = [name for name, gone in zip(motion.body.tree.segments, motion.lost[frame]) if gone]

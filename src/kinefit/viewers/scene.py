@@ -16,7 +16,7 @@ from kinefit.rendering.colours import LOST, RGB, quality_ramp, side_colour
 from kinefit.rendering.tubes import TubeMesh
 
 OTHERS: tuple[RGB, ...] = ((204, 121, 167), (86, 180, 233), (230, 159, 0), (120, 90, 60))
-"""Colours of the second, third ... motion, which are not told apart by side."""
+"""Colours of the second, third ... motion, which have one colour for both sides."""
 
 OUTLIER_WEIGHT = 0.05  # robust weight below which a measurement had no say
 OUTLIER = (255, 30, 30)

@@ -7,7 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from kinefit.calibration.check.sensor_verdicts import marker_lines, misfits, moved_cameras, sensor_findings, told
+from kinefit.calibration.check.sensor_verdicts import (
+    alignment_line,
+    marker_lines,
+    misfits,
+    moved_cameras,
+    sensor_findings,
+)
 from kinefit.cli.checks._refine import Refined
 from kinefit.diagnostics.sensor_fit import SensorAlignment, doubts_of
 from kinefit.geometry import se3
@@ -92,7 +98,7 @@ def test_a_doubtful_sensor_is_named_and_not_refined():
         assert (found.severity, found.cameras) == (severity, ("depth",))
         assert "--refine" not in found.remedy
         assert "because two halves disagree." in found.confidence
-        assert told(one) == "depth: not refined, because two halves disagree."
+        assert alignment_line(one) == "depth: not refined, because two halves disagree."
         assert Refined(None, (one, fit("markers", "markers", x=0.03))).moved[0].sensor == "markers"
 
 
@@ -102,4 +108,4 @@ def test_lines_of_markers_go_on_from_those_that_are_there():
     new = MarkersEntry(file="m", shift=tuple(shift), turn=tuple(turn)).T_world_file
     np.testing.assert_allclose(new, one.T @ MARKERS.markers[0].T_world_file, atol=2e-5)
     assert "[[markers]] of take.toml" in sensor_findings([one], MARKERS)[0].remedy
-    assert told(one).startswith("markers: turned 2.86 ± ")
+    assert alignment_line(one).startswith("markers: turned 2.86 ± ")

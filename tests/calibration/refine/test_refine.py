@@ -8,7 +8,7 @@ from tests.calibration.people_data import BODY, errors, room, seen, walker
 
 from kinefit.calibration.refine.gauge import aligned, covariance_in_gauge, generators, resized
 from kinefit.calibration.refine.refine import refine
-from kinefit.calibration.refine.sightings import PersonTrial, correlation_time, shifted, sight, togetherness
+from kinefit.calibration.refine.sightings import PersonTrial, correlation_time, residual_correlation, shifted, sight
 from kinefit.errors import CalibrationError, ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
@@ -57,7 +57,7 @@ def test_the_world_stays_the_old_calibrations(refined):
 
 
 def test_what_it_tells_names_every_camera(refined):
-    text = "\n".join(refined.told())
+    text = "\n".join(refined.summary_lines())
     assert all(name in text for name in room().names) and "px" in text and "nan" not in text
 
 
@@ -212,7 +212,7 @@ def test_correlation_time_of_errors_that_last():
 
 def test_independent_errors_are_not_together():
     sighting = sight(room(), PersonTrial(seen(), BODY, "z", 2.0), {})
-    assert togetherness(sighting) < 0.2
+    assert residual_correlation(sighting) < 0.2
     c = sighting.channels
     group = c.source * 100 + c.points.segments[c.column]
     common = np.random.default_rng(0).normal(size=(len(sighting.motion), group.max() + 1, 2))[:, group]
@@ -221,4 +221,4 @@ def test_independent_errors_are_not_together():
         for q, (name, r) in enumerate(sighting.motion.residuals.items())
     }
     same = replace(sighting, motion=replace(sighting.motion, residuals=residuals))
-    assert togetherness(same) > 0.95
+    assert residual_correlation(same) > 0.95

@@ -7,7 +7,7 @@ import pytest
 from kinefit.errors import ObservationError
 from kinefit.images.detectors.skin import WRISTS, SkinTracker
 from kinefit.readers.video import Video
-from kinefit.sensors.visibility.occlusion import SEEN
+from kinefit.sensors.visibility.occlusion import MIN_VISIBLE_CONFIDENCE
 
 SKIN, WOOD, WALL, SHIRT = (205, 150, 125), (190, 140, 110), (130, 150, 140), (40, 60, 120)
 FACE = (285.0, 80.0, 70.0, 100.0)
@@ -46,7 +46,7 @@ def test_hands_are_found_followed_and_told_apart():
         face, l_hand, r_hand = seen[k]
         assert np.linalg.norm(face.centre - (320, 130)) < 6
         assert np.linalg.norm(l_hand.centre - left[k]) < 10 and np.linalg.norm(r_hand.centre - right[k]) < 10
-        assert min(l_hand.confidence, r_hand.confidence) >= SEEN  # what has been followed is no guess
+        assert min(l_hand.confidence, r_hand.confidence) >= MIN_VISIBLE_CONFIDENCE  # what has been followed is no guess
     frame = tracker.frame("cam", 1.5, WRISTS)
     assert frame.names == WRISTS and frame.confidence.min() > 0.3
     np.testing.assert_array_equal(frame.uv[1], seen[-1][1].centre)

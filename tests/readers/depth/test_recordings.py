@@ -258,7 +258,7 @@ def test_times_that_do_not_increase_name_the_frame(tmp_path, times, frame):
         (lambda p: read_depth(png(p / "a", counts=COUNTS // 256 * 0 + 65535)), "nothing was measured"),
         (lambda p: read_depth(npz(p / "a.npz", depth=METRES * np.nan)), "nothing was measured"),
         (lambda p: read_depth(png(p / "a", counts=COUNTS.astype(np.uint8))), "8 bits in 1 channel"),
-        (lambda p: read_depth(raw(p / "a")), "size of the image is not told"),
+        (lambda p: read_depth(raw(p / "a")), "size of the image is not given"),
         (lambda p: read_depth(raw(p / "a"), size=(64, 50)), "6144 bytes, but 64x50 px of 16 bits are 6400"),
         (lambda p: read_depth(npz(p / "a.npz", depth=np.zeros(4))), r"`depth` has shape \(4,\)"),
         (lambda p: read_depth(npz(p / "a.npz", times=np.arange(4))), r"\(4,\) times for 5 frames"),

@@ -87,7 +87,7 @@ def taken(folder):
 
 
 def notes(guess, about=""):
-    return " | ".join(f"{note.sure} {note.about}: {note.told}" for note in guess.notes if about in note.about)
+    return " | ".join(f"{note.sure} {note.about}: {note.text}" for note in guess.notes if about in note.about)
 
 
 @pytest.mark.parametrize(
@@ -577,7 +577,7 @@ def test_videos_alone_become_cameras_that_are_found(folder):
     take = read_take(folder / "take.toml")
     assert take.calibration is None and [c.name for c in take.cameras] == ["left", "right"]
     assert all(camera.field_of_view == 64.0 for camera in take.cameras) and take.up == "z"
-    assert any(note.about == "calibration" and "people in view" in note.told for note in guess.notes)
+    assert any(note.about == "calibration" and "people in view" in note.text for note in guess.notes)
 
 
 def test_a_calibration_of_one_camera_is_left_out_and_a_damaged_one_refused(folder, rig):
@@ -585,7 +585,7 @@ def test_a_calibration_of_one_camera_is_left_out_and_a_damaged_one_refused(folde
     write_calibration(Rig((rig["cam01"],)), folder / "cam01.toml")
     (folder / "docker-compose.yml").write_text("a: [1,")  # of something else
     guess = guess_take(folder)
-    assert any("cam01.toml is of one camera alone" in note.told for note in guess.notes)
+    assert any("cam01.toml is of one camera alone" in note.text for note in guess.notes)
     (folder / "cam01.toml").write_text('[cam01]\nmatrix = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n[cam02]\nmatrix = "x"\n')
     with pytest.raises(CalibrationError, match=r"cam01.toml.*no calibration can be used"):
         guess_take(folder)

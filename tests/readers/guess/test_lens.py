@@ -72,6 +72,8 @@ def test_a_wide_lens_sees_wider():
 
 
 def test_init_takes_the_lens_from_the_file(tmp_path):
+    tmp_path = tmp_path / "alone"  # calibrations beside the folder would be taken, too
+    tmp_path.mkdir()
     write(tmp_path / "a.mov", {KEY: "13"})
     write(tmp_path / "b.mov", {})
     done = CliRunner().invoke(main, ["init", str(tmp_path)])

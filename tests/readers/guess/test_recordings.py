@@ -63,7 +63,7 @@ def test_colour_alone_is_left_to_the_detector(tmp_path):
     colour(Bag(), "/cam/image_raw").info("/cam/camera_info", K, SIZE).write(tmp_path / "bag")
     guess, take = guessed(tmp_path)
     assert [(c.name, c.topic) for c in take.cameras] == [("cam", "/cam/image_raw")] and take.up == "-y"
-    assert any("built-in detector" in note.told for note in guess.notes)
+    assert any("built-in detector" in note.text for note in guess.notes)
 
 
 def test_depth_without_a_lens_asks_for_it(tmp_path):
@@ -80,7 +80,7 @@ def test_without_places_one_sensor_is_taken_and_the_others_are_comments(tmp_path
     bag.write(tmp_path / "bag")
     guess, take = guessed(tmp_path)
     assert [d.name for d in take.depth] == ["a"] and '# topic = "/b/image_raw"' in guess.text
-    assert any(note.about == "calibration" and "/tf_static" in note.told for note in guess.notes)
+    assert any(note.about == "calibration" and "/tf_static" in note.text for note in guess.notes)
 
 
 def test_the_largest_of_several_is_taken_and_others_are_told(tmp_path):
@@ -89,7 +89,7 @@ def test_the_largest_of_several_is_taken_and_others_are_told(tmp_path):
     colour(bag, "/other/image_raw").write(tmp_path / "large")
     guess, take = guessed(tmp_path)
     assert take.depth[0].file.is_relative_to(tmp_path / "large")
-    assert any("small.mcap" in note.told and "left out" in note.told for note in guess.notes)
+    assert any("small.mcap" in note.text and "left out" in note.text for note in guess.notes)
 
 
 def test_recordings_that_are_not_read_say_so(tmp_path):
@@ -111,5 +111,5 @@ def test_beside_markers_a_recording_is_only_told_of(tmp_path):
     write_trc(cut(squat_and_wave(), 0, 5), tmp_path / "walk.trc")
     depth(Bag(), "/depth/image_raw").write(tmp_path / "bag")
     guess = guess_take(tmp_path)
-    assert any(note.about == "recording" and "left out" in note.told for note in guess.notes)
+    assert any(note.about == "recording" and "left out" in note.text for note in guess.notes)
     assert "[[depth]]" not in guess.text

@@ -11,7 +11,7 @@ from kinefit.errors import BodyError, ObservationError
 from kinefit.frame.routing import Sensors
 from kinefit.losses import geman_mcclure
 from kinefit.observations import MarkerFrame
-from kinefit.sensors.evidence import SHOWN
+from kinefit.sensors.evidence import MIN_VISIBLE_OUTLINE
 from kinefit.sensors.points.markers import MarkerSensor, of_points
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
@@ -77,11 +77,11 @@ def test_a_point_speaks_for_its_segment_and_at_a_joint_for_both():
     elbow, arm = BODY.tree.segment("forearm_l"), BODY.tree.segment("upperarm_l")
     points = PointSet(("joint", "middle"), np.array([elbow, elbow]), np.array([[0.0, 0, 0], [0, -0.15, 0]]))
     told = of_points(BODY, points, np.array([1.0, 100.0]))
-    assert told.agreeing[[elbow, arm]].tolist() == [SHOWN, SHOWN]
-    assert told.contrary[[elbow, arm]].tolist() == [SHOWN, 0.0]
-    assert told.agreeing.sum() == 2 * SHOWN and told.contrary.sum() == SHOWN
+    assert told.agreeing[[elbow, arm]].tolist() == [MIN_VISIBLE_OUTLINE, MIN_VISIBLE_OUTLINE]
+    assert told.contrary[[elbow, arm]].tolist() == [MIN_VISIBLE_OUTLINE, 0.0]
+    assert told.agreeing.sum() == 2 * MIN_VISIBLE_OUTLINE and told.contrary.sum() == MIN_VISIBLE_OUTLINE
     root = of_points(BODY, PointSet(("root",), np.array([0]), np.zeros((1, 3))), np.array([8.9]))
-    assert root.agreeing[0] == root.agreeing.sum() == SHOWN
+    assert root.agreeing[0] == root.agreeing.sum() == MIN_VISIBLE_OUTLINE
 
 
 def test_markers_speak_for_and_against_where_segments_are():

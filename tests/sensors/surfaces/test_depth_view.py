@@ -12,7 +12,7 @@ from kinefit.bodies.surfaces import MeshSurface, body_mesh
 from kinefit.bodies.surfaces.triangles import triangles
 from kinefit.initialization.depth_score import MAX_DEPTH_ERROR, OVERLAP_COST, POSTURE_COST, Score, prior_sigmas
 from kinefit.rendering import Canvas, rasterise
-from kinefit.sensors.surfaces.depth_view import UNKNOWN, geodesic_ends, outside, splat, view_of
+from kinefit.sensors.surfaces.depth_view import UNMEASURED_TRUST, geodesic_ends, outside, splat, view_of
 
 CAMERA = camera()
 
@@ -40,7 +40,7 @@ def test_what_is_empty_what_is_behind_and_what_lies_beside_the_image():
     depth[:100] = 3.0
     view = view_of(depth, person, CAMERA)
     assert view.trust[:, 0].max() == 0.0 and view.trust[-1].max() == 0.0  # the image ends left and below
-    assert set(np.unique(view.trust)) == {0.0, UNKNOWN, 1.0}
+    assert set(np.unique(view.trust)) == {0.0, UNMEASURED_TRUST, 1.0}
     wall = np.isfinite(view.behind)
     assert wall.any() and np.all(view.behind[wall] == 3.0) and np.all(view.trust[wall] == 1.0)
     assert not np.isfinite(view.behind[view.seen]).any()
@@ -57,7 +57,7 @@ def test_distance_outside_the_outline():
         x = x_camera @ CAMERA.T_world_camera[:3, :3].T + CAMERA.centre_world
         gap, trust = outside(view, x)
         assert abs(gap[0] - beyond) < 0.025 and gap[1] == 0.0  # a pixel of the view
-        assert trust[0] == UNKNOWN
+        assert trust[0] == UNMEASURED_TRUST
 
 
 def test_ends_of_a_cross_and_of_a_part_that_is_torn_off():

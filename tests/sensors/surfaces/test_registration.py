@@ -92,7 +92,7 @@ def test_one_that_would_move_farther_than_is_usual_is_not_written(walk, tmp_path
     take, seen, fit = fitted(walk, tmp_path, se3.transform(np.eye(3), [0.0, 0.0, 0.45]), frames=4)
     refined = Refined(None, misfits([fit]))
     assert refined.moved == ()
-    assert re.search(r"depth: not refined, because .*it would move by 4\d cm", "\n".join(refined.told()))
+    assert re.search(r"depth: not refined, because .*it would move by 4\d cm", "\n".join(refined.summary_lines()))
     before = sorted(path.name for path in tmp_path.iterdir())
     found = SimpleNamespace(take=take, observations=seen)
     write_refined(found, refined, tmp_path / "take.toml")

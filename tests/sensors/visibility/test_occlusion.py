@@ -13,7 +13,13 @@ from kinefit.sensors.points.keypoints import KeypointMeasurement, KeypointSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surfaces.depth_image import DepthImageSensor
-from kinefit.sensors.visibility.occlusion import THICK, DepthSeen, beside, depth_behind, hidden_points
+from kinefit.sensors.visibility.occlusion import (
+    MIN_OCCLUDED_DEPTH,
+    DepthSeen,
+    adjacent_cameras,
+    depth_behind,
+    hidden_points,
+)
 from kinefit.solvers.equations import normal_equations
 
 TRUTH = a_motion().state(0)
@@ -92,7 +98,7 @@ def test_only_cameras_of_the_same_side_count():
 
     near = CAMERA.centre_world + (0.05, 0.0, 0.0)
     across = 2 * WRIST - CAMERA.centre_world
-    assert beside(CAMERA, [at(near), at(across)], WRIST) == [0]
+    assert adjacent_cameras(CAMERA, [at(near), at(across)], WRIST) == [0]
     away = pushed(0.4)
     for eye, count in ((near, 1), (across, 0)):
         here = Scene(BODY, away, Rig((CAMERA, at(eye)))).at(away, measurements=shown().measurements)
@@ -112,7 +118,7 @@ def test_a_wrist_that_is_seen_speaks_against_a_body_that_hides_it(confidence, ag
     assert len(both.rows(here)) == 1 + against and (both.key != alone.key) == against
     lost = both.evidence(here).lost[WRISTS.segments[1]]
     assert lost == against and not alone.evidence(here).lost[WRISTS.segments[1]]
-    assert THICK < 0.4
+    assert MIN_OCCLUDED_DEPTH < 0.4
 
 
 def test_the_tracker_shows_keypoints_what_depth_images_saw():

@@ -1,10 +1,10 @@
 """Self-calibrating bundle adjustment with a known distance (H.-G. Maas, 1998; Triggs et al., 1999, with Schur).
 
-Unknown are each camera's pose and interior (fx, fy, cx, cy, k1, k2, p1, p2, k3) and both ends of the bar in every
-place. Observed are the pixels of the ends, in every place the distance of the two (P4, section 2.2), and, weakly, what
-any camera is like: a centre near that of the image, square pixels, little distortion. The first camera's pose is
-fixed, and the distance fixes the scale: no freedom is left over. The noise of the pixels and the scatter of the
-distance are estimated as variance components (W. Förstner, 1979).
+Unknowns are each camera's pose and intrinsics (fx, fy, cx, cy, k1, k2, p1, p2, k3) and both ends of the bar in every
+place. Observations are the pixels of the ends and, in every place, the distance of the two (P4, section 2.2). A weak
+prior is a common camera: a principal point near the image's centre, square pixels, little distortion. The first
+camera's pose is fixed, and the distance fixes the scale: no gauge freedom remains. The noise of the pixels and the
+scatter of the distance are estimated as variance components (W. Förstner, 1979).
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from kinefit.solvers.least_squares import descend
 
 POSE = 6
 INTERIOR = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-_CENTRE = 0.05  # of the image's width: standard deviation of a centre about the image's
-_SQUARE = 0.02  # of the image's width: standard deviation of fx - fy
-_LENS = np.array([0.5, 0.5, 0.02, 0.02, 0.3])  # standard deviations of k1, k2, p1, p2, k3 about none
-_HUBER = 3.0  # standard deviations; all but 1 % of normal errors keep full weight
-_LEAST_NOISE = 0.005  # [px]
-_LEAST_SCATTER = 1e-6  # of the length
+_CENTRE_SIGMA = 0.05  # of the image's width, of the principal point about the image's centre
+_ASPECT_SIGMA = 0.02  # of the image's width, of fx - fy
+_DISTORTION_SIGMA = np.array([0.5, 0.5, 0.02, 0.02, 0.3])  # of k1, k2, p1, p2, k3 about zero
+_HUBER = 3.0  # [standard deviations] all but 1 % of normal errors keep full weight
+_MIN_SIGMA_PX = 0.005
+_MIN_SCATTER = 1e-6  # of the length
 
 
 @dataclass(frozen=True, eq=False)
 class BarBundle:
-    """Cameras and places of the bar that agree best.
+    """Adjusted cameras and places of the bar.
 
     Parameters
     ----------
-    rig : Rig, the first camera where it was.
+    rig : Rig, the first camera unchanged.
     x_world : (F, 2, 3) [m] ends of the bar.
-    residuals : (F, C, 2, 2) [px] measured minus seen; NaN where unseen.
+    residuals : (F, C, 2, 2) [px] measured minus projected; NaN if unobserved.
     sigma : float [px] standard deviation of a pixel coordinate.
     scatter : float [m] standard deviation of the distance of the ends in one place.
     covariance : (C · P, C · P) of the cameras' parameters, P = 6 for the twist (v, ω) in the camera's frame, and 9
-        for the interior where that was estimated; zero for what is fixed.
+        for the intrinsics if these were estimated; zero for fixed parameters.
     ends : (F, 6, 6) [m²] covariance of each place's ends.
-    prior_share : (C · P,) share of the information on each parameter that is the prior's, 0 to 1.
+    prior_share : (C · P,) share 0..1 of the prior in the information on each parameter.
     """
 
     rig: Rig
@@ -67,14 +67,14 @@ _Linearised = tuple[Rig, NDArray, _BarEquations]
 
 
 class BarProblem:
-    """What was observed, and what may change.
+    """Observations and free parameters of the adjustment.
 
     Parameters
     ----------
-    uv : (F, C, 2, 2) [px] of place, camera, end; NaN where unseen.
+    uv : (F, C, 2, 2) [px] of place, camera, end; NaN if unobserved.
     length : float [m]
-    interiors : bool, whether they change too.
-    sigma, scatter : float [px], [m] standard deviations to begin with.
+    interiors : bool, whether intrinsics are free.
+    sigma, scatter : float [px], [m] initial standard deviations.
     """
 
     def __init__(self, uv: NDArray, length: float, *, interiors: bool, sigma: float, scatter: float) -> None:
@@ -85,7 +85,7 @@ class BarProblem:
         self.free[0, :POSE] = False
 
     def adjust(self, rig: Rig, x_world: NDArray, *, rounds: int = 4, iterations: int = 15) -> tuple[Rig, NDArray]:
-        """Damped Gauss-Newton to the least cost, the variance components anew in every round."""
+        """Minimise the cost over the rig and ends (F, 2, 3) [m], with new variance components in every round."""
         for _ in range(rounds):
             begin, stop = (rig, x_world, self.system(rig, x_world)), 1e-7
             found, _ = descend(begin, lambda at: at[2].cost, self._step, iterations=iterations, tolerance=stop)
@@ -107,20 +107,20 @@ class BarProblem:
         return rig, x_world, self.system(rig, x_world)
 
     def _components(self, rig: Rig, system: _BarEquations) -> None:
-        """Variances of pixels and distance, each from its squares and its share of the redundancy."""
+        """Estimate the variances of pixels and distance from their squares and shares of the redundancy."""
         cov, ends = system.covariances()
         prior = self._prior(rig)[0]
         x = self._normals
         of_length = np.einsum("fi,fij,fj->f", x, ends, x) / self.scatter**2
         places = len(self.uv)
         unknown = self.free.sum() + 6 * places - np.sum(of_length) - np.sum(prior * np.diag(cov))
-        self.sigma = max(np.sqrt(system.squares / max(system.count - unknown, 1.0)) * self.sigma, _LEAST_NOISE)
-        square = 1.4826 * np.median(np.abs(system.misfit))  # robust: one wrong place must not loosen all others
+        self.sigma = max(np.sqrt(system.squares / max(system.count - unknown, 1.0)) * self.sigma, _MIN_SIGMA_PX)
+        square = 1.4826 * np.median(np.abs(system.misfit))  # robust: one wrong place must not weaken all others
         left = max(1.0 - float(np.mean(of_length)), 0.05)
-        self.scatter = max(square / np.sqrt(left), _LEAST_SCATTER * self.length)
+        self.scatter = max(square / np.sqrt(left), _MIN_SCATTER * self.length)
 
     def result(self, rig: Rig, x_world: NDArray) -> BarBundle:
-        """With covariances, at what `adjust` gave."""
+        """The bundle with covariances, at the rig and ends (F, 2, 3) [m] of `adjust`."""
         system = self.system(rig, x_world)
         cov, ends = system.covariances()
         prior = self._prior(rig)[0]
@@ -134,13 +134,13 @@ class BarProblem:
             for c, camera in enumerate(rig):
                 width = max(camera.size)
                 now = np.concatenate([camera.matrix[:2, 2] - (np.array(camera.size) - 1) / 2, camera.distortion])
-                deviation = np.concatenate([np.full(2, _CENTRE * width), _LENS])
+                deviation = np.concatenate([np.full(2, _CENTRE_SIGMA * width), _DISTORTION_SIGMA])
                 information[c, POSE + 2 :] = 1.0 / deviation**2
                 pull[c, POSE + 2 :] = -now / deviation**2
         return information.ravel(), pull.ravel()
 
     def system(self, rig: Rig, x_world: NDArray) -> _BarEquations:
-        """Linearise at a rig and ends."""
+        """Linearise at a rig and ends (F, 2, 3) [m]."""
         F, C, P = len(self.uv), len(rig), self.columns
         H, b, cross = np.zeros((C * P, C * P)), np.zeros(C * P), np.zeros((F, 6, C * P))
         Hp, bp = np.zeros((F, 6, 6)), np.zeros((F, 6))
@@ -162,9 +162,9 @@ class BarProblem:
             of_camera = np.where(fine[:, None, None], of_camera, 0.0)
             of_end = np.where(fine[:, None, None], J @ camera.T_camera_world[:3, :3], 0.0)
             weighted = w[:, None, None] * of_camera
-            mine = slice(c * P, (c + 1) * P)
-            H[mine, mine] = np.tensordot(weighted, of_camera, axes=([0, 1], [0, 1]))
-            b[mine] = np.einsum("nkp,nk->p", weighted, left)
+            own = slice(c * P, (c + 1) * P)
+            H[own, own] = np.tensordot(weighted, of_camera, axes=([0, 1], [0, 1]))
+            b[own] = np.einsum("nkp,nk->p", weighted, left)
             Hx = np.einsum("nki,nkj->nij", w[:, None, None] * of_end, of_end).reshape(-1, 2, 3, 3)
             bx = np.einsum("nki,nk->ni", w[:, None, None] * of_end, left).reshape(-1, 6)
             places = np.flatnonzero(seen)
@@ -172,7 +172,7 @@ class BarProblem:
                 part = slice(3 * e, 3 * e + 3)
                 Hp[places, part, part] += Hx[:, e]
             bp[places] += bx
-            cross[places, :, mine] = np.einsum("nki,nkp->nip", of_end, weighted).reshape(-1, 6, P)
+            cross[places, :, own] = np.einsum("nki,nkp->nip", of_end, weighted).reshape(-1, 6, P)
             residuals[places, c] = np.where(fine[:, None], left, np.nan).reshape(-1, 2, 2)
         information, pull = self._prior(rig)
         cost += float(np.sum(pull**2 / np.where(information > 0, information, 1.0)))
@@ -183,10 +183,10 @@ class BarProblem:
         return _BarEquations(H, b, Hp, bp, cross, self.free.ravel(), cost + more, residuals, misfit, squares, total)
 
     def _square_pixels(self, rig: Rig, H: NDArray, b: NDArray) -> float:
-        """Add fx - fy = 0 of each camera; its cost."""
+        """Add the prior fx - fy = 0 of each camera; returns its cost."""
         cost = 0.0
         for c, camera in enumerate(rig):
-            weight, at = 1.0 / (_SQUARE * max(camera.size)) ** 2, c * self.columns + POSE
+            weight, at = 1.0 / (_ASPECT_SIGMA * max(camera.size)) ** 2, c * self.columns + POSE
             off = float(camera.matrix[1, 1] - camera.matrix[0, 0])
             H[at : at + 2, at : at + 2] += weight * np.array([[1.0, -1.0], [-1.0, 1.0]])
             b[at : at + 2] += weight * off * np.array([1.0, -1.0])
@@ -194,7 +194,7 @@ class BarProblem:
         return cost
 
     def _distances(self, x_world: NDArray, Hp: NDArray, bp: NDArray) -> tuple[NDArray, float]:
-        """Add |b - a| = length of each place; what is missing [m], and the cost."""
+        """Add |b - a| = length of each place; returns the misfits (F,) [m] and the cost."""
         way = x_world[:, 1] - x_world[:, 0]
         distance = np.linalg.norm(way, axis=1)
         n = way / np.maximum(distance, 1e-12)[:, None]

@@ -1,4 +1,4 @@
-"""Cameras calibrated with a bar: lenses, places and scale from two targets at a known distance (P4, section 2.2)."""
+"""Calibrate cameras with a bar: intrinsics, poses and scale from two targets at a known distance (P4, section 2.2)."""
 
 from __future__ import annotations
 
@@ -12,41 +12,42 @@ from kinefit._arguments import checked
 from kinefit.calibration.bar.bundle import INTERIOR, POSE, BarBundle, BarProblem
 from kinefit.calibration.bar.placing import place
 from kinefit.calibration.bar.report import BarCameraReport, advice_of, reports_of
-from kinefit.calibration.bar.start import FEWEST, first_pairs, near, resect
+from kinefit.calibration.bar.start import MIN_PLACES, first_pairs, inlier_distance, resect
 from kinefit.calibration.bar.targets import BarViews
 from kinefit.calibration.bar.world import on_floor
 from kinefit.calibration.known import known_camera
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 
-LENGTH_SIGMA = 1e-4  # [m] to which a bar is usually measured, with a calliper or a good rule
-_SHORTEST, _LONGEST = 0.01, 20.0  # [m] of a bar
-_UNSURE = 0.03  # of the focal length, one standard deviation: no calibration but a guess
-_OUTLIER = 6.0  # standard deviations: none of 10,000 normal errors
-_LOOSE = 0.02  # of the length by which it may scatter: more is no bar, or cameras out of step
-_SECOND = 4.0  # standard deviations by which a second length may differ
-_TAPE = 0.005  # of a distance between lenses measured with a tape, one standard deviation
+LENGTH_SIGMA = 1e-4  # [m] of a bar measured with a calliper or a good rule
+_MIN_LENGTH = 0.01  # [m]
+_MAX_LENGTH = 20.0  # [m]
+_MAX_RELATIVE_STD = 0.03  # of the focal length, or of the cameras' distances: with more it is a guess
+_OUTLIER_SIGMAS = 6.0  # none of 10,000 normal errors
+_MAX_SCATTER = 0.02  # of the length: more is no rigid bar, or unsynchronised cameras
+_MAX_DISTANCE_SIGMAS = 4.0  # of a second length
+_TAPE_SIGMA = 0.005  # of a distance between lenses measured with a tape
 
 
 @dataclass(frozen=True, eq=False)
 class BarCalibration:
-    """Cameras calibrated with a bar.
+    """Result of a calibration with a bar.
 
     Parameters
     ----------
     rig : Rig
     length : float [m] of the bar.
-    cameras : {camera: CameraReport}
-    sigma_px : float [px] standard deviation of a coordinate of a target, as the adjustment finds it.
+    cameras : {camera: BarCameraReport}
+    sigma_px : float [px] estimated standard deviation of a target's coordinate.
     scatter : float [m] standard deviation of the distance of the targets from place to place.
-    frames : (F,) int, of the places used; x_world (F, 2, 3) [m] the ends there, in no constant order.
-    uv, residuals : (F, C, 2, 2) [px] targets used and measured minus seen; NaN where unused.
-    ambiguous : int, places left out because two orders of the targets fit alike.
-    left_out : int, places left out for other reasons.
+    frames, x_world : (F,) int used, and (F, 2, 3) [m] the ends in them, in no constant order.
+    uv, residuals : (F, C, 2, 2) [px] used targets, and measured minus projected; NaN if unused.
+    ambiguous : int, places discarded because two orders of the targets fit alike.
+    left_out : int, places discarded for other reasons.
     world : str
-        Where the origin is, and what points up.
+        Description of the origin and the vertical axis.
     advice : tuple of str
-        What to record more of.
+        What else to record.
     covariance : (C · P, C · P), as in `BarBundle`, in the gauge of the first camera.
     """
 
@@ -80,23 +81,23 @@ def calibrate_bar(
 
     Parameters
     ----------
-    seen : {camera: BarViews}, as `find_bars` and `read_centroids` give them; images of one number are of one time.
+    seen : {camera: BarViews} of `find_bars` or `read_centroids`; images of one number are of one time.
     length : float [m]
-        From centre to centre of the targets.
+        Distance of the targets, from centre to centre.
     interiors : Rig, optional
-        Interiors that are kept (their poses are not used); without, they are calibrated too.
+        Known intrinsics, kept (their poses are not used); default: intrinsics are calibrated too.
     length_sigma : float [m]
-        Standard deviation of the length given.
+        Standard deviation of `length`.
     floor : frames in which the bar lies on the floor, in two directions or more: the targets' height is zero, z up.
-        Without, the world is the first camera's frame.
+        Default: the world is the first camera's frame.
     known_distance : (camera, camera, float [m]), optional
-        A second length, from lens to lens, by which the bar's is checked.
+        A second length, from lens to lens, as a check of the bar's.
 
     Raises
     ------
     CalibrationError
-        Too few places, targets that do not belong together, an arrangement that does not determine the lenses or the
-        cameras, a length that a second one contradicts.
+        Too few places, targets that do not match, an arrangement that does not determine the intrinsics or the poses,
+        a length that a second one contradicts.
     """
     names = list(seen)
     check_bar(length, length_sigma)
@@ -121,16 +122,16 @@ def calibrate_bar(
 
 
 def check_bar(length: float, length_sigma: float = LENGTH_SIGMA) -> None:
-    """CalibrationError where a length [m] is that of no bar."""
-    if not (_SHORTEST < length < _LONGEST and 0 < length_sigma < length):
+    """Raise CalibrationError for an implausible length [m] of a bar."""
+    if not (_MIN_LENGTH < length < _MAX_LENGTH and 0 < length_sigma < length):
         known = "" if 0 < length_sigma < length else f", known to {length_sigma:g} m"
-        metres = next((length * unit for unit in (0.001, 0.01) if 0.1 < length * unit < _LONGEST), 0.9)
+        metres = next((length * unit for unit in (0.001, 0.01) if 0.1 < length * unit < _MAX_LENGTH), 0.9)
         remedy = f"Give it in metres, such as {metres:g}."
         raise CalibrationError(f"a bar of {length:g} m{known}", place="length", remedy=remedy)
 
 
 def check_cameras(names: Collection[str]) -> None:
-    """CalibrationError where too few cameras are there."""
+    """Raise CalibrationError for fewer than two cameras."""
     if len(names) < 2:
         problem = f"{len(names)} camera: a bar calibrates two or more together"
         raise CalibrationError(problem, remedy="Give what two cameras or more saw at the same times.")
@@ -147,14 +148,14 @@ def _camera(name: str, views: BarViews, interiors: Rig | None) -> Camera:
 def _adjusted(
     cameras: list[Camera], uv: NDArray, length: float, known: bool
 ) -> tuple[BarBundle, NDArray, NDArray, NDArray]:
-    """Bundle of all cameras; pixels used (U, C, 2, 2), places used (F,) bool, ambiguous (F,) bool."""
+    """Bundle of all cameras; used pixels (U, C, 2, 2), used places (F,) bool, ambiguous places (F,) bool."""
     pairs = first_pairs(cameras, uv, known, length)
     best: tuple[float, list[int], Rig] | None = None
     for pair in pairs[:6]:
         rig, sigma, share = _grown(Rig(pair.cameras), uv[:, [pair.first, pair.second]], length, known)
-        worth = sigma / max(share, 1e-3) ** 2
-        if best is None or worth < best[0]:
-            best = (worth, [pair.first, pair.second], rig)
+        cost = sigma / max(share, 1e-3) ** 2
+        if best is None or cost < best[0]:
+            best = (cost, [pair.first, pair.second], rig)
     assert best is not None
     _, members, rig = best
     while len(members) < len(cameras):
@@ -169,7 +170,7 @@ def _adjusted(
             raise CalibrationError(
                 f"it shares {count} places with the cameras before it ({', '.join(rig.names)}), of which "
                 f"{100 * share:.0f} % agree", place=f"camera {cameras[c].name}",
-                remedy=f"Is it in step? Wave the bar where it and another camera see it, in {FEWEST} places or more.",
+                remedy=f"Is it in step? Wave the bar where it and another camera see it, {MIN_PLACES} times or more.",
             )  # fmt: skip
         members, rig = [*members, c], Rig((*rig, camera))
         rig, _, _ = _grown(rig, uv[:, members], length, known)
@@ -177,7 +178,7 @@ def _adjusted(
     rig = rig.moved(rig.cameras[0].T_camera_world)
     sigma = 1.0
     for n in range(4):
-        limit = _limit(rig, known) if n == 0 else max(_OUTLIER * sigma * np.sqrt(2), 0.05)
+        limit = _limit(rig, known) if n == 0 else max(_OUTLIER_SIGMAS * sigma * np.sqrt(2), 0.05)
         placed = place(rig, uv, length, limit, (0.05, 0.02, 0.01, 0.01)[n] * length)
         used = np.isfinite(placed.x_world).all(axis=(1, 2))
         _check_count(int(used.sum()), len(uv))
@@ -189,16 +190,16 @@ def _adjusted(
 
 
 def _limit(rig: Rig, known: bool) -> float:
-    return max(near(camera, known) * (camera.matrix[0, 0] if known else max(camera.size)) for camera in rig)
+    return max(inlier_distance(camera, known) * (camera.matrix[0, 0] if known else max(camera.size)) for camera in rig)
 
 
 def _grown(rig: Rig, uv: NDArray, length: float, known: bool) -> tuple[Rig, float, float]:
-    """A rig adjusted to the places that it knows, twice; noise [px] and share of places that fit."""
+    """A rig adjusted twice to the places that it triangulates; noise [px] and share of places that fit."""
     sigma, share = 1.0, 0.0
     for n in range(2):
         placed = place(rig, uv, length, _limit(rig, known), (0.2, 0.05)[n] * length)
         used = np.isfinite(placed.x_world).all(axis=(1, 2))
-        if used.sum() < FEWEST:
+        if used.sum() < MIN_PLACES:
             return rig, np.inf, 0.0
         problem = BarProblem(placed.uv[used], length, interiors=not known, sigma=sigma, scatter=5e-3 * length)
         rig, _ = problem.adjust(rig, placed.x_world[used], rounds=2, iterations=15)
@@ -208,7 +209,7 @@ def _grown(rig: Rig, uv: NDArray, length: float, known: bool) -> tuple[Rig, floa
 
 
 def _check_count(used: int, total: int) -> None:
-    if used < FEWEST:
+    if used < MIN_PLACES:
         raise CalibrationError(
             f"the cameras agree on {used} of {total} places of the bar",
             remedy="Are the videos in step, and the two targets the brightest spots that move? Wave it in 50 places.",
@@ -216,7 +217,7 @@ def _check_count(used: int, total: int) -> None:
 
 
 def _check(bundle: BarBundle, length: float, known: bool, seen: Mapping[str, BarViews]) -> None:
-    if bundle.scatter > _LOOSE * length:
+    if bundle.scatter > _MAX_SCATTER * length:
         raise CalibrationError(
             f"the distance of the two targets scatters by {100 * bundle.scatter / length:.1f} % from place to place",
             remedy="Are the videos in step, and the two brightest spots always those of one stiff bar?",
@@ -225,22 +226,22 @@ def _check(bundle: BarBundle, length: float, known: bool, seen: Mapping[str, Bar
     std = np.sqrt(np.diag(bundle.covariance)).reshape(-1, P)
     for c, camera in enumerate(bundle.rig):
         used = int(np.isfinite(bundle.residuals[:, c]).all(axis=(1, 2)).sum())
-        if used < FEWEST:
+        if used < MIN_PLACES:
             raise CalibrationError(
                 f"only {used} of its {len(seen[camera.name].ends)} images of the bar agree with the other cameras",
                 place=f"camera {camera.name}", remedy="Is it in step? Wave the bar where it and another camera see it.",
             )  # fmt: skip
-        if not known and not std[c, POSE] < _UNSURE * camera.matrix[0, 0]:
+        if not known and not std[c, POSE] < _MAX_RELATIVE_STD * camera.matrix[0, 0]:
             raise CalibrationError(
                 f"the focal length is not determined: {camera.matrix[0, 0]:.0f} px may be off by "
                 f"{100 * std[c, POSE] / camera.matrix[0, 0]:.0f} %", place=f"camera {camera.name}",
                 remedy="Wave the bar near and far, in all directions, set the cameras apart, or give --interiors.",
             )  # fmt: skip
     farthest = max(float(np.linalg.norm(camera.centre_world)) for camera in bundle.rig)
-    unsure = float(np.sqrt((std[:, :3] ** 2).sum(axis=1)).max())
-    if unsure > _UNSURE * farthest:
+    position_std = float(np.sqrt((std[:, :3] ** 2).sum(axis=1)).max())
+    if position_std > _MAX_RELATIVE_STD * farthest:
         raise CalibrationError(
-            f"where the cameras stand is known to {unsure:.2f} m only, of {farthest:.2f} m between them",
+            f"where the cameras stand is known to {position_std:.2f} m only, of {farthest:.2f} m between them",
             remedy="Wave the bar near and far and in all directions, and set the cameras 20 degrees apart or more.",
         )
 
@@ -250,8 +251,8 @@ def _check_second(bundle: BarBundle, length: float, sigma: float, known: tuple[s
     found = float(np.linalg.norm(bundle.rig[a].centre_world - bundle.rig[b].centre_world))
     if not metres > 0:
         raise CalibrationError(f"a distance of {metres} m", place=f"{a} to {b}", remedy="Give it in metres.")
-    unsure = np.hypot(_TAPE, sigma / length)
-    if abs(np.log(found / metres)) > _SECOND * unsure:
+    relative_std = np.hypot(_TAPE_SIGMA, sigma / length)
+    if abs(np.log(found / metres)) > _MAX_DISTANCE_SIGMAS * relative_std:
         raise CalibrationError(
             f"with a bar of {length:g} m they stand {found:.3f} m apart, not {metres:g} m",
             place=f"cameras {a} and {b}",

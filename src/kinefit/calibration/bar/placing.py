@@ -1,4 +1,4 @@
-"""Where the bar was in every frame, and which target is which in every camera."""
+"""Triangulate the bar in every frame, and assign its targets in every camera."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ class BarPlacement:
 
 
 def place(rig: Rig, uv: NDArray, length: float, limit: float, tolerance: float) -> BarPlacement:
-    """The bar in every frame: of all orders the ends that most cameras agree with and that keep the length.
+    """Triangulate the bar in every frame, in the order of targets with the lowest cost in all cameras and the length.
 
-    Frames in which two orders fit alike (two cameras and a bar in the plane through both) are left out.
+    Frames in which two orders fit alike (two cameras and a bar in the plane through both) are discarded.
 
     Parameters
     ----------
     uv : (F, C, 2, 2) [px], targets in any order.
-    limit : float [px] within which a camera agrees.
-    tolerance : float [m] within which the length does.
+    limit : float [px] largest error of a camera that agrees.
+    tolerance : float [m] standard deviation of the length.
     """
     F, C = uv.shape[:2]
     seen = np.isfinite(uv).all(axis=(2, 3))
@@ -49,13 +49,13 @@ def place(rig: Rig, uv: NDArray, length: float, limit: float, tolerance: float) 
     rows, best = np.arange(F), np.argmin(costs, axis=0)
     x_world, order = np.array(ends)[best, rows], np.array(orders)[best, rows]
     differs = (np.array(orders) ^ order) & seen
-    other = differs.any(axis=2) & (differs != seen).any(axis=2)  # all exchanged is the same bar, named the other way
+    other = differs.any(axis=2) & (differs != seen).any(axis=2)  # all swapped is the same bar
     rival = np.where(other, costs, np.inf).min(axis=0)
     least = np.array(costs)[best, rows]
     ambiguous = np.isfinite(least) & (rival < least + 9.0)  # three standard deviations
     ordered = np.where(order[:, :, None, None], uv[:, :, ::-1], uv)
-    told = np.stack([camera.project(np.nan_to_num(x_world)) for camera in rig], axis=1)
-    off = np.linalg.norm(told - ordered, axis=3).max(axis=2)
+    projected = np.stack([camera.project(np.nan_to_num(x_world)) for camera in rig], axis=1)
+    off = np.linalg.norm(projected - ordered, axis=3).max(axis=2)
     used = seen & (off < limit) & ~ambiguous[:, None]
     keeps = np.abs(np.linalg.norm(x_world[:, 1] - x_world[:, 0], axis=1) - length) < 5 * tolerance
     used &= ((used.sum(axis=1) >= 2) & keeps)[:, None]
@@ -64,13 +64,13 @@ def place(rig: Rig, uv: NDArray, length: float, limit: float, tolerance: float) 
 
 
 def _agreement(rig: Rig, x: NDArray, uv: NDArray, limit: float) -> tuple[NDArray, NDArray]:
-    """Truncated costs (F,) of ends x (F, 2, 3), a third of the limit being 1, and which cameras exchange them."""
+    """Truncated costs (F,) of ends x (F, 2, 3), a third of the limit counting 1, and (F, C) cameras that swap them."""
     cost, exchanged = np.zeros(len(x)), np.zeros(uv.shape[:2], bool)
     for c, camera in enumerate(rig):
         seen = np.isfinite(uv[:, c]).all(axis=(1, 2))
         at = camera.project(np.nan_to_num(x))
         both = [np.sum((at - uv[:, c][:, order]) ** 2, axis=(1, 2)) for order in ((0, 1), (1, 0))]
-        both = [np.where(np.isfinite(one), one, np.inf) for one in both]
+        both = [np.where(np.isfinite(square), square, np.inf) for square in both]
         exchanged[:, c] = both[1] < both[0]
         cost += np.where(seen, np.minimum(np.minimum(*both), 2 * limit**2), 0.0) / (limit / 3) ** 2
     return np.where(np.isfinite(x).all(axis=(1, 2)), cost, np.inf), exchanged

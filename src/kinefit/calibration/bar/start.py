@@ -1,6 +1,6 @@
-"""Where cameras stand to each other, from unordered pairs of targets, with no pose and perhaps no lens known.
+"""Initial relative poses of cameras from unordered pairs of targets, with or without known intrinsics.
 
-No image tells which of the two targets is which: every step tries both orders and keeps the one that fits.
+No image distinguishes the two targets: every step tries both orders and keeps the one that fits.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera
 from kinefit.geometry.se3 import exp_so3, transform
 
-FEWEST = 12  # places that two cameras share: 48 coordinates for 7 unknowns of their orientation, with orders unknown
-_HYPOTHESES = 1500  # a sample of four places has its orders right once in eight
-_NEAR = 0.01  # of the image's width: an unknown lens bends lines by as much
-_NEAR_KNOWN = 3.0  # [px] where the lens is known
-_FOCALS = np.geomspace(0.4, 4.0, 25)  # focal length over the image's longer side: 100 to 14 degrees wide
-_AGREE = 0.6  # of the places that two cameras share
-_PARALLAX = np.radians(2.0)  # between rays, below which distances are chance
+MIN_PLACES = 12  # that two cameras share: 48 coordinates for 7 unknowns of their orientation, with orders unknown
+_HYPOTHESES = 1500  # one in eight samples of four places has the right orders
+_MAX_ERROR = 0.01  # of the image's width: the distortion of an unknown lens
+_MAX_ERROR_KNOWN_LENS_PX = 3.0
+_TRIED_FOCALS = np.geomspace(0.4, 4.0, 25)  # focal length over the image's longer side: 100 to 14 degrees wide
+_MIN_AGREEING_SHARE = 0.6  # of the places that two cameras share
+_MIN_PARALLAX = np.radians(2.0)  # between rays: with less distances are undetermined
 
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two cameras that agree: places in the rig, cameras with focal length and pose, share of places that agree."""
+    """Two cameras that agree: indices in the rig, cameras with focal length and pose, agreeing share, score."""
 
     first: int
     second: int
@@ -38,7 +38,7 @@ class Pair:
 
 
 def flat(camera: Camera, uv: NDArray, known: bool) -> NDArray:
-    """Image coordinates that are perspective: with a known lens those at distance 1, else widths from the centre."""
+    """Perspective coordinates (..., 2) of pixels uv (..., 2): normalised if the lens is known, else in image widths."""
     if known:
         ray = camera.with_pose(np.eye(4)).ray(uv)
         return ray[..., :2] / np.where(ray[..., 2:] > 1e-6, ray[..., 2:], np.nan)
@@ -46,7 +46,7 @@ def flat(camera: Camera, uv: NDArray, known: bool) -> NDArray:
 
 
 def with_focal(camera: Camera, focal: float, known: bool) -> Camera:
-    """A camera of a focal length [widths], centred and without distortion; unchanged where its lens is known."""
+    """A camera of a focal length [image widths], centred and without distortion; unchanged if its lens is known."""
     if known:
         return camera
     f = focal * max(camera.size)
@@ -55,56 +55,57 @@ def with_focal(camera: Camera, focal: float, known: bool) -> Camera:
     return replace(camera, matrix=K, distortion=np.zeros(5), model="radtan")
 
 
-def near(camera: Camera, known: bool) -> float:
-    """Distance in flat coordinates within which measurements agree."""
-    return _NEAR_KNOWN / camera.matrix[0, 0] if known else _NEAR
+def inlier_distance(camera: Camera, known: bool) -> float:
+    """Largest error of an inlier in the unit of `flat`: image widths, or normalised coordinates of a known lens."""
+    return _MAX_ERROR_KNOWN_LENS_PX / camera.matrix[0, 0] if known else _MAX_ERROR
 
 
 def first_pairs(cameras: Sequence[Camera], uv: NDArray, known: bool, length: float) -> list[Pair]:
-    """Pairs of cameras to begin with, best first; several focal lengths of one pair may stand in the list.
+    """Initial pairs of cameras, best first; one pair may occur with several focal lengths.
 
     Parameters
     ----------
-    cameras : of which lens and size count.
+    cameras : with their lenses and image sizes.
     uv : (F, C, 2, 2) [px] of place, camera, target.
 
     Raises
     ------
     CalibrationError
-        Too few common places, targets that do not belong together, or that all lie in a plane.
+        Too few common places, targets that do not match, or all targets in one plane.
     """
     seen = np.isfinite(uv).all(axis=(2, 3))
     shared = {(i, j): int((seen[:, i] & seen[:, j]).sum()) for i, j in combinations(range(len(cameras)), 2)}
-    enough = {pair: n for pair, n in shared.items() if n >= FEWEST}
+    enough = {pair: n for pair, n in shared.items() if n >= MIN_PLACES}
     if not enough:
         (i, j), most = max(shared.items(), key=lambda item: item[1])
         raise CalibrationError(
-            f"no two cameras see the bar in {FEWEST} common places; {cameras[i].name} and {cameras[j].name} in {most}",
+            f"no two cameras see the bar in {MIN_PLACES} common places; "
+            f"{cameras[i].name} and {cameras[j].name} in {most}",
             remedy="Wave the bar where two cameras see both targets at a time; 50 places and more, over all the volume."
         )
     pairs: list[Pair] = []
-    told: dict[str, float] = {}
+    reasons: dict[str, float] = {}
     for i, j in sorted(enough, key=lambda pair: -enough[pair])[:8]:
         both = seen[:, i] & seen[:, j]
         a, b = flat(cameras[i], uv[both, i], known), flat(cameras[j], uv[both, j], known)
-        limit = max(near(cameras[i], known), near(cameras[j], known))
+        limit = max(inlier_distance(cameras[i], known), inlier_distance(cameras[j], known))
         F, order, inside = epipolar(a, b, limit)
         share = float(inside.mean())
         name = f"{cameras[i].name} and {cameras[j].name}"
-        if share < _AGREE:
-            told[f"{name} agree in {100 * share:.0f} % of {both.sum()} places"] = share
+        if share < _MIN_AGREEING_SHARE:
+            reasons[f"{name} agree in {100 * share:.0f} % of {both.sum()} places"] = share
             continue
         b = np.where(order[:, None, None], b[:, ::-1], b)
         if _is_flat(a[inside], b[inside], limit):
-            told[f"all places that {name} share lie in one plane, or they stand all but in one place"] = 1.0
+            reasons[f"all places that {name} share lie in one plane, or they stand all but in one place"] = 1.0
             continue
         for metric, gain in _metric((cameras[i], cameras[j]), F, a[inside], b[inside], known, length):
             pairs.append(Pair(i, j, metric, share, gain * share))
     if not pairs:
-        worst = max(told, key=lambda text: told[text]) if told else "no two cameras see it from sides that differ"
+        worst = max(reasons, key=reasons.__getitem__, default="no two cameras see it from sides that differ")
         flatness = "plane" in worst
         raise CalibrationError(
-            f"the targets do not tell how the cameras stand: {worst}",
+            f"the targets do not determine how the cameras stand: {worst}",
             remedy="Wave the bar near and far, high and low, in all directions." if flatness
             else "Are the videos in step, and the two targets the brightest spots? Set the cameras farther apart.",
         )  # fmt: skip
@@ -112,7 +113,7 @@ def first_pairs(cameras: Sequence[Camera], uv: NDArray, known: bool, length: flo
 
 
 def epipolar(a: NDArray, b: NDArray, limit: float) -> tuple[NDArray, NDArray, NDArray]:
-    """Fundamental matrix of unordered pairs of points by consensus, with the orders that fit it.
+    """Fundamental matrix of unordered pairs of points by random sampling, with the orders that fit it.
 
     Parameters
     ----------
@@ -121,8 +122,8 @@ def epipolar(a: NDArray, b: NDArray, limit: float) -> tuple[NDArray, NDArray, ND
     Returns
     -------
     F : (3, 3) with x_bᵀ F x_a = 0
-    exchanged : (M,) bool, where the targets of b stand the other way round.
-    inside : (M,) bool, places that agree.
+    swapped : (M,) bool, places with swapped targets in b.
+    inside : (M,) bool, inliers.
     """
     return _consensus(a, b, _eight_points, _order_costs, limit, rounds=10, least=4)
 
@@ -131,9 +132,9 @@ def _consensus(
     a: NDArray, b: NDArray, model_of: Callable[[NDArray, NDArray], NDArray],
     costs: Callable[[NDArray, NDArray, NDArray], NDArray], limit: float, *, rounds: int, least: int,
 ) -> tuple[NDArray, NDArray, NDArray]:  # fmt: skip
-    """The model of pairs a (M, 2, n) and b (M, 2, 2), whose order is unknown, that most agree with; see `epipolar`.
+    """The model with the lowest robust cost of pairs a (M, 2, n) and b (M, 2, 2) of unknown order; see `epipolar`.
 
-    It is found from four pairs at a time, then from all that agree, in so many rounds, while `least` do.
+    Hypotheses are from four pairs; the best is refined by its inliers in some rounds, while there are `least`.
     """
     rng, M = np.random.default_rng(0), len(a)
     sample = rng.integers(0, M, (_HYPOTHESES, 4))
@@ -142,15 +143,15 @@ def _consensus(
     models = model_of(a[sample].reshape(_HYPOTHESES, 8, -1), bs.reshape(_HYPOTHESES, 8, 2))
     few = np.unique(np.linspace(0, M - 1, min(M, 150)).astype(int))
     best = int(np.argmin(np.minimum(costs(models, a[few], b[few]).min(axis=0), 2 * limit**2).sum(axis=1)))
-    model, exchanged, inside = models[best][None], np.zeros(M, bool), np.ones(M, bool)
+    model, swapped, inside = models[best][None], np.zeros(M, bool), np.ones(M, bool)
     for _ in range(rounds):
         straight, crossed = costs(model, a, b)[:, 0]
-        exchanged, inside = crossed < straight, np.minimum(straight, crossed) < 2 * limit**2
+        swapped, inside = crossed < straight, np.minimum(straight, crossed) < 2 * limit**2
         if inside.sum() < least:
             break
-        ordered = np.where(exchanged[:, None, None], b[:, ::-1], b)[inside]
+        ordered = np.where(swapped[:, None, None], b[:, ::-1], b)[inside]
         model = model_of(a[inside].reshape(1, 2 * inside.sum(), -1), ordered.reshape(1, -1, 2))
-    return model[0], exchanged, inside
+    return model[0], swapped, inside
 
 
 def _eight_points(a: NDArray, b: NDArray) -> NDArray:
@@ -175,7 +176,7 @@ def _eight_points(a: NDArray, b: NDArray) -> NDArray:
 
 
 def _order_costs(F: NDArray, a: NDArray, b: NDArray) -> NDArray:
-    """(2, K, M) squared Sampson distances of both targets in sum, straight and exchanged."""
+    """(2, K, M) sums of squared Sampson distances of both targets, in order and swapped."""
     x, y = (np.concatenate([p, np.ones((*p.shape[:2], 1))], axis=2) for p in (a, b))
     lines = np.einsum("kij,mej->kmei", F, x)
     back = np.einsum("kji,mej->kmei", F, y)
@@ -188,7 +189,7 @@ def _order_costs(F: NDArray, a: NDArray, b: NDArray) -> NDArray:
 
 
 def _is_flat(a: NDArray, b: NDArray, limit: float) -> bool:
-    """Whether all targets lie in one plane: a homography explains the second image as well as the first allows."""
+    """Whether all targets lie in one plane: a homography maps the first image to the second within the limit."""
     H, _ = cv2.findHomography(a.reshape(-1, 2), b.reshape(-1, 2), cv2.LMEDS)
     if H is None:
         return False
@@ -199,9 +200,9 @@ def _is_flat(a: NDArray, b: NDArray, limit: float) -> bool:
 def _metric(
     cameras: tuple[Camera, Camera], F: NDArray, a: NDArray, b: NDArray, known: bool, length: float
 ) -> list[tuple[tuple[Camera, Camera], float]]:
-    """Cameras with which the bar keeps its length, by focal lengths and the poses of these, and what each is worth."""
+    """Pairs of cameras for which the bar keeps its length, over focal lengths and their poses, with a score each."""
     few = np.unique(np.linspace(0, len(a) - 1, min(len(a), 80)).astype(int))
-    focals = np.ones(1) if known else _FOCALS
+    focals = np.ones(1) if known else _TRIED_FOCALS
     trials = []
     for fi in focals:
         for fj in focals:
@@ -213,7 +214,7 @@ def _metric(
             T, lengths, angle, front = found
             middle = np.median(lengths)
             spread = float(np.median(np.abs(np.log(lengths / middle)))) if middle > 0 else np.inf
-            if angle > _PARALLAX:
+            if angle > _MIN_PARALLAX:
                 trials.append((spread + 0.5 * (1 - s[1] / s[0]) + 2 * (1 - front), fi, fj, T, middle, angle))
     trials.sort(key=lambda trial: trial[0])
     chosen: list[tuple[tuple[Camera, Camera], float]] = []
@@ -228,8 +229,8 @@ def _metric(
     return chosen
 
 
-def _alike(one: tuple[Camera, Camera], other: tuple[Camera, Camera]) -> bool:
-    return all(abs(np.log(p.matrix[0, 0] / q.matrix[0, 0])) < 0.25 for p, q in zip(one, other))
+def _alike(a: tuple[Camera, Camera], b: tuple[Camera, Camera]) -> bool:
+    return all(abs(np.log(p.matrix[0, 0] / q.matrix[0, 0])) < 0.25 for p, q in zip(a, b))
 
 
 def _posed(E: NDArray, a: NDArray, b: NDArray) -> tuple[NDArray, NDArray, float, float] | None:
@@ -241,7 +242,7 @@ def _posed(E: NDArray, a: NDArray, b: NDArray) -> tuple[NDArray, NDArray, float,
     for R in (u @ W @ vt, u @ W.T @ vt):
         R = R * np.sign(np.linalg.det(R))
         for t in (u[:, 2], -u[:, 2]):
-            # rays s p from the first, s' Rᵀ q from the second at -Rᵀ t: nearest points
+            # nearest points of the rays s p from the first camera and r Rᵀ q from the second at -Rᵀ t
             p, q, centre = rays[0], rays[1] @ R, -R.T @ t
             pp, qq, pq = (np.sum(x * y, axis=1) for x, y in ((p, p), (q, q), (p, q)))
             pc, qc = p @ centre, q @ centre
@@ -256,24 +257,24 @@ def _posed(E: NDArray, a: NDArray, b: NDArray) -> tuple[NDArray, NDArray, float,
 
 
 def resect(camera: Camera, x_world: NDArray, uv: NDArray, known: bool) -> tuple[Camera, float]:
-    """A camera laid on the bar's known places, and the share of places that agree.
+    """Resect a camera from the bar's known ends; returns it with the share of places that agree.
 
     Parameters
     ----------
     x_world : (M, 2, 3) [m] ends.
     uv : (M, 2, 2) [px] targets, in any order.
     """
-    if len(uv) < FEWEST:
+    if len(uv) < MIN_PLACES:
         return camera, 0.0
-    p, limit = flat(camera, uv, known), near(camera, known)
+    p, limit = flat(camera, uv, known), inlier_distance(camera, known)
     middle, size = x_world.mean(axis=(0, 1)), max(float(x_world.std()), 1e-9)
     x = np.concatenate([(x_world - middle) / size, np.ones((len(uv), 2, 1))], axis=2)
-    _, exchanged, inside = _consensus(x, p, _direct, _projected, limit, rounds=8, least=6)
+    _, swapped, inside = _consensus(x, p, _direct, _projected, limit, rounds=8, least=6)
     if inside.sum() < 6:
         return camera, 0.0
-    ordered = np.where(exchanged[:, None, None], p[:, ::-1], p)
+    ordered = np.where(swapped[:, None, None], p[:, ::-1], p)
     best_cost, best_camera = np.inf, camera
-    for focal in np.ones(1) if known else _FOCALS:
+    for focal in np.ones(1) if known else _TRIED_FOCALS:
         image = np.ascontiguousarray(ordered[inside].reshape(-1, 2) / focal)
         ok, turn, shift = cv2.solvePnP(
             np.ascontiguousarray(x_world[inside].reshape(-1, 3)), image, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP
@@ -301,7 +302,7 @@ def _direct(x: NDArray, p: NDArray) -> NDArray:
 
 
 def _projected(P: NDArray, x: NDArray, p: NDArray) -> NDArray:
-    """(2, K, M) squared distances of both targets in sum, straight and exchanged."""
+    """(2, K, M) sums of squared distances of both targets, in order and swapped."""
     seen = np.einsum("kij,mej->kmei", P, x)
     depth = np.where(np.abs(seen[..., 2:]) > 1e-12, seen[..., 2:], 1e-12)
     seen = seen[..., :2] / depth

@@ -1,4 +1,4 @@
-"""Centroids of a bar's targets from a table."""
+"""Read the centroids of a bar's targets from a table."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _COLUMNS = ("camera", "frame", "u", "v")
 def read_centroids(
     path: str | PathLike[str], sizes: Mapping[str, tuple[int, int]] | tuple[int, int]
 ) -> dict[str, BarViews]:
-    """What cameras saw of a bar, of a CSV file with the columns camera, frame, u, v: a row a target, two an image.
+    """Read a CSV file with the columns camera, frame, u, v: one row for each target, two for each image.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def read_centroids(
     Raises
     ------
     FileError
-        No such table, other columns, or what is no number; with the line.
+        No such table, other columns, or a cell that is no number; with the line.
     CalibrationError
         A camera without a size, targets outside of the image, or no image with two targets.
     """

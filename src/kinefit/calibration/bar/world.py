@@ -1,4 +1,4 @@
-"""The world of a calibration with a bar: the first camera's frame, or the floor on which the bar lay."""
+"""World frame of a calibration with a bar: the first camera's, or the floor on which the bar lay."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.se3 import transform
 
-_WIDE = 0.1  # extent of the places on the floor across their longest, below which they tell no plane
+_MIN_FLOOR_ASPECT = 0.1  # width over length of the points on the floor: narrower ones determine no plane
 
 
 def on_floor(rig: Rig, x_world: NDArray, frames: NDArray, floor: Sequence[int]) -> tuple[Rig, NDArray, str]:
-    """The rig in the world wanted, T_new_world (4, 4), and where that is.
+    """The rig in the requested world, T_new_world (4, 4), and a description of that world.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ def on_floor(rig: Rig, x_world: NDArray, frames: NDArray, floor: Sequence[int]) 
     Raises
     ------
     CalibrationError
-        A frame without the bar, or places that all lie in one direction.
+        A frame without the bar, or points on one line.
     """
     first = rig.names[0]
     if not floor:
@@ -43,7 +43,7 @@ def on_floor(rig: Rig, x_world: NDArray, frames: NDArray, floor: Sequence[int]) 
     points = x_world[np.searchsorted(frames, np.array(floor))].reshape(-1, 3)
     middle = points.mean(axis=0)
     size, axes = np.linalg.svd(points - middle)[1:]
-    if len(floor) < 2 or size[1] < _WIDE * size[0]:
+    if len(floor) < 2 or size[1] < _MIN_FLOOR_ASPECT * size[0]:
         raise CalibrationError(
             "the bar on the floor lies along one line, which leaves open what is up", place="floor",
             remedy="Lay it there in two directions, and give a frame of each.",
@@ -56,8 +56,8 @@ def on_floor(rig: Rig, x_world: NDArray, frames: NDArray, floor: Sequence[int]) 
     R = np.stack([along, np.cross(up, along), up])
     T = transform(R, -R @ points[0])
     height = 1e3 * float(np.sqrt(np.mean(((points - middle) @ up) ** 2)))
-    told = ", ".join(map(str, floor))
+    listed = ", ".join(map(str, floor))
     return rig.moved(T), T, (
         f"Origin in a target of the bar on the floor (frame {floor[0]}), x along the bar, z up; the targets of frames "
-        f'{told} lie in a plane to {height:.1f} mm RMS. Write up = "z" in the take.'
+        f'{listed} lie in a plane to {height:.1f} mm RMS. Write up = "z" in the take.'
     )

@@ -1,9 +1,9 @@
-"""Bundle adjustment of cameras and a board that stands elsewhere in every frame (Triggs et al., 1999, with Schur).
+"""Bundle adjustment of cameras and a board at a new pose in every frame (Triggs et al., 1999, with Schur).
 
-Cameras seldom take their pictures at exactly one time, and a board in a hand moves. So every view may see the board a
-little off its pose in the frame: x_camera = T_camera_world T_world_board exp(η) x_board with η ~ N(0, Σ) of each view,
-Σ (one variance of shift, one of turn) found from the data. η is taken out of each view's equations first; what the
-shape of a board within one picture says of the lens keeps its full weight, what pictures say of each other does not.
+Cameras are seldom exactly synchronised, and a hand-held board moves. So in each view the board may be slightly off its
+pose in the frame: x_camera = T_camera_world T_world_board exp(η) x_board, with η ~ N(0, Σ) for each view. Σ (a variance
+of shift and one of turn) is estimated. η is eliminated from each view's equations first. So the shape of a board within
+one image constrains the lens with full weight, and the relation between images counts less.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.solvers.least_squares import descend
 
-_POSE = 6
-_HUBER = 1.345  # standard deviations: 95 % efficient where errors are normal (Huber, 1981)
-_NOISE = 0.25  # [px] of a corner along one axis, as its detectors find it in sharp to slightly blurred pictures
-_FIRST_JITTER = (3e-3, 6e-3)  # [m, rad] of a board in a hand and cameras some milliseconds apart; found anew
-_LEAST_JITTER = (1e-5, 2e-5)  # [m, rad] no board is flatter
+_POSE = 6  # parameters of a pose
+_HUBER_SIGMAS = 1.345  # 95 % efficient for normal errors (Huber, 1981)
+_CORNER_SIGMA_PX = 0.25  # along one axis, in sharp to slightly blurred images
+_INITIAL_JITTER = (3e-3, 6e-3)  # [m, rad] of a hand-held board and cameras some milliseconds apart
+_MIN_JITTER = (1e-5, 2e-5)  # [m, rad] no board is flatter
 
 
 @dataclass(frozen=True, eq=False)
 class Corners:
-    """M corners seen.
+    """M detected corners.
 
     Parameters
     ----------
-    camera, frame : (M,) int, places in the rig and in the stack of board poses.
+    camera, frame : (M,) int, indices in the rig and in the stack of board poses.
     x_board : (M, 3) [m]
     uv : (M, 2) [px]
     """
@@ -42,23 +42,23 @@ class Corners:
     uv: NDArray
 
     def only(self, keep: NDArray) -> Corners:
-        """Some of them."""
+        """The corners selected by a mask (M,) bool."""
         return Corners(self.camera[keep], self.frame[keep], self.x_board[keep], self.uv[keep])
 
 
 @dataclass(frozen=True, eq=False)
 class BoardBundle:
-    """Cameras and board poses that agree best.
+    """Adjusted cameras and board poses.
 
     Parameters
     ----------
     rig : Rig
     Ts_world_board : (F, 4, 4) [m]
-    residuals : (M, 2) [px] measured minus seen, the board being where the frame has it.
-    within : (M, 2) [px] the same, the board being where the view has it.
+    residuals : (M, 2) [px] measured minus projected, with the board at its pose in the frame.
+    within : (M, 2) [px] the same with the board at its pose in the view.
     jitter : (shift [m], turn [rad]) standard deviations of the board in a view about its pose in the frame.
-    position_std : (C,) [m] of each camera's place, relative to the first; NaN where the boards leave it open.
-    focal_std : (C,) [px], zero where the interior was kept.
+    position_std : (C,) [m] of each camera's centre, relative to the first; NaN if undetermined.
+    focal_std : (C,) [px], zero for known intrinsics.
     """
 
     rig: Rig
@@ -73,18 +73,19 @@ class BoardBundle:
 def adjust_boards(
     rig: Rig, Ts_world_board: NDArray, corners: Corners, *, interiors: bool, max_iterations: int = 40, rounds: int = 6
 ) -> BoardBundle:
-    """Cameras and board poses of least robust pixel error; the first camera stays where it is.
+    """Minimise the robust pixel error over cameras and board poses; the first camera stays fixed.
 
     Parameters
     ----------
+    Ts_world_board : (F, 4, 4) [m] start
     corners : Corners
-        Those of one view beside each other.
+        Corners of one view consecutive.
     interiors : bool
         Whether focal lengths, centres and distortion change too (lens model "radtan" only).
     rounds : int
-        At most so many estimates of Σ (by expectation maximisation), each with its solve.
+        Largest number of estimates of Σ (by expectation maximisation), each with a solve.
     """
-    jitter = _FIRST_JITTER
+    jitter = _INITIAL_JITTER
     for _ in range(rounds):
         problem = _BoardProblem(corners, interiors, jitter)
         rig, Ts_world_board = problem.solve(rig, Ts_world_board, max_iterations)
@@ -99,23 +100,23 @@ def adjust_boards(
 
 
 def residuals(rig: Rig, Ts_world_board: NDArray, corners: Corners) -> NDArray:
-    """(M, 2) [px] measured minus seen; NaN behind a camera."""
+    """(M, 2) [px] measured minus projected; NaN behind a camera."""
     T = Ts_world_board[corners.frame]
     x_world = (T[:, :3, :3] @ corners.x_board[..., None])[..., 0] + T[:, :3, 3]
-    seen = np.empty(corners.uv.shape)
+    projected = np.empty(corners.uv.shape)
     for c, camera in enumerate(rig):
-        mine = corners.camera == c
-        seen[mine] = camera.project(x_world[mine])
-    return corners.uv - seen
+        own = corners.camera == c
+        projected[own] = camera.project(x_world[own])
+    return corners.uv - projected
 
 
 def interior_parameters(camera: Camera) -> int:
-    """How many numbers of an interior may change: fx, fy, cx, cy and the distortion."""
+    """Number of intrinsic parameters: fx, fy, cx, cy and the distortion."""
     return 4 + camera.distortion.size
 
 
 def moved_camera(camera: Camera, delta: NDArray, interiors: bool) -> Camera:
-    """The camera, its pose moved by a twist delta[:6] in its frame, its interior changed by the rest."""
+    """The camera changed by delta (6 + P,): a twist in its frame, then intrinsic parameters."""
     T = se3.exp(delta[:_POSE]) @ camera.T_camera_world
     T[:3, :3] = se3.nearest_rotation(T[:3, :3])
     if not interiors:
@@ -150,7 +151,7 @@ class CameraEquations:
     cost: float
 
     def reduced(self, damping: float) -> tuple[NDArray, NDArray, NDArray]:
-        """The cameras' equations with the frames' unknowns taken out, and the inverses of these (F, 6, 6)."""
+        """Schur complement of the cameras, (n, n) and (n,), and the inverse blocks of the frames (F, 6, 6)."""
         diagonal = np.einsum("fii->fi", self.Hf)
         inverse = np.linalg.inv(self.Hf + np.eye(6) * (damping * diagonal + 1e-12 * diagonal.max() + 1e-12)[:, None, :])
         weighted = inverse @ self.cross
@@ -159,14 +160,14 @@ class CameraEquations:
         return S, self.b - np.einsum("fij,fi->j", weighted, self.bf), inverse
 
     def step(self, damping: float) -> tuple[NDArray, NDArray]:
-        """Change of the cameras (n,) and of the frames' unknowns (F, 6)."""
+        """Steps of the cameras' parameters (N,) and of the frames' unknowns (F, 6)."""
         S, b, inverse = self.reduced(damping)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))  # coefficients and metres differ by many orders
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))  # units differ by many orders of magnitude
         delta = scale * np.linalg.solve(S * np.outer(scale, scale) + 1e-14 * np.eye(len(S)), scale * b)
         return delta, (inverse @ (self.bf - self.cross @ delta)[..., None])[..., 0]
 
     def covariances(self) -> tuple[NDArray, NDArray]:
-        """(n, n) of the cameras, zero where they are fixed, and (F, 6, 6) of the frames' unknowns."""
+        """Covariances (N, N) of the cameras, zero for fixed parameters, and (F, 6, 6) of the frames' unknowns."""
         S, _, inverse = self.reduced(0.0)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
         cov = np.linalg.pinv(S * np.outer(scale, scale), hermitian=True, rcond=1e-15) * np.outer(scale, scale)
@@ -186,7 +187,7 @@ _Linearised = tuple[Rig, NDArray, _BoardEquations]
 
 
 class _BoardProblem:
-    """The corners, what may change, and Σ; views are runs of corners of one camera and frame."""
+    """The corners, the free parameters, and Σ; views are runs of corners of one camera and frame."""
 
     def __init__(self, corners: Corners, interiors: bool, jitter: tuple[float, float]) -> None:
         self.corners, self.interiors = corners, interiors
@@ -195,10 +196,10 @@ class _BoardProblem:
         starts = np.concatenate([[0], change])
         self.views = list(zip(starts, np.append(change, len(corners.camera))))
         self.camera, self.frame = corners.camera[starts], corners.frame[starts]
-        self.sigma = _NOISE
+        self.sigma = _CORNER_SIGMA_PX
 
     def solve(self, rig: Rig, Ts_world_board: NDArray, max_iterations: int) -> tuple[Rig, NDArray]:
-        """Damped Gauss-Newton to the least cost."""
+        """Minimise the cost by damped Gauss-Newton."""
 
         def step(now: _Linearised, damping: float) -> _Linearised:
             cameras, boards = now[2].step(damping)
@@ -212,26 +213,26 @@ class _BoardProblem:
         return found[:2]
 
     def jitter_of(self, rig: Rig, Ts_world_board: NDArray) -> tuple[float, float]:
-        """Standard deviations (shift, turn) of η over the views of frames that two or more cameras saw."""
+        """Standard deviations (shift, turn) of η over the views of frames shared by two or more cameras."""
         system = self.system(rig, Ts_world_board)
         count = np.bincount(self.frame, minlength=len(Ts_world_board))[self.frame]
         if not (count > 1).any():
-            return _LEAST_JITTER
-        # The frame's pose took up one view's share of the freedom. Medians: a wrong view must not loosen all others.
+            return _MIN_JITTER
+        # The frame's pose absorbs one view's freedom. Medians: a wrong view must not weaken all others.
         second = (system.eta**2 + system.spread)[count > 1] * (count / np.maximum(count - 1, 1))[count > 1, None]
         shift, turn = (float(np.sqrt(np.median(second[:, part].mean(axis=1)))) for part in (slice(0, 3), slice(3, 6)))
-        return max(shift, _LEAST_JITTER[0]), max(turn, _LEAST_JITTER[1])
+        return max(shift, _MIN_JITTER[0]), max(turn, _MIN_JITTER[1])
 
     def system(self, rig: Rig, Ts: NDArray) -> _BoardEquations:
-        """Linearise at a rig and board poses."""
+        """Linearise at a rig and board poses (F, 4, 4)."""
         corners, C, F, V = self.corners, len(rig), len(Ts), len(self.views)
         P = _POSE + max(interior_parameters(camera) for camera in rig) * self.interiors
         free = np.zeros((C, P), bool)
         free[1:, :_POSE] = True
         G = np.zeros((len(corners.uv), 2, P + 7))  # camera, board, residual
         for c, camera in enumerate(rig):
-            mine = corners.camera == c
-            x_board, T = corners.x_board[mine], camera.T_camera_world @ Ts[corners.frame[mine]]
+            own = corners.camera == c
+            x_board, T = corners.x_board[own], camera.T_camera_world @ Ts[corners.frame[own]]
             x = (T[:, :3, :3] @ x_board[..., None])[..., 0] + T[:, :3, 3]
             uv, J, J_interior = pixel_columns(camera, x, self.interiors)
             free[c, _POSE : _POSE + J_interior.shape[2]] = True
@@ -240,8 +241,8 @@ class _BoardProblem:
             part[..., _POSE : _POSE + J_interior.shape[2]] = J_interior
             part[..., :P] *= free[c]
             part[..., P:-1] = np.concatenate([JR, np.cross(x_board[:, None], JR)], axis=2)
-            part[..., -1] = corners.uv[mine] - uv
-            G[mine] = np.where(np.isfinite(part).all(axis=(1, 2), keepdims=True) & (x[:, 2, None, None] > 0), part, 0.0)
+            part[..., -1] = corners.uv[own] - uv
+            G[own] = np.where(np.isfinite(part).all(axis=(1, 2), keepdims=True) & (x[:, 2, None, None] > 0), part, 0.0)
         H, Hb, cross = np.zeros((C, P, C, P)), np.zeros((F, 6, 6)), np.zeros((F, 6, C, P))
         b, bb, cost, within = np.zeros((C, P)), np.zeros((F, 6)), 0.0, np.zeros(corners.uv.shape)
         eta, spread = np.zeros((V, 6)), np.zeros((V, 6))
@@ -259,7 +260,7 @@ class _BoardProblem:
         return _BoardEquations(*cameras, cost, within, eta, spread)
 
     def _view(self, G: NDArray, P: int) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
-        """One view's equations with η taken out; its residuals at the best η, η itself, its variances, the cost."""
+        """One view's equations with η eliminated; its residuals at the best η, η, its variances, the cost."""
         w, board, left = np.ones(len(G)), G[..., P:-1], G[..., -1]
         for _ in range(2):
             WG = (w / self.sigma**2)[:, None, None] * G
@@ -268,14 +269,15 @@ class _BoardProblem:
             eta = inverse @ M[P:-1, -1]
             rest = left - board @ eta
             size = np.linalg.norm(rest, axis=1) / self.sigma
-            w = np.minimum(1.0, _HUBER / np.maximum(size, 1e-12))
+            w = np.minimum(1.0, _HUBER_SIGMAS / np.maximum(size, 1e-12))
         M -= M[:, P:-1] @ inverse @ M[P:-1]
-        cost = np.sum(np.where(size < _HUBER, size**2, _HUBER * (2 * size - _HUBER))) + eta @ (self.precision * eta)
+        huber = np.where(size < _HUBER_SIGMAS, size**2, _HUBER_SIGMAS * (2 * size - _HUBER_SIGMAS))
+        cost = np.sum(huber) + eta @ (self.precision * eta)
         return M, rest, eta, np.diag(inverse), float(cost)
 
 
 def _deviations(system: _BoardEquations, cameras: int) -> tuple[NDArray, NDArray]:
-    """Standard deviations of the cameras' places [m] and focal lengths [px]."""
+    """Standard deviations of the cameras' centres (C,) [m] and focal lengths (C,) [px]."""
     variance = np.diag(system.covariances()[0]).reshape(cameras, -1)
     focal = variance[:, _POSE] if variance.shape[1] > _POSE else np.zeros(cameras)
     return np.sqrt(variance[:, :3].sum(axis=1)), np.sqrt(focal)

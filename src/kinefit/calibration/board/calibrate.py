@@ -1,4 +1,4 @@
-"""Cameras calibrated with a board: interiors from its views, exteriors from the frames in which two of them see it."""
+"""Calibrate cameras with a board: intrinsics from its views, extrinsics from frames that two cameras share."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import inverse
 
-_ENOUGH_VIEWS = 15  # of one camera; fewer leave the distortion to chance
-_ENOUGH_SHARED = 8  # frames of a pair
-_ENOUGH_COVERED = 0.5  # of the picture
-_SURE = 0.005  # of the focal length, one standard deviation
+_ADVISED_VIEWS = 15  # of one camera; with fewer the distortion is poorly determined
+_ADVISED_SHARED = 8  # frames of a pair
+_ADVISED_COVERAGE = 0.5  # of the image
+_MAX_FOCAL_STD = 0.005  # of the focal length, without advice
 
 
 @dataclass(frozen=True, eq=False)
 class BoardCameraReport:
-    """How well one camera was calibrated.
+    """Quality of one camera's calibration.
 
     Parameters
     ----------
     rms_px : float [px]
-        Distance of the corners seen from where cameras and boards together put them.
+        Distance of the corners from their projections, with the board at its pose in the frame.
     own_rms_px : float [px]
-        The same, the board being where this view has it: what lens and detector leave.
+        The same with the board at its pose in this view: the error of lens and detector.
     views, used : int
-        Images in which the board was found, and of these the ones that the intrinsics were found from.
+        Images with the board, and those of them used for the intrinsics.
     coverage : float
-        Share of the image (cells of an 8 x 8 grid) in which corners were seen.
+        Share 0..1 of the image (cells of an 8 x 8 grid) with corners.
     focal_std_px, position_std : float [px], [m]
-        Standard deviations; 0 for what was given or defines the world, infinite where nothing observes it.
+        Standard deviations; 0 if given or defining the world, infinite if unobserved.
     """
 
     rms_px: float
@@ -53,22 +53,22 @@ class BoardCameraReport:
 
 @dataclass(frozen=True, eq=False)
 class BoardCalibration:
-    """Cameras calibrated with a board.
+    """Result of a calibration with a board.
 
     Parameters
     ----------
     rig : Rig
     board : Board
-    cameras : {camera: CameraReport}
+    cameras : {camera: BoardCameraReport}
     rms_px, own_rms_px : float [px], as in `BoardCameraReport`, over all cameras.
     shared : {(camera, camera): int}
-        Frames in which both see the board and agree; empty where only intrinsics were wanted.
+        Frames in which both see the board and agree; empty for intrinsics alone.
     jitter : (float [m], float [rad])
-        How far a view's board was from its place in the frame: what cameras out of step, or a bent board, do.
+        Standard deviation of a view's board about its pose in the frame, from unsynchronised cameras or a bent board.
     world : str
-        Where the origin is, and what points up.
+        Description of the origin and the vertical axis.
     advice : tuple of str
-        What to record more of.
+        What else to record.
     """
 
     rig: Rig
@@ -95,20 +95,20 @@ def calibrate_board(
 
     Parameters
     ----------
-    seen : {camera: CameraViews}, as `find_boards` gives them; views of one frame number are of one time.
+    seen : {camera: CameraViews} of `find_boards`; views of one frame number are of one time.
     board : Board
     interiors : Rig, optional
-        Interiors that are kept (their poses are not used); without, they are calibrated too.
+        Known intrinsics, kept (their poses are not used); default: intrinsics are calibrated too.
     floor : int, optional
         Frame in which the board lies on the floor, face up: origin in its first inner corner, x along its rows, z up.
-        Without, the world is the first camera's frame.
+        Default: the world is the first camera's frame.
     exteriors : bool
-        False: intrinsics alone; the cameras need not see the board together, and stand at the origin.
+        False: intrinsics alone; the cameras need no common views, and are placed at the origin.
 
     Raises
     ------
     CalibrationError
-        Too few views, a focal length that they do not determine, cameras that share no view, a floor that is not seen.
+        Too few views, an undetermined focal length, cameras without a shared view, a floor that is not visible.
     """
     if not seen:
         raise CalibrationError("no camera", remedy="Give the views of at least one camera.")
@@ -139,11 +139,11 @@ def _interiors_only(
         raise CalibrationError("intrinsics are given and extrinsics not wanted", remedy="Leave out one of the two.")
     reports = {
         name: BoardCameraReport(
-            one.rms_px, one.rms_px, len(seen[name].views), len(one.frames), one.coverage, one.focal_std, np.inf
+            own.rms_px, own.rms_px, len(seen[name].views), len(own.frames), own.coverage, own.focal_std, np.inf
         )
-        for name, one in single.items()
+        for name, own in single.items()
     }
-    rms = float(np.sqrt(np.mean([one.rms_px**2 for one in single.values()])))
+    rms = float(np.sqrt(np.mean([own.rms_px**2 for own in single.values()])))
     rig = Rig(tuple(cameras.values()))
     advice = tuple(_advice(rig, reports, {}, 1))
     return BoardCalibration(rig, board, reports, rms, rms, {}, (0.0, 0.0), "Interiors alone: no poses.", advice)
@@ -184,10 +184,10 @@ def _rms(residuals: NDArray) -> float:
 def _report(
     c: int, seen: CameraViews, single: Interiors | None, placed: Placed, bundle: BoardBundle
 ) -> BoardCameraReport:
-    mine = placed.corners.camera == c
-    used = len(np.unique(placed.corners.frame[mine]))
+    own = placed.corners.camera == c
+    used = len(np.unique(placed.corners.frame[own]))
     return BoardCameraReport(
-        _rms(bundle.residuals[mine]), _rms(bundle.within[mine]), len(seen.views),
+        _rms(bundle.residuals[own]), _rms(bundle.within[own]), len(seen.views),
         len(single.frames) if single else used, coverage(seen), float(bundle.focal_std[c]),
         float(bundle.position_std[c]),
     )
@@ -199,18 +199,18 @@ def _advice(
     out = []
     for camera in rig:
         report = reports[camera.name]
-        if report.views < _ENOUGH_VIEWS:
-            out.append(f"{camera.name}: {report.views} views; record {_ENOUGH_VIEWS} or more, turned to all sides.")
-        if report.focal_std_px and report.coverage < _ENOUGH_COVERED:
+        if report.views < _ADVISED_VIEWS:
+            out.append(f"{camera.name}: {report.views} views; record {_ADVISED_VIEWS} or more, turned to all sides.")
+        if report.focal_std_px and report.coverage < _ADVISED_COVERAGE:
             out.append(
                 f"{camera.name}: the board covered {100 * report.coverage:.0f} % of the image; bring it near, and "
                 "into the corners: the distortion there is a guess."
             )
-        if report.focal_std_px > _SURE * camera.matrix[0, 0]:
+        if report.focal_std_px > _MAX_FOCAL_STD * camera.matrix[0, 0]:
             part = 100 * report.focal_std_px / camera.matrix[0, 0]
             out.append(f"{camera.name}: focal length known to {part:.1f} % only; turn the board by 20 to 45 degrees.")
     for camera in rig if count > 1 else ():
         best = max((n for pair, n in shared.items() if camera.name in pair), default=0)
-        if best < _ENOUGH_SHARED:
-            out.append(f"{camera.name}: shares {best} frames with another camera; record {_ENOUGH_SHARED} or more.")
+        if best < _ADVISED_SHARED:
+            out.append(f"{camera.name}: shares {best} frames with another camera; record {_ADVISED_SHARED} or more.")
     return out

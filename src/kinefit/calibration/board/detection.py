@@ -1,4 +1,4 @@
-"""Calibration boards found in pictures: checkerboards and ChArUco boards, upright, turned or inverted."""
+"""Detect calibration boards in images: checkerboards and ChArUco boards, upright, turned or inverted."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ DICTIONARIES = tuple(
     + ["ARUCO_ORIGINAL", "APRILTAG_16h5", "APRILTAG_25h9", "APRILTAG_36h10", "APRILTAG_36h11", "ARUCO_MIP_36h12"]
 )
 SPELLING = "checkerboard:COLUMNSxROWS:SQUARE (inner corners, metres) or charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY]"
-_FEWEST = 6  # corners of a partly seen board that fix its pose and leave something to check it by
-_FLAT = 0.04  # of the board's extent in the picture: farther from a plane's picture than any usual lens bends it
+_MIN_CORNERS = 6  # of a partly visible board: enough for its pose and a check of it
+_MAX_PLANE_ERROR = 0.04  # of the board's extent in the image: more than the distortion of a common lens
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Board:
     square, marker : float [m]
         Edge of a square, and of a marker in it.
     dictionary : str
-        Of the markers, such as "4X4_50"; empty: found out from the pictures.
+        Of the markers, such as "4X4_50"; empty: detected in the images.
     legacy : bool
         ChArUco boards printed by OpenCV before 4.6 with an even number of rows.
     """
@@ -53,22 +53,25 @@ class Board:
     def __post_init__(self) -> None:
         smallest = 3 if self.kind == "charuco" else 2
         if self.kind not in ("checkerboard", "charuco"):
-            self._refuse(f"no board '{self.kind}'")
+            self._raise(f"no board '{self.kind}'")
         if min(self.size) < smallest or max(self.size) > 200:
-            self._refuse(f"a board of {self.size[0]}x{self.size[1]}")
-        if not 0 < self.square < 10:  # nobody carries squares of 10 m: they were given in millimetres
-            self._refuse(f"squares of {self.square:g} m")
+            self._raise(f"a board of {self.size[0]}x{self.size[1]}")
+        if not 0 < self.square < 10:  # 10 m must be millimetres
+            self._raise(f"squares of {self.square:g} m")
         if self.kind == "charuco" and not 0 < self.marker < self.square:
-            self._refuse(f"markers of {self.marker:g} m in squares of {self.square:g} m")
+            self._raise(f"markers of {self.marker:g} m in squares of {self.square:g} m")
         if self.kind == "charuco" and self.dictionary and self.dictionary not in DICTIONARIES:
-            self._refuse(f"no dictionary '{self.dictionary}'; there are: {', '.join(DICTIONARIES)}")
+            self._raise(f"no dictionary '{self.dictionary}'; there are: {', '.join(DICTIONARIES)}")
 
-    def _refuse(self, problem: str) -> None:
+    def _raise(self, problem: str) -> None:
         raise CalibrationError(problem, place="board", remedy=f"Write {SPELLING}, for example charuco:5x7:0.04:0.03.")
 
     @classmethod
     def parse(cls, text: str) -> Board:
-        """Board of a text such as "checkerboard:9x6:0.025" or "charuco:5x7:0.04:0.03:5X5_100[:legacy]"."""
+        """Board of a text such as "checkerboard:9x6:0.025" or "charuco:5x7:0.04:0.03:5X5_100[:legacy]".
+
+        Raises CalibrationError for any other text.
+        """
         kind, *parts = text.strip().split(":")
         wrong = CalibrationError(f"cannot read the board '{text}'", place="board", remedy=f"Write {SPELLING}.")
         try:
@@ -109,20 +112,20 @@ class Board:
 
     @cached_property
     def symmetries(self) -> tuple[NDArray, ...]:
-        """Orders (N,) of the corners under the turns that leave the board looking as it was; the first is none."""
+        """Orders (N,) of the corners under the rotations that map the board onto itself; the first is the identity."""
         columns, rows = self.grid
         index = np.arange(columns * rows).reshape(rows, columns)
         if self.kind == "charuco":
             return (index.ravel(),)
-        turns = [np.rot90(index, k) for k in (range(4) if columns == rows else (0, 2))]
+        orders = [np.rot90(index, k) for k in (range(4) if columns == rows else (0, 2))]
         dark = np.indices((rows - 1, columns - 1)).sum(axis=0) % 2
-        looks = [np.rot90(dark, k) for k in (range(4) if columns == rows else (0, 2))]
-        return tuple(turn.ravel() for turn, look in zip(turns, looks) if np.array_equal(look, dark))
+        patterns = [np.rot90(dark, k) for k in (range(4) if columns == rows else (0, 2))]
+        return tuple(order.ravel() for order, p in zip(orders, patterns) if np.array_equal(p, dark))
 
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """A board in one picture: its corners `ids` (n,) at `uv` (n, 2) [px]; `mirrored` where its back was seen."""
+    """A board in one image: its corners `ids` (n,) at `uv` (n, 2) [px]; `mirrored` if its back is visible."""
 
     frame: int
     ids: NDArray
@@ -132,7 +135,7 @@ class BoardView:
 
 @dataclass(frozen=True, eq=False)
 class CameraViews:
-    """All that one camera saw of the board: picture size (width, height) [px] and the views, by rising frame."""
+    """All views of the board in one camera: image size (width, height) [px] and the views, in order of frames."""
 
     size: tuple[int, int]
     views: tuple[BoardView, ...]
@@ -144,9 +147,9 @@ class CameraViews:
 
 
 class Finder:
-    """Finds one board in pictures; remembers whether it is printed white on black.
+    """Finder of one board in images; remembers whether it is printed white on black.
 
-    A ChArUco board may have its mirror image on its back, corner on corner, as those of caliscope have.
+    A ChArUco board may have its mirror image on its back, corner on corner, as caliscope's boards have.
 
     Parameters
     ----------
@@ -158,14 +161,14 @@ class Finder:
         self._ways = [(inverted, mirrored) for mirrored in (False, True) for inverted in (False, True)]
         if board.kind == "charuco":
             whole = _dictionary(board.dictionary)
-            own = whole.bytesList[: (board.size[0] * board.size[1]) // 2]  # no other markers can be on it
+            own = whole.bytesList[: (board.size[0] * board.size[1]) // 2]  # the board has no others
             markers = cv2.aruco.Dictionary(own, whole.markerSize, whole.maxCorrectionBits)
             pattern = cv2.aruco.CharucoBoard(board.size, board.square, board.marker, markers)
             pattern.setLegacyPattern(board.legacy)
             self._detector = cv2.aruco.CharucoDetector(pattern)
 
     def find(self, image: NDArray, frame: int) -> BoardView | None:
-        """The board in a picture (H, W, 3) RGB or (H, W) grey; None where it is not seen."""
+        """Find the board in an image (H, W, 3) RGB or (H, W) grey; None if it is not visible."""
         grey = grey_image(image)
         if self.board.kind == "checkerboard":
             return self._checkerboard(grey, frame)
@@ -180,7 +183,7 @@ class Finder:
     def _charuco(self, grey: NDArray, frame: int, inverted: bool, mirrored: bool) -> BoardView | None:
         grey = 255 - grey if inverted else grey
         uv, ids, _, _ = self._detector.detectBoard(np.ascontiguousarray(grey[:, ::-1]) if mirrored else grey)
-        if ids is None or len(ids) < _FEWEST:
+        if ids is None or len(ids) < _MIN_CORNERS:
             return None
         uv = uv.reshape(-1, 2).astype(float)
         if not _is_plane(ids.ravel(), uv, self.board):
@@ -200,7 +203,7 @@ class Finder:
             return None
         grid = uv.reshape(rows, columns, 2).astype(float)
         step = min(np.linalg.norm(np.diff(grid, axis=a), axis=2).min() for a in (0, 1))
-        window = int(np.clip(0.4 * step, 2, 15))  # looks at no corner but its own
+        window = int(np.clip(0.4 * step, 2, 15))  # contains no other corner
         stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
         points = cv2.cornerSubPix(grey, uv.reshape(-1, 1, 2).astype(np.float32), (window, window), (-1, -1), stop)
         return BoardView(
@@ -209,7 +212,7 @@ class Finder:
 
 
 def _upright(grid: NDArray, grey: NDArray) -> NDArray:
-    """Corners (rows, columns, 2) in an order that is not mirrored and begins at a dark square where one end does."""
+    """Order corners (rows, columns, 2) without mirroring, beginning at a dark square if one end has one."""
     right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if right[0] * down[1] - right[1] * down[0] < 0:
         grid = grid[:, ::-1]
@@ -231,7 +234,7 @@ def _upright(grid: NDArray, grey: NDArray) -> NDArray:
 
 
 def _is_plane(ids: NDArray, uv: NDArray, board: Board) -> bool:
-    """Whether the corners are those of a flat board: markers read wrongly, or of another board, are not."""
+    """Whether the corners fit a plane; misread markers, or those of another board, do not."""
     flat = board.corners[ids][:, :2]
     if np.linalg.matrix_rank(flat - flat.mean(axis=0), tol=0.5 * board.square) < 2:
         return False
@@ -239,8 +242,8 @@ def _is_plane(ids: NDArray, uv: NDArray, board: Board) -> bool:
     if H is None:
         return False
     error = cv2.perspectiveTransform(flat[None], H)[0] - uv
-    # Seen from its face a board's frame, y up, is mirrored in the picture, v down.
-    return bool(np.abs(error).max() < _FLAT * np.ptp(uv, axis=0).max() and np.linalg.det(H) * H[2, 2] < 0)
+    # From its front a board's frame, y up, is mirrored in the image, v down.
+    return bool(np.abs(error).max() < _MAX_PLANE_ERROR * np.ptp(uv, axis=0).max() and np.linalg.det(H) * H[2, 2] < 0)
 
 
 def _dictionary(name: str) -> Any:
@@ -248,7 +251,7 @@ def _dictionary(name: str) -> Any:
 
 
 def with_dictionary(board: Board, images: Sequence[NDArray]) -> Board:
-    """The board with the dictionary that most markers in some pictures are of, where it names none."""
+    """The board with the dictionary of most markers in images (H, W) or (H, W, 3), unless it names one."""
     if board.kind != "charuco" or board.dictionary:
         return board
     names = _dictionaries_seen(board, images)
@@ -256,7 +259,7 @@ def with_dictionary(board: Board, images: Sequence[NDArray]) -> Board:
 
 
 def fitting_boards(board: Board, images: Sequence[NDArray]) -> list[Board]:
-    """Other boards that some pictures show: of another dictionary, the legacy pattern, or another size; best first."""
+    """Other boards visible in images (H, W) or (H, W, 3): another dictionary, legacy pattern or size; best first."""
     greys = [grey_image(image) for image in images]
     found: dict[Board, int] = {}
     if board.kind == "charuco":
@@ -277,10 +280,10 @@ def fitting_boards(board: Board, images: Sequence[NDArray]) -> list[Board]:
 
 
 def _dictionaries_seen(board: Board, images: Iterable[NDArray]) -> list[str]:
-    """Dictionaries of which markers are seen, most first; of each family the smallest with enough for the board."""
+    """Dictionaries with visible markers, most first; of each family the smallest with enough for the board."""
     needed = board.size[0] * board.size[1] // 2
     families: dict[str, str] = {}
-    for name in DICTIONARIES:  # the dictionaries of one family begin alike
+    for name in DICTIONARIES:  # names of one family have a common prefix
         if len(_dictionary(name).bytesList) >= needed:
             families.setdefault(name.partition("_")[0] if name[1] == "X" else name, name)
     greys = [grey for image in images for grey in (grey_image(image), 255 - grey_image(image))]
@@ -289,10 +292,10 @@ def _dictionaries_seen(board: Board, images: Iterable[NDArray]) -> list[str]:
         detector = cv2.aruco.ArucoDetector(_dictionary(name))
         found = [detector.detectMarkers(grey)[1] for grey in greys]
         counts[name] = sum(len(ids) for ids in found if ids is not None)
-    # Noise reads as a marker now and then; a board shows several.
+    # Noise is sometimes read as a marker; a board has several.
     return sorted((name for name, count in counts.items() if count >= 4), key=lambda name: -counts[name])
 
 
 def grey_image(image: NDArray) -> NDArray:
-    """(H, W) of an image in colour (RGB), or in grey already."""
+    """(H, W) grey values of an image in RGB (H, W, 3), or in grey already."""
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image

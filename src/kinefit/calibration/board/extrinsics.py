@@ -1,4 +1,4 @@
-"""Where cameras stand to each other, from the frames in which two of them see one board."""
+"""Relative poses of cameras, from frames in which two of them see one board."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import inverse, transform
 
-_AMBIGUOUS = 3.0  # a flat board's second pose counts while it fits at most this much worse than the first
-_PROPOSALS = 25  # frames that propose where a camera stands; all shared frames vote
-_LIMIT = 0.01  # of the picture's diagonal: a pose from one view puts the board this near where another camera sees it
-_FEW = 3  # frames that agree by chance
+_MAX_AMBIGUITY_RATIO = 3.0  # of the errors of a flat board's two poses; with more the second is discarded
+_MAX_PROPOSALS = 25  # frames that propose a relative pose; all shared frames vote
+_MAX_ERROR = 0.01  # of the image diagonal, between a camera's view and the board's pose from another view
+_MIN_VOTES = 3  # fewer frames may agree by chance
 
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """What one camera's view tells of the board: candidates (K, 4, 4) T_camera_board, best first, and rays (n, 2)."""
+    """Poses of the board from one view: candidates (K, 4, 4) T_camera_board, best first, and rays (n, 2)."""
 
     view: BoardView
     Ts_camera_board: NDArray
-    xy: NDArray  # (n, 2) normalised picture coordinates
+    xy: NDArray  # (n, 2) normalised image coordinates
 
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Rig in the frame of its best connected camera, boards in it, the corners seen, and the votes of each pair."""
+    """Rig in the frame of its first camera, poses of the board in it, the corners, and the votes of each pair."""
 
     rig: Rig
     Ts_world_board: NDArray
@@ -43,7 +43,7 @@ class Placed:
 
 
 def place_cameras(cameras: Mapping[str, Camera], seen: Mapping[str, CameraViews], board: Board) -> Placed:
-    """Chain the cameras by the pairs that most frames agree on, and put the board into every frame.
+    """Chain the cameras by the pairs with most votes, and estimate the board's pose in every frame.
 
     Raises
     ------
@@ -62,8 +62,8 @@ def place_cameras(cameras: Mapping[str, Camera], seen: Mapping[str, CameraViews]
         shared[a, b] = len(common)
         if common:
             T_b_a, agree = _vote(cameras[b], [(poses[a][f], poses[b][f]) for f in common], board)
-            # One shared frame says where the camera stands, and nothing says whether that is true.
-            if agree >= min(_FEW, len(common)) and agree >= 0.3 * len(common):
+            # One shared frame gives a pose without any check of it.
+            if agree >= min(_MIN_VOTES, len(common)) and agree >= 0.3 * len(common):
                 links[a, b], votes[a, b] = T_b_a, agree
     Ts_camera_world = _chain(list(cameras), links, votes, shared)
     rig = Rig(tuple(camera.with_pose(Ts_camera_world[name]) for name, camera in cameras.items()))
@@ -71,7 +71,7 @@ def place_cameras(cameras: Mapping[str, Camera], seen: Mapping[str, CameraViews]
 
 
 def _poses(camera: Camera, view: BoardView, board: Board) -> Poses:
-    """Both poses of a flat board that its picture allows (T. Collins and A. Bartoli, IJCV 2014)."""
+    """Both poses of a flat board that one view allows (T. Collins and A. Bartoli, IJCV 2014)."""
     rays = camera.with_pose(np.eye(4)).ray(view.uv)
     ok = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.05)
     view = BoardView(view.frame, view.ids[ok], view.uv[ok], view.mirrored)
@@ -81,7 +81,7 @@ def _poses(camera: Camera, view: BoardView, board: Board) -> Poses:
         x = board.corners[view.ids]
         try:
             found = cv2.solvePnPGeneric(x, xy, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
-        except cv2.error:  # what is left of the corners lies on one line
+        except cv2.error:  # the remaining corners lie on one line
             found = (0, (), (), ())
         for r, t, error in zip(found[1], found[2], np.ravel(found[3])):
             T = transform(cv2.Rodrigues(r)[0], np.ravel(t))
@@ -89,12 +89,12 @@ def _poses(camera: Camera, view: BoardView, board: Board) -> Poses:
                 candidates.append((float(error), T))
     candidates.sort(key=lambda pair: pair[0])
     floor = 0.3 / camera.matrix[0, 0]  # both fit within the noise of a corner
-    kept = [T for error, T in candidates if error <= _AMBIGUOUS * max(candidates[0][0], floor)]
+    kept = [T for error, T in candidates if error <= _MAX_AMBIGUITY_RATIO * max(candidates[0][0], floor)]
     return Poses(view, np.array(kept).reshape(-1, 4, 4), xy)
 
 
 def _turned(board: Board) -> list[NDArray]:
-    """T_board_board of every turn that leaves the board looking the same."""
+    """T_board_board (4, 4) of every rotation that maps the board onto itself."""
     out = []
     for order in board.symmetries:
         flat, turned = board.corners[:, :2], board.corners[order][:, :2]
@@ -106,8 +106,8 @@ def _turned(board: Board) -> list[NDArray]:
     return out
 
 
-def _seen_at(T_camera_board: NDArray, poses: Poses, board: Board) -> float:
-    """Median distance of a view's corners from where a pose of the board puts them, in normalised coordinates."""
+def _view_error(T_camera_board: NDArray, poses: Poses, board: Board) -> float:
+    """Median distance of a view's corners from their projections at a pose of the board, in normalised coordinates."""
     best = np.inf
     for order in board.symmetries:
         x = board.corners[order[poses.view.ids]] @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]
@@ -117,17 +117,17 @@ def _seen_at(T_camera_board: NDArray, poses: Poses, board: Board) -> float:
 
 
 def _vote(camera: Camera, pairs: list[tuple[Poses, Poses]], board: Board) -> tuple[NDArray, int]:
-    """T_b_a that most shared frames agree on (as MLESAC does it), and how many do."""
-    limit = _LIMIT * float(np.hypot(*camera.size)) / camera.matrix[0, 0]
-    chosen = [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _PROPOSALS)).astype(int))]
+    """T_b_a with the lowest robust cost over shared frames (MLESAC), and the number of frames that agree."""
+    limit = _MAX_ERROR * float(np.hypot(*camera.size)) / camera.matrix[0, 0]
+    chosen = [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_PROPOSALS)).astype(int))]
     best, best_T, best_agree = np.inf, np.eye(4), 0
     turns = _turned(board)
     for a, b in chosen:
         for T_a, T_b, turn in product(a.Ts_camera_board, b.Ts_camera_board, turns):
             T_b_a = T_b @ turn @ inverse(T_a)
             cost, agree = 0.0, 0
-            for one, other in pairs:
-                error = min([_seen_at(T_b_a @ T, other, board) for T in one.Ts_camera_board] or [np.inf])
+            for in_a, in_b in pairs:
+                error = min([_view_error(T_b_a @ T, in_b, board) for T in in_a.Ts_camera_board] or [np.inf])
                 cost, agree = cost + min(error, limit), agree + (error < limit)
                 if cost >= best:
                     break
@@ -142,12 +142,12 @@ def _chain(
     votes: Mapping[tuple[str, str], int],
     shared: Mapping[tuple[str, str], int],
 ) -> dict[str, NDArray]:
-    """T_camera_world of every camera, the first one's frame being the world: the tree of most votes (Prim)."""
+    """T_camera_world of every camera, in the frame of the first: the spanning tree of most votes (Prim)."""
     placed = {names[0]: np.eye(4)}
     while len(placed) < len(names):
         across = [(n, pair) for pair, n in votes.items() if (pair[0] in placed) != (pair[1] in placed)]
         if not across:
-            _refuse(names, set(placed), shared)
+            _raise_unconnected(names, set(placed), shared)
         _, (a, b) = max(across)
         if a in placed:
             placed[b] = links[a, b] @ placed[a]
@@ -156,7 +156,7 @@ def _chain(
     return placed
 
 
-def _refuse(names: list[str], placed: set[str], shared: Mapping[tuple[str, str], int]) -> None:
+def _raise_unconnected(names: list[str], placed: set[str], shared: Mapping[tuple[str, str], int]) -> None:
     rest = [name for name in names if name not in placed]
     group = ", ".join(name for name in names if name in placed)
     common = {pair: n for pair, n in shared.items() if (pair[0] in placed) != (pair[1] in placed) and n}
@@ -177,25 +177,25 @@ def _refuse(names: list[str], placed: set[str], shared: Mapping[tuple[str, str],
 def _place_boards(
     rig: Rig, poses: Mapping[str, Mapping[int, Poses]], board: Board, votes: dict[tuple[str, str], int]
 ) -> Placed:
-    """The pose of the board that all cameras of a frame like best, and each view's corners by the same names."""
+    """The pose of the board with the lowest cost in every frame, with all views' corners in a common order."""
     frames = sorted({frame for of_camera in poses.values() for frame in of_camera})
     Ts: list[NDArray] = []
     kept, columns = [], []
     for frame in frames:
         here = [(c, poses[camera.name][frame]) for c, camera in enumerate(rig) if frame in poses[camera.name]]
-        limits = [_LIMIT * float(np.hypot(*camera.size)) / camera.matrix[0, 0] for camera in rig]
+        limits = [_MAX_ERROR * float(np.hypot(*camera.size)) / camera.matrix[0, 0] for camera in rig]
         best, best_T = np.inf, None
         for c, of_view in here:
             for T_camera_board in of_view.Ts_camera_board:
                 T = rig.cameras[c].T_world_camera @ T_camera_board
-                cost = sum(min(_seen_at(rig.cameras[d].T_camera_world @ T, p, board), limits[d]) for d, p in here)
+                cost = sum(min(_view_error(rig.cameras[d].T_camera_world @ T, p, board), limits[d]) for d, p in here)
                 if cost < best:
                     best, best_T = cost, T
         if best_T is None:
             continue
         for c, of_view in here:
             T = rig.cameras[c].T_camera_world @ best_T
-            if _seen_at(T, of_view, board) < limits[c]:
+            if _view_error(T, of_view, board) < limits[c]:
                 columns.append((c, len(Ts), *_named(T, of_view, board)))
         Ts.append(best_T)
         kept.append(frame)
@@ -215,7 +215,7 @@ def _place_boards(
 
 
 def _named(T_camera_board: NDArray, poses: Poses, board: Board) -> tuple[NDArray, NDArray]:
-    """Corners of a view on the board, turned as the pose has it, and their pixels."""
+    """Corners of a view in the board's frame, in the order of the pose, and their pixels."""
     errors = []
     for order in board.symmetries:
         x = board.corners[order[poses.view.ids]] @ T_camera_board[:3, :3].T + T_camera_board[:3, 3]

@@ -1,4 +1,4 @@
-"""Focal length, centre and distortion of one camera from views of a board (Z. Zhang, PAMI 2000; by OpenCV)."""
+"""Calibrate the intrinsics of one camera from views of a board (Z. Zhang, PAMI 2000; by OpenCV)."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from kinefit.calibration.board.detection import Board, BoardView, CameraViews
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera
 
-FEWEST_VIEWS = 4  # three determine focal length and centre; one more to have something to check
-_MOST_VIEWS = 60  # more add time, hardly accuracy
-_MANY_VIEWS = 20  # from which the third radial coefficient is tried
-_REACH = 0.7  # of the way to the picture's corner that board corners reach, below which k3 would bend free space
-_UNSURE = 0.03  # of the focal length, one standard deviation: no calibration but a guess
-_FRONTAL = np.radians(10.0)  # turned by less than this, distance and focal length are one
-_CELLS = 8  # cells along each side of the picture, for the share of it that was covered
-_OUTLIER = 3.0  # times the median view's error
+MIN_VIEWS = 4  # three determine focal length and centre; one more allows a check
+_MAX_VIEWS = 60  # more add time, hardly accuracy
+_MIN_K3_VIEWS = 20  # to estimate the third radial coefficient
+_MIN_K3_REACH = 0.7  # of the way to the image's corner, covered by board corners: with less k3 is extrapolated
+_MAX_FOCAL_STD = 0.03  # of the focal length: with more it is a guess
+_MIN_TILT = np.radians(10.0)  # between two views: with less, distance and focal length are not separable
+_COVERAGE_CELLS = 8  # along each side of the image
+_MAX_ERROR_RATIO = 3.0  # of a view's error to the median view's
 
 
 @dataclass(frozen=True, eq=False)
 class Interiors:
-    """Interior of a camera and how well its views tell it.
+    """Intrinsics of a camera, with their uncertainty.
 
     Parameters
     ----------
     camera : Camera, at the origin.
     rms_px : float, of the views used.
     focal_std : float [px] standard deviation of the focal length, as OpenCV estimates it.
-    coverage : float, share of an 8 x 8 grid over the picture in which a corner was seen.
-    tilt : float [rad] angle between the two views that are turned most against each other.
+    coverage : float, share 0..1 of an 8 x 8 grid over the image with a corner.
+    tilt : float [rad] largest angle between two views of the board.
     frames : tuple of int, of the views used.
     """
 
@@ -45,33 +45,33 @@ class Interiors:
 
 
 def calibrate_interiors(name: str, seen: CameraViews, board: Board) -> Interiors:
-    """Calibrate one camera; views that fit badly are dropped, k3 and the centre stay fixed unless the views tell them.
+    """Calibrate one camera; outlier views are discarded, k3 and the centre stay fixed unless the views determine them.
 
     Raises
     ------
     CalibrationError
-        Too few views; or none turned enough, so that the focal length is not determined.
+        Too few views, or too little tilt to determine the focal length.
     """
     place = f"camera {name}"
     views = _spread([view for view in seen.views if len(view.ids) >= 8 or len(board.corners) < 8], seen.size)
-    if len(views) < FEWEST_VIEWS:
+    if len(views) < MIN_VIEWS:
         raise CalibrationError(
             f"the board is seen in {len(views)} images that show enough of it",
             place=place,
-            remedy=f"Record {FEWEST_VIEWS} or better 20 views, turned by 20 to 45 degrees, over the whole image.",
+            remedy=f"Record {MIN_VIEWS} or better 20 views, turned by 20 to 45 degrees, over the whole image.",
         )
     flags = _flags(views, seen.size)
     while True:
         rms, K, k, rotations, stds, errors = _calibrate(views, seen.size, board, flags)
-        keep = errors <= max(_OUTLIER * float(np.median(errors)), 0.3)
-        if keep.all() or keep.sum() < max(FEWEST_VIEWS, len(views) // 2):
+        keep = errors <= max(_MAX_ERROR_RATIO * float(np.median(errors)), 0.3)
+        if keep.all() or keep.sum() < max(MIN_VIEWS, len(views) // 2):
             break
         views = [view for view, good in zip(views, keep) if good]
     std, tilt = float(stds[0]), _tilt(rotations)
-    if tilt < _FRONTAL or not std < _UNSURE * K[0, 0]:
-        told = f"{100 * std / K[0, 0]:.0f} %" if np.isfinite(std) else "any amount"
+    if tilt < _MIN_TILT or not std < _MAX_FOCAL_STD * K[0, 0]:
+        error = f"{100 * std / K[0, 0]:.0f} %" if np.isfinite(std) else "any amount"
         raise CalibrationError(
-            f"the focal length is not determined: {K[0, 0]:.0f} px may be off by {told}; the board turned by "
+            f"the focal length is not determined: {K[0, 0]:.0f} px may be off by {error}; the board turned by "
             f"{np.degrees(tilt):.0f} degrees in {len(views)} views",
             place=place,
             remedy="Record views in which the board is turned by 20 to 45 degrees, to all sides, near and far.",
@@ -82,22 +82,22 @@ def calibrate_interiors(name: str, seen: CameraViews, board: Board) -> Interiors
 
 
 def coverage(seen: CameraViews) -> float:
-    """Share of an 8 x 8 grid over the picture in which a corner was seen."""
+    """Share 0..1 of the cells of a grid (8, 8) over the image in which a corner was detected."""
     if not seen.views:
         return 0.0
     uv = np.concatenate([view.uv for view in seen.views])
-    cells = np.clip((uv + 0.5) / seen.size * _CELLS, 0, _CELLS - 1).astype(int)
-    return len(np.unique(cells, axis=0)) / _CELLS**2
+    cells = np.clip((uv + 0.5) / seen.size * _COVERAGE_CELLS, 0, _COVERAGE_CELLS - 1).astype(int)
+    return len(np.unique(cells, axis=0)) / _COVERAGE_CELLS**2
 
 
 def _flags(views: list[BoardView], size: tuple[int, int]) -> int:
     uv, half = np.concatenate([view.uv for view in views]), np.array(size) / 2
     reach = np.quantile(np.linalg.norm(uv - half, axis=1), 0.98) / np.linalg.norm(half)
-    return 0 if len(views) >= _MANY_VIEWS and reach > _REACH else cv2.CALIB_FIX_K3
+    return 0 if len(views) >= _MIN_K3_VIEWS and reach > _MIN_K3_REACH else cv2.CALIB_FIX_K3
 
 
 def _calibrate(views: list[BoardView], size: tuple[int, int], board: Board, flags: int) -> tuple:
-    """OpenCV's calibration; with the centre fixed to the picture's where it would wander without sense."""
+    """OpenCV's calibration; with the principal point fixed at the image's centre if it is not determined."""
     x = [board.corners[view.ids].astype(np.float32) for view in views]
     uv = [view.uv.reshape(-1, 1, 2).astype(np.float32) for view in views]
     for extra in (0, cv2.CALIB_FIX_PRINCIPAL_POINT):
@@ -114,19 +114,19 @@ def _calibrate(views: list[BoardView], size: tuple[int, int], board: Board, flag
 
 
 def _tilt(rotations: list[NDArray]) -> float:
-    """Largest angle between the normals of two views."""
+    """Largest angle [rad] between the board's normals of two views."""
     normals = np.array([R[:, 2] for R in rotations])
     return float(np.arccos(np.clip((normals @ normals.T).min(), -1, 1)))
 
 
 def _spread(views: list[BoardView], size: tuple[int, int]) -> list[BoardView]:
-    """Views that differ most in place, size and shape of the board: farthest first (T. Gonzalez, 1985)."""
-    if len(views) <= _MOST_VIEWS:
+    """Views that differ most in position, size and shape of the board: farthest-point sampling (T. Gonzalez, 1985)."""
+    if len(views) <= _MAX_VIEWS:
         return views
     features = np.array([_shape(view, size) for view in views])
     chosen = [int(np.argmax(np.linalg.norm(features - features.mean(axis=0), axis=1)))]
     distance = np.full(len(views), np.inf)
-    while len(chosen) < _MOST_VIEWS:
+    while len(chosen) < _MAX_VIEWS:
         distance = np.minimum(distance, np.linalg.norm(features - features[chosen[-1]], axis=1))
         chosen.append(int(np.argmax(distance)))
     return [views[i] for i in sorted(chosen)]

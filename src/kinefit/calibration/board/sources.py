@@ -1,4 +1,4 @@
-"""Videos and pictures in which a board is looked for: one a camera, frame by frame at the same times."""
+"""Videos and images in which boards are detected: one source for each camera, at the same frames."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from kinefit.calibration.board.detection import (
 from kinefit.errors import CalibrationError, FileError
 from kinefit.readers.video import Video
 
-_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-_VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mts", ".wmv")
-_SAMPLES = 6  # pictures of each camera in which another board is looked for, when the one named is not there
-_PAIRED = 5  # frames by which videos of one recording differ where one recorder stopped later
+_IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+_VIDEO_ENDINGS = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".mts", ".wmv")
+_SUGGESTION_IMAGES = 6  # of each camera, in which another board is searched for if the named one is not visible
+_MAX_LENGTH_DIFFERENCE = 5  # frames, of videos of one recording: a recorder may stop later
 
 Progress = Callable[[str, int, int], object]
 
 
 class NumberedImages:
-    """Pictures of one camera by frame number; as `Video`, but some frames may be missing."""
+    """Images of one camera by frame number; like `Video`, but some frames may be missing."""
 
     def __init__(self, files: Mapping[int, Path]) -> None:
         self.files = dict(sorted(files.items()))
@@ -41,11 +41,11 @@ class NumberedImages:
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """Of the frames that there are."""
+        """Numbers of the existing frames."""
         return tuple(self.files)
 
     def read(self, frame: int) -> NDArray[np.uint8]:
-        """One frame, (H, W, 3) RGB."""
+        """One frame, (H, W, 3) RGB; raises CalibrationError for an image of another size."""
         image = read_picture(self.files[frame])
         size = (image.shape[1], image.shape[0])
         if getattr(self, "size", size) != size:
@@ -57,19 +57,19 @@ class NumberedImages:
         return image
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no file stays open."""
 
 
 class Frames(Video):
-    """A video of one camera by frame number, or by steps of a rate [Hz] (`put_on`): those nearest to its frames."""
+    """A video of one camera, by steps of a common rate [Hz] (`put_on`), each nearest to one of its frames."""
 
     def put_on(self, rate: float) -> None:
-        """Count frames by steps of this rate [Hz], of which some may be without."""
+        """Number the frames by steps of a rate [Hz]; some steps may have none."""
         self._frames = {round(float(time) * rate): i for i, time in enumerate(self.times)}
 
     @property
     def numbers(self) -> tuple[int, ...]:
-        """Of the frames that there are."""
+        """Numbers of the existing frames."""
         return tuple(self._frames)
 
     def read(self, i: int) -> NDArray[np.uint8]:
@@ -78,16 +78,16 @@ class Frames(Video):
 
 
 def camera_sources(paths: Iterable[str | PathLike[str]]) -> dict[str, Path | dict[int, Path]]:
-    """Cameras and what each saw, by name: a video, or pictures by frame number.
+    """Find the sources of all cameras, by name: a video, or images by frame number.
 
-    A file is a video, named as the camera. A folder holds videos; or pictures whose names end or begin with the
-    frame's number: left01.jpg, 01_right.jpg are two cameras, 01.jpg one with the folder's name; or folders of such
-    pictures, one a camera.
+    A file is a video, named as the camera. A folder holds videos; or images whose names end or begin with the frame's
+    number: left01.jpg, 01_right.jpg are two cameras, 01.jpg one with the folder's name; or one folder of such images
+    for each camera.
 
     Raises
     ------
     FileError
-        Nothing there, or nothing that is known.
+        No such file or folder, or none of a known format.
     CalibrationError
         Two cameras of one name.
     """
@@ -105,28 +105,29 @@ def camera_sources(paths: Iterable[str | PathLike[str]]) -> dict[str, Path | dic
         if not path.is_dir():
             raise FileError("no such file or folder", file=path, remedy="Give videos, or folders of images.")
         inside = sorted(path.iterdir())
-        videos = [file for file in inside if file.suffix.lower() in _VIDEOS]
-        pictures = [file for file in inside if file.suffix.lower() in _PICTURES]
-        folders = {sub.name: _pictures(sub) for sub in inside if sub.is_dir()}
+        videos = [file for file in inside if file.suffix.lower() in _VIDEO_ENDINGS]
+        images = [file for file in inside if file.suffix.lower() in _IMAGE_ENDINGS]
+        folders = {sub.name: _images_in(sub) for sub in inside if sub.is_dir()}
         if videos:
             for video in videos:
                 add(video.stem, video, video)
-        elif pictures:
-            for name, files in _by_camera(pictures, path.name).items():
+        elif images:
+            for name, files in _by_camera(images, path.name).items():
                 add(name, files, path)
         else:
             for name, listed in folders.items():
                 if listed:
                     add(name, dict(enumerate(listed)), path)
-        if not (videos or pictures or any(folders.values())):
+        if not (videos or images or any(folders.values())):
             raise FileError(
-                "no video and no image in it", file=path, remedy=f"Known are {', '.join(_VIDEOS + _PICTURES)}."
-            )
+                "no video and no image in it", file=path,
+                remedy=f"Known are {', '.join(_VIDEO_ENDINGS + _IMAGE_ENDINGS)}.",
+            )  # fmt: skip
     return found
 
 
-def _pictures(folder: Path) -> list[Path]:
-    return sorted(file for file in folder.iterdir() if file.suffix.lower() in _PICTURES)
+def _images_in(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in _IMAGE_ENDINGS)
 
 
 def _by_camera(files: list[Path], folder: str) -> dict[str, dict[int, Path]]:
@@ -137,7 +138,7 @@ def _by_camera(files: list[Path], folder: str) -> dict[str, dict[int, Path]]:
         name, number = (numbered["name"] or folder, int(numbered["number"])) if numbered else (folder, n)
         group = out.setdefault(name, {})
         group[number if number not in group else max(group) + 1] = file
-    if max(len(group) for group in out.values()) == 1:  # names that say nothing
+    if max(len(group) for group in out.values()) == 1:  # names without meaning
         return {folder: dict(enumerate(files))}
     return out
 
@@ -150,25 +151,25 @@ def find_boards(
     include: Sequence[int] = (),
     progress: Progress | None = None,
 ) -> tuple[Board, dict[str, CameraViews]]:
-    """Look for the board in all cameras, at the same frames of each.
+    """Detect the board in all cameras, at the same frames of each.
 
     Parameters
     ----------
-    sources : as `camera_sources` gives them.
+    sources : of `camera_sources`.
     max_frames : int
-        So many frames at most, evenly over the recording.
-    include : frames that are looked at in any case.
+        Largest number of frames, evenly spaced over the recording.
+    include : frames to search in any case.
 
     Returns
     -------
     Board
-        With the dictionary, where the one given named none.
+        With the detected dictionary, if the given one has none.
     {camera: CameraViews}
 
     Raises
     ------
     CalibrationError
-        A camera in which the board is never seen; the message tells what other board is, if one is.
+        A camera in which the board is never visible; the message names another board that is.
     """
     with opened(sources) as cameras:
         wanted = evenly(cameras, max_frames, include)
@@ -186,15 +187,15 @@ def find_boards(
             seen[name] = CameraViews(camera.size, tuple(views))
         unseen = [name for name, views in seen.items() if not views.views]
         if unseen:
-            _refuse(board, unseen, cameras, any(views.views for views in seen.values()))
+            _raise_unseen(board, unseen, cameras, any(views.views for views in seen.values()))
         if board.kind == "checkerboard":
-            _refuse_part(board, seen, cameras)
+            _check_whole(board, seen, cameras)
         return board, seen
 
 
 @contextmanager
 def opened(sources: Mapping[str, Path | dict[int, Path]]) -> Iterator[dict[str, NumberedImages | Frames]]:
-    """The cameras of `camera_sources`, open; closed at the end.
+    """Context with the opened cameras of `camera_sources`.
 
     Raises
     ------
@@ -216,28 +217,28 @@ def opened(sources: Mapping[str, Path | dict[int, Path]]) -> Iterator[dict[str, 
 
 
 def evenly(cameras: Mapping[str, NumberedImages | Frames], max_frames: int, include: Sequence[int] = ()) -> list[int]:
-    """Numbers of at most so many frames, evenly over the recording, and of those to include that there are."""
+    """Numbers of at most `max_frames` frames, evenly spaced, and of the existing ones among `include`."""
     frames = sorted({frame for camera in cameras.values() for frame in camera.numbers})
     chosen = {frames[i] for i in np.linspace(0, len(frames) - 1, min(len(frames), max_frames)).astype(int)}
     return sorted(chosen | (set(include) & set(frames)))
 
 
 def _check_lengths(lengths: Mapping[str, int]) -> None:
-    if lengths and max(lengths.values()) - min(lengths.values()) > _PAIRED:
-        told = ", ".join(f"{name} {count}" for name, count in lengths.items())
+    if lengths and max(lengths.values()) - min(lengths.values()) > _MAX_LENGTH_DIFFERENCE:
+        listed = ", ".join(f"{name} {count}" for name, count in lengths.items())
         raise CalibrationError(
-            f"the videos have different numbers of frames ({told}), so frames of one number are not of one time",
+            f"the videos have different numbers of frames ({listed}), so frames of one number are not of one time",
             remedy="Cut them so that they begin and end together.",
         )
 
 
 def sample(source: NumberedImages | Frames, count: int) -> list[NDArray]:
-    """So many images, evenly over the recording."""
+    """`count` images (H, W, 3), evenly spaced over the recording."""
     frames = source.numbers
     return [source.read(frames[i]) for i in np.unique(np.linspace(0, len(frames) - 1, count).astype(int))]
 
 
-def _refuse(board: Board, unseen: list[str], opened: Mapping[str, NumberedImages | Frames], others: bool) -> None:
+def _raise_unseen(board: Board, unseen: list[str], opened: Mapping[str, NumberedImages | Frames], others: bool) -> None:
     place = f"camera{'s' * (len(unseen) > 1)} {', '.join(unseen)}"
     if others:
         raise CalibrationError(
@@ -245,8 +246,8 @@ def _refuse(board: Board, unseen: list[str], opened: Mapping[str, NumberedImages
             place=place,
             remedy="Show the board to every camera, near enough that its squares are 20 px or more; or leave it out.",
         )
-    images = [image for name in unseen for image in sample(opened[name], _SAMPLES)]
-    fits = fitting_boards(board, images[: 2 * _SAMPLES])
+    images = [image for name in unseen for image in sample(opened[name], _SUGGESTION_IMAGES)]
+    fits = fitting_boards(board, images[: 2 * _SUGGESTION_IMAGES])
     tried = "other dictionaries, the legacy pattern and the board turned" if board.kind == "charuco" else "other sizes"
     found = f"there is one that reads as --board {fits[0]}" if fits else f"nor with {tried}"
     size = "squares" if board.kind == "charuco" else "inner corners, which are one less than squares"
@@ -257,12 +258,12 @@ def _refuse(board: Board, unseen: list[str], opened: Mapping[str, NumberedImages
     )
 
 
-def _refuse_part(board: Board, seen: Mapping[str, CameraViews], opened: Mapping[str, NumberedImages | Frames]) -> None:
-    """Refuse a board that is a part of a larger one: which part, differs from picture to picture."""
+def _check_whole(board: Board, seen: Mapping[str, CameraViews], opened: Mapping[str, NumberedImages | Frames]) -> None:
+    """Raise CalibrationError if the board is a part of a larger one: the part would differ between images."""
     shown = [source.read(seen[name].views[i].frame) for name, source in opened.items() for i in (0, -1)]
     for other in fitting_boards(board, shown[:4])[:1]:
-        ours, theirs = sorted(board.size), sorted(other.size)
-        if ours != theirs and all(a <= b for a, b in zip(ours, theirs)):
+        size, larger = sorted(board.size), sorted(other.size)
+        if size != larger and all(a <= b for a, b in zip(size, larger)):
             raise CalibrationError(
                 f"{board} is only a part of the board that is seen, {other}",
                 place=f"cameras {', '.join(opened)}",

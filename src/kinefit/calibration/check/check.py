@@ -1,4 +1,4 @@
-"""`check_take`: what is wrong with a recording, in plain words, how sure that is, and what would mend it."""
+"""`check_take`: find the faults of a recording, with their evidence and remedies."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from kinefit.subject.subject import Subject
 from kinefit.tracking.sizing import SizedPerson, sized_by_depth
 from kinefit.tracking.takes.take_recording import recording_of
 
-_SHOWS_MOST = "moving"  # of several people: who stands still shows cameras little of the volume, and clocks nothing
+_DEFAULT_PERSON = "moving"  # of several people: a standing one covers little of the volume, and no clock offsets
 
 
 @checked
 def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = None) -> Check:
-    """Look for everything that is wrong with a take.
+    """Find all faults of a take.
 
-    Files that cannot be read, and pictures that do not fit their calibration, become findings; the rest is checked
-    without them.
+    Files that cannot be read, and images that do not fit their calibration, become findings; the check goes on without
+    them.
 
     Raises
     ------
@@ -76,9 +76,9 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
         return Check(take.name, ranked(missing), loaded.take, seen)
     rig, named = seen.rig, {entry.camera for entry in loaded.take.keypoints}
     with TakePictures(loaded.take, seen) as pictures:
-        one = follow(rig, seen.keypoints, take.person or _SHOWS_MOST, images=pictures)
-    seen = replace(seen, keypoints=one.keypoints)
-    begun = Check(take.name, (*loaded.findings, *_others(one, take.person is not None)), loaded.take, seen)
+        person = follow(rig, seen.keypoints, take.person or _DEFAULT_PERSON, images=pictures)
+    seen = replace(seen, keypoints=person.keypoints)
+    begun = Check(take.name, (*loaded.findings, *_others(person, take.person is not None)), loaded.take, seen)
     check = check_keypoints(
         rig.select(tuple(n for n in rig.names if n in named)), seen.keypoints, body=take.body, up=take.up,
         height=take.height, begun=begun, progress=progress,
@@ -86,17 +86,17 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
     return _with_sensors(check, progress)
 
 
-def _others(one: PersonKeypoints, asked: bool) -> list[Finding]:
-    """Who else is in view."""
-    if len(one.people) < 2:
+def _others(person: PersonKeypoints, asked: bool) -> list[Finding]:
+    """A note on other people in view."""
+    if len(person.people) < 2:
         return []
-    why = "" if asked else ", who moves most and so tells most of the cameras"
-    text = f"{len(one.people)} people are in view; the check is by person {one.number}{why}."
+    why = "" if asked else ", who moves most and so shows most of the cameras' errors"
+    text = f"{len(person.people)} people are in view; the check is by person {person.number}{why}."
     return [Finding("note", "people", text, remedy="Another: write person = 2 to [take], or whichever it is.")]
 
 
 def _of_depth_alone(take: Take, seen: Observations) -> list[Finding]:
-    """Whether the person in the first images of a depth camera hangs upside down."""
+    """Findings of a take with depth cameras alone: an upside-down image of the person."""
     text = "Depth alone: where its cameras stand is not checked."
     found = [Finding("note", "load", text, remedy="Add videos of two cameras, whose keypoints show the person.")]
     try:
@@ -108,7 +108,7 @@ def _of_depth_alone(take: Take, seen: Observations) -> list[Finding]:
 
 
 def _with_sensors(check: Check, progress: Progress | None) -> Check:
-    """The check with how depth cameras and marker systems lie against the videos, where these have no fault."""
+    """The check with the alignment of depth cameras and marker systems to the videos, if these have no fault."""
     take, seen = check.take, check.observations
     if take is None or seen is None or not (take.depth or take.markers):
         return check
@@ -121,24 +121,24 @@ def _with_sensors(check: Check, progress: Progress | None) -> Check:
             fits = fit_sensors(take, seen, progress=progress)
             found = sensor_findings(fits, take)
         except KinefitError as error:
-            text = f"Whether other sensors fit the videos cannot be told: {error.problem}."
+            text = f"Whether other sensors fit the videos cannot be determined: {error.problem}."
             found = [Finding("note", "sensor", text, remedy=error.remedy or "")]
     return replace(check, findings=ranked([*check.findings, *found]), sensors=fits)
 
 
-_ATTEMPTS = 12  # each goes round one obstacle
+_MAX_ATTEMPTS = 12  # to load; each works around one error
 
 
 @dataclass(frozen=True, eq=False)
 class Loaded:
-    """What could be read.
+    """The readable part of a take.
 
     Parameters
     ----------
     take : Take
-        As it must be written to be read: with the remedies of the findings.
+        With the remedies of the findings, so that it can be read.
     observations : Observations or None
-        None where not even two cameras are left.
+        None with fewer than two cameras left.
     findings : tuple of Finding
     """
 
@@ -148,7 +148,7 @@ class Loaded:
 
 
 def load_leniently(take: Take) -> Loaded:
-    """Read a take; what cannot be read is left out or guessed, and told."""
+    """Read a take; unreadable parts are skipped or guessed, each with a finding."""
     if take.calibration is None and not take.depth:
         return Loaded(
             take,
@@ -170,26 +170,26 @@ def load_leniently(take: Take) -> Loaded:
         findings += found
     take = replace(take, cameras=tuple(cameras))
     take = _framed_keypoints(take, rig, findings)
-    for _ in range(_ATTEMPTS):
+    for _ in range(_MAX_ATTEMPTS):
         try:
             return Loaded(take, load_observations(take), tuple(findings))
         except KinefitError as error:
             findings.append(finding_of(error))
-            around = _without(take, error)
-            if around is None:
+            reduced = _without(take, error)
+            if reduced is None:
                 break
-            take = around
+            take = reduced
     return Loaded(take, None, tuple(findings))
 
 
 def _known_cameras(take: Take, rig: Rig, findings: list[Finding]) -> Take:
-    """Without cameras that the calibration lacks."""
-    strange = [entry.name for entry in take.cameras if entry.name not in rig]
-    for name in strange:
+    """The take without cameras that the calibration lacks; adds a finding for each."""
+    unknown = [entry.name for entry in take.cameras if entry.name not in rig]
+    for name in unknown:
         text = f"{name} is not in the calibration, which has {', '.join(rig.names)}; it is left out."
         remedy = "Correct its name in the take, or calibrate it too."
         findings.append(Finding("fault", "load", text, (name,), remedy=remedy))
-    return _only(take, [entry.name for entry in take.cameras if entry.name in rig]) if strange else take
+    return _only(take, [entry.name for entry in take.cameras if entry.name in rig]) if unknown else take
 
 
 def _only(take: Take, names: list[str]) -> Take:
@@ -200,7 +200,7 @@ def _only(take: Take, names: list[str]) -> Take:
 
 
 def _framed_keypoints(take: Take, rig: Rig, findings: list[Finding]) -> Take:
-    """With `frame` for keypoints that lack it and need it: detectors run on the video."""
+    """The take with `frame` for keypoints without it: the video's, on which detectors run."""
     entries = {entry.name: entry for entry in take.cameras}
     out = []
     for source in take.keypoints:
@@ -218,7 +218,7 @@ def _framed_keypoints(take: Take, rig: Rig, findings: list[Finding]) -> Take:
 
 
 def _without(take: Take, error: KinefitError) -> Take | None:
-    """The take with a way round an error: other frames, or without the file at fault; None where there is none."""
+    """The take with a workaround for an error: other frames, or without the faulty file; None if there is none."""
     frames = re.search(r"frames = \[(\d+), (\d+)\]", error.remedy or "")
     if frames and error.file == take.path:
         cut = int(frames[1]), int(frames[2])
@@ -227,8 +227,8 @@ def _without(take: Take, error: KinefitError) -> Take | None:
         if any(_within(error.file, file) for file in (source.file, *_of_camera(take, source.camera)) if file) or (
             source.camera in (error.place or "").replace(",", " ").split() and "keypoints" in (error.place or "")
         ):
-            left = [entry.camera for entry in take.keypoints if entry is not source]
-            return _only(take, left) if len(set(left)) >= 2 else None
+            cameras = [entry.camera for entry in take.keypoints if entry is not source]
+            return _only(take, cameras) if len(set(cameras)) >= 2 else None
     return None
 
 

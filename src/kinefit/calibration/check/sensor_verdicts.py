@@ -1,4 +1,4 @@
-"""What a check says of sensors that do not fit the videos, and the lines of a take that set them right."""
+"""Findings on sensors that do not fit the videos, and the entries of a take that correct them."""
 
 from __future__ import annotations
 
@@ -15,46 +15,46 @@ from kinefit.geometry.camera import Rig
 from kinefit.readers.take.entries import MarkersEntry
 from kinefit.readers.take.file import Take
 
-_INVERTED = np.radians(150.0)  # [rad] turn of a camera that is upside down
-_LATE = 0.01  # [s] by which a clock must be off: 1 cm of somebody who walks
+_MIN_INVERTED_TURN = np.radians(150.0)  # of an upside-down camera
+_MIN_CLOCK_ERROR = 0.01  # [s] that is reported: a person walks 1 cm
 
 
 def misfits(fits: Iterable[SensorAlignment]) -> tuple[SensorAlignment, ...]:
-    """Those that surely do not fit, by more than is usual."""
+    """The alignments that significantly do not fit."""
     return tuple(f for f in fits if f.misfit)
 
 
 def sensor_findings(fits: Sequence[SensorAlignment], take: Take) -> list[Finding]:
-    """A fault for each sensor that does not fit, a doubt for each clock that is off, good news of all others."""
+    """A fault for each sensor that does not fit, a doubt for each clock offset, "good" for all others."""
     out, wrong, file = [], misfits(fits), take.path.name
     for fit in fits:
-        told = f"{np.degrees(fit.turn):.2f} ± {np.degrees(fit.bars[1]):.2f}° and {amount(fit)}"
-        sure = f"{fit.deviations:.0f} standard deviations; ± holds 95 % of errors, the surface's own among them."
-        if fit.kind == "depth" and fit.turn > _INVERTED:
+        shift = f"{np.degrees(fit.turn):.2f} ± {np.degrees(fit.bars[1]):.2f}° and {amount(fit)}"
+        evidence = f"{fit.deviations:.0f} standard deviations; ± holds 95 % of errors, the surface's own among them."
+        if fit.kind == "depth" and fit.turn > _MIN_INVERTED_TURN:
             turn = f"{np.degrees(fit.turn):.0f} degrees"
             text = f"{fit.sensor} hangs upside down, or is so stated: what it sees fits the person turned by {turn}."
             remedy = "Correct its pose in the calibration, or turn its images by 180 degrees; `track` leaves it out."
             out.append(Finding("fault", "sensor", text, (fit.sensor,), remedy=remedy))
         elif fit in wrong and fit.doubts:
             may = "does not fit the videos" if fit.falls else "may not fit the videos"
-            text = f"{fit.sensor} {may}: it seems off by {told} at the person."
+            text = f"{fit.sensor} {may}: it seems off by {shift} at the person."
             unsure = f"Where it belongs is not sure, because {'; '.join(fit.doubts)}."
             remedy = "Calibrate it together with the videos, or record a person who walks and turns nearer to it."
             out.append(Finding("fault" if fit.falls else "doubt", "sensor", text, (fit.sensor,), unsure, remedy))
         elif fit in wrong and fit.kind == "depth":
-            text = f"{fit.sensor} does not fit the videos: its pose in the calibration is off by {told} at the person."
+            text = f"{fit.sensor} does not fit the videos: its pose in the calibration is off by {shift} at the person."
             refine = command("check", take.path, "--refine")
             remedy = f"To move it run {refine} (or calibrate it together with the videos)."
-            out.append(Finding("fault", "sensor", text, (fit.sensor,), sure, remedy))
+            out.append(Finding("fault", "sensor", text, (fit.sensor,), evidence, remedy))
         elif fit in wrong:
-            text = f"{fit.sensor} does not fit the videos: its frame is off by {told} at the person."
+            text = f"{fit.sensor} does not fit the videos: its frame is off by {shift} at the person."
             remedy = f"Write {' and '.join(marker_lines(fit, take))} into [[markers]] of {file}."
-            out.append(Finding("fault", "sensor", text, (fit.sensor,), sure, remedy))
+            out.append(Finding("fault", "sensor", text, (fit.sensor,), evidence, remedy))
         else:
-            told = f"{np.degrees(fit.turn):.2f}° and {1e3 * fit.shift:.0f} mm at the person"
-            out.append(Finding("good", "sensor", f"{fit.sensor} fits the videos to {told}."))
+            shift = f"{np.degrees(fit.turn):.2f}° and {1e3 * fit.shift:.0f} mm at the person"
+            out.append(Finding("good", "sensor", f"{fit.sensor} fits the videos to {shift}."))
         late, std = fit.twist[6], float(np.sqrt(fit.covariance[6, 6]))
-        if abs(late) > max(MISFIT_SIGMAS * std, _LATE):
+        if abs(late) > max(MISFIT_SIGMAS * std, _MIN_CLOCK_ERROR):
             text = f"The clock of {fit.sensor} is off by {1e3 * late:+.0f} ± {1e3 * std:.0f} ms against the videos."
             entry = next((e for e in take.depth if e.name == fit.sensor), None) or marker_entry(fit, take)
             table = "depth" if fit.kind == "depth" else "markers"
@@ -64,12 +64,12 @@ def sensor_findings(fits: Sequence[SensorAlignment], take: Take) -> list[Finding
 
 
 def amount(fit: SensorAlignment) -> str:
-    """Its shift in millimetres, with the bar."""
+    """Text of the shift [mm] with its error bar."""
     return f"{1e3 * fit.shift:.1f} ± {1e3 * fit.bars[0]:.1f} mm"
 
 
-def told(fit: SensorAlignment) -> str:
-    """What a refinement does to a sensor, or why it does nothing, in one line."""
+def alignment_line(fit: SensorAlignment) -> str:
+    """Line of text on a sensor's correction, or on the reasons against one."""
     if fit.doubts:
         return f"{fit.sensor}: not refined, because {'; '.join(fit.doubts)}."
     turn, bar = np.degrees(fit.turn), np.degrees(fit.bars[1])
@@ -77,7 +77,7 @@ def told(fit: SensorAlignment) -> str:
 
 
 def moved_cameras(fits: Iterable[SensorAlignment], take: Take, rig: Rig) -> Rig:
-    """The depth cameras among the sensors where they belong, named as in the calibration.
+    """The depth cameras at their corrected poses, named as in the calibration.
 
     Parameters
     ----------
@@ -93,12 +93,12 @@ def moved_cameras(fits: Iterable[SensorAlignment], take: Take, rig: Rig) -> Rig:
 
 
 def marker_entry(fit: SensorAlignment, take: Take) -> MarkersEntry:
-    """The table of a marker system in the take."""
+    """The [[markers]] entry of a marker system in the take."""
     return take.markers[marker_index(fit.sensor)]
 
 
 def marker_lines(fit: SensorAlignment, take: Take) -> tuple[str, str]:
-    """The two lines of [[markers]] that put a marker system where it belongs."""
+    """The two lines of [[markers]] that correct a marker system's pose."""
     T = fit.T @ marker_entry(fit, take).T_world_file
     turn, shift = np.degrees(se3.log_so3(T[:3, :3])), T[:3, 3]
     numbers = lambda values, digits: ", ".join(f"{v:.{digits}f}" for v in values)

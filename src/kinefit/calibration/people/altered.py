@@ -1,4 +1,4 @@
-"""Videos of a take that no camera can be found from: mirrored, in slow motion, or of people whom no other one shows."""
+"""Videos of a take that no camera can be found from: mirrored, in slow motion, or of people that no other one shows."""
 
 from __future__ import annotations
 

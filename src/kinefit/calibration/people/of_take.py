@@ -109,7 +109,7 @@ def _find(take: Take, made_from: str, progress: Step | None) -> FoundCameras:
         up=take.up, sigma=median(entry.sigma for entry in take.keypoints), progress=progress,
     )
     changes = found.cameras.values()
-    first, *lines = found.told()
+    first, *lines = found.summary_lines()
     notes = [f"Nothing tells where the cameras stand: found from the people in view. {first}", "; ".join(lines)]
     if heard:
         clocks = ", ".join(f"{name} {1e3 * offset:+.0f} ms" for name, offset in heard.items())

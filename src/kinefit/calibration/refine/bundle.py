@@ -26,7 +26,7 @@ _At = tuple[Rig, NDArray, NDArray]  # cameras, time offsets, points
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Cameras and points that agree best.
+    """Adjusted cameras and points.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class Bundle:
     offsets : (C,) [s]
     x : (P, 3) [m]
     cost : float
-    S : (C · 10, C · 10) information of the data about the cameras, the points taken out.
+    S : (C · 10, C · 10) information of the data on the cameras, points eliminated.
     """
 
     rig: Rig
@@ -55,16 +55,16 @@ def bundle_adjust(
     max_iterations: int = 30,
     tolerance: float = 1e-4,
 ) -> Bundle:
-    """Cameras and points x (P, 3) [m] of least robust pixel error, by damped Gauss-Newton with the points taken out.
+    """Minimise the robust pixel error over cameras and points x (P, 3) [m], by damped Gauss-Newton with Schur.
 
     Parameters
     ----------
-    rig, x : where to start.
+    rig, x : start.
     prior : CameraPrior
-        What may change, and how far. Without a prior the gauge (place, turn, scale) stays where the damping leaves it.
+        Free parameters and their priors. Without priors only the damping fixes the gauge (position, rotation, scale).
     offsets : (C,) [s] time offsets to start from; default 0.
     tolerance : float
-        Stop when an iteration lowers the cost by less than this share.
+        Share of the cost; an iteration that lowers it by less ends the adjustment.
     """
     loss = loss or geman_mcclure()
     begin: _At = rig, np.zeros(len(rig)) if offsets is None else offsets, x

@@ -1,4 +1,4 @@
-"""The freedom that pictures leave: where the world is, how it is turned, and its scale."""
+"""The gauge of a calibration, which images do not determine: position, rotation and scale of the world."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.solvers.bundle.cameras import COLUMNS, POSE
 
-_PLACE, _TURN = 0.05, np.radians(1.0)  # a camera's place and turn count alike where 5 cm stand against 1°: 3 m away
+_PLACE_SIGMA = 0.05  # [m] of a camera's centre, that weighs as much as
+_TURN_SIGMA = np.radians(1.0)  # of its rotation: at a distance of 3 m
 
 
 def resized(rig: Rig, factor: float) -> Rig:
-    """The rig in a world whose lengths are multiplied by a factor."""
+    """The rig with all lengths of its world multiplied by a number."""
     cameras = []
     for camera in rig:
         T = np.array(camera.T_camera_world)
@@ -23,7 +24,7 @@ def resized(rig: Rig, factor: float) -> Rig:
 
 
 def generators(rig: Rig) -> NDArray:
-    """(C · 10, 7) how the cameras' parameters change when the world moves (v, ω) and grows, pictures staying."""
+    """(C · 10, 7) derivatives of the cameras' parameters by a twist (v, ω) and the scale of the world, images fixed."""
     out = np.zeros((len(rig), COLUMNS, 7))
     for block, camera in zip(out, rig, strict=True):
         block[POSE, :6] = -se3.adjoint(camera.T_camera_world)
@@ -33,15 +34,15 @@ def generators(rig: Rig) -> NDArray:
 
 def _gauge_weight(cameras: int) -> NDArray:
     weight = np.zeros((cameras, COLUMNS))
-    weight[:, :3], weight[:, 3:6] = _PLACE**-2, _TURN**-2
+    weight[:, :3], weight[:, 3:6] = _PLACE_SIGMA**-2, _TURN_SIGMA**-2
     return weight.ravel()
 
 
 def aligned(rig: Rig, old: Rig, *, scale: bool = True) -> tuple[Rig, NDArray, float]:
-    """The rig in the frame of an old one: the similarity that brings all cameras nearest to where they were.
+    """Align a rig with an old one by the similarity that moves all cameras nearest to their old poses.
 
-    Least squares over the cameras' places and turns together, 5 cm counting as 1°. Returns the rig, T_old_new (4, 4)
-    and the factor that lengths are multiplied by (1 where `scale` is False): x_old = T_old_new (factor · x_new).
+    Least squares over the cameras' centres and rotations, 5 cm counting as 1°. Returns the rig, T_old_new (4, 4), and
+    the scale factor (1 if `scale` is False): x_old = T_old_new (factor · x_new).
     """
     T, factor = _by_centres(rig, old)
     factor = factor if scale else 1.0
@@ -62,7 +63,7 @@ def aligned(rig: Rig, old: Rig, *, scale: bool = True) -> tuple[Rig, NDArray, fl
 
 
 def _by_centres(rig: Rig, old: Rig) -> tuple[NDArray, float]:
-    """T_old_new and factor to start from: mean turn, then centres."""
+    """Initial T_old_new (4, 4) and factor: mean rotation, then centres."""
     turns = [b.T_world_camera[:3, :3] @ a.T_camera_world[:3, :3] for a, b in zip(rig, old)]
     R = se3.nearest_rotation(np.sum(turns, axis=0))
     a, b = (np.stack([c.centre_world for c in r]) for r in (rig, old))
@@ -74,10 +75,9 @@ def _by_centres(rig: Rig, old: Rig) -> tuple[NDArray, float]:
 
 
 def covariance_in_gauge(rig: Rig, S: NDArray, free: NDArray) -> NDArray:
-    """(C · 10, C · 10) covariance of the cameras' parameters with the gauge of `aligned`, from their information S.
+    """(C · 10, C · 10) covariance of the cameras' parameters in the gauge of `aligned`, from their information S.
 
-    free (C · 10,) bool: what was estimated; the rest has none. Directions that nothing determines come out large, not
-    infinite.
+    free (C · 10,) bool: estimated parameters; all others have zero. Undetermined directions are large, not infinite.
     """
     G, W = generators(rig), _gauge_weight(len(rig))
     G = G * free[:, None]

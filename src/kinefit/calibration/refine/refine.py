@@ -1,4 +1,4 @@
-"""Cameras set right by the body that they saw: bundle adjustment over poses, bone lengths and cameras together."""
+"""Refine cameras by a tracked person: bundle adjustment over poses, bone lengths and cameras."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked, renamed
 from kinefit.bodies import Body
 from kinefit.calibration.refine.gauge import aligned, resized
-from kinefit.calibration.refine.result import SURE_PX, CameraChange, Refinement, changes_of
+from kinefit.calibration.refine.result import MAX_STATIC_SIGMA_PX, CameraChange, Refinement, changes_of
 from kinefit.calibration.refine.sightings import (
     PersonSighting,
     PersonTrial,
@@ -30,20 +30,27 @@ from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.solvers.bundle.body_bundle import BundleState, fit_body_and_cameras
 from kinefit.solvers.bundle.cameras import COLUMNS, FOCAL, POSE, RADIAL, TIME, CameraPrior, PointPixels, departure
 
-PLACE_SIGMA, TURN_SIGMA = 0.05, np.radians(2.0)
-"""How far a calibration is believed to be off [m, rad]: tripods that were knocked, not cameras that were moved."""
-_FOCAL_SIGMA, _RADIAL_SIGMA, _TIME_SIGMA = 0.03, 0.05, 0.2  # share, 1, [s]
-_STATIC_SIGMA = 1.0  # [px] of a point read by hand
-_RAYLEIGH = 1.177  # median length of a normal error in the plane, in σ
-_COARSEST = 30.0  # [px] beyond it points of different cameras are not taken for one
-_MOST_FRAMES, _LEAST_FRAMES = 600, 10
-_ROUNDS, _CLOCK_ROUNDS = 3, 6  # clocks come nearer by steps: how fast a point moves is told by frames out of step
-_SETTLED, _SETTLED_FRAMES = 2e-4, 0.02  # [m, rad] 0.3 px; [frames]: tracking anew would find the same
-_LIMIT_PX = 10.0  # a calibration known no better than this is no better than the ones that need refining
-_LIMIT_POINT = 0.05  # [m] the same: a tripod that was knocked
-_FAR_OFF = 10.0  # times these limits where nothing was known before: half a metre; said, and held by the error bars
-_LENS = 0.2  # of a focal length: one that is known no better puts people a fifth nearer, as a guess does
-_IMPLAUSIBLE = 0.02  # of the image's diagonal: a camera left with more is another one, or elsewhere
+PLACE_SIGMA = 0.05
+"""[m] of a camera's calibrated centre: a tripod that was knocked, not a camera that was moved."""
+TURN_SIGMA = np.radians(2.0)
+"""[rad] of a camera's calibrated rotation, likewise."""
+_FOCAL_SIGMA = 0.03  # share
+_RADIAL_SIGMA = 0.05
+_TIME_SIGMA = 0.2  # [s]
+_STATIC_SIGMA_PX = 1.0  # of a manually annotated point
+_RAYLEIGH_MEDIAN = 1.177  # of the length of a normal error in the plane, in σ
+_MAX_SIGMA_PX = 30.0  # of keypoints; with more, points of different cameras do not match
+_MAX_FRAMES = 600
+_MIN_FRAMES = 10
+_MAX_ROUNDS = 3
+_MAX_CLOCK_ROUNDS = 6  # clocks converge slowly: velocities are from unsynchronised frames
+_CONVERGED_STEP = 2e-4  # [m, rad] 0.3 px: tracking again would give the same result
+_CONVERGED_FRAMES = 0.02  # of the clocks, likewise
+_MAX_UNCERTAINTY_PX = 10.0  # with more, the refined calibration is no better than the given one
+_MAX_POINT_STD = 0.05  # [m] likewise: a tripod that was knocked
+_FROM_SCRATCH_FACTOR = 10.0  # on these limits, if no poses were known: half a metre, which the error bars report
+_MAX_FOCAL_STD = 0.2  # of a focal length: with more, people are a fifth nearer, as with a guess
+_MAX_RESIDUAL = 0.02  # of the image's diagonal: a camera with more is another one, or elsewhere
 
 
 StaticPoints = Mapping[str, Mapping[str, tuple[float, float]]]
@@ -68,29 +75,29 @@ def refine(
     sigma: float = KEYPOINT_SIGMA,
     progress: Progress | None = None,
 ) -> Refinement:
-    """A rig set right by the person that it saw, and by static points where some are given.
+    """Refine a rig by the person in view, and by static points if given.
 
-    Poses, bone lengths, the places of the detector's points and the cameras are solved together, robustly; then the
-    person is tracked anew with the better cameras, and so on for three rounds.
+    A robust bundle adjustment estimates poses, bone lengths, landmark offsets and cameras jointly. Then the person is
+    tracked again with the refined cameras; at most three rounds, six with time offsets.
 
     Parameters
     ----------
-    rig : Rig, near the truth: 5 cm and 2° a camera are its prior.
+    rig : Rig, accurate to 5 cm and 2° for each camera (standard deviations of the prior).
     keypoints : records of the same number of frames and the same rate.
     body : Body, generic.
     focal, distortion, time_offsets : bool
-        Estimate focal lengths (one factor a camera), k1 and k2, time offsets too. Principal points stay.
-    static_points : {name: {camera: (u, v)}} [px] in the calibration's image, of things that did not move.
+        Whether to estimate focal lengths (one factor a camera), k1 and k2, time offsets. Principal points stay fixed.
+    static_points : {name: {camera: (u, v)}} [px] in the calibration's image, of static objects.
     height : float [m] stature of the person: sets the scale.
     known_length : (point, point, [m]): sets the scale; static points or keypoints of the body.
-    sigma : float [px] standard deviation of a sure keypoint.
+    sigma : float [px] standard deviation of a keypoint of full confidence.
 
     Raises
     ------
     CalibrationError
-        Too little motion, or too few common views, to place the cameras better than 10 px; cameras that fit nothing.
+        Too little motion, or too few common views, for an uncertainty below 10 px; cameras that do not fit.
     ObservationError
-        Streams that differ; a height, length or static point that cannot be.
+        Streams that differ; an impossible height, length or static point.
     """
     check_input(rig, keypoints, height, known_length, static_points)
     prior_std = prior_sigma(len(rig), focal=focal, distortion=distortion, time_offsets=time_offsets)
@@ -103,7 +110,7 @@ def refine(
 
 
 def prior_sigma(cameras: int, *, focal: bool, distortion: bool, time_offsets: bool) -> NDArray:
-    """(C, 10) how far each parameter of a calibrated camera may be off."""
+    """(C, 10) prior standard deviations of each parameter of calibrated cameras; 0 fixes a parameter."""
     prior_std = np.zeros((cameras, COLUMNS))
     prior_std[:, :3], prior_std[:, 3:6] = PLACE_SIGMA, TURN_SIGMA
     prior_std[:, FOCAL] = _FOCAL_SIGMA * focal
@@ -116,27 +123,28 @@ def refine_from(
     rig: Rig, trial: PersonTrial, prior: CameraPrior, gauge: Gauge, *, static_points: StaticPoints | None = None,
     free: PointPixels | None = None, progress: Progress | None = None, from_scratch: bool = False,
 ) -> Refinement:  # fmt: skip
-    """As `refine`, from any start with any prior; `gauge` puts the rig into its final frame and says by which rule.
+    """Refine as `refine`, from any start with any prior.
 
-    `free`: pixels of more points in space, of which nothing is known.
+    `gauge` transforms the rig to its final frame, and returns the rule as text; `free` are pixels of further points
+    without a prior.
     """
     step = progress or (lambda *_: None)
-    names, static = static_pixels(rig, static_points or {}, _STATIC_SIGMA)
+    names, static = static_pixels(rig, static_points or {}, _STATIC_SIGMA_PX)
     if free is not None and len(free.point):
         both = ((static.camera, free.camera), (static.point, len(names) + free.point), (static.uv, free.uv),
                 (static.weight, free.weight))  # fmt: skip
         static = PointPixels(*map(np.concatenate, both))
     offsets = np.zeros(len(rig))
     first: PersonSighting | None = None
-    rounds = _CLOCK_ROUNDS if prior.freedom[:, TIME].any() else _ROUNDS
+    rounds = _MAX_CLOCK_ROUNDS if prior.freedom[:, TIME].any() else _MAX_ROUNDS
     for turn in range(rounds):
         step("refining", turn, rounds + 1)
         seen = _sight(rig, trial, offsets)
         first = first or seen
-        off = float(np.nanmedian(np.linalg.norm(seen.residuals, axis=-1))) / _RAYLEIGH
-        if off > 2.0 * trial.sigma:  # so far off, a robust loss would take most of what is seen for outliers
-            seen = _sight(rig, replace(trial, sigma=min(off, _COARSEST)), offsets)
-        chosen = spread_frames(seen, _MOST_FRAMES)
+        residual_sigma = float(np.nanmedian(np.linalg.norm(seen.residuals, axis=-1))) / _RAYLEIGH_MEDIAN
+        if residual_sigma > 2.0 * trial.sigma:  # else the loss rejects most points
+            seen = _sight(rig, replace(trial, sigma=min(residual_sigma, _MAX_SIGMA_PX)), offsets)
+        chosen = spread_frames(seen, _MAX_FRAMES)
         _check_frames(seen, chosen)
         pixels, (model, theta) = pixel_frames(seen, chosen), body_model(seen, trial.body)
         states = [seen.motion.state(int(f)) for f in chosen]
@@ -145,7 +153,7 @@ def refine_from(
         change = np.abs(departure(bundle.rig, rig)[:, POSE]).max(), np.abs(np.ptp(bundle.offsets))
         rig, offsets = bundle.rig, offsets + bundle.offsets
         offsets = offsets - offsets[0]
-        if change[0] < _SETTLED and change[1] * seen.motion.rate < _SETTLED_FRAMES:
+        if change[0] < _CONVERGED_STEP and change[1] * seen.motion.rate < _CONVERGED_FRAMES:
             break
     else:  # the last adjustment may have changed the scale, which the gauge takes from the person
         seen = _sight(rig, trial, offsets)
@@ -156,11 +164,12 @@ def refine_from(
     assert first is not None
     changes, distance = changes_of(prior.rig, rig, first, last, covariance, offsets)
     step("refining", rounds + 1, rounds + 1)
-    check_result(rig, changes, distance, times=_FAR_OFF if from_scratch else 1.0)
-    left = _static_residuals(rig, static, names)
+    check_result(rig, changes, distance, times=_FROM_SCRATCH_FACTOR if from_scratch else 1.0)
+    static_residuals = _static_residuals(rig, static, names)
     return Refinement(
         rig, dict(zip(rig.names, offsets.tolist(), strict=True)), changes, rule, chosen,
-        all(c.uncertainty <= SURE_PX for c in changes.values()), last.motion, distance, left, from_scratch,
+        all(c.uncertainty <= MAX_STATIC_SIGMA_PX for c in changes.values()), last.motion, distance,
+        static_residuals, from_scratch,
     )  # fmt: skip
 
 
@@ -186,8 +195,8 @@ def static_start(rig: Rig, static: PointPixels) -> NDArray:
 def _static_residuals(rig: Rig, static: PointPixels, names: tuple[str, ...]) -> dict[str, float]:
     x, out = static_start(rig, static), {}
     for p, name in enumerate(names):
-        mine = static.point == p
-        seen = zip(static.camera[mine], static.uv[mine], strict=True)
+        own = static.point == p
+        seen = zip(static.camera[own], static.uv[own], strict=True)
         out[name] = float(np.median([np.linalg.norm(rig.cameras[c].project(x[p]) - uv) for c, uv in seen]))
     return out
 
@@ -195,11 +204,11 @@ def _static_residuals(rig: Rig, static: PointPixels, names: tuple[str, ...]) -> 
 def _in_old_frame(
     rig: Rig, old: Rig, seen: PersonSighting, static: StaticPoints, height: float | None, known_length: Length | None
 ) -> tuple[Rig, str]:
-    """The rig in the old frame and with the right scale, and the rule in words."""
+    """The rig in the old frame with the known scale, and the rule as text."""
     rule = "The world is the old calibration's: all cameras together stay as near as they can to where they were"
     if known_length is not None:
         a, b, metres = known_length
-        names, pixels = static_pixels(rig, static, _STATIC_SIGMA)
+        names, pixels = static_pixels(rig, static, _STATIC_SIGMA_PX)
         if a in names and b in names:
             x = static_start(rig, pixels)
             length = float(np.linalg.norm(x[names.index(a)] - x[names.index(b)]))
@@ -215,7 +224,7 @@ def _in_old_frame(
 
 
 def length_of(seen: PersonSighting, a: str, b: str) -> float:
-    """[m] median distance between two keypoints of the person as tracked."""
+    """Median distance [m] between two keypoints of the tracked person."""
     x = seen.motion.positions(seen.channels.with_points(seen.motion.body).points.select((a, b)))
     return float(np.median(np.linalg.norm(x[:, 0] - x[:, 1], axis=1)))
 
@@ -224,7 +233,13 @@ def check_input(
     rig: Rig, keypoints: Sequence[Keypoints], height: float | None, known_length: Length | None,
     static: StaticPoints | None = None,
 ) -> None:  # fmt: skip
-    """Refuse what cannot be before any work is done."""
+    """Check the input of `refine`: rig, streams, height and length [m], static points (u, v) [px].
+
+    Raises
+    ------
+    CalibrationError, ObservationError
+        As `refine`.
+    """
     unseen = [name for name in rig.names if name not in {k.camera for k in keypoints}]
     if len(rig) < 2 or unseen:
         raise CalibrationError(
@@ -232,8 +247,8 @@ def check_input(
             remedy="Give keypoints of every camera, and two cameras or more.",
         )
     if len({(len(k), k.rate) for k in keypoints}) > 1:
-        told = ", ".join(f"{k.camera}: {len(k)} frames at {k.rate:g} Hz" for k in keypoints)
-        raise ObservationError(f"keypoint streams differ ({told})", remedy="Set frames or rate in the take.")
+        listed = ", ".join(f"{k.camera}: {len(k)} frames at {k.rate:g} Hz" for k in keypoints)
+        raise ObservationError(f"keypoint streams differ ({listed})", remedy="Set frames or rate in the take.")
     if height is not None and not 0.3 < height < 3.0:
         raise ObservationError(f"a height of {height:g} m", remedy="Give the person's height in metres.")
     if known_length is not None and not 1e-3 < known_length[2] < 100.0:
@@ -250,7 +265,7 @@ def check_input(
 
 
 def _check_frames(seen: PersonSighting, frames: NDArray) -> None:
-    if len(frames) < _LEAST_FRAMES:
+    if len(frames) < _MIN_FRAMES:
         raise CalibrationError(
             f"only {len(frames)} of {len(seen.motion)} frames show the person well enough to refine the cameras",
             remedy="Record someone who walks through the whole volume for ten seconds, seen by all cameras.",
@@ -258,29 +273,30 @@ def _check_frames(seen: PersonSighting, frames: NDArray) -> None:
 
 
 def check_result(rig: Rig, changes: Mapping[str, CameraChange], distance: float, *, times: float = 1.0) -> None:
-    """Refuse cameras that still fit nothing, and those that the recording does not tell.
+    """Check that refined cameras fit the keypoints, and that the recording determines them.
 
     Parameters
     ----------
-    distance : float [m] how well a point about the person is known.
-    times : of the usual limits.
+    distance : float [m] standard deviation of a triangulated point near the person.
+    times : factor on the limits of uncertainty.
 
     Raises
     ------
     CalibrationError
+        Cameras that do not fit, or undetermined lenses or poses.
     """
     wrong = [
         name for name, c in changes.items()
-        if not c.residual_after < _IMPLAUSIBLE * float(np.hypot(*rig[name].size))
+        if not c.residual_after < _MAX_RESIDUAL * float(np.hypot(*rig[name].size))
     ]
     if wrong:
-        told = ", ".join(f"{name} ({changes[name].residual_after:.0f} px)" for name in wrong)
+        listed = ", ".join(f"{name} ({changes[name].residual_after:.0f} px)" for name in wrong)
         raise CalibrationError(
-            f"refined, the body still does not lie where these cameras see it: {told}",
+            f"refined, the body still does not lie where these cameras see it: {listed}",
             remedy="Look whether two cameras are exchanged, the calibration is of another session or the cameras are "
             "out of step; `kinefit calibrate people` starts from no poses at all.",
         )
-    loose = [name for name, c in changes.items() if not c.focal_std <= _LENS]
+    loose = [name for name, c in changes.items() if not c.focal_std <= _MAX_FOCAL_STD]
     if loose:
         shares = ", ".join(f"{name} to {100 * changes[name].focal_std:.0f} %" for name in loose)
         raise CalibrationError(
@@ -289,12 +305,12 @@ def check_result(rig: Rig, changes: Mapping[str, CameraChange], distance: float,
             remedy="Record someone who walks towards the cameras and away, raises the arms and is seen whole; or state "
             "field_of_view, or calibrate the lenses with a board.",
         )  # fmt: skip
-    unknown = [name for name, c in changes.items() if not c.uncertainty <= times * _LIMIT_PX]
-    if unknown or not distance <= times * _LIMIT_POINT:
-        told = ", ".join(f"{name} to {changes[name].uncertainty:.0f} px" for name in unknown)
-        told = told or f"space to {1e3 * distance:.0f} mm"
+    unknown = [name for name, c in changes.items() if not c.uncertainty <= times * _MAX_UNCERTAINTY_PX]
+    if unknown or not distance <= times * _MAX_POINT_STD:
+        listed = ", ".join(f"{name} to {changes[name].uncertainty:.0f} px" for name in unknown)
+        listed = listed or f"space to {1e3 * distance:.0f} mm"
         raise CalibrationError(
-            f"too little motion to refine: static points about the person would be known in {told}",
+            f"too little motion to refine: static points about the person would be known in {listed}",
             remedy="Record someone who walks through the whole volume, turns and raises the arms, seen by all cameras; "
             "or give static points.",
         )

@@ -1,4 +1,4 @@
-"""The result of a calibration: the rig, what changed, and how sure it is."""
+"""Result of a refinement: the rig, its changes, and their uncertainty."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.solvers.bundle.cameras import COLUMNS, FOCAL, TIME, camera_jacobian, departure
 
-SURE_PX = 3.0
-"""[px] up to which a rig is trusted: a static point about the person is seen where it says, one standard deviation."""
+MAX_STATIC_SIGMA_PX = 3.0
+"""Standard deviation of a static point's residual near the person, up to which a rig is reliable."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraChange:
-    """What refining did to one camera.
+    """Change of one camera by a refinement.
 
     Parameters
     ----------
-    residual_before, residual_after : float [px] median over its keypoints, of the body tracked.
+    residual_before, residual_after : float [px] median over its keypoints, of the tracked body.
     bias_after : (2,) [px] median shift, measured minus fitted.
-    turn, shift : float [rad], [m] how far it was turned and moved.
+    turn, shift : float [rad], [m] by which it was rotated and moved.
     focal : float, change of the focal length as a share.
     time : float [s] to add to its times.
     turn_std, shift_std, focal_std, time_std : float
-        One standard deviation of each, in the gauge stated; 0 for what was fixed.
-    uncertainty : float [px] one standard deviation of a static point's residual, anywhere about the person.
+        Standard deviation of each, in the stated gauge; 0 if fixed.
+    uncertainty : float [px] standard deviation of a static point's residual near the person.
     """
 
     residual_before: float
@@ -49,21 +49,21 @@ class CameraChange:
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """A refined rig, and how sure it is.
+    """A refined rig with its uncertainty.
 
     Parameters
     ----------
     rig : Rig
     time_offsets : {camera: [s]} to add to each camera's, the first camera's being 0.
     cameras : {camera: CameraChange}
-    gauge : str, the rule that place, turn and scale of the world keep to.
+    gauge : str, the rule that fixes position, rotation and scale of the world.
     frames : (F,) int used.
     confident : bool
-        A static point about the person is seen where the rig says to 3 px in every camera (one standard deviation).
-    motion : Motion as tracked with the new rig.
-    point_std : float [m] one standard deviation of where a point about the person is found to be.
-    static : {point: [px]} median residual of the static points given, triangulated with the new rig.
-    from_scratch : bool, no poses were known before; then `turn` and `shift` tell of a first guess.
+        Whether `uncertainty` is at most 3 px in every camera.
+    motion : Motion tracked with the new rig.
+    point_std : float [m] standard deviation of a triangulated point near the person.
+    static : {point: [px]} median residual of the given static points, triangulated with the new rig.
+    from_scratch : bool, no poses were known before; then `turn` and `shift` are relative to an initial guess.
     """
 
     rig: Rig
@@ -77,8 +77,8 @@ class Refinement:
     static: Mapping[str, float]
     from_scratch: bool = False
 
-    def told(self) -> list[str]:
-        """The result in plain words, a line each."""
+    def summary_lines(self) -> list[str]:
+        """Lines of text that summarise the result."""
         known = f"points about the person known to {1e3 * self.point_std:.0f} mm"
         out = [f"{len(self.frames)} frames; {known}. {self.gauge}"]
         for name, c in self.cameras.items():
@@ -103,11 +103,11 @@ class Refinement:
 def changes_of(
     old: Rig, rig: Rig, first: PersonSighting, last: PersonSighting, covariance: NDArray, offsets: NDArray
 ) -> tuple[dict[str, CameraChange], float]:
-    """What was done to each camera, and how far [m] a point may lie from where it is.
+    """Change of each camera, and the standard deviation [m] of a triangulated point.
 
-    covariance (C · 10, C · 10) is that of the cameras' parameters.
+    covariance (C · 10, C · 10) is of the cameras' parameters, offsets (C,) [s] of their clocks.
     """
-    clock = np.zeros((len(rig), len(covariance)))  # against the first camera's: a common delay changes nothing
+    clock = np.zeros((len(rig), len(covariance)))  # relative to the first camera: a common delay has no effect
     clock[np.arange(len(rig)), np.arange(TIME, len(covariance), COLUMNS)] = 1.0
     clock[:, TIME] -= 1.0
     clock_std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", clock, covariance, clock), 0.0))
@@ -116,7 +116,7 @@ def changes_of(
     out = {}
     for c, name in enumerate(rig.names):
         std = np.sqrt(np.maximum(np.diag(covariance)[c * COLUMNS : (c + 1) * COLUMNS], 0.0))
-        before, after = (_left(s, c) for s in (first, last))
+        before, after = (_camera_residuals(s, c) for s in (first, last))
         out[name] = CameraChange(
             residual_before=float(np.median(np.linalg.norm(before, axis=-1))),
             residual_after=float(np.median(np.linalg.norm(after, axis=-1))),
@@ -131,24 +131,24 @@ def changes_of(
     return out, distance
 
 
-def _left(seen: PersonSighting, camera: int) -> NDArray:
-    """(M, 2) [px] what a camera's keypoints left over, seen ones alone."""
-    mine = seen.residuals[:, seen.channels.camera == camera].reshape(-1, 2)
-    mine = mine[np.isfinite(mine).all(axis=1)]
-    return mine if len(mine) else np.full((1, 2), np.inf)
+def _camera_residuals(seen: PersonSighting, camera: int) -> NDArray:
+    """(M, 2) [px] residuals of a camera's observed keypoints."""
+    own = seen.residuals[:, seen.channels.camera == camera].reshape(-1, 2)
+    own = own[np.isfinite(own).all(axis=1)]
+    return own if len(own) else np.full((1, 2), np.inf)
 
 
 def places(motion: Motion) -> NDArray:
-    """(P, 3) [m] places spread over the box that the person was in."""
+    """(P, 3) [m] points spread over the box in which the person moved."""
     x = motion.segment_poses()[..., :3, 3].reshape(-1, 3)
     return np.stack(np.meshgrid(*np.linspace(x.min(axis=0), x.max(axis=0), 4).T), axis=-1).reshape(-1, 3)
 
 
 def expected_errors(rig: Rig, covariance: NDArray, x_world: NDArray) -> tuple[NDArray, float]:
-    """Median over static points (P, 3) [m] of what their triangulation is off by, one standard deviation.
+    """Standard deviations of triangulated static points (P, 3) [m], median over the points.
 
-    covariance (C · 10, C · 10) is that of the cameras. Returns (C,) [px] the length of the residual in each camera, and
-    [m] how far the point lies from where it is.
+    covariance (C · 10, C · 10) is of the cameras. Returns (C,) [px] those of the residual in each camera, and [m] that
+    of the point.
     """
     J_camera = np.stack([camera_jacobian(camera, x_world) for camera in rig], axis=1)
     J_camera[..., TIME] = 0.0

@@ -1,4 +1,4 @@
-"""What a rig saw of one person, put right by tracking: the measurements that a bundle adjustment takes."""
+"""Track one person with a rig, and prepare the measurements for a bundle adjustment."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from kinefit.tracking.video import track
 
 Progress = Callable[[str, int, int], None]
 
-_INLIER = 0.25  # robust factor (Geman-McClure: within its scale) above which a residual tells of noise
-_POINT = 0.01  # [m] standard deviation of a detector's points about the body's, where no fit tells
-_TRACKED = 0.3  # quality of a frame that counts
+_MIN_INLIER_WEIGHT = 0.25  # of the robust loss (Geman-McClure: within its scale)
+_POINT_SIGMA = 0.01  # [m] default of a detector's points about the body's
+_MIN_QUALITY = 0.3  # of a frame that counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class PersonSighting:
     channels : Channels of the generic body's points.
     subject : Subject
     motion : Motion
-    uv : (F, N, 2) [px] with left and right put right, NaN where unseen.
+    uv : (F, N, 2) [px] with swaps of left and right corrected, NaN if unobserved.
     confidence : (F, N) of them.
     """
 
@@ -60,19 +60,19 @@ class PersonSighting:
 
     @property
     def trusted(self) -> NDArray:
-        """(F, N, 2) [px] residuals of what is no outlier; else NaN."""
-        return np.where((self.weights > _INLIER)[..., None], self.residuals, np.nan)
+        """(F, N, 2) [px] residuals of inliers; NaN for outliers."""
+        return np.where((self.weights > _MIN_INLIER_WEIGHT)[..., None], self.residuals, np.nan)
 
 
 def one_person(rig: Rig, keypoints: Sequence[Keypoints]) -> list[Keypoints]:
-    """The keypoints of the person to follow alone."""
+    """The keypoints of the tracked person alone."""
     return [record.of_one(person) for record, person in zip(keypoints, choose_people(rig, keypoints), strict=True)]
 
 
 def shifted(record: Keypoints, offset: float) -> Keypoints:
-    """One person's keypoints at times `offset` [s] earlier in the record: what a camera whose clock is late saw.
+    """One person's keypoints, shifted to correct a clock that is late by `offset` [s].
 
-    Frame f becomes what was seen at f − offset · rate, linear between two frames that both saw the point.
+    Frame f becomes frame f − offset · rate, interpolated linearly between two frames with the point.
     """
     if offset == 0.0:
         return record
@@ -91,14 +91,14 @@ def shifted(record: Keypoints, offset: float) -> Keypoints:
 
 @dataclass(frozen=True, eq=False)
 class PersonTrial:
-    """Keypoints of the person who calibrates the cameras, and how they are fitted.
+    """Keypoints of the person who calibrates the cameras, with the options of the fit.
 
     Parameters
     ----------
     keypoints : records of the same number of frames and the same rate.
     body : Body, generic.
     up : str, vertical axis of the world.
-    sigma : float [px] standard deviation of a sure keypoint.
+    sigma : float [px] standard deviation of a keypoint of full confidence.
     """
 
     keypoints: Sequence[Keypoints]
@@ -121,11 +121,11 @@ def sight(rig: Rig, trial: PersonTrial, offsets: Mapping[str, float]) -> PersonS
 
 
 def body_model(sighting: PersonSighting, body: Body) -> tuple[ShapeParameters, NDArray]:
-    """The generic body's lengths and points as parameters with their prior, and (p,) what the subject's fit found."""
+    """The generic body's lengths and points as parameters with their prior, and their fitted values (P,)."""
     subject, points = sighting.subject, sighting.channels.points
     found = () if subject.fit is None else subject.fit.parameters
-    stds = [float(np.max(one.std)) for one in found if isinstance(one, PointOffsets)]
-    model = shape_parameters(body, points, subject.scales, PROPORTIONS, max(stds, default=_POINT))
+    stds = [float(np.max(p.std)) for p in found if isinstance(p, PointOffsets)]
+    model = shape_parameters(body, points, subject.scales, PROPORTIONS, max(stds, default=_POINT_SIGMA))
     moved = sighting.channels.with_points(subject.body).points.points
     moved = moved - sighting.channels.with_points(body.scaled(subject.scales)).points.points
     theta, first = model.mean.copy(), len(subject.scales)
@@ -136,21 +136,21 @@ def body_model(sighting: PersonSighting, body: Body) -> tuple[ShapeParameters, N
 
 
 def spread_frames(sighting: PersonSighting, most: int) -> NDArray:
-    """Frames with a trusted pose, spread evenly over the take."""
-    good = np.flatnonzero(sighting.motion.quality > _TRACKED)
+    """(K,) at most `most` frames with a reliable pose, evenly spaced over the take."""
+    good = np.flatnonzero(sighting.motion.quality > _MIN_QUALITY)
     return good[np.unique(np.linspace(0, len(good) - 1, min(most, len(good))).astype(int))] if len(good) else good
 
 
 def pixel_frames(sighting: PersonSighting, frames: NDArray) -> PixelFrames:
-    """Measurements of some frames, with the velocities of the pixels.
+    """Measurements of some frames (K,) int, with the velocities of the pixels.
 
-    Errors of a detector's points on one segment in one view come together (a hidden shoulder, a blurred face): n points
-    of correlation ρ tell as much as n / (1 + (n − 1) ρ) of them (the design effect: L. Kish, Survey sampling, 1965),
-    with the ρ that the residuals show.
+    Errors of a detector's points on one segment in one view are correlated (an occluded shoulder, a blurred face). n
+    points of correlation ρ count as n / (1 + (n − 1) ρ) independent ones (the design effect: L. Kish, Survey sampling,
+    1965); the residuals give ρ.
     """
     c = sighting.channels
     group = _groups(sighting)
-    share = 1.0 / (1.0 + (np.bincount(group)[group] - 1) * togetherness(sighting))
+    share = 1.0 / (1.0 + (np.bincount(group)[group] - 1) * residual_correlation(sighting))
     weight = sighting.confidence / np.square(c.sigma)
     uv, velocity = np.nan_to_num(sighting.uv[frames]), velocities(sighting)[frames]
     return PixelFrames(c.points, c.camera, c.column, uv, weight[frames], share, velocity)
@@ -163,8 +163,8 @@ def _groups(sighting: PersonSighting) -> NDArray:
     return np.unique(key, return_inverse=True)[1]
 
 
-def togetherness(sighting: PersonSighting) -> float:
-    """Correlation, 0..1, of the residuals of points on one segment in one view."""
+def residual_correlation(sighting: PersonSighting) -> float:
+    """Correlation, a number 0..1, of the residuals of points on one segment in one view."""
     values = sighting.trusted
     seen = np.isfinite(values).all(axis=-1)
     values, group = np.where(seen[..., None], values, 0.0), _groups(sighting)
@@ -178,22 +178,22 @@ def togetherness(sighting: PersonSighting) -> float:
 
 
 def velocities(sighting: PersonSighting) -> NDArray:
-    """(F, N, 2) [px/s] of every channel's point as tracked; 0 where it cannot be seen."""
+    """(F, N, 2) [px/s] velocities of every channel's tracked point; 0 behind the camera."""
     c, motion = sighting.channels, sighting.motion
     x = motion.positions(c.with_points(motion.body).points)
     x_dot = np.gradient(x, 1.0 / motion.rate, axis=0) if len(x) > 1 else np.zeros_like(x)
     out = np.zeros(sighting.uv.shape)
     for k, camera in enumerate(c.rig):
-        mine = c.camera == k
-        _, J = camera.project_with_jacobian(x[:, c.column[mine]])
-        out[:, mine] = (J @ x_dot[:, c.column[mine]][..., None])[..., 0]
+        own = c.camera == k
+        _, J = camera.project_with_jacobian(x[:, c.column[own]])
+        out[:, own] = (J @ x_dot[:, c.column[own]][..., None])[..., 0]
     return np.nan_to_num(out)
 
 
 def static_pixels(
     rig: Rig, points: Mapping[str, Mapping[str, tuple[float, float]]], sigma: float
 ) -> tuple[tuple[str, ...], PointPixels]:
-    """Names and pixels of points that do not move, {name: {camera: (u, v)}}."""
+    """Names and pixels of static points {name: {camera: (u, v)}} [px], with a standard deviation [px]."""
     names = tuple(points)
     rows = [(rig.index(c), p, uv) for p, name in enumerate(names) for c, uv in points[name].items()]
     return names, PointPixels(
@@ -203,7 +203,7 @@ def static_pixels(
 
 
 def correlation_time(values: NDArray) -> float:
-    """Frames in which the errors (F, N, 2) of channels forget themselves; 1 if they do at once, at most F.
+    """Correlation time of the errors (F, N, 2) of channels, a number of frames: 1 for white noise, at most F.
 
     Integrated autocorrelation, over lags until the mean correlation falls below zero (the initial positive sequence:
     C. Geyer, Practical Markov chain Monte Carlo, 1992).

@@ -1,4 +1,4 @@
-"""How sure refined cameras are: what the residuals say of chance, and what parts of the body say of bias."""
+"""Uncertainty of refined cameras: random errors from the residuals, systematic errors from a jackknife by segments."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from kinefit.solvers.bundle.body_bundle import BodyBundle, BundleState, fit_body
 from kinefit.solvers.bundle.cameras import CameraPrior, PointPixels, departure
 from kinefit.solvers.bundle.shape import PixelFrames, ShapeParameters
 
-_FRAMES = 40  # that the parts are compared over
+_MAX_JACKKNIFE_FRAMES = 40
 
 
 def chance(bundle: BodyBundle, prior: CameraPrior, seen: PersonSighting, frames: NDArray) -> NDArray:
-    """Covariance (C · 10, C · 10) of the cameras for errors that come and go.
+    """Covariance (C · 10, C · 10) of the cameras from random errors.
 
-    They are as large, and last as long, as the residuals without each channel's mean.
+    Their variance and correlation time are those of the residuals without each channel's mean.
     """
     values = seen.trusted
     counts = np.isfinite(values).all(axis=-1).sum(axis=0)
     mean = np.nansum(values, axis=0) / np.maximum(counts, 1)[:, None]
-    new = min(1.0, len(values) / max(len(frames), 1) / correlation_time(values - mean))  # share of frames that are news
+    new = min(1.0, len(values) / max(len(frames), 1) / correlation_time(values - mean))  # independent share of frames
     share = seen.confidence / np.square(seen.channels.sigma)
     power = float(np.nanmean(np.sum((values - mean) ** 2, axis=-1) * share)) / 2.0
     free = prior.freedom.ravel() > 0
@@ -34,12 +34,12 @@ def chance(bundle: BodyBundle, prior: CameraPrior, seen: PersonSighting, frames:
 def bias(
     model: ShapeParameters, bundle: BodyBundle, frames: PixelFrames, prior: CameraPrior, static: PointPixels
 ) -> NDArray:
-    """Covariance (C · 10, C · 10) of the cameras for errors that stay.
+    """Covariance (C · 10, C · 10) of the cameras from systematic errors.
 
-    A detector's points lie beside the anatomical ones, differently from each side. Grouped jackknife (M. Quenouille,
-    1956; J. Tukey, 1958): the cameras are fitted without one segment's points after the other.
+    A detector's points are biased against the anatomical ones, differently in each view. Grouped jackknife (M.
+    Quenouille, 1956; J. Tukey, 1958): fit the cameras without the points of each segment in turn.
     """
-    some = np.unique(np.linspace(0, len(frames.uv) - 1, min(_FRAMES, len(frames.uv))).astype(int))
+    some = np.unique(np.linspace(0, len(frames.uv) - 1, min(_MAX_JACKKNIFE_FRAMES, len(frames.uv))).astype(int))
     owner = frames.points.segments[frames.column]
     groups = np.unique(owner)
 

@@ -58,6 +58,6 @@ def people(
             sigma=median(source.sigma for source in entry.keypoints),
         )  # fmt: skip
     write_calibration(found.rig, out)
-    for line in found.told():
+    for line in found.summary_lines():
         _screen.say(line)
     _screen.say(f"Written: {out}")

@@ -23,7 +23,7 @@ def check_page(check: Check, *, refinement: Refined | None = None, up: str = "z"
     """The whole page as text."""
     sections = [_findings(check)]
     if refinement is not None:
-        sections.append(p.section("Refined calibration", p.bullets(refinement.told()), anchor="refined"))
+        sections.append(p.section("Refined calibration", p.bullets(refinement.summary_lines()), anchor="refined"))
     if check.biases and check.views is not None:
         sections.append(_cameras(check))
         sections.append(picture_section(check))

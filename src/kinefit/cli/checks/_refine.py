@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kinefit.calibration.check.sensor_verdicts import marker_lines, misfits, moved_cameras, told
+from kinefit.calibration.check.sensor_verdicts import alignment_line, marker_lines, misfits, moved_cameras
 from kinefit.calibration.check.sensors import fit_sensors
 from kinefit.cli import _screen
 from kinefit.diagnostics.keypoints import Check
@@ -37,13 +37,13 @@ class Refined:
         """Sensors of which it is sure where they belong: they alone are moved."""
         return tuple(fit for fit in self.sensors if not fit.doubts)
 
-    def told(self) -> list[str]:
+    def summary_lines(self) -> list[str]:
         """The result in plain words, a line each."""
         stay = "The videos' cameras stay: nothing is wrong with them."
         if self.moved:
             stay = f"{stay[:-1]}, and {' and '.join(f.sensor for f in self.moved)} is moved to fit them."
-        lines = self.cameras.told() if self.cameras is not None else [stay]
-        return [*lines, *(told(fit) for fit in self.sensors)]
+        lines = self.cameras.summary_lines() if self.cameras is not None else [stay]
+        return [*lines, *(alignment_line(fit) for fit in self.sensors)]
 
 
 def refined_of(
@@ -106,7 +106,7 @@ def write_refined(found: Check, refined: Refined, path: Path) -> None:
     if len(rig):
         write_calibration_like(rig, old.file, new, unit=old.unit)
         _screen.say(f"Written: {new}\n")
-    for line in refined.told():
+    for line in refined.summary_lines():
         _screen.say(line)
     if not len(rig) and not markers:
         _screen.say(f"Next:\n  {command('track', path)}")

@@ -140,7 +140,7 @@ def _tell(session: LiveSession, kept: Any, quiet: bool) -> None:
         text = f"{1000 * ms[len(ms) // 2]:.1f} ms, 99 % within {1000 * ms[int(0.99 * (len(ms) - 1))]:.1f} ms"
         _screen.say(f"from frame to pose: median {text}", stderr=quiet)
     if session.size is not None:
-        _screen.say(f"note: {session.size.told or 'the session ended before the size of the person was found'}",
+        _screen.say(f"note: {session.size.outcome or 'the session ended before the size of the person was found'}",
                     stderr=quiet)  # fmt: skip
     if kept is not None:
         path = "nothing was found, no motion is left" if kept.path is None else str(kept.path)

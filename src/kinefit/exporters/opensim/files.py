@@ -1,6 +1,6 @@
 """OpenSim: landmarks over time (.trc), angles over time (.mot) and the fitted body as a model (.osim).
 
-All three stand in OpenSim's world, y up (TRC unless told otherwise). The root's coordinates are those of OpenSim's
+All three stand in OpenSim's world, y up (TRC by default). The root's coordinates are those of OpenSim's
 ground_pelvis joint: the way of its origin, then turns about its own z (tilt), x (list) and y (rotation).
 """
 

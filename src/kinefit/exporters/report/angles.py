@@ -112,11 +112,11 @@ def _over_time(curve: Curve, times: NDArray, row: int, legend: bool) -> list[dic
     out: list[dict] = []
     if len(band_t):
         out.append(_filled(band_t, band, colour, name, axes))
-    told = np.where(known, 2 * std, 0)
+    half_width = np.where(known, 2 * std, 0)
     line = {"x": t, "mode": "lines" if len(t) > 2 else "markers", "name": name, "legendgroup": name, **axes}
     if known.any():
         out.append(line | {
-            "y": np.where(known, values, np.nan), "line": {"color": colour, "width": 1.8}, "customdata": told,
+            "y": np.where(known, values, np.nan), "line": {"color": colour, "width": 1.8}, "customdata": half_width,
             "hovertemplate": f"{name} %{{y:.4~g}} ± %{{customdata:.2~g}} {curve.unit}<extra></extra>",
             "showlegend": legend and row == 0,
         })  # fmt: skip
@@ -150,9 +150,9 @@ def _over_cycle(curve: Curve, values: NDArray, row: int, of: str) -> list[dict]:
             })  # fmt: skip
     unseen = not np.isfinite(curve.std).mean() > 0.5
     line = {"color": _GREY if unseen else colour, "width": 2.2, **({"dash": "dot"} if unseen else {})}
-    told = f"{name}, {len(values)} {'' if of.strip() == curve.side else of}cycles"
+    label = f"{name}, {len(values)} {'' if of.strip() == curve.side else of}cycles"
     out.append({
-        "x": PERCENT, "y": mean, "mode": "lines", "name": told, "line": line,
+        "x": PERCENT, "y": mean, "mode": "lines", "name": label, "line": line,
         "hovertemplate": f"{name} %{{y:.4~g}} {curve.unit}<extra></extra>", "legendgroup": name,
         "showlegend": row == 0, **axes,
     })  # fmt: skip

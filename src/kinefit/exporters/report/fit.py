@@ -49,7 +49,7 @@ def sensor_fits(motion: Motion) -> tuple[SensorFit, ...]:
 
 
 def overall_median(motion: Motion, unit: str = "px") -> float:
-    """Median residual of all points, or else surfaces, of a unit ("px", or "m" told in mm), NaN where there is none."""
+    """Median residual of all points, or else surfaces, of a unit ("px", or "m", shown in mm); NaN without any."""
     own = [r for r in motion.residuals.values() if r.unit == unit]
     chosen = [r for r in own if r.of_points] or own
     norms = [r.norms[np.isfinite(r.norms)] for r in chosen]
@@ -67,10 +67,11 @@ def sensor_table(motion: Motion, fits: Sequence[SensorFit]) -> Html:
         shift = [f"{v:+.1f}" for v in f.shift] + ["–"] * (3 - len(f.shift))
         swaps = runs_of(np.asarray(motion.residuals[f.name].swapped, bool), round(0.1 * motion.rate))
         links = [moment(motion.times[a], f"{motion.times[a]:.2f} s") for a, _ in swaps[:6]]
-        told = joined(f"{f.swapped} frames: ", Html(", ".join(links)), " …" if len(swaps) > 6 else "") if swaps else "–"
+        more = " …" if len(swaps) > 6 else ""
+        swapped = joined(f"{f.swapped} frames: ", Html(", ".join(links)), more) if swaps else "–"
         rows.append(
             [f.name, _told(f.median, f.unit), _told(f.most, f.unit), *(shift[:2] if flat else shift),
-             f"{100 * f.seen:.0f} %", f"{100 * f.left_out:.1f} %", told]
+             f"{100 * f.seen:.0f} %", f"{100 * f.left_out:.1f} %", swapped]
         )  # fmt: skip
     if flat:
         columns.remove("z")

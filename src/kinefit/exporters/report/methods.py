@@ -37,14 +37,14 @@ def methods(motion: Motion, date: str, doubtful: int) -> list[p.Html]:
 
 def methods_sentences(motion: Motion, doubtful: int) -> list[str]:
     """The sentences of the methods paragraph."""
-    told, body = motion.provenance, motion.body
+    provenance, body = motion.provenance, motion.body
     pixels = [name for name, r in motion.residuals.items() if r.unit == "px"]
     places = [name for name, r in motion.residuals.items() if r.unit == "m"]
     out = [
         f"The motion \"{motion.name}\" ({len(motion)} frames at {motion.rate:g} Hz) was estimated with kinefit "
-        f"{told.get('kinefit', told.get('version', _version()))}."
+        f"{provenance.get('kinefit', provenance.get('version', _version()))}."
     ]  # fmt: skip
-    out += [text for text in (_cameras(told, pixels), _markers(places), _calibration(told)) if text]
+    out += [text for text in (_cameras(provenance, pixels), _markers(places), _calibration(provenance)) if text]
     of = "those found for the subject" if motion.residuals else "given"
     stature = f" (stature of the model {body.stature:.2f} m)" if body.stature else ""
     out.append(
@@ -54,7 +54,7 @@ def methods_sentences(motion: Motion, doubtful: int) -> list[str]:
     )
     if motion.residuals:
         out.append("All measurements were fitted together by robust weighted least squares over the joint coordinates.")
-    out += _told_settings(told)
+    out += _settings(provenance)
     for unit in ("px", "m"):
         median = overall_median(motion, unit)
         if np.isfinite(median):
@@ -99,16 +99,16 @@ def lengths_table(motion: Motion) -> p.Html:
         side = {"_l": "left", "_r": "right"}.get(ends[1][-2:], "middle")
         name = " to ".join(e[:-2] if e.endswith(("_l", "_r")) else e for e in ends)
         std = stds.get(f"{body.tree.segments[parent]}-{body.tree.segments[child]}")
-        told = f"{100 * length:.1f}" + (f" ± {100 * std:.1f}" if isinstance(std, float) and np.isfinite(std) else "")
-        rows.setdefault(name, {})[side] = told
+        text = f"{100 * length:.1f}" + (f" ± {100 * std:.1f}" if isinstance(std, float) and np.isfinite(std) else "")
+        rows.setdefault(name, {})[side] = text
     cells = [(name, *(found.get(side, "") for side in ("left", "middle", "right"))) for name, found in rows.items()]
     return p.table(["joint to joint [cm]", "left", "middle", "right"], cells)
 
 
-def _cameras(told: Mapping[str, Any], names: list[str]) -> str:
+def _cameras(provenance: Mapping[str, Any], names: list[str]) -> str:
     if not names:
         return ""
-    keypoints = [entry for entry in told.get("keypoints", []) if isinstance(entry, Mapping)]
+    keypoints = [entry for entry in provenance.get("keypoints", []) if isinstance(entry, Mapping)]
     formats = [(str(e.get("format", "")), e.get("set") or "") for e in keypoints]
     kinds = dict.fromkeys(f"{_DETECTORS.get(name, name)} {points}".strip() for name, points in formats)
     accuracies = sorted({float(e["accuracy"]) for e in keypoints if isinstance(e.get("accuracy"), int | float)})
@@ -121,24 +121,24 @@ def _markers(names: list[str]) -> str:
     return f"Markers of {listed(names)} entered." if names else ""
 
 
-def _calibration(told: Mapping[str, Any]) -> str:
-    found = told.get("calibration")
+def _calibration(provenance: Mapping[str, Any]) -> str:
+    found = provenance.get("calibration")
     if not isinstance(found, Mapping) or "file" not in found:
         return ""
     digest = f" (SHA-256 {str(found['sha256'])[:16]}…)" if found.get("sha256") else ""
     return f"The calibration of the cameras was {found['file']}{digest}."
 
 
-def _told_settings(told: Mapping[str, Any]) -> list[str]:
+def _settings(provenance: Mapping[str, Any]) -> list[str]:
     out = []
-    smoothing = told.get("smoothing")
+    smoothing = provenance.get("smoothing")
     if smoothing:
         how = _listing(smoothing) if isinstance(smoothing, Mapping) else ""
         out.append(f"The whole take was smoothed in one solve{f' ({how})' if how else ''}{_estimated(smoothing)}.")
-    if isinstance(told.get("tracking"), Mapping):
-        out.append(f"Settings of the tracking: {_listing(told['tracking'])}.")
-    if told.get("height"):
-        out.append(f"The subject's height was given as {told['height']:g} m.")
+    if isinstance(provenance.get("tracking"), Mapping):
+        out.append(f"Settings of the tracking: {_listing(provenance['tracking'])}.")
+    if provenance.get("height"):
+        out.append(f"The subject's height was given as {provenance['height']:g} m.")
     return out
 
 

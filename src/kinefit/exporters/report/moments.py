@@ -18,7 +18,7 @@ from kinefit.motion import Motion, Residuals
 
 POORLY_SUPPORTED = 0.5  # quality below which the measurements support less than half of the body
 _GAP = 0.1  # [s] stretches nearer than this are one to somebody who looks at the video
-_MANY = 0.25  # share of outliers that is told as a cause; robust fits of good keypoints leave out less than a tenth
+_MANY = 0.25  # share of outliers that is reported as a cause; robust fits of good keypoints leave out less than a tenth
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ def doubtful_moments(motion: Motion) -> tuple[Moment, ...]:
     and those that are twice as uncertain as in the median.
     """
     found = [*_nobody(motion), *_doubts(motion)]
-    told = [replace(m, causes=causes(motion, m)) for m in _merged(motion.body, found)]
-    return tuple(sorted(told, key=lambda m: (-m.score, m.start)))
+    with_causes = [replace(m, causes=causes(motion, m)) for m in _merged(motion.body, found)]
+    return tuple(sorted(with_causes, key=lambda m: (-m.score, m.start)))
 
 
 def doubt_sentence(motion: Motion, moments: Sequence[Moment]) -> str:
@@ -85,8 +85,8 @@ def throughout_sentence(motion: Motion) -> str:
     if len(sigmas) == len(motion.body.tree.segments):
         return f"the whole body (±{200 * min(sigmas.values()):.0f} to {200 * max(sigmas.values()):.0f}\u00a0cm)"
     widest: dict[str, float] = {}
-    for name, told in _spoken(motion.body, list(sigmas)).items():
-        widest[told] = max(sigmas[name], widest.get(told, 0.0))
+    for name, words in _spoken(motion.body, list(sigmas)).items():
+        widest[words] = max(sigmas[name], widest.get(words, 0.0))
     return listed([f"{name} (±{200 * sigma:.0f}\u00a0cm)" for name, sigma in widest.items()], 20)
 
 
@@ -118,7 +118,7 @@ def never_observed(motion: Motion) -> tuple[str, ...]:
 def shared_by_prior(motion: Motion) -> dict[str, float]:
     """Coupled coordinates whose share of a bend the posture prior tells, with their median standard deviation [deg].
 
-    Those of a coupling are told where none of them is known to 5 degrees, beyond which errors may mislead a clinician
+    Those of a coupling are reported if none of them is known to 5 degrees, beyond which errors may mislead a clinician
     (McGinley et al. 2009, Gait & Posture 29:360).
     """
     tree, out = motion.body.tree, dict[str, float]()

@@ -148,7 +148,7 @@ def bullets(items: Iterable[str]) -> Html:
 
 
 def callout(severity: str, title: str, *parts: str) -> Html:
-    """A box that stands out; severity "good", "note", "warning" or "bad" (told by sign and colour)."""
+    """A box that stands out; severity "good", "note", "warning" or "bad" (shown by sign and colour)."""
     sign = SEVERITIES[severity]
     body = "".join(_block(part) for part in parts)
     return Html(
@@ -192,8 +192,9 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]], *, caption: str
 
     head = "".join(cell("th", i, name) for i, name in enumerate(columns))
     body = "".join("<tr>" + "".join(cell("td", i, c) for i, c in enumerate(row)) + "</tr>" for row in rows)
-    told = f"<caption>{inline(caption)}</caption>" if caption else ""
-    return Html(f'<div class="wide"><table>{told}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>')
+    caption_tag = f"<caption>{inline(caption)}</caption>" if caption else ""
+    table = f"<table>{caption_tag}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    return Html(f'<div class="wide">{table}</div>')
 
 
 def shaded(text: str, share: float) -> Html:
@@ -240,10 +241,10 @@ def picture(
     if not encoded:
         raise ExportError("an image cannot be encoded", remedy="Give (H, W, 3) uint8 RGB.")
     text = base64.b64encode(data.tobytes()).decode("ascii")
-    told = f"<figcaption>{inline(caption)}</figcaption>" if caption else ""
+    caption_tag = f"<figcaption>{inline(caption)}</figcaption>" if caption else ""
     return Html(
         f'<figure><img alt="{escape(re.sub("<[^>]*>", "", caption))}" width="{size[0]}" height="{size[1]}" '
-        f'src="data:image/{kind};base64,{text}">{told}</figure>'
+        f'src="data:image/{kind};base64,{text}">{caption_tag}</figure>'
     )
 
 

@@ -19,7 +19,7 @@ document.querySelectorAll(".player").forEach(place => {
   const play = make("button", bar, { textContent: "Play", onclick: () => run(!playing) });
   const slider = make("input", bar, { type: "range", min: 0, max: Math.max(last, 1), step: "any", value: 0 });
   slider.setAttribute("aria-label", "time");
-  const told = make("span", bar, { className: "at" });
+  const clock = make("span", bar, { className: "at" });
   const pick = make("select", bar, { title: "speed", onchange: () => speed = +pick.value });
   for (const [value, text] of [[1, "speed 1"], [0.5, "½"], [0.25, "¼"], [0.1, "⅒"]]) make("option", pick, { value, textContent: text });
   const button = (text, act) => make("button", bar, { textContent: text, onclick: () => { act(); draw(); } });
@@ -87,7 +87,7 @@ document.querySelectorAll(".player").forEach(place => {
     }
     parts.sort((p, q) => q[0] - p[0]).forEach(part => part[1]());
     slider.value = at;
-    if (!moved) told.textContent = `${(data.start + at / data.rate).toFixed(2)} s`;
+    if (!moved) clock.textContent = `${(data.start + at / data.rate).toFixed(2)} s`;
   }
   function grid(project, c, far) {
     const wide = view.cameras ? 2 * extent() : size, step = wide > 12 ? 2 : wide > 5 ? 1 : 0.5;

@@ -107,16 +107,16 @@ def _cells(found: Extremes | None) -> tuple[str, ...]:
         return ("not observed", "", "", "")
     part = "" if found.share > 0.995 else "*"
     speed, twice = found.fastest
-    fastest = "–" if not np.isfinite(speed) else told(speed, twice) if np.isfinite(twice) else f"{speed:.0f}"
-    return (*(told(*pair) for pair in (found.lowest, found.highest)), told(*found.span) + part, fastest)
+    fastest = "–" if not np.isfinite(speed) else with_error(speed, twice) if np.isfinite(twice) else f"{speed:.0f}"
+    return (*(with_error(*pair) for pair in (found.lowest, found.highest)), with_error(*found.span) + part, fastest)
 
 
 def _difference(left: Extremes | None, right: Extremes | None) -> str:
     if left is None or right is None:
         return "–"
-    return told(left.span[0] - right.span[0], float(np.hypot(left.span[1], right.span[1])))
+    return with_error(left.span[0] - right.span[0], float(np.hypot(left.span[1], right.span[1])))
 
 
-def told(value: float, twice: float) -> str:
+def with_error(value: float, twice: float) -> str:
     """A value with two standard deviations."""
     return f"{value:.0f} ± {twice:.0f}".replace("-0 ", "0 ").replace("-", "−")

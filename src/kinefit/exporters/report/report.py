@@ -130,10 +130,10 @@ def write_report(
 def trust_sentence(motion: Motion, moments: Sequence[Moment]) -> str:
     """One sentence on how far the motion can be trusted."""
     parts = []
-    for unit, told in (("px", "px"), ("m", "mm")):
+    for unit, shown_unit in (("px", "px"), ("m", "mm")):
         names = [name for name, r in motion.residuals.items() if r.unit == unit and np.isfinite(r.norms).any()]
         if names:
-            parts.append(f"fits {listed(names, 6)} to a median of {overall_median(motion, unit):.1f} {told}")
+            parts.append(f"fits {listed(names, 6)} to a median of {overall_median(motion, unit):.1f} {shown_unit}")
     start = " and ".join(parts) or "comes without measurements to compare it with"
     if not moments:
         return f"The motion {start}; no doubtful moment."
@@ -163,12 +163,12 @@ def _summary(
     parts += [p.callout(severity, title, text) for severity, title, text in findings]
     shifted = [f for f in sensor_fits(motion) if f.is_shifted]
     if shifted:
-        told = ", ".join(f"{f.name} ({f.shift[0]:+.1f}, {f.shift[1]:+.1f}) px" for f in shifted)
+        shifts = ", ".join(f"{f.name} ({f.shift[0]:+.1f}, {f.shift[1]:+.1f}) px" for f in shifted)
         text = (
             "Much of what is left over is one and the same shift in every frame. This points to the calibration or the "
             "image size, not to the person: run kinefit check on the take."
         )
-        parts.append(p.callout("warning", f"Constant shift in {told}.", text))
+        parts.append(p.callout("warning", f"Constant shift in {shifts}.", text))
     blind = never_observed(motion)
     if blind:
         text = "No measurement observes them: what is shown follows from the prior posture and is no result."

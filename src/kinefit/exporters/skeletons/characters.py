@@ -71,13 +71,13 @@ def write_character(
 
 def _glb(motion: Motion, found: Retargeted) -> bytes:
     assert found.character.gltf is not None
-    told: dict[str, Any] = json.loads(json.dumps(found.character.gltf.json))
+    gltf: dict[str, Any] = json.loads(json.dumps(found.character.gltf.json))
     data = bytearray(found.character.gltf.binary)
 
     def add(array: NDArray, kind: str, **more: Any) -> int:
         data.extend(bytes(-len(data) % 4))
         content = np.ascontiguousarray(array, "<f4").tobytes()
-        views, accessors = told.setdefault("bufferViews", []), told.setdefault("accessors", [])
+        views, accessors = gltf.setdefault("bufferViews", []), gltf.setdefault("accessors", [])
         views.append({"buffer": 0, "byteOffset": len(data), "byteLength": len(content)})
         data.extend(content)
         accessors.append({
@@ -95,15 +95,15 @@ def _glb(motion: Motion, found: Retargeted) -> bytes:
         channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": path}})
 
     for node in map(int, np.flatnonzero(found.moving)):
-        _as_parts(told["nodes"][node], found.character.gltf.local(node))
+        _as_parts(gltf["nodes"][node], found.character.gltf.local(node))
         channel(node, "rotation", np.roll(continuous_quaternions(found.rotations[:, node]), -1, axis=-1), "VEC4")
         if node == found.mover:
             channel(node, "translation", found.places, "VEC3")
     animation = {"name": motion.name, "samplers": samplers, "channels": channels}
-    told["animations"] = [animation, *told.get("animations", [])]
+    gltf["animations"] = [animation, *gltf.get("animations", [])]
     data.extend(bytes(-len(data) % 4))
-    told["buffers"] = [{**told["buffers"][0], "byteLength": len(data)}]
-    text = json.dumps(told, separators=(",", ":"), ensure_ascii=False).encode()
+    gltf["buffers"] = [{**gltf["buffers"][0], "byteLength": len(data)}]
+    text = json.dumps(gltf, separators=(",", ":"), ensure_ascii=False).encode()
     text += b" " * (-len(text) % 4)
     head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(data), len(text), 0x4E4F534A)
     return head + text + struct.pack("<I4s", len(data), b"BIN\0") + bytes(data)

@@ -53,14 +53,14 @@ def in_words(fingers: Sequence[str]) -> str:
     """Segments of fingers by hand: "both hands: ring, little, index distal"; a whole digit by its name alone."""
     hands = {}
     for side, words in SIDES.items():
-        told = []
+        missing = []
         for digit, bones in DIGITS.items():
             lost = [bone for bone in bones if f"{digit}_{bone}_{side}" in fingers]
-            told += [digit] if len(lost) == len(bones) else [f"{digit} {bone}" for bone in lost]
-        hands[f"{words['side']} hand"] = "all fingers" if told == list(DIGITS) else ", ".join(told)
+            missing += [digit] if len(lost) == len(bones) else [f"{digit} {bone}" for bone in lost]
+        hands[f"{words['side']} hand"] = "all fingers" if missing == list(DIGITS) else ", ".join(missing)
     if len(set(hands.values())) == 1:
         hands = {"both hands": hands["left hand"]}
-    return "; ".join(f"{hand}: {told}" for hand, told in hands.items() if told)
+    return "; ".join(f"{hand}: {missing}" for hand, missing in hands.items() if missing)
 
 
 def _direction(character: Character, chain: Sequence[int], node: int) -> NDArray:

@@ -112,8 +112,8 @@ def retargeted(motion: Motion, character: Character, names: Mapping[str, str] | 
 def _nodes(character: Character, names: Mapping[str, str] | None) -> dict[str, int]:
     """Segment -> node of a character that stands, its left to the left; the thorax carries arms and head."""
     there = np.flatnonzero(character.joints)
-    told = {segment: character.names[node] for segment, node in character.told.items()}
-    found = joint_map([character.names[n] for n in there], {**told, **(names or {})}, source=str(character.path))
+    mapped = {segment: character.names[node] for segment, node in character.vrm_joints.items()}
+    found = joint_map([character.names[n] for n in there], {**mapped, **(names or {})}, source=str(character.path))
     nodes = {segment: int(there[i]) for segment, i in found.items()}
     hands = {side: _below(character, nodes[f"hand_{side}"]) for side in "lr"}
     nodes = {segment: node for segment, node in nodes.items() if segment not in FINGERS or node in hands[segment[-1]]}

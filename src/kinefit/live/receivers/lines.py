@@ -1,4 +1,4 @@
-"""Poses as JSON lines, into a file or to the standard output."""
+"""Write poses as JSON lines to a file or the standard output."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ class JsonLines:
             raise ExportError(problem, file=self.path, remedy="Name another file.") from error
 
     def hello(self, body: Body, packet: bytes) -> None:
-        """One line."""
+        """Write the packet of a new body as one line."""
         self._write(packet)
 
     def pose(self, posed: PosePacket, packet: bytes) -> None:
-        """One line."""
+        """Write the packet of a pose as one line."""
         self._write(packet)
 
     def close(self) -> None:
-        """End the file."""
+        """Close the file."""
         if self._file is not sys.stdout.buffer:
             self._file.close()
 

@@ -14,7 +14,7 @@ from kinefit.live.packets import PosePacket
 class Lsl:
     """Two outlets: NAME-angles [deg, of sliding coordinates m] and NAME-joints [m], each with standard deviations.
 
-    What nothing observes has the standard deviation inf; while the person is not found, nothing is sent.
+    Unobserved coordinates have the standard deviation inf; while the person is not found, nothing is sent.
 
     Raises
     ------
@@ -33,7 +33,7 @@ class Lsl:
         self._factor = np.ones(0)
 
     def hello(self, body: Body, packet: bytes) -> None:
-        """Streams of this body; those of another one end."""
+        """Open streams for a new body; those of the previous one end."""
         tree = body.tree
         self._factor = np.where(tree.prismatic, 1.0, np.degrees(1.0))
         angles = [(name, "m" if slides else "deg") for name, slides in zip(tree.coordinates, tree.prismatic)]
@@ -43,7 +43,7 @@ class Lsl:
         self._outlets = [self._outlet(kind, columns) for kind, columns in (("angles", angles), ("joints", joints))]
 
     def pose(self, posed: PosePacket, packet: bytes) -> None:
-        """One sample of each stream."""
+        """Send one sample of each stream."""
         r = posed.result
         if r is None:
             return

@@ -2,7 +2,7 @@
 // Moves the figure by the packets of the session, and tells what is dropped, silent and lost.
 (() => {
   const { segments, points, turn } = JSON.parse(document.getElementById("capsules").textContent);
-  const told = document.getElementById("told"), list = document.getElementById("sensors");
+  const status = document.getElementById("status"), list = document.getElementById("sensors");
   const figure = document.querySelector(".player");
   let body = null, socket = null, at = 0;
 
@@ -33,21 +33,21 @@
       tell(p, `quality ${Math.round(100 * p.quality)} %` + (names.length ? `, lost: ${names.join(", ")}` : ""));
     },
     waiting(p) { tell(p, "nobody is found"); },
-    refused(p) { told.textContent = p.why; },
+    refused(p) { status.textContent = p.why; },
     done() {},
   };
   function tell(p, what) {
     const now = performance.now(), rate = at ? 1000 / (now - at) : 0;
     at = now;
     const dropped = Object.values(p.dropped).reduce((a, b) => a + b, 0);
-    told.textContent = `${p.time.toFixed(2)} s, ${(1000 * p.latency).toFixed(0)} ms after the image, ${rate.toFixed(0)} a second, `
+    status.textContent = `${p.time.toFixed(2)} s, ${(1000 * p.latency).toFixed(0)} ms after the image, ${rate.toFixed(0)} a second, `
       + `${dropped} dropped, ${what}`;
     for (const label of list.children) label.className = p.silent.includes(label.dataset.sensor) ? "silent" : "";
   }
   function open() {
     socket = new WebSocket(location.href.replace(/^http/, "ws"));
     socket.onmessage = event => { const p = JSON.parse(event.data); (act[p.type] || (() => {}))(p); };
-    socket.onclose = () => { told.textContent = "the session is over; a next one with the same token is shown here"; setTimeout(open, 1000); };
+    socket.onclose = () => { status.textContent = "the session is over; a next one with the same token is shown here"; setTimeout(open, 1000); };
   }
   open();
 })();

@@ -33,10 +33,10 @@ _SIDES = {
 }  # fmt: skip
 BONES = _TRUNK | {f"{k}_{s}": words["Side"] + v for k, v in _SIDES.items() for s, words in SIDES.items()}
 BONES |= {segment: name[0].upper() + name[1:] for segment, name in VRM0_FINGERS.items()}
-"""Segment -> bone of Unity's humanoid."""
+"""{segment: bone of Unity's humanoid}."""
 
 
-_AT_ONCE = struct.pack(">Q", 1)  # the time tag that says: now
+_TIME_TAG_NOW = struct.pack(">Q", 1)
 
 
 def osc_message(address: str, *values: str | int | float) -> bytes:
@@ -49,34 +49,34 @@ def osc_message(address: str, *values: str | int | float) -> bytes:
 
 
 def osc_bundle(messages: Sequence[bytes]) -> bytes:
-    """Messages that belong together."""
-    return b"".join([b"#bundle\0", _AT_ONCE, *(struct.pack(">i", len(one)) + one for one in messages)])
+    """A bundle of messages."""
+    return b"".join([b"#bundle\0", _TIME_TAG_NOW, *(struct.pack(">i", len(m)) + m for m in messages)])
 
 
 @lru_cache(maxsize=1000)  # the same addresses and bones in every pose
 def _text(value: str) -> bytes:
-    """A string, ended by a zero and filled up to a multiple of four bytes."""
+    """A string, zero-terminated and padded to a multiple of four bytes."""
     data = value.encode() + b"\0"
     return data + b"\0" * (-len(data) % 4)
 
 
-_MOST = 1400  # [bytes] of one packet on most networks
-_NOTHING = (0.0,) * 7  # place and turn, of which the bones' messages are made once, and the numbers put behind
+_MAX_PACKET_BYTES = 1400  # on most networks
+_ZERO_POSE = (0.0,) * 7  # position and quaternion; messages are made with it once, and its numbers replaced
 _ROOT = osc_message("/VMC/Ext/Root/Pos", "root", 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class Vmc:
-    """Sends poses to a host and port.
+    """Sender of poses to a host and port.
 
     Parameters
     ----------
-    host, port : where the avatar listens; most programs at 39539
+    host, port : of the avatar's program; most listen at 39539
     up : vertical axis of the session's world
 
     Raises
     ------
     ExportError
-        A host that is not known.
+        An unknown host.
     BodyError
         From `hello`: a body without pelvis.
     """
@@ -97,24 +97,24 @@ class Vmc:
         self.unsent = 0
 
     def hello(self, body: Body, packet: bytes) -> None:
-        """Another body: its bones, each with the next one above that is one."""
+        """Prepare the bones of a new body, each with its nearest ancestor bone; raises BodyError without a pelvis."""
         self._rest = rest_pose(body, "t", "kinefit", "VMC")
         segments, parents = body.tree.segments, body.tree.parents
         if "pelvis" not in segments:
             raise BodyError(f"body '{body.name}' has no pelvis", place="VMC", remedy="Follow a person: humanoid.")
-        kept, lowest = [s for s, name in enumerate(segments) if name in BONES], []
-        for s in kept:
+        bones, ancestors = [s for s, name in enumerate(segments) if name in BONES], []
+        for s in bones:
             above = int(parents[s])
             while above >= 0 and segments[above] not in BONES:
                 above = int(parents[above])
-            lowest.append(above)
+            ancestors.append(above)
         self._heads = [
-            osc_message("/VMC/Ext/Bone/Pos", BONES[segments[s]], *_NOTHING)[: -4 * len(_NOTHING)] for s in kept
+            osc_message("/VMC/Ext/Bone/Pos", BONES[segments[s]], *_ZERO_POSE)[: -4 * len(_ZERO_POSE)] for s in bones
         ]
-        self._segments, self._above = np.array(kept), np.array(lowest)
+        self._segments, self._above = np.array(bones), np.array(ancestors)
 
     def pose(self, posed: PosePacket, packet: bytes) -> None:
-        """Send a pose; where the network is busy, it is left out and counted in `unsent`."""
+        """Send a pose; if the network is busy, skip it and count it in `unsent`."""
         if posed.result is None or self._rest is None:
             self._send(osc_bundle([osc_message("/VMC/Ext/OK", 0)]))
             return
@@ -122,7 +122,7 @@ class Vmc:
             self._send(data)
 
     def packets(self, Ts_world_segment: NDArray, time: float) -> list[bytes]:
-        """OSC bundles of one pose, none larger than a network's packet."""
+        """OSC bundles of one pose (S, 4, 4) [m] at a time [s], none larger than a network's packet."""
         assert self._rest is not None
         segments, above = self._segments, self._above
         T = self._turn @ Ts_world_segment
@@ -138,7 +138,7 @@ class Vmc:
         return _parts([ok, now, _ROOT, *bones])
 
     def close(self) -> None:
-        """End it."""
+        """Close the socket."""
         self._socket.close()
 
     def _send(self, data: bytes) -> None:
@@ -150,10 +150,10 @@ class Vmc:
 
 def _parts(messages: list[bytes]) -> list[bytes]:
     out, part, size = [], list[bytes](), 0
-    for one in messages:
-        if part and size + len(one) + 4 > _MOST:
+    for message in messages:
+        if part and size + len(message) + 4 > _MAX_PACKET_BYTES:
             out.append(osc_bundle(part))
             part, size = [], 0
-        part.append(one)
-        size += len(one) + 4
+        part.append(message)
+        size += len(message) + 4
     return [*out, osc_bundle(part)]

@@ -1,6 +1,6 @@
-"""Poses over WebSocket, and the page that shows them: any number of receivers, none of which can keep another waiting.
+"""Serve poses over WebSocket, and a page that shows them, to any number of independent receivers.
 
-Each receiver has one slot: a slow one gets the newest pose and misses those between, which it sees by their numbers.
+Each receiver has one slot: a slow one gets the newest pose and skips those between, as their numbers show.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from kinefit.serving.access import Access
 from kinefit.serving.policy import inline_policy
 from kinefit.serving.server import Connection, Page, PageServer
 
-_MAX_WAITING_ANSWERS = 100  # of a client that does not read them: then it is disconnected
+_MAX_WAITING_ANSWERS = 100  # a client that leaves more unread is disconnected
 Ask = Callable[[bytes, Answer], None]
 
 
 class _Client:
-    """What one receiver still has to get."""
+    """Unsent packets of one receiver."""
 
     def __init__(self) -> None:
         self.hello: bytes | None = None
@@ -39,30 +39,29 @@ class _Client:
         self.news = asyncio.Event()
 
     async def next(self) -> list[bytes]:
-        """All that is new."""
+        """Wait for new packets, and return all of them."""
         await self.news.wait()
         self.news.clear()
-        out = [one for one in (self.hello, *self.answers, self.pose) if one is not None]
+        out = [packet for packet in (self.hello, *self.answers, self.pose) if packet is not None]
         self.hello, self.pose, self.answers = None, None, []
         return out
 
 
 class WebSockets:
-    """Serves poses and their page at one port, to this computer alone unless `host` says otherwise.
+    """Server of poses and their page at one port, by default to this computer alone.
 
     Parameters
     ----------
-    port : the next free one is not taken: receivers are told one port. 0 for any.
+    port : fixed, as receivers expect it; 0 for any free one
     host : "127.0.0.1" or "0.0.0.0" for all networks
-    token : of the address, see `serving.access.Access`; a random one where it is None
+    token : of the address, see `serving.access.Access`; None for a random one
     title : of the page
-    ask : what is done with clients' wishes, each a JSON text with the place for its answer; None where they are to be
-        left unheard
+    ask : callback for a client's wish (JSON) and its answer; None rejects all wishes
 
     Raises
     ------
     ExportError
-        The port is in use, the host none of this computer, or a token that cannot be used.
+        The port is in use, the host is none of this computer, or the token is invalid.
     """
 
     def __init__(
@@ -80,21 +79,21 @@ class WebSockets:
 
     @property
     def port(self) -> int:
-        """At which poses and page are."""
+        """Port of poses and page."""
         return self._server.port
 
     @property
     def url(self) -> str:
-        """Address of the page, with the token; that of poses and wishes begins with ws instead of http."""
+        """Address of the page, with the token; the socket's address has ws instead of http."""
         return self._server.url
 
     @property
     def receivers(self) -> int:
-        """How many are connected."""
+        """Number of connected receivers."""
         return len(self._clients)
 
     def hello(self, body: Body, packet: bytes) -> None:
-        """Tell all, and everybody who comes later, of the body."""
+        """Send a new body to all present and future receivers."""
         self._page = live_page(self._title, body, msgspec.json.decode(packet)["up"])
         self._hello = packet
         self._server.call(self._spread, packet, True)
@@ -117,7 +116,7 @@ class WebSockets:
             client.news.set()
 
     async def _talk(self, connection: Connection) -> None:
-        """Send packets and hear wishes, until the client is gone."""
+        """Send packets and receive wishes until the client disconnects."""
         client = _Client()
         if self._hello is not None:
             client.hello = self._hello
@@ -131,10 +130,10 @@ class WebSockets:
             sending.cancel()
 
     async def _listen(self, connection: Connection, client: _Client) -> None:
-        """Pass on what a client asks for; what may not be asked is answered at once."""
+        """Pass a client's wishes on; reject those that are not allowed."""
 
-        def answer(told: Mapping[str, Any]) -> None:  # from any thread
-            self._server.call(back, msgspec.json.encode(told))
+        def answer(content: Mapping[str, Any]) -> None:  # from any thread
+            self._server.call(back, msgspec.json.encode(content))
 
         def back(packet: bytes) -> None:
             if len(client.answers) >= _MAX_WAITING_ANSWERS:
@@ -167,7 +166,7 @@ _WAITING = '<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" cont
 
 
 def live_page(title: str, body: Body | None, up: str) -> Page:
-    """Self-contained HTML; without a body it loads itself again until there is one."""
+    """Self-contained HTML page; without a body it reloads until there is one."""
     if body is None:
         return Page(_WAITING.encode())
     figure, capsules = live_figure(body)
@@ -182,7 +181,7 @@ def live_page(title: str, body: Body | None, up: str) -> Page:
     html = (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
         f'<meta name="viewport" content="width=device-width"><style>{style}</style></head><body><main>'
-        f'<h1>{escape(title)}</h1><p id="told">waiting</p>{figure}<p id="sensors"></p></main>'
+        f'<h1>{escape(title)}</h1><p id="status">waiting</p>{figure}<p id="sensors"></p></main>'
         f'<script type="application/json" id="capsules">{to_json(places)}</script>'
         f"{''.join(f'<script>{script}</script>' for script in scripts)}</body></html>"
     )

@@ -31,9 +31,14 @@ Intrinsics = tuple[tuple[int, int], NDArray, NDArray, str]
 
 
 def colmap_cameras(folder: Path) -> list[Camera]:
-    """One camera an image, named after the image; translation in the model's arbitrary unit.
+    """Read one camera for each image, named after it; translations in the model's arbitrary unit.
 
     COLMAP puts the centre of the first pixel at (0.5, 0.5); here it is (0, 0).
+
+    Raises
+    ------
+    CalibrationError
+        No text model, an unknown lens model, an image without its camera, numbers that are missing or not finite.
     """
     intrinsics = _cameras(folder / "cameras.txt")
     path = folder / "images.txt"
@@ -65,15 +70,25 @@ def colmap_cameras(folder: Path) -> list[Camera]:
 
 
 def _names(images: list[PurePosixPath]) -> list[str]:
-    """Names of the cameras: of the images without folder and ending, where these differ."""
+    """Names of the cameras: file names without folder and ending if these are unique, else with the folder."""
     stems = [image.stem for image in images]
     return stems if len(set(stems)) == len(stems) else [str(image.with_suffix("")) for image in images]
 
 
 def colmap_texts(rig: Rig, folder: Path, metres_per_unit: float) -> dict[str, str]:
-    """cameras.txt and images.txt of a model with the cameras of a rig, by the names of its images; all else is kept.
+    """Texts of cameras.txt and images.txt with the rig's cameras, matched by image names; all else is kept.
 
-    A lens that the camera's model cannot hold gets the smallest model that can.
+    A lens that the camera's model cannot represent gets the smallest model that can.
+
+    Parameters
+    ----------
+    folder : of the model
+    metres_per_unit : float [m]
+
+    Raises
+    ------
+    CalibrationError
+        Images that share a camera and now differ in their lens; a model that cannot be read.
     """
     path = folder / "images.txt"
     images = [(number, line.split(maxsplit=9)) for number, line in _lines(path)[::2]]
@@ -140,7 +155,7 @@ def _cameras(path: Path) -> dict[str, Intrinsics]:
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
-    """Lines with their numbers, without comments; empty ones kept, as they mean "no points"."""
+    """Lines with their numbers, without comments; empty lines are kept, as they mean "no points"."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):

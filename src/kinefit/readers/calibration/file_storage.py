@@ -16,7 +16,7 @@ _ESCAPES = {"n": "\n", "t": "\t", "r": "\r", "0": "\0"}
 
 
 class _BoundedTree(ElementTree.TreeBuilder):
-    """Elements of XML, no deeper than a calibration's."""
+    """Builder of XML elements with a limited depth."""
 
     depth = 0
 
@@ -31,9 +31,14 @@ class _BoundedTree(ElementTree.TreeBuilder):
 
 
 def parse_xml(text: str) -> ElementTree.Element:
-    """The root of an XML text; ValueError (`ElementTree.ParseError` is a SyntaxError) where it is none.
+    """Parse an XML text to its root element.
 
-    A document type is refused: its entities may stand for gigabytes.
+    Raises
+    ------
+    ValueError
+        A document type: its entities may expand to gigabytes.
+    ElementTree.ParseError
+        No XML.
     """
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("a document type (<!DOCTYPE ...>), which no calibration has")
@@ -71,15 +76,15 @@ def storage_of_yaml(text: str) -> Any:
     """Values of OpenCV's YAML: dicts, lists, numbers, texts, None.
 
     Block and flow collections, quoted and plain scalars and comments are read; tags are skipped. Anchors and text over
-    several lines are refused.
+    several lines raise ValueError.
     """
-    # Headers differ: OpenCV 4 writes "%YAML:1.0" and "---", OpenCV 5 "%YAML 1.2", hands write none.
+    # Headers differ: OpenCV 4 writes "%YAML:1.0" and "---", OpenCV 5 "%YAML 1.2", people write none.
     lines = ["" if line.startswith(("%", "---", "...")) else line for line in text.splitlines()]
     return _Yaml("\n".join(lines)).document()
 
 
 class _Yaml:
-    """A YAML text, read from its beginning to its end."""
+    """Recursive-descent parser of a YAML text."""
 
     _GAP = re.compile(r"(?:[ \t\n]++|#[^\n]*+)*+")
     _TAG = re.compile(r"!\S*+")
@@ -214,7 +219,7 @@ class _Yaml:
 
 
 def _scalar(text: str) -> Any:
-    """The number that a plain text writes, else the text."""
+    """The number of a plain scalar, else its text."""
     number = _NUMBER.fullmatch(text)
     if number is None:
         return _WORDS[text.lower()] if text.lower() in _WORDS else text

@@ -1,4 +1,4 @@
-"""Cameras that were found from the people in view: Pose2Sim TOML, with clocks and how sure they are in [metadata]."""
+"""Cameras estimated from the people in view: Pose2Sim TOML, with clocks and sigmas in [metadata]."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ _KEY = "kinefit_found_from"
 
 @dataclass(frozen=True, eq=False)
 class FoundCameras:
-    """A rig that was found from people.
+    """A rig that was estimated from people.
 
     Parameters
     ----------
     rig : Rig [m]
     time_offsets : (C,) [s] to add to each camera's times, in the rig's order.
-    position_sigma, rotation_sigma : float [m], [deg] how far a camera may be off, one standard deviation.
-    notes : what was found and how sure it is, in sentences.
-    made_from : text that tells the keypoints and settings: another text, another result.
+    position_sigma, rotation_sigma : float [m], [deg] standard deviations of a camera's pose.
+    notes : sentences on the result and its uncertainty.
+    made_from : text that identifies the keypoints and settings: another text, another result.
     """
 
     rig: Rig
@@ -38,7 +38,7 @@ class FoundCameras:
 
 
 def write_found(found: FoundCameras, path: str | PathLike[str]) -> None:
-    """Write it; raises as `write_calibration`."""
+    """Write a rig that was estimated from people; raises as `write_calibration`."""
     write_calibration(
         found.rig, path,
         metadata={
@@ -49,12 +49,12 @@ def write_found(found: FoundCameras, path: str | PathLike[str]) -> None:
 
 
 def read_found(path: str | PathLike[str]) -> FoundCameras | None:
-    """What `write_found` wrote; None for a calibration of any other source, or no file.
+    """Read a file of `write_found`; None for a calibration of any other source, or no file.
 
     Raises
     ------
     FileError
-        One of `write_found` that was changed so that it cannot be read.
+        A file of `write_found` that was changed so that it cannot be read.
     """
     path = Path(path)
     if (metadata := _metadata(path)) is None:
@@ -70,7 +70,7 @@ def read_found(path: str | PathLike[str]) -> FoundCameras | None:
 
 
 def found_notes(entry: CalibrationEntry | None) -> tuple[str, ...]:
-    """What is worth saying of a take's calibration: where it was found from people, how sure it is."""
+    """Notes on a take's calibration if it was estimated from people; else empty."""
     metadata = _metadata(entry.file) if entry is not None else None
     return () if metadata is None else tuple(map(str, metadata.get("notes", ())))
 

@@ -34,7 +34,7 @@ def read_mat(path: Path) -> Table:
     except NotImplementedError:
         remedy = "Save it again: save('calibration.mat', '-struct', 's', '-v7')."
         raise FileError("a file of MATLAB's version 7.3", file=path, remedy=remedy) from None
-    except Exception as error:  # whatever a damaged file makes of the reader
+    except Exception as error:  # a damaged file can raise anything
         raise FileError(f"no file of MATLAB that can be read: {error}", file=path, remedy="Save it again.") from None
     variables = {key: _plain(value, path) for key, value in found.items() if not key.startswith("__")}
     pair = next((v for v in variables.values() if isinstance(v, dict) and "CameraParameters1" in v), variables)
@@ -42,7 +42,7 @@ def read_mat(path: Path) -> Table:
 
 
 def _plain(value: Any, path: Path) -> Any:
-    """Dicts, lists, texts and numbers of what scipy gives."""
+    """Convert a value of scipy's reader to dicts, lists, texts and numbers."""
     if isinstance(value, dict):
         return {key: _plain(inner, path) for key, inner in value.items()}
     if isinstance(value, np.ndarray) and value.dtype.names is None and value.dtype != object:
@@ -55,15 +55,20 @@ def _plain(value: Any, path: Path) -> Any:
 
 
 def matlab_tree(tree: Any, path: Path, of_mat: bool = False) -> Any:
-    """A tree with MATLAB's cameras in OpenCV's terms; all else as it is.
+    """Convert MATLAB's cameras in a tree to OpenCV's conventions; all else is kept.
 
     MATLAB's `toStruct` gives ImageSize (rows, columns), RadialDistortion (k1 k2 [k3]), TangentialDistortion (p1 p2),
     and K, or before R2022b IntrinsicMatrix = Kᵀ; the centre of the first pixel is (1, 1) (`cameraIntrinsicsToOpenCV`
     takes one off). Of a stereo pair RotationOfCamera2 and TranslationOfCamera2 are for points as rows: x2 = x1 R + t;
-    the first camera is the world. `of_mat`: tables of other names count pixels and give sizes like that, too.
+    the first camera is the world. `of_mat`: tables with other names have the same pixel and size conventions.
+
+    Raises
+    ------
+    CalibrationError
+        MATLAB's fisheye model; entries of a wrong shape; a principal point outside of the image.
     """
     if isinstance(tree, list):
-        return [matlab_tree(one, path, of_mat) for one in tree]
+        return [matlab_tree(inner, path, of_mat) for inner in tree]
     if not isinstance(tree, dict):
         return tree
     if isinstance(tree.get("CameraParameters1"), dict) and isinstance(tree.get("CameraParameters2"), dict):

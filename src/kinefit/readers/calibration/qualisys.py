@@ -26,7 +26,7 @@ _DISTORTION = (
 
 
 def qualisys_cameras(root: Element, path: Path) -> list[Camera]:
-    """Active cameras of a parsed file; translation in the file's unit (millimetres).
+    """Active cameras of a parsed file; translations in the file's unit (millimetres).
 
     Qualisys' file gives the camera's position p and, in r11..r33, the rotation r from world to camera axes:
     T_camera_world = (F r, -F r p) with F = diag(1, -1, -1), and lengths in the image in 1/64 px. Theia3D writes the
@@ -95,7 +95,10 @@ def _camera(element: Element, path: Path) -> Camera:
 
 
 def qualisys_text(rig: Rig, text: str, metres_per_unit: float, path: Path) -> str:
-    """The text of a file with the cameras of a rig, by serial; everything else is kept."""
+    """The text of a file with the cameras of a rig, matched by serial number; everything else is kept.
+
+    `metres_per_unit` [m] is of the file; raises CalibrationError for a lens model that the format lacks.
+    """
     head, mark, rest = text.partition("<calibration")
     parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
     root = ElementTree.fromstring(mark + rest, parser)

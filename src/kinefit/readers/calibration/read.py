@@ -1,4 +1,4 @@
-"""Calibrations of cameras: any usual file or folder -> `Rig`; and back, as Pose2Sim TOML."""
+"""Read camera calibrations of all common formats into a `Rig`; write a rig as Pose2Sim TOML."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ FORMATS = (
     "Theia3D XML, Vicon .xcp, MATLAB .mat, COLMAP text (cameras.txt and images.txt), MCAP of ROS 2"
 )
 MAX_CALIBRATION_BYTES = 2_000_000
-"""Bytes of one file of a calibration; a camera takes about a thousand."""
+"""Largest file of a calibration [bytes]; a camera takes about a thousand."""
 PAIRS = (("intrinsics", "extrinsics"), ("intri", "extri"))
-"""Names of two files that are one calibration: of OpenCV's stereo calibration, of EasyMocap."""
+"""Stems of two files that form one calibration: OpenCV's stereo calibration, EasyMocap."""
 
 _MAX_CAMERAS = 1000  # of a rig; the largest domes have 500
 _XML_MAKERS = {"qualisys": qualisys_cameras, "vicon": vicon_cameras}  # both in millimetres
-_FARTHEST = 200.0  # [m] a camera farther from the world's origin was not measured in metres
+_MAX_ORIGIN_DISTANCE = 200.0  # [m] a camera farther from the world's origin is not in metres
 
 
 @checked
@@ -70,24 +70,24 @@ def read_calibration(
         and TOML is read by the names of its keys (docs/calibration.md). Poses are world to camera unless their name
         says otherwise. A single camera without a pose becomes the world.
     unit : "auto", "m", "dm", "cm", "mm", "inch" or float [m]
-        Unit of length of the file. "auto": what the file states (`unit = "mm"`, alone or under [metadata]), or what
-        its format defines (Qualisys, Vicon, FreeMoCap: mm, Panoptic: cm), else metres unless that cannot be.
+        Unit of length of the file. "auto": as the file states (`unit = "mm"`, alone or under [metadata]), or as its
+        format defines (Qualisys, Vicon, FreeMoCap: mm, Panoptic: cm), else metres, an error if that is implausible.
     image_size : (width, height) [px], or a function of the camera's name, optional
-        Size of the images, for files that do not state it; of the function None for a camera that it does not know.
+        Size of the images, for files that do not state it; the function returns None for an unknown camera.
     exteriors : bool
-        False: cameras without a pose are taken too, and stand at the origin.
+        False: cameras without a pose are read too, and placed at the origin.
 
     Returns
     -------
     Rig
-        In metres, pixels with (0, 0) in the centre of the first.
+        In metres; pixel (0, 0) is the centre of the first pixel.
 
     Raises
     ------
     FileError
-        Where the file is missing or of no known format.
+        A missing file, or no known format.
     CalibrationError
-        Where a camera cannot be used: missing key, wrong shape, not finite, wrong unit.
+        A camera with a missing key, a wrong shape, numbers that are not finite, or a wrong unit.
     """
     path = Path(path)
     if not path.exists():
@@ -131,14 +131,14 @@ def write_calibration(
 
     Parameters
     ----------
-    metadata : more that is to stand under [metadata].
+    metadata : more entries of [metadata].
 
     Raises
     ------
     ExportError
-        Where it cannot be written.
+        The file cannot be written.
     CalibrationError
-        Where a camera has what the format lacks.
+        A camera that the format cannot represent.
     """
     path = Path(path)
     more = "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in metadata.items())
@@ -215,7 +215,7 @@ def calibration_sources(path: Path) -> list[tuple[str, list[Path]]]:
 def _calibration_files(folder: Path) -> list[Path]:
     endings = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt", ".xcp", ".mat")
     files = sorted(file for file in folder.iterdir() if file.is_file() and file.name.lower().endswith(endings))
-    tables = [file for file in files if file.suffix.lower() not in (".xcp", ".mat")]  # these may be of anything
+    tables = [file for file in files if file.suffix.lower() not in (".xcp", ".mat")]  # these have other uses, too
     return tables or files
 
 
@@ -245,7 +245,7 @@ def _rig_of(
 
 
 def _parse(path: Path) -> tuple[str, Any]:
-    """Kind of a file, as `recognise` tells it, or "mat", and its tables, or the root of its XML."""
+    """Kind of a file (of `recognise`, or "mat"), and its tables, or the root of its XML."""
     if path.suffix.lower() == ".mat":
         return "mat", read_mat(path)
     text = _read_text(path)
@@ -272,7 +272,7 @@ def _read_text(path: Path) -> str:
 
 
 def recognise(text: str, path: Path) -> str:
-    """Tell "toml", "json", "yaml", "xml" (OpenCV), "qualisys" or "vicon" from the content."""
+    """Detect "toml", "json", "yaml", "xml" (OpenCV), "qualisys" or "vicon" from the content; else raise FileError."""
     start = text.lstrip()
     if start.startswith("<"):
         tag = _xml_root(text, path).tag.lower()
@@ -302,7 +302,7 @@ def _chosen_unit(tree: dict, unit: str | float) -> str | float:
 
 
 def metres_per_unit(tree: dict, unit: str | float, path: Path) -> float:
-    """Metres per unit of length of a parsed file; 1 where nothing tells it."""
+    """Metres per unit of length of a parsed file; 1 if it states none."""
     return _factor(_chosen_unit(tree, unit), path) or 1.0
 
 
@@ -324,7 +324,7 @@ def _factor(unit: str | float, path: Path) -> float | None:
 def _in_metres(camera: Camera, factor: float | None, path: Path) -> Camera:
     if factor is None:
         distance = float(np.linalg.norm(camera.centre_world))
-        if distance > _FARTHEST:
+        if distance > _MAX_ORIGIN_DISTANCE:
             raise CalibrationError(
                 f"stands {distance:.0f} from the world's origin, which cannot be metres",
                 file=path,

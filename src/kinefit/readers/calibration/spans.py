@@ -1,4 +1,4 @@
-"""Where the value of a key stands in TOML, JSON or YAML text, so that it can be replaced and all else kept."""
+"""Locate the value of a key in TOML, JSON or YAML text, so that it can be replaced and all else kept."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _LEAD = re.compile(r"\s*(!!opencv-[\w-]+|\{|\[)?")
 
 
 class ValueSpan(NamedTuple):
-    """Place of one value.
+    """Position of one value in a text.
 
-    `start:stop` are the brackets of its numbers, `after` is behind the whole value (an OpenCV matrix has more than its
-    numbers), `indent` what stands before its key in the key's line; `matrix` tells an OpenCV matrix.
+    `start:stop` are the brackets of its numbers, `after` is the end of the whole value (an OpenCV matrix has more than
+    its numbers), `indent` the text before its key on the key's line; `matrix`: whether it is an OpenCV matrix.
     """
 
     start: int
@@ -27,7 +27,7 @@ class ValueSpan(NamedTuple):
 
 
 def value_span(text: str, key: str, occurrence: int) -> ValueSpan | None:
-    """Span of the list or matrix that the n-th `key` of a text has; None where it is written otherwise."""
+    """Span of the list or matrix of the n-th `key` in a text; None if the value has another notation."""
     for token in _TOKEN.finditer(text):
         if token[2] and _name(token[1]) == key:
             if occurrence == 0:

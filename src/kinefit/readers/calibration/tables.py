@@ -1,4 +1,4 @@
-"""Cameras out of tables of keys and values: OpenCV FileStorage (YAML, XML, JSON), Pose2Sim, aniposelib, caliscope."""
+"""Cameras in tables of keys and values: OpenCV FileStorage (YAML, XML, JSON), Pose2Sim, aniposelib, caliscope."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Table = dict[str, Any]
 Sizes = tuple[int, int] | Callable[[str], tuple[int, int] | None]
 """(width, height) [px] of all images, or a function of the camera's name, None where it knows none."""
 
-# Names that the formats use for one thing, lower case, without underscores and blanks.
+# Names of each quantity in the formats, lower case, without underscores and blanks.
 _KEYS = {
     "matrix": (
         "matrix", "cameramatrix", "cammatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "intrinsicparameters",
@@ -46,8 +46,8 @@ _KEYS = {
     "model": ("distortionmodel", "model", "cameramodel"),
     **{key: (key, f"{key[0]}l{key[1]}" if key[0] == "f" else f"pp{key[1]}") for key in ("fx", "fy", "cx", "cy")},
 }  # fmt: skip
-_LARGEST = 1e12
-"""Of any number: coefficients of distortion reach millions, and squares must not overflow."""
+_MAX_NUMBER = 1e12
+"""Coefficients of distortion reach millions, and squares must not overflow."""
 _FISHEYE = ("fisheye", "equidistant", "kannalabrandt")
 _OTHER_MODELS = (
     "omni", "mei", "unified", "doublesphere", "eucm", "division", "fov", "scaramuzza", "ocam", "thinprism", "ftheta",
@@ -59,7 +59,7 @@ _PARSERS: dict[str, Callable[[str], Any]] = {"json": json.loads, "yaml": storage
 
 
 def read_table(text: str, kind: str, path: Path) -> Table:
-    """Parse "toml", "json", "yaml" or "xml" (the last two: OpenCV FileStorage) into nested tables."""
+    """Parse "toml", "json", "yaml" or "xml" (the last two: OpenCV FileStorage); raises CalibrationError if broken."""
     try:
         if kind == "toml":
             return dict(_matrices(parse_toml(text, path, CalibrationError)))
@@ -79,7 +79,7 @@ def _matrices(value: Any) -> Any:
 
 
 def _matrix(table: Table) -> Any:
-    """Array of a stored OpenCV matrix (OpenCV 5 writes vectors with `sizes`); any other table as it is."""
+    """Nested lists of a stored OpenCV matrix (OpenCV 5 writes vectors with `sizes`); other tables unchanged."""
     of_ros = {"rows", "cols"} <= table.keys() and isinstance(table.get("data"), list)  # without dt
     if not (of_ros or {"dt", "data"} <= table.keys()):
         return table
@@ -88,17 +88,17 @@ def _matrix(table: Table) -> Any:
 
 
 def find_all(table: Table, kind: str) -> list[Any]:
-    """Values that a table gives for a kind of key, under whichever of its names."""
+    """Values in a table under any of the names of a quantity, see `_KEYS`."""
     return [value for key, value in table.items() if re.sub(r"[\W_]", "", str(key)).lower() in _KEYS[kind]]
 
 
 def find(table: Table, kind: str) -> Any:
-    """First value that a table gives for a kind of key; None without."""
+    """First value in a table under any of the names of a quantity, see `_KEYS`; None if there is none."""
     return next(iter(find_all(table, kind)), None)
 
 
 def camera_tables(tree: Any, name: str) -> list[tuple[str, Table]]:
-    """All tables that hold a camera matrix, with the camera's name (its own, else its key's)."""
+    """All tables with a camera matrix, and the camera's name (its own, else its key)."""
     if isinstance(tree, list):
         inner = [camera_tables(entry, f"{name}_{i}") for i, entry in enumerate(tree)]
         return [found for group in inner for found in group]
@@ -123,7 +123,7 @@ def _is_by_camera(value: Any) -> bool:
 
 
 def _by_camera(tree: Table) -> Table:
-    """One table a camera, of a table whose keys bear the cameras' names, or whose values are tables of cameras.
+    """Regroup a table by camera, if its keys contain the cameras' names or its values are tables by camera.
 
     EasyMocap's intri.yml and extri.yml have keys K_01, dist_01, Rot_01 (R_01 is the same as a vector), T_01, H_01.
     """
@@ -143,7 +143,7 @@ def _by_camera(tree: Table) -> Table:
 
 
 def _with_scalars(table: Table) -> Table:
-    """The table with a matrix of its fx, fy, cx, cy and a distortion of its k1, k2, p1 ..., where it has only these."""
+    """The table with fx, fy, cx, cy as a matrix and k1, k2, p1 ... as a distortion, if it has only these."""
     if "K" in table and "k" in table:  # a matrix and coefficients
         table = {"distortion" if key == "k" else key: value for key, value in table.items()}
     pinhole = [find(table, key) for key in ("fx", "fy", "cx", "cy")]
@@ -159,7 +159,7 @@ def _with_scalars(table: Table) -> Table:
 
 
 def stereo_named(tree: Table) -> Table:
-    """The table with OpenCV's names M1, D1, M2, D2 for the two cameras of a pair, whose pose is R, T; else as it is."""
+    """The table with OpenCV's names M1, D1, M2, D2, if it is a stereo pair with R and T; else unchanged."""
     named = {}
     for key, value in tree.items():
         found = _OF_PAIR.fullmatch(str(key))
@@ -168,7 +168,7 @@ def stereo_named(tree: Table) -> Table:
 
 
 def stereo_tables(tree: Table, path: Path, names: tuple[str, str] = ("left", "right")) -> list[tuple[str, Table]]:
-    """The two cameras of OpenCV's stereo calibration; the first is the world."""
+    """The two cameras of OpenCV's stereo calibration; the first is the world. Lacking keys raise CalibrationError."""
     missing = [key for key in ("M1", "D1", "M2", "D2", "R", "T") if key not in tree]
     if missing:
         raise CalibrationError(
@@ -187,10 +187,10 @@ def stereo_tables(tree: Table, path: Path, names: tuple[str, str] = ("left", "ri
 
 
 def stated_unit(tree: Table) -> str | None:
-    """Unit of length that a file states: `unit`, alone or under `metadata`; or that its program writes.
+    """Unit of length that a file states, or that its program is known to use; None if neither.
 
-    The CMU Panoptic Studio's cameras (each has a `panel` and a `node`) stand in centimetres, FreeMoCap's (its
-    `metadata` has the board's `charuco_square_size`, in mm as a rule) in millimetres.
+    A file states `unit`, alone or under `metadata`. CMU Panoptic Studio (each camera has a `panel` and a `node`) uses
+    centimetres, FreeMoCap (`metadata` has `charuco_square_size`, mostly in mm) millimetres.
     """
     metadata = tree.get("metadata")
     metadata = metadata if isinstance(metadata, dict) else {}
@@ -210,8 +210,13 @@ def camera_from_table(
 ) -> Camera:
     """Camera of one table; translation in the file's unit.
 
-    A matrix that is transposed, [[fx, 0, 0], [s, fy, 0], [cx, cy, 1]], tells that points are rows, as in MATLAB before
-    R2022b and in JARVIS: x_camera = x_world R + t, so that R is transposed, too.
+    With a transposed matrix, [[fx, 0, 0], [s, fy, 0], [cx, cy, 1]], points are rows, as in MATLAB before R2022b and in
+    JARVIS: x_camera = x_world R + t, so R is transposed, too.
+
+    Raises
+    ------
+    CalibrationError
+        No image size; a lens model that OpenCV lacks; a missing pose; entries of a wrong shape.
     """
     place = f"camera {name}"
     K = numbers(find(table, "matrix"), None, path, f"{place}, camera matrix")
@@ -241,13 +246,13 @@ def camera_from_table(
 
 
 def is_transposed(K: ArrayLike) -> bool:
-    """Whether a camera matrix (3, 3) is written for points as rows."""
+    """Whether a camera matrix (3, 3) is transposed, for points as rows."""
     K = np.asarray(K, float) if np.shape(K) == (3, 3) else np.eye(3)
     return bool(K[2, :2].any()) and not K[:2, 2].any()
 
 
 def _pose(table: Table, of_rows: bool, pose_needed: bool, path: Path, place: str) -> NDArray:
-    """T_camera_world of a table, in the file's unit."""
+    """(4, 4) T_camera_world of a table, in the file's unit."""
     rotation, translation = find(table, "rotation"), find(table, "translation")
     for kind in ("pose", "inverse pose"):
         pose = find(table, kind)
@@ -255,8 +260,8 @@ def _pose(table: Table, of_rows: bool, pose_needed: bool, path: Path, place: str
             continue
         matrix = numbers(pose, None, path, f"{place}, pose")
         if matrix.shape not in ((3, 4), (4, 4)) or (matrix.shape == (4, 4) and np.any(matrix[3] != (0, 0, 0, 1))):
-            told = f"pose of shape {matrix.shape}" + ", whose last row is not 0 0 0 1" * (matrix.shape == (4, 4))
-            raise CalibrationError(told, file=path, place=place, remedy="Give (4, 4), a point being a column.")
+            problem = f"pose of shape {matrix.shape}" + ", whose last row is not 0 0 0 1" * (matrix.shape == (4, 4))
+            raise CalibrationError(problem, file=path, place=place, remedy="Give (4, 4), a point being a column.")
         T = rigid(matrix[:3, :3], matrix[:3, 3], path, place)
         return T if kind == "pose" else inverse(T)
     if rotation is not None and translation is not None:
@@ -281,7 +286,7 @@ def _pose(table: Table, of_rows: bool, pose_needed: bool, path: Path, place: str
 def build_camera(
     name: str, size: tuple[int, int], K: NDArray, k: NDArray, model: str, T: NDArray, path: Path
 ) -> Camera:
-    """Camera whose errors name the file."""
+    """Make a camera of K (3, 3), k (N,) and T_camera_world (4, 4); raises CalibrationError with the file's path."""
     try:
         return Camera(name, size, K, k, model, T)
     except CalibrationError as error:
@@ -289,21 +294,21 @@ def build_camera(
 
 
 def numbers(value: Any, shape: tuple[int, ...] | None, path: Path, place: str) -> NDArray:
-    """Float array of a shape (any order of one column), no value beyond 1e12, or a typed error."""
+    """Float array of a shape such as (3, 3), None for any; raises CalibrationError if not finite or above 1e12."""
     try:
         array = np.array(value, dtype=float)
         array = array if shape is None else array.reshape(shape)
     except (TypeError, ValueError, OverflowError):
         wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "numbers"
         raise CalibrationError(f"expected {wanted}", file=path, place=place, remedy="Repair this entry.") from None
-    if not np.isfinite(array).all() or np.abs(array).max(initial=0.0) > _LARGEST:
+    if not np.isfinite(array).all() or np.abs(array).max(initial=0.0) > _MAX_NUMBER:
         problem = "a number is not finite or absurdly large"
         raise CalibrationError(problem, file=path, place=place, remedy="Repair this entry.")
     return array
 
 
 def rigid(R: NDArray, t: NDArray, path: Path, place: str) -> NDArray:
-    """(4, 4) of a rotation that a file gives with few digits: the nearest exact rotation."""
+    """(4, 4) transform with the nearest rotation to R (3, 3); raises CalibrationError if R is not orthonormal."""
     if not np.abs(R).max() <= 2:  # not finite, too
         R = np.zeros((3, 3))
     left, stretch, right = np.linalg.svd(R)

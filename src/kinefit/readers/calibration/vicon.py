@@ -15,24 +15,24 @@ from kinefit.readers.calibration.tables import build_camera, numbers, rigid
 
 _MAX_LENS_ERROR_PX = 0.01  # of the lens in OpenCV's terms against Vicon's, anywhere in the image
 _MAX_CENTRE_OFFSET_PX = 0.5  # of the distortion's centre from the principal point
-_SAME = 1e-3  # share by which a pixel's sides may differ
-_RADII = 400  # at which both lenses are compared
+_MAX_ASPECT_ERROR = 1e-3  # of a square pixel
+_COMPARED_RADII = 400  # at which both lens models are compared
 
 
 def vicon_cameras(root: Element, path: Path) -> list[Camera]:
-    """Calibrated video cameras of a parsed file, or all cameras of one without video; translation in millimetres.
+    """Calibrated video cameras of a parsed file; all cameras if it has no video. Translations in mm.
 
     A camera is named by its DEVICEID, which Nexus writes into the names of its videos. ORIENTATION is the quaternion
-    (x, y, z, w) of the rotation R world to camera, POSITION the camera's place p: T_camera_world = (R, -R p); it looks
-    along its z, y down. VICON_RADIAL (k1 k2) and VICON_RADIAL2 ("Vicon3Parameter" cx cy k1 k2 k3) take an image point d
+    (x, y, z, w) of the rotation R world to camera, POSITION the camera's centre p: T_camera_world = (R, -R p); it looks
+    along z, y down. VICON_RADIAL (k1 k2) and VICON_RADIAL2 ("Vicon3Parameter" cx cy k1 k2 k3) take an image point d
     [px] from its centre to d (1 + k1 |d|² + k2 |d|⁴ + k3 |d|⁶) of an ideal lens: from distorted to ideal, the reverse
-    of OpenCV. The pixel (0, 0) is taken for the centre of the first.
-    Source: Vicon CaraPost's reference, "About calibration data (XCP) files", for the attributes; that the lens leads
-    from distorted to ideal was found by other readers of these files, on positions that were known.
+    of OpenCV. Pixel (0, 0) is assumed to be the centre of the first.
+    Source: Vicon CaraPost's reference, "About calibration data (XCP) files", for the attributes; the direction of the
+    lens model is from other readers of these files, tested on known positions.
     """
-    cameras = [one for one in root.iter("Camera") if one.find("KeyFrames/KeyFrame") is not None]
-    filming = [one for one in cameras if one.get("ISDV", "0") != "0" or "video" in one.get("TYPE", "").lower()]
-    return [_camera(one, path) for one in filming or cameras]
+    cameras = [c for c in root.iter("Camera") if c.find("KeyFrames/KeyFrame") is not None]
+    video_cameras = [c for c in cameras if c.get("ISDV", "0") != "0" or "video" in c.get("TYPE", "").lower()]
+    return [_camera(c, path) for c in video_cameras or cameras]
 
 
 def _camera(element: Element, path: Path) -> Camera:
@@ -51,7 +51,7 @@ def _camera(element: Element, path: Path) -> Camera:
     width, height = values("SENSOR_SIZE", (2,))
     (focal,), centre = values("FOCAL_LENGTH", (1,)), values("PRINCIPAL_POINT", (2,))
     sides = [values(key, (1,), "1")[0] for key in ("PIXEL_ASPECT_RATIO", "PIXEL_ASPECT_RATIO_CORRECTION")]
-    if max(abs(side - 1) for side in sides) > _SAME or values("SKEW", (1,), "0")[0] != 0:
+    if max(abs(side - 1) for side in sides) > _MAX_ASPECT_ERROR or values("SKEW", (1,), "0")[0] != 0:
         problem = "pixels that are no squares: PIXEL_ASPECT_RATIO or SKEW"
         raise CalibrationError(problem, file=path, place=place, remedy="Resample the video to square pixels.")
     K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
@@ -93,7 +93,7 @@ def _opencv_radial(radial: NDArray, corner: float, focal: float, path: Path, pla
     radial : (3,) of `_radial`
     corner : distance of the farthest corner from the principal point [px]
     """
-    distorted = np.linspace(0, corner, _RADII + 1)[1:]
+    distorted = np.linspace(0, corner, _COMPARED_RADII + 1)[1:]
     ideal = distorted * (1 + np.stack([distorted**2, distorted**4, distorted**6], axis=1) @ radial)
     k, error = np.zeros(8), np.inf
     if np.all(np.diff(ideal, prepend=0) > 0):

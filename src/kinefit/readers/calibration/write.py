@@ -1,4 +1,4 @@
-"""Calibrations written as another one is: the same file, or folder, with other numbers in it."""
+"""Write a calibration in the format of an existing one: the same file, or folder, with other numbers."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ def write_calibration_like(
     image_size: tuple[int, int] | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Write a rig in the format of an existing calibration, and keep everything else that stands there.
+    """Write a rig in the format of an existing calibration, and keep all of its other content.
 
-    Interiors, distortion and poses of the rig's cameras are replaced, in the file's own unit and notation; other
-    cameras, comments, boards and names stay. What was written is read back and compared before it appears. OpenCV's
-    stereo pair has no place for the pose of its first camera: it is told in that camera's frame, and rectifications
-    (R1 .. Q) in it stay those of the old one.
+    Intrinsics, distortion and poses of the rig's cameras are replaced, in the file's own unit and notation; other
+    cameras, comments, boards and names stay. The result is read back and compared before it appears. OpenCV's stereo
+    pair has no entry for the pose of its first camera: it is written in that camera's frame, and its rectifications
+    (R1 .. Q) stay those of the old calibration.
 
     Parameters
     ----------
@@ -63,14 +63,14 @@ def write_calibration_like(
     Returns
     -------
     Path
-        What was written.
+        The path.
 
     Raises
     ------
     CalibrationError
-        A camera that `like` lacks, or something of it that the format cannot hold.
+        A camera that `like` lacks, or a property that the format cannot represent.
     ExportError
-        Where `path` exists, or cannot be written.
+        `path` exists, or cannot be written.
     """
     like, path = Path(like), Path(path)
     like = like.parent if like.name in ("cameras.txt", "images.txt") else like
@@ -116,7 +116,7 @@ def _move(root: Path, path: Path, texts: dict[str, str]) -> None:
 
 
 def _compare(rig: Rig, written: Path, like: Path, **reading: Any) -> None:
-    """What is read back is what was to be written, or an error says what the format did not hold."""
+    """Read the written calibration back; raise CalibrationError for what the format did not represent."""
     try:
         back = read_calibration(written, exteriors=False, **reading)
     except KinefitError as error:
@@ -127,12 +127,12 @@ def _compare(rig: Rig, written: Path, like: Path, **reading: Any) -> None:
         found = back[camera.name] if camera.name in back else None
         if found is not None and (found.size, found.model) == (camera.size, camera.model):
             scale = max(1.0, float(np.abs(camera.T_camera_world[:3, 3]).max()))
-            same = {
+            equal = {
                 "matrix": np.allclose(found.matrix, camera.matrix, rtol=1e-9, atol=1e-9),
                 "distortion": np.allclose(_padded(found), _padded(camera), rtol=1e-9, atol=1e-12),
                 "pose": np.allclose(found.T_camera_world, camera.T_camera_world, rtol=0, atol=1e-8 * scale),
             }
-            lost = [what for what, held in same.items() if not held]
+            lost = [what for what, kept in equal.items() if not kept]
         else:
             lost = ["image size or lens model"]
         if lost:
@@ -149,7 +149,7 @@ def _padded(camera: Camera) -> NDArray:
 
 
 def _texts(rig: Rig, like: Path, unit: str | float) -> tuple[dict[str, str], Rig]:
-    """Text of each file by its path below `like` ("" for the file itself), and the rig as the format tells it."""
+    """Text of each file by its path below `like` ("" for the file itself), and the rig in the format's frame."""
     if like.is_dir() and ((like / "cameras.txt").exists() or (like / "cameras.bin").exists()):
         texts = colmap_texts(rig, like, metres_per_unit({}, unit, like))
         points = like / "points3D.txt"  # COLMAP opens no model without
@@ -172,7 +172,7 @@ def _texts(rig: Rig, like: Path, unit: str | float) -> tuple[dict[str, str], Rig
 
 
 def _replace_tables(rig: Rig, name: str, files: dict[Path, str], kinds: dict[Path, str], unit: str | float) -> Rig:
-    """Replace the numbers of all cameras of one group of files, in `files`; returns the rig as they tell it."""
+    """Replace the numbers of all cameras of one group of files, in `files`; returns the rig in their frame."""
     trees = {file: read_table(text, kinds[file], file) for file, text in files.items()}
     merged = {key: value for tree in trees.values() for key, value in tree.items()}
     first = next(iter(files))
@@ -190,7 +190,7 @@ def _replace_tables(rig: Rig, name: str, files: dict[Path, str], kinds: dict[Pat
         for key, value, new in _entries(rig[camera_name], table, scale):
             place = places.get(id(value))
             if place is None and (value is not None or known is None):
-                continue  # the given zero pose of a stereo pair; whatever else is missing shows when it is read back
+                continue  # the zero pose of a stereo pair; reading back finds anything else that is missing
             file, word, n = place or known  # type: ignore[misc]
             if file in roots:
                 _edit_xml(roots[file], word, n, new, None if place else key)
@@ -205,7 +205,7 @@ def _replace_tables(rig: Rig, name: str, files: dict[Path, str], kinds: dict[Pat
 
 
 def _places(tree: Any, kind: str) -> dict[int, tuple[str, int]]:
-    """{identity of a list: (its key, how many of that key stand before it)}, in the order of the text."""
+    """{identity of a list: (its key, number of the same keys before it)}, in the order of the text."""
     counts: dict[str, int] = {}
     out: dict[int, tuple[str, int]] = {}
 
@@ -226,7 +226,7 @@ def _places(tree: Any, kind: str) -> dict[int, tuple[str, int]]:
 
 
 def _entries(camera: Camera, table: dict, scale: float) -> list[tuple[str, Any, NDArray]]:
-    """(key for a new entry, what stands there or None, what shall) of each entry of a camera."""
+    """(key of a new entry, old value or None, new value) of each entry of a camera."""
     T = np.array(camera.T_camera_world)
     T[:3, 3] /= scale
     pose, inverse_pose = find(table, "pose"), find(table, "inverse pose")
@@ -257,13 +257,13 @@ def _entries(camera: Camera, table: dict, scale: float) -> list[tuple[str, Any, 
 
 
 def _shaped(new: ArrayLike, old: Any) -> NDArray:
-    """In the shape of what stood there, if it has as many numbers."""
+    """The new value in the shape of the old one, if it has as many numbers."""
     array = np.asarray(new, dtype=float)
     return array if old is None or np.size(old) != array.size else array.reshape(np.shape(old))
 
 
 def _edit(text: str, word: str, n: int, new: NDArray, key: str | None, kind: str) -> list[tuple[int, int, str]]:
-    """Change of a text that replaces the value of the n-th `word`, or puts a new `key` behind it."""
+    """Edits (start, stop, text) that replace the value of the n-th `word`, or add a new `key` after it."""
     span = value_span(text, word, n)
     if span is None:
         return []

@@ -1,1 +1,1 @@
-"""Depth recordings."""
+"""Readers of depth images and point clouds."""

@@ -7,19 +7,19 @@ from kinefit._jit import jit
 
 @jit
 def lzf(packed, out):
-    """Decompress bytes (uint8) into `out`; returns how many were written, -1 where the data is broken."""
+    """Decompress bytes (uint8) into `out`; return the number of bytes written, -1 if the data is broken."""
     end, size, i, n = len(packed), len(out), 0, 0
     while i < end:
         control = int(packed[i])
         i += 1
-        if control < 32:  # so many and one more bytes as they are
+        if control < 32:  # a run of control + 1 literal bytes
             run = control + 1
             if i + run > end or n + run > size:
                 return -1
             for k in range(run):
                 out[n + k] = packed[i + k]
             i += run
-        else:  # a piece of what is written already; it may overlap itself
+        else:  # a copy of earlier output; it may overlap itself
             run, back = control >> 5, (control & 31) << 8
             if i + (2 if run == 7 else 1) > end:
                 return -1

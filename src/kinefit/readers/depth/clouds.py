@@ -24,22 +24,22 @@ _PLY_TYPES = {
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
-_UNPACKED = 100  # bytes that LZF can make of one: 264 of three
-_MOST = 200_000_000  # points; more is a broken header
+_MAX_LZF_RATIO = 100  # of unpacked to packed bytes: LZF makes 264 of three
+_MAX_POINTS = 200_000_000  # more is a broken header
 
 
 @dataclass(frozen=True, eq=False)
 class FileCloud:
-    """A cloud as a file holds it.
+    """The point cloud of a file.
 
     Parameters
     ----------
     points : (N, 3)
-        In the file's own unit and frame; NaN where an organised cloud has no point.
+        In the file's own unit and frame; NaN at pixels of an organised cloud without a point.
     shape : (height, width) or None
-        Of the image that an organised cloud was; its points are in row order.
+        Of the image of an organised cloud; its points are in row order.
     T_file_sensor : (4, 4)
-        Pose of the sensor, where the file tells it (PCD's VIEWPOINT); its translation in the file's unit.
+        Pose of the sensor if the file states it (PCD's VIEWPOINT), else the identity; translation in the file's unit.
     """
 
     points: NDArray
@@ -53,7 +53,7 @@ def read_cloud(path: str | PathLike[str]) -> FileCloud:
     Raises
     ------
     FileError
-        Missing, cut, or of another kind; the message tells what is wrong.
+        Missing, truncated, or of another format.
     """
     path = Path(path)
     data = read_bytes(path)
@@ -82,7 +82,7 @@ def _pcd(data: bytes, path: Path) -> FileCloud:
     counts = [int(c) for c in header.get("COUNT", ["1"] * len(names))]
     width, height = int(header["WIDTH"][0]), int(header["HEIGHT"][0])
     number = int(header.get("POINTS", [str(width * height)])[0])
-    if not 0 <= number == width * height < _MOST:
+    if not 0 <= number == width * height < _MAX_POINTS:
         raise FileError(f"{number} points, but {width} x {height}", file=path, remedy=_REMEDY)
     if not (set(sizes) <= {1, 2, 4, 8} and all(0 < c < 10_000 for c in counts) and len(counts) == len(names)):
         problem = f"SIZE {' '.join(map(str, sizes[:9]))}, COUNT {' '.join(map(str, counts[:9]))}"
@@ -114,7 +114,7 @@ def _pcd(data: bytes, path: Path) -> FileCloud:
 
 def _unpacked(body: bytes, path: Path) -> NDArray[np.uint8]:
     packed, size = (int(v) for v in np.frombuffer(body, "<u4", 2))
-    if len(body) < 8 + packed or size > _UNPACKED * len(body):
+    if len(body) < 8 + packed or size > _MAX_LZF_RATIO * len(body):
         raise FileError(f"{len(body) - 8} of {packed} bytes are there", file=path, remedy=_CUT)
     out = np.empty(size, np.uint8)
     if lzf(np.frombuffer(body, np.uint8, packed, 8), out) != size:
@@ -135,7 +135,7 @@ def _ply(data: bytes, path: Path) -> FileCloud:
         elif words[:1] == ["property"]:
             elements[-1][2].append(words[1:])
     name, number, properties = elements[0] if elements else ("", 0, [])
-    if name != "vertex" or any(p[0] == "list" for p in properties) or not 0 <= number < _MOST:
+    if name != "vertex" or any(p[0] == "list" for p in properties) or not 0 <= number < _MAX_POINTS:
         raise FileError("its first element is not a plain 'vertex'", file=path, remedy=_REMEDY)
     where = [_place(axis, [p[1] for p in properties], path) for axis in "xyz"]
     if kind == "ascii":
@@ -146,7 +146,7 @@ def _ply(data: bytes, path: Path) -> FileCloud:
         table = _binary(body, record, number, path)
         points = np.stack([table[f"f{w}"].astype(float) for w in where], axis=1)
     else:
-        raise FileError(f"format {kind or 'not told'}", file=path, remedy=_REMEDY)
+        raise FileError(f"format {kind or 'missing'}", file=path, remedy=_REMEDY)
     return FileCloud(points, None, np.eye(4))
 
 
@@ -157,7 +157,7 @@ def _place(axis: str, names: list[str], path: Path) -> int:
 
 
 def _text(body: bytes, rows: int, columns: int, path: Path) -> NDArray:
-    """(rows, columns) numbers; what follows them (faces) is left."""
+    """(rows, columns) numbers; anything after them (faces) is ignored."""
     words = body.split(None, rows * columns)[: rows * columns]
     if len(words) < rows * columns:
         problem = f"{len(words) // max(columns, 1)} of {rows} points are there"
@@ -173,7 +173,7 @@ def _binary(body: bytes, record: np.dtype, number: int, path: Path) -> NDArray:
 
 
 def _rotation(q: NDArray) -> NDArray:
-    """Rotation of a quaternion (w, x, y, z)."""
+    """(3, 3) rotation of a quaternion (w, x, y, z)."""
     length = float(np.linalg.norm(q))
     if len(q) != 4 or not length > 0.0:
         raise ValueError(f"VIEWPOINT with the quaternion {q}")
@@ -186,7 +186,7 @@ def _rotation(q: NDArray) -> NDArray:
 
 
 def depth_of(cloud: FileCloud) -> NDArray:
-    """(H, W) depth of an organised cloud along its sensor's axis, in its unit; 0 where it has no point."""
+    """(H, W) depth of an organised cloud along its sensor's axis, in its unit; 0 at pixels without a point."""
     assert cloud.shape is not None
     z = in_sensor(cloud)[:, 2].reshape(cloud.shape)
     return np.where(z > 0.0, z, 0.0)
@@ -199,7 +199,7 @@ def in_sensor(cloud: FileCloud) -> NDArray:
 
 
 def camera_of(cloud: FileCloud, name: str, path: str | PathLike[str] | None = None) -> Camera:
-    """The pinhole camera, at the origin, that an organised cloud was seen with: fitted to its points.
+    """The pinhole camera of an organised cloud, at the origin, fitted to its points.
 
     Raises
     ------
@@ -216,7 +216,7 @@ def camera_of(cloud: FileCloud, name: str, path: str | PathLike[str] | None = No
         ray = x[ok, axis] / x[ok, 2]
         A = np.stack([ray, np.ones(len(ray))], axis=1)
         if len(ray) < 100 or np.ptp(ray) < 1e-3:
-            raise CalibrationError("too few points to tell the camera", file=path, remedy="Give its intrinsics.")
+            raise CalibrationError("too few points to determine the camera", file=path, remedy="Give its intrinsics.")
         if not np.abs(A).max() < 1e6:
             raise CalibrationError("points that no camera sees", file=path, remedy="Give its intrinsics.")
         (K[axis, axis], K[axis, 2]), *_ = np.linalg.lstsq(A, pixel[ok], rcond=None)

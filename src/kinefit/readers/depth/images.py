@@ -20,12 +20,12 @@ from kinefit.errors import FileError, ObservationError
 from kinefit.geometry.camera import Camera
 
 PICTURES = (".png", ".tif", ".tiff")
-_SATURATED = 65535  # the highest count of a 16-bit sensor: too far or too bright
+_SATURATED_COUNT = 65535  # the highest of a 16-bit sensor: too far or too bright
 
 
 @dataclass(frozen=True, eq=False)
 class DepthSource:
-    """Where depth comes from, before its unit is known.
+    """A source of depth images, before its unit is known.
 
     Parameters
     ----------
@@ -35,14 +35,14 @@ class DepthSource:
         Frame number -> (H, W), counts or metres.
     size : (width, height) [px]
     unit : float [m]
-        Of one count, as the format has it.
+        Of one count, by the format's convention.
     stated : bool
-        Whether the file itself tells the unit, and not only custom.
+        Whether the file itself states the unit.
     times : (F,) [s] or None
     camera : Camera or None
     rate : float [Hz] or None
     names : tuple of str
-        Of the files, one a frame, where there is one for each.
+        Of the files, if there is one for each frame; else empty.
     """
 
     count: int
@@ -63,7 +63,7 @@ def natural(name: str) -> tuple[tuple[int, int, str], ...]:
 
 
 def listed(path: Path) -> list[Path]:
-    """Files of a folder, of a pattern such as frames/depth_*.png, or the one file; in natural order."""
+    """Files of a folder, of a pattern such as frames/depth_*.png, or one file; in natural order."""
     if path.is_dir():
         found = [file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")]
     elif "*" in path.name:
@@ -75,7 +75,7 @@ def listed(path: Path) -> list[Path]:
 
 
 def picture_source(files: list[Path]) -> DepthSource:
-    """Depth in 16-bit pictures (counts) or 32-bit float TIFF (metres), one file a frame."""
+    """Source of 16-bit images (counts) or float TIFF (metres), one file a frame, or one TIFF of many pages."""
     pages = len(page_sizes(files[0])) if len(files) == 1 else 1  # one TIFF of many pages
 
     def image(i: int) -> NDArray:
@@ -87,14 +87,14 @@ def picture_source(files: list[Path]) -> DepthSource:
 
 
 def depth_picture(file: Path) -> NDArray:
-    """(H, W) as a file holds it: counts of 16 bits, or metres in float.
+    """(H, W) depth image of a file: 16-bit counts, or metres in float.
 
     Raises
     ------
     FileError
         No image, or damaged.
     ObservationError
-        An image that is no depth: of 8 bits, or of several channels.
+        An image of 8 bits, or of several channels.
     """
     return _depth_of(read_picture(file, cv2.IMREAD_UNCHANGED), file)
 
@@ -111,24 +111,29 @@ def _depth_of(picture: NDArray, file: Path) -> NDArray:
 
 
 def counts_of(picture: NDArray) -> NDArray:
-    """(H, W) float32 of a picture, 0 where 16 bits say that nothing was measured."""
+    """(H, W) float32 counts of an image, 0 at saturated 16-bit pixels."""
     depth = picture.astype(np.float32)
     if picture.dtype == np.uint16:
-        depth[picture == _SATURATED] = 0.0
+        depth[picture == _SATURATED_COUNT] = 0.0
     return depth
 
 
 def raw_source(files: list[Path], size: tuple[int, int] | None) -> DepthSource:
-    """Little-endian 16-bit counts, row by row and nothing else: one file a frame, or all frames in one file.
+    """Source of raw little-endian 16-bit counts, row by row: one file a frame, or all frames in one file.
 
-    Of a folder the files take part whose names differ by their numbers alone, the largest such group.
+    Reads the largest group of files whose names differ by their numbers only.
+
+    Raises
+    ------
+    ObservationError
+        No image size, or files whose length does not fit it.
     """
     alike = Counter(re.sub(r"\d+", "#", file.name) for file in files).most_common(1)[0][0]
     files = [file for file in files if re.sub(r"\d+", "#", file.name) == alike]
     length = files[0].stat().st_size
     if size is None:
         raise ObservationError(
-            f"raw files of {length} bytes, and the size of the image is not told", file=files[0],
+            f"raw files of {length} bytes, and the size of the image is not given", file=files[0],
             remedy="Give size = [width, height]; 614400 bytes are 640x480 in 16 bits.",
         )  # fmt: skip
     width, height = size
@@ -154,7 +159,13 @@ def raw_source(files: list[Path], size: tuple[int, int] | None) -> DepthSource:
 
 
 def array_source(path: Path) -> DepthSource:
-    """Depth in a numpy archive: `depth` (F, H, W) or (H, W); `times` (F,) [s], `unit` [m], `rate` [Hz] as it has."""
+    """Source of a numpy archive: `depth` (F, H, W) or (H, W); optional `times` (F,) [s], `unit` [m], `rate` [Hz].
+
+    Raises
+    ------
+    ObservationError
+        No `depth`, or an array of a wrong shape or type.
+    """
     content = read_npz(path, remedy="Write it with numpy.savez.")
     keys = sorted(content)
     depth = content.get("depth")

@@ -1,4 +1,4 @@
-"""Recordings of depth: any usual folder or file -> `DepthVideo`, or `CloudVideo` for points without order."""
+"""Read depth recordings of all common formats: `DepthVideo`, or `CloudVideo` for unorganised points."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ FORMATS = (
     "a folder of 16-bit PNG or TIFF, of raw 16-bit files or of organised PCD clouds; .npz; Azure Kinect .mkv; "
     "RealSense .bag; .mcap of ROS 2"
 )
-_PLAUSIBLE = (0.1, 30.0)  # [m] medians of depth: no sensor measures nearer, none shows a person farther away
-_USUAL = (0.4, 6.0)  # [m] where a person stands before a depth sensor
-_UNITS = (1.0, 0.001, 0.01, 0.000125, 0.0001, 0.0002, 0.00025)  # [m] a count, as sensors and data sets have it
-_RATE = 30.0  # [Hz] of nearly every depth camera, where nothing tells it
+_MIN_MEDIAN_DEPTH = 0.1  # [m] no sensor measures nearer
+_MAX_MEDIAN_DEPTH = 30.0  # [m] no sensor shows a person farther away
+_PERSON_DISTANCES = (0.4, 6.0)  # [m] typical range in front of a depth sensor
+_COUNT_UNITS = (1.0, 0.001, 0.01, 0.000125, 0.0001, 0.0002, 0.00025)  # [m] of sensors and data sets
+_DEFAULT_RATE = 30.0  # [Hz] of nearly every depth camera
 
 
 @checked
@@ -37,41 +38,41 @@ def read_depth(
     sensor: str | None = None,
     unit: float | None = None,
     rate: float | None = None,
-    usual_rate: float | None = _RATE,
+    usual_rate: float | None = _DEFAULT_RATE,
     size: tuple[int, int] | None = None,
     range: tuple[float, float] = (0.0, np.inf),
     time_unit: float | None = None,
     time_offset: float = 0.0,
 ) -> DepthVideo:
-    """Read depth images; they stay in their files until they are asked for.
+    """Read depth images; each frame is loaded on demand.
 
     Parameters
     ----------
     path : file, folder or pattern (frames/depth_*.png)
-        16-bit PNG or TIFF (float TIFF: metres), raw little-endian 16-bit files, .npz (`depth` (F, H, W), and `times`
-        [s], `unit` [m], `rate` [Hz] as it has), organised PCD, Azure Kinect .mkv, RealSense .bag, .mcap of ROS 2, with
-        the topic as a part of the path where several have depth (session.mcap/front/depth/image_raw). Files are taken
+        16-bit PNG or TIFF (float TIFF: metres), raw little-endian 16-bit files, .npz (`depth` (F, H, W), optional
+        `times` [s], `unit` [m], `rate` [Hz]), organised PCD, Azure Kinect .mkv, RealSense .bag, .mcap of ROS 2, with
+        the topic as a part of the path if several have depth (session.mcap/front/depth/image_raw). Files are taken
         in the order of the numbers in their names.
     sensor : str, optional
         Name of the sensor's camera; default: the name of the file or folder.
     unit : float [m], optional
-        Of one count; default: what the file tells, else 0.001 for whole numbers and 1 for float.
+        Of one count; default: as the file states, else 0.001 for whole numbers and 1 for float.
     rate : float [Hz], optional
-        Default: what the file tells or its times give.
+        Default: as the file states or its times give.
     usual_rate : float [Hz] or None
-        Where nothing tells the rate; None: that is an error.
+        For files without rate and times; None raises.
     size : (width, height) [px], of raw files.
     range : (near, far) [m]
-        Measurements outside of it are dropped.
+        Measurements outside of it are discarded.
     time_unit : float [s], optional
-        Of the last number in every file's name, where that is the time; default: frames are evenly spaced.
+        Unit of the last number in every file's name, if that is a time; default: frames are evenly spaced.
     time_offset : float [s]
         Time of the first frame in the take.
 
     Raises
     ------
     FileError
-        Missing, damaged, of another kind, or a library for it is missing.
+        Missing, damaged, of another format, or its library is not installed.
     ObservationError
         A wrong unit, no depth at all or none in `range`, times that do not increase, or a size that does not fit.
     """
@@ -95,14 +96,14 @@ def read_clouds(
     sensor: str | None = None,
     unit: float = 1.0,
     rate: float | None = None,
-    usual_rate: float | None = _RATE,
+    usual_rate: float | None = _DEFAULT_RATE,
     range: tuple[float, float] = (0.0, np.inf),
     time_unit: float | None = None,
     time_offset: float = 0.0,
     T_world_sensor: ArrayLike | None = None,
     viewpoint: bool = True,
 ) -> CloudVideo:
-    """Read clouds of points, PCD or PLY, organised or not: one file, a folder or a pattern of them.
+    """Read point clouds, PCD or PLY, organised or not: one file, a folder or a pattern.
 
     Parameters
     ----------
@@ -110,7 +111,7 @@ def read_clouds(
     unit : float [m] of the files' coordinates
     range : (near, far) [m] distance from the sensor
     T_world_sensor : (4, 4) [m], optional
-        Where the sensor stood; default: where the first file tells (VIEWPOINT of a PCD), else at the origin.
+        Pose of the sensor; default: as the first file states (VIEWPOINT of a PCD), else the origin.
     viewpoint : bool
         Whether the sensor saw the points from the origin of its frame; False for clouds of several sensors.
 
@@ -141,7 +142,7 @@ def read_clouds(
 
 
 def is_unordered(path: Path) -> bool:
-    """Whether a path holds clouds of points without the order of an image."""
+    """Whether a path holds unorganised point clouds."""
     files = _of_ending(listed(path), clouds.ENDINGS)
     return bool(files) and clouds.read_cloud(files[0]).shape is None
 
@@ -173,7 +174,7 @@ def _source(path: Path, name: str, size: tuple[int, int] | None) -> DepthSource:
 
 
 def _of_ending(files: list[Path], endings: tuple[str, ...]) -> list[Path]:
-    """The files of these kinds; an error where there are two of them."""
+    """The files with these endings; raises ObservationError for two different endings."""
     found = [file for file in files if file.suffix.lower() in endings]
     kinds = sorted({file.suffix.lower() for file in found})
     if len(kinds) > 1:
@@ -208,10 +209,10 @@ def _depth(file: Path) -> NDArray:
 
 
 def _times(
-    source: DepthSource, rate: float | None, usual: float | None, time_unit: float | None, time_offset: float,
+    source: DepthSource, rate: float | None, default_rate: float | None, time_unit: float | None, time_offset: float,
     path: Path,
 ) -> tuple[NDArray, float]:
-    """Times [s] and rate [Hz] from what is told, by the caller first."""
+    """Times (F,) [s] and rate [Hz]; the caller's values come before the file's."""
     times = source.times
     if time_unit is not None:
         numbers = [re.findall(r"\d+", name) for name in source.names]
@@ -224,7 +225,7 @@ def _times(
     if rate is not None and not 0 < rate < 1e6:
         raise ObservationError(f"rate {rate:g} Hz", file=path, remedy="Give frames per second.")
     if times is None:
-        rate = rate or source.rate or (usual if source.count > 1 else _RATE)
+        rate = rate or source.rate or (default_rate if source.count > 1 else _DEFAULT_RATE)
         if rate is None:
             raise ObservationError("nothing tells its rate", file=path, remedy="Give rate = ... in frames per second.")
         return np.arange(source.count) / rate + time_offset, rate
@@ -237,7 +238,7 @@ def _times(
         )  # fmt: skip
     if source.rate and measured and abs(source.rate / measured - 1.0) < 0.1:
         measured = source.rate  # times are rounded to milliseconds
-    return times + time_offset, rate or measured or source.rate or usual or _RATE
+    return times + time_offset, rate or measured or source.rate or default_rate or _DEFAULT_RATE
 
 
 def _factor(unit: float, path: Path) -> float:
@@ -251,23 +252,23 @@ def _scaled(image: Callable[[int], NDArray], factor: float) -> Callable[[int], N
 
 
 def _check_content(video: DepthVideo, factor: float, path: Path) -> None:
-    """Look at some frames for what no tracking could survive: no depth, a wrong unit, a range that is too narrow."""
+    """Check some frames for depth, a plausible unit and a range that contains it; raises ObservationError."""
     seen: list[NDArray] = []
     first = dict.fromkeys(round(k) for k in np.linspace(0, len(video) - 1, 5))
     for i in (*first, *(k for k in builtins.range(len(video)) if k not in first)):
         if len(seen) >= len(first) and any(map(len, seen)):
-            break  # the others are looked at only while all are empty
+            break  # read the others only while all are empty
         image = np.asarray(video.image(i))
         if image.shape == video.size[::-1]:
             image = image[::4, ::4] if image.size > 40_000 else image
             seen.append(image[(image > 0) & np.isfinite(image)])
         else:
-            video.frame(i)  # tells what is wrong
+            video.frame(i)  # raises for the wrong size
     _check_values(np.concatenate(seen), factor, video.near, video.far, path)
 
 
 def _check_values(
-    depth: NDArray, factor: float, near: float, far: float, path: Path, least: float = _PLAUSIBLE[0]
+    depth: NDArray, factor: float, near: float, far: float, path: Path, least: float = _MIN_MEDIAN_DEPTH
 ) -> None:
     if not len(depth):
         raise ObservationError(
@@ -275,13 +276,13 @@ def _check_values(
             remedy="Was the sensor covered, or are these the infrared pictures?",
         )  # fmt: skip
     median = float(np.median(depth))
-    if not least < median < _PLAUSIBLE[1]:
-        likely = [unit for unit in _UNITS if _USUAL[0] < median / factor * unit < _USUAL[1]]
-        told = f"unit = {likely[0]:g}" if likely else "the sensor's own unit = ..."
+    if not least < median < _MAX_MEDIAN_DEPTH:
+        likely = [unit for unit in _COUNT_UNITS if _PERSON_DISTANCES[0] < median / factor * unit < _PERSON_DISTANCES[1]]
+        entry = f"unit = {likely[0]:g}" if likely else "the sensor's own unit = ..."
         what = " (millimetres taken for metres?)" if factor == 1.0 and median > 100 else ""
         raise ObservationError(
             f"the median depth is {median:.4g} m{what}: the unit of {factor:g} m a count is wrong", file=path,
-            remedy=f"Write {told} (metres a count).",
+            remedy=f"Write {entry} (metres a count).",
         )  # fmt: skip
     if not ((depth >= near) & (depth <= far)).any():
         low, high = np.percentile(depth, (1, 99))

@@ -1,4 +1,4 @@
-"""Depth in the containers that sensors record: Azure Kinect MKV (and any 16-bit grey video), RealSense bag."""
+"""Depth in recordings of sensors: Azure Kinect MKV (and any 16-bit grey video), RealSense bag."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from kinefit.geometry.camera import Camera
 from kinefit.readers.depth.images import DepthSource
 from kinefit.readers.video_files import open_container
 
-# Image of each depth mode of the Azure Kinect: size -> (size it is binned to, offset of the crop), Azure Kinect Sensor
-# SDK, mode_specific_calibration.c.
+# Depth modes of the Azure Kinect: size [px] -> (width of the binned sensor, offset of the crop) [px]; source: Azure
+# Kinect Sensor SDK, mode_specific_calibration.c.
 _AZURE_MODES = {(320, 288): (512, (96, 90)), (640, 576): (1024, (192, 180)), (512, 512): (512, (0, 0)),
                 (1024, 1024): (1024, (0, 0))}  # fmt: skip
 _GREY = ("gray16le", "gray16be", "gray12le", "gray10le", "gray14le")
 
 
 class _StreamTrack:
-    """Frames of one track of a container by number, in order of time."""
+    """Frames of one track of a container, by number in order of time."""
 
     def __init__(self, path: Path, index: int, raw: bool, times: list[int]) -> None:
         self._path, self._index, self._raw, self._times = path, index, raw, times
         self._container: Any = None
-        self._pictures: Iterator[tuple[int | None, Any]] = iter(())
+        self._items: Iterator[tuple[int | None, Any]] = iter(())
         self._next = -1
 
     def __call__(self, i: int) -> NDArray:
         if i != self._next:
             self._seek(i)
         try:
-            for pts, picture in self._pictures:
+            for pts, item in self._items:
                 if pts == self._times[i]:
                     self._next = i + 1
-                    return self._counts(picture, i)
+                    return self._counts(item, i)
                 if pts is None or pts > self._times[i]:
                     break
         except av.FFmpegError as error:
@@ -53,15 +53,15 @@ class _StreamTrack:
         self._container.seek(self._times[i], stream=stream, backward=True)
         packets = self._container.demux(stream)
         if self._raw:
-            self._pictures = ((packet.pts, packet) for packet in packets)
-        else:  # pictures may build on those before them, up to the last key frame
-            self._pictures = ((frame.pts, frame) for packet in packets for frame in packet.decode())
+            self._items = ((packet.pts, packet) for packet in packets)
+        else:  # frames may depend on those before them, back to the last key frame
+            self._items = ((frame.pts, frame) for packet in packets for frame in packet.decode())
 
-    def _counts(self, picture: Any, i: int) -> NDArray:
+    def _counts(self, item: Any, i: int) -> NDArray:
         if not self._raw:
-            return picture.to_ndarray(format="gray16le").astype(np.float32)
+            return item.to_ndarray(format="gray16le").astype(np.float32)
         codec = self._container.streams[self._index].codec_context
-        data = bytes(picture)
+        data = bytes(item)
         if len(data) != 2 * codec.width * codec.height:
             raise FileError(
                 f"{len(data)} bytes for {codec.width}x{codec.height} px", file=self._path, place=f"frame {i}",
@@ -71,7 +71,17 @@ class _StreamTrack:
 
 
 def track_source(path: Path, name: str) -> DepthSource:
-    """Depth of an Azure Kinect recording, or of any lossless video of one 16-bit grey channel."""
+    """Source of an Azure Kinect recording, or of any lossless video of one 16-bit grey channel.
+
+    Raises
+    ------
+    FileError
+        No readable video, no depth track, or no frames.
+    ObservationError
+        A video that is no depth.
+    CalibrationError
+        An attached calibration that cannot be read.
+    """
     try:
         with open_container(path) as container:
             stream = _depth_stream(container, path)
@@ -112,11 +122,11 @@ def _depth_stream(container: Any, path: Path) -> Any:
 
 
 def _azure_camera(container: Any, name: str, size: tuple[int, int], path: Path) -> Camera | None:
-    """Depth camera from the attached calibration, at the origin; None where there is none.
+    """Depth camera from the attached calibration, at the origin; None without one.
 
     Parameters are cx cy fx fy, as shares of the sensor's size with (0, 0) its corner, k1..k6, the centre of distortion
     (0), p2, p1. The Brown-Conrady model is OpenCV's rational one; "Rational6KT" has half its tangential terms' mixed
-    part, which those sensors set to nearly nothing.
+    part, which these sensors set to nearly zero.
     """
     attached = [bytes(s.data) for s in container.streams if s.type == "attachment" and getattr(s, "data", None)]
     text = next((data for data in attached if b"CalibrationInformation" in data), None)
@@ -124,8 +134,8 @@ def _azure_camera(container: Any, name: str, size: tuple[int, int], path: Path) 
         return None
     try:
         cameras = json.loads(text.rstrip(b"\0"))["CalibrationInformation"]["Cameras"]
-        told = next(c["Intrinsics"] for c in cameras if c["Location"] == "CALIBRATION_CameraLocationD0")
-        cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = [float(v) for v in told["ModelParameters"][:14]]
+        intrinsics = next(c["Intrinsics"] for c in cameras if c["Location"] == "CALIBRATION_CameraLocationD0")
+        cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = [float(v) for v in intrinsics["ModelParameters"][:14]]
     except (ValueError, KeyError, TypeError, StopIteration, RecursionError) as error:
         raise CalibrationError(
             f"its attached calibration cannot be understood ({error})", file=path, remedy="Give intrinsics."
@@ -138,14 +148,14 @@ def _azure_camera(container: Any, name: str, size: tuple[int, int], path: Path) 
 
 
 class _Bag:
-    """Depth frames of a RealSense recording by number; going back starts it anew."""
+    """Depth frames of a RealSense recording, by number; going back restarts it."""
 
     def __init__(self, rs: Any, path: Path) -> None:
         self._rs, self._path, self._next = rs, path, 0
         self._pipe: Any = None
 
     def start(self) -> Any:
-        """Start playing, not in real time; the profile of the depth stream."""
+        """Start playing as fast as possible; returns the pipeline's profile."""
         self.stop()
         config, self._pipe = self._rs.config(), self._rs.pipeline()
         config.enable_device_from_file(str(self._path), repeat_playback=False)
@@ -155,13 +165,13 @@ class _Bag:
         return profile
 
     def stop(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         if self._pipe is not None:
             self._pipe.stop()
             self._pipe = None
 
     def frames(self) -> Iterator[Any]:
-        """All depth frames from the next one on."""
+        """All remaining depth frames."""
         while self._pipe is not None:
             ok, both = self._pipe.try_wait_for_frames(2000)
             if not ok:
@@ -181,7 +191,15 @@ class _Bag:
 
 
 def bag_source(path: Path, name: str) -> DepthSource:
-    """Depth of a RealSense .bag, through Intel's own library."""
+    """Source of a RealSense .bag, read by Intel's library.
+
+    Raises
+    ------
+    FileError
+        The library is not installed, or the recording cannot be read.
+    CalibrationError
+        A lens model that OpenCV lacks.
+    """
     try:
         import pyrealsense2 as rs
     except ImportError:
@@ -192,18 +210,18 @@ def bag_source(path: Path, name: str) -> DepthSource:
     bag = _Bag(rs, path)
     try:
         profile = bag.start()
-        told = profile.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
+        lens = profile.get_stream(rs.stream.depth).as_video_stream_profile().get_intrinsics()
         unit = float(profile.get_device().first_depth_sensor().get_depth_scale())
         times = [frame.get_timestamp() * 1e-3 for frame in bag.frames()]
     except RuntimeError as error:
         raise FileError(f"no depth can be read from it ({error})", file=path, remedy="Record it again.") from error
     finally:
         bag.stop()
-    K = [[told.fx, 0, told.ppx], [0, told.fy, told.ppy], [0, 0, 1]]
-    if any(told.coeffs) and told.model != rs.distortion.brown_conrady:
+    K = [[lens.fx, 0, lens.ppx], [0, lens.fy, lens.ppy], [0, 0, 1]]
+    if any(lens.coeffs) and lens.model != rs.distortion.brown_conrady:
         raise CalibrationError(
-            f"lens model {told.model}", file=path, remedy="Give intrinsics of the undistorted depth image."
+            f"lens model {lens.model}", file=path, remedy="Give intrinsics of the undistorted depth image."
         )
-    camera = Camera(name, (told.width, told.height), K, told.coeffs if any(told.coeffs) else ())  # type: ignore[arg-type]
+    camera = Camera(name, (lens.width, lens.height), K, lens.coeffs if any(lens.coeffs) else ())  # type: ignore[arg-type]
     seconds = np.array(times)
     return DepthSource(len(times), bag, camera.size, unit, True, seconds - seconds[:1], camera)

@@ -1,4 +1,4 @@
-"""Cameras of a take to be: their videos, what became of the pictures, rate, unit of length and vertical axis."""
+"""Guess the cameras of a take: their videos and image frames, rate, unit of length and vertical axis."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.observations import Keypoints
 from kinefit.observations.clocks import frame_times, is_even, on_steps, steps_of
 from kinefit.readers.guess import views as guess_views
-from kinefit.readers.guess.draft import Draft, Told
+from kinefit.readers.guess.draft import Draft, Value
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile, KeypointFile
 from kinefit.readers.guess.keypoints import keypoint_entries, keypoint_sources, read_sources
 from kinefit.readers.guess.lens import field_of_view, stated_focal_length
@@ -22,17 +22,24 @@ from kinefit.readers.take.cameras import USUAL
 from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.video import Video, common_frames
 
-UNSTATED = 1.0  # [Hz] of what states no rate, until the user does
-_LABORATORY = (0.2, 15.0)  # [m] from a desk to a sports hall: how far cameras stand from their middle
+UNSTATED = 1.0  # [Hz] of files without a rate, until the user states it
+_MIN_SPREAD = 0.2  # [m] of the cameras from their centre: a desk
+_MAX_SPREAD = 15.0  # [m] of the cameras from their centre: a sports hall
 
 
 def describe_cameras(
     draft: Draft, calibration: CalibrationFile, videos: Sequence[Path], keypoints: Sequence[KeypointFile]
 ) -> None:
-    """Enter the cameras with their videos and keypoints, and everything that these tell."""
+    """Enter the cameras with their videos and keypoints, and everything that follows from these.
+
+    Raises
+    ------
+    TakeError
+        Neither videos nor keypoints fit a camera of the calibration.
+    """
     rig = calibration.rig
-    usual = [path for path in videos if not OF_CALIBRATION.search(draft.name(path))]
-    chosen = _choose_recording(draft, usual if usual or keypoints else videos, rig)
+    trials_only = [path for path in videos if not OF_CALIBRATION.search(draft.name(path))]
+    chosen = _choose_recording(draft, trials_only if trials_only or keypoints else videos, rig)
     with ExitStack() as stack:
         files = chosen.files if chosen else {}
         opened = {name: stack.enter_context(Video(path, rate=UNSTATED)) for name, path in files.items()}
@@ -42,7 +49,7 @@ def describe_cameras(
         names = [name for name in rig.names if name in opened or any(name in record for record in records)]
         if not names:
             raise _nothing_fits(draft, calibration, found=bool(sources))
-        draft.head["rate"] = draft.tell("rate", _rate(draft, opened, records), "rate")
+        draft.head["rate"] = draft.note_value("rate", _rate(draft, opened, records), "rate")
         rate = max((video.rate for video in opened.values()), default=UNSTATED)
         clocks = _clocks(opened, records, rate)
         records = _on_steps(records, clocks, opened, rate)
@@ -65,8 +72,8 @@ def describe_cameras(
             keypoint_entries(draft, source, record, frame, images, active=record is first)
     if len(names) == 1:
         lifted = names[0] in opened and not first
-        told = "the built-in detector tells how far limbs are" if lifted else ONE_CAMERA
-        draft.note("cameras", "likely" if lifted else "open", f"{names[0]} alone: {told}")
+        consequence = "the built-in detector tells how far limbs are" if lifted else ONE_CAMERA
+        draft.note("cameras", "likely" if lifted else "open", f"{names[0]} alone: {consequence}")
     if missing := [name for name in rig.names if name not in names]:
         draft.note("cameras", "sure", f"{', '.join(missing)} of the calibration: nothing here fits, left out")
     if opened and not first:
@@ -79,7 +86,7 @@ def describe_uncalibrated(draft: Draft, videos: Sequence[Path]) -> None:
     Raises
     ------
     TakeError
-        Videos of one name.
+        Two videos of one name.
     """
     opened: dict[str, Video] = {}
     with ExitStack() as stack:
@@ -91,33 +98,33 @@ def describe_uncalibrated(draft: Draft, videos: Sequence[Path]) -> None:
                     remedy="Name the folder of one recording, with one video of each camera.",
                 )  # fmt: skip
             opened[path.stem] = stack.enter_context(Video(path, rate=UNSTATED))
-        draft.head["rate"] = draft.tell("rate", _rate(draft, opened, []), "rate")
+        draft.head["rate"] = draft.note_value("rate", _rate(draft, opened, []), "rate")
         counts = {name: f"{len(video)} frames" for name, video in opened.items()}
     more = "a tenth more, a tenth nearer" if len(opened) == 1 else "it is found with where the cameras stand"
     why = f"degrees across the longer side; {USUAL:g} is usual for telephones; {more}"
     for path in videos:
-        video = Told(path, "likely", counts[path.stem]) if len(videos) > 1 else Told(path)
-        wide = Told(USUAL, "guess", why)
+        video = Value(path, "likely", counts[path.stem]) if len(videos) > 1 else Value(path)
+        wide = Value(USUAL, "guess", why)
         if (stated := stated_focal_length(path)) is not None:
             whence = f"degrees across the longer side; the file states a lens of {stated:g} mm; {more}"
-            wide = Told(round(field_of_view(stated), 1), "likely", whence)
+            wide = Value(round(field_of_view(stated), 1), "likely", whence)
         draft.cameras[path.stem] = {"video": video, "field_of_view": wide}
     if len(videos) == 1:
         alone = f"{draft.name(videos[0])} alone: a network tells how far limbs are; state height"
         draft.note("camera", "likely", alone)
         return
-    draft.head["up"] = Told("z", "sure", "found with the floor, from the people in view")
+    draft.head["up"] = Value("z", "sure", "found with the floor, from the people in view")
     draft.note("cameras", "likely", f"{len(videos)} videos of one moment: {', '.join(map(draft.name, videos))}")
     found = "none here: kinefit track finds lenses, places and clocks from the people in view"
     draft.note("calibration", "guess", found)
 
 
 def _nothing_fits(draft: Draft, calibration: CalibrationFile, *, found: bool) -> TakeError:
-    """The error of a folder whose files cannot be used with its calibration."""
+    """Make the error of a folder whose files do not fit its calibration."""
     names = ", ".join(calibration.rig.names)
     remedy = f"Let each file, or its folder, bear the name of its camera: {names}."
     if found:  # keypoints are there, but none can be read
-        remedy = "; ".join(note.told for note in draft.notes if note.about.startswith("keypoints"))
+        remedy = "; ".join(note.text for note in draft.notes if note.about.startswith("keypoints"))
     problem = "neither videos nor keypoints can be used with the cameras of the calibration"
     return TakeError(problem, file=draft.folder, place=draft.name(calibration.path), remedy=remedy)
 
@@ -137,7 +144,7 @@ def _clocks(
 def _on_steps(
     records: Sequence[dict[str, Keypoints]], clocks: Mapping[str, NDArray], opened: Mapping[str, Video], rate: float
 ) -> list[dict[str, Keypoints]]:
-    """Keypoints at the same steps of time in all cameras, where the times of the videos differ."""
+    """Keypoints interpolated to common times, if the times of the videos differ."""
     if all(is_even(times, rate) for times in clocks.values()):
         return list(records)
     stop = min(steps_of(times, rate)[1] for times in clocks.values())
@@ -150,20 +157,20 @@ def _on_steps(
 
 
 def _cut(draft: Draft, clocks: Mapping[str, NDArray], rate: float) -> None:
-    """Enter the frames that all streams have, where they differ in length."""
+    """Enter the frames that all streams share, if they differ in length."""
     try:
         common_frames(clocks, rate)
     except ObservationError:
         lengths = sorted({steps_of(times, rate)[1] for times in clocks.values()})
         listed = ", ".join(map(str, lengths))
-        told = Told((0, lengths[0]), "guess", f"streams of {listed} frames, taken as if they began together")
-        draft.head["frames"] = draft.tell("frames", told, "frames")
+        frames = Value((0, lengths[0]), "guess", f"streams of {listed} frames, taken as if they began together")
+        draft.head["frames"] = draft.note_value("frames", frames, "frames")
 
 
 def _frame_of_static(
     draft: Draft, calibration: CalibrationFile, videos: Sequence[Path], keypoints: Sequence[KeypointFile]
-) -> Told | None:
-    """Image frame of a detector's keypoints as a static trial tells it, in which they are best."""
+) -> Value | None:
+    """Image frame of a detector's keypoints from a static trial, in which they are most accurate; None without one."""
     still = [path for path in videos if STATIC.search(draft.name(path))]
     points = [k for k in keypoints if STATIC.search(draft.name(k.path))]
     if not (still and points) or len(still) == len(videos):
@@ -176,13 +183,13 @@ def _frame_of_static(
     found = next((entry["frame"] for _, entry in aside.keypoints if "frame" in entry), None)
     if found is None or found.sure == "guess":
         return None
-    return Told(found.value, "likely", f"as in the static trial, where {found.why}")
+    return Value(found.value, "likely", f"as in the static trial, where {found.why}")
 
 
 def _choose_recording(draft: Draft, paths: Sequence[Path], rig: Rig) -> Trial | None:
-    """Videos that were recorded together, told what else there is.
+    """Choose the videos of one recording; add remarks on all others.
 
-    No static trial, not drawn on by a detector, of most cameras, nearest to the folder, the largest: in this order.
+    In order of priority: no static trial, without a detector's overlay, most cameras, nearest to the folder, largest.
     """
     sizes: dict[Path, object] = {}
     wanted = {camera.name: camera.size for camera in rig}
@@ -215,31 +222,31 @@ def _choose_recording(draft: Draft, paths: Sequence[Path], rig: Rig) -> Trial | 
 
 
 def _pictures(
-    draft: Draft, rig: Rig, names: Sequence[str], opened: dict[str, Video], chosen: Trial | None, turn: Told
+    draft: Draft, rig: Rig, names: Sequence[str], opened: dict[str, Video], chosen: Trial | None, turn: Value
 ) -> dict[str, ImageFrame]:
-    """Enter each camera's video and what became of its picture; the image frames that are not the calibration's."""
+    """Enter each camera's video and image frame; returns the frames that differ from the calibration's."""
     images = {}
     for name in names:
         entry = draft.cameras.setdefault(name, {})
         if name not in opened or chosen is None:
             continue
         video, (sure, why) = opened[name], HOW[chosen.how]
-        entry["video"] = Told(video.path, sure, f"{why}; {len(video)} frames")
+        entry["video"] = Value(video.path, sure, f"{why}; {len(video)} frames")
         draft.note(f"camera {name}", sure, f"{draft.name(video.path)}: found {why}")
         relation = guess_views.picture(rig[name].size, video, turn)
-        for key, told in relation.items():
-            entry[key] = draft.tell(f"camera {name}", told, key)
+        for key, value in relation.items():
+            entry[key] = draft.note_value(f"camera {name}", value, key)
         if relation:
             image = str(relation["image"].value) if "image" in relation else ""
             images[name] = guess_views.image_frame(rig[name].size, video.size, _turn(relation), image)
     return images
 
 
-def _turn(entry: dict[str, Told]) -> int:
+def _turn(entry: dict[str, Value]) -> int:
     return int(str(entry["rotation"].value)) if "rotation" in entry else 0
 
 
-def _rate(draft: Draft, opened: Mapping[str, Video], records: Sequence[Mapping[str, Keypoints]]) -> Told:
+def _rate(draft: Draft, opened: Mapping[str, Video], records: Sequence[Mapping[str, Keypoints]]) -> Value:
     files = {name: video for name, video in opened.items() if video.path.is_file()}
     first = next((record for record in records if record), {})
     tables = [k.rate for k in first.values() if k.rate != UNSTATED]
@@ -249,14 +256,14 @@ def _rate(draft: Draft, opened: Mapping[str, Video], records: Sequence[Mapping[s
     if files:
         rate = max(video.rate for video in files.values())
         if all(is_even(video.times, rate) for video in files.values()):
-            return Told(rate, "sure", "of the videos")
+            return Value(rate, "sure", "of the videos")
         if min(video.rate for video in files.values()) > 0.999 * rate:
-            return Told(rate, "likely", "nominal, of the videos; points are interpolated between their frames")
+            return Value(rate, "likely", "nominal, of the videos; points are interpolated between their frames")
         listed = ", ".join(f"{name} {video.rate:.4g}" for name, video in files.items())
-        return Told(rate, "likely", f"the highest of the videos ({listed} Hz); points are interpolated between frames")
+        return Value(rate, "likely", f"the highest of the videos ({listed} Hz); points are interpolated between frames")
     if tables:
-        return Told(round(min(tables), 3), "likely", "median of the table's own times")
-    return Told(None, "open", "nothing here tells the frames per second: write it")
+        return Value(round(min(tables), 3), "likely", "median of the table's own times")
+    return Value(None, "open", "nothing here states the frames per second: write it")
 
 
 def _world(
@@ -265,21 +272,21 @@ def _world(
     """Enter unit and vertical axis of the calibration's world."""
     person: NDArray | None = None
     spread = calibration.spread
-    size = Told(None, "open", f"the cameras would stand {2 * spread:.3g} m apart, no keypoints tell more")
-    if _LABORATORY[0] < spread < _LABORATORY[1]:
-        size = Told("m", "likely", f"the cameras stand about {2 * spread:.2g} m apart")
+    size = Value(None, "open", f"the cameras would stand {2 * spread:.3g} m apart, no keypoints show a person's size")
+    if _MIN_SPREAD < spread < _MAX_SPREAD:
+        size = Value("m", "likely", f"the cameras stand about {2 * spread:.2g} m apart")
     if len(records) > 1:
         x, _ = guess_views.meet(calibration.rig, records, images)
         points = next(iter(records.values())).names
         size, person = guess_views.guess_unit(x, points), guess_views.up_of_person(x, points)
-    unit = Told(calibration.unit, "guess", "so the cameras stand some metres apart")
+    unit = Value(calibration.unit, "guess", "so the cameras stand some metres apart")
     if unit.value == "auto" and size.value not in (None, "m"):
         unit = size
     if unit.value != "auto" and draft.calibration:
-        draft.calibration[1]["unit"] = draft.tell("calibration", unit, "unit")
+        draft.calibration[1]["unit"] = draft.note_value("calibration", unit, "unit")
     else:
-        told = "as Qualisys defines it" if calibration.is_qualisys else "metres"
-        draft.note("calibration", size.sure, f"unit: {told}{'' if size.value else '?'}: {size.why}")
+        stated = "as Qualisys defines it" if calibration.is_qualisys else "metres"
+        draft.note("calibration", size.sure, f"unit: {stated}{'' if size.value else '?'}: {size.why}")
     turns = {name: _turn(entry) for name, entry in draft.cameras.items()}
     up = guess_views.guess_up(calibration.rig, person, turns, qualisys=calibration.is_qualisys)
-    draft.head["up"] = draft.tell("up", up, "up")
+    draft.head["up"] = draft.note_value("up", up, "up")

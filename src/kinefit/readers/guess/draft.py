@@ -1,4 +1,4 @@
-"""A take file in the making: what is known so far, how sure it is, and its text with a comment on every guess."""
+"""A draft of a take file: its values with their confidence, and its text with a comment on every guess."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from pathlib import Path
 
 from kinefit.readers.guess.files import CalibrationFile
 
-SURETIES = ("sure", "likely", "guess", "open")
-"""From "told by the files themselves" to "to be decided by the user"."""
+CONFIDENCE_LEVELS = ("sure", "likely", "guess", "open")
+"""From "stated by the files" to "the user decides"."""
 
-_WIDTH = 40  # columns before a comment
+_COMMENT_COLUMN = 40
 _HEAD = """\
 # A first take file, made by kinefit init from what lies in the folder.
 # A comment begins with how sure its line is: sure, likely, guess, or open (for you to decide). Then:
-#   kinefit check THIS_FILE      tells whether cameras, keypoints and calibration agree
+#   kinefit check THIS_FILE      checks whether cameras, keypoints and calibration agree
 #   kinefit track THIS_FILE      fits the body
 """
 
 
 @dataclass(frozen=True)
-class Told:
-    """A value, how sure it is (of `SURETIES`), and why; no value: to be decided by the user."""
+class Value:
+    """A value of a take file with its confidence (of `CONFIDENCE_LEVELS`) and reason; None: the user decides."""
 
     value: object
     sure: str = "sure"
@@ -33,73 +33,73 @@ class Told:
 
 @dataclass(frozen=True)
 class Note:
-    """One thing that was guessed.
+    """A remark on one guess.
 
     Parameters
     ----------
     about : "calibration", "camera cam01", "up" ...
-    sure : one of `SURETIES`
-    told : what, and why.
+    sure : one of `CONFIDENCE_LEVELS`
+    text : what was guessed, and why.
     """
 
     about: str
     sure: str
-    told: str
+    text: str
 
 
-Entry = Mapping[str, Told]
+Entry = Mapping[str, Value]
 
 
 @dataclass
 class Draft:
-    """What a take file shall say.
+    """The content of a take file.
 
     Parameters
     ----------
-    folder, beside : of the recording; of the take file.
+    folder, beside : folder of the recording; folder of the take file.
     head : keys of [take]
     calibration : the file, and keys of [calibration]
-    others : calibrations that were not taken.
+    others : calibrations that were not chosen.
     cameras : name -> keys of its [[camera]]
-    keypoints, depth, markers, surface_points : (whether in use or a comment, keys) of each table
+    keypoints, depth, markers, surface_points : (True if in use, False if a comment; keys) of each table
     """
 
     folder: Path
     beside: Path
     notes: list[Note] = field(default_factory=list)
-    head: dict[str, Told] = field(default_factory=dict)
-    calibration: tuple[CalibrationFile, dict[str, Told]] | None = None
+    head: dict[str, Value] = field(default_factory=dict)
+    calibration: tuple[CalibrationFile, dict[str, Value]] | None = None
     others: list[Path] = field(default_factory=list)
-    cameras: dict[str, dict[str, Told]] = field(default_factory=dict)
+    cameras: dict[str, dict[str, Value]] = field(default_factory=dict)
     keypoints: list[tuple[bool, Entry]] = field(default_factory=list)
     depth: list[tuple[bool, Entry]] = field(default_factory=list)
     markers: list[tuple[bool, Entry]] = field(default_factory=list)
     surface_points: list[tuple[bool, Entry]] = field(default_factory=list)
     comments: list[str] = field(default_factory=list)
 
-    def note(self, about: str, sure: str, told: str) -> None:
-        """Remember something for the screen."""
-        self.notes.append(Note(about, sure, told))
+    def note(self, about: str, sure: str, text: str) -> None:
+        """Add a remark for the screen."""
+        self.notes.append(Note(about, sure, text))
 
-    def tell(self, about: str, told: Told, key: str) -> Told:
-        """Remember a value for the screen too."""
-        self.note(about, told.sure, f"{key} = {_value(told.value, self)}: {told.why}" if told.value else told.why)
-        return told
+    def note_value(self, about: str, value: Value, key: str) -> Value:
+        """Add a remark on a value for the screen; returns the value."""
+        self.note(about, value.sure, f"{key} = {_value(value.value, self)}: {value.why}" if value.value else value.why)
+        return value
 
     def name(self, path: Path) -> str:
-        """A path as the user knows it: from the folder on."""
+        """A path relative to the recording's folder, for messages."""
         return _relative(path, self.folder)
 
     def text(self) -> str:
-        """The take file."""
-        head = {"name": Told(self.folder.name or "take"), **self.head}
-        head.setdefault("body", Told("humanoid", "sure", 'a whole person; "humanoid_hands" has fingers, too'))
+        """The text of the take file."""
+        head = {"name": Value(self.folder.name or "take"), **self.head}
+        head.setdefault("body", Value("humanoid", "sure", 'a whole person; "humanoid_hands" has fingers, too'))
         first = _table("[take]", head, self) + "".join(f"# {comment}\n" for comment in self.comments)
         parts = [_HEAD, first]
         if self.calibration:
             others = "".join(f"# file = {_value(path, self)}\n" for path in self.others)
             parts.append(_table("[calibration]", self.calibration[1], self) + others)
-        parts += [_table("[[camera]]", {"name": Told(name), **keys}, self) for name, keys in self.cameras.items()]
+        parts += [_table("[[camera]]", {"name": Value(name), **keys}, self) for name, keys in self.cameras.items()]
         parts += [_table("[[keypoints]]", keys, self, active) for active, keys in self.keypoints]
         parts += [_table("[[depth]]", keys, self, active) for active, keys in self.depth]
         parts += [_table("[[markers]]", keys, self, active) for active, keys in self.markers]
@@ -109,9 +109,9 @@ class Draft:
 
 def _table(title: str, keys: Entry, draft: Draft, active: bool = True) -> str:
     lines = [title]
-    for key, told in keys.items():
-        line = f"# {key} = " if told.value is None else f"{key} = {_value(told.value, draft)}"
-        lines.append(f"{line:<{_WIDTH - 2}}  # {told.sure}: {told.why}" if told.why else line)
+    for key, entry in keys.items():
+        line = f"# {key} = " if entry.value is None else f"{key} = {_value(entry.value, draft)}"
+        lines.append(f"{line:<{_COMMENT_COLUMN - 2}}  # {entry.sure}: {entry.why}" if entry.why else line)
     return "".join(f"{'' if active else '# '}{line}\n" for line in lines)
 
 
@@ -124,7 +124,7 @@ def _value(value: object, draft: Draft) -> str:
 
 
 def _relative(path: Path, start: Path) -> str:
-    """Path from a folder on, with slashes; whole where the two have nothing in common."""
+    """Path relative to a folder, with slashes; absolute if the two have no folder in common."""
     try:
         shared = os.path.commonpath([path, start])
     except ValueError:  # another drive

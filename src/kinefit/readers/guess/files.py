@@ -1,4 +1,4 @@
-"""What lies in a folder: calibrations, videos, keypoints, markers; each tried, none changed."""
+"""Find the calibrations, videos, keypoints and markers in a folder, by trying to read them."""
 
 from __future__ import annotations
 
@@ -33,29 +33,30 @@ MARKERS = {".c3d", ".trc"}
 OF_CALIBRATION = re.compile(
     r"(?<![a-z])(?:(?:intrinsic|extrinsic|charuco|checker|chess|calib)\w*|board|wand|int|ext)(?![a-z])", re.IGNORECASE
 )
-"""Words in a path that tell recordings made to calibrate cameras."""
+"""Words in the path of a recording for calibration."""
 STATIC = re.compile(r"(?<![a-z])(?:static|neutral|[ta][-_ ]?pose)", re.IGNORECASE)
-"""Words in a path that tell a trial in which the person stands still."""
+"""Words in the path of a static trial."""
 
 DRAWN_ON = re.compile(r"(?<![a-z])(?:pose|overlay|labell?ed|annotated|results?|debug)(?![a-z])", re.IGNORECASE)
-"""Words in a path that tell videos which a detector has drawn on."""
+"""Words in the path of a video with a detector's overlay."""
 
-_RESULTS = ("-kinefit", "-detect")  # folders that kinefit leaves
-_DEEPEST = 6  # folders below the given one
-_MANY = 12  # json files of numbered names in one folder are a detector's, not a camera's each
+_RESULT_ENDINGS = ("-kinefit", "-detect")  # of the folders that kinefit writes
+_MAX_DEPTH = 6  # folders below the given one
+_MIN_SEQUENCE = 12  # numbered json files in one folder are a detector's frames, fewer may be cameras
 _JSON_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.I)
-_CALISCOPE = {"sync_index", "port", "point_id", "img_loc_x", "img_loc_y"}
-_CALLED = re.compile(r"calib|intrin|extrin|cam", re.IGNORECASE)  # a broken file of another name may be anything
+_CALISCOPE_COLUMNS = {"sync_index", "port", "point_id", "img_loc_x", "img_loc_y"}
+_CALIBRATION_NAME = re.compile(r"calib|intrin|extrin|cam", re.IGNORECASE)  # else a broken file may be anything
 _UNITS = ("mm", "cm", "inch", "dm")
 _LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
-_BLACK, _GREY = 10, 0.1  # how far from black or white a mask's pixels are, compressed; share of others in photographs
+_MASK_TOLERANCE = 10  # grey levels of a compressed mask's pixels from black or white
+_MIN_GREY_SHARE = 0.1  # of the other pixels in a photograph
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationFile:
-    """A calibration of several cameras, and the unit of length it was read with.
+    """A calibration of several cameras, and the unit of length with which it was read.
 
-    `sized`: its cameras whose image size it does not state, so that it is their videos'.
+    `sized`: cameras whose image size is their video's, as the file states none.
     """
 
     path: Path
@@ -65,23 +66,23 @@ class CalibrationFile:
 
     @property
     def spread(self) -> float:
-        """[m] median distance of its cameras from their middle."""
+        """[m] median distance of its cameras from their centroid."""
         return _spread(self.rig)
 
     @property
     def is_refined(self) -> bool:
-        """Whether its name says so."""
+        """Whether its name contains "refined" or a similar word."""
         return any(word in self.path.name.lower() for word in ("refined", "adjusted", "optimi"))
 
     @property
     def is_qualisys(self) -> bool:
-        """Whether it is Qualisys', whose worlds are z up."""
+        """Whether it is a Qualisys file, whose world is z up."""
         return self.path.is_file() and "<calibration" in self.path.read_text("utf-8", errors="replace")[:1000]
 
 
 @dataclass(frozen=True)
 class KeypointFile:
-    """Keypoints of one camera (of all cameras: caliscope's table), with the number of frames and points in each."""
+    """Keypoints of one camera (of all cameras in caliscope's table), with the number of frames and of points."""
 
     path: Path
     format: str
@@ -90,17 +91,18 @@ class KeypointFile:
 
 
 def list_files(folder: Path) -> list[Path]:
-    """Files below a folder, in natural order; hidden ones and results of kinefit left out."""
+    """Files below a folder, in natural order, except hidden ones and results of kinefit."""
     found: list[Path] = []
     for parent, folders, names in os.walk(folder, followlinks=True):
         depth = len(Path(parent).relative_to(folder).parts)
-        folders[:] = [n for n in folders if not n.startswith(".") and not n.endswith(_RESULTS) and depth < _DEEPEST]
+        searched = folders if depth < _MAX_DEPTH else []
+        folders[:] = [name for name in searched if not name.startswith(".") and not name.endswith(_RESULT_ENDINGS)]
         found += [Path(parent) / name for name in names if not name.startswith(".")]
     return sorted(found, key=lambda path: natural(str(path)))
 
 
 def find_recordings(files: list[Path]) -> list[Path]:
-    """Recordings of ROS 2 among files: those in MCAP, the largest first; of a kind that is not read, the error says so.
+    """MCAP recordings of ROS 2 among files, the largest first.
 
     Raises
     ------
@@ -121,7 +123,7 @@ def find_calibrations(
 
     Parameters
     ----------
-    videos : whose size cameras have of which none is stated, by their names below `folder`.
+    videos : that give the image size of cameras without one, matched by their names below `folder`.
 
     Returns
     -------
@@ -131,7 +133,7 @@ def find_calibrations(
     singles: list[Path] = []
     faults: list[KinefitError] = []
     sizes = partial(_video_size, sorted(videos, key=lambda path: bool(OF_CALIBRATION.search(path.name))), folder)
-    detectors = {folder for folder, group in _by_folder(files) if sum(map(_numbered, group)) > _MANY}
+    detectors = {folder for folder, group in _by_folder(files) if sum(map(_numbered, group)) > _MIN_SEQUENCE}
     for path in files:
         known = path.name.lower().endswith(CALIBRATIONS) or _is_xml_text(path)
         if not known or (path.parent in detectors and _numbered(path)):
@@ -161,7 +163,7 @@ def _by_folder(files: list[Path]) -> list[tuple[Path, list[Path]]]:
 
 
 def _folders(files: list[Path], singles: list[Path]) -> list[Path]:
-    """Folders that are a calibration as a whole: COLMAP's, intrinsics and extrinsics, one file or folder a camera."""
+    """Folders that form one calibration: COLMAP, intrinsics and extrinsics, one file or folder for each camera."""
     out = []
     for folder, group in _by_folder(files):
         names = {path.name for path in group}
@@ -184,7 +186,7 @@ def _is_xml_text(path: Path) -> bool:
 
 
 def _video_size(videos: Sequence[Path], folder: Path | None, camera: str) -> tuple[int, int] | None:
-    """(width, height) [px] of the first video whose name, or number, is a camera's; None without."""
+    """(width, height) [px] of the first video with a camera's name or number; None if there is none."""
     for path in videos:
         if folder is not None and camera_of(path, folder, [camera]):
             try:
@@ -198,7 +200,7 @@ def _video_size(videos: Sequence[Path], folder: Path | None, camera: str) -> tup
 def _try(
     path: Path, faults: list[KinefitError], video_size: Callable[[str], tuple[int, int] | None]
 ) -> CalibrationFile | None:
-    """Read a calibration; without a unit that can be, in the one that puts the cameras most like a laboratory's."""
+    """Read a calibration; if it cannot be metres, in the unit with the most plausible camera distances."""
     sized: dict[str, tuple[int, int] | None] = {}
 
     def size_of(camera: str) -> tuple[int, int] | None:
@@ -208,42 +210,42 @@ def _try(
         return CalibrationFile(path, read_calibration(path, image_size=size_of), sized=tuple(sized))
     except CalibrationError as error:
         if "cannot be metres" not in error.problem:
-            if "no camera in it" not in error.problem and (error.place or _CALLED.search(path.name)):
+            if "no camera in it" not in error.problem and (error.place or _CALIBRATION_NAME.search(path.name)):
                 faults.append(error)
             return None
     except (KinefitError, RecursionError):
         return None
     rigs = {unit: read_calibration(path, unit=unit, image_size=size_of) for unit in _UNITS}
-    unit = min(rigs, key=lambda u: abs(np.log(_spread(rigs[u]) / 3.0)))  # [m] usual between cameras and what they see
+    unit = min(rigs, key=lambda u: abs(np.log(_spread(rigs[u]) / 3.0)))  # 3 m from the scene is typical
     return CalibrationFile(path, rigs[unit], unit, tuple(sized))
 
 
 def _spread(rig: Rig) -> float:
-    """[m] median distance of the cameras from their middle."""
+    """[m] median distance of the cameras from their centroid."""
     centres = np.array([camera.centre_world for camera in rig])
     return float(np.median(np.linalg.norm(centres - centres.mean(0), axis=1))) or 1e-9
 
 
 def find_videos(files: list[Path], folder: Path) -> list[Path]:
-    """Files that are called videos; of photographs that are numbered the folder, or a pattern where it has several."""
+    """Video files, and numbered photographs as a folder, or as patterns if it has several series."""
     films = [film for parent, group in _by_folder(files) for film in _films(group, parent, alone=parent != folder)]
     return [path for path in files if path.suffix.lower() in VIDEOS] + films
 
 
 def _films(group: list[Path], folder: Path, *, alone: bool) -> list[Path]:
-    """Cameras whose images lie in a folder: many photographs each, of names that differ by their last number."""
+    """Image series in a folder: many photographs whose names differ by the last number."""
     named: dict[str, list[Path]] = {}
     for path in group:
         if path.suffix.lower() in ENDINGS:
             named.setdefault(_LAST_NUMBER.sub("*", path.name), []).append(path)
-    films = [pattern for pattern, images in named.items() if len(images) >= _MANY and _is_film(images[0])]
+    films = [pattern for pattern, images in named.items() if len(images) >= _MIN_SEQUENCE and _is_film(images[0])]
     if alone and films and len(named) == 1:
         return [folder]
     return [folder / pattern for pattern in films if _is_whole(folder / pattern)]
 
 
 def _is_whole(pattern: Path) -> bool:
-    """Whether the images of a pattern can be a video: none is missing."""
+    """Whether the images of a pattern form a video without a gap."""
     try:
         ImageFolder(pattern, 1.0)
     except KinefitError:
@@ -254,15 +256,15 @@ def _is_whole(pattern: Path) -> bool:
 def _is_film(image: Path) -> bool:
     """Whether an image is a photograph."""
     try:
-        picture = read_picture(image, cv2.IMREAD_UNCHANGED)
+        pixels = read_picture(image, cv2.IMREAD_UNCHANGED)
     except FileError:
         return False
-    return picture.dtype == np.uint8 and (picture.ndim == 3 or _is_photograph(picture))
+    return pixels.dtype == np.uint8 and (pixels.ndim == 3 or _is_photograph(pixels))
 
 
 def _is_photograph(grey: NDArray) -> bool:
-    """Whether a grey image is more than a mask, whose pixels are all but black or white."""
-    return float(np.mean((grey > _BLACK) & (grey < 255 - _BLACK))) > _GREY
+    """Whether a grey image is no mask, whose pixels are nearly black or white."""
+    return float(np.mean((grey > _MASK_TOLERANCE) & (grey < 255 - _MASK_TOLERANCE))) > _MIN_GREY_SHARE
 
 
 def find_markers(files: list[Path]) -> list[Path]:
@@ -271,7 +273,7 @@ def find_markers(files: list[Path]) -> list[Path]:
 
 
 def find_keypoints(files: list[Path]) -> tuple[list[KeypointFile], list[str]]:
-    """Keypoints of every format that a take knows; and remarks on what looks like keypoints but is none of these."""
+    """Keypoints of all formats of a take file; and remarks on similar files of unknown formats."""
     found: list[KeypointFile] = []
     remarks: list[str] = []
     for folder, group in _by_folder(files):
@@ -285,29 +287,29 @@ def find_keypoints(files: list[Path]) -> tuple[list[KeypointFile], list[str]]:
         if shape is not None and len(shape) == 3 and shape[1:] in ((33, 3), (75, 3)):
             found.append(KeypointFile(path, "mediapipe", shape[0], shape[1]))
         elif shape is not None and len(shape) >= 3 and shape[-1] in (2, 3):
-            told = "landmarks are read as (frames, 33, 3), or (frames, 75, 3) with hands"
-            remarks.append(f"{path.name}: an array of shape {shape}; {told}")
+            known = "landmarks are read as (frames, 33, 3), or (frames, 75, 3) with hands"
+            remarks.append(f"{path.name}: an array of shape {shape}; {known}")
         if suffix == ".csv" and (frames := _caliscope_frames(path)):
             found.append(KeypointFile(path, "caliscope", frames, 33))
     return found, remarks
 
 
 def _openpose_points(numbered: list[Path]) -> int | None:
-    """Points of a person in json files of numbered names; 0: nobody in them; None: no files of OpenPose."""
-    there = False
+    """Number of points of a person in numbered json files; 0 without people, None if not OpenPose's."""
+    is_openpose = False
     for path in numbered:
         try:
             people = decode_openpose(path.read_bytes()).people
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, OSError):
-            if not there:
+            if not is_openpose:
                 return None
             continue
-        there = True
+        is_openpose = True
         if people:
             person = people[0]
             hands = person.hand_left_keypoints_2d or person.hand_right_keypoints_2d
             return len(person.with_hands() if hands else person.pose_keypoints_2d) // 3
-    return 0 if there else None
+    return 0 if is_openpose else None
 
 
 def _array_shape(path: Path) -> tuple[int, ...] | None:
@@ -316,11 +318,11 @@ def _array_shape(path: Path) -> tuple[int, ...] | None:
 
 
 def _caliscope_frames(path: Path) -> int:
-    """Frames of a table of caliscope that holds points of a body, not of a board; 0 for any other table."""
+    """Number of frames of a caliscope table with points of a body, not of a board; 0 for any other table."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
-            if not set(reader.fieldnames or ()) >= _CALISCOPE:
+            if not set(reader.fieldnames or ()) >= _CALISCOPE_COLUMNS:
                 return 0
             body = [int(row["sync_index"]) for row in reader if not row.get("obj_loc_x")]
     except (OSError, ValueError, TypeError, UnicodeDecodeError, csv.Error):

@@ -1,4 +1,4 @@
-"""A first take file from what lies in a folder: what was guessed, and how sure."""
+"""Guess a take file from the files in a folder, with the confidence of every guess."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kinefit.errors import CalibrationError, KinefitError, TakeError, command
 from kinefit.geometry.camera import Rig
 from kinefit.readers.guess import files as guess_files
 from kinefit.readers.guess.cameras import describe_cameras, describe_uncalibrated
-from kinefit.readers.guess.draft import Draft, Entry, Note, Told
+from kinefit.readers.guess.draft import Draft, Entry, Note, Value
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile
 from kinefit.readers.guess.names import trials
 from kinefit.readers.markers import read_markers
@@ -27,35 +27,35 @@ _CALIBRATE = (
 
 
 OPEN_HEIGHT = "height = 1.75  # open: the stature in metres, where you know it"
-"""The line of a take file that waits for the person's height, as a comment."""
+"""The commented line of a take file for the person's height."""
 
 
 @dataclass(frozen=True)
 class Guess:
-    """A take file that is not yet written: its text (TOML), and what was guessed, line by line."""
+    """The text of a take file (TOML), and a note on every guess."""
 
     text: str
     notes: tuple[Note, ...]
 
 
 def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | None = None) -> Guess:
-    """Make the text of a take file from what lies in a folder; writes nothing.
+    """Make the text of a take file from the files in a folder, without writing it.
 
     Parameters
     ----------
     folder : path
-        Searched with the folders below it; for a calibration the one above too.
+        Searched with its subfolders; for a calibration also the parent folder.
     beside : path, optional
-        Folder in which the take file will lie, to which its paths are relative. Default: `folder`.
+        Folder of the future take file, to which its paths are relative. Default: `folder`.
 
     Raises
     ------
     TakeError
-        No such folder; nothing in it that a take is made of; files that fit no camera of the calibration.
+        No such folder; no files of a take in it; files that fit no camera of the calibration.
     CalibrationError
         Videos or keypoints without a calibration.
     FileError
-        A video or a recording of ROS 2 that is damaged, or of a kind that is not read.
+        A video or a recording of ROS 2 that is damaged, or of an unknown kind.
     """
     folder = Path(folder).absolute()
     if folder.is_file():
@@ -84,8 +84,8 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
         describe_recordings(draft, recordings, alone=not (videos or keypoints or markers))
     _describe_markers(draft, markers)
     for path in [file for file in files if file.name == "trajectories.csv"] if draft.cameras else []:
-        told = Told(path, "likely", "a surface that kinefit surface followed; it needs a [start] or another sensor")
-        draft.surface_points.append((not draft.surface_points, {"file": draft.tell("surface", told, "file")}))
+        file = Value(path, "likely", "a surface that kinefit surface followed; it needs a [start] or another sensor")
+        draft.surface_points.append((not draft.surface_points, {"file": draft.note_value("surface", file, "file")}))
     draft.comments.append(OPEN_HEIGHT)
     return Guess(draft.text(), tuple(draft.notes))
 
@@ -93,7 +93,7 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
 def _choose_calibration(
     draft: Draft, files: list[Path], seen: Sequence[Path], markers: bool
 ) -> CalibrationFile | None:
-    """The calibration that most files fit; from the folder above where there is none here."""
+    """The calibration that most files fit; from the parent folder if there is none here; None without one."""
     videos = guess_files.find_videos(files, draft.folder)
     found, singles, faults = guess_files.find_calibrations(files, videos, draft.folder)
     if not found:
@@ -132,24 +132,24 @@ def _choose_calibration(
             else "it lies nearer"
         )  # fmt: skip
         why += f"; taken before {', '.join(map(draft.name, draft.others))}, since {reason}"
-    told = Told(best.path, "likely" if others else "sure", why)
-    draft.note("calibration", told.sure, f"{draft.name(best.path)}: {why}")
+    file = Value(best.path, "likely" if others else "sure", why)
+    draft.note("calibration", file.sure, f"{draft.name(best.path)}: {why}")
     if best.sized:
         draft.note("calibration", "likely", f"no size of the images of {', '.join(best.sized)}: their videos' is taken")
-    draft.calibration = best, {"file": told}
+    draft.calibration = best, {"file": file}
     return best
 
 
 def _of_one_moment(draft: Draft, videos: Sequence[Path]) -> list[Path]:
-    """The videos that lie nearest to the folder, without static trials and what a detector drew."""
-    usual = [v for v in videos if not any(p.search(draft.name(v)) for p in (STATIC, DRAWN_ON, OF_CALIBRATION))]
-    usual = usual or list(videos)
-    depth = min(draft.name(path).count("/") for path in usual)
-    return [path for path in usual if draft.name(path).count("/") == depth]
+    """The videos nearest to the folder, without static trials, calibrations and overlays of a detector."""
+    moving = [v for v in videos if not any(p.search(draft.name(v)) for p in (STATIC, DRAWN_ON, OF_CALIBRATION))]
+    moving = moving or list(videos)
+    depth = min(draft.name(path).count("/") for path in moving)
+    return [path for path in moving if draft.name(path).count("/") == depth]
 
 
 def _above(folder: Path) -> list[Path]:
-    """Files beside a folder, and in folders there that are called after a calibration."""
+    """Files in the parent of a folder, and in its subfolders with "calib" in their name."""
     out: list[Path] = []
     for path in sorted(folder.parent.iterdir()):
         inside = sorted(path.iterdir()) if path.is_dir() and "calib" in path.name.lower() else [path]
@@ -158,7 +158,7 @@ def _above(folder: Path) -> list[Path]:
 
 
 def _describe_markers(draft: Draft, files: Sequence[Path]) -> None:
-    """Enter marker files: in use where there is nothing else, else as comments (they may be another tool's results)."""
+    """Enter marker files: in use without cameras, else as comments (they may be another program's results)."""
     faults: list[KinefitError] = []
     records = {}
     for path in files:
@@ -174,14 +174,14 @@ def _describe_markers(draft: Draft, files: Sequence[Path]) -> None:
     moving = [path for path in records if not STATIC.search(path.name)]
     used = next(iter(moving or records), None) if not draft.cameras else None
     for path, record in records.items():
-        told = Told(path, "sure", f"{len(record.names)} markers, {len(record.positions)} frames, {record.rate:g} Hz")
-        draft.markers.append((path == used, {"file": told}))
+        file = Value(path, "sure", f"{len(record.names)} markers, {len(record.positions)} frames, {record.rate:g} Hz")
+        draft.markers.append((path == used, {"file": file}))
     if used is not None:
         record = records[used]
         extent = np.nanmedian(np.nanmax(record.positions, 1) - np.nanmin(record.positions, 1), axis=0)
-        up = Told("xyz"[int(np.nanargmax(extent))], "likely", f"markers spread {np.nanmax(extent):.2f} m along it")
-        up = Told(record.up, "sure", "the file says so") if record.up else up
-        draft.head = {"rate": Told(record.rate, "sure", "of the markers"), "up": draft.tell("up", up, "up")}
+        up = Value("xyz"[int(np.nanargmax(extent))], "likely", f"markers spread {np.nanmax(extent):.2f} m along it")
+        up = Value(record.up, "sure", "the file says so") if record.up else up
+        draft.head = {"rate": Value(record.rate, "sure", "of the markers"), "up": draft.note_value("up", up, "up")}
         draft.note("markers", "sure" if len(records) == 1 else "guess", f"{draft.name(used)}: taken")
         draft.note("markers", "sure", "kinefit.fit_markers fits a body to them; kinefit track needs cameras")
     left = len(records) - (used is not None)
@@ -190,27 +190,27 @@ def _describe_markers(draft: Draft, files: Sequence[Path]) -> None:
         draft.note("markers", "guess", f"{left} files stand as comments: {reason} other recordings".replace("  ", " "))
 
 
-_ALIGNED = "aligned"  # in the name of a topic with the same depth once more, as another camera would see it
+_ALIGNED = "aligned"  # in the name of a topic with the same depth, warped to another camera
 
 
 def describe_recordings(draft: Draft, paths: Sequence[Path], *, alone: bool) -> None:
-    """Enter the first of some recordings, topic by topic; beside other files they are only told of.
+    """Enter the first of some recordings, topic by topic; if other files are there, only add remarks.
 
     Raises
     ------
     TakeError
-        A recording that shows nothing.
+        A recording without images.
     FileError
-        A damaged one; the extra `ros` is not installed.
+        A damaged recording; the extra `ros` is not installed.
     """
     path, *others = paths
     if not alone:
-        told = "left out beside the other files; alone in a folder, kinefit init enters its topics"
-        for one in paths:
-            draft.note("recording", "open", f"{draft.name(one)}: {told}")
+        text = "left out beside the other files; alone in a folder, kinefit init enters its topics"
+        for recording in paths:
+            draft.note("recording", "open", f"{draft.name(recording)}: {text}")
         return
-    for one in others:
-        draft.note("recording", "open", f"{draft.name(one)}: left out, {draft.name(path)} is larger")
+    for other in others:
+        draft.note("recording", "open", f"{draft.name(other)}: left out, {draft.name(path)} is larger")
     topics = shown(path)
     if not topics:
         remedy = "Record depth (16UC1, 32FC1) or colour images of the cameras."
@@ -218,29 +218,29 @@ def describe_recordings(draft: Draft, paths: Sequence[Path], *, alone: bool) -> 
     depth, colour = [t for t in topics if t.deep], [t for t in topics if not t.deep]
     rig = _calibration(draft, path)
     first = (depth or colour)[0]
-    draft.head["rate"] = draft.tell("rate", Told(first.rate, "sure", f"of {first.topic}"), "rate")
-    draft.head["up"] = draft.tell("up", _up(rig), "up")
+    draft.head["rate"] = draft.note_value("rate", Value(first.rate, "sure", f"of {first.topic}"), "rate")
+    draft.head["up"] = draft.note_value("up", _up(rig), "up")
     _depth(draft, path, depth, rig)
     _colour(draft, path, colour, rig, beside_depth=bool(depth))
 
 
 def _calibration(draft: Draft, path: Path) -> Rig | None:
-    """Where the cameras stand, as the recording tells; None where it does not."""
+    """The cameras' rig from the recording; None if it has none that can be used."""
     try:
         rig = mcap_rig(path)
     except CalibrationError as error:
         draft.note("calibration", "open", f"{error.problem}. {error.remedy or ''}".strip())
         return None
     why = f"{len(rig)} cameras: {', '.join(rig.names)}"
-    draft.calibration = CalibrationFile(path, rig), {"file": Told(path, "sure", why)}
+    draft.calibration = CalibrationFile(path, rig), {"file": Value(path, "sure", why)}
     draft.note("calibration", "sure", f"{draft.name(path)}: {why}")
     return rig
 
 
-def _up(rig: Rig | None) -> Told:
+def _up(rig: Rig | None) -> Value:
     if rig is not None and len(rig) > 1:
-        return Told("z", "likely", "worlds of ROS are z up (REP 103)")
-    return Told("-y", "guess", "the world is the camera's own, taken as held level: y points down")
+        return Value("z", "likely", "worlds of ROS are z up (REP 103)")
+    return Value("-y", "guess", "the world is the camera's own, taken as held level: y points down")
 
 
 def _depth(draft: Draft, path: Path, topics: Sequence[Shown], rig: Rig | None) -> None:
@@ -248,28 +248,28 @@ def _depth(draft: Draft, path: Path, topics: Sequence[Shown], rig: Rig | None) -
     placed = [t for t in plain if rig is not None and t.camera in rig.names]
     used = placed or plain[:1]
     for t in topics:
-        told = f"{t.frames} images, {t.rate:g} Hz"
-        entry: dict[str, Told] = {"name": Told(t.name), "file": Told(path), "topic": Told(t.topic, "sure", told)}
+        count = f"{t.frames} images, {t.rate:g} Hz"
+        entry: dict[str, Value] = {"name": Value(t.name), "file": Value(path), "topic": Value(t.topic, "sure", count)}
         if t.camera is None:
-            entry["intrinsics"] = Told(None, "open", "[fx, fy, cx, cy] in pixels: no camera_info lies beside the topic")
+            entry["intrinsics"] = Value(None, "open", "[fx, fy, cx, cy] in pixels: the topic has no camera_info")
         draft.depth.append((t in used, entry))
         why = "" if t in used else (
-            ": a comment, the same once more" if t not in plain else ": a comment, nothing tells where it stands"
+            ": a comment, the same once more" if t not in plain else ": a comment, its pose is unknown"
         )  # fmt: skip
-        draft.note(f"depth {t.name}", "sure" if t in used else "guess", f"{t.topic}, {told}{why}")
+        draft.note(f"depth {t.name}", "sure" if t in used else "guess", f"{t.topic}, {count}{why}")
 
 
 def _colour(draft: Draft, path: Path, topics: Sequence[Shown], rig: Rig | None, *, beside_depth: bool) -> None:
     for t in topics:
         if rig is None or t.camera not in rig.names:
-            draft.note("camera", "open", f"{t.topic}: left out, nothing tells its lens and where it stands")
+            draft.note("camera", "open", f"{t.topic}: left out, its lens and pose are unknown")
             continue
         draft.cameras[t.name] = {
-            "video": Told(path), "topic": Told(t.topic, "sure", f"{t.frames} images, {t.rate:g} Hz"),
+            "video": Value(path), "topic": Value(t.topic, "sure", f"{t.frames} images, {t.rate:g} Hz"),
         }  # fmt: skip
         draft.note(f"camera {t.name}", "sure", t.topic)
         if beside_depth:
-            entry: Entry = {"camera": Told(t.name), "format": Told("detect", "open", "keypoints beside the depth")}
+            entry: Entry = {"camera": Value(t.name), "format": Value("detect", "open", "keypoints beside the depth")}
             draft.keypoints.append((False, entry))
     if draft.cameras and not beside_depth:
         draft.note("keypoints", "sure", "none here: kinefit track runs the built-in detector on the videos")

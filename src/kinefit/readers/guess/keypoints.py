@@ -1,4 +1,4 @@
-"""Keypoints of a take to be: which belong to the videos, their set, their image frame."""
+"""Guess the keypoints of a take: which belong to the videos, their set, their image frame."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from kinefit.errors import KinefitError, ObservationError
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.observations import Keypoints
 from kinefit.readers.guess import views as guess_views
-from kinefit.readers.guess.draft import Draft, Told
+from kinefit.readers.guess.draft import Draft, Value
 from kinefit.readers.guess.files import STATIC, KeypointFile
 from kinefit.readers.guess.names import Trial, camera_number, common_words, trials
 from kinefit.readers.keypoint_sets import HAND_POINTS, KEYPOINT_SETS, OPENPOSE_HANDS, SETS_WITH_HANDS
@@ -16,16 +16,16 @@ from kinefit.readers.keypoints import read_keypoints
 
 Source = dict[str, KeypointFile]  # camera -> its file, of one detector
 
-_SETS = {len(KEYPOINT_SETS[name]): name for name in sorted(KEYPOINT_SETS)}  # of 25 points BODY_25B
-_EITHER = (25, 25 + 2 * HAND_POINTS)  # points of BODY_25 and BODY_25B, without hands and with them
-_FORMATS = ("openpose", "mediapipe", "caliscope")  # of several detectors the first: its confidence tells the most
-_SAME_LENGTH = 0.1  # keypoints whose number of frames is farther from the video's are of another recording
+_SET_BY_COUNT = {len(KEYPOINT_SETS[name]): name for name in sorted(KEYPOINT_SETS)}  # 25 points: BODY_25B
+_AMBIGUOUS_COUNTS = (25, 25 + 2 * HAND_POINTS)  # points of BODY_25 and BODY_25B, without hands and with them
+_FORMATS = ("openpose", "mediapipe", "caliscope")  # the first that is there: its confidence is the most informative
+_MAX_LENGTH_ERROR = 0.1  # share of the video's frames; keypoints with a larger error are of another recording
 
 
 def keypoint_sources(
     draft: Draft, found: Sequence[KeypointFile], rig: Rig, frames: int, place: str
 ) -> list[Source]:
-    """Keypoints of each detector that belong to the videos: of so many frames (0: there are none) and of that place."""
+    """Keypoints of each detector that belong to the videos, by their number of frames (0 without videos) and place."""
     out: list[Source] = []
     for format in _FORMATS:
         of = {k.path: k for k in found if k.format == format and k.points}
@@ -43,19 +43,19 @@ def keypoint_sources(
         def rank(trial: Trial, counts: Mapping[str, int] = counts) -> tuple[bool, bool, int, int]:
             off = abs(counts[trial.place] - frames) if frames else -counts[trial.place]
             shared = -common_words(trial.place, place)
-            return bool(STATIC.search(trial.place)), bool(frames) and off > _SAME_LENGTH * frames, shared, off
+            return bool(STATIC.search(trial.place)), bool(frames) and off > _MAX_LENGTH_ERROR * frames, shared, off
 
         for trial in sorted(groups, key=rank)[:1]:
-            if frames and abs(counts[trial.place] - frames) > _SAME_LENGTH * frames:
-                told = f"{counts[trial.place]} frames, the videos have {frames}: of another recording, left out"
-                draft.note("keypoints", "likely", f"{trial.place}: {told}")
+            if frames and abs(counts[trial.place] - frames) > _MAX_LENGTH_ERROR * frames:
+                reason = f"{counts[trial.place]} frames, the videos have {frames}: of another recording, left out"
+                draft.note("keypoints", "likely", f"{trial.place}: {reason}")
             else:
                 out.append({name: of[path] for name, path in trial.files.items()})
     return out
 
 
 def read_sources(draft: Draft, sources: Sequence[Source]) -> list[dict[str, Keypoints]]:
-    """Keypoints of every detector and camera, as the files have them; what cannot be read is told and left out."""
+    """Read the keypoints of every detector and camera; add a remark on each file that cannot be read."""
     out = []
     for source in sources:
         read: dict[str, Keypoints] = {}
@@ -69,12 +69,14 @@ def read_sources(draft: Draft, sources: Sequence[Source]) -> list[dict[str, Keyp
 
 
 def _read(file: KeypointFile, camera: str) -> Keypoints:
-    """Keypoints of a camera; where no rate is told, at 1 Hz."""
+    """Read the keypoints of a camera, at 1 Hz if the format states no rate."""
     if file.format == "openpose":
-        if file.points not in _SETS:
-            raise ObservationError(f"{file.points} points; there are sets of {', '.join(map(str, sorted(_SETS)))}")
-        record = read_keypoints(file.path, format=file.format, camera=camera, rate=1.0, keypoint_set=_SETS[file.points])
-        if file.points in _EITHER:
+        if file.points not in _SET_BY_COUNT:
+            known = ", ".join(map(str, sorted(_SET_BY_COUNT)))
+            raise ObservationError(f"{file.points} points; there are sets of {known}")
+        name = _SET_BY_COUNT[file.points]
+        record = read_keypoints(file.path, format=file.format, camera=camera, rate=1.0, keypoint_set=name)
+        if file.points in _AMBIGUOUS_COUNTS:
             name = guess_views.guess_body_25(record)
             name = OPENPOSE_HANDS if file.points > 25 and name == "BODY_25" else name
             record = record.first_points(name, KEYPOINT_SETS[name])
@@ -87,37 +89,37 @@ def _read(file: KeypointFile, camera: str) -> Keypoints:
 
 
 def keypoint_entries(
-    draft: Draft, source: Source, records: Mapping[str, Keypoints], frame: Told | None,
+    draft: Draft, source: Source, records: Mapping[str, Keypoints], frame: Value | None,
     images: Mapping[str, ImageFrame], *, active: bool,
 ) -> None:
     """Enter the tables [[keypoints]] of one detector; as comments unless it is the one to use.
 
     Parameters
     ----------
-    frame : in which image the coordinates are, for the cameras in `images`.
+    frame : image frame of the coordinates, of the cameras in `images`.
     """
     if not records:
         return
     format = next(iter(source.values())).format
     what = f"{format}, {', '.join(sorted({r.keypoint_set for r in records.values()}))}, {len(records)} cameras"
-    told = f"{what}: taken" if active else f"{what}: left as comments, as one detector is enough to begin with"
-    draft.note("keypoints", "sure" if active else "guess", told)
+    text = f"{what}: taken" if active else f"{what}: left as comments, as one detector is enough to begin with"
+    draft.note("keypoints", "sure" if active else "guess", text)
     if active and any(_hands_seen(record) for record in records.values()):
-        body = Told("humanoid_hands", "likely", "the humanoid with fingers, as the keypoints have hands")
-        draft.head["body"] = draft.tell("body", body, "body")
+        body = Value("humanoid_hands", "likely", "the humanoid with fingers, as the keypoints have hands")
+        draft.head["body"] = draft.note_value("body", body, "body")
     if frame is not None:
-        draft.tell(f"keypoints, {format}", frame, "frame")
+        draft.note_value(f"keypoints, {format}", frame, "frame")
     for name, record in records.items():
-        entry = {"camera": Told(name), "file": Told(source[name].path), "format": Told(format)}
+        entry = {"camera": Value(name), "file": Value(source[name].path), "format": Value(format)}
         if format == "openpose":
-            of_two = source[name].points in _EITHER
-            why = f"{source[name].points} points" + ", told by where neck and hips lie" * of_two
-            entry["set"] = Told(record.keypoint_set, "likely" if of_two else "sure", why)
+            of_two = source[name].points in _AMBIGUOUS_COUNTS
+            why = f"{source[name].points} points" + ", recognised by the positions of neck and hips" * of_two
+            entry["set"] = Value(record.keypoint_set, "likely" if of_two else "sure", why)
         if frame is not None and name in images:
             entry["frame"] = frame
         draft.keypoints.append((active, entry))
 
 
 def _hands_seen(record: Keypoints) -> bool:
-    """Whether a detector gives points of hands, and saw some."""
+    """Whether a record has points of hands, with some detected."""
     return record.keypoint_set in SETS_WITH_HANDS and bool(record.confidence[..., -2 * HAND_POINTS :].any())

@@ -1,4 +1,4 @@
-"""The lens that a telephone states in its video: Apple's keys in the moov box, which FFmpeg leaves out."""
+"""The focal length that a phone states in its video: Apple's keys in the moov box, which FFmpeg omits."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from pathlib import Path
 import numpy as np
 
 _KEY = b"com.apple.quicktime.camera.focal_length.35mm_equivalent"
-_CROPPED = 1.15  # longer than stated: a video is cut out of the sensor, being wide and steadied (one: 32 for 27 mm)
-_LARGEST = 1 << 26  # bytes of a moov box: an hour at 240 Hz has a tenth
-_FULL_FRAME = 36.0  # [mm] its longer side
+_VIDEO_CROP_FACTOR = 1.15  # on the stated length: a video crops the sensor, wide and stabilised (one: 32 for 27 mm)
+_MAX_MOOV_BYTES = 1 << 26  # an hour at 240 Hz has a tenth
+_FULL_FRAME_MM = 36.0  # longer side of the sensor
 
 
 def stated_focal_length(path: Path) -> float | None:
-    """Focal length [mm] that a video file states for its lens, as of a full-frame camera; None where it states none."""
+    """Focal length [mm, full-frame equivalent] that a video file states; None if it states none."""
     try:
         with path.open("rb") as file:
             while len(head := file.read(16)) == 16:
                 size, kind, long = struct.unpack(">I4sQ", head)
                 file.seek(-8 if size != 1 else 0, 1)
                 left = size - 8 if size != 1 else long - 16
-                if kind == b"moov" and 0 < left <= _LARGEST:
+                if kind == b"moov" and 0 < left <= _MAX_MOOV_BYTES:
                     return _value(file.read(left))
                 if left < 0:
                     break
@@ -33,12 +33,12 @@ def stated_focal_length(path: Path) -> float | None:
 
 
 def field_of_view(focal_length: float) -> float:
-    """[deg] across the longer side of a video whose lens is stated as so long [mm]; good to a tenth."""
-    return float(2.0 * np.degrees(np.arctan(_FULL_FRAME / 2.0 / (_CROPPED * focal_length))))
+    """Field of view [deg] across the longer side of a video, from the stated focal length [mm]; good to a tenth."""
+    return float(2.0 * np.degrees(np.arctan(_FULL_FRAME_MM / 2.0 / (_VIDEO_CROP_FACTOR * focal_length))))
 
 
 def _value(data: bytes) -> float | None:
-    """The key's value in any `meta` of a moov box; None without."""
+    """Value of `_KEY` in any `meta` of a moov box; None without one."""
     for kind, inner in _boxes(data):
         if kind in (b"trak", b"udta"):
             found = _value(inner)
@@ -53,7 +53,7 @@ def _value(data: bytes) -> float | None:
 
 
 def _item(keys: bytes, items: bytes) -> float | None:
-    """Of the names in a `keys` box and the values in an `ilst` box, which are numbered from 1."""
+    """Value of `_KEY`, from names in a `keys` box and values in an `ilst` box, numbered from 1; None without it."""
     names = [name for _, name in _boxes(keys[8:])]
     values = {int.from_bytes(kind, "big"): item for kind, item in _boxes(items)}
     if _KEY not in names or (item := values.get(names.index(_KEY) + 1)) is None:
@@ -70,7 +70,7 @@ def _item(keys: bytes, items: bytes) -> float | None:
 
 
 def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """(kind, content) of the boxes that stand in a row."""
+    """(kind, content) of consecutive boxes."""
     at = 0
     while at + 8 <= len(data):
         size, kind = struct.unpack_from(">I4s", data, at)

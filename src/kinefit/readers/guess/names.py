@@ -1,4 +1,4 @@
-"""Which file belongs to which camera, told by names, numbers, sizes of pictures, and by order as the last resort."""
+"""Assign files to cameras: by names, numbers, image sizes, and by order as the last resort."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 
-# Words after which a number tells a camera: "Camera 1", "port_0", "GoPro3", "c2". Longer words first.
+# Words before the number of a camera: "Camera 1", "port_0", "GoPro3", "c2". Longer words first.
 _CAMERA_WORD = r"(?:camera|cam|kamera|port|view|gopro|kinect|miqus|webcam|device|dev|c|v|k)"
 _NUMBERED = re.compile(rf"(?<![a-z]){_CAMERA_WORD}[\s_.#-]*(\d+)", re.IGNORECASE)
 
@@ -17,9 +17,9 @@ HOW = {
     "number": ("likely", "by the number in its name"),
     "shifted": ("guess", "by the number in its name, which counts from another start"),
     "size": ("likely", "by the size of its picture"),
-    "order": ("guess", "by order only: nothing in the names tells it"),
+    "order": ("guess", "by order only: its name has no camera"),
 }
-"""How sure each way of matching is, and how it is told."""
+"""{way of matching: (confidence level, its text in a message)}, in order of decreasing confidence."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Trial:
     files : {camera: Path}
         In the order of the calibration.
     how : str
-        The least sure way, of `HOW`, by which a file found its camera.
+        The way of `HOW` with the least confidence among the files.
     place : str
-        Path within the folder, "*" where the cameras stood: "walk/videos/*".
+        Path within the folder, "*" in place of the cameras' names: "walk/videos/*".
     """
 
     files: Mapping[str, Path]
@@ -42,7 +42,7 @@ class Trial:
 
 
 def common_words(place: str, other: str) -> int:
-    """Number of words that two places share: what was recorded together mostly has some."""
+    """Number of words that two places share: files of one recording mostly have some in common."""
     words = [set(re.findall(r"[a-z0-9]+", text.lower())) for text in (place, other)]
     return len(words[0] & words[1])
 
@@ -57,19 +57,19 @@ def trials(
     paths: Sequence[Path], folder: Path, names: Sequence[str], sizes: Mapping[Path, object] | None = None,
     wanted: Mapping[str, object] | None = None,
 ) -> tuple[list[Trial], list[Path]]:
-    """Sort files into recordings, and within each to cameras.
+    """Group files into recordings, and assign them to cameras within each.
 
     Parameters
     ----------
     paths : files or folders, each of one camera
-    folder : above all of them
+    folder : that contains all of them
     names : of the calibration's cameras
-    sizes : {path: size of its picture}, optional
-    wanted : {camera: size of the calibration's picture}, optional
+    sizes : {path: (width, height) [px] of its image}, optional
+    wanted : {camera: (width, height) [px] of the calibration's image}, optional
 
     Returns
     -------
-    trials : the one with most cameras first; files that fit no camera.
+    trials, the one with most cameras first; files that fit no camera.
     """
     groups: dict[str, dict[str, Path]] = defaultdict(dict)
     ways: dict[str, str] = {}
@@ -106,24 +106,24 @@ def camera_of(path: Path, folder: Path, names: Sequence[str]) -> tuple[str, str,
 
 
 def _by_name(text: str, names: Sequence[str]) -> tuple[str, tuple[int, int]] | None:
-    """The longest camera's name that stands in a text as a word of its own, or after "cam": "vid1-camA" for "A"."""
+    """The longest camera name that is a word of a text, or follows "cam" in it: "vid1-camA" for "A"."""
     for name in sorted(names, key=len, reverse=True):
         word = rf"{_CAMERA_WORD}[\s_-]*"
         short = len(name) < (3 if name.isdigit() else 2) and name.lower() != text.lower()
-        word = word if short else f"(?:{word})?"  # a short one alone may be of a date, or an article
+        word = word if short else f"(?:{word})?"  # a short name alone may be part of a date, or an article
         match = re.search(rf"(?<![A-Za-z0-9]){word}{re.escape(name)}(?![A-Za-z0-9])", text, re.IGNORECASE)
         if match:
             return name, match.span()
     return None
 
 
-_DIGITS = 18  # of a camera's number that count: serial numbers have fewer
+_MAX_DIGITS = 18  # of a camera's number: serial numbers have fewer
 
 
 def camera_number(name: str) -> int | None:
     """The last number in a camera's name."""
     found = re.findall(r"\d+", name)
-    return int(found[-1][-_DIGITS:]) if found else None
+    return int(found[-1][-_MAX_DIGITS:]) if found else None
 
 
 def _by_number(text: str, names: Sequence[str]) -> tuple[str, tuple[int, int]] | None:
@@ -131,13 +131,13 @@ def _by_number(text: str, names: Sequence[str]) -> tuple[str, tuple[int, int]] |
     if None in numbers or len(numbers) < len(names):
         return None
     for match in _NUMBERED.finditer(text):
-        if int(match[1][-_DIGITS:]) in numbers:
-            return numbers[int(match[1][-_DIGITS:])], match.span()
+        if int(match[1][-_MAX_DIGITS:]) in numbers:
+            return numbers[int(match[1][-_MAX_DIGITS:])], match.span()
     return None
 
 
 def _joined(groups: dict[str, dict[str, Path]], ways: dict[str, str]) -> dict[str, dict[str, Path]]:
-    """Join places that differ only in the file's own name, where no camera would be there twice."""
+    """Join places that differ only in the file's own name, unless a camera would be there twice."""
     above: dict[str, list[str]] = defaultdict(list)
     for place in groups:
         above[place.rpartition("/")[0]].append(place)
@@ -156,7 +156,7 @@ def _joined(groups: dict[str, dict[str, Path]], ways: dict[str, str]) -> dict[st
 def _unnamed(
     paths: list[Path], folder: Path, names: Sequence[str], sizes: Mapping[Path, object], wanted: Mapping[str, object]
 ) -> tuple[list[Trial], list[Path]]:
-    """Files whose names tell no camera: by numbers that count from another start, by size, by order."""
+    """Assign files without a camera's name: by numbers that count from another start, by size, by order."""
     by_folder: dict[Path, list[Path]] = defaultdict(list)
     for path in sorted(paths, key=lambda p: natural(str(p))):
         by_folder[path.parent].append(path)
@@ -180,7 +180,7 @@ def _unnamed(
 
 
 def _shifted(found: Sequence[int | None], there: Sequence[int | None]) -> bool:
-    """Whether two lists of numbers are the same but for where they begin to count."""
+    """Whether two lists of numbers differ by a constant."""
     a, b = sorted(n for n in found if n is not None), sorted(n for n in there if n is not None)
     return len(a) == len(found) and len(b) == len(there) and len({m - n for m, n in zip(a, b)}) == 1
 

@@ -1,4 +1,4 @@
-"""What pictures and keypoints tell: black bars, the image frame of keypoints, the vertical, the unit of length."""
+"""Guess from images and keypoints: black bars, the image frame of keypoints, the vertical axis, the unit of length."""
 
 from __future__ import annotations
 
@@ -12,42 +12,42 @@ from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.motion import UP_AXES
 from kinefit.observations import Keypoints
-from kinefit.readers.guess.draft import Told
+from kinefit.readers.guess.draft import Value
 from kinefit.readers.video import Video
 
 Size = tuple[int, int]
 
-_BLACK = 32  # of 255: a row three quarters of which are darker is a bar's; compression smears edges into bars
-_FRAMES = 60  # of the keypoints, spread over the recording
-_CONFIDENT = 0.3
-_AGREE = 0.03  # two cameras agree on a point within this share of the picture's diagonal
-_SAME_ASPECT = 0.002
-_OUTSIDE = 0.005  # more points than this beside a picture are no slips of a detector
-_BETTER = 0.8  # a few pixels of shift are lost in a detector's noise and a calibration's bias; more than this is not
+_MAX_BAR_LEVEL = 32  # of 255: three quarters of a bar's pixels are darker; compression smears edges into bars
+_MAX_FRAMES = 60  # of the keypoints, spread over the recording
+_MIN_CONFIDENCE = 0.3
+_MAX_MISS = 0.03  # share of the image diagonal within which two cameras agree on a point
+_MAX_ASPECT_ERROR = 0.002
+_MIN_OUTSIDE_SHARE = 0.005  # of points outside of an image: more are no errors of a detector
+_MAX_RESIDUAL_RATIO = 0.8  # of two hypotheses: a detector's noise and a calibration's bias cause no larger difference
 _OFFSET_ROUNDS = 2  # after which a camera's offset changes by a tenth of a pixel
 _BONES = {  # [m] in a person of 1.75 m (Winter 2009, table 4.1: shares of the stature)
     ("shoulder", "elbow"): 0.186 * 1.75, ("elbow", "wrist"): 0.146 * 1.75, ("hip", "knee"): 0.245 * 1.75,
     ("knee", "ankle"): 0.246 * 1.75, ("shoulder", "hip"): 0.288 * 1.75,
 }  # fmt: skip
 _UNITS = {"m": 1.0, "dm": 10.0, "inch": 39.37, "cm": 100.0, "mm": 1000.0}
-_UNIT_TOLERANCE = 1.45  # people differ by 1.25 in size, detectors and half-seen bones add to it
+_MAX_SIZE_RATIO = 1.45  # people differ by 1.25 in size; detectors and partly occluded bones add to it
 
 
 def is_turned(calibrated: Size, size: Size) -> bool:
-    """Whether one of two pictures stands and the other lies."""
+    """Whether one of two image sizes is portrait and the other landscape."""
     return (size[0] - size[1]) * (calibrated[0] - calibrated[1]) < 0
 
 
-def guess_turn(rig: Rig, records: Mapping[str, Keypoints], sizes: Mapping[str, Size]) -> Told:
-    """Turn [deg], clockwise, of the pictures that stand where the calibration's lie: 90 or 270.
+def guess_turn(rig: Rig, records: Mapping[str, Keypoints], sizes: Mapping[str, Size]) -> Value:
+    """Clockwise rotation [deg] of videos in portrait whose calibration is in landscape, or the reverse: 90 or 270.
 
-    By the keypoints, which meet in space only after the right one; without any, so that people stand upright in a
-    world whose vertical is one of its axes, not the reverse of one.
+    The rays of keypoints intersect only after the right rotation. Without keypoints, the rotation is chosen so that
+    people stand upright in a world whose vertical is one of its positive axes.
 
     Parameters
     ----------
     records : {camera: Keypoints} as the files have them.
-    sizes : {camera: (width, height) [px]} of the videos, turned ones and others.
+    sizes : {camera: (width, height) [px]} of all videos.
     """
     turned = [name for name, size in sizes.items() if is_turned(rig[name].size, size)]
     misses, seen = {}, [name for name in turned if name in records]
@@ -56,46 +56,46 @@ def guess_turn(rig: Rig, records: Mapping[str, Keypoints], sizes: Mapping[str, S
         x, residual = meet(rig, records, images)
         found = np.isfinite(x).all(-1).sum()
         misses[degrees] = float(np.median(residual[np.isfinite(residual)])) / found if found else np.inf
-    if misses and min(misses.values()) < _BETTER * max(misses.values()):
+    if misses and min(misses.values()) < _MAX_RESIDUAL_RATIO * max(misses.values()):
         best = min(misses, key=lambda degrees: misses[degrees])
-        return Told(best, "likely", f"so that the keypoints of the cameras meet, not if turned by {360 - best}")
+        return Value(best, "likely", f"so that the keypoints of the cameras meet, not if turned by {360 - best}")
     for degrees in (90, 270):
         axis, angle = nearest_axis(up_of_cameras(rig, dict.fromkeys(turned, degrees)))
         if not axis.startswith("-") and angle < 30:
-            return Told(degrees, "guess", f"so that people stand upright, {axis} being up; else {360 - degrees}")
-    return Told(90, "guess", "clockwise or counterclockwise: try 90, then 270")
+            return Value(degrees, "guess", f"so that people stand upright, {axis} being up; else {360 - degrees}")
+    return Value(90, "guess", "clockwise or counterclockwise: try 90, then 270")
 
 
-def picture(calibrated: Size, video: Video, turn: Told) -> dict[str, Told]:
-    """How a video's picture came about from the calibration's: `image` and `rotation` of a `[[camera]]`.
+def picture(calibrated: Size, video: Video, turn: Value) -> dict[str, Value]:
+    """Relation of a video's image to the calibration's: `image` and `rotation` of a `[[camera]]`.
 
     Parameters
     ----------
     calibrated : (width, height) [px]
     video : Video
-    turn : of `guess_turn`, for a picture that is turned.
+    turn : of `guess_turn`, for a rotated video.
     """
     size, out = video.size, {}
-    told = f"the video has {size[0]}x{size[1]} px, the calibration {calibrated[0]}x{calibrated[1]}"
+    sizes = f"the video has {size[0]}x{size[1]} px, the calibration {calibrated[0]}x{calibrated[1]}"
     turned = calibrated
     if is_turned(calibrated, size):
         turned = calibrated[::-1]
-        out["rotation"] = Told(turn.value, turn.sure, f"{told}; {turn.why}")
+        out["rotation"] = Value(turn.value, turn.sure, f"{sizes}; {turn.why}")
     if size == turned:
         return out
-    if abs(size[0] * turned[1] / (size[1] * turned[0]) - 1) < _SAME_ASPECT:
-        return out | {"image": Told("scaled", "sure", f"{told}: the same shape")}
+    if abs(size[0] * turned[1] / (size[1] * turned[0]) - 1) < _MAX_ASPECT_ERROR:
+        return out | {"image": Value("scaled", "sure", f"{sizes}: the same shape")}
     bars, expected = black_bars(video), _letterbox_bars(turned, size)
     fits = np.all(np.abs(np.subtract(bars, expected)) <= np.maximum(2, 0.2 * np.asarray(expected)))
     if fits:
-        return out | {"image": Told("letterboxed", "sure", f"{told}, and it has black bars of {max(bars)} px")}
+        return out | {"image": Value("letterboxed", "sure", f"{sizes}, and it has black bars of {max(bars)} px")}
     if max(expected) < 2:
-        return out | {"image": Told("letterboxed", "likely", f"{told}: nearly the same shape")}
-    return out | {"image": Told("scaled", "guess", f"{told}, and it has no black bars; it may have been cut instead")}
+        return out | {"image": Value("letterboxed", "likely", f"{sizes}: nearly the same shape")}
+    return out | {"image": Value("scaled", "guess", f"{sizes}, and it has no black bars; it may have been cut instead")}
 
 
 def image_frame(calibrated: Size, size: Size, degrees: int, image: str) -> ImageFrame:
-    """Map of a picture that was turned clockwise, then "scaled" or "letterboxed" (or neither)."""
+    """Image frame of a video that was rotated clockwise [deg], then "scaled" or "letterboxed" (or neither)."""
     frame = ImageFrame.rotated(calibrated, degrees)
     turned = calibrated if degrees % 180 == 0 else calibrated[::-1]
     make = {"scaled": ImageFrame.scaled, "letterboxed": ImageFrame.letterboxed}.get(image)
@@ -103,10 +103,10 @@ def image_frame(calibrated: Size, size: Size, degrees: int, image: str) -> Image
 
 
 def black_bars(video: Video, frames: int = 5) -> tuple[int, int]:
-    """Width [px] of the dark bars (left or right, above or below), the smaller of both sides, in some of its frames."""
+    """Widths [px] of the black bars at the left or right, and above or below; the smaller of both sides."""
     numbers = np.unique(np.linspace(0, len(video) - 1, frames).astype(int))
     brightest = np.max([video.read(int(i)) for i in numbers], axis=0).max(axis=2)
-    columns, rows = (np.percentile(brightest, 75, axis=axis) > _BLACK for axis in (0, 1))
+    columns, rows = (np.percentile(brightest, 75, axis=axis) > _MAX_BAR_LEVEL for axis in (0, 1))
     return _dark_ends(columns), _dark_ends(rows)
 
 
@@ -121,28 +121,28 @@ def _letterbox_bars(calibrated: Size, size: Size) -> tuple[int, int]:
 
 
 def one_person(record: Keypoints, frames: NDArray) -> NDArray:
-    """(F, K, 2) [px] points of the largest surely seen person in some frames; NaN where unseen."""
+    """(F, K, 2) [px] points of the largest confident person in some frames; NaN where not detected."""
     points, confidence = record.points[frames], record.confidence[frames]
-    points = np.where((confidence > _CONFIDENT)[..., None], points, np.nan)
+    points = np.where((confidence > _MIN_CONFIDENCE)[..., None], points, np.nan)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # all of nobody is NaN
+        warnings.simplefilter("ignore", RuntimeWarning)  # a frame without people is all NaN
         extent = np.linalg.norm(np.nanmax(points, axis=2) - np.nanmin(points, axis=2), axis=-1)
     score = np.nan_to_num(extent) * np.isfinite(points[..., 0]).sum(-1)
     return points[np.arange(len(frames)), np.argmax(score, axis=1)]
 
 
 def spread_frames(count: int) -> NDArray:
-    """Frames of a recording, spread over it."""
-    return np.unique(np.linspace(0, count - 1, _FRAMES).astype(int))
+    """(F,) frame numbers, spread over a recording of `count` frames."""
+    return np.unique(np.linspace(0, count - 1, _MAX_FRAMES).astype(int))
 
 
 def looks_normalised(record: Keypoints) -> bool:
-    """Whether coordinates run from 0 to 1 rather than over pixels."""
+    """Whether coordinates are shares 0..1 of the image size, not pixels."""
     return bool(np.nanmax(np.abs(record.points)) <= 2.0)
 
 
 def guess_body_25(record: Keypoints) -> str:
-    """BODY_25 or BODY_25B, which both have 25 points: where neck and hips lie among the points tells it."""
+    """"BODY_25" or "BODY_25B", which both have 25 points, by the positions of neck and hips."""
     points = one_person(record, spread_frames(len(record)))
 
     def off(middle: int, left: int, right: int) -> NDArray:
@@ -151,63 +151,63 @@ def guess_body_25(record: Keypoints) -> str:
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        plain = np.nanmedian(np.stack([off(1, 2, 5), off(8, 9, 12)]))  # Neck, MidHip
-        later = np.nanmedian(np.stack([off(17, 5, 6), off(0, 1, 2)]))  # UpperNeck, nose between the eyes
-    return "BODY_25" if plain < later else "BODY_25B"
+        body_25 = np.nanmedian(np.stack([off(1, 2, 5), off(8, 9, 12)]))  # Neck, MidHip
+        body_25b = np.nanmedian(np.stack([off(17, 5, 6), off(0, 1, 2)]))  # UpperNeck, nose between the eyes
+    return "BODY_25" if body_25 < body_25b else "BODY_25B"
 
 
 def keypoint_frame(
     rig: Rig, records: Mapping[str, Keypoints], images: Mapping[str, ImageFrame], sizes: Mapping[str, Size]
-) -> Told | None:
-    """Whether keypoints are in pixels of the "video" or of the "calibration", where the two differ; None: nowhere.
+) -> Value | None:
+    """Whether keypoints are in pixels of the "video" or of the "calibration"; None if these are the same everywhere.
 
     Parameters
     ----------
     records : {camera: Keypoints} as the files have them.
-    images : {camera: ImageFrame} of the cameras whose picture is not the calibration's.
+    images : {camera: ImageFrame} of the cameras whose video differs from the calibration's image.
     sizes : {camera: (width, height) [px] of the video}
     """
     images = {name: image for name, image in images.items() if name in records}
     if not images:
         return None
     for name in images:
-        points = records[name].points[records[name].confidence > _CONFIDENT]
+        points = records[name].points[records[name].confidence > _MIN_CONFIDENCE]
         outside = {
             frame: float(np.any((points > np.add(size, 0.5)) | (points < -1.5), axis=-1).mean()) if len(points) else 0.0
             for frame, size in (("video", sizes[name]), ("calibration", rig[name].size))
         }
         for frame, other in (("calibration", "video"), ("video", "calibration")):
-            if outside[other] > _OUTSIDE > outside[frame]:
+            if outside[other] > _MIN_OUTSIDE_SHARE > outside[frame]:
                 share = f"{100 * outside[other]:.1f} % of the points of {name} lie outside the {other}'s picture"
-                return Told(frame, "sure" if outside[other] > 10 * _OUTSIDE else "likely", share)
+                return Value(frame, "sure" if outside[other] > 10 * _MIN_OUTSIDE_SHARE else "likely", share)
     medians = {}
     for frame in ("video", "calibration"):
         residual = meet(rig, records, images if frame == "video" else {})[1]
         medians[frame] = float(np.median(residual[np.isfinite(residual)])) if np.isfinite(residual).any() else np.nan
     if not np.isfinite(list(medians.values())).all():
-        return Told("video", "guess", "detectors run on the video; too little is seen to check it")
+        return Value("video", "guess", "detectors run on the video; too little is seen to check it")
     best, other = sorted(medians, key=lambda name: medians[name])
     why = f"the cameras agree to {medians[best]:.1f} px, to {medians[other]:.1f} px if in the {other}'s"
-    if medians[best] < _BETTER * medians[other]:
-        return Told(best, "likely", why)
+    if medians[best] < _MAX_RESIDUAL_RATIO * medians[other]:
+        return Value(best, "likely", why)
     for frame in medians:
         residual = meet(rig, records, images if frame == "video" else {}, offset_rounds=_OFFSET_ROUNDS)[1]
         medians[frame] = float(np.median(residual[np.isfinite(residual)]))
     best, other = sorted(medians, key=lambda name: medians[name])
     why = f"{medians[best]:.2f} px, {medians[other]:.2f} px if in the {other}'s"
-    return Told(best, "guess", f"by little: without each camera's constant offset the cameras agree to {why}")
+    return Value(best, "guess", f"by little: without each camera's constant offset the cameras agree to {why}")
 
 
 def meet(
     rig: Rig, records: Mapping[str, Keypoints], images: Mapping[str, ImageFrame] | None = None, offset_rounds: int = 0
 ) -> tuple[NDArray, NDArray]:
-    """Where the keypoints of the cameras meet in some frames.
+    """Triangulate the keypoints of some frames.
 
     Parameters
     ----------
     images : {camera: ImageFrame} of the cameras whose keypoints are not in the calibration's image.
     offset_rounds : int
-        How often each camera's median error, which a calibration that is a little off leaves, is taken from its points.
+        Times that each camera's median error, a bias of the calibration, is subtracted from its points.
 
     Returns
     -------
@@ -220,7 +220,7 @@ def meet(
         image, seen = (images or {}).get(name), one_person(record, frames)
         views.append(image.to_calibration(seen) if image else seen)
     points = np.stack(views, axis=2)  # (F, K, C, 2)
-    limit = _AGREE * max(float(np.hypot(*camera.size)) for camera in rig)
+    limit = _MAX_MISS * max(float(np.hypot(*camera.size)) for camera in rig)
     flat = points.reshape(-1, *points.shape[2:])
     x, inliers, residual = triangulate_robust(rig, flat, max_residual_px=limit)
     for _ in range(offset_rounds if inliers.any(0).all() else 0):
@@ -231,8 +231,8 @@ def meet(
     return x.reshape(*points.shape[:2], 3), residual.reshape(points.shape[:3])
 
 
-def guess_unit(x: NDArray, names: Sequence[str]) -> Told:
-    """Unit of the calibration's length from the size of the person seen, (F, K, 3) in that unit."""
+def guess_unit(x: NDArray, names: Sequence[str]) -> Value:
+    """Unit of length of the calibration, from the size of a person with points (F, K, 3) in that unit."""
     ratios = []
     for (a, b), length in _BONES.items():
         for side in ("left", "right"):
@@ -241,17 +241,17 @@ def guess_unit(x: NDArray, names: Sequence[str]) -> Told:
                 ratios += (np.linalg.norm(x[:, i] - x[:, j], axis=-1) / length).tolist()
     seen = np.array(ratios)[np.isfinite(ratios)]
     if len(seen) < 20:
-        return Told(None, "open", "too few points meet in space to tell the person's size")
+        return Value(None, "open", "too few points meet in space to estimate the person's size")
     ratio = float(np.median(seen))
     unit = min(_UNITS, key=lambda u: abs(np.log(ratio / _UNITS[u])))
-    if abs(np.log(ratio / _UNITS[unit])) < np.log(_UNIT_TOLERANCE):
+    if abs(np.log(ratio / _UNITS[unit])) < np.log(_MAX_SIZE_RATIO):
         height = 1.75 * ratio / _UNITS[unit]
-        return Told(unit, "likely", f"a person so long in the limbs would be {height:.2f} m tall")
-    return Told(None, "open", f"in metres the person would be {1.75 * ratio:.3g} m tall: no usual unit")
+        return Value(unit, "likely", f"a person so long in the limbs would be {height:.2f} m tall")
+    return Value(None, "open", f"in metres the person would be {1.75 * ratio:.3g} m tall: no usual unit")
 
 
 def up_of_person(x: NDArray, names: Sequence[str]) -> NDArray | None:
-    """(3,) direction from hips to shoulders, or from ankles to hips, median over frames; None where not seen."""
+    """(3,) unit direction from hips to shoulders, or ankles to hips, in points (F, K, 3); None if unobserved."""
     for low, high in (("hip", "shoulder"), ("ankle", "hip"), ("hip", "ear"), ("elbow", "shoulder")):
         at = {
             (side, joint): _point(names, side, joint) for side in ("left", "right") for joint in (low, high)
@@ -267,11 +267,11 @@ def up_of_person(x: NDArray, names: Sequence[str]) -> NDArray | None:
 
 
 def up_of_cameras(rig: Rig, turns: Mapping[str, int] | None = None) -> NDArray:
-    """(3,) mean direction that points up in the cameras' pictures: cameras mostly stand upright.
+    """(3,) mean unit direction that points up in the cameras' images: most cameras stand upright.
 
     Parameters
     ----------
-    turns : {camera: clockwise turn [deg] of its picture against the calibration's}, optional
+    turns : {camera: clockwise rotation [deg] of its video against the calibration's image}, optional
     """
     up_camera = {0: (0, -1, 0), 90: (-1, 0, 0), 180: (0, 1, 0), 270: (1, 0, 0)}
     ways = [np.array(up_camera[(turns or {}).get(c.name, 0)]) @ c.T_camera_world[:3, :3] for c in rig]
@@ -280,13 +280,13 @@ def up_of_cameras(rig: Rig, turns: Mapping[str, int] | None = None) -> NDArray:
 
 
 def nearest_axis(way: NDArray) -> tuple[str, float]:
-    """Axis of the world nearest to a direction, and the angle to it [deg]."""
+    """Axis of the world nearest to a unit direction (3,), and the angle to it [deg]."""
     name = max(UP_AXES, key=lambda axis: float(np.dot(UP_AXES[axis], way)))
     return name, float(np.degrees(np.arccos(np.clip(np.dot(UP_AXES[name], way), -1, 1))))
 
 
-def guess_up(rig: Rig, person: NDArray | None, turns: Mapping[str, int], *, qualisys: bool) -> Told:
-    """The vertical axis of the calibration's world from its format, the person and the cameras."""
+def guess_up(rig: Rig, person: NDArray | None, turns: Mapping[str, int], *, qualisys: bool) -> Value:
+    """The vertical axis of the calibration's world, by its format, the person's up (3,) and the cameras."""
     cameras, tilt = nearest_axis(up_of_cameras(rig, turns))
     votes = {"the cameras stand upright": cameras}
     if person is not None:
@@ -297,14 +297,14 @@ def guess_up(rig: Rig, person: NDArray | None, turns: Mapping[str, int], *, qual
     why, axis = next(iter(votes.items()))
     against = [f"{reason} would give {other}" for reason, other in votes.items() if other != axis]
     if against:
-        return Told(axis, "guess", f"{why}; but {', '.join(against)}")
+        return Value(axis, "guess", f"{why}; but {', '.join(against)}")
     leaning = f", {tilt:.0f} degrees off the axis: the world may lean" if tilt > 15 else ""
     sure = "guess" if tilt > 30 else "sure" if len(votes) > 1 and tilt < 20 else "likely"
-    return Told(axis, sure, f"{' and '.join(votes)}{leaning}")
+    return Value(axis, sure, f"{' and '.join(votes)}{leaning}")
 
 
 def _point(names: Sequence[str], side: str, joint: str) -> int | None:
-    """Index of a joint's point under a detector's spelling: "LHip", "left_hip"."""
+    """Index of a joint's point in either spelling, "LHip" or "left_hip"; None if it is missing."""
     for spelled in (f"{side}_{joint}", f"{side[0].upper()}{joint.capitalize()}"):
         if spelled in names:
             return list(names).index(spelled)

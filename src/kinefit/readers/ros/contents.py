@@ -1,4 +1,4 @@
-"""What an MCAP recording of ROS 2 shows: topics of depth and of colour, with their cameras and rates."""
+"""List the topics of an MCAP recording of ROS 2 with depth and colour images, with their cameras and rates."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Shown:
     Parameters
     ----------
     topic : str
-    deep : whether they are depth; else for the eye
-    camera : its name in the calibration that the recording is (`mcap_rig`); None where it has no CameraInfo
+    deep : whether they are depth; else colour
+    camera : its name in the recording's rig (`mcap_rig`); None without a CameraInfo
     frames : int; rate : float [Hz]
     """
 
@@ -37,7 +37,7 @@ class Shown:
 
 
 def shown(path: Path) -> list[Shown]:
-    """Topics of two images or more in an encoding that is read, one for each camera and kind; raw ones first.
+    """Topics with two images or more in a known encoding, one for each camera and kind; raw ones first.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def shown(path: Path) -> list[Shown]:
     with reading(path) as reader:
         topics = Topics(reader, path)
         names = camera_names(topics)
-        for topic in sorted(topics.of(IMAGE, COMPRESSED), key=lambda one: (is_rectified(one), len(one), one)):
+        for topic in sorted(topics.of(IMAGE, COMPRESSED), key=lambda name: (is_rectified(name), len(name), name)):
             first = topics.first(topic)
             deep = encoding(first) in UNITS
             times = topics.times(topic)[0] if deep or is_colour(first) else np.zeros(0)
@@ -59,4 +59,4 @@ def shown(path: Path) -> list[Shown]:
                 rate = round(median_rate(times, topic, path), 3)
                 found = Shown(topic, deep, names.get(folder), len(times), rate)
                 out.setdefault((found.name, deep), found)
-    return sorted(out.values(), key=lambda one: one.topic)
+    return sorted(out.values(), key=lambda found: found.topic)

@@ -1,4 +1,4 @@
-"""Depth in MCAP recordings of ROS 2: images, compressed or not, and what the camera says of its lens."""
+"""Depth in MCAP recordings of ROS 2: images, compressed or not, with the camera's intrinsics."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from kinefit.readers.ros.recordings import COMPRESSED, IMAGE, Messages, Topics, 
 
 
 def mcap_source(path: Path, name: str, topic: str | None = None) -> DepthSource:
-    """Depth of a topic; by default of the one that shows it, or of the one with a part called `name`.
+    """Source of a depth topic; by default the only one, or the one with a part called `name`.
 
-    Times are those of the images' headers, or of the recording where these do not increase; 0 is the recording's first
-    image of any topic. The lens is that of the CameraInfo beside the topic.
+    Times are those of the images' headers, or of the log if these do not increase; 0 is the recording's first image of
+    any topic. The intrinsics are those of the topic's CameraInfo.
 
     Raises
     ------
     FileError
         The extra is not installed, or the file is damaged.
     ObservationError
-        No such topic, one without depth, or none or several that have depth.
+        No such topic, a topic without depth, or no unique depth topic.
     CalibrationError
-        A lens that OpenCV does not have, or a part of its image.
+        A lens model that OpenCV lacks, or a cropped image.
     """
     with reading(path) as reader:
         topics = Topics(reader, path)
-        firsts = {one: topics.first(one) for one in topics.of(IMAGE, COMPRESSED)}
-        deep = {one: first for one, first in firsts.items() if encoding(first) in UNITS}
+        firsts = {t: topics.first(t) for t in topics.of(IMAGE, COMPRESSED)}
+        deep = {t: first for t, first in firsts.items() if encoding(first) in UNITS}
         refuse_encoding(topics, topic, "depth", tuple(UNITS))
         topic = topics.chosen(topic, deep, "depth images (16UC1, 32FC1)", name)
         times, logged = topics.times(topic)

@@ -24,25 +24,25 @@ INFO = "sensor_msgs/msg/CameraInfo"
 _ENDING = ".mcap"
 _MAX_CHUNK_BYTES = 110_000_000  # unpacked; recorders write 1 to 16 MB, or one image, which in 8K RGB takes 100 MB
 _CHUNK_SIZE_OFFSET = 1 + 8 + 8 + 8  # [bytes] from a chunk's record to its unpacked size: opcode, length, two times
-_CHUNK_HEAD_BYTES = 8 + 4 + 4 + 8 + 8 + 18  # size, checksum, length and text of the compression, length, frame's header
-_MIN_STEP_S = 1e-6  # between images; as `Video`, which takes folders of images up to a million a second
-_MUCH = 2**20  # [bytes] that are asked for at once, from which on it is seen whether they are there
+_CHUNK_HEAD_BYTES = 8 + 4 + 4 + 8 + 8 + 18  # size, checksum, length and name of the compression, length, frame's header
+_MIN_STEP_S = 1e-6  # between images; as `Video`, which reads folders of images up to a million a second
+_MAX_UNCHECKED_BYTES = 2**20  # of one read; larger requests are limited to the rest of the file
 
 
 def inside(path: Path) -> tuple[Path, str | None] | None:
-    """The recording that a path leads into, and the topic, None where it names none; None for other files.
+    """The recording that contains a path, and the topic (None if the path has none); None for other files.
 
     Raises
     ------
     FileError
-        A recording of another kind (SQLite), or one that is split into several files.
+        A recording in SQLite, or one that is split into several files.
     """
     for file in (path, *path.parents):
         found = _recording(file)
         if found is not None:
             topic = path.relative_to(file).as_posix()
             return found, None if topic == "." else f"/{topic}"
-        if file.suffix.lower() == _ENDING:  # one that is not there
+        if file.suffix.lower() == _ENDING:  # a missing recording
             return None
     return None
 
@@ -54,8 +54,9 @@ def _recording(path: Path) -> Path | None:
     if path.is_dir() and (path / "metadata.yaml").is_file():
         files = sorted(path.glob(f"*{_ENDING}"))
         if len(files) > 1:
-            told = f"a recording in {len(files)} files"
-            raise FileError(told, file=path, remedy=f"Name one of them ({files[0].name}), or merge them: `mcap merge`.")
+            problem = f"a recording in {len(files)} files"
+            remedy = f"Name one of them ({files[0].name}), or merge them: `mcap merge`."
+            raise FileError(problem, file=path, remedy=remedy)
         if files:
             return files[0]
         path = next(iter(path.glob("*.db3")), path)
@@ -66,27 +67,32 @@ def _recording(path: Path) -> Path | None:
 
 
 class Topics:
-    """What an open recording has.
+    """The topics of an open recording.
 
     Attributes
     ----------
-    kinds : {topic: type of its messages}, of those with messages that can be read
+    kinds : {topic: type of its messages}, of topics with readable messages
+
+    Raises
+    ------
+    FileError
+        A recording without an index.
     """
 
     def __init__(self, reader: Any, path: Path) -> None:
         self._reader, self.path = reader, path
         summary = reader.get_summary()
         if summary is None:
-            told = "it has no index: was the recording cut short?"
-            raise FileError(told, file=path, remedy="Run `mcap recover` on it.")
+            problem = "it has no index: was the recording cut short?"
+            raise FileError(problem, file=path, remedy="Run `mcap recover` on it.")
         self.kinds = {c.topic: summary.schemas[c.schema_id].name for c in summary.channels.values() if c.schema_id}
 
     def of(self, *kinds: str) -> list[str]:
-        """Topics of these types, in the order of their names."""
+        """Topics of these types, sorted by name."""
         return sorted(topic for topic, kind in self.kinds.items() if kind in kinds)
 
     def first(self, topic: str) -> Any:
-        """The first message; None where there is none."""
+        """The first message of a topic; None without one."""
         return next((message for *_, message in self._reader.iter_decoded_messages(topics=[topic])), None)
 
     def all(self, topic: str) -> Iterator[Any]:
@@ -94,12 +100,12 @@ class Topics:
         return (message for *_, message in self._reader.iter_decoded_messages(topics=[topic]))
 
     def chosen(self, topic: str | None, fitting: Mapping[str, Any] | list[str], what: str, name: str = "") -> str:
-        """The topic that is asked for; else the only one that fits, or that has a part called `name`.
+        """The requested topic; else the only fitting one, or the only fitting one with a part called `name`.
 
         Raises
         ------
         ObservationError
-            No such topic, or none or several that fit: the message names those that are there.
+            No such topic, or no unique one.
         """
         listed = ", ".join(sorted(fitting))
         if topic is not None:
@@ -107,20 +113,20 @@ class Topics:
                 return topic
             there = f"there {'is' if len(fitting) == 1 else 'are'} {listed}" if fitting else "no topic of it has any"
             kind = self.kinds.get(topic)
-            told = f"no topic {topic}" if kind is None else f"{topic} ({kind}) has no {what}"
-            raise ObservationError(f"{told}; of {what} {there}", file=self.path, remedy="Correct topic.")
-        named = [one for one in fitting if name in one.split("/")] or list(fitting)
+            problem = f"no topic {topic}" if kind is None else f"{topic} ({kind}) has no {what}"
+            raise ObservationError(f"{problem}; of {what} {there}", file=self.path, remedy="Correct topic.")
+        named = [t for t in fitting if name in t.split("/")] or list(fitting)
         if len(named) == 1:
             return named[0]
         if not named:
             have = ", ".join(sorted(self.kinds)) or "none"
-            told = f"no topic of it has {what}; its topics are {have}"
-            raise ObservationError(told, file=self.path, remedy="Record the camera's images.")
-        told = f"{len(named)} topics have {what}: {', '.join(sorted(named))}"
-        raise ObservationError(told, file=self.path, remedy="Write topic = ... beside the file.")
+            problem = f"no topic of it has {what}; its topics are {have}"
+            raise ObservationError(problem, file=self.path, remedy="Record the camera's images.")
+        problem = f"{len(named)} topics have {what}: {', '.join(sorted(named))}"
+        raise ObservationError(problem, file=self.path, remedy="Write topic = ... beside the file.")
 
     def begin(self) -> int:
-        """[ns] when the first image of any topic was seen, by its header; 0 where headers tell no time."""
+        """[ns] time of the first image of any topic, by its header; 0 if headers have no time."""
         stamps = []
         for topic in self.of(IMAGE, COMPRESSED):
             for _, _, message in self._reader.iter_messages(topics=[topic]):
@@ -129,9 +135,10 @@ class Topics:
         return min(stamps, default=0)
 
     def times(self, topic: str) -> tuple[NDArray, list[int]]:
-        """(N,) [s] of a topic's images, since the recording's first one; and when each was logged [ns].
+        """Times (N,) [s] of a topic's images from the recording's first image on, and log times [ns].
 
-        Headers tell the times; where these do not increase, the log does, and 0 is the topic's own first image.
+        Times are those of the headers. If these do not increase, they are those of the log, and 0 is the topic's own
+        first image.
         """
         stamps, logged = [], []
         for _, _, message in self._reader.iter_messages(topics=[topic]):
@@ -144,7 +151,7 @@ class Topics:
 
 
 def median_rate(times: NDArray, topic: str, path: Path) -> float:
-    """[Hz] of a topic's images, by the median step of their times (N,) [s].
+    """Rate [Hz] of a topic's images, from the median step of their times (N,) [s].
 
     Raises
     ------
@@ -162,13 +169,13 @@ def median_rate(times: NDArray, topic: str, path: Path) -> float:
 
 
 class Messages:
-    """Messages of a topic by number; in order they are read on, else they are sought.
+    """Messages of a topic, by number: sequential access reads on, random access seeks.
 
     Parameters
     ----------
     path : of the recording
     topic : str
-    logged : [ns] when each was
+    logged : log time of each [ns]
     """
 
     def __init__(self, path: Path, topic: str, logged: list[int]) -> None:
@@ -182,22 +189,22 @@ class Messages:
         Raises
         ------
         FileError
-            It is not there any more, or damaged.
+            It is missing or damaged.
         """
         if i != self._next:
             self._seek(i)
         try:
             *_, message = next(self._coming)
         except StopIteration:
-            told = "frame cannot be found again"
-            raise FileError(told, file=self._path, place=f"frame {i}", remedy="Copy it again.") from None
+            problem = "frame cannot be found again"
+            raise FileError(problem, file=self._path, place=f"frame {i}", remedy="Copy it again.") from None
         except Exception as error:  # of damaged files libraries raise anything
             raise _damaged(error, self._path) from error
         self._next = i + 1
         return message
 
     def close(self) -> None:
-        """Close the file; it is opened again when it is needed."""
+        """Close the file; the next access opens it again."""
         self._open.close()
         self._next = -1
 
@@ -206,13 +213,13 @@ class Messages:
         at = self._logged[i]
         reader = self._open.enter_context(reading(self._path))
         self._coming = iter(reader.iter_decoded_messages(topics=[self._topic], starting_at=at))
-        for _ in range(i - self._logged.index(at)):  # of several that were logged at once
+        for _ in range(i - self._logged.index(at)):  # of several messages with one log time
             next(self._coming, None)
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[Any]:
-    """A reader; whatever its library raises becomes an error of the file."""
+    """A reader as a context manager; raises FileError for all errors of its library."""
     try:
         from mcap.reader import make_reader
         from mcap_ros2.decoder import DecoderFactory
@@ -233,7 +240,7 @@ def reading(path: Path) -> Iterator[Any]:
 
 
 def _check_chunks(reader: Any, file: io.BufferedReader, path: Path) -> None:
-    """Raise FileError where a chunk unpacks to more than `_MAX_CHUNK_BYTES`, by its record and its Zstandard frame."""
+    """Raise FileError if a chunk unpacks to more than `_MAX_CHUNK_BYTES`, by its record and its Zstandard frame."""
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader
 
@@ -266,20 +273,20 @@ def _zstd_size(frame: bytes) -> int:
 
 
 class _BoundedReader(io.BufferedReader):
-    """A file from which no more is asked than there is: a damaged length would else be room in memory first."""
+    """A file whose reads are limited to its size: a damaged length would otherwise allocate memory."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        if size is not None and size > _MUCH:
+        if size is not None and size > _MAX_UNCHECKED_BYTES:
             size = min(size, max(os.fstat(self.fileno()).st_size - self.tell(), 0))
         return super().read(size)
 
 
 def _damaged(error: Exception, path: Path) -> FileError:
-    told = f"no recording of ROS 2 that can be read ({type(error).__name__}: {error})"
-    return FileError(told, file=path, remedy="Copy it again; `mcap doctor` says what is wrong with it.")
+    problem = f"no recording of ROS 2 that can be read ({type(error).__name__}: {error})"
+    return FileError(problem, file=path, remedy="Copy it again; `mcap doctor` says what is wrong with it.")
 
 
 def stamp(data: bytes) -> int:
-    """[ns] of the header that a message begins with, in CDR."""
+    """Time [ns] in the header at the beginning of a CDR message."""
     seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return seconds * 10**9 + nanoseconds

@@ -1,4 +1,4 @@
-"""Cameras of an MCAP recording (ROS 2): lenses of CameraInfo, places of /tf_static."""
+"""Cameras of an MCAP recording (ROS 2): intrinsics from CameraInfo, poses from /tf_static."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ _STATIC = "/tf_static"
 
 
 def mcap_rig(path: Path) -> Rig:
-    """Every camera that has a CameraInfo; its name is the shortest end of the topic's folder that no other camera has.
+    """Read every camera with a CameraInfo; its name is the shortest unique end of the topic's folder.
 
-    /front/color/camera_info and /front/depth/camera_info are `color` and `depth`, beside /side/color/camera_info they
-    are `front_color` and `depth`. Poses are those of the frames in the messages' headers, by /tf_static, in the frame
-    from which all of them hang; the optical axis is z, x to the right, y down (REP 103). A camera alone without
-    transforms is the world.
+    /front/color/camera_info and /front/depth/camera_info are `color` and `depth`; together with /side/color/camera_info
+    they are `front_color` and `depth`. Poses are those of the frames in the messages' headers, by /tf_static, in their
+    common root frame; the optical axis is z, x to the right, y down (REP 103). A single camera without transforms is
+    the world.
 
     Raises
     ------
     CalibrationError
-        No camera, one that is not calibrated, no transform to one, a lens that OpenCV does not have.
+        No camera, an uncalibrated one, one without a transform, a lens model that OpenCV lacks.
     FileError
         As `readers.ros.recordings.reading`.
     """
@@ -42,12 +42,12 @@ def mcap_rig(path: Path) -> Rig:
             raise CalibrationError("no topic of it has a CameraInfo", file=path, remedy=remedy)
         cameras = []
         for folder, info in infos.items():
-            beside = [topic for topic in images if topic.startswith(f"{folder}/")]
-            rectified = bool(beside) and all(is_rectified(topic) for topic in beside)
+            in_folder = [topic for topic in images if topic.startswith(f"{folder}/")]
+            rectified = bool(in_folder) and all(is_rectified(topic) for topic in in_folder)
             found = camera(info, names[folder], (int(info.width), int(info.height)), path, rectified=rectified)
             if found is None:
-                told = f"the CameraInfo of {folder} is not calibrated"
-                raise CalibrationError(told, file=path, remedy="Calibrate the camera, or record without this topic.")
+                problem = f"the CameraInfo of {folder} is not calibrated"
+                raise CalibrationError(problem, file=path, remedy="Calibrate the camera, or record without this topic.")
             cameras.append(found)
         frames = [str(info.header.frame_id).lstrip("/") for info in infos.values()]
     if len(frames) == 1 and frames[0] not in tree:
@@ -59,12 +59,12 @@ def mcap_rig(path: Path) -> Rig:
                 f"no transform in {_STATIC} between the frames {frames[0]} (below {roots[0][0]}) and {frame} "
                 f"(below {root})", file=path, remedy=f"Record {_STATIC}, and publish where each camera stands.",
             )  # fmt: skip
-    return Rig(tuple(_placed(one, T) for one, (_, T) in zip(cameras, roots)))
+    return Rig(tuple(_placed(c, T) for c, (_, T) in zip(cameras, roots)))
 
 
-def _placed(one: Camera, T_world_camera: NDArray) -> Camera:
-    lens = () if one.distortion is None else tuple(one.distortion)
-    return Camera(one.name, one.size, one.matrix, lens, T_camera_world=se3.inverse(T_world_camera))  # type: ignore[arg-type]
+def _placed(c: Camera, T_world_camera: NDArray) -> Camera:
+    lens = () if c.distortion is None else tuple(c.distortion)
+    return Camera(c.name, c.size, c.matrix, lens, T_camera_world=se3.inverse(T_world_camera))  # type: ignore[arg-type]
 
 
 def _infos(topics: Topics) -> dict[str, Any]:
@@ -74,7 +74,7 @@ def _infos(topics: Topics) -> dict[str, Any]:
 
 
 def camera_names(topics: Topics) -> dict[str, str]:
-    """{folder of a CameraInfo: its camera's name}, the shortest end of each folder that no other has."""
+    """{folder of a CameraInfo: its camera's name}, the shortest unique end of each folder."""
     out, folders = {}, list(_infos(topics))
     for folder in folders:
         parts, end = folder.strip("/").split("/"), folder
@@ -90,8 +90,8 @@ def _tree(topics: Topics) -> dict[str, tuple[str, NDArray]]:
     """{frame: (its parent, T_parent_frame)}."""
     out: dict[str, tuple[str, NDArray]] = {}
     for message in topics.all(_STATIC):
-        for one in message.transforms:
-            out[str(one.child_frame_id).lstrip("/")] = str(one.header.frame_id).lstrip("/"), _matrix(one.transform)
+        for t in message.transforms:
+            out[str(t.child_frame_id).lstrip("/")] = str(t.header.frame_id).lstrip("/"), _matrix(t.transform)
     return out
 
 
@@ -103,7 +103,7 @@ def _matrix(transform: Any) -> NDArray:
 
 
 def _root(frame: str, tree: dict[str, tuple[str, NDArray]]) -> tuple[str, NDArray]:
-    """The frame from which one hangs, and T_root_frame."""
+    """The root of a frame, and T_root_frame (4, 4)."""
     T, seen = np.eye(4), set[str]()
     while frame in tree and frame not in seen:
         seen.add(frame)

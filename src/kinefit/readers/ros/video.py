@@ -1,4 +1,4 @@
-"""Images of a topic of an MCAP recording (ROS 2) as the frames of a video: what `Video` reads such a path with."""
+"""Image topics of an MCAP recording (ROS 2) as videos; the reader of `Video` for such paths."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from kinefit.errors import ObservationError
 from kinefit.readers.ros.images import COLOURS, colours, is_colour, refuse_encoding
 from kinefit.readers.ros.recordings import COMPRESSED, IMAGE, Messages, Topics, median_rate, reading
 
-_GAP = 0.5  # [s] without an image, or three frames if that is longer, that a video cannot bridge
-
+_MAX_GAP_S = 0.5  # without an image, or three frames if that is longer
 _MAX_REPEATS = 100  # mean number of frames that show one image; a tenth of it where half of all images were dropped
 
 
 class McapVideo:
-    """Images at an even rate, that of the recording: each time shows the image nearest to it.
+    """Images resampled to the recording's median rate: each frame shows the image nearest in time.
 
     Frame 0 is at the recording's first image of any topic, so that cameras of one recording are in step.
 
@@ -25,27 +24,27 @@ class McapVideo:
     ----------
     path : Path of the recording
     topic : str or None
-        None: the only one that has images in colour or grey.
+        None: the only one with images in colour or grey.
 
     Raises
     ------
     FileError
         The extra is not installed, or the file is damaged.
     ObservationError
-        No such topic, one of another encoding, none or several that have images; more than half a second, and three
-        frames, without any; times that give no rate.
+        No such topic, an unknown encoding, no unique image topic; a gap of more than half a second and three frames;
+        times that give no rate.
     """
 
     def __init__(self, path: Path, topic: str | None) -> None:
         with reading(path) as reader:
             topics = Topics(reader, path)
-            fitting = [one for one in topics.of(IMAGE, COMPRESSED) if is_colour(topics.first(one))]
+            fitting = [t for t in topics.of(IMAGE, COMPRESSED) if is_colour(topics.first(t))]
             refuse_encoding(topics, topic, "image", (*COLOURS, "jpeg", "png"))
             self.topic = topics.chosen(topic, fitting, "images in colour or grey")
             times, logged = topics.times(self.topic)
             first = colours(topics.first(self.topic), path)
         rate = median_rate(times, self.topic, path)
-        gaps = np.flatnonzero(np.diff(times, prepend=0.0) > max(_GAP, 3.0 / rate))
+        gaps = np.flatnonzero(np.diff(times, prepend=0.0) > max(_MAX_GAP_S, 3.0 / rate))
         if len(gaps):
             begin, end = (0.0, *times)[gaps[0]], times[gaps[0]]
             raise ObservationError(
@@ -75,13 +74,13 @@ class McapVideo:
         return np.arange(len(self)) / self.rate
 
     def image(self, i: int) -> NDArray[np.uint8]:
-        """Frame `i` as (H, W, 3) uint8 RGB."""
+        """Frame `i` as (H, W, 3) uint8 RGB; raises ObservationError for an image of another size."""
         number = int(self._shown[i])
         if number != self._last[0]:
             image = colours(self._messages(number), self.path)
             if image.shape[1::-1] != self.size:
-                told = f"{image.shape[1]}x{image.shape[0]} px, but the first image has {self.size[0]}x{self.size[1]}"
+                problem = f"{image.shape[1]}x{image.shape[0]} px, but the first image has {self.size[0]}x{self.size[1]}"
                 remedy = "All images of a camera are of one size."
-                raise ObservationError(told, file=self.path, place=f"{self.topic}, frame {i}", remedy=remedy)
+                raise ObservationError(problem, file=self.path, place=f"{self.topic}, frame {i}", remedy=remedy)
             self._last = number, image
         return self._last[1].copy()

@@ -27,7 +27,7 @@ def read_amc(
     Parameters
     ----------
     asf_path, amc_path : path
-        A motion may borrow the skeleton of another subject that has the same bones and degrees of freedom.
+        The skeleton may be another subject's with the same bones and degrees of freedom.
     rate : float [Hz]
         Frames a second, which the format does not state; 120 in nearly all of the CMU library.
     unit : float [m], optional

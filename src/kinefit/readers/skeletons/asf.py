@@ -29,7 +29,7 @@ class Bone:
     vector : (3,) [m] from the bone's start to its end in the rest pose; zero for the root.
     R_world_axes : (3, 3) axes of its degrees of freedom in the rest pose.
     dofs : degrees of freedom ("rx", "tz", ...) in the order of the values in the AMC.
-    limits : (D, 2) [rad or m], or None where the file gives none.
+    limits : (D, 2) [rad or m], or None if the file states none.
     """
 
     name: str
@@ -69,12 +69,12 @@ def read_asf(path: str | PathLike[str], *, unit: float | None = None) -> AsfSkel
     ----------
     path : path
     unit : float [m], optional
-        Metres per unit of length; None takes inches divided by the file's `length`, as the CMU library means it.
+        Metres per unit of length; None: inches divided by the file's `length`, the convention of the CMU library.
 
     Raises
     ------
     FileError
-        If the file is missing, cut off, or its hierarchy is not a tree of the bones from the root.
+        Missing, truncated, or a hierarchy that is not a tree of the bones from the root.
     """
     sections = _sections(path)
     for name in ("root", "bonedata", "hierarchy"):
@@ -238,10 +238,10 @@ def _in_order(
         above = index[parent_of[name]] if name in parent_of else -1
         bones.append(Bone(name, above, bone.vector, bone.R_world_axes, bone.dofs, bone.limits))
         stack.extend(reversed(children.get(name, [])))
-    lost = [name for name in loose if name not in index]
-    if lost:
+    unreached = [name for name in loose if name not in index]
+    if unreached:
         raise FileError(
-            f"no path from the root to {', '.join(lost)}",
+            f"no path from the root to {', '.join(unreached)}",
             file=path,
             place=":hierarchy",
             remedy="Name every bone once as a child.",

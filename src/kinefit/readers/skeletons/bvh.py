@@ -19,8 +19,10 @@ from kinefit.readers.skeletons.common import euler_rotations, joint_poses, parse
 UNITS = (0.001, 0.01, 0.0254, 0.0254 / 0.45, 1.0)
 """Metres per unit that "auto" chooses from: mm, cm, inch, the unit of CMU's ASF files, m."""
 
-_STATURE, _LEAST, _LARGEST = 1.7, 1.0, 2.2  # [m]; from a child of six upwards
-_HEAD_TO_ANKLE = 0.85  # length of the chain of bones from the head's joint to the ankle, as a part of the stature
+_TYPICAL_STATURE = 1.7  # [m]
+_MIN_STATURE = 1.0  # [m] a child of six
+_MAX_STATURE = 2.2  # [m]
+_HEAD_TO_ANKLE_SHARE = 0.85  # of the stature: length of the chain of bones from the head's joint to the ankle
 
 
 @dataclass(frozen=True)
@@ -35,32 +37,30 @@ class _BvhJoint:
 def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str = "auto") -> SkeletonMotion:
     """Read a BVH file.
 
-    Rotation channels multiply from left to right in the order in which the file lists them. Position channels
-    hold the joint's place instead of its OFFSET in some programs' files and the way from its OFFSET in others';
-    taken is whichever the values are nearer to (for the root: in height). The rest pose is that of all angles
-    zero, which need not be one that a person can take.
+    Rotation channels multiply from left to right in the order of the file. Position channels replace the joint's
+    OFFSET in some programs' files and are added to it in others'; the reader takes whichever is nearer to the
+    values (for the root: in height). The rest pose has all angles zero; a person may be unable to take it.
 
     Parameters
     ----------
     path : path
     unit : float [m] or "auto"
-        Metres per unit of length of the file, which BVH does not state. "auto" takes the one of `UNITS` that
-        gives the skeleton the most human stature (within 1.0 to 2.2 m, nearest to 1.7 m). The unit taken is
-        stated in the motion's `source`.
+        Metres per unit of length of the file, which BVH does not state. "auto" chooses the one of `UNITS` with
+        the most plausible stature (within 1.0 to 2.2 m, nearest to 1.7 m). The motion's `source` states it.
     up : "x", "y", "z" or "auto"
         Vertical axis of the file's world. "auto" takes the axis along which, on average, the head is above the
-        feet; "y", as is usual, where the names do not tell head and feet.
+        feet; the common "y" if no joint is named as head and feet.
 
     Returns
     -------
     SkeletonMotion
-        In the file's world. A frame time that is a whole rate (or one / 1.001) rounded gives that rate exactly.
+        In the file's world. A frame time that is the rounded reciprocal of a whole rate (or one / 1.001) gives
+        that rate exactly.
 
     Raises
     ------
     FileError
-        If the file is missing, truncated, not BVH, holds anything but finite numbers where numbers belong, or
-        if no unit makes it human and none was given.
+        Missing, truncated, not BVH, numbers that are not finite, or no unit with a plausible stature.
     """
     text = read_text(path, "BVH")
     if up not in ("x", "y", "z", "auto"):
@@ -98,7 +98,7 @@ def _read_hierarchy(text: str, path: str | PathLike[str]) -> list[_BvhJoint]:
     if not tokens or tokens[0][0].upper() != "HIERARCHY":
         raise FileError("does not begin with HIERARCHY", file=path, place="line 1", remedy="Give a BVH file.")
     joints: list[_BvhJoint] = []
-    open_joints: list[dict] = []  # the nesting of braces: name, parent, and what is known so far
+    open_joints: list[dict] = []  # stack of open braces: name, parent, index
     at = 1
 
     def fault(problem: str, line: int) -> FileError:
@@ -162,7 +162,7 @@ def _end_name(parent: str, taken: set[str]) -> str:
 
 
 def _read_motion(text: str, channels: int, line: int, path: str | PathLike[str]) -> tuple[float, NDArray]:
-    """Rate [Hz] and values (F, C); `line` is the number of the line on which `text` begins."""
+    """Rate [Hz] and values (F, C) of the motion; `line` is the line number at which `text` begins."""
     lines = [(n, content) for n, content in enumerate(text.split("\n"), line) if content.strip()]
     found = []
     for i, pattern in enumerate((r"\s*Frames\s*:\s*(\d{1,12})\s*", r"\s*Frame\s+Time\s*:\s*(\S+)\s*")):
@@ -207,7 +207,7 @@ def _read_motion(text: str, channels: int, line: int, path: str | PathLike[str])
 
 
 def _exact_rate(frame_time: float, printed: str) -> float:
-    """[Hz] The whole rate, or whole / 1.001, whose frame time rounds to the one printed; else its reciprocal."""
+    """Rate [Hz]: whole, or whole / 1.001, if its frame time [s] rounds to the printed one; else the reciprocal."""
     decimals = len(printed.partition(".")[2]) if "e" not in printed.lower() else 15
     for step in (1.0, 1.0 / 1.001):
         rate = max(round(1.0 / frame_time / step), 1) * step
@@ -238,13 +238,13 @@ def _local_poses(joints: Sequence[_BvhJoint], values: NDArray) -> NDArray:
 
 
 def _is_added(positions: NDArray, offset: NDArray) -> bool:
-    """Whether position channels (F, P) are the way from the OFFSET (P,) rather than a place near it."""
+    """Whether position channels (F, P) are added to the OFFSET (P,), not in place of it."""
     from_origin = np.median(np.linalg.norm(positions, axis=1))
     return bool(from_origin <= np.median(np.linalg.norm(positions - offset, axis=1)))
 
 
 def _root_shift(root: _BvhJoint, values: NDArray, up: str) -> NDArray:
-    """(3,) the root's OFFSET where its position channels are to be added to it, else zero."""
+    """(3,) the root's OFFSET if its position channels are added to it, else zero."""
     shift = np.zeros(3)
     height = [k for k, channel in enumerate(root.channels) if channel == f"{up}position"]
     if _is_added(values[:, height], np.array(root.offset)[["xyz".index(up)] * len(height)]):
@@ -264,23 +264,23 @@ def _given_unit(unit: float | str, path: str | PathLike[str]) -> float:
 
 
 def _human_unit(names: Sequence[str], parents: Sequence[int], offsets: NDArray, path: str | PathLike[str]) -> float:
-    """The unit of `UNITS` in which the skeleton is most human.
+    """The unit of `UNITS` with the most plausible stature.
 
-    Measured along the bones from head to ankle, which no pose changes; by the extent of the rest pose where the
-    names do not tell head and feet.
+    The stature is the length of the bones from head to ankle, independent of the pose; the extent of the rest pose
+    if no joint is named as head and feet.
     """
     head, feet = _landmarks(names)
     if head is not None and feet:
         chains = [set(_chain(head, parents)) ^ set(_chain(foot, parents)) for foot in feet]
         lengths = np.linalg.norm(offsets, axis=1)
-        height = float(np.mean([lengths[list(chain)].sum() for chain in chains])) / _HEAD_TO_ANKLE
+        height = float(np.mean([lengths[list(chain)].sum() for chain in chains])) / _HEAD_TO_ANKLE_SHARE
     else:
         rest = np.array(offsets)
         for joint, parent in enumerate(parents):
             rest[joint] = offsets[joint] + rest[parent] if parent >= 0 else 0.0
         height = float(np.ptp(rest, axis=0).max())
-    unit = min(UNITS, key=lambda u: abs(height * u - _STATURE))
-    if not _LEAST <= height * unit <= _LARGEST:
+    unit = min(UNITS, key=lambda u: abs(height * u - _TYPICAL_STATURE))
+    if not _MIN_STATURE <= height * unit <= _MAX_STATURE:
         raise FileError(
             f"the skeleton is {height:.4g} units tall: in no usual unit is that a person",
             file=path,
@@ -290,7 +290,7 @@ def _human_unit(names: Sequence[str], parents: Sequence[int], offsets: NDArray, 
 
 
 def _landmarks(names: Sequence[str]) -> tuple[int | None, list[int]]:
-    """Joint of the head and those of the feet, as far as the names tell."""
+    """Joint of the head (None if not found by name) and joints of the feet."""
     heads = [i for i, name in enumerate(names) if "head" in name.lower()]
     feet = [i for i, name in enumerate(names) if re.search("foot|ankle", name.lower()) and not name.endswith("_end")]
     return (heads[0] if heads else None), feet

@@ -1,4 +1,4 @@
-"""Characters of animation programs: a skeleton at rest, with what is needed to put a motion onto it."""
+"""Read characters of animation programs: a skeleton in its rest pose, ready for retargeting."""
 
 from __future__ import annotations
 
@@ -21,15 +21,16 @@ from kinefit.readers.skeletons.bvh import read_bvh
 from kinefit.readers.skeletons.gltf import MALFORMED, Gltf, read_gltf
 
 KINDS = {".glb": "glb", ".vrm": "glb", ".gltf": "glb", ".bvh": "bvh"}
-"""What characters are read from, and in which format a motion on them is written."""
+"""{ending of a character file: format of the retargeted motion}."""
 
-_MAX_NODES, _MAX_VERTICES = 20_000, 2_000_000  # detailed characters have 2,000 and 500,000
-_UNEVEN = 1e-3  # of the scales along the axes: less is rounding
+_MAX_NODES = 20_000  # detailed characters have 2,000
+_MAX_VERTICES = 2_000_000  # detailed characters have 500,000
+_MAX_SHEAR = 1e-3  # of a node's scaled rotation: less is rounding
 
 
 @dataclass(frozen=True, eq=False)
 class Character:
-    """A skeleton at rest, its world y up.
+    """A skeleton in its rest pose, in a world with y up.
 
     Parameters
     ----------
@@ -38,15 +39,15 @@ class Character:
     parents : (J,) int, -1 for none.
     order : (J,) int, parents before their children.
     positions : (J, 3) [m]
-    rotations : (J, 3, 3) of their frames, without scale; mirrored where the file mirrors.
+    rotations : (J, 3, 3) of their frames, without scale; reflections if the file has some.
     scales : (J,) factor of lengths in each node.
     world : (3, 3) rotation that takes the file's world to one with y up.
-    joints : (J,) bool, nodes whose names count: those of the skin, where there is one.
-    told : segment -> index, joints that the file itself names (VRM).
+    joints : (J,) bool, nodes of the skin; all nodes without a skin.
+    vrm_joints : {segment: index}, joints that a VRM file assigns.
     points, owners : (P, 3) [m], (P,) int
-        Vertices of the mesh at rest, each with the node that moves it most; none where there is no mesh.
+        Vertices of the mesh in the rest pose, each with the node of the largest weight; empty without a mesh.
     unit : float, metres of the file's unit.
-    gltf, text : what the file holds, one of the two.
+    gltf, text : content of the file, one of the two.
     """
 
     path: Path
@@ -58,7 +59,7 @@ class Character:
     scales: NDArray
     world: NDArray
     joints: NDArray
-    told: Mapping[str, int]
+    vrm_joints: Mapping[str, int]
     points: NDArray
     owners: NDArray
     unit: float = 1.0
@@ -66,7 +67,7 @@ class Character:
     text: str = ""
 
     def in_parent(self, node: int, places: NDArray) -> NDArray:
-        """Places (F, 3) [m] in the world in the frame and the unit of a node's parent, which rests."""
+        """Transform points (F, 3) [m] from the world to the frame and unit of a node's parent in the rest pose."""
         parent = int(self.parents[node])
         if parent < 0:
             return np.asarray(places @ self.world / self.unit)
@@ -75,14 +76,14 @@ class Character:
 
 
 def read_character(path: str | PathLike[str]) -> Character:
-    """A character from a GLB, VRM, glTF or BVH file, in the pose in which its nodes stand there.
+    """Read a character from a GLB, VRM, glTF or BVH file, in the pose of its nodes.
 
-    Of BVH that is the pose of all angles zero, or where that is not upright the first frame.
+    For BVH that is the pose of all angles zero, or the first frame if that pose is not upright.
 
     Raises
     ------
     FileError
-        Not of these, not readable, without nodes, or unevenly scaled.
+        Another format, not readable, without nodes, or unevenly scaled.
     """
     path = Path(path)
     kind = KINDS.get(path.suffix.lower())
@@ -93,11 +94,11 @@ def read_character(path: str | PathLike[str]) -> Character:
 
 
 def read_names(path: str | PathLike[str]) -> dict[str, str]:
-    """A table of names: TOML of lines `segment = "joint"`.
+    """Read a table of joint names: TOML of lines `segment = "joint"`.
 
     Returns
     -------
-    segment (of `SEGMENTS`, `FINGERS`, `FACE` or `ENDS`) -> name of a joint
+    {segment (of `SEGMENTS`, `FINGERS`, `FACE` or `ENDS`): name of a joint}
 
     Raises
     ------
@@ -118,7 +119,7 @@ def read_names(path: str | PathLike[str]) -> dict[str, str]:
 
 
 def _order(parents: NDArray, path: Path) -> NDArray:
-    """Parents before their children."""
+    """(J,) node numbers, parents before their children; raises FileError for a cycle."""
     out, children = list[int](), [list[int]() for _ in parents]
     for node, parent in enumerate(parents.tolist()):
         (out if parent < 0 else children[parent]).append(node)
@@ -134,8 +135,8 @@ def _from_gltf(path: Path) -> Character:
     try:
         parents = gltf.parents()
         if not 0 < len(parents) <= _MAX_NODES:
-            told = f"more than {_MAX_NODES}" if len(parents) else "no"
-            raise FileError(f"holds {told} nodes", file=path, remedy="Export the character alone, with its skeleton.")
+            count = f"more than {_MAX_NODES}" if len(parents) else "no"
+            raise FileError(f"holds {count} nodes", file=path, remedy="Export the character alone, with its skeleton.")
         return _of_gltf(gltf, parents, _order(parents, path), path)
     except MALFORMED as error:
         problem = f"is no whole glTF file ({type(error).__name__}: {error})"
@@ -158,7 +159,7 @@ def _of_gltf(gltf: Gltf, parents: NDArray, order: NDArray, path: Path) -> Charac
     scales = sizes.mean(axis=1)
     for node in np.flatnonzero(joints):
         R = Ms[node, :3, :3] / max(scales[node], 1e-12)
-        if not np.allclose(R.T @ R, np.eye(3), atol=_UNEVEN):
+        if not np.allclose(R.T @ R, np.eye(3), atol=_MAX_SHEAR):
             remedy = "Apply the scale in the program that it comes from (Blender: Ctrl-A, Scale)."
             raise FileError("is scaled unevenly", file=path, place=f"node '{names[node]}'", remedy=remedy)
     points, owners = _vertices(gltf, Ms, path)
@@ -166,7 +167,7 @@ def _of_gltf(gltf: Gltf, parents: NDArray, order: NDArray, path: Path) -> Charac
         raise ValueError("a place that is not finite")
     rotations = Ms[:, :3, :3] / np.maximum(scales, 1e-12)[:, None, None]
     return Character(
-        path, names, parents, order, Ms[:, :3, 3], rotations, scales, np.eye(3), joints, _told(gltf.json), points,
+        path, names, parents, order, Ms[:, :3, 3], rotations, scales, np.eye(3), joints, _vrm_joints(gltf.json), points,
         owners, gltf=gltf,
     )  # fmt: skip
 
@@ -200,8 +201,8 @@ def _vertices(gltf: Gltf, Ms: NDArray, path: Path) -> tuple[NDArray, NDArray]:
     return np.concatenate(points), np.concatenate(owners)
 
 
-def _told(file: Mapping[str, Any]) -> dict[str, int]:
-    """Joints that a VRM file tells, of both of its versions."""
+def _vrm_joints(file: Mapping[str, Any]) -> dict[str, int]:
+    """{segment: node} that a VRM file assigns, version 0 or 1."""
     more = file.get("extensions", {})
     new = more.get("VRMC_vrm", {}).get("humanoid", {}).get("humanBones", {})
     old = more.get("VRM", {}).get("humanoid", {}).get("humanBones", [])
@@ -219,7 +220,7 @@ def _from_bvh(path: Path) -> Character:
     parents, R = np.array(skeleton.parents), rotation_between_up(skeleton.up, "y")
     rest = skeleton.rest
     rotations = np.tile(np.eye(3), (len(parents), 1, 1))
-    if np.ptp(rest @ R[1]) < 0.6 * np.ptp(skeleton.positions[0] @ R[1]):  # lies, or its bones lie along one axis
+    if np.ptp(rest @ R[1]) < 0.6 * np.ptp(skeleton.positions[0] @ R[1]):  # lying, or all bones along one axis
         rest, rotations = skeleton.positions[0], skeleton.Ts_world_joint[0, :, :3, :3]
     unit = re.search(r"\(unit (\S+) m\)$", skeleton.source)
     return Character(

@@ -1,4 +1,4 @@
-"""What the readers of skeleton motions share: text in, Euler angles to rotations, local poses to world poses."""
+"""Shared functions of the readers of skeleton motions: text, Euler angles, forward kinematics."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kinefit.errors import FileError
 
 
 def read_text(path: str | PathLike[str], kind: str) -> str:
-    """Text of a file of the given kind ("BVH"); FileError if it cannot be had or is no text."""
+    """Text of a file of the given kind ("BVH"); raises FileError if it cannot be read or is binary."""
     try:
         with open(path, encoding="utf-8-sig", errors="replace") as file:
             text = file.read()
@@ -26,7 +26,7 @@ def read_text(path: str | PathLike[str], kind: str) -> str:
 
 
 def parse_numbers(tokens: Sequence[str], *, file: str | PathLike[str], line: int) -> list[float]:
-    """Finite numbers of one line; FileError naming file and line otherwise."""
+    """Finite numbers of one line; raises FileError with file and line."""
     try:
         values = [float(token) for token in tokens]
     except ValueError:
@@ -56,7 +56,7 @@ def _is_number(token: str) -> bool:
 
 
 def euler_rotations(angles: NDArray, axes: Sequence[str]) -> NDArray:
-    """Product of the elementary rotations about `axes`, from left to right.
+    """Rotations of Euler angles: the product of elementary rotations about `axes`, from left to right.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def euler_rotations(angles: NDArray, axes: Sequence[str]) -> NDArray:
 
     Returns
     -------
-    (..., 3, 3)
+    (..., 3, 3) rotations
     """
     rotations = np.broadcast_to(np.eye(3), (*angles.shape[:-1], 3, 3))
     for k, axis in enumerate(axes):
@@ -82,7 +82,7 @@ def euler_rotations(angles: NDArray, axes: Sequence[str]) -> NDArray:
 
 
 def joint_poses(parents: Sequence[int], Ts_parent_joint: NDArray) -> NDArray:
-    """Poses in the world, (F, J, 4, 4), from poses in the parent's frame; parents come before children."""
+    """Poses (F, J, 4, 4) in the world, from poses (F, J, 4, 4) in the parents' frames; parents come first."""
     Ts_world_joint = np.array(Ts_parent_joint)
     for joint, parent in enumerate(parents):
         if parent >= 0:

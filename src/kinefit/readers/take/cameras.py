@@ -16,7 +16,7 @@ from kinefit.readers.take.file import Take
 from kinefit.readers.video import Video
 
 USUAL = 64.0
-"""[deg] across the longer side of the image where nothing is told: videos of telephones have some 60 to 70."""
+"""[deg] across the longer side of the image by default: videos of telephones have some 60 to 70."""
 
 
 def is_alone(take: Take) -> bool:
@@ -64,9 +64,9 @@ def what_is_assumed(take: Take) -> list[str]:
     if not is_alone(take):
         return []
     entry = take.cameras[0]
-    told = f"a field of view of {entry.field_of_view or USUAL:g}°" + ("" if entry.field_of_view else ", the usual one")
+    lens = f"a field of view of {entry.field_of_view or USUAL:g}°" + ("" if entry.field_of_view else ", the usual one")
     out = [
-        f"camera {entry.name} is alone and not calibrated: it is taken to look level, with {told}; where it is a tenth "
+        f"camera {entry.name} is alone and not calibrated: it is taken to look level, with {lens}; where it is a tenth "
         "wider, the person is a tenth nearer. Error bars do not hold this."
     ]
     if take.height is None:

@@ -90,11 +90,11 @@ def _values(take: Take) -> None:
             PersonChoice.of(take.person)
         except ObservationError as error:
             refuse(error.problem, "[take] person", error.remedy or "")
-        told = take.start is not None or take.pose is not None  # where the body is, and so who
-        if not (take.keypoints or (take.depth and not told)) and (
+        has_start = take.start is not None or take.pose is not None  # where the body is, and so who
+        if not (take.keypoints or (take.depth and not has_start)) and (
             take.depth or take.stereo or take.markers or take.silhouettes or take.skin
         ):
-            what = "[[keypoints]], beside a start" if told else "[[keypoints]] or [[depth]]"
+            what = "[[keypoints]], beside a start" if has_start else "[[keypoints]] or [[depth]]"
             refuse(f"'person' has no use without {what}", "[take] person", "Leave it out.")
     for key in ("height", "subject", "size"):
         if take.start is not None and getattr(take, key) is not None:
@@ -174,13 +174,13 @@ def _is_size(size: tuple[int, int]) -> bool:
 def _calibration(take: Take, entry: CalibrationEntry, refuse: Callable[[str, str, str], None]) -> None:
     """Standard deviations of cameras' poses: both, and for keypoints."""
     shift, turn = entry.position_sigma, entry.rotation_sigma
-    told, place = f"position_sigma {shift}, rotation_sigma {turn}", "[calibration]"
+    stated, place = f"position_sigma {shift}, rotation_sigma {turn}", "[calibration]"
     if shift is None and turn is None:
         return
     if shift is None or turn is None or (min(shift, turn) <= 0 and not shift == turn == 0):
-        refuse(told, place, "Give metres and degrees above 0, or 0 and 0 for an exact calibration, or neither.")
+        refuse(stated, place, "Give metres and degrees above 0, or 0 and 0 for an exact calibration, or neither.")
     elif not (shift < 1 and turn < 30):
-        refuse(told, place, "Give metres below 1 and degrees below 30: a camera that is so far off needs calibration.")
+        refuse(stated, place, "Give metres below 1 and degrees below 30: a camera that is so far off needs calibration.")
     others = (take.silhouettes, take.markers, take.depth, take.stereo, take.lines, take.skin, take.trackers)
     if not take.keypoints and any(others):
         refuse("position_sigma and rotation_sigma are for cameras with keypoints", place, "Leave both out.")
@@ -299,15 +299,15 @@ def _names(take: Take) -> None:
     for kind, several in (("silhouettes", take.silhouettes), ("regions", take.regions)):
         for camera in repeated(s.camera for s in several):  # type: ignore[attr-defined]
             raise TakeError(f"two {kind}", file=take.path, place=f"camera {camera}", remedy="Leave one out.")
-    told: list[tuple[object, ...]] = [
+    inputs: list[tuple[object, ...]] = [
         (f"keypoints of camera {k.camera}", k.file, k.format, k.frames, k.set == FACE_SET)
         for k in (*take.keypoints, *take.skin)
     ]
-    told += [(f"markers {m.file.name}", m.file, m.set) for m in take.markers]
-    told += [(f"surface points {p.file.name}", p.file) for p in take.surface_points]
-    told += [(f"trackers {p.file.name}", p.file, sorted(p.points)) for p in take.trackers]
-    for one in told:
-        if told.count(one) > 1:
+    inputs += [(f"markers {m.file.name}", m.file, m.set) for m in take.markers]
+    inputs += [(f"surface points {p.file.name}", p.file) for p in take.surface_points]
+    inputs += [(f"trackers {p.file.name}", p.file, sorted(p.points)) for p in take.trackers]
+    for one in inputs:
+        if inputs.count(one) > 1:
             remedy = "Leave one out: what is there twice would count twice."
             raise TakeError("the same file twice", file=take.path, place=str(one[0]), remedy=remedy)
     of_one = [(f"camera {c.name}", c.name, c.video) for c in take.cameras if c.video is not None]

@@ -34,21 +34,21 @@ class DepthSensors:
 
     def notes(self, rate: float) -> tuple[str, ...]:
         """What is worth saying of their time beside that of the take: other rates, frames that are missing."""
-        told = []
+        notes = []
         for video in (*self.depth, *self.clouds):
             if abs(video.rate / rate - 1.0) > _SAME:
-                told.append(
+                notes.append(
                     f"depth {video.sensor} has {video.rate:.4g} Hz, the take {rate:.4g} Hz: "
                     "each depth image counts at the step nearest to it"
                 )
             if len(video.gaps):
                 first = int(video.gaps[0])
                 gap = video.times[first] - video.times[first - 1]
-                told.append(
+                notes.append(
                     f"depth {video.sensor} lacks frames in {len(video.gaps)} places, the first before frame {first} "
                     f"({gap:.3g} s instead of {1.0 / video.rate:.3g} s)"
                 )
-        return tuple(told)
+        return tuple(notes)
 
 
 def load_depth(take: Take, rig: Rig | None, rates: Mapping[str, float]) -> DepthSensors:

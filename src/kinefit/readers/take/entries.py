@@ -42,7 +42,7 @@ class StartEntry(_Entry, frozen=True, kw_only=True):
 
 
 class SessionEntry(_Entry, frozen=True, kw_only=True):
-    """`[session]`: whom and what the recording shows, for the report; nothing is computed from it."""
+    """`[session]`: subject and movement of the recording, for the report; nothing is computed from it."""
 
     subject: str = ""  # a code rather than a name
     date: datetime.date | None = None  # of the recording, 2026-03-02
@@ -54,7 +54,7 @@ class SessionEntry(_Entry, frozen=True, kw_only=True):
     norms: Path | None = None  # table of normative values over the cycle: coordinate, percent, mean, sd
 
     @property
-    def told(self) -> dict[str, str]:
+    def stated(self) -> dict[str, str]:
         """What was stated, as texts."""
         return {k: str(v) for k in self.__struct_fields__ if (v := getattr(self, k)) and k != "norms"}
 

@@ -97,7 +97,7 @@ class Take:
     height : float [m] or None
         Stature of the person, as a first guess.
     person : int, str or None
-        Who is followed where several people are in view, see `PersonChoice`; None: the one of whom most is seen.
+        The target person if several are in view, see `PersonChoice`; None: the one with most visible points.
     subject : Path or None
         Take of the same person (a T-pose trial) that bone lengths come from; None: from this take itself.
     start : Path or None
@@ -109,7 +109,7 @@ class Take:
     frames : (start, stop) or None
         Steps of the common time, t = step / rate.
     calibration : CalibrationEntry or None
-    session : SessionEntry, whom and what the recording shows
+    session : SessionEntry, subject and movement of the recording
     hide_faces : bool
         Whether images and videos that are made from the take's show no faces.
     cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines, surface_points, trackers : tuples

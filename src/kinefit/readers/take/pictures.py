@@ -30,7 +30,7 @@ class TakePictures:
     def __call__(self, camera: str, frame: int) -> tuple[NDArray, ImageFrame] | None:
         """Image (H, W, 3) uint8 RGB at a frame of the keypoints, and its image frame.
 
-        None where the camera has no video, or none that can be read: what is looked up is then told less surely.
+        None where the camera has no video, or none that can be read: what is looked up is then less certain.
         """
         try:
             if camera not in self._open:

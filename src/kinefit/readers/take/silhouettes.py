@@ -158,7 +158,7 @@ class _BeforeBackground:
     def __init__(self, video: Video, plate: Path | None, size: tuple[int, int], frame: ImageFrame) -> None:
         self.video, self._file, self._size, self._frame = video, plate, size, frame
         if plate is not None:
-            assert self.plate  # told now where it does not fit
+            assert self.plate  # raises now if it does not fit
 
     @cached_property
     def plate(self) -> BackgroundPlate:

@@ -67,7 +67,7 @@ def _skin(entry: KeypointsEntry, take: Take, image: ImageFrame, file: Path, rate
 def _detected_face(
     take: Take, entry: KeypointsEntry, begin: int, end: int
 ) -> tuple[int, tuple[float, float, float, float]]:
-    """The first frame in which the built-in detector saw somebody, and the face there, of whom it saw best."""
+    """The first frame in which the built-in detector saw somebody, and the face there, of which it saw best."""
     file = detections_file(take.path, entry.camera)
     if not file.exists():
         raise TakeError(

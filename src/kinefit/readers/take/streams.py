@@ -46,8 +46,8 @@ def odd_streams(take: Take) -> Iterator[tuple[str, str, str]]:
     for entry in take.depth:
         place = f"depth {entry.name}"
         if (entry.stream is None) == (entry.file is None):
-            told = "neither a file nor a stream" if entry.file is None else "a stream and a file"
-            yield told, place, 'Write file = "...", or, for `kinefit live`, stream = "FOLDER".'
+            problem = "neither a file nor a stream" if entry.file is None else "a stream and a file"
+            yield problem, place, 'Write file = "...", or, for `kinefit live`, stream = "FOLDER".'
         if entry.stream is not None:
             for key in ("time_unit", "segment"):
                 if getattr(entry, key) is not None:

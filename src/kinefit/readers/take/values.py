@@ -19,23 +19,23 @@ _WORDS = {
 
 def wrong_value(error: msgspec.ValidationError, tables: Mapping[str, type[msgspec.Struct]], path: Path) -> TakeError:
     """The error of a value that a table of a take file cannot have; `tables` are the records of all of them."""
-    told, _, at = str(error).partition(" - at `$.")
+    message, _, at = str(error).partition(" - at `$.")
     at = at.rstrip("`")
     table, _, key = at.partition(".")
     name, _, number = table.rstrip("]").partition("[")
     place = f"[[{name}]] {int(number) + 1}, {key}" if number.isdigit() else f"[{name}] {key}"
     listed = ", ".join(map(repr, _options(tables, name, key)))
-    known = listed and ("enum" in told or "Invalid" in told)
-    remedy = f"There are: {listed}." if known else _form(told, key)
-    return TakeError(_plain(told), file=path, place=place.rstrip(", ") if at else None, remedy=remedy)
+    known = listed and ("enum" in message or "Invalid" in message)
+    remedy = f"There are: {listed}." if known else _form(message, key)
+    return TakeError(_plain(message), file=path, place=place.rstrip(", ") if at else None, remedy=remedy)
 
 
-def _plain(told: str) -> str:
+def _plain(message: str) -> str:
     """What msgspec says, in words."""
-    told = told.replace("Object missing required field", "there is no").replace("enum ", "")
-    wanted, _, given = told.partition(", got ")
+    message = message.replace("Object missing required field", "there is no").replace("enum ", "")
+    wanted, _, given = message.partition(", got ")
     if not wanted.startswith("Expected ") or not given:
-        return told
+        return message
     kinds = [word for kind in re.findall(r"\w+", wanted.partition("`")[2].partition("`")[0]) if kind != "null"
              for word in [_WORDS.get(kind, kind)]]  # fmt: skip
     length = re.search(r"of length (.*)", wanted)
@@ -53,9 +53,9 @@ def _options(tables: Mapping[str, type[msgspec.Struct]], name: str, key: str) ->
     return next((get_args(literal) for literal in (hint, *get_args(hint)) if get_origin(literal) is Literal), ())
 
 
-def _form(told: str, key: str) -> str | None:
+def _form(message: str, key: str) -> str | None:
     """How a value is written, of which msgspec says that it is of another type."""
-    wanted, _, given = told.partition(", got ")
+    wanted, _, given = message.partition(", got ")
     if key == "unit" and "str" in wanted:
         return 'Write it in quotes: unit = "mm", "cm" or "m".'
     if key in ("unit", "time_unit") and "str" in given:

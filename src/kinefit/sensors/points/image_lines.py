@@ -15,7 +15,7 @@ from kinefit.losses import Loss
 from kinefit.observations import LineFrame
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor
-from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
+from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence
 from kinefit.sensors.scene import Scene
 
 
@@ -148,8 +148,8 @@ class ImageLineMatched(Matched):
         out, m = np.zeros((2, len(scene.body.tree.segments))), self.measurement
         across, segments = m.across(scene) / m.of.sigma, m.points_of(scene.body).segments
         for line in np.unique(m.line[np.isfinite(across).all(axis=1)]):
-            far = int(np.nansum(across[m.line == line] ** 2) >= AGREES**2)
-            out[far, np.unique(segments[m.line == line])] += SHOWN
+            far = int(np.nansum(across[m.line == line] ** 2) >= AGREEMENT_SIGMAS**2)
+            out[far, np.unique(segments[m.line == line])] += MIN_VISIBLE_OUTLINE
         return Evidence(*out)
 
 

@@ -18,14 +18,14 @@ from kinefit.observations import KEYPOINTS, KeypointFrame, Keypoints
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.channels import Channels, known_points, make_channels
-from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
+from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence
 from kinefit.sensors.layout import Layout, Stream, projected
 from kinefit.sensors.points.hand_views import join_fingers
 from kinefit.sensors.points.left_right import find_swaps
 from kinefit.sensors.points.triangulation import rays, triangulated_frame
 from kinefit.sensors.points.view_bias import ViewBias
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.visibility.occlusion import SEEN, Hidden, hidden_points
+from kinefit.sensors.visibility.occlusion import MIN_VISIBLE_CONFIDENCE, Hidden, hidden_points
 from kinefit.solvers.pixels import PixelPoints
 
 
@@ -127,7 +127,7 @@ class KeypointMeasurement(Measurement):
             uv -= beside
         hidden: tuple[Hidden, ...] = ()
         if scene.measurements:
-            sure = self.confidence[order] >= SEEN
+            sure = self.confidence[order] >= MIN_VISIBLE_CONFIDENCE
             hidden = tuple(hidden_points(scene, self.layout.points_of(scene.body), channels.camera, sure))
         loss, near = self.of.loss, self.of.near
         if reach > near:
@@ -237,10 +237,10 @@ class KeypointMatched(Matched):
 
         Fingers of a hand are judged together, see `hand_views`.
         """
-        agrees = self.squares(scene) < AGREES**2
+        agrees = self.squares(scene) < AGREEMENT_SIGMAS**2
         seen, informs = self.weight > 0, self.measurement.layout.informs
         right, wrong = seen & agrees, seen & ~agrees
-        agreeing, contrary = SHOWN * (informs @ right), SHOWN * (informs @ wrong)
+        agreeing, contrary = MIN_VISIBLE_OUTLINE * (informs @ right), MIN_VISIBLE_OUTLINE * (informs @ wrong)
         if hands := self.measurement.layout.hands:
             join_fingers(hands, agreeing, contrary, *self._metres(scene))
         return Evidence(agreeing, contrary, self._elsewhere(right, wrong))
@@ -271,7 +271,7 @@ class KeypointMatched(Matched):
         points, row = np.unique(channels.column[which], return_inverse=True)
         views = np.full((len(points), len(channels.rig), 2), np.nan)
         views[row, channels.camera[which]] = self.uv[which]
-        limit = AGREES * float(channels.sigma[which].max())
+        limit = AGREEMENT_SIGMAS * float(channels.sigma[which].max())
         there = np.isfinite(triangulate_robust(channels.rig, views, max_residual_px=limit)[0]).all(axis=1)
         out[:] = False
         out[owner[which[there[row]]]] = True

@@ -15,7 +15,7 @@ from kinefit.losses import Loss
 from kinefit.observations import MarkerFrame
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
-from kinefit.sensors.evidence import AGREES, SHOWN, Evidence
+from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence
 from kinefit.sensors.scene import Scene
 
 _AT_JOINT = 0.05  # [m] from a joint: such a point is evidence for the segments on both sides of it
@@ -143,7 +143,7 @@ def of_points(body: Body, points: PointSet, square: NDArray) -> Evidence:
     above = body.tree.parents[points.segments]
     at_joint = np.flatnonzero((above >= 0) & (np.linalg.norm(points.points, axis=1) < _AT_JOINT))
     speaks = np.zeros((len(points), len(body.tree.segments)))
-    speaks[np.arange(len(points)), points.segments] = SHOWN
-    speaks[at_joint, above[at_joint]] += SHOWN
+    speaks[np.arange(len(points)), points.segments] = MIN_VISIBLE_OUTLINE
+    speaks[at_joint, above[at_joint]] += MIN_VISIBLE_OUTLINE
     with np.errstate(invalid="ignore"):
-        return Evidence((square < AGREES**2) @ speaks, (square >= AGREES**2) @ speaks)
+        return Evidence((square < AGREEMENT_SIGMAS**2) @ speaks, (square >= AGREEMENT_SIGMAS**2) @ speaks)

@@ -74,9 +74,9 @@ class ViewBias:
         return {s: {n: np.round(c, 5).tolist() for n, c in points.items()} for s, points in self.sets.items()}
 
     @classmethod
-    def from_told(cls, told: Mapping[str, Any]) -> ViewBias:
+    def from_record(cls, record: Mapping[str, Any]) -> ViewBias:
         """Of what `as_told` gave."""
-        return cls({s: {n: np.array(c, float) for n, c in points.items()} for s, points in told.items()})
+        return cls({s: {n: np.array(c, float) for n, c in points.items()} for s, points in record.items()})
 
 
 def beside(

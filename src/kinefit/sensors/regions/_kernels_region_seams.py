@@ -1,4 +1,4 @@
-"""Compiled seams: where two parts of a body run into each other in an image, and how that moves with both."""
+"""Kernels of seams: intersections of two parts of a body in an image, and their derivatives."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import math
 from kinefit._jit import jit
 from kinefit.geometry._kernels_camera import project_jacobian
 
-_STRAY = 3.0  # [px] by which a seam may lie beside the pixels that it was found at: a drawing is a pixel old at most
+_MAX_STRAY_PX = 3.0  # of a seam from the pixels where it was found: the body has moved a pixel since it was rendered
 
 
 @jit
 def borders(face, depth, segment, part, gap, every, out):
-    """Pairs of neighbouring pixels of two parts that meet: how many were written.
+    """Write the pairs of adjacent pixels of two parts that meet; return their number.
 
-    face, depth (h, w) [m] as drawn; segment, part (T,) of each face: the pair's parts differ, and their depths do by
+    face, depth (h, w) [m] as rendered; segment, part (T,) of each face: the pair's parts differ, and their depths do by
     `gap` [m] at most. One in `every` such pairs is kept: out (N, 6) is face one, face two (of the segment with the
     higher number first), column and row between them, and the direction from the first to the second.
     """
@@ -57,10 +57,10 @@ def _plane(vertices, faces, f):
 
 @jit
 def seams(camera, vertices, faces, found, uv, ray, least, outline, point, pulls):
-    """Points of the curves in which triangles of two parts cut each other: how many of `found` (N, 6) were kept.
+    """Write points of the curves in which triangles of two parts intersect; return how many of `found` (N, 6) have one.
 
     camera packed; vertices (V, 3) [m] in the world; uv (N, 2) [px] where the curve is about, ray (N, 3) [m] the point
-    of the surface there. Planes at a smaller angle than its sine `least` are left out. outline (4, N): pixel and unit
+    of the surface there. Planes at an angle whose sine is below `least` are skipped. outline (4, N): pixel and unit
     normal, away from the first part; point (N, 3) [m]; pulls (2, N, 3) [px/m]: the seam moves along its normal by
     pulls[0] · dx of the first part's point and pulls[1] · dx of the second part's.
     """
@@ -77,7 +77,7 @@ def seams(camera, vertices, faces, found, uv, ray, least, outline, point, pulls)
         y = (ha * (bz * tx - bx * tz) + hb * (tz * ax - tx * az) + ht * ty) / square
         z = (ha * (bx * ty - by * tx) + hb * (tx * ay - ty * ax) + ht * tz) / square
         ok, u, v, ux, uy, uz, vx, vy, vz = project_jacobian(camera, x, y, z)
-        if not ok or abs(u - uv[k, 0]) > _STRAY or abs(v - uv[k, 1]) > _STRAY:
+        if not ok or abs(u - uv[k, 0]) > _MAX_STRAY_PX or abs(v - uv[k, 1]) > _MAX_STRAY_PX:
             continue
         du, dv = ux * tx + uy * ty + uz * tz, vx * tx + vy * ty + vz * tz
         length = math.sqrt(du * du + dv * dv)

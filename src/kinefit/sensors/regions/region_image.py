@@ -1,4 +1,4 @@
-"""What lines across a contour look at: an image with tables of log ratios, or what is kept of it, a band of them."""
+"""Log ratios of colours about a contour: from an image with its tables, or from a stored band."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from kinefit.images import _kernels_regions as kernels
 from kinefit.images.regions import Ratios
 from kinefit.sensors.regions.region_parts import Drawn, Lines
 
-_LEVELS = 127  # of a log ratio that is kept, to either side of 0
-# A map that is kept is drawn as an image whose colours are numbers of levels, so that one kernel looks at both.
+_MAX_LEVEL = 127  # of a stored log ratio, to either side of 0
+# A stored band is an image whose colours are the numbers of levels, so that one kernel reads both.
 _PALETTE = np.arange(32768, dtype=np.int32) % 256
 
 
@@ -35,7 +35,7 @@ class Coloured:
     ratios: Ratios
 
     def profiles(self, lines: Lines, drawn: Drawn, half: int, step: int, guard: float) -> NDArray:
-        """(N, 2 half) log ratios along the normals of a contour; see `kernels.profiles`."""
+        """(N, 2 half) log ratios along the normals of a contour, sampled every `step` [px]; see `kernels.profiles`."""
         out, r = np.empty((len(lines.anchor), 2 * half)), self.ratios
         kernels.profiles(
             self.image, self.bins, *r.packed, r.logs, lines.anchor, lines.outline, *drawn, lines.own, lines.beyond,
@@ -46,7 +46,7 @@ class Coloured:
 
 @dataclass(frozen=True, eq=False)
 class Kept(Coloured):
-    """A band of log ratios about a contour, in place of the image: `image` and so on are unpacked when asked for.
+    """A stored band of log ratios about a contour, in place of the image; unpacked on demand.
 
     Parameters
     ----------
@@ -61,41 +61,41 @@ class Kept(Coloured):
     top: int = 0
 
     @cached_property
-    def _painted(self) -> NDArray:
+    def _level_image(self) -> NDArray:
         levels = np.frombuffer(zlib.decompress(self.packed), np.uint8).reshape(self.shape)
         out = np.zeros((*self.shape, 3), np.uint8)
         out[..., 1], out[..., 2] = (levels >> 5) << 3, (levels & 31) << 3
         return out
 
     def profiles(self, lines: Lines, drawn: Drawn, half: int, step: int, guard: float) -> NDArray:
-        """As of the image, within the band; beyond it nothing is told."""
+        """(N, 2 half) log ratios within the band, sampled every `step` [px]; 0 outside it."""
         moved = np.array(lines.outline)
         moved[:2] -= np.array([[self.left], [self.top]])
         there = drawn._replace(left=drawn.left - self.left, top=drawn.top - self.top)
         own = replace(lines, outline=moved, anchor=np.zeros_like(lines.anchor))
         out, r = np.empty((len(own.anchor), 2 * half)), self.ratios
         kernels.profiles(
-            self._painted, self.bins, *r.packed, r.logs, own.anchor, moved, *there, own.own, own.beyond, half, step,
+            self._level_image, self.bins, *r.packed, r.logs, own.anchor, moved, *there, own.own, own.beyond, half, step,
             guard, out,
         )  # fmt: skip
         return out
 
     def __getstate__(self) -> dict[str, object]:
-        return {k: v for k, v in self.__dict__.items() if k != "_painted"}
+        return {k: v for k, v in self.__dict__.items() if k != "_level_image"}
 
 
 def kept(seen: Coloured, lines: Lines, reach: int, most: float) -> Coloured:
-    """What lines from a contour, and from others a little beside it, would see within a reach [px].
+    """The band of log ratios within `reach` [px] of a contour; `most` bounds a log ratio.
 
-    A pixel has the log ratio of the contour's nearest point.
+    Each pixel has the log ratio of the contour's nearest point, so that slightly shifted contours can read it, too.
     """
     height, width = seen.image.shape[:2]
     uv = np.rint(lines.outline[:2]).astype(np.int64)
     inside = (uv[0] >= 0) & (uv[0] < width) & (uv[1] >= 0) & (uv[1] < height)
-    levels = Ratios.of_table(((np.arange(256) - _LEVELS) * (most / _LEVELS)).astype(np.float32)[None])
+    levels = Ratios.of_table(((np.arange(256) - _MAX_LEVEL) * (most / _MAX_LEVEL)).astype(np.float32)[None])
     none = np.zeros((1, 1, 3), np.uint8)
     if not inside.any():
-        return Kept(none, _PALETTE, levels, zlib.compress(bytes([_LEVELS])), (1, 1), 0, 0)
+        return Kept(none, _PALETTE, levels, zlib.compress(bytes([_MAX_LEVEL])), (1, 1), 0, 0)
     (u, v), number = uv[:, inside], np.flatnonzero(inside)
     left, top = max(int(u.min()) - reach, 0), max(int(v.min()) - reach, 0)
     crop = seen.image[top : int(v.max()) + reach + 1, left : int(u.max()) + reach + 1].astype(np.int32)
@@ -109,8 +109,8 @@ def kept(seen: Coloured, lines: Lines, reach: int, most: float) -> Coloured:
     j, i = np.nonzero(distance <= reach)
     point, bins = of[label[j, i]], seen.bins[colour[j, i]]
     inner = lines.anchor[point] < 0
-    told = seen.ratios.between(lines.own[point], lines.beyond[point], bins)
-    told[~inner] = seen.ratios.at(lines.anchor[point[~inner]], bins[~inner])
-    value[j, i] = told
-    packed = np.rint(value * (_LEVELS / most) + _LEVELS).astype(np.uint8)
+    ratio = seen.ratios.between(lines.own[point], lines.beyond[point], bins)
+    ratio[~inner] = seen.ratios.at(lines.anchor[point[~inner]], bins[~inner])
+    value[j, i] = ratio
+    packed = np.rint(value * (_MAX_LEVEL / most) + _MAX_LEVEL).astype(np.uint8)
     return Kept(none, _PALETTE, levels, zlib.compress(packed.tobytes(), 1), packed.shape, left, top)

@@ -1,4 +1,4 @@
-"""What a colour image says of where a body's contour is, frozen: a row for each line across it, and for each seam."""
+"""Frozen match of a colour image: one row for each line across the body's contour, and for each point of a seam."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class RegionMatched(Matched):
-    """A colour image with the places of the contour along its normals.
+    """A colour image with the positions of the contour along its normals.
 
     Parameters
     ----------
     measurement : RegionMeasurement
     rim : Rim, N points of the body's occluding contour, of edges of its mesh
-    place : (4, N) u, v [px] of where the contour is, and unit normals
+    place : (4, N) u, v [px] of the contour in the image, and unit normals
     weight : (N,) [1/px²]
     loss : Loss
     seams : Seams, optional
-    off, sure : (M,) [px], [1/px²] how far each of its points is from where the image shows it, and how sure that is
+    off, sure : (M,) [px], [1/px²] offset of each seam point from the image's seam, and its weight
     """
 
     measurement: RegionMeasurement
@@ -54,7 +54,7 @@ class RegionMatched(Matched):
         return self.measurement.sensor
 
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
-        """One row a line: the pixel of the body's point should lie, across the contour, where that is."""
+        """One row a line: the body's point should project onto the image's contour; one row a seam point."""
         seams = [] if self.seams is None else [self.seams.rows(scene, self.off, self.sure, self.loss)]
         camera = scene.placed(self.measurement.of.camera)
         if not scene.surface.morphing.is_rigid:
@@ -66,7 +66,7 @@ class RegionMatched(Matched):
         return [replace(rows, loss=self.loss), *seams]
 
     def evidence(self, scene: Scene) -> Evidence:
-        """Points of each segment's contour at which colours change as they should, and those at which they do not."""
+        """Share of each segment's contour at which the colours change as expected, and at which they do not."""
         return self.measurement.evidence(scene)
 
     def leftovers(self, scene: Scene) -> list[Leftover]:

@@ -1,4 +1,4 @@
-"""Parts of a body that have colours of their own (skin, shirt, trousers), and which of them a contour lies between."""
+"""Parts of a body with their own colours (skin, shirt, trousers), and the two parts at each point of a contour."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from kinefit.bodies import Body
 from kinefit.bodies.surfaces import BodyMesh, SkinnedMesh, TaperedCylinder
 from kinefit.correspondences.contours.rims import Rim
 
-AROUND, OTHER = -1, -2  # labels of what is around the body, and of what is neither that nor the body
-_BESIDE = 1.0  # [px] of the drawing from a contour to what is beyond it
+AROUND, OTHER = -1, -2  # labels of the background, and of pixels that are neither background nor body
+_LOOKUP_OFFSET_PX = 1.0  # of the rendering, from a contour to the part outside of it
 
 
 class Drawn(NamedTuple):
-    """A body as it was drawn, as kernels take it; see `kernels.count`.
+    """A rendered body as kernels take it; see `kernels.count`.
 
     Parameters
     ----------
-    face : (h, w) int32 triangle of every pixel of a window; -1 where there is none, -2 where something else is
+    face : (h, w) int32 triangle of every pixel of a window; -1 for background, -2 for other bodies
     label : (T,) int part of each triangle
     left, top, scale : [px], [px] of the image, [px] of the window in one of the image
-    joined : (G + 1, G + 1) bool, parts that lines may pass between; the last one is what is around the body
+    joined : (G + 1, G + 1) bool, parts between which lines may pass; the last one is the background
     """
 
     face: NDArray
@@ -42,8 +42,8 @@ class Lines:
     Parameters
     ----------
     outline : (4, N) u, v [px] and unit normals
-    anchor : (N,) int place of the surface whose statistic they have; -1 where the body itself lies beyond
-    own, beyond : (N,) int part of the body on the inside and on the outside, `AROUND` for none
+    anchor : (N,) int anchor whose colour statistics apply; -1 where another part of the body lies outside
+    own, beyond : (N,) int part of the body on the inside and on the outside, `AROUND` for the background
     """
 
     outline: NDArray
@@ -59,8 +59,8 @@ class Parts:
     ----------
     body : Body
     mesh : of its surface
-    anchors : int, places of the surface with statistics of their own; each lies on one part
-    apart : whether segments are parts
+    anchors : int, points of the surface with their own colour statistics; each lies on one part
+    apart : whether segments are parts; else the whole body is one
 
     Attributes
     ----------
@@ -68,11 +68,11 @@ class Parts:
     count : int, number of parts
     label : (T,) int part of each triangle
     joined : see `Drawn`
-    anchor : (V,) int place of each vertex
-    of : (A,) int part of each place
-    simple : whether the surface is one of simple shapes or of a model, and no mesh of the very body: seams between its
-        segments are not where clothes end (beside them joints of the balancing trial are 12 mm from where silhouettes
-        have them, without 8)
+    anchor : (V,) int anchor of each vertex
+    of : (A,) int part of each anchor
+    simple : whether the surface is of simple shapes or a model, no scan of the person: seams between its segments are
+        not where clothes end (with seams, joints of the balancing trial are 12 mm off those from silhouettes, without
+        them 8 mm)
     """
 
     def __init__(self, body: Body, mesh: BodyMesh | SkinnedMesh, anchors: int, apart: bool) -> None:
@@ -95,8 +95,8 @@ class Parts:
             self.anchor, self.of = own, np.arange(self.count)
 
     def lines(self, rim: Rim, drawn: Drawn) -> Lines:
-        """What the lines of a contour are compared with; where it is drawn before another part, both parts."""
-        x, y = ((rim.outline[k] - at + 0.5) * drawn.scale + _BESIDE * rim.outline[2 + k]
+        """Lines across a contour, with the parts inside and outside of it."""
+        x, y = ((rim.outline[k] - at + 0.5) * drawn.scale + _LOOKUP_OFFSET_PX * rim.outline[2 + k]
                 for k, at in enumerate((drawn.left, drawn.top)))  # fmt: skip
         i, j = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
         h, w = drawn.face.shape
@@ -109,9 +109,9 @@ class Parts:
 
 
 def spread_anchors(vertices: NDArray, count: int, part: NDArray | None = None) -> NDArray:
-    """(V,) the nearest of some vertices that are spread over all of them, each as far from the others as can be.
+    """(V,) nearest of `count` anchors, spread over vertices (V, 3) [m] by farthest-point sampling.
 
-    `part` (V,) int: one on another part counts as far away.
+    `part` (V,) int: anchors on other parts count as far away.
     """
     x = vertices
     if part is not None:

@@ -1,9 +1,9 @@
-"""Seams: where parts of different colours run into each other, a sleeve's end at an elbow, a robot's link in the next.
+"""Seams between parts of different colours, such as a sleeve's end at an elbow or two links of a robot.
 
-No contour shows how far a limb that points at the camera reaches; the seam at its joint does. It is the curve in which
-the surfaces of two parts cut each other, and it moves with both: a point of it stays on both surfaces. With a and b the
-normals of these, which move by dx_a and dx_b there, and with g = α a + β b the derivative of the pixel along the seam's
-normal in the image, the seam moves by α a·dx_a + β b·dx_b.
+The contour of a limb that points at the camera does not show its length; the seam at its joint does. A seam is the
+curve in which the surfaces of two parts intersect, and moves with both: its points stay on both surfaces. With a and b
+the normals of these, which move by dx_a and dx_b there, and with g = α a + β b the derivative of the pixel along the
+seam's normal in the image, the seam moves by α a·dx_a + β b·dx_b.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from kinefit.sensors.regions import _kernels_region_seams as kernels
 from kinefit.sensors.regions.region_parts import Drawn, Lines
 from kinefit.sensors.scene import Scene
 
-_GAP = 0.02  # [m] between depths of neighbouring pixels of two parts that cut each other
-_LEAST = 0.2  # sine of the angle between two surfaces: below it where they cut each other is not determined
-_EVERY = 3  # pairs of neighbouring pixels along a seam to a point
-SPACING = 2.5  # [px] of the drawing between points of a seam: a pair of pixels is 0.71 to 1 px of it long
-_MOST = 400  # points of one image
+_MAX_DEPTH_GAP = 0.02  # [m] between adjacent pixels of two parts that intersect
+_MIN_SURFACE_SINE = 0.2  # of the angle between two surfaces: below it their intersection is not determined
+_PIXEL_PAIRS_PER_POINT = 3  # along a seam
+SEAM_SPACING_PX = 2.5  # of the rendering, between points of a seam: a pair of pixels is 0.71 to 1 px long
+_MAX_SEAM_POINTS = 400  # in one image
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +54,12 @@ class Seams:
 
     @classmethod
     def found(cls, scene: Scene, finder: RimFinder, camera: Camera, drawn: Drawn, group: NDArray) -> Seams:
-        """Those of the body as it was drawn last, at a scene's state; group (S,) the part of each segment."""
-        pairs, vertices = np.empty((_MOST, 6)), np.ascontiguousarray(scene.pose.vertices)
+        """Find the seams of the body as last rendered, at a scene's state; group (S,) is the part of each segment."""
+        pairs, vertices = np.empty((_MAX_SEAM_POINTS, 6)), np.ascontiguousarray(scene.pose.vertices)
         label = np.ascontiguousarray(drawn.label)
-        n = kernels.borders(drawn.face, finder.depth, finder.face_segment, label, _GAP, _EVERY, pairs)
+        n = kernels.borders(
+            drawn.face, finder.depth, finder.face_segment, label, _MAX_DEPTH_GAP, _PIXEL_PAIRS_PER_POINT, pairs
+        )
         pairs = pairs[:n]
         at = np.array([drawn.left, drawn.top])
         uv = (pairs[:, 2:4] + 0.5) / drawn.scale - 0.5 + at
@@ -66,8 +68,8 @@ class Seams:
         rays = camera.ray(uv)
         far = np.sum((middle - camera.centre_world) * rays, axis=1)[:, None]
         n = kernels.seams(
-            camera.packed, vertices, finder.faces, pairs, uv, camera.centre_world + far * rays, _LEAST, outline,
-            point, pulls,
+            camera.packed, vertices, finder.faces, pairs, uv, camera.centre_world + far * rays, _MIN_SURFACE_SINE,
+            outline, point, pulls,
         )  # fmt: skip
         segments = finder.face_segment[pairs[:n, :2].astype(np.int64)]
         part = group[segments]
@@ -98,7 +100,7 @@ def _local(scene: Scene, segment: NDArray, x: NDArray) -> NDArray:
 
 @lru_cache(maxsize=8)
 def _moved_by(tree: KinematicTree) -> NDArray:
-    """(S, D) 1 where a coordinate moves a segment, else 0."""
+    """(S, D) 1 if a coordinate moves a segment, else 0."""
     out = np.zeros((len(tree.segments), tree.n_dofs - 6))
     for s, last in enumerate(tree.last_dof):
         chain = tree.chain[last, : tree.depth[last] + 1]

@@ -1,8 +1,8 @@
-"""Where a body may be that colours alone show: its silhouette sought in a small map of log ratios (P3, eq. 8).
+"""Search for a body by colours alone: its silhouette in a downsampled map of log ratios (P3, eq. 8).
 
-With p₁, p₂ fixed the energy (8) of a pose is, but for a constant, minus the sum of log p₁ / p₂ over its silhouette. So
-a pose costs one small drawing of a coarse mesh. Places are found by correlation of the silhouette at some rotations
-with the map; the best of them are improved by drawing poses at random around them, closer and closer.
+With p₁, p₂ fixed the energy (8) of a pose is, up to a constant, minus the sum of log p₁ / p₂ over its silhouette. So a
+pose costs one small rendering of a coarse mesh. Correlation of the silhouette at some rotations with the map gives
+positions; random samples around the best of them, with a sigma that shrinks, refine these.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ from kinefit.sensors.regions.region_image import Coloured
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import inverse
 
-_CELLS = 14  # of a grid about the body in which vertices are merged: two cells of the map each
-_CLOSER = 0.6  # by which poses are drawn closer in every round
-_LEAST, _MOST = (0.05, 0.05), (2.0, 1.0)  # [lengths of the body], [rad] between which a deviation is taken to be
-_SIGMAS = 3.0  # standard deviations to which places are looked at
+_MERGE_CELLS = 14  # of a grid about the body in which vertices are merged: two cells of the map each
+_SIGMA_DECAY = 0.6  # of the samples, from round to round
+_MIN_SIGMA = (0.05, 0.05)  # [lengths of the body], [rad] of the prediction
+_MAX_SIGMA = (2.0, 1.0)  # [lengths of the body], [rad] of the prediction
+_SEARCH_SIGMAS = 3.0  # of the prediction, which the map covers
 
 
 class Seeker:
-    """A coarse mesh of a body with room to draw it.
+    """A coarse mesh of a body with buffers to render it.
 
     Parameters
     ----------
@@ -45,7 +46,7 @@ class Seeker:
 
     def __init__(self, vertices: NDArray, faces: NDArray) -> None:
         self.size = float(np.ptp(vertices, axis=0).max())
-        cells = ((vertices - vertices.min(axis=0)) / (self.size / _CELLS)).astype(np.int64)
+        cells = ((vertices - vertices.min(axis=0)) / (self.size / _MERGE_CELLS)).astype(np.int64)
         self._cell = np.unique(cells, axis=0, return_inverse=True)[1].ravel()
         self._number = np.bincount(self._cell)
         f = self._cell[faces]
@@ -54,12 +55,12 @@ class Seeker:
         self._faces, self._room = np.ascontiguousarray(f, np.int32), np.empty((6, len(self._number)))
 
     def posed(self, vertices: NDArray) -> NDArray:
-        """(C, 3) [m] of the coarse mesh, from the vertices (V, 3) of the fine one."""
+        """(C, 3) [m] vertices of the coarse mesh, from the vertices (V, 3) [m] of the fine one."""
         sums = [np.bincount(self._cell, vertices[:, k], len(self._number)) for k in range(3)]
         return np.ascontiguousarray((np.array(sums) / self._number).T)
 
     def explained(self, x: NDArray, poses: NDArray, lens: NDArray, ratios: NDArray) -> tuple[NDArray, NDArray]:
-        """Sums (M,) of log ratios inside of the silhouettes of M poses (M, 4, 4), and the faces (h, w) drawn last."""
+        """Sums (M,) of log ratios inside the silhouettes of M poses (M, 4, 4), and the faces (h, w) rendered last."""
         depth, face = np.empty(ratios.shape, np.float32), np.empty(ratios.shape, np.int32)
         out = np.empty(len(poses))
         kernels.explained(x, self._faces, poses, lens, ratios, self._room, depth, face, out)
@@ -67,20 +68,20 @@ class Seeker:
 
 
 def region_starts(
-    scene: Scene, camera: Camera, seeker: Seeker, seen: Coloured, information: NDArray | None, told: Evidence,
+    scene: Scene, camera: Camera, seeker: Seeker, seen: Coloured, information: NDArray | None, evidence: Evidence,
     s: SearchSettings, *, rigid: bool = True,
 ) -> list[BodyState]:  # fmt: skip
-    """States from which a fit may as well begin, the best first; none where the body is where it was expected.
+    """Alternative start states, the best first; none if the body is at its prediction.
 
     Parameters
     ----------
-    scene : where the body is expected
+    scene : with the body at its prediction
     seen : Coloured image, with the log ratio of each bin of colours
-    information : (n, n) of where it is expected, None where nothing is known
-    told : what the image says of the state that was found from there
-    rigid : whether the body is; one that is not is sought only if it is not where it was found, as a whole
+    information : (n, n) of the prediction; None without one
+    evidence : of the image on the state that the fit found from the prediction
+    rigid : whether the body is rigid; a jointed one is searched for only if it is lost as a whole
     """
-    agreeing, contrary = told.agreeing.sum(), told.contrary.sum()
+    agreeing, contrary = evidence.agreeing.sum(), evidence.contrary.sum()
     right = agreeing >= s.poor * (agreeing + contrary)
     if right and not rigid:
         return []
@@ -96,11 +97,11 @@ def region_starts(
     x = x @ R.T + t
     if x[:, 2].min() < MIN_Z:
         return []
-    low, high = (np.repeat([length * size, angle], 3) for length, angle in (_LEAST, _MOST))
+    low, high = (np.repeat([length * size, angle], 3) for length, angle in (_MIN_SIGMA, _MAX_SIGMA))
     spread = np.clip(spread, low, high)
     scale = camera.matrix[0, 0] / float(x[:, 2].mean())  # [px/m]
     step = max(round(size * scale / s.side), 1)
-    uv, reach = camera.project(scene.pose.vertices), (_SIGMAS * spread[:2].max() + 0.25 * size) * scale
+    uv, reach = camera.project(scene.pose.vertices), (_SEARCH_SIGMAS * spread[:2].max() + 0.25 * size) * scale
     first = np.clip(np.floor(np.nanmin(uv, axis=0) - reach), 0, camera.size).astype(int)
     last = np.clip(np.ceil(np.nanmax(uv, axis=0) + reach), 0, camera.size).astype(int)
     wide, tall = (last - first) // step
@@ -119,14 +120,14 @@ def region_starts(
 def seek(
     seeker: Seeker, x_camera: NDArray, ratios: NDArray, lens: NDArray, spread: NDArray, s: SearchSettings
 ) -> NDArray:
-    """Motions (K, 4, 4) of a body in the camera's frame under which its silhouette explains a map best, the best first.
+    """Motions (K, 4, 4) of a body in the camera's frame whose silhouettes have the largest log ratios, best first.
 
     Parameters
     ----------
-    x_camera : (C, 3) [m] the coarse mesh where it is expected
+    x_camera : (C, 3) [m] the coarse mesh at its prediction
     ratios : (h, w) log ratios
-    lens : (5,) fx, fy, cx, cy [cells] of the map, and the nearest depth [m] drawn
-    spread : (6,) one standard deviation of where it is expected: along the camera's axes [m], about them [rad]
+    lens : (5,) fx, fy, cx, cy [cells] of the map, and the nearest depth [m] rendered
+    spread : (6,) standard deviations of the prediction: along the camera's axes [m], about them [rad]
     """
     middle = x_camera.mean(axis=0)
     x = np.ascontiguousarray(x_camera - middle)
@@ -157,10 +158,10 @@ def seek(
         j, i = np.unravel_index(int(np.argmax(match / whole - s.doubt * far)), match.shape)
         found.append(p + np.array([dx[i], dy[j], 0, 0, 0, 0]))
     pool = np.array(found)
-    worth = value(pool)
+    values = value(pool)
     cell = 2.0 * middle[2] / lens[0]
     width = np.minimum(0.5 * spread, [cell, cell, 0.05 * middle[2], 0.3, 0.3, 0.3])
-    ends = [_improved(value, pool[k], float(worth[k]), width, s) for k in np.argsort(-worth)[: s.best]]
+    ends = [_improved(value, pool[k], float(values[k]), width, s) for k in np.argsort(-values)[: s.best]]
     ends.sort(key=lambda end: -end[1])
     back = np.eye(4)
     back[:3, 3] = -middle
@@ -170,21 +171,21 @@ def seek(
 def _improved(
     value: Callable[[NDArray], NDArray], p: NDArray, best: float, width: NDArray, s: SearchSettings
 ) -> tuple[NDArray, float]:
-    """The best of some poses drawn around one (6,), closer and closer, and its worth."""
+    """The best of random poses around one (6,), with a width that shrinks each round, and its value."""
     draws = _draws(s.draws, 6)
     for _ in range(s.rounds):
         tried = p + draws * width
-        worth = value(tried)
-        k = int(np.argmax(worth))
-        if worth[k] > best:
-            p, best = tried[k], float(worth[k])
-        width = _CLOSER * width
+        values = value(tried)
+        k = int(np.argmax(values))
+        if values[k] > best:
+            p, best = tried[k], float(values[k])
+        width = _SIGMA_DECAY * width
     return p, best
 
 
 @lru_cache(maxsize=8)
 def _draws(count: int, dimensions: int) -> NDArray:
-    """(count, dimensions) normal numbers, the same ones every time, the first of them zero."""
+    """(count, dimensions) normal samples, the same in every call, the first of them zero."""
     out = np.random.default_rng(7).normal(size=(count, dimensions))
     out[0] = 0.0
     return out

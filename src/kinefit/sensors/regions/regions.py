@@ -1,8 +1,8 @@
-"""A body's contour in a colour image, by the colours inside and outside of it (P3 2.4): no masks, no background plate.
+"""Region-based contour tracking in colour images, without masks or a background plate (P3 2.4).
 
-Points of the occluding contour, as drawn at the state, each look along their normal: where along it do colours change
-from the body's to those around it? The likelihood of every place gives one row a line, its residual the mean, its
-variance the variance of that place. Lines that no place explains well tell nothing.
+Each point of the rendered occluding contour searches along its normal for the change from the body's colours to the
+background's. The likelihood of every position on a line gives one row: its mean is the residual, its variance the
+row's variance. Lines on which no position is likely have no weight.
 """
 
 from __future__ import annotations
@@ -28,29 +28,31 @@ from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.regions.region_image import Coloured, kept
 from kinefit.sensors.regions.region_matched import RegionMatched
 from kinefit.sensors.regions.region_parts import OTHER, Drawn, Lines, Parts
-from kinefit.sensors.regions.region_seams import SPACING, Seams
+from kinefit.sensors.regions.region_seams import SEAM_SPACING_PX, Seams
 from kinefit.sensors.regions.region_starts import Starts
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 
-_LEARNT = 0.6  # share of what is seen of a body of parts that must speak for it, if its colours are to be learnt
-_CLEAR = 0.5  # share of its outline that must tell anything: in a new light nothing does, at first
-# Images, and then [s], after which colours of a body of parts are learnt; of people, whose clothes fold, of every one.
-_FIRST, _OFTEN = 10, 0.05
-_WIDE = 1e4  # [px] to which lines reach where nothing is known of how well the body is expected
-_FEW = 16  # one vertex in so many tells how far a body has moved
-_GAIN = 200.0  # logarithms by which another limb must explain the image better: of fits from wrong ones 5 % gain 90
-_STALE = 1.0  # [px] by which a body may have moved since it was drawn: the width of its edge in the drawing
-_GUARD = 4.0  # [px] about the contour in which a line always tells: as far as a state may be off its drawing
-# Of the median offset of lines, in deviations, that the loss takes for one: the fit then needs 5 steps in place of 6,
-# and at its end the loss is as it was; 1.5 (the deviation that a median stands for) let outliers in.
-_SPREAD = 0.5
-_JUDGED = 2  # [px] step of the lines by which a state is judged: they reach twice as far as the last ones of the fit
-_AGREES = 1.5, 3.0  # [px], [deviations of the contour] within which a line speaks for its segment
-_ROOM = 4.0  # times as far judging lines reach at least: one that points anywhere agrees in a quarter of cases
-# Of rendered sequences in which nothing was reset, right poses have at most a third of such lines off in 97 %, wrong
-# ones more than that in 65 %: a wrong silhouette agrees along half of its contour by chance.
-_AGAINST = 2.0  # lines that agree, which one that does not outweighs
+_MIN_LEARN_SUPPORT = 0.6  # agreeing share of the evidence on a body of parts, before its colours are learnt
+_MIN_INFORMATIVE_SHARE = 0.5  # of its contour's lines, before its colours are learnt: in a new light there are none
+# A body of parts learns from its first images, then at intervals; people, whose clothes fold, from every image.
+_WARM_UP_IMAGES = 10
+_LEARN_INTERVAL_S = 0.05
+_MAX_REACH_PX = 1e4  # of lines while the error of the prediction is unknown
+_VERTEX_STRIDE = 16  # of the vertices that measure a body's motion
+_MIN_LIKELIHOOD_GAIN = 200.0  # log likelihood that another limb must gain: 5 % of fits from wrong ones gain 90
+_MAX_RENDER_SHIFT_PX = 1.0  # of a body since it was rendered: the width of its rendered edge
+_GUARD_BAND_PX = 4.0  # about the contour, in which lines always count: the error of a state against its rendering
+# The loss takes this share of the lines' median offset for one sigma: the fit then needs 5 steps in place of 6, and
+# ends with the same loss; 1.5 (the sigma that a median stands for) let outliers in.
+_MEDIAN_SHARE = 0.5
+_JUDGE_STEP_PX = 2  # of the lines that judge a state: they reach twice as far as the last ones of the fit
+_AGREEMENT_PX = 1.5  # within which a line supports its segment, or
+_CONTOUR_AGREEMENT_SIGMAS = 3.0
+_MIN_JUDGE_REACH = 4.0  # of judging lines, in agreement distances: a random offset agrees in a quarter of cases
+# In rendered sequences without resets, at most a third of these lines disagree for 97 % of right poses, more for 65 %
+# of wrong ones: a wrong silhouette agrees along half of its contour by chance.
+_CONTRADICTION_WEIGHT = 2.0  # agreeing lines that one contradicting line outweighs
 
 
 class RegionSensor(Sensor):
@@ -60,7 +62,7 @@ class RegionSensor(Sensor):
     ----------
     camera : Camera, whose name frames bear; the sensor's own is "region CAMERA".
     sigma : float [px] standard deviation of the contour, shape of the body included, in the camera's image.
-        None for `TrackSettings.region` of a body of meshes, and `shape` of one of simple shapes where it is first seen.
+        None for `TrackSettings.region` of a body of meshes, and `shape` of one of simple shapes, at its first distance.
     settings : TrackSettings
     """
 
@@ -72,25 +74,25 @@ class RegionSensor(Sensor):
         self.bins, self.count = colour_bins(settings.regions.space, settings.regions.levels)
         self.regions, self.colours = settings.regions, RegionColours.none(self.count, settings.regions)
         self.ratios: Ratios | None = None
-        self.reach, self._searches = _WIDE, dict[str, Any]()  # [px] how far off the contour may be; of `Starts`
+        self.reach, self._searches = _MAX_REACH_PX, dict[str, Any]()  # [px] error of the prediction; of `Starts`
         self._parts: Parts | None = None
         self._starts: Starts | None = None
-        self._known, self._learnt = False, -np.inf  # colours were counted of the body; [s] when they were last
+        self._known, self._learnt = False, -np.inf  # colours of the body are known; [s] when last learnt
 
     def parts(self, scene: Scene) -> Parts:
-        """Parts of the body that have colours of their own."""
+        """Parts of the body with their own colours."""
         if self._parts is None:
             self._parts = Parts(scene.body, scene.surface.morphing.mesh, self.regions.anchors, self.regions.parts)
         return self._parts
 
     def starts(self, scene: Scene) -> Starts:
-        """What the body is sought with."""
+        """Searches for the body and its limbs."""
         if self._starts is None:
             self._starts = Starts(scene, self.parts(scene).label, self.settings, self._searches)
         return self._starts
 
     def prepare(self, frame: ColourFrame, scene: Scene) -> RegionMeasurement:
-        """The image with what is known of colours; before anything is known they are those at the scene's state.
+        """The measurement of one image with the learnt colours; at first with those at the scene's state.
 
         Raises
         ------
@@ -115,23 +117,23 @@ class RegionSensor(Sensor):
         return m
 
     def learn(self, measurement: RegionMeasurement, scene: Scene, sure: bool) -> None:
-        """Blend in the colours of a step in which the body was seen; and how far it was from where it was expected."""
+        """Learn the colours of a step in which the body was observed, and the error of its prediction."""
         if measurement.waits(scene):
             self.colours, self._known = RegionColours.none(self.count, self.regions), sure
             self._know(measurement, scene)
             return
-        self._known, told = True, measurement.evidence(scene)
-        parts, wrong = self.parts(scene), told.lost | told.hidden
-        if parts.count > 1:  # some limb is often lost: what is not may well be learnt from
-            share = float(told.agreeing.sum()) / max(float((told.agreeing + told.contrary).sum()), 1e-9)
-            sure = share > _LEARNT and measurement.clear > _CLEAR
-        if not sure or told.hidden.all():
-            self.reach = _WIDE
+        self._known, evidence = True, measurement.evidence(scene)
+        parts, wrong = self.parts(scene), evidence.lost | evidence.hidden
+        if parts.count > 1:  # some limb is often lost: learn from the others
+            share = float(evidence.agreeing.sum()) / max(float((evidence.agreeing + evidence.contrary).sum()), 1e-9)
+            sure = share > _MIN_LEARN_SUPPORT and measurement.clear > _MIN_INFORMATIVE_SHARE
+        if not sure or evidence.hidden.all():
+            self.reach = _MAX_REACH_PX
             return
         off = 2.0 * measurement.off(scene)
-        self.reach = off if self.reach >= _WIDE else max(off, 0.7 * self.reach)
-        often = parts.count == 1 or parts.simple or self.colours.images < _FIRST
-        if often or abs(measurement.time - self._learnt) > _OFTEN:
+        self.reach = off if self.reach >= _MAX_REACH_PX else max(off, 0.7 * self.reach)
+        often = parts.count == 1 or parts.simple or self.colours.images < _WARM_UP_IMAGES
+        if often or abs(measurement.time - self._learnt) > _LEARN_INTERVAL_S:
             self._know(measurement, scene, wrong)
             self._learnt = measurement.time
 
@@ -141,20 +143,20 @@ class RegionSensor(Sensor):
 
 
 class RegionMeasurement(Measurement):
-    """A colour image of one time, with the statistics of colours that it is compared with.
+    """A colour image of one time, with the colour statistics for its comparison.
 
     Parameters
     ----------
     of : RegionSensor
     frame : ColourFrame
-    scene : Scene with the body where it is expected.
+    scene : Scene with the body at its prediction.
 
     Attributes
     ----------
     image : (H, W, 3) uint8 RGB; None once it is compact
-    seen : Coloured, what lines look at
-    first : whether its colours are those at the state at which the body was only expected
-    clear : share of the outline's lines that tell anything at the state that was judged last
+    seen : Coloured, which lines sample
+    first : whether its colours are those at the predicted state
+    clear : share 0..1 of the contour's lines that are informative, at the state judged last
     """
 
     settled = False
@@ -169,38 +171,38 @@ class RegionMeasurement(Measurement):
         self.within = of.reach * max(z + camera.T_camera_world[2, 3], 0.0) / camera.matrix[0, 0]
         self._last: tuple[NDArray, Camera, Rim] | None = None
         self._lines: Lines | None = None
-        self._told: tuple[tuple[BodyState, Body, Camera], Evidence] | None = None
+        self._judgement: tuple[tuple[BodyState, Body, Camera], Evidence] | None = None
         self._judged: BodyState | None = None
         self.clear, self.first = 0.0, False
 
     def _few(self, scene: Scene) -> NDArray:
-        return scene.placed(self.of.camera).project(scene.pose.vertices[::_FEW])
+        return scene.placed(self.of.camera).project(scene.pose.vertices[::_VERTEX_STRIDE])
 
     def waits(self, scene: Scene) -> bool:
-        """Whether it tells nothing yet: no colours are known, and depth shows where the body is."""
+        """Whether it has no weight yet: colours are unknown, and a depth image constrains the body."""
         return self.first and any(m.depth_image() is not None for m in scene.measurements)
 
     def pixels_per_metre(self, scene: Scene) -> float:
-        """[px/m] at the body's distance."""
+        """[px/m] scale of the image at the body's distance."""
         camera = scene.placed(self.of.camera)
-        z = float(np.median(scene.pose.vertices[::_FEW] @ camera.T_camera_world[2, :3])) + camera.T_camera_world[2, 3]
-        return float(camera.matrix[0, 0]) / max(z, 0.1)
+        z = float(np.median(scene.pose.vertices[::_VERTEX_STRIDE] @ camera.T_camera_world[2, :3]))
+        return float(camera.matrix[0, 0]) / max(z + camera.T_camera_world[2, 3], 0.1)
 
     def off(self, scene: Scene) -> float:
-        """[px] how far the body is from where it was expected, at most."""
+        """[px] largest distance of the body from its prediction in the image."""
         return float(np.nanmax(np.abs(self._few(scene) - self._expected), initial=0.0))
 
     def rim(self, scene: Scene) -> Rim:
-        """The occluding contour at a scene's state, of parts before others too; kept for the state asked for last."""
+        """The occluding contour at a scene's state, also of parts before others; cached for the latest state."""
         vertices, camera = scene.pose.vertices, scene.placed(self.of.camera)
         if self._last is None or self._last[0] is not vertices or self._last[1] is not camera:
             finder, others = scene.surface.rims(camera), [s for s in scene.others if s.body.surfaces]
             rim = finder.find(
                 vertices, camera, spacing=self._spacing or 1.0, inner=self.of.parts(scene).count > 1,
-                stale=0.0 if others and self._last is None else _STALE, close=self.of.settings.outline,
+                stale=0.0 if others and self._last is None else _MAX_RENDER_SHIFT_PX, close=self.of.settings.outline,
                 others=[(s.pose.vertices, s.surface.morphing.mesh.faces) for s in others],
             )  # fmt: skip
-            if not self._spacing:  # the first look tells how long the contour is
+            if not self._spacing:  # the first contour gives its length
                 self._spacing = max(len(rim) / self.of.regions.lines, 1.0)
                 count = int(len(rim) / self._spacing)
                 rim = rim.chosen((np.arange(count) * self._spacing).astype(np.int64))
@@ -208,15 +210,15 @@ class RegionMeasurement(Measurement):
         return self._last[2]
 
     def _drawn(self, scene: Scene) -> Drawn:
-        """The body as it was drawn last."""
+        """The body as last rendered."""
         finder, parts = scene.surface.rims(scene.placed(self.of.camera)), self.of.parts(scene)
         w = finder.window
         return Drawn(finder.face, parts.label, w.left, w.top, w.scale, parts.joined)
 
     def counted(self, scene: Scene, before: RegionColours, wrong: NDArray | None = None) -> RegionColours:
-        """What is known of colours, with those of this image, the body being where a scene has it.
+        """Colour statistics updated with this image, with the body at a scene's state.
 
-        Of segments that are `wrong` (S,) bool nothing is learnt.
+        Segments that are `wrong` (S,) bool are excluded.
         """
         of, s, rim, image = self.of, self.of.regions, self.rim(scene), self.image
         rim = rim.chosen(~rim.inner if wrong is None else ~(rim.inner | wrong[rim.segment]))
@@ -240,36 +242,36 @@ class RegionMeasurement(Measurement):
         return before.blended(inside, outside, lines, s)
 
     def profiles(self, scene: Scene, rim: Rim, step: int) -> NDArray:
-        """(N, 2 half) log ratios along the normals of a contour, in samples of `step` pixels."""
+        """(N, 2 half) log ratios along the normals of a contour, sampled every `step` [px]."""
         assert self.seen is not None
         drawn = self._drawn(scene)
         self._lines = self.of.parts(scene).lines(rim, drawn)
-        return self.seen.profiles(self._lines, drawn, self.of.regions.half, step, _GUARD)
+        return self.seen.profiles(self._lines, drawn, self.of.regions.half, step, _GUARD_BAND_PX)
 
     def match(self, scene: Scene, reach: float) -> RegionMatched:
-        """Where along its normals the contour of the body is."""
+        """Locate the body's contour along its normals; `reach` is the correspondence distance [m]."""
         of, s, rim = self.of, self.of.regions, self.rim(scene)
         step = max(min(round(reach / of.settings.near), math.ceil(self.reach / s.half)), 1)
-        lines, told = self.profiles(scene, rim, step), np.empty((3, len(rim)))
-        kernels.places(lines, float(step), s.heat, told)
+        lines, found = self.profiles(scene, rim, step), np.empty((3, len(rim)))  # offset, variance, information
+        kernels.places(lines, float(step), s.heat, found)
         if s.rule == "shift":
-            kernels.shifts(lines, float(step), told[:2])
+            kernels.shifts(lines, float(step), found[:2])
         place = np.array(rim.outline)
-        place[:2] += told[0] * place[2:]
-        # Errors are alike along a piece of the contour, of which several lines tell.
+        place[:2] += found[0] * place[2:]
+        # Errors are alike along a piece of the contour, which several lines cross.
         share = min(self._spacing / self._drawn(scene).scale / s.alike, 1.0)
-        weight = np.where(told[2] > s.tells, share / (told[1] + of.sigma**2), 0.0)
+        weight = np.where(found[2] > s.tells, share / (found[1] + of.sigma**2), 0.0)
         if self.waits(scene):
-            return RegionMatched(self, rim, place, 0.0 * weight, geman_mcclure(s.loss), None, told[0], told[1])
-        # While the body is not where the image shows it most lines say so: outliers are those beyond the others.
-        off = np.sort((np.square(told[0]) * weight)[weight > 0.0])
-        spread = max(_SPREAD * math.sqrt(off[len(off) // 2]), math.sqrt(share)) if len(off) else math.sqrt(share)
+            return RegionMatched(self, rim, place, 0.0 * weight, geman_mcclure(s.loss), None, found[0], found[1])
+        # While the body is off, so are most lines: outliers are those with larger offsets than the others.
+        off = np.sort((np.square(found[0]) * weight)[weight > 0.0])
+        spread = max(_MEDIAN_SHARE * math.sqrt(off[len(off) // 2]), math.sqrt(share)) if len(off) else math.sqrt(share)
         loss = geman_mcclure(s.loss * spread)
         seams = self._seams(scene, step)
         return RegionMatched(self, rim, place, weight, loss, *seams)
 
     def _seams(self, scene: Scene, step: int) -> tuple[Seams | None, NDArray, NDArray]:
-        """Where parts of the body run into each other, how far off [px] and how sure [1/px²] that is in the image."""
+        """Seams between parts of the body, their offsets (M,) [px] in the image and their weights (M,) [1/px²]."""
         of, s, none = self.of, self.of.regions, np.zeros(0)
         parts, camera, seen = of.parts(scene), scene.placed(of.camera), self.seen
         known = parts.count > 1 and not parts.simple and scene.surface.morphing.is_rigid
@@ -277,71 +279,72 @@ class RegionMeasurement(Measurement):
             return None, none, none
         drawn = self._drawn(scene)
         seams = Seams.found(scene, scene.surface.rims(camera), camera, drawn, parts.group)
-        told = np.empty((3, len(seams)))
-        kernels.places(seen.profiles(seams.lines, drawn, s.half, step, _GUARD), float(step), s.heat, told)
-        share = min(SPACING / drawn.scale / s.alike, 1.0)
-        return seams, told[0], np.where(told[2] > s.tells, share / (told[1] + of.sigma**2), 0.0)
+        found = np.empty((3, len(seams)))
+        kernels.places(seen.profiles(seams.lines, drawn, s.half, step, _GUARD_BAND_PX), float(step), s.heat, found)
+        share = min(SEAM_SPACING_PX / drawn.scale / s.alike, 1.0)
+        return seams, found[0], np.where(found[2] > s.tells, share / (found[1] + of.sigma**2), 0.0)
 
-    def starts(self, scene: Scene, information: NDArray | None, told: Evidence) -> Sequence[BodyState]:
-        """Where colours alone show the body, if it is expected too roughly, or not where it was found.
+    def starts(self, scene: Scene, information: NDArray | None, evidence: Evidence) -> Sequence[BodyState]:
+        """Start states by colours alone, if the prediction is uncertain, or the fit disagrees with the image.
 
-        Of a body of parts that nothing else was measured of, also where its limbs may be.
+        If no other sensor measured a body of parts, also of its limbs. information (n, n) is of the prediction.
         """
         of, seen, camera, found = self.of, self.seen, scene.placed(self.of.camera), self._judged
         if self.image is None or seen is None or not of.settings.search or self.waits(scene):
             return ()
-        whole = of.starts(scene).whole(scene, camera, seen, information, told)
+        whole = of.starts(scene).whole(scene, camera, seen, information, evidence)
         if whole or information is None or found is None or not self._alone(scene):
             return whole
-        return of.starts(scene).limbs(scene, camera, seen, information, told, found, self.time)
+        return of.starts(scene).limbs(scene, camera, seen, information, evidence, found, self.time)
 
     def _alone(self, scene: Scene) -> bool:
-        """Whether nothing else was measured of a body of rigid parts: its colours alone then tell where limbs are."""
+        """Whether this is the only measurement of a body of rigid parts: then its colours alone locate the limbs."""
         return scene.surface.morphing.is_rigid and self.of.parts(scene).count > 1 and len(scene.measurements) == 1
 
     def better(self, new: Scene, old: Scene) -> bool | None:
-        """Of a body of parts: whether the colours of all its pixels say so."""
+        """Whether the new state has the higher likelihood of all pixels; None unless colours alone locate the limbs."""
         if self.image is None or not self._alone(new):
             return None
         gain = self._explained(new) - self._explained(old)
-        self._last = None  # what was drawn last is neither
-        return gain > _GAIN
+        self._last = None  # the latest rendering is of the old state
+        return gain > _MIN_LIKELIHOOD_GAIN
 
     def _explained(self, scene: Scene) -> float:
-        """By how much better the body where a scene has it explains the image than no body does, in logarithms."""
+        """Log likelihood ratio of the image with the body at a scene's state against no body."""
         assert self.seen is not None
         camera = scene.placed(self.of.camera)
-        scene.surface.rims(camera).find(scene.pose.vertices, camera, spacing=_WIDE, close=self.of.settings.outline)
+        x, close = scene.pose.vertices, self.of.settings.outline
+        scene.surface.rims(camera).find(x, camera, spacing=_MAX_REACH_PX, close=close)
         return kernels.likelihood(self.seen.image, self.seen.bins, self.seen.ratios.logs, *self._drawn(scene)[:5])
 
     def evidence(self, scene: Scene) -> Evidence:
-        """Points of each segment's contour at which colours change as they should, and those at which they do not."""
+        """Share of each segment's contour at which the colours change as expected, and at which they do not."""
         if self.waits(scene):
             return Evidence.none(len(scene.body.tree.segments))
         self._judged = scene.state
         about = scene.state, scene.body, scene.placed(self.of.camera)
-        if self._told is not None and all(a is b for a, b in zip(self._told[0], about)):
-            return self._told[1]
+        if self._judgement is not None and all(a is b for a, b in zip(self._judgement[0], about)):
+            return self._judgement[1]
         rim, areas = self.rim(scene), scene.surface.areas
-        told, agrees = np.empty((3, len(rim))), max(_AGREES[0], _AGREES[1] * self.of.sigma)
-        step = max(_JUDGED, math.ceil(_ROOM * agrees / self.of.regions.half))
-        kernels.places(self.profiles(scene, rim, step), float(step), self.of.regions.heat, told)
-        tells, here = told[2] > self.of.regions.tells, np.abs(told[0]) < agrees
-        agreeing = np.bincount(rim.segment[tells & here], minlength=len(areas))
-        contrary = np.bincount(rim.segment[tells & ~here], minlength=len(areas))
+        found, agrees = np.empty((3, len(rim))), max(_AGREEMENT_PX, _CONTOUR_AGREEMENT_SIGMAS * self.of.sigma)
+        step = max(_JUDGE_STEP_PX, math.ceil(_MIN_JUDGE_REACH * agrees / self.of.regions.half))
+        kernels.places(self.profiles(scene, rim, step), float(step), self.of.regions.heat, found)
+        informative, here = found[2] > self.of.regions.tells, np.abs(found[0]) < agrees
+        agreeing = np.bincount(rim.segment[informative & here], minlength=len(areas))
+        contrary = np.bincount(rim.segment[informative & ~here], minlength=len(areas))
         spacing = self._spacing / self._drawn(scene).scale
         whole = np.maximum(np.sqrt(np.pi * areas) * self.pixels_per_metre(scene) / spacing, 1.0)  # points, if alone
-        out = Evidence(agreeing / whole, _AGAINST * contrary / whole)
-        self._told, self.clear = (about, out), float(tells[~rim.inner].mean()) if (~rim.inner).any() else 0.0
+        out = Evidence(agreeing / whole, _CONTRADICTION_WEIGHT * contrary / whole)
+        self._judgement, self.clear = (about, out), float(informative[~rim.inner].mean()) if (~rim.inner).any() else 0.0
         return out
 
     def compact(self) -> RegionMeasurement:
-        """Without the image: log ratios about the contour as it was drawn last."""
+        """A copy with log ratios about the latest contour in place of the image."""
         out = copy(self)
         if self.image is not None and self.seen is not None and self._lines is not None:
-            out.seen = kept(self.seen, self._lines, _JUDGED * self.of.regions.half, self.of.regions.most)
+            out.seen = kept(self.seen, self._lines, _JUDGE_STEP_PX * self.of.regions.half, self.of.regions.most)
         out.image = None
         return out
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_last": None, "_lines": None, "_told": None}
+        return {**self.__dict__, "_last": None, "_lines": None, "_judgement": None}

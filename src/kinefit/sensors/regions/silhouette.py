@@ -1,4 +1,4 @@
-"""A silhouette of one time, made ready once, so that every iteration makes its rows quickly."""
+"""Silhouettes: the contour of a mask and the body's occluding contour as rows."""
 
 from __future__ import annotations
 
@@ -22,27 +22,26 @@ from kinefit.observations import SilhouetteFrame
 from kinefit.rendering import scaled
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments
-from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.evidence import AGREEMENT_SIGMAS, Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.visibility.parting import drawn_together, outside_others
 
-_AGREES = 3.0  # standard deviations within which a contour agrees
-_STALE = 0.5  # [px] by which a body may have moved in the virtual image: half of how far beside its contour one looks
-_LIMB = 0.04  # [m] radius of a forearm: an outline farther off is another part's, however poor the masks are
-_SPACING = 2.0  # [px] between points of an outline, in the image in which they are compared
-_LEAST = 3.0  # [px] of that image within which points are always paired: the neighbours on a slanted outline
+_MAX_RENDER_SHIFT_PX = 0.5  # of a body since its rendering: half of the offset at which pixels at the contour are read
+_FOREARM_RADIUS = 0.04  # [m]: a contour farther off is another part's, however poor the masks are
+_POINT_SPACING_PX = 2.0  # of a contour, in the image in which contours are compared
+_MIN_PAIR_DISTANCE_PX = 3.0  # of that image, within which points always pair: the neighbours on a slanted contour
 
 
 def outline_camera(camera: Camera, settings: TrackSettings) -> Camera:
-    """The camera with an image in which outlines are compared, a whole number of times smaller than its own."""
+    """The camera of the image in which contours are compared: its own, downsampled by a whole factor."""
     return scaled(camera, 1.0 / max(round(max(camera.size) / settings.outline), 1))
 
 
 def averaged(mask: NDArray, size: tuple[int, int]) -> NDArray:
-    """A mask (H, W) averaged down to a size (width, height): by a whole factor first, as that is fast.
+    """A mask (H, W), downsampled to a size (width, height) [px] by area averaging.
 
-    The factor is at most half of the whole one: what the second step then shares between pixels is small.
+    A whole factor comes first, as that is fast; it is at most half of the total, so that the second step blurs little.
     """
     height, width = mask.shape
     half = int(0.5 * min(width / size[0], height / size[1]))
@@ -54,12 +53,12 @@ def averaged(mask: NDArray, size: tuple[int, int]) -> NDArray:
 
 
 class SilhouetteSensor(Sensor):
-    """The silhouette in one camera: the body's occluding contour and the image's outline towards each other.
+    """The silhouettes of one camera. Rows pull the body's occluding contour and the mask's contour together.
 
     Parameters
     ----------
     camera : Camera, whose name frames bear; the sensor's own is "silhouette CAMERA".
-    sigma : float [px] standard deviation of the outline, shape of the body included, in the camera's image.
+    sigma : float [px] standard deviation of the contour, shape of the body included, in the camera's image.
     settings : TrackSettings
     """
 
@@ -71,7 +70,7 @@ class SilhouetteSensor(Sensor):
         self.sigma = max(sigma * self.scale, 0.5)
 
     def prepare(self, frame: SilhouetteFrame, scene: Scene) -> SilhouetteMeasurement:
-        """The outline of the blobs that are the body's.
+        """The measurement of one mask: the contour of the blobs that are the body's.
 
         Raises
         ------
@@ -84,19 +83,19 @@ class SilhouetteSensor(Sensor):
 
 
 class SilhouetteMeasurement(Measurement):
-    """A silhouette of one time; of several blobs those count that are where the body is expected.
+    """A silhouette of one time; of several blobs those at the body's predicted place count.
 
     Parameters
     ----------
     of : SilhouetteSensor
     frame : SilhouetteFrame
-    scene : Scene with the body where it is expected.
+    scene : Scene with the body at its prediction.
 
     Attributes
     ----------
-    mask : (h, w) uint8 of that image
-    outline : (4, M) u, v [px] and unit normals of its outline
-    sigma : float [px] there
+    mask : (h, w) uint8 in the image of `camera`
+    outline : (4, M) u, v [px] and unit normals of its contour
+    sigma : float [px] in that image
     """
 
     settled = False
@@ -116,28 +115,28 @@ class SilhouetteMeasurement(Measurement):
         self.pixels_per_metre = focal / max(float(np.median(z)), 0.1)  # [px/m] at the body
         self._last: tuple[NDArray, Camera, Rim] | None = None
         self.rim(scene, stale=0.0)
-        size = 2 * int(np.ceil(of.settings.reach * self.pixels_per_metre)) + 1  # as far about it as it may have moved
+        size = 2 * int(np.ceil(of.settings.reach * self.pixels_per_metre)) + 1  # its largest motion
         seen = scene.surface.rims(scene.placed(self.camera)).drawn(self.camera) >= 0
         own = cv2.dilate(seen.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
-        theirs = self._parted(mask, scene)
-        self.mask = choose_person(np.where(theirs, 0, mask).astype(np.uint8), own)
-        points = outline(self.mask)[:, :: max(round(1.3 * _SPACING), 1)]
-        if theirs.any():  # where one person is cut off from another, no contour was seen
-            beside = cv2.dilate(theirs.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+        other_people = self._parted(mask, scene)
+        self.mask = choose_person(np.where(other_people, 0, mask).astype(np.uint8), own)
+        points = outline(self.mask)[:, :: max(round(1.3 * _POINT_SPACING_PX), 1)]
+        if other_people.any():  # a border between two people is no contour
+            near_others = cv2.dilate(other_people.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
             column, row = (np.clip(np.rint(points[k]).astype(int), 0, n - 1) for k, n in enumerate(mask.shape[::-1]))
-            points = points[:, ~beside[row, column]]
+            points = points[:, ~near_others[row, column]]
         self.outline = np.ascontiguousarray(points)
-        # Over a patch of the surface the errors of an outline are alike, and every place is measured from both sides.
-        share = min(_SPACING / (of.settings.patch * self.pixels_per_metre), 1.0)
+        # The errors of a contour are alike over a patch of the surface, and each point is paired from both sides.
+        share = min(_POINT_SPACING_PX / (of.settings.patch * self.pixels_per_metre), 1.0)
         self._row_sigma = self.sigma / np.sqrt(share / 2.0)
 
     @property
     def camera(self) -> Camera:
-        """The camera with the image in which outlines are compared."""
+        """The camera of the image in which contours are compared."""
         return self.of.small
 
     def _parted(self, mask: NDArray, scene: Scene) -> NDArray:
-        """(h, w) bool, where the silhouette is another person's."""
+        """(h, w) bool: pixels of the silhouette that are another person's."""
         if not scene.others:
             return np.zeros(mask.shape, bool)
         own, others = (drawn_together(several, self.camera) for several in ([scene], scene.others))
@@ -145,40 +144,44 @@ class SilhouetteMeasurement(Measurement):
             return np.zeros(mask.shape, bool)
         return outside_others(mask, own, others)
 
-    def rim(self, scene: Scene, stale: float = _STALE) -> Rim:
-        """The occluding contour at a scene's state, without its inner points; kept for the state asked for last."""
+    def rim(self, scene: Scene, stale: float = _MAX_RENDER_SHIFT_PX) -> Rim:
+        """The occluding contour at a scene's state, without inner points; cached for the latest state.
+
+        The body is rendered anew if it has moved by more than `stale` [px].
+        """
         vertices, camera = scene.pose.vertices, scene.placed(self.camera)
         if self._last is None or self._last[0] is not vertices or self._last[1] is not camera or stale == 0.0:
-            rim = scene.surface.rims(camera).find(vertices, camera, spacing=_SPACING, inner=False, stale=stale)
+            rim = scene.surface.rims(camera).find(vertices, camera, spacing=_POINT_SPACING_PX, inner=False, stale=stale)
             self._last = vertices, camera, rim
         return self._last[2]
 
     def match(self, scene: Scene, reach: float) -> SilhouetteMatched:
-        """Points of both outlines that are near each other and look the same way."""
-        bound = max(reach * self.pixels_per_metre, _AGREES * self.sigma, _LEAST)
+        """Pair near points of both contours with similar normals; `reach` is the correspondence distance [m]."""
+        bound = max(reach * self.pixels_per_metre, AGREEMENT_SIGMAS * self.sigma, _MIN_PAIR_DISTANCE_PX)
         rim = self.rim(scene)
         i, k = outline_pairs(rim.outline, self.outline, reach=bound, angle=self.of.settings.angle)
         loss = geman_mcclure(0.5 * bound / self._row_sigma)
         return SilhouetteMatched(self, rim.chosen(i), np.ascontiguousarray(self.outline[:, k]), self._row_sigma, loss)
 
     def evidence(self, scene: Scene) -> Evidence:
-        """Points of each segment's outline that the silhouette's outline runs along, and those that it does not."""
+        """Share of each segment's contour with a silhouette's contour along it, and share without."""
         rim, areas = self.rim(scene), scene.surface.areas
-        reach = max(min(_AGREES * self.sigma, _LIMB * self.pixels_per_metre), _LEAST)
+        reach = max(min(AGREEMENT_SIGMAS * self.sigma, _FOREARM_RADIUS * self.pixels_per_metre), _MIN_PAIR_DISTANCE_PX)
         i, _ = outline_pairs(rim.outline, self.outline, reach=reach, angle=self.of.settings.angle, both=False)
         agreeing = np.bincount(rim.segment[i], minlength=len(areas))
         seen = np.bincount(rim.segment, minlength=len(areas))
-        whole = np.maximum(np.sqrt(np.pi * areas) * self.pixels_per_metre / _SPACING, 1.0)  # points, if seen alone
+        # points of an unoccluded segment
+        whole = np.maximum(np.sqrt(np.pi * areas) * self.pixels_per_metre / _POINT_SPACING_PX, 1.0)
         return Evidence(agreeing / whole, (seen - agreeing) / whole)
 
     def overlap(self, scene: Scene) -> float:
-        """Intersection over union of the body's own silhouette at a scene's state and the image's, 0..1."""
+        """Intersection over union, a share 0..1, of the body's silhouette at a scene's state and the mask."""
         self.rim(scene, stale=0.0)
         body, image = scene.surface.rims(scene.placed(self.camera)).drawn(self.camera) >= 0, self.mask > 127
         return float((body & image).sum() / max((body | image).sum(), 1))
 
     def compact(self) -> SilhouetteMeasurement:
-        """Without what was drawn of the body."""
+        """A copy without the rendered contour."""
         return copy(self)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -193,7 +196,7 @@ class SilhouetteMatched(Matched):
     ----------
     measurement : SilhouetteMeasurement
     rim : Rim, N points of the body's occluding contour, of edges of its mesh
-    tangents : (4, N) u, v [px] and unit normals of the image's outline
+    tangents : (4, N) u, v [px] and unit normals of the image's contour
     row_sigma : float [px] standard deviation of a pair
     loss : Loss
     """
@@ -211,7 +214,7 @@ class SilhouetteMatched(Matched):
         return self.measurement.sensor
 
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
-        """One row a pair: the pixel of the body's point should lie on the tangent of the image's outline."""
+        """One row a pair: the body's point should project onto the tangent of the image's contour."""
         camera = scene.placed(self.measurement.camera)
         if scene.surface.morphing.is_rigid:
             rows = outline_rows(
@@ -222,11 +225,11 @@ class SilhouetteMatched(Matched):
         return [replace(blended, loss=self.loss)]
 
     def evidence(self, scene: Scene) -> Evidence:
-        """Points of each segment's outline that the silhouette's outline runs along, and those that it does not."""
+        """Share of each segment's contour with a silhouette's contour along it, and share without."""
         return self.measurement.evidence(scene)
 
     def leftovers(self, scene: Scene) -> list[Leftover]:
-        """Distances [px], in the camera's own image, of the image's outline from the body's, by segments."""
+        """Distances [px], in the camera's own image, of the mask's contour from the body's, by segments."""
         uv = scene.placed(self.measurement.camera).project(self.rim.on(scene.pose.vertices))
         away = np.sum(self.tangents[2:].T * (self.tangents[:2].T - uv), axis=1) / self.measurement.of.scale
         seen = np.isfinite(away)

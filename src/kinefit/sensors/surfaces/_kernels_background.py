@@ -1,4 +1,4 @@
-"""What stands still behind a body: the mean and the deviation of each cell's depth, learnt while it is watched."""
+"""Background model of a depth camera: mean and variance of the depth of each cell, learnt while it tracks."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ import math
 from kinefit._jit import jit
 from kinefit.geometry._kernels_camera import ROT, TRANS
 
-MOST = 50.0  # measurements that the newest one is weighed against: a sensor that warms up is followed
+MAX_MEMORY_IMAGES = 50.0  # in the running mean: it follows a sensor that warms up
 
 
 @jit
 def learn(
-    depth, rays, camera, low, high, drawn, cell, row, step, variance, gate, wait, told,
+    depth, rays, camera, low, high, drawn, cell, row, step, variance, gate, wait, learns_near,
     mean, spread, count, waiting, bound,
 ):  # fmt: skip
     """Learn one image, cell by cell (its upper left pixel), every `step`-th row of cells from `row` on.
 
     depth (H, W) [m], 0 for none; rays, camera as in `gated_points`; low, high (3,) [m]: box that the body may be in;
-    drawn (h, w) at any size: inf where neither the body is nor what is about it; variance = (a, b): a + b z⁴ of a depth
-    z, where it is not learnt yet; gate: deviations squared; wait: how often a new thing in the box must be seen; told:
-    whether such things may be learnt at all.
-    In place: mean [m], spread [m²] of it, count of measurements (0: not known), waiting: how often a new thing was
-    seen; bound [m]: mean less √gate deviations: what is nearer is something new; inf where nothing is known.
+    drawn (h, w) at any size: inf outside the body and its margin; variance = (a, b): a + b z⁴ of a depth
+    z, until it is learnt; gate: squared sigmas of an outlier; wait: images that an object new in the box must stay;
+    learns_near: whether such objects may be learnt at all.
+    In place: mean [m], spread [m²] of it, count of measurements (0: unknown), waiting: images in which a new object was
+    seen; bound [m]: mean minus √gate sigmas: anything nearer is new; inf where the background is unknown.
     """
     r00, r01, r02 = camera[ROT], camera[ROT + 1], camera[ROT + 2]
     r10, r11, r12 = camera[ROT + 3], camera[ROT + 4], camera[ROT + 5]
@@ -38,14 +38,14 @@ def learn(
             z = float(depth[v, u])
             if z <= 0.0:
                 continue
-            usual = variance[0] + variance[1] * z * z * z * z
+            prior = variance[0] + variance[1] * z * z * z * z
             off = z - mean[i, j]
             known = count[i, j] > 0.0
             if known and off * off <= gate * spread[i, j]:
-                n = count[i, j] + 1.0 if count[i, j] < MOST else MOST
+                n = count[i, j] + 1.0 if count[i, j] < MAX_MEMORY_IMAGES else MAX_MEMORY_IMAGES
                 mean[i, j] += off / n
                 part = off * off * (n - 1.0) / n
-                spread[i, j] += (part - spread[i, j]) / (n + 4.0)  # what is usual counts for four
+                spread[i, j] += (part - spread[i, j]) / (n + 4.0)  # the prior counts for four
                 count[i, j] = n
                 waiting[i, j] = 0.0
                 bound[i, j] = mean[i, j] - math.sqrt(gate * spread[i, j])
@@ -59,24 +59,24 @@ def learn(
             w = r02 * a + r12 * b + r22 * c
             near = low[0] < x < high[0] and low[1] < y < high[1] and low[2] < w < high[2]
             own = drawn[i * drawn.shape[0] // rows, j * drawn.shape[1] // columns] < math.inf
-            forget = own and z < front  # it hides the body, which may come out behind it at any time
+            forget = own and z < front  # it occludes the body, which may reappear behind it at any time
             if near:
-                may = told and not own
+                may = learns_near and not own
                 waiting[i, j] = waiting[i, j] + 1.0 if may or known else 0.0
                 enough = waiting[i, j] >= wait
-                forget = known and (mean[i, j] < front or (enough and not may))  # it has gone: this may be the body
+                forget = known and (mean[i, j] < front or (enough and not may))  # gone: this may be the body
                 if not enough and not forget:
                     continue
             if forget:
                 count[i, j], waiting[i, j], bound[i, j] = 0.0, 0.0, math.inf
                 continue
-            mean[i, j], spread[i, j], count[i, j], waiting[i, j] = z, usual, 1.0, 0.0
-            bound[i, j] = z - math.sqrt(gate * usual)
+            mean[i, j], spread[i, j], count[i, j], waiting[i, j] = z, prior, 1.0, 0.0
+            bound[i, j] = z - math.sqrt(gate * prior)
 
 
 @jit
 def mark(depth, bound, cell, first, last):
-    """Turn the sign of pixels of an image, in place, that show no more than what stands still, or lies behind it."""
+    """Negate the pixels of an image, in place, that show the background or lie behind it."""
     height, width = depth.shape
     for i in range(first[0], last[0]):
         bottom = (i + 1) * cell if (i + 1) * cell < height else height
@@ -90,7 +90,7 @@ def mark(depth, bound, cell, first, last):
 
 @jit
 def widened(drawn, reach, out):
-    """Where a body is drawn, and up to `reach` pixels about it: 0 there, inf elsewhere."""
+    """Write to out (h, w) 0 where a body is rendered, and up to `reach` pixels about it; inf elsewhere."""
     rows, columns = drawn.shape
     for i in range(rows):
         for j in range(columns):

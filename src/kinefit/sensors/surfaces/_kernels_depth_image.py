@@ -1,4 +1,4 @@
-"""Kernels of measured points: which pixels of a depth image may be the body's."""
+"""Kernels that select measured points near the body."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from kinefit.geometry._kernels_camera import ROT, TRANS
 def gated_points(
     depth, rays, camera, low, high, first_row, last_row, first_column, last_column, step, patches, out, share,
 ):  # fmt: skip
-    """World points (3, N) of every `step`-th pixel of a window that lie in the box low..high (3,) [m]; how many.
+    """Write the world points (3, N) of every `step`-th pixel of a window that lie in the box low..high (3,) [m]; count.
 
-    share (N,): of a patch of surface, about, that stands behind a point, 1 at most: `patches` [1/m²] times z².
+    share (N,): patches of surface that a point stands for, about, at most 1: `patches` [1/m²] times z².
     """
     r00, r01, r02 = camera[ROT], camera[ROT + 1], camera[ROT + 2]
     r10, r11, r12 = camera[ROT + 3], camera[ROT + 4], camera[ROT + 5]
@@ -40,7 +40,7 @@ def gated_points(
 
 @jit
 def box(x, out):
-    """Least and largest coordinates (2, 3) of points (N, 3)."""
+    """Write the smallest and largest coordinates (2, 3) of points (N, 3)."""
     for k in range(3):
         low, high = math.inf, -math.inf
         for i in range(x.shape[0]):

@@ -17,15 +17,15 @@ def agreement(
     parents, dof_start, prismatic, axes, rest, roots, angles, vertices, owner, faces, fingers, T_view_world, lens,
     observed, behind, trust, base, tolerance, out,
 ):  # fmt: skip
-    """How well each of B poses explains what was seen, both ways, in pixels.
+    """Pixels that each of B poses explains, and pixels that contradict it.
 
     roots (B, 4, 4), angles (B, D); vertices (V, 3) at rest with their segments owner (V,), closed faces (T, 3) of
     them, and of which hand's fingers they are (T,), 0 for none; lens (4,): fx, fy, cx, cy of the view. observed (h, w)
-    [m], 0 where the body was not seen; behind (h, w) [m]: what else was measured there, inf for nothing; trust (h, w)
-    in 0..1: how sure it is that no body is at a pixel without one; base (h, w) [m]: parts that stay, drawn before, inf
-    where none is. What they say is counted once, and put right where the pose's own parts are drawn before them.
-    Fingers of a hand are stretched where that explains more, else folded away.
-    Out (B, 2): pixels explained, each 1 - |Δz| / tolerance; pixels contradicted: drawn where the sensor saw past it.
+    [m], 0 where the body was not seen; behind (h, w) [m]: depth of other objects, inf for none; trust (h, w) in 0..1:
+    confidence that no body is at a pixel without one; base (h, w) [m]: rendered depth of fixed parts, inf for none.
+    Fixed parts are counted once, and corrected where the pose's own parts are in front of them. Fingers of a hand are
+    stretched if that explains more, else folded.
+    Out (B, 2): pixels explained, each 1 - |Δz| / tolerance; pixels contradicted: rendered where the sensor saw past it.
     """
     h, w = observed.shape
     frames, screws = np.empty((parents.size, 12)), np.empty((axes.shape[0], 6))
@@ -35,7 +35,7 @@ def agreement(
     for i in range(h):
         for j in range(w):
             if base[i, j] < math.inf:
-                explained, contradicted = _told(base[i, j], observed[i, j], behind[i, j], trust[i, j], tolerance)
+                explained, contradicted = _judged(base[i, j], observed[i, j], behind[i, j], trust[i, j], tolerance)
                 whole_for += explained
                 whole_against += contradicted
     for b in range(len(roots)):
@@ -55,9 +55,9 @@ def agreement(
                 if not z < before:
                     continue
                 hand = fingers[face[i, j]]
-                explained, contradicted = _told(z, observed[i, j], behind[i, j], trust[i, j], tolerance)
+                explained, contradicted = _judged(z, observed[i, j], behind[i, j], trust[i, j], tolerance)
                 if before < math.inf:
-                    less, fewer = _told(before, observed[i, j], behind[i, j], trust[i, j], tolerance)
+                    less, fewer = _judged(before, observed[i, j], behind[i, j], trust[i, j], tolerance)
                     explained, contradicted = explained - less, contradicted - fewer
                 hands[hand, 0] += explained
                 hands[hand, 1] += contradicted
@@ -81,8 +81,8 @@ def _box(room, h, w):
 
 
 @jit
-def _told(z, observed, behind, trust, tolerance):
-    """How much a pixel drawn at z [m] explains, and how much speaks against it."""
+def _judged(z, observed, behind, trust, tolerance):
+    """Explained and contradicted part, each 0..1, of a pixel rendered at z [m]."""
     if observed > 0.0:
         gap = (z - observed) / tolerance
         size, before = abs(gap), -0.5 * gap
@@ -93,19 +93,19 @@ def _told(z, observed, behind, trust, tolerance):
 
 @jit
 def of_hands(depth, hand, observed, behind, trust, tolerance, out):
-    """How much the fingers of each hand explain and how much speaks against them, out (H, 2), by pixels hand (h, w)."""
+    """Write to out (H, 2) the explained and contradicted pixels of each hand's fingers; hand (h, w)."""
     out[:] = 0.0
     for i in range(depth.shape[0]):
         for j in range(depth.shape[1]):
             if hand[i, j] > 0:
-                explained, contradicted = _told(depth[i, j], observed[i, j], behind[i, j], trust[i, j], tolerance)
+                explained, contradicted = _judged(depth[i, j], observed[i, j], behind[i, j], trust[i, j], tolerance)
                 out[hand[i, j], 0] += explained
                 out[hand[i, j], 1] += contradicted
 
 
 @jit
 def overlaps(parents, dof_start, prismatic, axes, rest, roots, angles, owner, starts, ends, pairs, apart, out):
-    """How deep capsules of a body lie in each other, summed [m], for each of B poses: out (B,).
+    """Write the summed penetration [m] of a body's capsules to out (B,), for each of B poses.
 
     owner (C,), starts and ends (C, 3) [m] at rest; pairs (P, 2) and apart (P,) [m] as in `collision_pairs`.
     """

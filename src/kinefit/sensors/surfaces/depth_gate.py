@@ -1,4 +1,4 @@
-"""Which pixels of a depth image may be the body's."""
+"""Select the pixels of a depth image that may show the body."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from kinefit.sensors.surfaces.depth_view import DepthView, view_of
 
 
 def window_of(camera: Camera, low: NDArray, high: NDArray) -> tuple[tuple[int, int], tuple[int, int], float]:
-    """First and last row and column of the image that a box low..high (3,) [m] fills, and its largest depth [m]."""
+    """First and last (row, column) of the image that a box low..high (3,) [m] fills, and its largest depth [m]."""
     corners = np.stack(np.meshgrid(*zip(low, high)), axis=-1).reshape(-1, 3)
     z = corners @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
     uv, (width, height) = camera.project(corners), camera.size
@@ -27,13 +27,13 @@ def gathered(
     depth: NDArray, camera: Camera, box: tuple[NDArray, NDArray], window: tuple[tuple[int, int], tuple[int, int]],
     shown: NDArray, settings: TrackSettings,
 ) -> tuple[NDArray, NDArray]:  # fmt: skip
-    """(3, N) [m] measured points in a box, and (N,) the share of an independent measurement that each is.
+    """(3, N) [m] measured points in a box, and (N,) in 0..1 the independent measurements that each counts for.
 
     Parameters
     ----------
     depth : (H, W) [m], 0 or less where nothing of the body was measured.
     box : (3,), (3,) [m] corners; window : first and last row and column that it fills, see `window_of`.
-    shown : (h, w) [m] the body's own depth, inf where it is not: by its pixels the image is thinned.
+    shown : (h, w) [m] the body's rendered depth, inf outside: the image is thinned in proportion to its area.
     """
     (first, last), K = window, camera.matrix
     drawn = np.isfinite(shown).mean() * camera.size[0] * camera.size[1]  # pixels that the body fills, about
@@ -48,9 +48,9 @@ def gathered(
 
 
 def person_view(depth: NDArray, camera: Camera, box: tuple[NDArray, NDArray]) -> DepthView | None:
-    """What a body can be sought in: all that was measured in a box (3,), (3,) [m] and is not background.
+    """The view in which a body is searched for: all points in a box (3,), (3,) [m] that are not background.
 
-    None where there is nothing. depth (H, W) [m] is negative where it shows the background.
+    None if there are none. depth (H, W) [m] is negative where it shows the background.
     """
     rays, T = camera.ray_table, camera.T_world_camera
     x = np.stack([*rays, np.ones_like(rays[0])], axis=-1) * depth[..., None] @ T[:3, :3].T + T[:3, 3]

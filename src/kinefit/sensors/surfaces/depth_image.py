@@ -1,4 +1,4 @@
-"""A depth image of one time, made ready once, so that every iteration makes its rows quickly."""
+"""Depth cameras: measured points, visible surface and free space of a depth image as rows."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from kinefit.images.depth_noise import without_speckles
 from kinefit.observations import DepthFrame
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor, by_segments
-from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.evidence import AGREEMENT_SIGMAS, Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surfaces import _kernels_depth_image as kernels
@@ -29,14 +29,14 @@ from kinefit.sensors.visibility.occlusion import DepthSeen
 from kinefit.sensors.visibility.parting import drawn_together, of_others
 from kinefit.sensors.visibility.visibility import judge_segments
 
-AGREES = 3.0  # standard deviations of a measurement that agrees
-_SHAPE = 0.03  # [m] by which a surface of simple shapes is off
-_LIMB = 0.04  # [m] radius of a forearm
-_MOST_PIXELS, _MOST_POINTS = 25_000, 5_000  # of what is kept: 100 kB and 80 kB
+_SHAPE_ERROR = 0.03  # [m] of a surface of simple shapes
+_FOREARM_RADIUS = 0.04  # [m]
+_MAX_KEPT_PIXELS = 25_000  # of a compact measurement: 100 kB
+_MAX_KEPT_POINTS = 5_000  # of a compact measurement: 80 kB
 
 
 class DepthImageSensor(Sensor):
-    """A depth camera: measured points towards the surface, the visible surface towards what was measured, free space.
+    """A depth camera. Rows pull measured points and visible surface together, and surface out of free space.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class DepthImageSensor(Sensor):
     camera : Camera
     sigma : float [m] standard deviation of a depth.
     settings : TrackSettings
-    background : Background of this camera, None where it moves, or shows nothing but the body.
+    background : Background of this camera; None if it moves, or shows only the body.
     """
 
     shows_person = True
@@ -56,7 +56,7 @@ class DepthImageSensor(Sensor):
         self._coarse: dict[int, Camera] = {1: camera}
 
     def prepare(self, frame: DepthFrame, scene: Scene) -> DepthImageMeasurement:
-        """The part of an image that is about the body.
+        """The measurement of one image: its part near the body.
 
         Raises
         ------
@@ -68,14 +68,14 @@ class DepthImageSensor(Sensor):
         return DepthImageMeasurement(self, frame, scene)
 
     def learn(self, measurement: DepthImageMeasurement, scene: Scene, sure: bool) -> None:
-        """Let the background learn from a whole image, with the body where it was found."""
+        """Let the background learn from a whole image, with the body at its fitted state."""
         if self.background is None or measurement.is_compact:
             return
         shown = measurement.drawn_alone(scene)
         self.background.learn(np.abs(measurement.depth), shown, measurement.box, sure)
 
     def coarse(self, step: int) -> Camera:
-        """The camera of an image of every `step`-th row and column, from the middle of the first `step` on."""
+        """The camera of an image of every `step`-th row and column, starting in the middle of the first `step`."""
         if step not in self._coarse:
             (width, height), first = self.camera.size, (step - 1) // 2
             S = np.array([[1.0 / step, 0.0, -first / step], [0.0, 1.0 / step, -first / step], [0.0, 0.0, 1.0]])
@@ -91,13 +91,13 @@ class DepthImageMeasurement(Measurement):
     ----------
     of : DepthImageSensor
     frame : DepthFrame
-    scene : Scene with the body where it is expected: about it, measured points are gathered.
+    scene : Scene with the body at its prediction: measured points near it count.
 
     Attributes
     ----------
     sigma : float [m] standard deviation of a depth
-    box : (3,), (3,) [m] corners of what is about the body
-    is_compact : bool, whether only the part about the body is kept.
+    box : (3,), (3,) [m] corners of the region near the body
+    is_compact : bool, whether only the part near the body is kept.
     """
 
     settled = False
@@ -117,8 +117,8 @@ class DepthImageMeasurement(Measurement):
         self._kept = depth if of.background is None else of.background.marked(depth, first, last)
         self._shown: NDArray | None = surface.depth(vertices, camera).copy()
         if scene.others:
-            theirs = of_others(self._kept, self._shown, drawn_together(scene.others, camera), camera)
-            self._kept = np.where(theirs, -self._kept, self._kept)
+            other_people = of_others(self._kept, self._shown, drawn_together(scene.others, camera), camera)
+            self._kept = np.where(other_people, -self._kept, self._kept)
         self._space = self._free(self._shown)
         self._matches, self.is_compact = 0, False
         self._judged: tuple[BodyState, NDArray] | None = None
@@ -134,7 +134,7 @@ class DepthImageMeasurement(Measurement):
 
     @property
     def depth(self) -> NDArray:
-        """(H, W) float32 [m] of its camera: 0 where nothing was measured or kept, negative where it is background."""
+        """(H, W) float32 [m] of its camera: 0 where unmeasured or discarded, negative for background."""
         width, height = self.camera.size
         if self._kept.shape == (height, width):
             return self._kept
@@ -143,18 +143,18 @@ class DepthImageMeasurement(Measurement):
         return out
 
     def _free(self, shown: NDArray) -> FreeSpace | None:
-        """Where the body can be, and where some of it is missing, with the body as it is drawn."""
+        """Free space of the image, given the body's rendered depth (h, w) [m]; None if it is disabled."""
         if not np.isfinite(self.of.settings.through):
             return None
-        return FreeSpace.of(self.depth, farthest=self._farthest, shown=shown, tolerance=self._astray)
+        return FreeSpace.of(self.depth, farthest=self._farthest, shown=shown, tolerance=self._contradiction_distance)
 
     @property
-    def _astray(self) -> float:
-        """[m] by which a measurement lies behind the surface and speaks against it."""
-        return AGREES * self.sigma + _SHAPE
+    def _contradiction_distance(self) -> float:
+        """[m] behind the surface from which a measurement contradicts it."""
+        return AGREEMENT_SIGMAS * self.sigma + _SHAPE_ERROR
 
     def _drawn(self, scene: Scene) -> tuple[NDArray, FreeSpace | None]:
-        """The body's own depth and free space, drawn anew after every `render_every` matches."""
+        """The body's rendered depth (h, w) [m] and free space, updated after every `render_every` matches."""
         due = self._shown is None or (self._matches > 0 and self._matches % self.of.settings.render_every == 0)
         self._matches += 1
         if not due and self._shown is not None:
@@ -166,9 +166,12 @@ class DepthImageMeasurement(Measurement):
         return shown, space
 
     def match(self, scene: Scene, reach: float) -> DepthImageMatched:
-        """Nearest points of the surface, the visible samples' pixels, and where samples in free space should go."""
+        """Match points to the nearest surface, visible samples to pixels, and samples in free space to targets.
+
+        `reach` is the correspondence distance [m].
+        """
         samples, s, sigma = scene.surface.samples, self.of.settings, self.sigma
-        bound, depth, camera = max(reach, AGREES * sigma), self.depth, scene.placed(self.camera)
+        bound, depth, camera = max(reach, AGREEMENT_SIGMAS * sigma), self.depth, scene.placed(self.camera)
         shown, space = self._drawn(scene)
         measured = along(np.ascontiguousarray(self._points.T, float), self.camera, scene)
         points = surface_rows(
@@ -178,14 +181,14 @@ class DepthImageMeasurement(Measurement):
         pixels = depth_image_rows(
             scene.frames, samples, camera, depth, shown, reach=bound, sigma=self._sample_sigma
         )
-        # A point that noise has put behind a limb's middle is nearest to its far side and makes no row, so that nearest
-        # points draw thin limbs towards the sensor: by 2 to 5 cm with deviations of 3 cm. Pixels do not.
-        blur = min(_LIMB / (4.0 * sigma), 1.0) ** 2 if bound <= max(s.near, AGREES * sigma) else 1.0
+        # A point that noise moves behind a limb's axis is nearest to its far side and makes no row. So nearest points
+        # pull thin limbs towards the sensor, by 2 to 5 cm with a sigma of 3 cm. Pixels do not.
+        blur = min(_FOREARM_RADIUS / (4.0 * sigma), 1.0) ** 2 if bound <= max(s.near, AGREEMENT_SIGMAS * sigma) else 1.0
         free = None
         if space is not None:
             sigma = s.through * space.cell
             free = FreePairs.found(
-                scene, samples, space, camera, tolerance=self._astray, sigma=sigma, seen=pixels.group
+                scene, samples, space, camera, tolerance=self._contradiction_distance, sigma=sigma, seen=pixels.group
             )  # fmt: skip
         return DepthImageMatched(
             self, SurfacePairs.nearest(points, measured, scene, bound / 2.0, blur, camera),
@@ -193,48 +196,48 @@ class DepthImageMeasurement(Measurement):
         )  # fmt: skip
 
     def evidence(self, scene: Scene) -> Evidence:
-        """Pixels for and against each segment; see `judge_segments`."""
+        """Pixels that support or contradict each segment; see `judge_segments`."""
         camera, vertices = scene.placed(self.camera), scene.surface.posed(scene.state)
         layers = scene.surface.layers(camera)
-        told = judge_segments(vertices, layers, self.depth, camera, noise=(self.sigma / 2.0, 0.0))
+        verdict = judge_segments(vertices, layers, self.depth, camera, noise=(self.sigma / 2.0, 0.0))
         self._judged = None if self.is_compact else (scene.state, layers.front.copy())
         if self._doubtful is None:
-            return told.evidence
-        orphaned, of = np.zeros(len(told.unseen), bool), layers.limbs.jointed
-        orphaned[of] = ~told.holds[scene.body.tree.parents[of]]
-        return replace(told.evidence, unplaced=told.unseen | orphaned | self._doubtful)
+            return verdict.evidence
+        orphaned, of = np.zeros(len(verdict.unseen), bool), layers.limbs.jointed
+        orphaned[of] = ~verdict.holds[scene.body.tree.parents[of]]
+        return replace(verdict.evidence, unplaced=verdict.unseen | orphaned | self._doubtful)
 
     def doubt(self, segments: NDArray) -> None:
-        """Know of segments (S,) bool that something in the image that nothing explains may be; no earlier image helps.
+        """Mark segments (S,) bool that an unexplained object in the image may be, without help from earlier images.
 
-        So what a limb's segment hangs on must be seen, too.
+        So the parent of a limb's segment must be visible, too.
         """
         self._doubtful = segments
 
     def drawn_alone(self, scene: Scene) -> NDArray:
-        """(h, w) [m] the body's own depth at a scene's state, small; what evidence has drawn is not drawn twice."""
+        """(h, w) [m] the body's rendered depth at a scene's state, downsampled; reuses the rendering of `evidence`."""
         if self._judged is not None and self._judged[0] is scene.state:
             return self._judged[1]
         return scene.surface.depth(scene.surface.posed(scene.state), scene.placed(self.camera))
 
     def depth_image(self) -> DepthSeen:
-        """For other sensors, what stands still among it."""
+        """The image for occlusion tests of other sensors, background included."""
         return DepthSeen(np.abs(self.depth), self.camera, self.sigma)
 
     def hints(self, scene: Scene) -> Hints:
-        """All that was measured about the body and is not background."""
+        """A view of all points near the body that are not background."""
         return Hints(view=person_view(self.depth, self.camera, self.box))
 
     def compact(self) -> DepthImageMeasurement:
-        """The part of the image about the body, of every n-th row and column, and its points: at most 200 kB."""
+        """A copy with the part near the body only, every n-th row and column, and its points: at most 200 kB."""
         if self.is_compact:
             return self
         out = copy(self)
-        thin = max(-(-self._share.size // _MOST_POINTS), 1)
+        thin = max(-(-self._share.size // _MAX_KEPT_POINTS), 1)
         out._points = np.ascontiguousarray(self._points[:, ::thin], np.float32)
         out._share = np.minimum(thin * self._share[::thin], 1.0).astype(np.float32)
         (top, left), (bottom, right) = self._window
-        step = max(int(np.ceil(np.sqrt((bottom - top) * (right - left) / _MOST_PIXELS))), 1)
+        step = max(int(np.ceil(np.sqrt((bottom - top) * (right - left) / _MAX_KEPT_PIXELS))), 1)
         out._step, first = step, (step - 1) // 2
         out._at = max(-((first - top) // step), 0), max(-((first - left) // step), 0)
         end = -((first - bottom) // step), -((first - right) // step)
@@ -253,7 +256,7 @@ class DepthImageMatched(Matched):
     measurement : DepthImageMeasurement
     points : SurfacePairs of measured points and the nearest ones of the surface
     samples : SurfacePairs of visible samples of the surface
-    free : FreePairs of samples that the sensor saw through; None where these are not asked for.
+    free : FreePairs of samples in observed free space; None if it is disabled.
     """
 
     measurement: DepthImageMeasurement
@@ -273,11 +276,11 @@ class DepthImageMatched(Matched):
         return [pairs.rows(scene) for pairs in (self.points, self.samples, self.free) if pairs is not None]
 
     def evidence(self, scene: Scene) -> Evidence:
-        """Pixels for and against each segment; see `judge_segments`."""
+        """Pixels that support or contradict each segment; see `judge_segments`."""
         return self.measurement.evidence(scene)
 
     def leftovers(self, scene: Scene) -> list[Leftover]:
-        """Distances [m] of what was measured from the surface, by segments."""
+        """Distances [m] of measured points from the surface, by segments."""
         both = [pairs.on_segments(scene) for pairs in (self.points, self.samples)]
         residual, segment = (np.concatenate([getattr(r, name) for r in both]) for name in ("residual", "segment"))
         return [by_segments(self.sensor, scene.body, residual, segment, "m")]

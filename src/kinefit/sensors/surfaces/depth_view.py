@@ -1,4 +1,4 @@
-"""One person in one depth image, small: what a search for the posture compares poses with."""
+"""A depth image cut to one person and downsampled, with which a search for the posture compares poses."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from numpy.typing import NDArray
 from kinefit.geometry.camera import Camera
 from kinefit.sensors.surfaces import _kernels_depth_view as kernels
 
-_LENS = 300.0  # [px] of the camera that a cloud is looked at with
-_JUMP = 0.10  # [m] between neighbouring pixels that belong together: less than from an arm to the trunk behind it
-UNKNOWN = 0.5  # trust that a pixel without any measurement is empty: background out of range, or a hole
+_CLOUD_FOCAL_PX = 300.0  # of the virtual camera that renders a cloud
+_MAX_NEIGHBOUR_DISTANCE = 0.10  # [m] of adjacent pixels of one surface: less than from an arm to the trunk behind it
+UNMEASURED_TRUST = 0.5  # that a pixel without a measurement is empty: background out of range, or a hole
 
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """A depth image cut to one person and made small.
+    """A depth image cut to one person and downsampled.
 
     Parameters
     ----------
     T_view_world : (4, 4) [m]
     lens : (4,) [px] fx, fy, cx, cy of the small image, without distortion.
     observed : (h, w) float32 [m] depth of the person, 0 elsewhere.
-    behind : (h, w) float32 [m] depth of anything else that was measured, inf for nothing.
-    trust : (h, w) float32 in 0..1, how sure it is that the person is not at a pixel where it was not observed:
-        1 where something else was measured, 0 beside the sensor's image.
+    behind : (h, w) float32 [m] depth of other objects, inf where nothing was measured.
+    trust : (h, w) float32 in 0..1, confidence that the person is not at a pixel where it was not observed: 1 where
+        another object was measured, 0 outside the sensor's image.
     points : (h, w, 3) [m] in the world, 0 where the person was not observed.
     """
 
@@ -40,7 +40,7 @@ class DepthView:
 
     @property
     def seen(self) -> NDArray:
-        """(h, w) bool, where the person was observed."""
+        """(h, w) bool: pixels at which the person was observed."""
         return self.observed > 0
 
     @property
@@ -55,7 +55,7 @@ class DepthView:
 
     @property
     def thickness(self) -> NDArray:
-        """(h, w) [m] distance of every seen pixel to the person's outline."""
+        """(h, w) [m] distance of every pixel of the person to the contour."""
         inside = cv2.distanceTransform(self.seen.astype(np.uint8), cv2.DIST_L2, 3)
         return inside * self.observed / self.lens[0]
 
@@ -63,7 +63,7 @@ class DepthView:
 def view_of(
     depth: NDArray, person: NDArray, camera: Camera, *, pixels: int = 72, width: float = 0.022, margin: float = 0.3
 ) -> DepthView:
-    """The part of a depth image about a person.
+    """The part of a depth image around a person, downsampled.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def view_of(
     pixels : int, longer side of the view without its margin, at most
     width : float [m] of a pixel, at least: a wrist is two wide
     margin : float
-        Added on every side, as a share of the longer side: where a limb may be sought and was not seen.
+        Added on every side, as a share of the longer side: room to search for an occluded limb.
     """
     rays = camera.ray_table[:, person & (depth > 0)]
     low, high = np.nanmin(rays, axis=1), np.nanmax(rays, axis=1)
@@ -93,7 +93,7 @@ def view_of(
     own = person[row, column] & (measured > 0)
     observed = np.where(own, measured, 0.0)
     behind = np.where(~own & (measured > 0), measured, np.inf)
-    trust = np.where(inside, np.where(measured > 0, 1.0, UNKNOWN), 0.0)
+    trust = np.where(inside, np.where(measured > 0, 1.0, UNMEASURED_TRUST), 0.0)
     x = x_view * observed[..., None]
     points = np.where(own[..., None], x @ camera.T_world_camera[:3, :3].T + camera.centre_world, 0.0)
     observed, behind, trust = (np.ascontiguousarray(a, np.float32) for a in (observed, behind, trust))
@@ -101,9 +101,9 @@ def view_of(
 
 
 def splat(points: NDArray, camera: Camera) -> tuple[NDArray, Camera]:
-    """A depth image (h, w) [m] that a cloud (N, 3) [m] of the world would have made, coarse enough to be closed.
+    """A depth image (h, w) [m] of a cloud (N, 3) [m] in the world, coarse enough to have no holes.
 
-    Returns it with its camera.
+    Returns it with its downsampled camera.
     """
     x = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
     uv = camera.project(points)
@@ -124,7 +124,7 @@ def geodesic_ends(view: DepthView, centre: NDArray, *, count: int = 7, least: fl
     """(E, 3) [m] ends of the limbs: the points farthest from `centre` (3,) along the surface, one after the other.
 
     Accumulative geodesic extrema (Plagemann et al., ICRA 2010): every end found becomes a source itself. Parts that
-    are cut off by holes are joined over their narrowest gap. An end nearer than `least` [m] to the others is none.
+    holes cut off are joined over the narrowest gap. An end needs a geodesic distance of `least` [m] to the others.
     """
     seen, points = view.seen, view.points
     if not seen.any():
@@ -132,7 +132,7 @@ def geodesic_ends(view: DepthView, centre: NDArray, *, count: int = 7, least: fl
     distance = np.full(seen.shape, np.inf)
     away = np.where(seen, np.linalg.norm(points - centre, axis=-1), np.inf)
     distance[np.unravel_index(np.argmin(away), seen.shape)] = 0.0
-    kernels.spread(points, seen, _JUMP, distance)
+    kernels.spread(points, seen, _MAX_NEIGHBOUR_DISTANCE, distance)
     _bridge(points, seen, distance)
     ends: list[NDArray] = []
     while len(ends) < count:
@@ -142,12 +142,12 @@ def geodesic_ends(view: DepthView, centre: NDArray, *, count: int = 7, least: fl
             break
         ends.append(points[at])
         distance[at] = 0.0
-        kernels.spread(points, seen, _JUMP, distance)
+        kernels.spread(points, seen, _MAX_NEIGHBOUR_DISTANCE, distance)
     return np.array(ends).reshape(-1, 3)
 
 
 def _bridge(points: NDArray, seen: NDArray, distance: NDArray) -> None:
-    """Reach the parts that are cut off: from the nearest point that is reached, straight through the air."""
+    """Extend geodesic distances (h, w) to disconnected parts, in a straight line over the narrowest gap."""
     for _ in range(8):
         inside, outside = np.nonzero(seen & np.isfinite(distance)), np.nonzero(seen & ~np.isfinite(distance))
         if not len(outside[0]):
@@ -158,13 +158,13 @@ def _bridge(points: NDArray, seen: NDArray, distance: NDArray) -> None:
         k, m = np.unravel_index(np.argmin(gaps), gaps.shape)
         start = distance[inside][:: max(len(a) // 400, 1)][m]
         distance[outside[0][k], outside[1][k]] = start + gaps[k, m]
-        kernels.spread(points, seen, _JUMP, distance)
+        kernels.spread(points, seen, _MAX_NEIGHBOUR_DISTANCE, distance)
 
 
 def outside(view: DepthView, x_world: NDArray) -> tuple[NDArray, NDArray]:
-    """How far points (N, 3) [m] lie outside the person's outline, (N,) [m] across the line of sight; 0 within it.
+    """Distance of points (N, 3) [m] outside the person's contour, (N,) [m] across the line of sight; 0 inside.
 
-    And how sure it is, (N,) in 0..1: 0 beside the sensor's image and behind what else was measured.
+    And its confidence, (N,) in 0..1: 0 outside the sensor's image and behind other objects.
     """
     x = x_world @ view.T_view_world[:3, :3].T + view.T_view_world[:3, 3]
     z = np.maximum(x[:, 2], 1e-3)
@@ -174,12 +174,12 @@ def outside(view: DepthView, x_world: NDArray) -> tuple[NDArray, NDArray]:
     column, row = np.where(inside, column, 0), np.where(inside, row, 0)
     gap = cv2.distanceTransform((~view.seen).astype(np.uint8), cv2.DIST_L2, 3)[row, column]
     trust = np.where(inside & (x[:, 2] < view.behind[row, column]), view.trust[row, column], 0.0)
-    # the outline itself runs half a pixel before the first pixel without the person
+    # the contour runs half a pixel before the first pixel without the person
     return np.maximum(gap - 0.5, 0.0) * z / view.lens[0], trust
 
 
 def camera_at(x_world: NDArray, viewpoint: NDArray | None) -> Camera:
-    """A camera at a viewpoint (3,) [m] that looks at points (N, 3) [m]; 3 m before them along z where there is none."""
+    """A virtual camera at a viewpoint (3,) [m], looking at points (N, 3) [m]; without one 3 m off along -z."""
     middle = np.median(x_world, axis=0)
     eye = middle - np.array((0.0, 0.0, 3.0)) if viewpoint is None else np.asarray(viewpoint, float)
     z = (middle - eye) / max(float(np.linalg.norm(middle - eye)), 1e-9)
@@ -188,5 +188,5 @@ def camera_at(x_world: NDArray, viewpoint: NDArray | None) -> Camera:
     T = np.eye(4)
     T[:3, :3] = np.stack([x, np.cross(z, x), z])
     T[:3, 3] = -T[:3, :3] @ eye
-    K = np.array([[_LENS, 0, 319.5], [0, _LENS, 319.5], [0, 0, 1.0]])
+    K = np.array([[_CLOUD_FOCAL_PX, 0, 319.5], [0, _CLOUD_FOCAL_PX, 319.5], [0, 0, 1.0]])
     return Camera("cloud", (640, 640), K, T_camera_world=T)

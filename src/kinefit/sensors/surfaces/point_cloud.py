@@ -1,4 +1,4 @@
-"""A cloud of points of one time, made ready once, so that every iteration makes its rows quickly."""
+"""Point clouds: measured points as rows towards the body's surface."""
 
 from __future__ import annotations
 
@@ -13,25 +13,24 @@ from kinefit.geometry.camera import Camera
 from kinefit.observations import PointCloud
 from kinefit.rows import AnyRows, Rows
 from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor, by_segments
-from kinefit.sensors.evidence import Evidence
+from kinefit.sensors.evidence import AGREEMENT_SIGMAS, Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surfaces.depth_image import AGREES
 from kinefit.sensors.surfaces.depth_view import camera_at, splat, view_of
 from kinefit.sensors.surfaces.surface_match import SurfacePairs, along
 
-_PRIMES = np.array((73856093, 19349663, 83492791))  # that number cells of space (Teschner et al., VMV 2003)
+_HASH_PRIMES = np.array((73856093, 19349663, 83492791))  # of a spatial hash (Teschner et al., VMV 2003)
 
 
 class PointCloudSensor(Sensor):
-    """A scanner: points on some surface, on the body, or on one segment of it (P2 2.3), towards the body's surface.
+    """A scanner of points on any surface, on the body, or on one of its segments (P2 2.3).
 
     Parameters
     ----------
     name : as its frames are named
     sigma : float [m] standard deviation of a point.
     settings : TrackSettings
-    camera : Camera, where the scanner is one of the rig's: its points go with it.
+    camera : Camera, if the scanner is one of the rig's: its points move with the camera's pose.
     """
 
     shows_person = True
@@ -40,7 +39,7 @@ class PointCloudSensor(Sensor):
         self.name, self.sigma, self.settings, self.camera = name, sigma, settings, camera
 
     def prepare(self, frame: PointCloud, scene: Scene) -> PointCloudMeasurement:
-        """The points about the body.
+        """The measurement of one cloud: its points near the body.
 
         Raises
         ------
@@ -57,7 +56,7 @@ class PointCloudMeasurement(Measurement):
     ----------
     of : PointCloudSensor
     frame : PointCloud
-    scene : Scene with the body where it is expected: points that may be another's are taken about it.
+    scene : Scene with the body at its prediction: points of unknown origin count only near it.
 
     Attributes
     ----------
@@ -78,7 +77,7 @@ class PointCloudMeasurement(Measurement):
             x = x[((x > low) & (x < high)).all(axis=1)]
         self.points = np.array(x[:: max(len(x) // s.points, 1)], float)
         cells = np.floor(np.clip(self.points, -1e6, 1e6) / s.patch).astype(np.int64)
-        patches = len(np.unique(cells @ _PRIMES))
+        patches = len(np.unique(cells @ _HASH_PRIMES))
         self._point_sigma = of.sigma * np.sqrt(max(len(self.points) / max(patches, 1), 1.0))
 
     @property
@@ -86,15 +85,15 @@ class PointCloudMeasurement(Measurement):
         return self.of.camera
 
     def match(self, scene: Scene, reach: float) -> PointCloudMatched:
-        """Nearest points of the surface; for points known to be the body's twice as far."""
-        bound = max(2.0 * reach if self._certain else reach, AGREES * self.sigma)
+        """Match points to the nearest surface within `reach` [m]; twice as far if they are known to be the body's."""
+        bound = max(2.0 * reach if self._certain else reach, AGREEMENT_SIGMAS * self.sigma)
         points, _ = self._seen(scene)
         camera = None if self._camera is None else scene.placed(self._camera)
         near = self._near(scene, bound)
         return PointCloudMatched(self, SurfacePairs.nearest(near, points, scene, bound / 2.0, camera=camera))
 
     def _seen(self, scene: Scene) -> tuple[NDArray, NDArray | None]:
-        """(N, 3) [m] its points and (3,) [m] where the sensor stood, where a scene's rig has it."""
+        """(N, 3) [m] its points and (3,) [m] its viewpoint, with the scanner's pose in the scene's rig."""
         if self._camera is None:
             return self.points, self._eye
         eye = None if self._eye is None else along(self._eye[None], self._camera, scene)[0]
@@ -108,18 +107,18 @@ class PointCloudMeasurement(Measurement):
         )  # fmt: skip
 
     def evidence(self, scene: Scene) -> Evidence:
-        """For a segment, as much as there are points near it, of those that its share of the surface should have."""
-        rows, areas = self._near(scene, AGREES * self.sigma), scene.surface.areas
+        """Support of each segment: points near it over the number expected from its share of the surface, at most 1."""
+        rows, areas = self._near(scene, AGREEMENT_SIGMAS * self.sigma), scene.surface.areas
         count, none = len(self.points), np.zeros(len(areas))
         if self._segment is not None:
-            share, told = len(rows) / max(count, 1), Evidence(none, none.copy())
-            told.agreeing[self._segment], told.contrary[self._segment] = share, (1.0 - share) * bool(count)
-            return told
+            share, out = len(rows) / max(count, 1), Evidence(none, none.copy())
+            out.agreeing[self._segment], out.contrary[self._segment] = share, (1.0 - share) * bool(count)
+            return out
         expected = np.maximum(count * areas / max(areas.sum(), 1e-12), 1.0)
         return Evidence(np.minimum(np.bincount(rows.segment, minlength=len(none)) / expected, 1.0), none)
 
     def hints(self, scene: Scene) -> Hints:
-        """The points as a camera at the sensor would show them."""
+        """A view of the points from the sensor."""
         if not len(self.points):
             return Hints()
         coarse, small = splat(self.points, camera_at(self.points, self._eye))
@@ -151,7 +150,7 @@ class PointCloudMatched(Matched):
         return [self.pairs.rows(scene)]
 
     def evidence(self, scene: Scene) -> Evidence:
-        """For a segment, as much as there are points near it, of those that its share of the surface should have."""
+        """Support of each segment: points near it over the number expected from its share of the surface, at most 1."""
         return self.measurement.evidence(scene)
 
     def leftovers(self, scene: Scene) -> list[Leftover]:

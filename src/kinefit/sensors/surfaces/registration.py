@@ -1,9 +1,8 @@
-"""Where a depth camera must be for its points to lie on the person, whose poses are known from the videos.
+"""Register a depth camera to a person whose poses are known from videos.
 
-Only the camera moves. Points and surface are matched and solved in turn from several starts within the prior, with
-weights that end at a distance which shrinks. What a place is worth is its truncated distances: of every point that was
-measured, with new correspondences, frame by frame. So places can be compared, and one in which nearest points only
-settled is told from the right one.
+Only the camera moves. Iterative closest points run from several starts within the prior, with a correspondence distance
+that shrinks. The cost of a camera pose is the sum of truncated squared distances of all measured points, with new
+correspondences in each frame. Costs of two poses are comparable, which separates a local minimum from the right pose.
 """
 
 from __future__ import annotations
@@ -21,31 +20,33 @@ from kinefit.sensors.base import Measurement, matched_by, rows_at
 from kinefit.sensors.displaced import AXES, CLOCK, displacement
 from kinefit.sensors.scene import Scene
 
-CLEAR = 3.0
-"""Standard errors, over the frames, by which truncated distances of one place must be above those of another."""
+MIN_COST_GAP_SIGMAS = 3.0
+"""Standard errors, over the frames, by which the cost of one pose must exceed that of another."""
 
-NEAR = 0.1
-"""[m] at which a distance counts in full."""
+TRUNCATION_DISTANCE = 0.1
+"""[m] above which the squared distance of a point is truncated."""
 
-FAR, FINE = (0.3, 0.3, 0.2, 0.2, 0.15, 0.1), (0.1, 0.08, 0.06, 0.05)
-"""[m] at which weights end, round by round: of the starts, and of what the best of them becomes."""
+COARSE_DISTANCES = (0.3, 0.3, 0.2, 0.2, 0.15, 0.1)
+"""[m] correspondence distance of each round, from all starts."""
 
-_SURFACE, _SHARE = (
-    0.03,
-    0.02,
-)  # [m] of a point from a surface of simple shapes; share that is independent
-_HEIGHTS, _CLOSE = np.linspace(-0.06, 0.06, 9), 0.05  # [m] that are tried, and at which a distance then counts in full
+FINE_DISTANCES = (0.1, 0.08, 0.06, 0.05)
+"""[m] correspondence distance of each round, from the best of them."""
+
+_SURFACE_SIGMA = 0.03  # [m] of a point from a surface of simple shapes
+_INDEPENDENT_SHARE = 0.02  # of the points: neighbours err alike
+_TRIED_HEIGHTS = np.linspace(-0.06, 0.06, 9)  # [m]
+_HEIGHT_TRUNCATION = 0.05  # [m] in place of `TRUNCATION_DISTANCE` while heights are tried
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """What one sensor saw, in frames whose poses are known.
+    """Measurements of one sensor in frames with known poses.
 
     Parameters
     ----------
     sensor : name
-    steps : F lists, what it measured in each frame, as `Displaced` measurements about `centre`.
-    scenes : F scenes, at the poses that are known.
+    steps : F lists of its `Displaced` measurements about `centre`, one for each frame.
+    scenes : F scenes, at the known poses.
     centre : (3,) [m] about which its frame turns.
     information : (6, 6) of the prior of shift and turn.
     """
@@ -57,7 +58,7 @@ class Registration:
     information: NDArray
 
     def rows(self, twist: NDArray, reach: float) -> list[list[Rows]]:
-        """Of each frame: rows of measured points first, then of others, with the sensor at a twist (7,)."""
+        """Rows of each frame with the sensor at a twist (7,), measured points first; `reach` [m] as of `match`."""
         values = {self.sensor: values_of(twist)}
         out = []
         for several, scene in zip(self.steps, self.scenes):
@@ -66,17 +67,17 @@ class Registration:
             out.append([r for rows in each for r in rows if isinstance(r, Rows)])
         return out
 
-    def costs(self, twist: NDArray, near: float = NEAR) -> NDArray:
-        """(F,) [m²] truncated squared distances of measured points, less those of points that are all far away."""
+    def costs(self, twist: NDArray, near: float = TRUNCATION_DISTANCE) -> NDArray:
+        """(F,) [m²] sums of squared distances truncated at `near` [m], minus their value if all were truncated."""
         squares = [np.square(rows[0].residual) if rows else np.zeros(0) for rows in self.rows(twist, near)]
         return np.array([np.sum(np.minimum(r, near**2) - near**2) for r in squares])
 
     def above(self, twist: NDArray, other: NDArray) -> bool:
-        """Whether distances at a twist (7,) are clearly above those at another one."""
+        """Whether the cost at a twist (7,) is significantly above that at another (7,)."""
         return clearly_above(self.costs(twist), self.costs(other))
 
     def settled(self, twist: NDArray, reach: Sequence[float]) -> NDArray:
-        """(7,) where the sensor comes to rest from a twist; the clock stays."""
+        """(7,) local minimum from a start (7,), a round for each correspondence distance [m]; the clock is fixed."""
         shift, R, clock = twist[:3], se3.exp_so3(twist[3:6]), twist[6:]
         for end in reach:
             now = np.concatenate([shift, se3.log_so3(R)])
@@ -84,7 +85,8 @@ class Registration:
             for rows in (r for several in self.rows(np.append(now, clock), end) for r in several):
                 point, way = rows.data[:3].T - (self.centre + shift), rows.data[3:6].T
                 A = np.hstack([way, np.cross(point, way)])
-                weight = _SHARE / _SURFACE**2 * np.square(np.clip(1.0 - np.square(rows.residual / end), 0.0, None))
+                inside = np.clip(1.0 - np.square(rows.residual / end), 0.0, None)
+                weight = _INDEPENDENT_SHARE / _SURFACE_SIGMA**2 * np.square(inside)
                 H += (weight[:, None] * A).T @ A
                 g += A.T @ (weight * rows.residual)
             step = np.linalg.solve(H, g)
@@ -92,22 +94,22 @@ class Registration:
         return np.concatenate([shift, se3.log_so3(R), clock])
 
     def height(self, twist: NDArray, up: NDArray) -> NDArray:
-        """(7,) a twist raised so that the points lie nearest to the surface.
+        """(7,) a twist (7,) raised along `up` (3,) to the height of lowest cost.
 
-        Correspondences slide along a standing person: matched and solved in turn, heights come 3 % nearer in a round.
-        So heights are tried, and the smallest truncated distances of all points, with new correspondences, are found.
+        Correspondences slide along a standing person: a round of closest points reduces the error of the height by 3 %
+        only. So heights are tried, and a parabola through the costs gives the best one.
         """
         way = np.append(up, np.zeros(4))
-        cost = np.array([self.costs(twist + raised * way, _CLOSE).sum() for raised in _HEIGHTS])
-        least = int(np.clip(np.argmin(cost), 2, len(_HEIGHTS) - 3))
-        a, b, _ = np.polyfit(_HEIGHTS[least - 2 : least + 3], cost[least - 2 : least + 3], 2)
-        best = -0.5 * b / a if a > 0.0 else _HEIGHTS[least]
-        return twist + float(np.clip(best, _HEIGHTS[0], _HEIGHTS[-1])) * way
+        cost = np.array([self.costs(twist + raised * way, _HEIGHT_TRUNCATION).sum() for raised in _TRIED_HEIGHTS])
+        least = int(np.clip(np.argmin(cost), 2, len(_TRIED_HEIGHTS) - 3))
+        a, b, _ = np.polyfit(_TRIED_HEIGHTS[least - 2 : least + 3], cost[least - 2 : least + 3], 2)
+        best = -0.5 * b / a if a > 0.0 else _TRIED_HEIGHTS[least]
+        return twist + float(np.clip(best, _TRIED_HEIGHTS[0], _TRIED_HEIGHTS[-1])) * way
 
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """Where starts came to rest.
+    """Local minima of several starts.
 
     Parameters
     ----------
@@ -120,28 +122,28 @@ class Ends:
 
     @cached_property
     def best(self) -> NDArray:
-        """(7,) the one of the smallest truncated distances."""
+        """(7,) the twist of lowest cost."""
         return min(self.twists, key=lambda twist: float(self.registration.costs(twist).sum()))
 
     @property
     def rivals(self) -> tuple[NDArray, ...]:
-        """Of (7,): what leads from the best one to each other whose distances are not clearly above."""
+        """Differences (7,) from the best minimum to each other that is not significantly worse."""
         return tuple(apart(t, self.best) for t in self.twists if not self.registration.above(t, self.best))
 
 
 def clearly_above(costs: NDArray, others: NDArray) -> bool:
-    """Whether costs (F,) of one place are above those of another one by more than chance; see `CLEAR`."""
+    """Whether costs (F,) of one pose are significantly above those of another (F,); see `MIN_COST_GAP_SIGMAS`."""
     more = costs - others
-    return bool(more.mean() > CLEAR * more.std(ddof=1) / np.sqrt(len(more)))
+    return bool(more.mean() > MIN_COST_GAP_SIGMAS * more.std(ddof=1) / np.sqrt(len(more)))
 
 
 def starts(origin: NDArray, centre: NDArray, std: tuple[float, float]) -> list[NDArray]:
-    """Twists (7,): none; one and two deviations of turn about the origin across the way to the centre, of shift along.
+    """Start twists (7,): zero, turns about the origin and shifts towards the centre by one and two sigmas.
 
     Parameters
     ----------
-    origin, centre : (3,) [m] of the sensor's frame, and of what it saw.
-    std : [m], [rad] of the origin's shift, and of the turn.
+    origin, centre : (3,) [m] of the sensor's frame, and of its points.
+    std : [m], [rad] standard deviations of the origin's shift, and of the turn.
     """
     way = centre - origin
     length = float(np.linalg.norm(way))
@@ -156,16 +158,16 @@ def starts(origin: NDArray, centre: NDArray, std: tuple[float, float]) -> list[N
 
 
 def values_of(twist: NDArray) -> dict[str, float]:
-    """The scene's values of a sensor at a twist (7,)."""
+    """{name: value} [m, rad, s] of a sensor in a scene, from a twist (7,)."""
     return dict(zip((*AXES, CLOCK), np.asarray(twist, float).tolist()))
 
 
 def apart(twist: NDArray, other: NDArray) -> NDArray:
-    """(7,) shift of the centre, turn and clock that lead from another twist to one."""
+    """(7,) shift of the centre, turn and clock offset from another twist (7,) to one (7,)."""
     at = lambda t: displacement(values_of(t), np.zeros(3))[:3, :3]
     return np.concatenate([twist[:3] - other[:3], se3.log_so3(at(twist) @ at(other).T), twist[6:] - other[6:]])
 
 
 def twist_of(values: Mapping[str, float]) -> NDArray:
-    """(7,) of a scene's values of a sensor."""
+    """(7,) twist [m, rad, s] of a scene's values of a sensor; inverse of `values_of`."""
     return np.array([values[what] for what in (*AXES, CLOCK)])

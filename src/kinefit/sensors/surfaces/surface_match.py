@@ -1,4 +1,4 @@
-"""Correspondences between a body's surface and what was measured, frozen: they hold at any state, on any like body."""
+"""Frozen correspondences of surface and measurements: valid at any state of any body with the same surfaces."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from kinefit.sensors.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class SurfacePairs:
-    """N measured points, each with the point of the surface that it belongs to: point to plane (P2 2.3).
+    """N measured points with their corresponding points of the surface: point to plane (P2 2.3).
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class SurfacePairs:
     weight : (N,) [1/m²]
     scale : float [m] of the loss (Geman-McClure): at this distance a pair has a quarter of its weight.
     at_surface : bool, see `anchored_rows`.
-    camera : Camera that measured them, where `x_world` has it; they go with it where a scene's rig has it elsewhere.
+    camera : Camera that measured them, at the pose of `x_world`; they move with its pose in a scene's rig.
     """
 
     anchors: SurfaceAnchors
@@ -45,9 +45,9 @@ class SurfacePairs:
         cls, rows: Rows, x_world: NDArray, scene: Scene, scale: float, factor: float = 1.0,
         camera: Camera | None = None,
     ) -> SurfacePairs:  # fmt: skip
-        """Pairs of measured points (M, 3) [m] and their nearest points: `surface_rows` of them in the scene's state.
+        """Pairs of measured points (M, 3) [m] and nearest points, from `surface_rows` at the scene's state.
 
-        `factor` multiplies the weights.
+        `scale` [m] is of the loss; `factor` multiplies the weights.
         """
         x, rest, normal = anchored(rows, x_world, scene.frames)
         anchors = SurfaceAnchors(scene.body, rows.segment, rest, normal)
@@ -57,13 +57,13 @@ class SurfacePairs:
     def seen(
         cls, rows: Rows, samples: SurfaceSamples, scene: Scene, scale: float, camera: Camera
     ) -> SurfacePairs:
-        """Pairs of visible samples and what was measured at their pixels: `depth_image_rows` in the scene's state."""
+        """Pairs of visible samples and their pixels' points, (M, 3) [m], from `depth_image_rows` at its state."""
         rest, normal = samples.point[:, rows.group].T, samples.normal[:, rows.group].T
         anchors = SurfaceAnchors(scene.body, rows.segment, np.ascontiguousarray(rest), np.ascontiguousarray(normal))
         return cls(anchors, np.ascontiguousarray(rows.point), rows.weight.copy(), scale, False, camera)
 
     def on_segments(self, scene: Scene) -> Rows:
-        """The rows, as if no joint moved with an angle."""
+        """The rows, ignoring joint centres that move with angles."""
         points, normals = self.anchors.on(scene.body)
         measured = self.x_world if self.camera is None else along(self.x_world, self.camera, scene)
         made = anchored_rows(
@@ -79,14 +79,14 @@ class SurfacePairs:
 
 @dataclass(frozen=True, eq=False)
 class FreePairs:
-    """Samples of the surface in free space, each with the place in the image that it is drawn to.
+    """Samples of the surface in free space, each with its target in the image.
 
     Parameters
     ----------
     anchors : SurfaceAnchors, N
     camera : Camera
     target : (N, 2) [px]
-    slack, sigma : float [px]
+    slack, sigma : float [px] half a cell of free space; standard deviation
     """
 
     anchors: SurfaceAnchors
@@ -100,8 +100,13 @@ class FreePairs:
         cls, scene: Scene, samples: SurfaceSamples, space: FreeSpace, camera: Camera, *, tolerance: float, sigma: float,
         seen: NDArray,
     ) -> FreePairs:  # fmt: skip
-        """As `free_space_rows` finds them at a scene's state, without fingers of which more is in the air than `seen`.
+        """Find them with `free_space_rows` at a scene's state, without fingers that are folded.
 
+        A hand counts as folded if more of its samples are in free space than in `seen`.
+
+        Parameters
+        ----------
+        tolerance : float [m], sigma : float [px]
         seen : (M,) int, samples with a measurement at their pixels
         """
         chosen = np.empty(len(samples), np.int64)
@@ -128,7 +133,7 @@ class FreePairs:
 
 
 def along(x_world: NDArray, camera: Camera, scene: Scene) -> NDArray:
-    """(N, 3) [m] what a camera measured, moved with it to where a scene's rig has it."""
+    """(N, 3) [m] points that a camera measured, moved with its pose to the one in a scene's rig."""
     there = scene.placed(camera)
     if there is camera:
         return x_world
@@ -137,5 +142,5 @@ def along(x_world: NDArray, camera: Camera, scene: Scene) -> NDArray:
 
 
 def _on_joints(scene: Scene, rows: Rows) -> Rows | DofRows:
-    """Rows with the derivative of joints that move with angles, where there are any."""
+    """Rows with the derivatives of joint centres that move with angles, if any do."""
     return rows if scene.morphing is None else on_moved_joints(scene.morphing.pose(scene.state), rows)

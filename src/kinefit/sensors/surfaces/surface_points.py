@@ -1,10 +1,10 @@
-"""Tracked points of a surface: each sticks to the place of the body where it was first seen (P4-5, P4-11).
+"""Tracked points of a surface: each is anchored to the point of the body where it was first seen (P4-5, P4-11).
 
-A point that was not seen before is drawn to the nearest surface, as one of a cloud. Once the limb rests in the cloud,
-so that places of points on it no longer wander from step to step, they are anchored where they lie on its segment; from
-then on each says in all three directions where that place is, so that turns about a limb's own axis are seen. Anchors
-are what the sensor learnt, not parameters: skin slides on the bone by `slide`. How a limb was turned about its bone
-when its first points were anchored they never tell: that deviation lasts, for all of its points together.
+A new point is pulled to the nearest surface, like a point of a cloud. Once a limb has converged, so that its points no
+longer move on the segment from step to step, they are anchored there. From then on each point constrains all three
+directions, so that rotations about a limb's own axis are observable. The sensor learns the anchors; they are no
+parameters: skin slides on the bone by `slide`. The rotation of a limb about its bone at the time of its first anchors
+stays unobserved: it is a systematic error that all of its points share.
 """
 
 from __future__ import annotations
@@ -25,20 +25,25 @@ from kinefit.sensors.checks import of_kind
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.surfaces.surface_match import SurfacePairs
 
-_SETTLED = 0.05  # of the slide, by which places on a limb may wander from step to step: 0.5 mm, a degree of a thin arm
-_PATIENCE = 10  # steps after which a limb counts as settled: a cloud does not tell a round one's turn at all
-_AGREES = 3.0  # standard deviations from the surface within which a new point is anchored
+_MAX_WANDER = 0.05  # of the slide, from step to step on a converged limb: 0.5 mm, a degree of a thin arm
+_MAX_WAIT_STEPS = 10  # until a limb counts as converged: a cloud never fixes the rotation of a round one
+_MAX_ANCHOR_SIGMAS = 3.0  # from the surface, of a point that is anchored
 Anchor = tuple[int, NDArray]
 
 
 class SurfacePointSensor(Sensor):
-    """A surface that is tracked: skin, a sleeve. Give it to `Tracker(..., sensors=[...])` or to a `Recording`.
+    """A tracked surface, such as skin or a sleeve. Give it to `Tracker(..., sensors=[...])` or to a `Recording`.
 
     Parameters
     ----------
     name : as its frames are named
-    slide : float [m] standard deviation by which the surface slides on the bone, and the body's surface is off
-    most : int, points that are used at a time, spread evenly
+    slide : float [m] standard deviation of the surface's sliding on the bone and of the body's surface
+    most : int, largest number of points used at a time, spread evenly
+
+    Raises
+    ------
+    ObservationError
+        A slide or a number that is not positive.
     """
 
     state_attributes = ("anchors", "turns", "_last", "_waited")
@@ -48,12 +53,12 @@ class SurfacePointSensor(Sensor):
             raise ObservationError(f"a slide of {slide} m, {most} points", remedy="Give positive numbers.")
         self.name, self.slide, self.most = name, float(slide), int(most)
         self.anchors: Mapping[int, Anchor] = {}
-        self.turns: Mapping[int, NDArray] = {}  # of segments, until they got their first anchor; see `Matched`
-        self._last: Mapping[int, Anchor] = {}  # places of points on limbs that have not settled
+        self.turns: Mapping[int, NDArray] = {}  # of segments until their first anchor; see `Matched`
+        self._last: Mapping[int, Anchor] = {}  # of points on limbs that have not converged
         self._waited: Mapping[int, int] = {}  # steps of each such limb
 
     def prepare(self, frame: SurfacePointFrame, scene: Scene) -> SurfacePointMeasurement:
-        """Points with an anchor first, then new ones, no more than `most`."""
+        """The measurement of one frame: anchored points first, then new ones, at most `most`."""
         of_kind(frame, SurfacePointFrame, f"a frame of the sensor '{self.name}'", "Give what it saw in such a record.")
         known = np.array([int(i) in self.anchors for i in frame.ids], bool)
         order = np.concatenate([np.flatnonzero(known), np.flatnonzero(~known)])
@@ -68,10 +73,10 @@ class SurfacePointSensor(Sensor):
         )
 
     def learn(self, measurement: SurfacePointMeasurement, scene: Scene, sure: bool) -> None:
-        """Anchor new points on limbs that have settled; let go of those that left the limb they were given to.
+        """Anchor new points on converged limbs; discard the anchors of points that have left their limb.
 
-        A point is let go where its place on the segment is far from where it is seen, while most points of the same
-        segment agree: it belongs to another limb, or its path went astray. Its next frame gives it to the nearest.
+        An anchor is discarded if it is far from the measured point while most points of its segment agree: the point
+        is another limb's, or its track has drifted. In the next frame it is matched to the nearest surface.
         """
         if not sure:
             return
@@ -79,7 +84,7 @@ class SurfacePointSensor(Sensor):
         if lost:
             self.anchors = {i: anchor for i, anchor in self.anchors.items() if i not in lost}
         new = measurement.new
-        near = measurement.near(scene, new, _AGREES * self.slide)
+        near = measurement.near(scene, new, _MAX_ANCHOR_SIGMAS * self.slide)
         f = scene.frames[near.segment]
         gap = measurement.x_world[new][near.group] - f[:, 9:]
         rest = np.einsum("nji,nj->ni", f[:, :9].reshape(-1, 3, 3), gap)
@@ -90,26 +95,26 @@ class SurfacePointSensor(Sensor):
         self._last = {i: anchor for i, anchor in found.items() if anchor[0] not in settled}
         added = {i: anchor for i, anchor in found.items() if anchor[0] in settled}
         seen = {s for s, _ in found.values()} - known
-        self.turns = {**self.turns, **{s: self._surest(s, scene) for s in seen}}
+        self.turns = {**self.turns, **{s: self._least_turn(s, scene) for s in seen}}
         if added:
             self.anchors = {**self.anchors, **added}
 
-    def _surest(self, segment: int, scene: Scene) -> NDArray:
-        """How surely a limb that waits for anchors was turned about its bone when that was known best."""
+    def _least_turn(self, segment: int, scene: Scene) -> NDArray:
+        """(3,) [rad] smallest rotation uncertainty of a limb about its bone while it waits for anchors."""
         now, before = _turn(scene, segment), self.turns.get(segment) if self._waited.get(segment, 0) > 1 else None
         return now if before is None or not before.any() or now @ now < before @ before else before
 
     def _rests(self, segment: int, found: Mapping[int, Anchor]) -> bool:
-        """Whether places of points on a segment have stopped to wander, or have been waited for long enough."""
+        """Whether points have stopped moving on a segment, or it has waited for `_MAX_WAIT_STEPS`."""
         waited = self._waited.get(segment, 0) + 1
         self._waited = {**self._waited, segment: waited}
         both = [i for i, (s, _) in found.items() if s == segment and self._last.get(i, (-1, None))[0] == segment]
         moved = [float(np.linalg.norm(found[i][1] - self._last[i][1])) for i in both]
-        return waited > _PATIENCE or (len(moved) > 2 and float(np.median(moved)) < _SETTLED * self.slide)
+        return waited > _MAX_WAIT_STEPS or (len(moved) > 2 and float(np.median(moved)) < _MAX_WANDER * self.slide)
 
 
 def _turn(scene: Scene, segment: int) -> NDArray:
-    """(3,) [rad] in its frame: standard deviation of how a segment is turned about its bone, by the scene's state."""
+    """(3,) [rad] in its frame: standard deviation of a segment's rotation about its bone, from the scene's state."""
     bone = scene.body.segment_ends().get(segment)
     if bone is None or scene.covariance is None or not np.any(bone):
         return np.zeros(3)
@@ -126,9 +131,9 @@ class SurfacePointMeasurement(Measurement):
     Parameters
     ----------
     sensor, time, ids, x_world : as of the frame
-    variance : (N,) [m²] with the slide
+    variance : (N,) [m²], slide included
     slide : float [m]
-    anchors : {id: (segment, place in its frame (3,) [m])} of its points, as known then
+    anchors : {id: (segment, (3,) [m] in its frame)} of its points at that time
     turns : {segment: (3,) [rad]} of those, see `Matched`
     """
 
@@ -148,24 +153,24 @@ class SurfacePointMeasurement(Measurement):
         return np.flatnonzero([int(i) not in self.anchors for i in self.ids])
 
     def strayed(self, scene: Scene) -> set[int]:
-        """Points that are far from their anchors, on segments where the median is within one standard deviation."""
+        """Ids of points far from their anchors, on segments whose median distance is within one standard deviation."""
         index = [k for k, i in enumerate(self.ids) if int(i) in self.anchors]
         if not index:
             return set()
-        told = [self.anchors[int(i)] for i in self.ids[index]]
-        segment = np.array([s for s, _ in told])
+        anchors = [self.anchors[int(i)] for i in self.ids[index]]
+        segment = np.array([s for s, _ in anchors])
         f = scene.frames[segment]
-        at = np.einsum("nij,nj->ni", f[:, :9].reshape(-1, 3, 3), np.array([x for _, x in told])) + f[:, 9:]
+        at = np.einsum("nij,nj->ni", f[:, :9].reshape(-1, 3, 3), np.array([x for _, x in anchors])) + f[:, 9:]
         off = np.linalg.norm(self.x_world[index] - at, axis=1) / np.sqrt(3.0 * self.variance[index])
         out: set[int] = set()
         for s in np.unique(segment):
-            mine = np.flatnonzero(segment == s)
-            if np.median(off[mine]) < 1.0:
-                out |= {int(self.ids[index[k]]) for k in mine if off[k] > _AGREES}
+            on_segment = np.flatnonzero(segment == s)
+            if np.median(off[on_segment]) < 1.0:
+                out |= {int(self.ids[index[k]]) for k in on_segment if off[k] > _MAX_ANCHOR_SIGMAS}
         return out
 
     def near(self, scene: Scene, index: ArrayLike, reach: float) -> Rows:
-        """Rows of some points to the nearest surface, within a distance [m]; groups count among `index`."""
+        """Rows of points index (M,) to the nearest surface within a distance [m]; groups count in `index`."""
         chosen = np.asarray(index, int)
         return surface_rows(
             scene.body, scene.state, np.ascontiguousarray(self.x_world[chosen]), max_distance=reach,
@@ -173,13 +178,13 @@ class SurfacePointMeasurement(Measurement):
         )  # fmt: skip
 
     def match(self, scene: Scene, reach: float) -> SurfacePointMatched:
-        """Anchors where there are; nearest points of the surface for the others."""
+        """Match points to their anchors, new ones to the nearest surface; a loss scale of at least `reach` [m]."""
         new = self.new
         old = np.setdiff1d(np.arange(len(self.ids)), new)
-        pairs, scale = [], max(reach, _AGREES * self.slide)
+        pairs, scale = [], max(reach, _MAX_ANCHOR_SIGMAS * self.slide)
         if len(old):
-            told = [self.anchors[int(i)] for i in self.ids[old]]
-            segment, rest = np.array([s for s, _ in told]), np.array([x for _, x in told])
+            known = [self.anchors[int(i)] for i in self.ids[old]]
+            segment, rest = np.array([s for s, _ in known]), np.array([x for _, x in known])
             for axis in np.eye(3):
                 anchors = SurfaceAnchors(scene.body, segment, rest, np.tile(axis, (len(old), 1)))
                 x = np.ascontiguousarray(self.x_world[old])
@@ -193,12 +198,12 @@ class SurfacePointMeasurement(Measurement):
 
 @dataclass(frozen=True, eq=False)
 class SurfacePointMatched(Matched):
-    """Points with their places on the body.
+    """Tracked points with their correspondences on the body.
 
     Parameters
     ----------
     pairs : of anchored points along three axes, and of new ones along the surface's normal
-    lasts : share of the variance that lasts: the slide
+    lasts : share 0..1 of the variance that is systematic: the slide's
     sensor : of the measurement
     turns : of the measurement
     """
@@ -216,7 +221,7 @@ class SurfacePointMatched(Matched):
 
     def leftovers(self, scene: Scene) -> list[Leftover]:
         """Distances [m] along the axes and normals, by segments."""
-        told = [pairs.on_segments(scene) for pairs in self.pairs]
-        residual = np.concatenate([np.zeros(0), *(rows.residual for rows in told)])
-        segment = np.concatenate([np.zeros(0, np.int64), *(rows.segment for rows in told)])
+        parts = [pairs.on_segments(scene) for pairs in self.pairs]
+        residual = np.concatenate([np.zeros(0), *(rows.residual for rows in parts)])
+        segment = np.concatenate([np.zeros(0, np.int64), *(rows.segment for rows in parts)])
         return [by_segments(self.sensor, scene.body, residual, segment, "m")]

@@ -1,1 +1,1 @@
-"""What of a body each camera sees: visibility, occlusion, limbs that part from the rest."""
+"""What of a body each camera sees: visibility, occlusion, assignment of pixels to people."""

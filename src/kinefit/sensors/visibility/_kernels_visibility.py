@@ -1,4 +1,4 @@
-"""Kernels of the judgement of segments: two layers of a drawn body, and what was measured at their pixels."""
+"""Kernels that judge segments: two layers of a rendered body, and the depths measured at their pixels."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from kinefit._jit import jit
 
-OWN, ALONE, SHARED, EMPTY, COVERED, UNKNOWN, BLANK = range(7)
+OWN, UNIQUE, SHARED, EMPTY, COVERED, UNKNOWN, BLANK = range(7)
 COUNTS = 7
 
 
@@ -32,7 +32,7 @@ def add_layer(layer, label, front, behind, owner, counts):
 
 @jit
 def measured(depth, across, down, out):
-    """Where something was measured at the pixels that `judge` looks at: out (h, w) uint8."""
+    """Write to out (h, w) uint8 whether the image has a depth at the pixels that `judge` samples."""
     for v in range(out.shape[0]):
         for u in range(out.shape[1]):
             out[v, u] = depth[int((v + 0.5) * down), int((u + 0.5) * across)] != 0.0
@@ -43,15 +43,15 @@ def judge(
     front, behind, owner, depth, away, across, down, focal, slack, gap, constant, quadratic, rays, axes, end, counts,
     ends,
 ):  # fmt: skip
-    """Count every segment's foremost pixels by what was measured there.
+    """Count every segment's foremost pixels by the depth measured there.
 
-    depth (H, W) [m], 0 for none, negative where it is known to be something else's, `across` and `down` times as wide
-    and high as front, behind and owner (h, w); a measurement agrees within slack + constant + quadratic z² [m], at the
-    pixel or at one of four that are `slack` beside it at that depth; focal [px] of the full image. A pixel without a
-    measurement is blank where the next one with one is farther than `gap` [m] of the body, by away (h, w) [cells].
-    rays (2, H, W) of the full image and axes (S, 7) of the segments (`LimbEnds.axes`) tell which part of a segment a
-    pixel shows: empty and blank ones of fingers are unknown; ends (S, 2) gets, of the first `end` (0..1)
-    of its length, the foremost pixels and those that agree.
+    depth (H, W) [m] is 0 without a measurement and negative where it is known to belong to another object; `across` and
+    `down` times as wide and high as front, behind and owner (h, w). A measurement agrees within
+    slack + constant + quadratic z² [m], at the pixel or at one of four neighbours `slack` [m] away at that depth; focal
+    [px] of the full image. A pixel without a measurement is blank if the nearest one is farther than `gap` [m] on the
+    body, by away (h, w) [cells]. rays (2, H, W) of the full image and axes (S, 7) (`LimbEnds.axes`) give each pixel its
+    place along a segment: empty and blank ones of fingers are unknown. ends (S, 2) gets, of the first `end` (0..1)
+    of a segment's length, the foremost pixels and those that agree.
     """
     height, width = depth.shape
     for v in range(front.shape[0]):
@@ -65,11 +65,11 @@ def judge(
             bound = slack + constant + quadratic * z * z
             agrees = abs(m - z) <= bound
             if not agrees:
-                beside = int(slack * focal / z + 0.5)
-                above = iv - beside if iv >= beside else 0
-                below = iv + beside if iv + beside < height else height - 1
-                left = iu - beside if iu >= beside else 0
-                right = iu + beside if iu + beside < width else width - 1
+                offset = int(slack * focal / z + 0.5)
+                above = iv - offset if iv >= offset else 0
+                below = iv + offset if iv + offset < height else height - 1
+                left = iu - offset if iu >= offset else 0
+                right = iu + offset if iu + offset < width else width - 1
                 agrees = abs(depth[above, iu] - z) <= bound or abs(depth[below, iu] - z) <= bound
                 agrees = agrees or abs(depth[iv, left] - z) <= bound or abs(depth[iv, right] - z) <= bound
             s = owner[v, u]
@@ -80,7 +80,7 @@ def judge(
                 ends[s, 1] += 1 if agrees else 0
             z = behind[v, u]
             if agrees:
-                kind = SHARED if abs(m - z) <= slack + constant + quadratic * z * z and z < 1e30 else ALONE
+                kind = SHARED if abs(m - z) <= slack + constant + quadratic * z * z and z < 1e30 else UNIQUE
             elif m == 0.0:
                 kind = BLANK if away[v, u] * across * front[v, u] > gap * focal else UNKNOWN
             elif abs(-m - front[v, u]) <= bound:

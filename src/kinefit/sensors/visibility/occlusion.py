@@ -1,4 +1,4 @@
-"""Keypoints that are seen cannot lie behind what a depth camera beside theirs has measured."""
+"""Occlusion of keypoints: a visible keypoint cannot lie behind the surface that an adjacent depth camera measures."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from kinefit.geometry.camera import Camera
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.scene import Scene
 
-SEEN = 0.8  # confidence from which a keypoint is taken to be seen; detectors are less sure of what they guess
-BESIDE = np.radians(10.0)  # between two cameras' views of the body: at 0.5 m behind a hand they are 9 cm apart
-THICK = 0.15  # [m] more than any joint lies below the skin, less than a trunk is thick
-_SKIN = 0.05  # [m] of a joint below it, give or take as much
-_AROUND = 1  # pixels about a keypoint, of which the median counts
+MIN_VISIBLE_CONFIDENCE = 0.8  # from which a keypoint counts as visible; detectors give occluded points less
+MAX_VIEW_ANGLE = np.radians(10.0)  # between two cameras' views of the body: 0.5 m behind a hand they are 9 cm apart
+MIN_OCCLUDED_DEPTH = 0.15  # [m] below the skin: deeper than any joint, less than a trunk is thick
+_JOINT_DEPTH = 0.05  # [m] of a joint below the skin, and its standard deviation
+_MEDIAN_RADIUS_PX = 1  # of the pixels about a keypoint whose median depth counts
 
 
 class DepthSeen(NamedTuple):
-    """A depth image for other sensors to ask: (H, W) [m], its camera, its standard deviation [m]."""
+    """A depth image for occlusion tests of other sensors: (H, W) [m], its camera, its standard deviation [m]."""
 
     depth: NDArray
     camera: Camera
@@ -31,14 +31,14 @@ class DepthSeen(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Hidden:
-    """Keypoints of one camera that lie too deep behind what was measured in front of them.
+    """Keypoints of one camera that lie too deep behind the measured surface.
 
     Parameters
     ----------
     index : (K,) int, channels
-    target, sight : (K, 3) [m] where each should lie, along the unit line of sight
+    target, sight : (K, 3) [m] target point of each, and (K, 3) unit line of sight along which it is pulled there
     sigma : float [m]
-    far : int, channels that lie so deep that they could not be seen
+    far : int, channels behind `MIN_OCCLUDED_DEPTH`, which cannot be visible
     """
 
     index: NDArray
@@ -49,51 +49,51 @@ class Hidden:
 
     @property
     def key(self) -> bytes:
-        """The same for the same channels."""
+        """Equal for the same channels."""
         return self.index.tobytes()
 
     def rows(self, scene: Scene, points: PointSet) -> Rows | DofRows:
-        """One row a channel, up to a joint's depth below the skin; points (N,) are those of all channels."""
-        mine = PointSet(
+        """One row a channel, towards a joint's depth below the skin; points (N,) are those of all channels."""
+        own = PointSet(
             tuple(points.names[k] for k in self.index), points.segments[self.index], points.points[self.index]
         )
-        gap = np.einsum("ki,ki->k", self.sight, self.target - scene.positions(mine))
-        return scene.along(mine, self.sight, gap, self.sigma)
+        gap = np.einsum("ki,ki->k", self.sight, self.target - scene.positions(own))
+        return scene.along(own, self.sight, gap, self.sigma)
 
 
-def hidden_points(scene: Scene, points: PointSet, camera: NDArray, sure: NDArray) -> Iterator[Hidden]:
-    """Points of keypoints that depth images of the same time, from beside their cameras, have something in front of.
+def hidden_points(scene: Scene, points: PointSet, camera: NDArray, visible: NDArray) -> Iterator[Hidden]:
+    """Keypoints that are occluded in depth images of the same time from adjacent cameras.
 
     Parameters
     ----------
     points : PointSet of N channels; camera (N,) int, index in the rig of each
-    sure : (N,) bool, those that are surely seen
+    visible : (N,) bool, channels whose detector reports them as visible
     """
-    told = (d for m in scene.measurements if (d := m.depth_image()) is not None)
-    seen = [d._replace(camera=scene.placed(d.camera)) for d in told]
+    images = (d for m in scene.measurements if (d := m.depth_image()) is not None)
+    seen = [d._replace(camera=scene.placed(d.camera)) for d in images]
     if not seen:
         return
     root = scene.state.T_world_root[:3, 3]
-    for c in np.unique(camera[sure]):
-        near = beside(scene.rig.cameras[c], [d.camera for d in seen], root)
+    for c in np.unique(camera[visible]):
+        near = adjacent_cameras(scene.rig.cameras[c], [d.camera for d in seen], root)
         if not near:
             continue
-        index = np.flatnonzero(sure & (camera == c))
+        index = np.flatnonzero(visible & (camera == c))
         shown = seen[near[0]]
-        mine = PointSet(tuple(points.names[k] for k in index), points.segments[index], points.points[index])
-        x = scene.positions(mine)
+        own = PointSet(tuple(points.names[k] for k in index), points.segments[index], points.points[index])
+        x = scene.positions(own)
         behind = depth_behind(x, shown)
-        deep = np.flatnonzero(behind > 2.0 * _SKIN)
+        deep = np.flatnonzero(behind > 2.0 * _JOINT_DEPTH)
         if len(deep):
             sight = x[deep] - shown.camera.centre_world
             sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-            target = x[deep] - (behind[deep, None] - _SKIN) * sight
-            sigma = float(np.hypot(_SKIN, shown.sigma))
-            yield Hidden(index[deep], target, sight, sigma, index[behind > THICK])
+            target = x[deep] - (behind[deep, None] - _JOINT_DEPTH) * sight
+            sigma = float(np.hypot(_JOINT_DEPTH, shown.sigma))
+            yield Hidden(index[deep], target, sight, sigma, index[behind > MIN_OCCLUDED_DEPTH])
 
 
 def depth_behind(x_world: NDArray, seen: DepthSeen) -> NDArray:
-    """(K,) [m] how far behind the surface that was measured there each point (K, 3) lies; NaN where nothing was."""
+    """(K,) [m] depth of each point (K, 3) behind the measured surface; NaN where nothing was measured."""
     camera, (width, height) = seen.camera, seen.camera.size
     uv = camera.project(x_world)
     z = x_world @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
@@ -101,15 +101,16 @@ def depth_behind(x_world: NDArray, seen: DepthSeen) -> NDArray:
     for k in np.flatnonzero(np.isfinite(uv).all(axis=1) & (z > 0.0)):
         u, v = np.rint(uv[k]).astype(int)
         if 0 <= u < width and 0 <= v < height:
-            near = seen.depth[max(v - _AROUND, 0) : v + _AROUND + 1, max(u - _AROUND, 0) : u + _AROUND + 1]
+            rows, columns = (slice(max(i - _MEDIAN_RADIUS_PX, 0), i + _MEDIAN_RADIUS_PX + 1) for i in (v, u))
+            near = seen.depth[rows, columns]
             near = near[(near > 0.0) & (near < np.inf)]
             if len(near):
                 behind[k] = z[k] - np.median(near)
     return behind
 
 
-def beside(camera: Camera, others: Sequence[Camera], x_world: NDArray) -> list[int]:
-    """Those of the other cameras that see a place (3,) [m] from about the same side."""
+def adjacent_cameras(camera: Camera, others: Sequence[Camera], x_world: NDArray) -> list[int]:
+    """Indices of the other cameras whose view of a point (3,) [m] differs by at most `MAX_VIEW_ANGLE`."""
     sights = np.array([c.centre_world - x_world for c in (camera, *others)])
     sights /= np.linalg.norm(sights, axis=1, keepdims=True)
-    return [k for k in range(len(others)) if sights[0] @ sights[k + 1] > np.cos(BESIDE)]
+    return [k for k in range(len(others)) if sights[0] @ sights[k + 1] > np.cos(MAX_VIEW_ANGLE)]

@@ -1,7 +1,7 @@
-"""Which pixels are another person's: images are parted by the bodies that are expected in them.
+"""Assign the pixels of an image to people, by the bodies that are predicted in it.
 
-A pixel belongs to the body whose drawn surface is nearest to what was measured there: beside it in the image, and
-before or behind it. Without a depth, beside it alone.
+A pixel belongs to the body whose rendered surface is nearest to the measured point, across the image and in depth.
+Without a depth only the distance across the image counts.
 """
 
 from __future__ import annotations
@@ -17,32 +17,32 @@ from kinefit.geometry.camera import Camera
 from kinefit.observations import DepthFrame
 from kinefit.sensors.scene import Scene
 
-_REACH = 0.4  # [m] beyond which what was measured is nobody's: an arm that has moved since the last frame is nearer
+_MAX_BODY_DISTANCE = 0.4  # [m] farther points belong to no body: an arm that has moved since the last frame is nearer
 
 
 def drawn_together(scenes: Sequence[Scene], camera: Camera) -> NDArray | None:
-    """(h, w) [m] depth of the nearest of several bodies in a camera, small, inf where none is; None for no bodies."""
+    """(h, w) [m] rendered depth of the nearest of several bodies, downsampled, inf where none; None for no bodies."""
     images = [s.surface.depth(s.surface.posed(s.state), s.placed(camera)).copy() for s in scenes if s.body.surfaces]
     return np.minimum.reduce(images) if images else None
 
 
 def of_others(depth: NDArray, own: NDArray, others: NDArray | None, camera: Camera) -> NDArray:
-    """(H, W) bool: what was measured is nearer to another body than to the own one.
+    """(H, W) bool: the measured point is nearer to another body than to the own one.
 
     Parameters
     ----------
     depth : (H, W) [m], 0 or less where nothing was measured
-    own, others : (h, w) [m] depth of the own body and of all others as they are drawn, inf where they are not
+    own, others : (h, w) [m] rendered depth of the own body and of all others, inf where there is none
     camera : of the depth image
     """
     if others is None or not np.isfinite(others).any():
         return np.zeros(depth.shape, bool)
     away = _distance(depth, others, camera)
-    return (depth > 0.0) & (away < _REACH) & (away < _distance(depth, own, camera))
+    return (depth > 0.0) & (away < _MAX_BODY_DISTANCE) & (away < _distance(depth, own, camera))
 
 
 def without_others(frame: DepthFrame, others: Sequence[Scene], camera: Camera) -> DepthFrame:
-    """A depth image with nothing where other bodies are."""
+    """A depth image with 0 at the pixels of other bodies."""
     drawn = drawn_together(others, camera)
     if drawn is None:
         return frame
@@ -51,12 +51,12 @@ def without_others(frame: DepthFrame, others: Sequence[Scene], camera: Camera) -
 
 
 def outside_others(mask: NDArray, own: NDArray, others: NDArray) -> NDArray:
-    """(h, w) bool: pixels of a silhouette that are beside another drawn body rather than beside the own one.
+    """(h, w) bool: pixels of a silhouette that are nearer to another rendered body than to the own one.
 
     Parameters
     ----------
-    mask : (h, w) silhouette of everybody
-    own, others : (h', w') [m] depth as drawn, inf where nobody is; before each other the nearer one has the pixel
+    mask : (h, w) silhouette of all people
+    own, others : (h', w') [m] rendered depth, inf for no body; where they overlap the nearer one has the pixel
     """
     if not np.isfinite(others).any():
         return np.zeros(mask.shape, bool)
@@ -67,7 +67,7 @@ def outside_others(mask: NDArray, own: NDArray, others: NDArray) -> NDArray:
 
 
 def _distance(depth: NDArray, drawn: NDArray, camera: Camera) -> NDArray:
-    """(H, W) [m] of what was measured from the nearest place that a body is drawn at."""
+    """(H, W) [m] distance of each measured point from the nearest rendered point of a body."""
     seen = np.isfinite(drawn)
     if not seen.any():
         return np.full(depth.shape, np.inf)

@@ -1,4 +1,4 @@
-"""What a tracker needs of a body's surface, made once: samples, a mesh, and room to draw it."""
+"""A body's surface for tracking, made once: samples, a mesh, and render buffers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from kinefit.geometry.camera import Camera
 from kinefit.rendering import Canvas, scaled
 from kinefit.sensors.visibility.visibility import Layers
 
-_COLUMNS = 160  # of the image in which the body's own hidden parts are found: a forearm at 3 m is four pixels wide
+_RENDER_COLUMNS = 160  # of the image that finds self-occlusions: a forearm at 3 m is four pixels wide
 
 
 class TrackedSurface:
@@ -32,8 +32,8 @@ class TrackedSurface:
     Attributes
     ----------
     mesh : BodyMesh of its simple surfaces, for depth
-    morphing : Morphing, its skin (the mesh, where it has none) and what changes that, for outlines
-    judged : the state that was drawn segment by segment last, in all cameras
+    morphing : Morphing, its skin (the mesh, where it has none) with its morphs, for contours
+    judged : the state that was last rendered segment by segment, in all cameras
 
     Raises
     ------
@@ -62,13 +62,13 @@ class TrackedSurface:
 
     @cached_property
     def samples(self) -> SurfaceSamples:
-        """Points spread over all of it."""
+        """Points spread over the whole surface."""
         points, normals, segment = sample(self.body, self.count)
         return SurfaceSamples(segment, points.T, normals.T)
 
     @cached_property
     def fingers(self) -> NDArray:
-        """(N,) bool: samples that are not where they are drawn while a hand is a fist."""
+        """(N,) bool: samples of fingers, which are elsewhere while the hand is a fist."""
         return of_fingers(self.body, self.samples.segment, self.samples.point.T)
 
     @cached_property
@@ -79,7 +79,7 @@ class TrackedSurface:
         return np.asarray(0.5 * np.bincount(self.mesh.face_segment, twice, len(self.body.tree.segments)))
 
     def posed(self, state: BodyState) -> NDArray:
-        """(V, 3) [m] its mesh in the world; kept for the state that was asked for last."""
+        """(V, 3) [m] its mesh in the world; cached for the latest state."""
         if self.mesh is self.morphing.mesh:
             return self.pose(state).vertices
         if self._posed is None or self._posed[0] is not state:
@@ -91,28 +91,31 @@ class TrackedSurface:
         return self._posed[1]
 
     def pose(self, state: BodyState) -> MorphedPose:
-        """Its skin in the world, morphed; kept for the state that was asked for last."""
+        """Its morphed skin in the world; cached for the latest state."""
         if self._pose is None or self._pose.state is not state:
             pose = self.morphing.pose(state)
-            assert pose.vertices is not None  # now, and not by several threads
+            assert pose.vertices is not None  # computed now, before several threads ask for it
             self._pose = pose
         return self._pose
 
     def depth(self, vertices_world: NDArray, camera: Camera) -> NDArray:
-        """(h, w) [m] its own depth in a camera, small, inf where it is not; overwritten by the next call for it."""
-        small = scaled(camera, min(_COLUMNS / camera.size[0], 1.0))
+        """(h, w) [m] its rendered depth in a camera, downsampled, inf where there is no body; vertices (V, 3).
+
+        The next call for this camera overwrites it.
+        """
+        small = scaled(camera, min(_RENDER_COLUMNS / camera.size[0], 1.0))
         if camera not in self._canvases:
             self._canvases[camera] = Canvas(small.size)
         return self._canvases[camera].draw_for(small, vertices_world, self.mesh.faces, cull=True).depth
 
     def rims(self, camera: Camera) -> RimFinder:
-        """What finds its outline in a camera, with room for this camera alone."""
+        """The finder of its occluding contour in one camera, with its own buffers."""
         if camera not in self._rims:
             self._rims[camera] = RimFinder(self.morphing.mesh, next(iter(self._rims.values()), None))
         return self._rims[camera]
 
     def layers(self, camera: Camera) -> Layers:
-        """Room to draw it segment by segment."""
+        """Buffers to render it segment by segment."""
         if camera not in self._layers:
             self._layers[camera] = Layers(self.body, camera, mesh=self.mesh)
         return self._layers[camera]

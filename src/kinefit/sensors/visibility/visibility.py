@@ -1,14 +1,12 @@
-"""Which segments a depth image speaks for, which against, and which it does not show.
+"""Judge every segment of a body by a depth image: supported, contradicted, or unobserved.
 
-Every segment is drawn by itself, so that at each pixel the foremost segment and what would be seen without it are
-known. A measurement supports a segment only where the body without it would not explain it as well: an arm that has
-slipped into the trunk agrees with the trunk's surface, but nothing that was measured needs it.
+Each segment is rendered by itself, so that at each pixel the foremost segment and the surface behind it are known. A
+measurement supports a segment only if the rest of the body does not explain it: an arm that has slipped into the trunk
+agrees with the trunk's surface, but no measurement requires it.
 
-Where limbs' segments begin: the joints between them, of which an image may show nothing.
-
-A tube that is slid along itself covers what it covered before, but for its ends. So a segment may agree with nearly all
-that was measured of it and have its joint at another place. Its first third tells: where less than two thirds of it are
-seen, beside the image or where nothing was measured, the joint may be a ninth of the segment away: 3 cm of a forearm.
+A tube that slides along its axis covers the same pixels, except at its ends. So a segment may agree with nearly all
+measurements while its joint is elsewhere. The third of the segment next to the joint decides: if less than two thirds
+of it are visible, the joint may be off by a ninth of the segment, 3 cm of a forearm.
 """
 
 from __future__ import annotations
@@ -26,29 +24,28 @@ from kinefit.bodies.surfaces import BodyMesh, body_mesh
 from kinefit.correspondences.targets import check_depth_image
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import Canvas, scaled
-from kinefit.sensors.evidence import BELIEVED, SHOWN, Evidence
+from kinefit.sensors.evidence import AGREEMENT_SIGMAS, BELIEVED, MIN_VISIBLE_OUTLINE, Evidence
 from kinefit.sensors.visibility import _kernels_visibility as kernels
 
-COLUMNS = 160  # of the drawn image: a person's forearm at 3 m is then four pixels wide
-FEWEST = 16  # pixels of a whole outline: fewer say too little of a segment
-DEVIATIONS = 3.0  # of a measurement that agrees
-GAP = 0.03  # [m] to the next measurement: holes, hair, gaps between fingers and shadows beside edges are narrower
-SEES = 0.2  # share of the body that may be blank where blank means that nothing is there: five to one against the body
+RENDER_COLUMNS = 160  # of the rendered image: a person's forearm at 3 m is then four pixels wide
+MIN_CONTOUR_PIXELS = 16  # of a whole segment: fewer are no evidence
+MAX_HOLE = 0.03  # [m] to the next measurement: holes, hair, gaps between fingers and shadows at edges are narrower
+MAX_BLANK_SHARE = 0.2  # of the body, if a blank pixel is to mean empty space: five to one against the body
 
 
 @dataclass(frozen=True, eq=False)
 class SegmentVerdict:
-    """What a depth image says of each segment.
+    """Pixels of a depth image that support or contradict each segment.
 
     Parameters
     ----------
     counts : (S, 6) int, pixels of each segment
-        its whole outline; foremost and supported by a measurement that nothing else of the body explains; supported,
-        but explained without it; empty: something was measured behind, or it is blank (nothing was measured within
-        `GAP`, by a sensor that measures nearly all of the body); covered: something was measured in front;
-        unknown: no measurement, or fingers in the air, which may be folded away.
+        its whole rendered area; foremost, and supported by a measurement that no other segment explains; supported, but
+        explained without it; empty: a measurement lies behind, or it is blank (no measurement within `MAX_HOLE`, by a
+        sensor that measures nearly all of the body); covered: a measurement lies in front; unknown: no measurement, or
+        fingers in free space, which may be folded.
     unseen : (S,) bool
-        Segments whose joint is not seen, however much else of them is; see `LimbEnds`.
+        Segments whose joint is unobserved, even if the rest of them agrees; see `LimbEnds`.
     """
 
     counts: NDArray
@@ -56,35 +53,35 @@ class SegmentVerdict:
 
     @property
     def supported(self) -> NDArray:
-        """(S,) pixels that speak for a segment and for nothing else."""
-        return self.counts[:, kernels.ALONE]
+        """(S,) pixels that support a segment and no other."""
+        return self.counts[:, kernels.UNIQUE]
 
     @property
     def seen(self) -> NDArray:
-        """(S,) pixels that speak for or against a segment, or might as well be another's."""
-        return self.counts[:, [kernels.ALONE, kernels.SHARED, kernels.EMPTY]].sum(axis=1)
+        """(S,) pixels that support a segment, contradict it, or agree with another as well."""
+        return self.counts[:, [kernels.UNIQUE, kernels.SHARED, kernels.EMPTY]].sum(axis=1)
 
     @property
     def covered(self) -> NDArray:
-        """(S,) share in 0..1 of a segment's foremost pixels that something else hides."""
+        """(S,) share in 0..1 of a segment's foremost pixels that another object occludes."""
         return self.counts[:, kernels.COVERED] / np.maximum(self.counts[:, 1:].sum(axis=1), 1)
 
     @property
     def holds(self) -> NDArray:
-        """(S,) bool: segments that are seen where they are, wherever their joint is."""
-        enough = self.supported >= SHOWN * np.maximum(self.counts[:, kernels.OWN], FEWEST)
+        """(S,) bool: segments whose visible part agrees, wherever their joint is."""
+        enough = self.supported >= MIN_VISIBLE_OUTLINE * np.maximum(self.counts[:, kernels.OWN], MIN_CONTOUR_PIXELS)
         return np.asarray(enough & (self.supported >= BELIEVED * self.seen))
 
     @property
     def evidence(self) -> Evidence:
-        """For and against each segment, in outlines of it; nothing of one that agrees and whose joint is not seen."""
-        against, whole = self.seen - self.supported, np.maximum(self.counts[:, kernels.OWN], FEWEST)
+        """Evidence in contours of each segment; none for one that agrees while its joint is unobserved."""
+        against, whole = self.seen - self.supported, np.maximum(self.counts[:, kernels.OWN], MIN_CONTOUR_PIXELS)
         share = np.where(self.unseen & (self.supported >= against), 0.0, 1.0 / whole)
         return Evidence(share * self.supported, share * against, unplaced=self.unseen)
 
 
 class Layers:
-    """Room to draw a body segment by segment, made once for a body and a size of image.
+    """Buffers to render a body segment by segment, for one body and one size of image.
 
     Parameters
     ----------
@@ -95,7 +92,7 @@ class Layers:
 
     def __init__(self, body: Body, camera: Camera, *, mesh: BodyMesh | None = None) -> None:
         self.mesh = mesh = body_mesh(body) if mesh is None else mesh
-        self.camera = scaled(camera, min(COLUMNS / camera.size[0], 1.0))
+        self.camera = scaled(camera, min(RENDER_COLUMNS / camera.size[0], 1.0))
         self.canvas = Canvas(self.camera.size)
         width, height = self.camera.size
         self.front, self.behind = np.empty((2, height, width), np.float32)
@@ -106,7 +103,7 @@ class Layers:
         self._parts = [_part(mesh, s) for s in np.unique(mesh.segment)]
 
     def draw(self, vertices_world: NDArray) -> None:
-        """Draw the body's mesh (V, 3) [m]: `front`, `behind`, `owner`, and each segment's outline in `counts`."""
+        """Render the body's mesh (V, 3) [m]: `front`, `behind`, `owner`, and each segment's area in `counts`."""
         self.front.fill(np.inf)
         self.behind.fill(np.inf)
         self.counts.fill(0)
@@ -117,7 +114,7 @@ class Layers:
 
 
 def _part(mesh: BodyMesh, segment: int) -> tuple[int, slice, NDArray]:
-    """A segment's run of vertices and its faces, counted within the run (a body's mesh may hold it in several)."""
+    """A segment's range of vertices, and its faces, indexed within the range (a mesh may interleave segments)."""
     own = np.flatnonzero(mesh.segment == segment)
     first, last = int(own[0]), int(own[-1]) + 1
     return int(segment), slice(first, last), np.ascontiguousarray(mesh.faces[mesh.face_segment == segment] - first)
@@ -134,10 +131,10 @@ def judge_segments(
     vertices_world : (V, 3) [m] its mesh in the pose to be judged.
     layers : Layers of this body and camera; overwritten.
     depth : (H, W) [m]
-        0 where nothing was measured; negative where it is known to be something else's, see `Background`.
+        0 where nothing was measured; negative where it is known to belong to another object, see `Background`.
     noise : a [m] and b [1/m] of a depth's standard deviation a + b z².
     slack : float [m]
-        What a pose and a shape may be off and still count as right, along the line of sight and across it.
+        Tolerated error of pose and shape, along the line of sight and across it.
 
     Raises
     ------
@@ -153,24 +150,25 @@ def judge_segments(
     axes = layers.limbs.axes(vertices_world, camera)
     layers.ends.fill(0)
     kernels.judge(
-        layers.front, layers.behind, layers.owner, depth, away, *cells, camera.matrix[0, 0], slack, GAP,
-        DEVIATIONS * noise[0], DEVIATIONS * noise[1], camera.ray_table, axes, END, layers.counts, layers.ends,
+        layers.front, layers.behind, layers.owner, depth, away, *cells, camera.matrix[0, 0], slack, MAX_HOLE,
+        AGREEMENT_SIGMAS * noise[0], AGREEMENT_SIGMAS * noise[1], camera.ray_table, axes, JOINT_END_SHARE,
+        layers.counts, layers.ends,
     )  # fmt: skip
     counts = layers.counts[:, : kernels.BLANK].copy()
     blank = layers.counts[:, kernels.BLANK]
-    few = blank.sum() <= SEES * layers.counts[:, 1:].sum()
+    few = blank.sum() <= MAX_BLANK_SHARE * layers.counts[:, 1:].sum()
     counts[:, kernels.EMPTY if few else kernels.UNKNOWN] += blank
     return SegmentVerdict(counts, layers.limbs.unseen(axes, layers.ends, camera))
 
 
-END = 1.0 / 3.0  # of a segment's length from its joint on
-SEEN_END = 2.0 / 3.0  # of it that must be seen: with less a forearm may be slid along itself by 3 cm
-_STEPS = 16  # places along it
-_FEWEST = 16  # pixels of it: with fewer it is far away, or other parts of the body hide it
+JOINT_END_SHARE = 1.0 / 3.0  # of a segment's length, next to its joint
+MIN_JOINT_END_VISIBLE = 2.0 / 3.0  # share of that end: with less a forearm may have slid along its axis by 3 cm
+_JOINT_END_SAMPLES = 16  # points along the end
+_MIN_JOINT_END_PIXELS = 16  # with fewer the segment is far away, or other parts of the body occlude it
 
 
 class LimbEnds:
-    """The axes of a body's segments, made once.
+    """The axes of a body's segments, which decide whether the end at a joint is visible.
 
     Parameters
     ----------
@@ -199,7 +197,7 @@ class LimbEnds:
         self._number, self._count = np.diff(first), count
 
     def axes(self, vertices_world: NDArray, camera: Camera) -> NDArray:
-        """(S, 7) of each segment in the camera's frame: begin (3,) [m], axis (3,) [1/m] up to 1, fingers."""
+        """(S, 7) of each segment in the camera's frame: begin (3,) [m], axis (3,) [1/m], fingers' begin in 0..1."""
         ends = np.add.reduceat(vertices_world[self._index], self._first, axis=0) / self._number[:, None]
         ends = (ends @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]).reshape(-1, 2, 3)
         along = ends[:, 1] - ends[:, 0]
@@ -210,7 +208,7 @@ class LimbEnds:
         return out
 
     def unseen(self, axes: NDArray, counts: NDArray, camera: Camera) -> NDArray:
-        """(S,) bool: segments of which too little of the end at their joint is seen, where a limb goes on from it.
+        """(S,) bool: segments of a limb whose end at the joint is too little visible.
 
         Parameters
         ----------
@@ -220,13 +218,13 @@ class LimbEnds:
         """
         out, s = np.zeros(self._count, bool), self.jointed
         inside, (drawn, agreeing) = self._inside(axes[s], camera), counts[s].T
-        whole = drawn / np.maximum(inside, 1.0 / _STEPS)  # with what lies beside the image
-        out[s] = (inside == 0.0) | ((whole >= _FEWEST) & (agreeing < SEEN_END * whole))
+        whole = drawn / np.maximum(inside, 1.0 / _JOINT_END_SAMPLES)  # with the part outside the image
+        out[s] = (inside == 0.0) | ((whole >= _MIN_JOINT_END_PIXELS) & (agreeing < MIN_JOINT_END_VISIBLE * whole))
         return out
 
     def _inside(self, axes: NDArray, camera: Camera) -> NDArray:
         """(N,) share of the ends' axes that lies within the image."""
-        t = END * (np.arange(_STEPS) + 0.5) / _STEPS
+        t = JOINT_END_SHARE * (np.arange(_JOINT_END_SAMPLES) + 0.5) / _JOINT_END_SAMPLES
         along = axes[:, 3:6] / np.maximum(np.square(axes[:, 3:6]).sum(axis=1, keepdims=True), 1e-12)
         x = axes[:, None, :3] + t[:, None] * along[:, None]
         K, (width, height) = camera.matrix, camera.size

@@ -38,11 +38,11 @@ def on_floor(motion: Motion, recording: Recording, floors: list[FloorPlane]) -> 
         return motion
     floor, axis = floors[0], np.array(UP_AXES[motion.up])
     T = floor.T_level_world(motion.up)
-    told = {
+    entries = {
         "T_level_world": T.tolist(), "tilt_deg": float(np.degrees(np.arccos(np.clip(floor.normal @ axis, -1.0, 1.0)))),
         "height_std_m": round(floor.height_std, 4), "tilt_std_deg": round(float(np.degrees(floor.tilt_std)), 2),
     }  # fmt: skip
-    return replace(motion.moved(T, eye), provenance={**motion.provenance, FLOOR: told})
+    return replace(motion.moved(T, eye), provenance={**motion.provenance, FLOOR: entries})
 
 
 def rig_on_floor(rig: Rig, provenance: Mapping[str, Any]) -> Rig:
@@ -54,8 +54,8 @@ def floor_sentences(provenance: Mapping[str, Any]) -> list[str]:
     """What is worth saying of a floor that was found."""
     if FLOOR not in provenance:
         return []
-    told = provenance[FLOOR]
+    entries = provenance[FLOOR]
     return [
-        f"the floor was found where feet rest: height zero, known to {1e3 * told['height_std_m']:.0f} mm, level to "
-        f"{told['tilt_std_deg']:.1f} degrees (one standard deviation); soles are held where they rest"
+        f"the floor was found where feet rest: height zero, known to {1e3 * entries['height_std_m']:.0f} mm, level to "
+        f"{entries['tilt_std_deg']:.1f} degrees (one standard deviation); soles are held where they rest"
     ]

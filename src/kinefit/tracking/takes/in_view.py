@@ -44,7 +44,7 @@ class InView:
     Parameters
     ----------
     seen : Observations
-    people : the one of whom most is seen first; empty where nobody but one was ever detected
+    people : in order of decreasing visibility; empty if only one was ever detected
     depth : of each of them, some depth images by step that show nobody else; empty where keypoints tell who is there
     starts : of each of them step and state to begin with, likewise
     floors : the floor that the first tracked person stands on, once it is found: the others share that world
@@ -113,7 +113,7 @@ def _elsewhere(motion: Motion, own: Motion) -> Motion:
 
 
 def people_in_view(take: Take) -> InView | None:
-    """Everybody whom a take's keypoints show, or the first depth images where it has none.
+    """Find everybody that a take's keypoints show, or the first depth images where it has none.
 
     None where markers, lines or other points take part, which are not parted by people, or where the take tells itself
     where a body is.
@@ -156,7 +156,7 @@ def people_in_depth(seen: Observations, recording: Recording, body: Body) -> InV
     if len(every) < 2:
         return InView(seen, ())
     images = tuple(_of_blob(k, every, step, found, recording) for k in range(len(every)))
-    persons = tuple(_person(blob, surety, len(recording)) for surety, blob, _ in scored)
+    persons = tuple(_person(blob, confidence, len(recording)) for confidence, blob, _ in scored)
     return InView(seen, persons, images, tuple((step, state) for *_, state in scored))
 
 
@@ -204,6 +204,6 @@ def _nearest(blob: DepthBlob, among: Sequence[DepthBlob], reach: float) -> Depth
     return among[best] if away[best] < reach else None
 
 
-def _person(blob: DepthBlob, surety: float, steps: int) -> PersonTrack:
+def _person(blob: DepthBlob, confidence: float, steps: int) -> PersonTrack:
     rows: NDArray = np.flatnonzero(blob.mask.any(axis=1))
-    return PersonTrack((), np.ones(steps, int), surety, 0.0, float(np.ptp(rows)), np.asarray(blob.centre))
+    return PersonTrack((), np.ones(steps, int), confidence, 0.0, float(np.ptp(rows)), np.asarray(blob.centre))

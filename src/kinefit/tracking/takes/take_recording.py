@@ -46,7 +46,7 @@ def recording_of(
     ----------
     seen : of the take
     body : the take's
-    people : everybody whom its keypoints show, where they have been looked for
+    people : the people that its keypoints show, if they were detected
 
     Raises
     ------
