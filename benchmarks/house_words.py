@@ -29,7 +29,7 @@ _VAGUE = frozenset(
 )
 """Words that name no quantity: a constant that consists of such words alone says nothing of what it bounds."""
 
-_SHAPE = re.compile(r"\([A-Z0-9][\w +·*−-]*(,[ \w+·*−-]*)+\)|\(\w,\)")
+_SHAPE = re.compile(r"\((\.\.\.|[A-Za-z0-9][\w +·*−-]{0,8})(, ?(\.\.\.|[\w +·*−-]{1,9}))+\)|\(\w,\)")
 _UNIT = re.compile(r"\[[^\]]+\]|\bpx\b|bool|int\b|share|number|None|count|unit")
 
 
@@ -70,9 +70,11 @@ def lacks_shapes(node: ast.FunctionDef) -> bool:
 
 
 def lacks_raises(node: ast.FunctionDef) -> bool:
-    """Whether it raises itself and its docstring has no word on that."""
-    raises = [n for n in ast.walk(node) if isinstance(n, ast.Raise) and n.exc is not None]
-    return bool(raises) and "raise" not in (ast.get_docstring(node) or "").lower()
+    """Whether it raises itself and its docstring has neither a part on that nor the error's name."""
+    raises = [n.exc for n in ast.walk(node) if isinstance(n, ast.Raise) and n.exc is not None]
+    text = ast.get_docstring(node) or ""
+    names = {ast.unparse(exc).partition("(")[0].rpartition(".")[2] for exc in raises}
+    return bool(raises) and "raise" not in text.lower() and not any(name in text for name in names)
 
 
 def run() -> None:

@@ -54,6 +54,11 @@ def renamed(**new_names: str) -> Callable[[F], F]:
     Parameters
     ----------
     new_names : old="new"
+
+    Raises
+    ------
+    ObservationError
+        Both names are given.
     """
 
     def decorate(function: F) -> F:

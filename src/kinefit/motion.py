@@ -38,6 +38,7 @@ def rotation_between_up(source: str, target: str) -> NDArray:
     """(3, 3) rotation that takes a world with vertical axis `source` to one with vertical axis `target`.
 
     It turns by the smallest angle, so a z-up world (x right, y away) becomes y-up (x right, z towards) and so on.
+    Raises ObservationError for an axis of no such name.
     """
     for axis in (source, target):
         if axis not in UP_AXES:

@@ -69,7 +69,10 @@ class Rows:
         group: NDArray | None = None,
         loss: Loss | None = None,
     ) -> Rows:
-        """Rows from segment (N,), point (N, 3) [m], direction (N, 3), residual (N,) [m], weight (N,) [1/m²]."""
+        """Rows from segment (N,), point (N, 3) [m], direction (N, 3), residual (N,) [m], weight (N,) [1/m²].
+
+        Raises ObservationError for arrays of other shapes.
+        """
         n = len(segment)
         given = {"point": (n, 3), "direction": (n, 3), "residual": (n,), "weight": (n,)}
         for (name, shape), values in zip(given.items(), (point, direction, residual, weight)):

@@ -18,7 +18,7 @@ def no_format(name: str, valid: Iterable[str]) -> str:
 
 
 def check_folder(folder: Path, option: str = "--out") -> None:
-    """Refuse a folder that cannot be written, before anything is computed; leave nothing there."""
+    """Raise ExportError for a folder that cannot be written, before anything is computed; leave nothing there."""
     there = folder.absolute()
     while not there.exists() and there != there.parent:
         there = there.parent
@@ -33,14 +33,14 @@ def check_folder(folder: Path, option: str = "--out") -> None:
 
 
 def check_file(path: Path, option: str = "--out") -> None:
-    """Refuse a file that cannot be written, before anything is computed; leave nothing there."""
+    """Raise ExportError for a file that cannot be written, before anything is computed; leave nothing there."""
     if path.is_dir():
         raise ExportError("a folder of that name is in the way", file=path, remedy=f"Name a file by {option}.")
     check_folder(path.absolute().parent, option)
 
 
 def check_new(path: Path, overwrite: bool = False, remedy: str = "Add --overwrite, or name another.") -> None:
-    """Refuse a file that cannot be written, or that is there already and must not be written over."""
+    """Raise ExportError for a file that cannot be written, or that exists."""
     if path.exists() and not overwrite:
         raise ExportError("there is a file of this name already", file=path, remedy=remedy)
     check_file(path)

@@ -132,7 +132,7 @@ def _with_file(entry: KeypointsEntry, take: Take) -> KeypointsEntry:
 
 
 def somebody(jobs: Sequence[DetectionJob], tell: Tell = warn) -> dict[str, Path]:
-    """Files of the cameras that see somebody; a note about the others, an error where there is no other."""
+    """Files of the cameras that see somebody; a note about the others. ObservationError where there is no other."""
     empty = {job.camera: len(found) for job in jobs if not (found := read_detections(job.file)).seen.any()}
     remedy = "It wants at least half a body, a tenth of the picture high or more, in a picture that is not too dark."
     if len(empty) == len(jobs):

@@ -139,7 +139,7 @@ class Tracker:
         self.sensors.set_sigma(sensor, sigma)
 
     def start_at(self, state: BodyState) -> None:
-        """Take a state as that of the last frame; its velocity is unknown."""
+        """Take a state as that of the last frame; its velocity is unknown. BodyError for another body's."""
         of_kind(state, BodyState, "the state", "Give one as body.usual_state(T_world_root), or of a Motion.")
         if len(state.angles) != len(self.body.tree.coordinates):
             problem = f"a state of {len(state.angles)} angles, the body has {len(self.body.tree.coordinates)}"

@@ -1,6 +1,6 @@
 const canvas = document.getElementById("canvas"), pen = canvas.getContext("2d"), points = {}, pictures = {}, views = {}
 let asked, camera, joint, drag = null
-const view = () => views[camera], status = document.getElementById("status")
+const view = () => views[camera], statusLine = document.getElementById("status")
 function button(parent, name, act) { const b = document.createElement("button"); b.textContent = name; b.onclick = act
   b.dataset.name = name; document.getElementById(parent).append(b) }
 function show() {
@@ -34,9 +34,9 @@ canvas.onwheel = e => { e.preventDefault(); const v = view(), f = Math.exp(-e.de
 const socket = new WebSocket(location.href.replace(/^http/, "ws"))
 document.getElementById("done").onclick = () => socket.send(JSON.stringify({ step: asked.step, points }))
 onresize = () => asked && show()
-socket.onclose = () => { if (status.className !== "good") status.textContent = "kinefit init has ended; run it again" }
+socket.onclose = () => { if (statusLine.className !== "good") statusLine.textContent = "kinefit init has ended; run it again" }
 socket.onmessage = event => { const all = JSON.parse(event.data)
-  if (!all.cameras) { status.textContent = all.answer; status.className = all.taken ? "good" : ""; return }
+  if (!all.cameras) { statusLine.textContent = all.answer; statusLine.className = all.taken ? "good" : ""; return }
   asked = all; camera = all.cameras[0]; joint = all.joints[0]
   for (const name of all.cameras) { points[name] = {}; views[name] = {}; pictures[name] = new Image()
     pictures[name].onload = show; pictures[name].src = "picture/" + encodeURIComponent(name)

@@ -101,7 +101,7 @@ def _guarded(access: Access) -> Iterator[list[int]]:
 
 
 def free_port(host: str, port: int) -> int:
-    """The first free port of a host from `port` on; 0 stands for any."""
+    """The first free port of a host from `port` on; 0 stands for any. Raises ExportError without one."""
     for candidate in [*range(port, min(port + 100, 65536)), 0]:
         try:
             with socket.create_server((host, candidate)):

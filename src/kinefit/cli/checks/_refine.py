@@ -92,7 +92,10 @@ def _refine(
 
 
 def write_refined(found: Check, refined: Refined, path: Path) -> None:
-    """Write the refined calibration beside the old one, and a copy of the take at `path` that uses it."""
+    """Write the refined calibration beside the old one, and a copy of the take at `path` that uses it.
+
+    Raises TakeError where the form of [calibration] cannot be changed.
+    """
     from kinefit.exporters.atomic import write_text
     from kinefit.readers.calibration.write import write_calibration_like
     from kinefit.readers.take.file import read_take

@@ -94,7 +94,10 @@ def read_photograph(path: Path) -> NDArray:
 
 
 def read_seeds(path: Path, views: int) -> list[Seeds]:
-    """Seeds from the first camera to each other one, of a CSV file: a row has u and v in every view."""
+    """Seeds from the first camera to each other one, of a CSV file: a row has u and v in every view.
+
+    Raises FileError for a file without points, or with other columns.
+    """
     remedy = "Give u and v [px] of each point in every view: u1,v1,u2,v2."
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:

@@ -61,7 +61,7 @@ class Wanted:
     neighbours: bool = False
 
     def side_of_all(self) -> int:
-        """Side of the windows [px], of all."""
+        """Side of the windows [px], of all; ObservationError for one that is no odd number."""
         if not self.window.isdigit():
             problem = f"a window of '{self.window}'"
             raise ObservationError(problem, remedy="Give an odd number of pixels; or 'texture' for photographs.")
@@ -93,7 +93,7 @@ def mask_of(path: Path | None, field: str | None) -> NDArray | None:
 
 
 def measure_photographs(rig: Rig, views: StateImages, wanted: Wanted, progress: Progress) -> list[str]:
-    """Measure all states and write them; what to say about them."""
+    """Measure all states and write them; returns lines about them. Raises ObservationError for a state out of range."""
     rig = with_field(rig, wanted.field)
     count = len(views.photographs[0])
     if wanted.still is not None and wanted.still >= count:

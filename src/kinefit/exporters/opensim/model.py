@@ -27,7 +27,10 @@ _EYE, _ZERO = np.eye(3), "0 0 0"
 
 
 def model(body: Body, root_coordinates: list[str], path: str | PathLike[str]) -> ET.Element:
-    """The element <Model>; `root_coordinates`: names of the turns z, x, y and the three ways; `path` for messages."""
+    """The element <Model>; `root_coordinates`: names of the turns z, x, y and the three ways; `path` for messages.
+
+    Raises ExportError for a joint of more than three turns or three ways.
+    """
     tree = body.tree
     names = plain_names(body.alias("opensim", s) for s in tree.segments)
     coordinates = plain_names(tree.coordinates)

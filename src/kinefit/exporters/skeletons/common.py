@@ -64,7 +64,7 @@ def _given_z(R: NDArray, z: NDArray, before: NDArray) -> NDArray:
 def bone_names(body: Body, names: str, path: str | PathLike[str]) -> list[str]:
     """Name of every segment in one of `NAMES`, however spelled, each once; `path` for messages.
 
-    A segment without a counterpart there keeps its own name; a body without any is refused, unless for "bvh".
+    A segment without a counterpart there keeps its own name; without any it raises ExportError, unless for "bvh".
     """
     names = convention(names)
     if names not in NAMES:

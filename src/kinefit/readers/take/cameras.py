@@ -75,7 +75,10 @@ def what_is_assumed(take: Take) -> list[str]:
 
 
 def read_rig(take: Take, exteriors: bool = True) -> Rig | None:
-    """The calibrated cameras that a take names; None where it has no calibration, or no cameras."""
+    """The calibrated cameras that a take names; None where it has no calibration, or no cameras.
+
+    Raises CalibrationError where the calibration lacks one of them.
+    """
     if take.calibration is None or not (take.cameras or take.depth):
         return None
     sizes = partial(calibrated_size, take)
@@ -109,7 +112,10 @@ def calibrated_size(take: Take, name: str) -> tuple[int, int] | None:
 
 
 def image_frame(entry: CameraEntry, rig: Rig | None, video_size: tuple[int, int] | None, take: Take) -> ImageFrame:
-    """How the image of a camera relates to the calibration's; an error proposes the line to write."""
+    """How the image of a camera relates to the calibration's.
+
+    Raises TakeError or CalibrationError, with the line to write, where the sizes do not agree.
+    """
     assert rig is not None
     if video_size and entry.size and entry.size != video_size:
         raise TakeError(

@@ -180,7 +180,7 @@ def _calibration(take: Take, entry: CalibrationEntry, refuse: Callable[[str, str
     if shift is None or turn is None or (min(shift, turn) <= 0 and not shift == turn == 0):
         refuse(stated, place, "Give metres and degrees above 0, or 0 and 0 for an exact calibration, or neither.")
     elif not (shift < 1 and turn < 30):
-        refuse(stated, place, "Give metres below 1 and degrees below 30: a camera that is so far off needs calibration.")
+        refuse(stated, place, "Give metres below 1 and degrees below 30: a camera that far off needs calibration.")
     others = (take.silhouettes, take.markers, take.depth, take.stereo, take.lines, take.skin, take.trackers)
     if not take.keypoints and any(others):
         refuse("position_sigma and rotation_sigma are for cameras with keypoints", place, "Leave both out.")

@@ -119,7 +119,10 @@ def settings_of(take: Take, settings: TrackSettings | None = None) -> TrackSetti
 
 
 def load_keypoints(take: Take, *, exteriors: bool = True) -> Observations:
-    """What the sensors of a take saw, keypoints of cameras among it; `exteriors` as in `load_observations`."""
+    """What the sensors of a take saw, keypoints of cameras among it; `exteriors` as in `load_observations`.
+
+    Raises TakeError for a take without keypoints.
+    """
     observations = load_observations(take, exteriors=exteriors)
     if not observations.keypoints or observations.rig is None:
         raise TakeError(
@@ -131,7 +134,7 @@ def load_keypoints(take: Take, *, exteriors: bool = True) -> Observations:
 
 
 def trial_of(take: Take, *, frames: int = 50) -> Subject | None:
-    """The person as another trial shows it, where a take names one (`subject`)."""
+    """The person as another trial shows it, where a take names one (`subject`); TakeError for one of another body."""
     if take.subject is None:
         return None
     trial = read_take(take.subject)
