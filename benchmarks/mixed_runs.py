@@ -30,7 +30,7 @@ from benchmarks.smoothing import acceleration_noise, peak_speeds
 from kinefit import Motion, track_take
 from kinefit.bodies import PointSet
 from kinefit.evaluation import angle_errors
-from kinefit.exporters.report.doubt import FAR, contradicted, doubtful, end_sigmas
+from kinefit.exporters.report.doubt import DOUBT_DISTANCE_M, contradicted, doubtful, end_sigmas
 
 MIXES: dict[str, tuple[str, ...]] = {
     "cameras": ("keypoints",),
@@ -100,7 +100,8 @@ def compare(truth: Motion, motion: Motion, seen: tuple[NDArray, NDArray], second
         acceleration_noise(shift, truth.rate), float(np.median(peak_speeds(motion) / peak_speeds(truth))), *seen,
         seconds,
         np.array([
-            error_of_ends(truth, motion) > FAR, doubtful(end_sigmas(motion), contradicted(motion)), motion.lost,
+            error_of_ends(truth, motion) > DOUBT_DISTANCE_M, doubtful(end_sigmas(motion), contradicted(motion)),
+            motion.lost,
         ]),
     )  # fmt: skip
 

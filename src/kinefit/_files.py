@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from kinefit.errors import FileError, KinefitError, ObservationError
 
 _MIN_STEP_S = 1e-6  # between frames of a table; shorter or longer than its inverse, times are in another unit
-_LARGEST = 4_000_000  # characters of a TOML file, which tomllib reads in about 2 s; kinefit's own have some thousands
+_MAX_TOML_CHARACTERS = 4_000_000  # which tomllib reads in about 2 s; kinefit's own files have thousands
 _DOTTED = re.compile(r"(?<![\w.-])(?:(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+\.[ \t]*+){50}")
 BACKSLASHES = "A backslash in double quotes begins a special character: use forward slashes, or single quotes."
 """What to do about C:\\Users in a TOML file."""
@@ -114,7 +114,7 @@ def parse_toml(text: str, file: str | os.PathLike[str], error: type[KinefitError
         No TOML, with line and column; or tables so deep, keys or numbers so long that nobody wrote them.
     """
     text = text.removeprefix("\ufeff")  # that some editors of Windows begin a file with
-    if len(text) > _LARGEST:
+    if len(text) > _MAX_TOML_CHARACTERS:
         raise error(f"a TOML file of {len(text) / 1e6:.0f} MB", file=file, remedy="Is it another file?")
     if (dotted := _DOTTED.search(text)) is not None:  # tomllib's time grows with the square of their number
         place = f"line {text.count(chr(10), 0, dotted.start()) + 1}"

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 _trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
 
-LARGE = 8 * 2**20
+MIN_MAPPED_BYTES = 8 * 2**20
 """Bytes from which an array lies in a file: keypoints of a camera of some minutes."""
 
 
 def room(shape: tuple[int, ...], dtype: Any = float) -> NDArray:
     """Zeros, in a file (`TMPDIR`) where they are many and there is room for them, else in memory."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
-    if size < LARGE or not hasattr(os, "posix_fallocate"):
+    if size < MIN_MAPPED_BYTES or not hasattr(os, "posix_fallocate"):
         return np.zeros(shape, dtype)
     try:
         with tempfile.TemporaryFile() as file:
@@ -34,7 +34,7 @@ def room(shape: tuple[int, ...], dtype: Any = float) -> NDArray:
 
 def kept(array: NDArray) -> NDArray:
     """The same numbers in a `room` of their own, where they are many; else the array itself."""
-    if array.nbytes < LARGE:
+    if array.nbytes < MIN_MAPPED_BYTES:
         return array
     out = room(array.shape, array.dtype)
     out[...] = array

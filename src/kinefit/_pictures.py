@@ -18,7 +18,7 @@ from kinefit.errors import FileError
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _MAX_FILE_BYTES = 8 * MAX_IMAGE_PIXELS  # of one image, not compressed: four channels of 16 bits
-_AGAIN = "Copy or write it again, or leave it out."
+_REMEDY_DAMAGED = "Copy or write it again, or leave it out."
 
 
 def read_picture(file: str | os.PathLike[str], flags: int = cv2.IMREAD_COLOR_RGB) -> NDArray:
@@ -32,7 +32,7 @@ def read_picture(file: str | os.PathLike[str], flags: int = cv2.IMREAD_COLOR_RGB
     path = Path(file)
     page_sizes(path)  # before the file is loaded
     if (size := path.stat().st_size) > _MAX_FILE_BYTES:
-        raise FileError(f"an image file of {size / 1e6:.0f} MB", file=path, remedy=_AGAIN)
+        raise FileError(f"an image file of {size / 1e6:.0f} MB", file=path, remedy=_REMEDY_DAMAGED)
     return decode_picture(read_bytes(path), flags, file=path)
 
 
@@ -52,7 +52,7 @@ def decode_picture(
     except cv2.error:
         picture = None
     if picture is None:
-        raise FileError("no image, or damaged", file=file, place=place, remedy=_AGAIN)
+        raise FileError("no image, or damaged", file=file, place=place, remedy=_REMEDY_DAMAGED)
     return np.asarray(picture)
 
 
@@ -74,7 +74,8 @@ def page_sizes(file: Path) -> list[Size]:
 def _checked_sizes(stream: BinaryIO, file: str | os.PathLike[str], place: str | None = None) -> list[Size]:
     sizes = image_sizes(stream)
     if not sizes or min(map(min, sizes)) < 1:
-        raise FileError(f"no image, or damaged: kinefit reads {IMAGE_KINDS}", file=file, place=place, remedy=_AGAIN)
+        problem = f"no image, or damaged: kinefit reads {IMAGE_KINDS}"
+        raise FileError(problem, file=file, place=place, remedy=_REMEDY_DAMAGED)
     check_image_size(max(sizes, key=math.prod), file, place)
     return sizes
 
@@ -92,7 +93,7 @@ def read_page(file: Path, number: int) -> NDArray:
     except cv2.error:
         done, pages = False, ()
     if not done or len(pages) != 1:
-        raise FileError("a page that cannot be decoded", file=file, place=f"page {number}", remedy=_AGAIN)
+        raise FileError("a page that cannot be decoded", file=file, place=f"page {number}", remedy=_REMEDY_DAMAGED)
     return np.asarray(pages[0])
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from kinefit.errors import FileError
 
-_PLAIN = {type(None), bool, float, str, bytes}
+_PLAIN_TYPES = {type(None), bool, float, str, bytes}
 _LIST, _TUPLE, _MAPPING, _ARRAY, _SCALAR, _LARGE, _REFERENCE, _RECORD = range(8)  # _RECORD + k: the k-th class
 _INT64 = 2**63  # what msgpack holds of whole numbers; a generator of random numbers has longer ones
 _HEAD = struct.Struct("<IBI16s")  # bytes that follow, tag, number, checksum
@@ -83,7 +83,7 @@ class Codec:
 
     def _tree(self, thing: Any, refer: Refer | None) -> Any:
         kind = type(thing)
-        if kind in _PLAIN:
+        if kind in _PLAIN_TYPES:
             return thing
         if kind is int:
             return thing if -_INT64 <= thing < _INT64 else [_LARGE, str(thing)]

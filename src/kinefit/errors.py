@@ -37,20 +37,24 @@ class KinefitError(Exception):
         remedy: str | None = None,
     ) -> None:
         self.file, self.problem, self.place = file, shortened(problem), shortened(str(place), 120) if place else place
-        file_text = shortened(str(file), _PATH) if file else ""
-        room = _ALL - len(self.problem) - len(self.place or "") - max(len(file_text) - _USUAL, 0)
-        self.remedy = shortened(remedy, max(room, _LEAST)) if remedy else remedy
+        file_text = shortened(str(file), _MAX_PATH_CHARACTERS) if file else ""
+        extra = max(len(file_text) - _TYPICAL_PATH_CHARACTERS, 0)
+        room = _MAX_ERROR_CHARACTERS - len(self.problem) - len(self.place or "") - extra
+        self.remedy = shortened(remedy, max(room, _MIN_REMEDY_CHARACTERS)) if remedy else remedy
         where = ", ".join(part for part in (file_text, self.place) if part)
         text = f"{where}: {self.problem}" if where else self.problem
         super().__init__(f"{text.rstrip('.')}. {self.remedy}" if remedy else text)
 
 
-_LISTED = 240  # characters of a list of names
-_LONGEST, _ALL = 300, 570  # characters of a problem, and of all parts: what a file gives them may be of any length
-_PATH, _USUAL, _LEAST = 260, 150, 60  # of a path, also one that a file names; of a usual one; of a remedy
+_MAX_LIST_CHARACTERS = 240  # characters of a list of names
+_MAX_PROBLEM_CHARACTERS = 300  # values of a file, which a problem may quote, have any length
+_MAX_ERROR_CHARACTERS = 570  # of all parts together
+_MAX_PATH_CHARACTERS = 260  # also of a path that a file names
+_TYPICAL_PATH_CHARACTERS = 150
+_MIN_REMEDY_CHARACTERS = 60
 
 
-def shortened(text: str, longest: int = _LONGEST) -> str:
+def shortened(text: str, longest: int = _MAX_PROBLEM_CHARACTERS) -> str:
     """A text of a message, its middle left out where a file gave it more than `longest` characters."""
     half = longest // 2 - 3
     return text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"
@@ -92,7 +96,7 @@ def choices(kind: str, name: str, valid: object) -> str:
     """Sentence that names an unknown thing and lists what exists, of many the nearest: for messages."""
     names = [str(v) for v in valid]  # type: ignore[attr-defined]
     listed = ", ".join(names) or "none"
-    if len(listed) > _LISTED:
+    if len(listed) > _MAX_LIST_CHARACTERS:
         near = difflib.get_close_matches(str(name), names, 5, 0.3) or names[:5]
         listed = f"{', '.join(near)} and {len(names) - len(near)} more"
     return f"no {kind} '{name}'; there are: {listed}"

@@ -28,7 +28,7 @@ UP_AXES = {
 
 
 BELIEVED = 0.5  # share of what is seen of a segment that must speak for it: more for than against
-_AT_ONCE = 2000  # frames of which all segments' poses are made at once
+_FRAMES_PER_BLOCK = 2000  # frames of which all segments' poses are made at once
 ARRAYS = "times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality"
 """Of a motion, one entry a frame each."""
 
@@ -200,7 +200,7 @@ class Motion:
             f"angles {self.angles.shape} [rad], joint_centres {self.joint_std.shape} [m], to_dataframe()",
         ]
 
-    def parts(self, frames: int = _AT_ONCE) -> Iterator[Motion]:
+    def parts(self, frames: int = _FRAMES_PER_BLOCK) -> Iterator[Motion]:
         """Its stretches of so many frames, without residuals: what is computed of one takes little memory."""
         for start in range(0, max(len(self), 1), frames):
             arrays = {name: getattr(self, name)[start : start + frames] for name in ARRAYS}
@@ -244,7 +244,7 @@ class Motion:
     def positions(self, points: PointSet | None = None) -> NDArray:
         """(F, K, 3) [m] points in the world; by default the body's landmarks."""
         points = self.body.landmarks if points is None else points
-        parts = (slice(i, i + _AT_ONCE) for i in range(0, max(len(self), 1), _AT_ONCE))
+        parts = (slice(i, i + _FRAMES_PER_BLOCK) for i in range(0, max(len(self), 1), _FRAMES_PER_BLOCK))
         return np.concatenate([
             self.body.trajectories(self.Ts_world_root[part], self.angles[part], points) for part in parts
         ])  # fmt: skip

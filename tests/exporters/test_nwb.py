@@ -11,7 +11,7 @@ from tests.exporters.synthetic import smooth_motion
 
 from kinefit.errors import ExportError
 from kinefit.exporters import write_nwb
-from kinefit.exporters.nwb import CLOSE, confidence
+from kinefit.exporters.nwb import CONFIDENCE_RADIUS_M, confidence
 
 
 def quiet(do):
@@ -79,7 +79,7 @@ def test_names_that_nwb_does_not_allow_become_plain(motion, tmp_path):
 
 def test_confidence_is_the_probability_of_being_near():
     for sigma in (0.001, 0.008, 0.02, 0.3):
-        assert np.isclose(confidence(np.full(3, sigma)), chi(3).cdf(CLOSE / sigma), atol=1e-12)
+        assert np.isclose(confidence(np.full(3, sigma)), chi(3).cdf(CONFIDENCE_RADIUS_M / sigma), atol=1e-12)
     assert confidence(np.zeros(3)) == 1.0
     assert confidence(np.array([0.001, np.inf, 0.001])) == 0.0
     assert confidence(np.array([0.01, 0.01, 0.03])) < confidence(np.full(3, 0.01))

@@ -9,7 +9,7 @@ import numpy as np
 from kinefit._arguments import checked
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes
-from kinefit.exporters.c3d_file import MOST, Groups, c3d_bytes, label_groups, screens
+from kinefit.exporters.c3d_file import MAX_FRAMES, Groups, c3d_bytes, label_groups, screens
 from kinefit.exporters.curves import Curve, curves
 from kinefit.exporters.skeletons.common import UNITS, bone_names, convention, length_factor, plain_names, turned
 from kinefit.motion import Motion
@@ -49,7 +49,7 @@ def write_c3d(
     about = [f"joint centre {joint}" for joint in body.joints] + ["landmark"] * len(body.landmarks)
     about += [f"{', '.join(c.name for c in found)} [deg]" for found in angles.values()]
     first = round(float(motion.times[0]) * motion.rate) + 1 if len(motion) else 0
-    if not (len(motion) and len(labels) <= MOST and first > 0):
+    if not (len(motion) and len(labels) <= MAX_FRAMES and first > 0):
         raise ExportError(
             f"C3D cannot hold {len(motion)} frames of {len(labels)} points from frame {first} on", file=path,
             remedy="Cut the motion to frames of time 0 and later, and at least one.",

@@ -16,12 +16,12 @@ from kinefit.errors import ExportError
 Value = Sequence[str] | NDArray
 Groups = Mapping[str, Mapping[str, Value]]
 
-MOST = 65535
+MAX_FRAMES = 65535
 """What an unsigned word counts to: points, and frames in the header (beyond which the group TRIAL counts)."""
 
 _BLOCK, _INTEL = 512, 84
 _CHARS, _BYTES, _INTEGERS, _REALS = -1, 1, 2, 4  # kinds of parameters
-_LONGEST = 255  # entries along one dimension, and characters of one text
+_MAX_DIMENSION = 255  # entries along one dimension, and characters of one text
 
 
 def c3d_bytes(
@@ -43,7 +43,7 @@ def c3d_bytes(
     channels = 0 if analog is None else analog.shape[1]
     point: dict[str, Value] = {
         "USED": np.array(count, np.uint16), "SCALE": np.array(scale, np.float32), "RATE": np.array(rate, np.float32),
-        "FRAMES": np.array(min(frames, MOST), np.uint16), "DATA_START": np.array(0, np.uint16),
+        "FRAMES": np.array(min(frames, MAX_FRAMES), np.uint16), "DATA_START": np.array(0, np.uint16),
     }  # fmt: skip
     trial: dict[str, Value] = {
         f"ACTUAL_{end}_FIELD": np.array([number % 65536, number // 65536], np.uint16)
@@ -59,22 +59,22 @@ def c3d_bytes(
     table = np.concatenate([points, fourth[..., None]], axis=2).astype("<f4").reshape(frames, -1)
     if analog is not None:
         table = np.concatenate([table, analog.astype("<f4")], axis=1)
-    clipped = (min(first, MOST), min(last, MOST))
+    clipped = (min(first, MAX_FRAMES), min(last, MAX_FRAMES))
     head = struct.pack(
         "<BBHHHHHfHHf", 2, 0x50, count, channels, *clipped, 10, scale, 2 + blocks, samples if channels else 1, rate
     )
     data = table.tobytes()
-    counted = frames <= MOST  # some readers count more frames than the header can by the file's length
+    counted = frames <= MAX_FRAMES  # some readers count more frames than the header can by the file's length
     return head.ljust(_BLOCK, b"\0") + _padded(_parameters(whole, blocks)) + (_padded(data) if counted else data)
 
 
 def label_groups(labels: Sequence[str], about: Sequence[str]) -> dict[str, Value]:
     """LABELS, LABELS2 ... and DESCRIPTIONS: no list holds more than 255."""
     out: dict[str, Value] = {}
-    for k in range(0, len(labels), _LONGEST):
-        suffix = str(k // _LONGEST + 1) if k else ""
-        out[f"LABELS{suffix}"] = labels[k : k + _LONGEST]
-        out[f"DESCRIPTIONS{suffix}"] = about[k : k + _LONGEST]
+    for k in range(0, len(labels), _MAX_DIMENSION):
+        suffix = str(k // _MAX_DIMENSION + 1) if k else ""
+        out[f"LABELS{suffix}"] = labels[k : k + _MAX_DIMENSION]
+        out[f"DESCRIPTIONS{suffix}"] = about[k : k + _MAX_DIMENSION]
     return out
 
 
@@ -107,7 +107,7 @@ def _record(name: str, group: int, content: bytes) -> bytes:
 
 def _coded(value: Value) -> bytes:
     if not isinstance(value, np.ndarray):
-        coded = [text.encode("utf-8")[:_LONGEST] for text in value]
+        coded = [text.encode("utf-8")[:_MAX_DIMENSION] for text in value]
         width = max(map(len, coded), default=0)
         cells = b"".join(text.ljust(width) for text in coded)
         return struct.pack("<b", _CHARS) + bytes([2, width, len(coded)]) + cells

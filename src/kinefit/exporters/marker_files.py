@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes, write_text
-from kinefit.exporters.c3d_file import MOST, Value, c3d_bytes, label_groups, screens
+from kinefit.exporters.c3d_file import MAX_FRAMES, Value, c3d_bytes, label_groups, screens
 from kinefit.exporters.skeletons.common import length_factor
 from kinefit.observations import Markers
 from kinefit.readers.c3d_file import C3d, read_c3d
@@ -50,7 +50,7 @@ def write_markers(
     path = Path(path)
     unit = unit or (markers.unit if markers.unit in UNITS else "mm")
     factor = length_factor(unit, UNITS, path)
-    if not len(markers) or not markers.names or len(markers.names) > MOST:
+    if not len(markers) or not markers.names or len(markers.names) > MAX_FRAMES:
         problem = f"{len(markers)} frames of {len(markers.names)} markers cannot be written"
         raise ExportError(problem, file=path, remedy="Write at least one frame of at least one marker.")
     if path.suffix.lower() == ".c3d":

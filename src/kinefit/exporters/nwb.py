@@ -18,7 +18,7 @@ from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import bone_names, convention, plain_names, turned
 from kinefit.motion import Motion
 
-CLOSE = 0.02
+CONFIDENCE_RADIUS_M = 0.02
 """[m] within which `confidence` has the true joint centre."""
 
 
@@ -68,14 +68,14 @@ def write_nwb(motion: Motion, path: str | PathLike[str], *, up: str | None = Non
 
 
 def confidence(std: NDArray) -> NDArray:
-    """(...) probability that a point whose coordinates have such standard deviations (..., 3) [m] lies within `CLOSE`.
+    """(...) probability that a point with standard deviations (..., 3) [m] lies within `CONFIDENCE_RADIUS_M`.
 
     Of a normal distribution equal in all directions, with the mean variance: erf(r/√2) − √(2/π) r exp(−r²/2), where r
-    is `CLOSE` by the standard deviation (Maxwell's distribution).
+    is `CONFIDENCE_RADIUS_M` by the standard deviation (Maxwell's distribution).
     """
     sigma = np.sqrt(np.mean(np.square(std), axis=-1))
     known = np.isfinite(sigma) & (sigma > 0)
-    r = np.divide(CLOSE, sigma, out=np.zeros_like(sigma), where=known)
+    r = np.divide(CONFIDENCE_RADIUS_M, sigma, out=np.zeros_like(sigma), where=known)
     erf = np.reshape([math.erf(value) for value in np.ravel(r / math.sqrt(2.0)).tolist()], r.shape)
     out = erf - math.sqrt(2.0 / math.pi) * r * np.exp(-0.5 * r**2)
     return np.where(sigma == 0.0, 1.0, np.where(known, np.clip(out, 0.0, 1.0), 0.0))
@@ -112,7 +112,7 @@ def _pose(ndx_pose: Any, pynwb: Any, motion: Motion, bones: list[str]) -> list[A
         series.append(ndx_pose.PoseEstimationSeries(
             name=name, description=f"joint centre, segment {tree.segments[s]}", data=centres[:, s], unit="meters",
             reference_frame=f"right-handed world, {motion.up} up, of the calibration", confidence=sure[:, s],
-            confidence_definition=f"probability that the true centre lies within {CLOSE:g} m, by its error bar",
+            confidence_definition=f"probability that the true centre is within {CONFIDENCE_RADIUS_M:g} m, by its sigma",
             timestamps=series[0] if series else np.array(motion.times),
         ))  # fmt: skip
     pose = ndx_pose.PoseEstimation(

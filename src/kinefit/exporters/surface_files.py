@@ -18,7 +18,7 @@ from kinefit.photogrammetry.strain import Strain
 from kinefit.photogrammetry.surface import MeasuredSurface
 from kinefit.photogrammetry.trajectories import Trajectories
 
-_LARGEST = 1400  # [px] of a picture's longer side
+_MAX_IMAGE_SIDE_PX = 1400  # [px] of a picture's longer side
 _BAR = 90  # [px] of the scale beside it
 
 
@@ -100,7 +100,7 @@ def write_field_picture(
     shown = surface.measured & np.isfinite(values)
     if not shown.any():
         raise ExportError("nothing measured to paint", file=path, remedy="Look at the correlations in the CSV file.")
-    scale = min(1.0, _LARGEST / max(image.shape))
+    scale = min(1.0, _MAX_IMAGE_SIDE_PX / max(image.shape))
     low, high = np.percentile(image, (0.5, 99.5))
     grey = np.clip((image - low) * (255.0 / max(high - low, 1e-9)), 0, 255).astype(np.uint8)
     grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

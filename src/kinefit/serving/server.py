@@ -37,7 +37,7 @@ _MAX_CONNECTIONS = 128  # at a time, half-open ones included; a process may have
 _MAX_CONNECTIONS_AT_ONCE = 64.0  # of all clients: a page with 50 images opens one for each
 _MAX_CONNECTIONS_PER_SECOND = 16.0  # on average; each costs 1 ms, and 2 ms where it floods
 _MAX_WAITING_CONNECTIONS = 32  # in the system's queue: two seconds' worth
-_TOO_MANY = "too many connections are opened"
+_PROBLEM_CONNECTIONS = "too many connections are opened"
 _OPEN_TIMEOUT_S = 5.0  # of a handshake
 _CLOSE_TIMEOUT_S = 1.0
 
@@ -128,7 +128,7 @@ class _Listener(socket.socket):
     def accept(self) -> tuple[socket.socket, Any]:
         """The next connection, or the error after which asyncio looks again in a second."""
         if not self._opened.has(time.monotonic()):
-            raise OSError(errno.EMFILE, _TOO_MANY)
+            raise OSError(errno.EMFILE, _PROBLEM_CONNECTIONS)
         accepted = super().accept()
         self._opened.take(time.monotonic())
         return accepted
@@ -136,7 +136,7 @@ class _Listener(socket.socket):
 
 def _report(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     """Log what goes wrong in a server's thread, except that connections have to wait."""
-    if _TOO_MANY not in str(context.get("exception")):
+    if _PROBLEM_CONNECTIONS not in str(context.get("exception")):
         loop.default_exception_handler(context)
 
 

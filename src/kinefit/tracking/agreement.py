@@ -13,12 +13,12 @@ from kinefit.rows import Rows
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.scene import Scene
 
-FAR = 3.0
+CONTRADICTION_SIGMAS = 3.0
 """Standard deviations, as they are stated, that half of a sensor's residuals must exceed to be a contradiction."""
 
 LOOKS = 12  # frames that are looked at, spread over the take
 _RAYLEIGH = 1.177  # median length of a vector whose two parts have a standard deviation of 1
-_TINY = 1e-6  # share of a direction that nothing measures
+_MIN_MEASURED_SHARE = 1e-6  # share of a direction that nothing measures
 
 
 def contradictions(scenes: Sequence[Scene], matched: Sequence[Sequence[Matched]]) -> dict[str, dict[str, Any]]:
@@ -42,7 +42,7 @@ def contradictions(scenes: Sequence[Scene], matched: Sequence[Sequence[Matched]]
     if len(kept) < 2:
         return {}
     summaries = {sensor: _summary(rows) for sensor, rows in kept.items() if rows}
-    far = {sensor: t for sensor, t in summaries.items() if t["deviations"] > FAR}
+    far = {sensor: t for sensor, t in summaries.items() if t["deviations"] > CONTRADICTION_SIGMAS}
     return dict(sorted(far.items(), key=lambda one: -one[1]["deviations"]))
 
 
@@ -67,7 +67,7 @@ def cameras_apart(residuals: Mapping[str, Residuals], sigma: Mapping[str, float]
     for name, median in medians.items() if len(medians) > 2 else ():
         others = float(np.median([m for other, m in medians.items() if other != name]))
         deviations = median / max(_RAYLEIGH * sigma[name], others)
-        if deviations > FAR:
+        if deviations > CONTRADICTION_SIGMAS:
             found[name] = {
                 "deviations": round(deviations, 2), "median_px": round(median, 1), "others_px": round(others, 1)
             }
@@ -94,7 +94,7 @@ def _summary(rows: Sequence[Rows]) -> dict[str, Any]:
     if not len(size):
         return {"deviations": 0.0, "median_m": 0.0, "shift_m": [0.0, 0.0, 0.0]}
     A = (direction * weight) @ direction.T
-    shift = np.linalg.pinv(A, rcond=_TINY, hermitian=True) @ (direction @ (weight * residual))
+    shift = np.linalg.pinv(A, rcond=_MIN_MEASURED_SHARE, hermitian=True) @ (direction @ (weight * residual))
     return {
         "deviations": round(float(np.sqrt(np.median(square))), 2), "median_m": round(float(np.median(size)), 4),
         "shift_m": [round(float(v), 4) for v in shift],

@@ -19,7 +19,7 @@ CAMERAS = "cameras"
 LEFT_OUT = "cameras left out"
 """Key of `Motion.provenance`: {depth camera: [m, rad] by which it would have to be moved and turned}."""
 
-_MOVED = 1e-9  # [m, rad] below which a camera stayed where it was
+_MIN_MOTION = 1e-9  # [m, rad] below which a camera stayed where it was
 
 
 def as_told(found: Sequence[SubjectFit]) -> dict[str, Any]:
@@ -40,7 +40,7 @@ def as_told(found: Sequence[SubjectFit]) -> dict[str, Any]:
 def between(rig: Rig, other: Rig) -> dict[str, Any]:
     """How the cameras of a rig that stand elsewhere in another one were moved there, as `as_told` has it."""
     moved = {c.name: se3.log(other[c.name].T_camera_world @ se3.inverse(c.T_camera_world)) for c in rig}
-    return {name: {"moved": twist.tolist()} for name, twist in moved.items() if np.any(np.abs(twist) > _MOVED)}
+    return {name: {"moved": twist.tolist()} for name, twist in moved.items() if np.any(np.abs(twist) > _MIN_MOTION)}
 
 
 def composed(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[str, Any]:

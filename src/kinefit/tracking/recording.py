@@ -327,14 +327,15 @@ def keypoint_records(steps: Sequence[Sequence[Any]], rate: float, *, start: floa
     return tuple(out)
 
 
-_SIZES, _FIRST = 4, 5.0  # depth images from which a person's size is found, spread over so much of the beginning [s]
+_SIZING_IMAGES = 4  # depth images from which a person's size is found ...
+_SIZING_S = 5.0  # ... spread over the beginning
 
 
 def _first_depth(cameras: Mapping[Any, Mapping[int, DepthFrame]], rate: float) -> dict[int, DepthFrame]:
     """Some of the first images of the depth camera that comes first, by step."""
     shown = next(iter(cameras.values()), {})
-    some = [i for i in shown if i <= next(iter(shown)) + _FIRST * rate]
-    return {some[k]: shown[some[k]] for k in spread(len(some), _SIZES)}
+    some = [i for i in shown if i <= next(iter(shown)) + _SIZING_S * rate]
+    return {some[k]: shown[some[k]] for k in spread(len(some), _SIZING_IMAGES)}
 
 
 def spread(count: int, most: int) -> NDArray:

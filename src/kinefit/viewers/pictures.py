@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.readers.video import Video
 
-_WIDEST = np.tan(np.radians(65.0))  # a flat picture of more would be all border
-_KEPT = 96_000_000  # bytes of pictures that are kept
+_MAX_HALF_WIDTH = np.tan(np.radians(65.0))  # a flat picture of more would be all border
+_MAX_CACHE_BYTES = 96_000_000  # bytes of pictures that are kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ def flat_view(camera: Camera, longest: int) -> PinholeView:
     ahead = np.isfinite(rays).all(-1) & (rays[:, 2] > 0)
     slopes = np.abs(rays[ahead, :2] / rays[ahead, 2:])
     plain = 0.5 * np.array([w, h]) / camera.matrix[[0, 1], [0, 1]]  # where no ray reaches the border
-    tx, ty = (float(t) for t in np.minimum(slopes.max(axis=0) if len(slopes) else plain, _WIDEST))
+    tx, ty = (float(t) for t in np.minimum(slopes.max(axis=0) if len(slopes) else plain, _MAX_HALF_WIDTH))
     scale = longest / max(tx, ty)
     return PinholeView((max(1, round(scale * tx)), max(1, round(scale * ty))), (tx, ty))
 
@@ -153,7 +153,7 @@ class CameraImages:
                 camera, image = self._cameras[name], self._images.get(name, ImageFrame.identity())
                 self._maps[name, longest] = undistortion(camera, image, flat_view(camera, longest))
             self._kept[key] = flatten(self._videos[name].read(i), self._maps[name, longest])
-            while len(self._kept) > 1 and sum(p.nbytes for p in self._kept.values()) > _KEPT:
+            while len(self._kept) > 1 and sum(p.nbytes for p in self._kept.values()) > _MAX_CACHE_BYTES:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
         return self._kept[key]

@@ -9,7 +9,7 @@ from tests.exporters.synthetic import smooth_motion
 
 from kinefit.exporters.curves import Curve, curves
 from kinefit.exporters.report.names import NAMES
-from kinefit.exporters.report.ranges import WIDE, extremes, ranges_of, ranges_table
+from kinefit.exporters.report.ranges import MAX_STD_DEG, extremes, ranges_of, ranges_table
 
 RATE = 50.0
 TIMES = np.arange(101) / RATE
@@ -39,7 +39,7 @@ def test_what_was_not_observed_takes_no_part():
     assert found.highest[0] < 51 and found.fastest[0] < 150 and found.share == pytest.approx(91 / 101)
     tracked = np.arange(101) < 20
     assert extremes(curve(), RATE, tracked).lowest[0] == pytest.approx(30.0)
-    assert extremes(curve(WIDE), RATE, np.ones(101, bool)) is None
+    assert extremes(curve(MAX_STD_DEG), RATE, np.ones(101, bool)) is None
 
 
 def test_the_table_has_left_beside_right_and_says_what_is_unknown():

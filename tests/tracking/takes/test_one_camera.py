@@ -11,7 +11,7 @@ from kinefit.exporters.pictures.detections import write_detections
 from kinefit.geometry import se3
 from kinefit.observations import MEDIAPIPE_33, Detections
 from kinefit.readers.detections import read_detections
-from kinefit.readers.take.cameras import USUAL
+from kinefit.readers.take.cameras import DEFAULT_FIELD_OF_VIEW
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation import squat_and_wave
@@ -50,7 +50,7 @@ def folder(tmp_path_factory):
 def write_phone(path, T):
     motion, rng = truth()[0], np.random.default_rng(1)
     x = motion.positions(motion.body.keypoints("MEDIAPIPE_33").select(MEDIAPIPE_33)) @ T[:3, :3].T + T[:3, 3]
-    focal = 0.5 * max(SIZE) / np.tan(np.radians(USUAL) / 2)
+    focal = 0.5 * max(SIZE) / np.tan(np.radians(DEFAULT_FIELD_OF_VIEW) / 2)
     own = np.stack([x[..., 0], -x[..., 2], x[..., 1]], axis=-1)  # along u, v and away
     uv = focal * own[..., :2] / own[..., 2:] + (np.array(SIZE) - 1) / 2 + rng.normal(scale=3.0, size=(*x.shape[:2], 2))
     hips = own[:, [MEDIAPIPE_33.index(n) for n in ("left_hip", "right_hip")]].mean(axis=1, keepdims=True)

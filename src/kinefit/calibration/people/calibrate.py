@@ -29,17 +29,17 @@ from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.solvers.bundle.cameras import FOCAL, TIME, CameraPrior, PointPixels
 
-_SURE = 0.3  # confidence of a keypoint that takes part in the start
-_MOST = 2500  # points in space of the start
-_FREE = 1000  # of more people, beside the one whose body is fitted
-_ANYWHERE = 20.0, 3.0  # [m], [rad] no prior to speak of
-GUESSED = 0.25  # of a focal length's logarithm: 64 degrees stand for 52 to 78 (one standard deviation)
-STATED = 0.1  # where a file or a user states it: videos are cut out of the sensor by a part that differs as much
+_MIN_CONFIDENCE = 0.3  # confidence of a keypoint that takes part in the start
+_MAX_POINTS = 2500  # points in space of the start
+_MAX_OTHER_POINTS = 1000  # of more people, beside the one whose body is fitted
+_FLAT_POSE_SIGMAS = 20.0, 3.0  # [m], [rad] no prior to speak of
+GUESSED_FOCAL_SIGMA = 0.25  # of a focal length's logarithm: 64 degrees stand for 52 to 78 (one standard deviation)
+STATED_FOCAL_SIGMA = 0.1  # the same, of a stated one: the crop of videos differs by as much
 _CLOCKS, _NEAR_CLOCKS = 2.0, 0.05  # [s] clocks of cameras that were started by hand; what the first look leaves
-_COARSE = 8.0, 4.0, 2.0, 1.0  # standard deviations of a keypoint at which the robust loss begins, and ends
-_TOGETHER = 20.0  # pixels of a detector that tell as much of a lens as one: their errors come together
+_LOSS_SIGMAS = 8.0, 4.0, 2.0, 1.0  # standard deviations of a keypoint at which the robust loss begins, and ends
+_CORRELATED_PIXELS = 20.0  # pixels of a detector that tell as much of a lens as one: their errors come together
 _BEFORE = 0.05  # of the rig's size: points nearer to a camera are triangulated badly
-_AGREE = 5.0  # standard deviations within which the cameras' rays meet, before they are adjusted
+_MAX_RAY_SIGMAS = 5.0  # standard deviations within which the cameras' rays meet, before they are adjusted
 
 
 @renamed(accuracy="sigma")
@@ -102,14 +102,14 @@ def calibrate_people(
     (points, uv), *beside = seen
     rig = first or first_rig(given, uv.reshape(-1, len(given), 2), sigma)
     step("first cameras", 1, 2)
-    spread = np.broadcast_to(GUESSED if focal is True else focal, len(given)).astype(float)
+    spread = np.broadcast_to(GUESSED_FOCAL_SIGMA if focal is True else focal, len(given)).astype(float)
     clock = _NEAR_CLOCKS if time_offsets else 0.0
     rig, x = _adjusted(rig, given, [u for _, u in seen], sigma, focal=spread, clock=clock, rate=rate)
     factor = _whole_scale(body, points, x, height)
     rig = settled(resized(rig, factor), factor * x, _above_soles(body, points), up=up)
     step("first cameras", 2, 2)
     prior_std = prior_sigma(len(rig), focal=bool(spread.any()), distortion=False, time_offsets=bool(time_offsets))
-    prior_std[:, :3], prior_std[:, 3:6], prior_std[:, FOCAL] = *_ANYWHERE, spread
+    prior_std[:, :3], prior_std[:, 3:6], prior_std[:, FOCAL] = *_FLAT_POSE_SIGMAS, spread
     prior = CameraPrior(Rig(tuple(replace(a, matrix=b.matrix) for a, b in zip(rig, given, strict=True))), prior_std)
 
     def stand(rig: Rig, seen: PersonSighting) -> tuple[Rig, str]:
@@ -139,9 +139,10 @@ def free_points(rig: Rig, people: Sequence[NDArray], sigma: float) -> PointPixel
     They tell of the cameras wherever these people were, and nothing of bodies.
     """
     flat = np.concatenate([np.zeros((0, len(rig), 2)), *(uv.reshape(-1, len(rig), 2) for uv in people)])
-    agree = triangulate_robust(rig, flat, max_residual_px=2.0 * _AGREE * sigma)[1]
+    agree = triangulate_robust(rig, flat, max_residual_px=2.0 * _MAX_RAY_SIGMAS * sigma)[1]
     good = np.flatnonzero(agree.sum(axis=1) >= 2)
-    good = good[np.unique(np.linspace(0, len(good) - 1, min(_FREE, len(good))).astype(int))] if len(good) else good
+    some = np.linspace(0, max(len(good) - 1, 0), min(_MAX_OTHER_POINTS, len(good)))
+    good = good[np.unique(some.astype(int))]
     point, camera = np.nonzero(agree[good] & np.isfinite(flat[good]).all(axis=-1))
     return PointPixels(camera, point, flat[good][point, camera], np.full(len(point), sigma**-2))
 
@@ -149,7 +150,7 @@ def free_points(rig: Rig, people: Sequence[NDArray], sigma: float) -> PointPixel
 def common_pixels(channels: Channels) -> NDArray:
     """(F, K, C, 2) [px] of every point in every camera, NaN where unseen or unsure."""
     out = np.full((len(channels.uv), len(channels.points), len(channels.rig), 2), np.nan)
-    sure = np.where((channels.confidence > _SURE)[..., None], channels.uv, np.nan)
+    sure = np.where((channels.confidence > _MIN_CONFIDENCE)[..., None], channels.uv, np.nan)
     out[:, channels.column, channels.camera] = sure
     return out
 
@@ -166,9 +167,9 @@ def _adjusted(
     speed = np.concatenate([np.gradient(uv, axis=0).reshape(-1, len(rig), 2) for uv in people])
     speed = np.nan_to_num(speed * rate)
     many = np.flatnonzero(np.isfinite(flat).all(axis=-1).sum(axis=1) >= 2)
-    many = many[np.unique(np.linspace(0, len(many) - 1, min(_MOST, len(many))).astype(int))]
+    many = many[np.unique(np.linspace(0, len(many) - 1, min(_MAX_POINTS, len(many))).astype(int))]
     offsets = np.zeros(len(rig))
-    for coarse in _COARSE:
+    for coarse in _LOSS_SIGMAS:
         size = float(np.linalg.norm(np.ptp([c.centre_world for c in rig], axis=0)))
         x = triangulate(rig, flat[many])
         seen = np.isfinite(flat[many]).all(axis=-1)
@@ -179,13 +180,14 @@ def _adjusted(
         weight = np.full(len(point), (coarse * sigma) ** -2)
         pixels = PointPixels(camera, point, flat[chosen], weight, speed[chosen] if clock else None)
         prior_std = prior_sigma(len(rig), focal=False, distortion=False, time_offsets=False)
-        prior_std[:, :3], prior_std[:, 3:6], prior_std[:, FOCAL] = 10.0 * size, _ANYWHERE[1], focal / np.sqrt(_TOGETHER)
+        prior_std[:, :3], prior_std[:, 3:6] = 10.0 * size, _FLAT_POSE_SIGMAS[1]
+        prior_std[:, FOCAL] = focal / np.sqrt(_CORRELATED_PIXELS)
         prior_std[1:, TIME] = clock
         mean = Rig(tuple(replace(a, matrix=b.matrix) for a, b in zip(rig, given, strict=True)))
         bundle = bundle_adjust(rig, pixels, x[good], CameraPrior(mean, prior_std), offsets=offsets)
         rig, offsets = bundle.rig, bundle.offsets
     first = people[0].reshape(-1, len(rig), 2)
-    x = triangulate_robust(rig, first, max_residual_px=_AGREE * sigma)[0]
+    x = triangulate_robust(rig, first, max_residual_px=_MAX_RAY_SIGMAS * sigma)[0]
     return rig, x.reshape(*people[0].shape[:2], 3)
 
 

@@ -11,10 +11,10 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.triangulation import triangulate_robust
 
-_LEAST = 50  # keypoints that two cameras must have in common
-_MOST = 4000  # of them that take part
-_APART = np.radians(3.0)  # angle between two cameras' rays below which they tell no distance
-_WITHIN = 3.0  # standard deviations of a keypoint that agrees
+_MIN_COMMON_KEYPOINTS = 50  # keypoints that two cameras must have in common
+_MAX_KEYPOINTS = 4000  # of them that take part
+_MIN_RAY_ANGLE = np.radians(3.0)  # angle between two cameras' rays below which they tell no distance
+_MAX_INLIER_SIGMAS = 3.0  # standard deviations of a keypoint that agrees
 
 
 def first_rig(rig: Rig, uv: NDArray, sigma: float) -> Rig:
@@ -51,7 +51,7 @@ def first_rig(rig: Rig, uv: NDArray, sigma: float) -> Rig:
         x = _points(rig, poses, uv, sigma)
         trials = {c: _laid_on(rig.cameras[c], flat[:, c], x, sigma) for c in range(len(rig)) if c not in poses}
         best = max(trials, key=lambda c: trials[c][1])
-        if trials[best][1] < _LEAST:
+        if trials[best][1] < _MIN_COMMON_KEYPOINTS:
             names = ", ".join(rig.names[c] for c in trials)
             raise CalibrationError(
                 f"what {names} saw agrees with no other camera", place=f"camera {rig.names[best]}",
@@ -68,51 +68,51 @@ def _normalised(camera: Camera, uv: NDArray) -> NDArray:
 
 
 def _thinned(index: NDArray) -> NDArray:
-    return index[np.unique(np.linspace(0, len(index) - 1, min(len(index), _MOST)).astype(int))]
+    return index[np.unique(np.linspace(0, len(index) - 1, min(len(index), _MAX_KEYPOINTS)).astype(int))]
 
 
 def _relative_pose(rig: Rig, flat: NDArray, i: int, j: int, sigma: float) -> tuple[NDArray, float] | None:
     """T_j_i (4, 4), translation of length 1, and how good a start the pair is; None where it is none."""
     both = _thinned(np.flatnonzero(np.isfinite(flat[:, [i, j]]).all(axis=(1, 2))))
-    if len(both) < _LEAST:
+    if len(both) < _MIN_COMMON_KEYPOINTS:
         return None
     a, b = np.ascontiguousarray(flat[both, i]), np.ascontiguousarray(flat[both, j])
     focal = np.mean([rig.cameras[c].matrix[0, 0] for c in (i, j)])
     cv2.setRNGSeed(0)
     E, mask = cv2.findEssentialMat(
-        a, b, np.eye(3), method=cv2.RANSAC, prob=0.99999, threshold=_WITHIN * sigma / focal, maxIters=3000
+        a, b, np.eye(3), method=cv2.RANSAC, prob=0.99999, threshold=_MAX_INLIER_SIGMAS * sigma / focal, maxIters=3000
     )
     if E is None or E.shape != (3, 3):
         return None
     count, R, t, mask = cv2.recoverPose(E, a, b, np.eye(3), mask=mask)
-    if count < _LEAST:
+    if count < _MIN_COMMON_KEYPOINTS:
         return None
     T = se3.transform(R, t.ravel())
     agreed = mask.ravel() > 0
     rays = np.stack([np.append(p, 1.0) for p in a[agreed]]), np.stack([np.append(p, 1.0) for p in b[agreed]]) @ R
     cosine = np.sum(rays[0] * rays[1], axis=1) / np.linalg.norm(rays[0], axis=1) / np.linalg.norm(rays[1], axis=1)
     angle = float(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))
-    return (T, count * np.sin(angle)) if _APART < angle < np.pi - _APART else None
+    return (T, count * np.sin(angle)) if _MIN_RAY_ANGLE < angle < np.pi - _MIN_RAY_ANGLE else None
 
 
 def _points(rig: Rig, poses: dict[int, NDArray], uv: NDArray, sigma: float) -> NDArray:
     """(P, 3) points on which two of the cameras known so far agree, NaN elsewhere."""
     known = sorted(poses)
     part = Rig(tuple(rig.cameras[c].with_pose(poses[c]) for c in known))
-    return triangulate_robust(part, uv[:, known], max_residual_px=_WITHIN * sigma)[0]
+    return triangulate_robust(part, uv[:, known], max_residual_px=_MAX_INLIER_SIGMAS * sigma)[0]
 
 
 def _laid_on(camera: Camera, flat: NDArray, x: NDArray, sigma: float) -> tuple[NDArray, int]:
     """T_camera_world (4, 4) of a camera that sees points x (P, 3), and how many agree."""
     both = _thinned(np.flatnonzero(np.isfinite(flat).all(axis=1) & np.isfinite(x).all(axis=1)))
-    if len(both) < _LEAST:
+    if len(both) < _MIN_COMMON_KEYPOINTS:
         return np.eye(4), 0
     cv2.setRNGSeed(0)
     ok, turn, shift, inliers = cv2.solvePnPRansac(
         np.ascontiguousarray(x[both]), np.ascontiguousarray(flat[both]), np.eye(3), None, iterationsCount=1000,
-        reprojectionError=_WITHIN * sigma / camera.matrix[0, 0], confidence=0.9999, flags=cv2.SOLVEPNP_EPNP,
+        reprojectionError=_MAX_INLIER_SIGMAS * sigma / camera.matrix[0, 0], confidence=0.9999, flags=cv2.SOLVEPNP_EPNP,
     )
-    if not ok or inliers is None or len(inliers) < _LEAST:
+    if not ok or inliers is None or len(inliers) < _MIN_COMMON_KEYPOINTS:
         return np.eye(4), 0
     chosen = both[inliers.ravel()]
     turn, shift = cv2.solvePnPRefineLM(x[chosen], flat[chosen], np.eye(3), None, turn, shift)

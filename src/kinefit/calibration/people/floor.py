@@ -10,15 +10,15 @@ from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion, rotation_between_up
 from kinefit.smoothing.foot_contacts import fit_plane, upward
 
-_SOLE = 0.12  # [m] points this little above the soles are the foot's
+_MAX_FOOT_HEIGHT_M = 0.12  # [m] points this little above the soles are the foot's
 _FLAT = 0.02  # [m] how well a foot on the floor tells its height
 _STEPS = 20.0  # looks at the floor that are news, over a take
-_NEAR = 0.03  # [m] the lower foot bears more than one this much higher
+_MAX_SUPPORT_DIFFERENCE_M = 0.03  # [m] the lower foot bears more than one this much higher
 _MASS = {
     "pelvis": 0.142, "abdomen": 0.139, "thorax": 0.216, "head": 0.081, "upperarm": 0.028, "forearm": 0.016,
     "hand": 0.006, "thigh": 0.100, "shank": 0.0465, "foot": 0.0145,
 }  # fmt: skip
-_LOW = 20  # per cent of frames in which the lower foot surely stands
+_STANCE_PERCENT = 20  # per cent of frames in which the lower foot surely stands
 
 
 def settled(
@@ -46,7 +46,7 @@ def settled(
             R = _upright(R.T @ np.append(-fit[:2], 1.0))
     x = x_world @ R.T
     _, height = _soles(x, rest_height)
-    ground = float(np.percentile(height, _LOW)) if len(height) else float(np.nanmin(x[..., 2]))
+    ground = float(np.percentile(height, _STANCE_PERCENT)) if len(height) else float(np.nanmin(x[..., 2]))
     middle = np.nanmedian(x.reshape(-1, 3), axis=0)
     towards = R @ rig.cameras[0].centre_world - middle
     turn = se3.exp_so3(np.array([0.0, 0.0, -np.arctan2(towards[1], towards[0])]))
@@ -77,10 +77,11 @@ def _upright(up: NDArray) -> NDArray:
 
 def _stand(x: NDArray, rest_height: NDArray) -> NDArray:
     """(F, 3) where the person stands: the feet's points, the lower ones more; NaN where none is known."""
-    feet = np.flatnonzero(rest_height < _SOLE)
+    feet = np.flatnonzero(rest_height < _MAX_FOOT_HEIGHT_M)
     height = x[:, feet, 2] - rest_height[feet]
     low = np.min(np.where(np.isfinite(height), height, np.inf), axis=1, keepdims=True, initial=np.inf)
-    weight = np.where(np.isfinite(height), np.exp(-np.where(np.isfinite(height), height - low, 0.0) / _NEAR), 0.0)
+    above = np.where(np.isfinite(height), height - low, 0.0)
+    weight = np.where(np.isfinite(height), np.exp(-above / _MAX_SUPPORT_DIFFERENCE_M), 0.0)
     total = weight.sum(axis=1, keepdims=True)
     mean = np.einsum("fk,fkd->fd", weight, np.nan_to_num(x[:, feet])) / np.where(total > 0, total, 1.0)
     return np.where(total > 0, mean, np.nan)
@@ -88,7 +89,7 @@ def _stand(x: NDArray, rest_height: NDArray) -> NDArray:
 
 def _soles(x: NDArray, rest_height: NDArray) -> tuple[NDArray, NDArray]:
     """Horizontal place (M, 2) and height (M,) of the lower foot's sole in every frame in which it hardly moves."""
-    feet = np.flatnonzero(rest_height < _SOLE)
+    feet = np.flatnonzero(rest_height < _MAX_FOOT_HEIGHT_M)
     at = x[:, feet] - np.array([0.0, 0.0, 1.0]) * rest_height[feet, None]
     known = np.isfinite(at).all(axis=(1, 2)) if len(feet) else np.zeros(len(x), bool)
     at = at[known]

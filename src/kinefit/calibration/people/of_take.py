@@ -14,12 +14,12 @@ import numpy as np
 from kinefit._arguments import checked
 from kinefit.bodies import load_body
 from kinefit.calibration.people.altered import refuse_videos
-from kinefit.calibration.people.calibrate import GUESSED, STATED, calibrate_people
+from kinefit.calibration.people.calibrate import GUESSED_FOCAL_SIGMA, STATED_FOCAL_SIGMA, calibrate_people
 from kinefit.preparing.each_video import Step, Tell
 from kinefit.preparing.take import warn, with_detections
 from kinefit.readers.calibration.found import FoundCameras, read_found, write_found
 from kinefit.readers.sound import sound_offsets
-from kinefit.readers.take.cameras import USUAL, is_uncalibrated
+from kinefit.readers.take.cameras import DEFAULT_FIELD_OF_VIEW, is_uncalibrated
 from kinefit.readers.take.entries import CalibrationEntry
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import load_observations
@@ -101,8 +101,8 @@ def _find(take: Take, made_from: str, progress: Step | None) -> FoundCameras:
     refuse_videos(take)
     seen = load_observations(take, exteriors=False)
     assert seen.rig is not None
-    stated = {e.name for e in take.cameras if e.field_of_view not in (None, USUAL)}
-    focal = [STATED if name in stated else GUESSED for name in seen.rig.names]
+    stated = {e.name for e in take.cameras if e.field_of_view not in (None, DEFAULT_FIELD_OF_VIEW)}
+    focal = [STATED_FOCAL_SIGMA if name in stated else GUESSED_FOCAL_SIGMA for name in seen.rig.names]
     found = calibrate_people(
         tuple(seen.rig), seen.keypoints, load_body(take.body), height=take.height, focal=focal,
         time_offsets=_MAX_SOUND_ERROR_S if len(heard) == len(cameras) else True,
@@ -128,7 +128,8 @@ def _made_from(take: Take) -> str:
     """A hash of everything that the cameras are found from."""
     digest = hashlib.sha256(repr((take.height, take.up, take.rate, take.frames, take.body)).encode())
     for camera in take.cameras:
-        digest.update(repr((camera.name, camera.field_of_view or USUAL, camera.size, camera.time_offset)).encode())
+        lens = camera.field_of_view or DEFAULT_FIELD_OF_VIEW
+        digest.update(repr((camera.name, lens, camera.size, camera.time_offset)).encode())
     for entry in take.keypoints:
         files = [] if entry.file is None else sorted(entry.file.rglob("*")) if entry.file.is_dir() else [entry.file]
         for file in files:

@@ -19,15 +19,16 @@ _JOINTS = tuple(
     f"{side}_{joint}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in ("left", "right")
 )
 _AHEAD = np.array([0.0, 0.0, 1.0])
-_SURE = 0.6  # confidence of a landmark that takes part
+_MIN_CONFIDENCE = 0.6  # confidence of a landmark that takes part
 _PEOPLE = 4  # of one camera that are tried
-_LEAST, _SHARE = 10, 0.4  # frames in common, and share of the shorter record, without which clocks are not compared
+_MIN_COMMON_FRAMES = 10  # of two records whose clocks are compared
+_MIN_COMMON_SHARE = 0.4  # the same, of the shorter record
 _SCALE = 0.05  # [m] of the loss: landmarks of two cameras that are farther apart count less (Geman-McClure)
 _STRANGERS = 0.5  # of 1 less the correlation of their movements: one person in two cameras has 0.06 to 0.29, two
 # people or two days 0.57 to 0.89, of the real recordings that were looked at
 _OVERLAP = 0.25  # power of the share of frames in common: who jumps moves alike a jump later, too, in fewer frames
-_NEAR = 0.15  # [s] about a period's best, in which the frames in common say nothing more
-_SAME = 1.0  # [px] two cameras whose landmarks are mostly nearer show one video twice
+_PERIOD_WINDOW_S = 0.15  # [s] about a period's best, in which the frames in common say nothing more
+_MAX_DOUBLE_PX = 1.0  # [px] two cameras whose landmarks are mostly nearer show one video twice
 
 
 _Pair = tuple[int, int, int, int]  # camera, person of it, camera, person of it
@@ -155,7 +156,7 @@ def skeletons_of(camera: Camera, record: Keypoints) -> list[LiftedSkeleton]:
         assert one.lifted is not None
         x, uv = one.lifted[:, 0][:, columns], one.points[:, 0][:, columns]
         confidence = one.confidence[:, 0][:, columns]
-        known = np.isfinite(x).all(axis=-1) & np.isfinite(uv).all(axis=-1) & (confidence > _SURE)
+        known = np.isfinite(x).all(axis=-1) & np.isfinite(uv).all(axis=-1) & (confidence > _MIN_CONFIDENCE)
         out.append(_placed(camera, one, np.where(known[..., None], x, np.nan), uv, np.where(known, confidence, 0.0)))
         taken = np.zeros(left.confidence.shape[:2], bool)
         taken[np.flatnonzero(chosen >= 0), chosen[chosen >= 0]] = True
@@ -190,7 +191,7 @@ def _refuse_doubles(seen: Sequence[Sequence[LiftedSkeleton]]) -> None:
     for a, b in combinations([people[0].record for people in seen], 2):
         frames = min(len(a), len(b))
         away = np.linalg.norm(a.points[:frames, 0] - b.points[:frames, 0], axis=-1)
-        if np.isfinite(away).sum() > _LEAST and np.nanmedian(away) < _SAME:
+        if np.isfinite(away).sum() > _MIN_COMMON_FRAMES and np.nanmedian(away) < _MAX_DOUBLE_PX:
             raise CalibrationError(
                 f"{a.camera} and {b.camera} show the same pictures", place=f"camera {b.camera}",
                 remedy="It is one video twice: leave one out.",
@@ -200,7 +201,7 @@ def _refuse_doubles(seen: Sequence[Sequence[LiftedSkeleton]]) -> None:
 def _common(a: LiftedSkeleton, b: LiftedSkeleton, lag: int) -> tuple[slice, slice] | None:
     """Frames of both that belong together with a lag; None for too few."""
     first, last = max(0, -lag), min(len(a.x), len(b.x) - lag)
-    if last - first < max(_LEAST, _SHARE * min(len(a.x), len(b.x))):
+    if last - first < max(_MIN_COMMON_FRAMES, _MIN_COMMON_SHARE * min(len(a.x), len(b.x))):
         return None
     return slice(first, last), slice(first + lag, last + lag)
 
@@ -209,7 +210,7 @@ def _turned(a: LiftedSkeleton, b: LiftedSkeleton, frames: tuple[slice, slice]) -
     """(3, 3) turn that lays one skeleton on the other in frames of both, robustly; None for too few joints."""
     x, y, w = a.x[frames[0]], b.x[frames[1]], np.minimum(a.weight[frames[0]], b.weight[frames[1]])
     x, y, w = (v[w > 0] for v in (x, y, w))
-    if len(w) < _LEAST * len(_JOINTS) // 4:
+    if len(w) < _MIN_COMMON_FRAMES * len(_JOINTS) // 4:
         return None
     share = w
     for _ in range(5):
@@ -276,7 +277,7 @@ def _clocks(count: int, rate: float, pairs: dict[_Pair, SkeletonMatch], most: in
         if (i, j) not in best or match.cost < best[i, j].cost:
             best[i, j] = match
     late, at = np.zeros(count, int), np.arange(-most, most + 1)
-    near = round(_NEAR * rate)
+    near = round(_PERIOD_WINDOW_S * rate)
     for turn in range(2 * count):
         before, last = late.copy(), turn >= count
         for j in range(1, count):

@@ -22,7 +22,7 @@ SHARES = {
 }  # fmt: skip
 """Share of a segment in a person's mass (de Leva 1996; collar bones and toes are taken out of trunk and foot)."""
 
-_WATER, _LEAST = 1000.0, 0.01  # [kg/m³], [kg]
+_DENSITY_KG_M3, _MIN_MASS_KG = 1000.0, 0.01  # [kg/m³], [kg]
 _EYE, _ZERO = np.eye(3), "0 0 0"
 
 
@@ -178,7 +178,7 @@ def mass_properties(segment: str, surfaces: Sequence[Surface]) -> tuple[float, N
     rods = [_rod(surface) for surface in surfaces] or [(np.array([0.0, 0.025, 0.0]), _EYE, 0.05, np.full(2, 0.02))]
     volumes = np.array([np.pi * length * radii[0] * radii[1] for _, _, length, radii in rods])
     share = SHARES.get(re.sub("_[lr]$", "", segment))
-    mass = max(_LEAST, share * PERSON if share else _WATER * float(volumes.sum()))
+    mass = max(_MIN_MASS_KG, share * PERSON if share else _DENSITY_KG_M3 * float(volumes.sum()))
     masses = mass * volumes / volumes.sum()
     centre = sum(m * middle for m, (middle, _, _, _) in zip(masses, rods)) / mass
     inertia = np.zeros((3, 3))

@@ -17,7 +17,7 @@ from kinefit.observations import DepthVideo
 from kinefit.rendering import render_body, scaled
 from kinefit.rendering.colours import LOST
 
-_ABOUT = 0.6  # [m] in front of and behind the body that the colours are spread over
+_COLOUR_RANGE_M = 0.6  # [m] in front of and behind the body that the colours are spread over
 _DASH_PX = 6.0  # of a lost segment's outline
 _WIDTH = 640  # [px] of a picture, at least: small sensors are enlarged
 
@@ -47,7 +47,7 @@ def depth_picture(
     if frame is not None:
         raster = render_body(motion.body, motion.state(frame), large)
         middle = float(np.median(raster.depth[raster.seen])) if raster.seen.any() else middle
-    shade = np.clip((middle + _ABOUT - depth) / (2.0 * _ABOUT), 0.0, 1.0)
+    shade = np.clip((middle + _COLOUR_RANGE_M - depth) / (2.0 * _COLOUR_RANGE_M), 0.0, 1.0)
     picture = cv2.applyColorMap((255 * shade).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
     picture = np.where((depth > 0)[..., None], picture, 0).astype(np.uint8)
     out = np.ascontiguousarray(np.repeat(np.repeat(picture, times, axis=0), times, axis=1))

@@ -23,7 +23,7 @@ MEASURED, OUTLIER, WAY = (255, 240, 60), (255, 40, 40), (255, 90, 220)
 OUTLIER_WEIGHT = 0.05
 _SAMPLES = np.linspace(0.0, 1.0, 6)[:, None]  # along a bone, which a lens may bend
 _LIMB_WIDTH, _FINGER_WIDTH = 0.022, 0.007  # [m] of a bone as drawn
-_SHIFT, _FAR = 4, 20000.0  # OpenCV's sub-pixel bits; [px] beyond which nothing is drawn
+_SUBPIXEL_BITS, _MAX_DRAWN_PX = 4, 20000.0  # OpenCV's sub-pixel bits; [px] beyond which nothing is drawn
 _DASH_WIDTHS = 3.0  # length of a dash, and of a gap, over the width of its line: its ends are round
 
 
@@ -143,11 +143,11 @@ def draw_line(
     image: NDArray, uv: NDArray, colour: tuple[int, int, int], thickness: int, dash: float = 0.0
 ) -> None:  # fmt: skip
     """Draw a line through pixels (N, 2); with `dash` [px] in pieces of that length and gaps as long."""
-    uv = uv[np.isfinite(uv).all(-1) & (np.abs(uv) < _FAR).all(-1)]
+    uv = uv[np.isfinite(uv).all(-1) & (np.abs(uv) < _MAX_DRAWN_PX).all(-1)]
     if len(uv) >= 2:
         pieces = _dashes(uv, dash) if dash else [uv]
-        points = [np.rint(piece * (1 << _SHIFT)).astype(np.int32) for piece in pieces]
-        cv2.polylines(image, points, False, colour, thickness, cv2.LINE_AA, _SHIFT)
+        points = [np.rint(piece * (1 << _SUBPIXEL_BITS)).astype(np.int32) for piece in pieces]
+        cv2.polylines(image, points, False, colour, thickness, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
 def _dashes(uv: NDArray, length: float) -> list[NDArray]:
@@ -159,6 +159,6 @@ def _dashes(uv: NDArray, length: float) -> list[NDArray]:
 
 
 def _dot(image: NDArray, uv: NDArray, radius: float, colour: tuple[int, int, int], thickness: int) -> None:
-    if np.isfinite(uv).all() and (np.abs(uv) < _FAR).all():
-        x, y, r = (round(float(v) * (1 << _SHIFT)) for v in (uv[0], uv[1], radius))
-        cv2.circle(image, (x, y), r, colour, thickness, cv2.LINE_AA, _SHIFT)
+    if np.isfinite(uv).all() and (np.abs(uv) < _MAX_DRAWN_PX).all():
+        x, y, r = (round(float(v) * (1 << _SUBPIXEL_BITS)) for v in (uv[0], uv[1], radius))
+        cv2.circle(image, (x, y), r, colour, thickness, cv2.LINE_AA, _SUBPIXEL_BITS)

@@ -14,7 +14,7 @@ from kinefit.exporters.report.norms import Norms
 from kinefit.exporters.report.page import CENTRE, LEFT, RIGHT, Html, plot
 from kinefit.motion import Motion
 
-MOST = 1000  # points of a curve; the page is about as many pixels wide
+MAX_CURVE_POINTS = 1000  # points of a curve; the page is about as many pixels wide
 _COLOURS = {"left": LEFT, "right": RIGHT, "": CENTRE}
 _ROW, _GREY = 190, "#8a949e"  # [px] height of one plot
 
@@ -83,7 +83,7 @@ def cycle_plots(motion: Motion, cycles: Cycles, norms: Norms | None = None) -> d
     return out
 
 
-def thinned(values: NDArray, most: int = MOST) -> NDArray:
+def thinned(values: NDArray, most: int = MAX_CURVE_POINTS) -> NDArray:
     """Frames that keep the shape of a curve (F,): the lowest and highest value of each of `most` / 2 equal parts."""
     if len(values) <= most:
         return np.arange(len(values))

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from kinefit.motion import Motion, rotation_between_up
 
 PERCENT = np.arange(101.0)
-_SHORTEST, _LONGEST = 0.4, 3.0  # [s] of a stride: sprinters take 0.45 s, people who hardly walk 2.5 s
+_MIN_STRIDE_S, _MAX_STRIDE_S = 0.4, 3.0  # [s] of a stride: sprinters take 0.45 s, people who hardly walk 2.5 s
 _STEP = 0.12  # share of the stature that a foot travels to and fro at least: shuffling 20 cm strides of an adult
 _EVEN = 0.25  # coefficient of variation of the durations above which a movement is not a repeated one
-_ALIKE = 0.75  # coefficient of multiple correlation; 0.75 and more is called good (Garofalo et al. 2009)
+_MIN_CORRELATION = 0.75  # coefficient of multiple correlation; 0.75 and more is called good (Garofalo et al. 2009)
 _GAIT = ("hip_flexion", "knee_angle")  # the curves that must be alike; every lower limb here has them
 
 
@@ -62,7 +62,7 @@ def find_cycles(motion: Motion) -> Cycles | None:
     A repeated movement has two or more cycles that last about as long (coefficient of variation at most 25 %) and look
     alike (coefficient of multiple correlation at least 0.75). Cycles in which nobody was seen for a frame are left out.
     """
-    if len(motion) < 3 or len(motion) / motion.rate < 2 * _SHORTEST:
+    if len(motion) < 3 or len(motion) / motion.rate < 2 * _MIN_STRIDE_S:
         return None
     return _gait(motion) or _repeated(motion)
 
@@ -146,8 +146,8 @@ def _gait(motion: Motion) -> Cycles | None:
         assert way is not None
         smooth = _smoothed(way, motion.rate)
         least = _STEP * (motion.body.stature or 1.7)
-        strikes = _peaks(smooth, least, round(_SHORTEST * motion.rate))
-        leaves = _peaks(-smooth, least, round(_SHORTEST * motion.rate))
+        strikes = _peaks(smooth, least, round(_MIN_STRIDE_S * motion.rate))
+        leaves = _peaks(-smooth, least, round(_MIN_STRIDE_S * motion.rate))
         starts[side] = strikes
         spans = _usable(motion, strikes)
         columns = [d for d, c in enumerate(motion.body.tree.coordinates) if c in [f"{g}_{side}" for g in _GAIT]]
@@ -156,7 +156,7 @@ def _gait(motion: Motion) -> Cycles | None:
         curves = normalised(np.unwrap(motion.angles[:, columns], axis=0), spans)
         alike.append(float(np.mean([likeness(curves[..., c]) for c in range(len(columns))])))
         sides.append(Side(name, spans, _toe_off(spans, leaves)))
-    if not sides or min(alike) < _ALIKE or not _alternate(starts["l"], starts["r"]):
+    if not sides or min(alike) < _MIN_CORRELATION or not _alternate(starts["l"], starts["r"]):
         return None
     return Cycles("gait", tuple(sides), float(np.mean(alike)))
 
@@ -174,18 +174,18 @@ def _repeated(motion: Motion) -> Cycles | None:
         return None
     found = []
     for sign in (1.0, -1.0):  # from one extreme posture to the same again
-        peaks = _peaks(sign * course, 0.5 * extent, round(_SHORTEST * motion.rate))
+        peaks = _peaks(sign * course, 0.5 * extent, round(_MIN_STRIDE_S * motion.rate))
         for starts in (peaks, peaks[::2], peaks[1::2]):  # a movement may come to its extreme twice in a cycle
             spans = _usable(motion, starts, longest=np.inf)
             if len(spans) >= 2 and _even(spans):
                 found.append((likeness(normalised(angles, spans)), spans))
-    if not found or max(found, key=lambda item: item[0])[0] < _ALIKE:
+    if not found or max(found, key=lambda item: item[0])[0] < _MIN_CORRELATION:
         return None
     best = max(found, key=lambda item: (item[0], len(item[1])))
     return Cycles("repeated movement", (Side("both", best[1], np.zeros(0)),), best[0])
 
 
-def _usable(motion: Motion, starts: NDArray, longest: float = _LONGEST) -> NDArray:
+def _usable(motion: Motion, starts: NDArray, longest: float = _MAX_STRIDE_S) -> NDArray:
     spans = np.stack([starts[:-1], starts[1:]], axis=1) if len(starts) > 1 else np.zeros((0, 2), int)
     return np.array(
         [s for s in spans if s[1] - s[0] <= longest * motion.rate and np.all(motion.quality[s[0] : s[1] + 1] > 0)], int

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from kinefit.motion import Motion
 
-FAR = 0.08  # [m] from the truth: about as thick as a limb, which then lies beside itself
-_DOUBTFUL = 0.11  # [m] root of the summed variances, from which an end is rather farther off than `FAR`: 9 cm of an
+DOUBT_DISTANCE_M = 0.08  # [m] from the truth: about as thick as a limb, which then lies beside itself
+_DOUBTFUL = 0.11  # [m] root of the summed variances, above which `DOUBT_DISTANCE_M` is likely exceeded: 9 cm of an
 # error that is alike in all directions, 12 of one along a line; on simulated takes of all sensors 10 were 45 to 61 %
-_ANYWHERE = 1.0  # [m, rad] of a root that nothing holds
+_FLAT_ROOT_SIGMA = 1.0  # [m, rad] of a root that nothing holds
 _MAX_STD = 1e3  # [rad, m] of a coordinate without a prior
 _WINDOW = 0.05  # [s] to either side, in which most views must contradict: an outlier is alone
 
@@ -32,13 +32,13 @@ def uncertain_throughout(motion: Motion) -> dict[str, float]:
     if not motion.residuals or not len(motion):
         return {}
     middle = np.median(end_sigmas(motion), axis=0)
-    return {name: float(m) for name, m in zip(motion.body.tree.segments, middle) if m > FAR}
+    return {name: float(m) for name, m in zip(motion.body.tree.segments, middle) if m > DOUBT_DISTANCE_M}
 
 
 def end_sigmas(motion: Motion) -> NDArray:
     """(F, S) [m] standard deviation, in all directions together, of the less certain end of each segment."""
     tree, surfaces = motion.body.tree, motion.body.segment_ends()
-    prior = np.concatenate([np.full(6, _ANYWHERE), np.minimum(tree.posture_std, _MAX_STD)])
+    prior = np.concatenate([np.full(6, _FLAT_ROOT_SIGMA), np.minimum(tree.posture_std, _MAX_STD)])
     std = np.where(np.isfinite(motion.dof_std), motion.dof_std, prior)
     known = np.linalg.norm(motion.joint_std, axis=-1)
     unbounded = ~np.isfinite(known)
@@ -72,7 +72,7 @@ def contradicted(motion: Motion) -> NDArray:
         owners, there = np.asarray(r.segments), np.isfinite(r.norms)
         fitted = np.where(there[..., None], r.measured - r.values, np.nan)
         joints = np.where(there[..., None], motion.joint_centres[:, owners], np.nan)
-        far = r.norms > FAR * _pixels_per_metre(fitted, joints)[:, None]
+        far = r.norms > DOUBT_DISTANCE_M * _pixels_per_metre(fitted, joints)[:, None]
         for s in np.unique(owners):
             count = there[:, owners == s].sum(axis=1)
             seen[:, s] += count > 0

@@ -19,9 +19,9 @@ from kinefit.rendering.colours import LEFT, LOST, RIGHT, side_colour, to_hex
 from kinefit.rendering.tubes import is_last
 
 RATE = 15.0  # [Hz] of the figure: enough for the eye to follow, the player goes smoothly between
-MOST = 3000  # frames: longer takes are shown at a lower rate
+MAX_FIGURE_FRAMES = 3000  # frames: longer takes are shown at a lower rate
 _BONE = 0.02  # [m] radius of a bone that has no surface
-_DEEP = 0.35  # [m] how far a camera's pyramid reaches
+_PYRAMID_DEPTH_M = 0.35  # [m] how far a camera's pyramid reaches
 
 
 class Capsules(NamedTuple):
@@ -36,7 +36,7 @@ def figure(motion: Motion, rig: Rig | None = None) -> Html:
     """The body as it moves, with the cameras of a rig; the floor lies under the lowest foot."""
     R = rotation_between_up(motion.up, "z")
     capsules = _capsules(motion.body)
-    step = max(1, round(motion.rate / RATE), -(-len(motion) // MOST))
+    step = max(1, round(motion.rate / RATE), -(-len(motion) // MAX_FIGURE_FRAMES))
     frames = np.arange(0, len(motion), step)
     T = se3.transform(R, np.zeros(3))
     x = motion.body.trajectories(T @ motion.Ts_world_root[frames], motion.angles[frames], capsules.points)
@@ -141,6 +141,6 @@ def _pyramid(name: str, camera: Any, R: NDArray) -> dict[str, Any]:
     width, height = camera.size
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
     rays = np.column_stack([corners, np.ones(4)]) @ np.linalg.inv(camera.matrix).T
-    x = np.vstack([np.zeros(3), _DEEP * rays])
+    x = np.vstack([np.zeros(3), _PYRAMID_DEPTH_M * rays])
     T = camera.T_world_camera
     return {"name": name, "points": (x @ T[:3, :3].T + T[:3, 3]) @ R.T}

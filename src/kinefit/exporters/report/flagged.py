@@ -14,7 +14,9 @@ from kinefit.motion import Motion
 
 Pictures = Mapping[str, Mapping[int, NDArray[np.uint8]]]
 
-_LINES, _ROW, _MOST = 12, 24, 200  # rows of the time line, [px] of each; moments that the table lists
+_MAX_TIMELINE_ROWS = 12
+_TIMELINE_ROW_PX = 24
+_MAX_TABLE_MOMENTS = 200
 _WARNING, _BAD = "#e0a100", "#d0441c"
 
 
@@ -34,7 +36,7 @@ def flagged(motion: Motion, moments: Sequence[Moment], pictures: Pictures, width
         seen = [p.folded("Pictures", p.gallery(shots, size="small"))] if shots else []
         out.append(p.callout(severity, _when(motion, m), " ".join(m.what + m.causes), *seen))
     if len(moments) > MOMENTS:
-        rest = moments[MOMENTS : MOMENTS + _MOST]
+        rest = moments[MOMENTS : MOMENTS + _MAX_TABLE_MOMENTS]
         rows = [(_when(motion, m), " ".join(m.what), " ".join(m.causes) or "–") for m in rest]
         more = f"{len(moments) - MOMENTS} more, less severe"
         out.append(p.folded(more, p.table(["when", "what", "why"], rows, first_left=3)))
@@ -46,7 +48,7 @@ def time_line(motion: Motion, moments: Sequence[Moment]) -> p.Html:
     rows: dict[str, list[Moment]] = {}
     for m in moments:
         rows.setdefault(listed(spoken_segments(motion.body, m.segments)) or "whole body", []).append(m)
-    shown = list(rows)[:_LINES]
+    shown = list(rows)[:_MAX_TIMELINE_ROWS]
     traces = []
     for name in reversed(shown):  # plots grow upwards
         for bad, colour in ((False, _WARNING), (True, _BAD)):
@@ -64,7 +66,7 @@ def time_line(motion: Motion, moments: Sequence[Moment]) -> p.Html:
         "margin": {"l": 10, "r": 12, "t": 30, "b": 40}, "yaxis": {"type": "category", "automargin": True},
         "xaxis": {"title": "time [s]", "range": [float(motion.times[0]), float(motion.times[-1])]},
     }  # fmt: skip
-    height = _ROW * len(shown) + 86
+    height = _TIMELINE_ROW_PX * len(shown) + 86
     return p.plot(traces, layout, height=height, label="when which part of the body is doubtful", seeks=True)
 
 

@@ -18,7 +18,7 @@ from kinefit.motion import Motion, Residuals
 
 POORLY_SUPPORTED = 0.5  # quality below which the measurements support less than half of the body
 _GAP = 0.1  # [s] stretches nearer than this are one to somebody who looks at the video
-_MANY = 0.25  # share of outliers that is reported as a cause; robust fits of good keypoints leave out less than a tenth
+_MIN_OUTLIER_SHARE = 0.25  # reported as a cause; fits of good keypoints reject less than a tenth
 
 
 @dataclass(frozen=True)
@@ -249,7 +249,7 @@ def causes(motion: Motion, moment: Moment) -> tuple[str, ...]:
     seeing = [name for name, share in share_seen.items() if share >= 0.5]
     if pixels and len(seeing) < len(pixels) and len(seeing) <= 2:
         out.append(f"Only {listed(seeing)} saw it." if seeing else "No camera saw it for most of this time.")
-    if seen_points and sum(left_out.values()) >= _MANY * seen_points:
+    if seen_points and sum(left_out.values()) >= _MIN_OUTLIER_SHARE * seen_points:
         most = max(left_out, key=lambda name: left_out[name])
         share = 100 * sum(left_out.values()) / seen_points
         out.append(f"{share:.0f} % of its keypoints were left out as outliers, most of them in {most}.")

@@ -16,7 +16,7 @@ from kinefit.exporters.report.angles import by_joint
 from kinefit.exporters.report.names import spoken
 from kinefit.motion import Motion
 
-WIDE = 45.0
+MAX_STD_DEG = 45.0
 """[deg] standard deviation beyond which an angle counts as not observed: ±2 of it are half a turn."""
 
 _HEAD = ("lowest", "highest", "range", "fastest")
@@ -50,7 +50,7 @@ def extremes(curve: Curve, rate: float, tracked: NDArray) -> Extremes | None:
     rate : float [Hz]
     tracked : (F,) bool, frames in which somebody was seen.
     """
-    known = tracked & (curve.std < WIDE)
+    known = tracked & (curve.std < MAX_STD_DEG)
     if known.sum() < 2:
         return None
     at = np.flatnonzero(known)

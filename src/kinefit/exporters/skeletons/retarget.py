@@ -22,7 +22,8 @@ from kinefit.geometry import se3
 from kinefit.motion import Motion
 from kinefit.readers.skeletons.characters import Character
 
-_FAR = {"thigh": "shank", "shank": "foot", "upperarm": "forearm", "forearm": "hand"}  # bones whose direction is kept
+# Bones whose direction is kept, with the segment that each leads to.
+_NEXT_SEGMENT = {"thigh": "shank", "shank": "foot", "upperarm": "forearm", "forearm": "hand"}
 _BODY_NEEDED = tuple(f"{name}_{side}" for name in ("thigh", "shank", "upperarm", "forearm") for side in "lr")
 _UP = np.array([0.0, 1.0, 0.0])
 _ALONG = 0.9  # cosine above which a bone that points forward tells nothing of what is in front of it
@@ -168,8 +169,8 @@ def _axes(
             out[segment] = _frame(_UP, mine) @ _frame(_UP, own).T
         elif bone == "toes" and f"foot_{side}" in out:
             out[segment] = out[f"foot_{side}"]
-        elif bone in _FAR or bone == "hand":
-            far = _FAR.get(bone)
+        elif bone in _NEXT_SEGMENT or bone == "hand":
+            far = _NEXT_SEGMENT.get(bone)
             knuckles = common_knuckles(used, side)
             mine = x[nodes[f"{far}_{side}"]] - x[nodes[segment]] if far else _hand(character, nodes, side)
             ends = [segments[name] for name in ([f"{far}_{side}"] if far else knuckles) if name in segments]

@@ -18,7 +18,7 @@ from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, Calibr
 from kinefit.readers.guess.keypoints import keypoint_entries, keypoint_sources, read_sources
 from kinefit.readers.guess.lens import field_of_view, stated_focal_length
 from kinefit.readers.guess.names import HOW, Trial, trials
-from kinefit.readers.take.cameras import USUAL
+from kinefit.readers.take.cameras import DEFAULT_FIELD_OF_VIEW
 from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.video import Video, common_frames
 
@@ -101,10 +101,10 @@ def describe_uncalibrated(draft: Draft, videos: Sequence[Path]) -> None:
         draft.head["rate"] = draft.note_value("rate", _rate(draft, opened, []), "rate")
         counts = {name: f"{len(video)} frames" for name, video in opened.items()}
     more = "a tenth more, a tenth nearer" if len(opened) == 1 else "it is found with where the cameras stand"
-    why = f"degrees across the longer side; {USUAL:g} is usual for telephones; {more}"
+    why = f"degrees across the longer side; {DEFAULT_FIELD_OF_VIEW:g} is usual for telephones; {more}"
     for path in videos:
         video = Value(path, "likely", counts[path.stem]) if len(videos) > 1 else Value(path)
-        wide = Value(USUAL, "guess", why)
+        wide = Value(DEFAULT_FIELD_OF_VIEW, "guess", why)
         if (stated := stated_focal_length(path)) is not None:
             whence = f"degrees across the longer side; the file states a lens of {stated:g} mm; {more}"
             wide = Value(round(field_of_view(stated), 1), "likely", whence)

@@ -15,7 +15,7 @@ from kinefit.readers.take.entries import CameraEntry
 from kinefit.readers.take.file import Take
 from kinefit.readers.video import Video
 
-USUAL = 64.0
+DEFAULT_FIELD_OF_VIEW = 64.0
 """[deg] across the longer side of the image by default: videos of telephones have some 60 to 70."""
 
 
@@ -50,7 +50,7 @@ def assumed_camera(entry: CameraEntry, size: tuple[int, int] | None, take: Take)
             remedy="Give the camera its video, or size = [width, height].",
         )  # fmt: skip
     width, height = size
-    focal = 0.5 * max(size) / np.tan(np.radians(entry.field_of_view or USUAL) / 2.0)
+    focal = 0.5 * max(size) / np.tan(np.radians(entry.field_of_view or DEFAULT_FIELD_OF_VIEW) / 2.0)
     matrix = np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
     up = np.array(UP_AXES[take.up], float)
     ahead = np.roll(np.abs(up), -1)
@@ -64,7 +64,8 @@ def what_is_assumed(take: Take) -> list[str]:
     if not is_alone(take):
         return []
     entry = take.cameras[0]
-    lens = f"a field of view of {entry.field_of_view or USUAL:g}°" + ("" if entry.field_of_view else ", the usual one")
+    lens = f"a field of view of {entry.field_of_view or DEFAULT_FIELD_OF_VIEW:g}°"
+    lens += "" if entry.field_of_view else ", the usual one"
     out = [
         f"camera {entry.name} is alone and not calibrated: it is taken to look level, with {lens}; where it is a tenth "
         "wider, the person is a tenth nearer. Error bars do not hold this."

@@ -34,7 +34,7 @@ _ONLY: dict[str, dict[str, tuple[str, ...]]] = {
 }  # fmt: skip
 """Formats for which a key means something: with any other it is refused."""
 
-_MOST = 10**9  # steps of a take
+_MAX_STEPS = 10**9  # steps of a take
 ONE_CAMERA = "keypoints of one camera do not tell how far a person is; two cameras do, or one beside depth or markers"
 _SETS = {"openpose": tuple(KEYPOINT_SETS), "skin": SKIN_SETS, "detect": (*MEDIAPIPE_SETS, FACE_SET)}
 
@@ -105,7 +105,7 @@ def _values(take: Take) -> None:
         _calibration(take, take.calibration, refuse)
     if take.pose is not None:
         _pose(take, take.pose, refuse)
-    if take.frames is not None and not -_MOST < take.frames[0] < take.frames[1] < _MOST:
+    if take.frames is not None and not -_MAX_STEPS < take.frames[0] < take.frames[1] < _MAX_STEPS:
         refuse(f"frames {list(take.frames)}", "[take] frames", "Give [first, one after the last].")
     for camera in take.cameras:
         if not abs(camera.time_offset) < 1e6 or (camera.size and not _is_size(camera.size)):
@@ -120,7 +120,7 @@ def _values(take: Take) -> None:
             refuse(f"no file of {source.format} keypoints", place, 'Write file = "...", or format = "detect".')
         if source.face is not None and not all(v > 0 for v in source.face[2:]):
             refuse(f"face = {list(source.face)}", place, "Give [left, top, width, height] in pixels of the video.")
-        if source.frames is not None and not -_MOST < source.frames[0] < source.frames[1] < _MOST:
+        if source.frames is not None and not -_MAX_STEPS < source.frames[0] < source.frames[1] < _MAX_STEPS:
             refuse(f"frames {list(source.frames)}", place, "Give [first, one after the last].")
     pixels: dict[str, tuple[Any, ...]] = {"keypoints": (*take.keypoints, *take.skin), "lines": take.lines}
     for kind, entries in (pixels | {"silhouette": take.silhouettes, "region": take.regions}).items():

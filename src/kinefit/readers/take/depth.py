@@ -14,7 +14,7 @@ from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.readers.depth.recordings import is_unordered, read_clouds, read_depth
 from kinefit.readers.take.file import DepthEntry, Take
 
-_SAME = 0.01  # rates that differ by less are one
+_MAX_RATE_DIFFERENCE = 0.01  # rates that differ by less are one
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class DepthSensors:
         """What is worth saying of their time beside that of the take: other rates, frames that are missing."""
         notes = []
         for video in (*self.depth, *self.clouds):
-            if abs(video.rate / rate - 1.0) > _SAME:
+            if abs(video.rate / rate - 1.0) > _MAX_RATE_DIFFERENCE:
                 notes.append(
                     f"depth {video.sensor} has {video.rate:.4g} Hz, the take {rate:.4g} Hz: "
                     "each depth image counts at the step nearest to it"

@@ -75,7 +75,7 @@ class _TakeFile(_Entry, frozen=True, kw_only=True):
     tracker: tuple[TrackerEntry, ...] = ()
 
 
-_ONCE = ("take", "session", "start", "calibration")
+_SINGLE_TABLES = ("take", "session", "start", "calibration")
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ def read_take(path: str | PathLike[str]) -> Take:
     return take
 
 
-_LONGEST = 2048  # bytes of a path within a take: systems allow 4096 in all
+_MAX_PATH_BYTES = 2048  # bytes of a path within a take: systems allow 4096 in all
 
 
 def _path_in(folder: Path) -> Callable[[type, Any], Path]:
@@ -207,7 +207,7 @@ def _path_in(folder: Path) -> Callable[[type, Any], Path]:
     def make(_: type, value: Any) -> Path:
         if not isinstance(value, str) or not value:
             raise ValueError("a file or folder is a text")
-        if len(value.encode()) > _LONGEST or any(len(part.encode()) > 255 for part in Path(value).parts):
+        if len(value.encode()) > _MAX_PATH_BYTES or any(len(part.encode()) > 255 for part in Path(value).parts):
             raise ValueError(f"{shortened(value, 60)!r} is no path: it is too long")
         if any(ord(character) < 32 for character in value):
             raise ValueError(f"{value!r} is no path: {BACKSLASHES}")
@@ -243,7 +243,7 @@ def _check_keys(raw: dict[str, Any], path: Path) -> None:
     for table, content in raw.items():
         if table not in TABLES:
             raise TakeError(choices("sensor or table", table, TABLES), file=path, place=f"[{table}]")
-        many = table not in _ONCE
+        many = table not in _SINGLE_TABLES
         if many != isinstance(content, list):
             wanted = f"[[{table}]]" if many else f"[{table}]"
             raise TakeError(f"'{table}' is not a table {wanted}", file=path, place=table, remedy=f"Write {wanted}.")
@@ -259,7 +259,8 @@ def _check_keys(raw: dict[str, Any], path: Path) -> None:
 
 def _belongs(key: str) -> str | None:
     """Which tables have a key."""
-    tables = [f"[{name}]" if name in _ONCE else f"[[{name}]]" for name in TABLES if key in _fields(TABLES[name])]
+    holding = [name for name in TABLES if key in _fields(TABLES[name])]
+    tables = [f"[{name}]" if name in _SINGLE_TABLES else f"[[{name}]]" for name in holding]
     return f"'{key}' belongs to {', '.join(tables)}." if tables else None
 
 

@@ -29,7 +29,7 @@ from kinefit.sensors.checks import of_kind
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import MARKER_LOSS, TrackSettings
 
-_NEAR = TrackSettings.near  # [m] correspondence distance at which the loss holds as it is
+_REFERENCE_DISTANCE_M = TrackSettings.near  # [m] correspondence distance at which the loss holds as it is
 _LEVER = 0.1  # [m] of the points that show an orientation to a start
 
 
@@ -131,7 +131,8 @@ class BodyTrackerMeasurement(Measurement):
 
     def match(self, scene: Scene, reach: float) -> BodyTrackerMatched:
         """As they are named."""
-        return BodyTrackerMatched(self, replace(MARKER_LOSS, scale=MARKER_LOSS.scale * max(reach / _NEAR, 1.0)))
+        scale = MARKER_LOSS.scale * max(reach / _REFERENCE_DISTANCE_M, 1.0)
+        return BodyTrackerMatched(self, replace(MARKER_LOSS, scale=scale))
 
     def hints(self, scene: Scene) -> Hints:
         """Where they are, and points ahead along their axes where their orientation is known."""

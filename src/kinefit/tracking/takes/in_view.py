@@ -30,9 +30,9 @@ from kinefit.tracking.video import track
 
 _LIKE = 0.4  # score of a start in a thing that is a person: 0.45 and more of people of another size than the body's
 _SURELY = 0.6  # the same of one that no furniture reaches: boxes come to 0.5, so below it a person has to move
-_STILL = 0.8  # overlap of the pixels of a thing that stands still: 0.95 and more of furniture, its noisy edges included
-_MOST = 4  # things in a depth image that are looked at
-_SAME = 0.3  # [m] two roots that are nearer are of one person
+_MIN_STATIC_OVERLAP = 0.8  # of the pixels of a static object: 0.95 and more of furniture, noisy edges included
+_MAX_BLOBS = 4  # things in a depth image that are looked at
+_MAX_DUPLICATE_DISTANCE_M = 0.3  # [m] two roots that are nearer are of one person
 _WALK = 3.0  # [m/s]
 _STRIDE = 0.5  # [m] by which the middle of what is seen of a person moves without a step
 
@@ -107,7 +107,7 @@ def _elsewhere(motion: Motion, own: Motion) -> Motion:
     """The frames of a motion in which it is not where one's own is: there both follow one person, the first listed."""
     k = np.abs(motion.times[:, None] - own.times).argmin(axis=1)
     apart = motion.Ts_world_root[:, :3, 3] - own.Ts_world_root[k, :3, 3]
-    use = np.linalg.norm(apart, axis=1) > _SAME
+    use = np.linalg.norm(apart, axis=1) > _MAX_DUPLICATE_DISTANCE_M
     arrays = {name: getattr(motion, name)[use] for name in ARRAYS}
     return replace(motion, **arrays, residuals={})
 
@@ -143,7 +143,7 @@ def people_in_depth(seen: Observations, recording: Recording, body: Body) -> InV
     frame = recording.depth[step]
     camera = recording.rig[frame.sensor]
     scored: list[tuple[float, DepthBlob, BodyState]] = []
-    for blob in found[step][:_MOST]:
+    for blob in found[step][:_MAX_BLOBS]:
         alone = np.where(blob.mask, frame.depth, 0.0)
         try:
             start = start_from_points(body, None, camera, alone, up=recording.up_axis, count=1, attempts=1)[0]
@@ -189,7 +189,7 @@ def _moves(blob: DepthBlob, step: int, found: Mapping[int, Sequence[DepthBlob]])
     """Whether a thing covers other pixels in another image; furniture does not, nor does one image tell."""
     others = [found[at] for at in found if at != step]
     overlaps = [max((_overlap(blob.mask, b.mask) for b in among), default=0.0) for among in others]
-    return min(overlaps, default=1.0) < _STILL
+    return min(overlaps, default=1.0) < _MIN_STATIC_OVERLAP
 
 
 def _overlap(one: NDArray, other: NDArray) -> float:

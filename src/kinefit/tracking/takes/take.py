@@ -35,7 +35,7 @@ from kinefit.tracking.takes.in_view import InView, people_in_view
 from kinefit.tracking.takes.take_recording import from_afar, recording_of
 from kinefit.tracking.video import Progress, track
 
-_USUAL = "humanoid"  # body of a take that names none
+_DEFAULT_BODY = "humanoid"  # body of a take that names none
 
 
 @checked
@@ -79,7 +79,7 @@ def track_take(
             "the take has no [[keypoints]], nor any other sensor", file=take.path,
             remedy=f"It needs keypoints of two or more cameras; {command('detect', take.path)} finds them in videos.",
         )  # fmt: skip
-    named = body if take.start is None or take.body == _USUAL else load_body(take.body)
+    named = body if take.start is None or take.body == _DEFAULT_BODY else load_body(take.body)
     if named.tree.segments != body.tree.segments:
         raise TakeError(
             f"the body is {take.body}, and the motion that the take starts from has another, {body.name}",

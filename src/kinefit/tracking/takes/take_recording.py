@@ -34,7 +34,8 @@ from kinefit.tracking.recording import Recording, spread
 from kinefit.tracking.takes.floor_level import FLOOR
 
 _EMPTY = 30  # images of an empty scene that are looked at: more add nothing
-_SIZES, _FIRST = 4, 5.0  # depth images from which a person's size is found, spread over so much of the beginning [s]
+_SIZING_IMAGES = 4  # depth images from which a person's size is found ...
+_SIZING_S = 5.0  # ... spread over the beginning
 
 
 def recording_of(
@@ -252,9 +253,9 @@ def _first_depth(depth: Sequence[DepthVideo], seen: Observations) -> dict[int, D
     start, stop = seen.frames
     for video in depth:
         frames = {s - start: k for s in range(start, stop) if (k := video.at_step(s, seen.rate)) is not None}
-        first = [step for step in frames if step <= min(frames) + _FIRST * seen.rate]
+        first = [step for step in frames if step <= min(frames) + _SIZING_S * seen.rate]
         if first:
-            return {first[c]: video.frame(frames[first[c]]) for c in spread(len(first), _SIZES)}
+            return {first[c]: video.frame(frames[first[c]]) for c in spread(len(first), _SIZING_IMAGES)}
     return {}
 
 
