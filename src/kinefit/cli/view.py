@@ -177,12 +177,12 @@ def _triangulated(take: Take, seen: Observations) -> NDArray | None:
 
 def _serve(recording: ViewerContent, port: int, access: Access, browser: bool, cylinders: bool) -> None:
     from kinefit.viewers.player import Player
-    from kinefit.viewers.show import CYLINDERS, USUAL
+    from kinefit.viewers.show import CYLINDERS, DEFAULT_LAYERS
     from kinefit.viewers.stage import open_server, quiet
 
     server = open_server(port, access, label=f"kinefit: {recording.name}")
     try:
-        player = Player(server, recording, layers=CYLINDERS if cylinders else USUAL)
+        player = Player(server, recording, layers=CYLINDERS if cylinders else DEFAULT_LAYERS)
         player.tick(0.0)
         if port and server.get_port() != port:
             _screen.note(f"Port {port} is in use: another one is taken.")
@@ -203,10 +203,10 @@ def _serve(recording: ViewerContent, port: int, access: Access, browser: bool, c
 def _write(recording: ViewerContent, html: Path, cylinders: bool) -> None:
     from kinefit.exporters.atomic import write_text
     from kinefit.viewers.page import page
-    from kinefit.viewers.show import CYLINDERS, USUAL, Choice
+    from kinefit.viewers.show import CYLINDERS, DEFAULT_LAYERS, Choice
 
     _screen.note("Drawing the scene ...")
-    text, frames = page(recording, choice=Choice(CYLINDERS if cylinders else USUAL))
+    text, frames = page(recording, choice=Choice(CYLINDERS if cylinders else DEFAULT_LAYERS))
     write_text(html, text)
     thinned = f" of {len(recording.times)}" if frames < len(recording.times) else ""
     _screen.say(f"{html}: {frames}{thinned} frames, {len(text) / 1e6:.1f} MB; opens in any browser, offline")

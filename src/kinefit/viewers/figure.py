@@ -16,7 +16,7 @@ from kinefit.viewers import scene as content
 PARTS = ("skin", "bones", "joints", "surface", "landmarks", "uncertainty")
 """Layers of a figure."""
 
-USUAL, CYLINDERS = frozenset({"skin"}), frozenset({"bones", "joints", "surface"})
+DEFAULT_PARTS, CYLINDERS = frozenset({"skin"}), frozenset({"bones", "joints", "surface"})
 """Those that are shown at first, and those that show the cylinders of the fit instead."""
 
 _SURFACE_OPACITY, _ELLIPSOID = 0.22, (150, 60, 230)

@@ -74,7 +74,7 @@ class View:
         self._frames = dict(image_frames or {})
         self._maps: dict[str, NDArray] = {}
         self._time = self.server.gui.add_markdown("waiting for the first state")
-        boxes = {part: self.server.gui.add_checkbox(part, part in figure.USUAL) for part in figure.PARTS}
+        boxes = {part: self.server.gui.add_checkbox(part, part in figure.DEFAULT_PARTS) for part in figure.PARTS}
         self._boxes = boxes
 
     @property
@@ -136,7 +136,7 @@ class View:
         if self._rig is None or name not in self._rig:
             raise CalibrationError(choices("camera", name, self._rig.names if self._rig else ()))
         if name not in self._maps:
-            view = pictures.flat_view(self._rig[name], stage.SMALL)
+            view = pictures.flat_view(self._rig[name], stage.FRUSTUM_IMAGE_PX)
             self._maps[name] = pictures.undistortion(
                 self._rig[name], self._frames.get(name, ImageFrame.identity()), view
             )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.motion import Motion
 from kinefit.viewers import figure, scene
-from kinefit.viewers.show import ALL, LAYERS, NONE, USUAL, Choice, Show, ViewerContent
+from kinefit.viewers.show import ALL, DEFAULT_LAYERS, LAYERS, NONE, Choice, Show, ViewerContent
 from kinefit.viewers.stage import look_through
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class Player:
     """
 
     def __init__(
-        self, server: viser.ViserServer, recording: ViewerContent, *, layers: frozenset[str] = USUAL
+        self, server: viser.ViserServer, recording: ViewerContent, *, layers: frozenset[str] = DEFAULT_LAYERS
     ) -> None:  # fmt: skip
         self.server, self.recording, self._first_layers = server, recording, layers
         self.show = Show(server, recording)

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 LAYERS = (*figure.PARTS, "path", "points", "markers", "cameras", "images", "floor")
 """What can be shown and hidden."""
 
-USUAL = figure.USUAL | frozenset(LAYERS) - set(figure.PARTS)
+DEFAULT_LAYERS = figure.DEFAULT_PARTS | frozenset(LAYERS) - set(figure.PARTS)
 """What is shown at first."""
 
-CYLINDERS = USUAL - figure.USUAL | figure.CYLINDERS
+CYLINDERS = DEFAULT_LAYERS - figure.DEFAULT_PARTS | figure.CYLINDERS
 """The same with the body's cylinders and bones in place of a skin."""
 
 ALL, NONE = "all cameras", "none"
@@ -149,7 +149,7 @@ class Choice:
         The person stays in place and the floor glides beneath it (not while looking through a camera).
     """
 
-    layers: frozenset[str] = USUAL
+    layers: frozenset[str] = DEFAULT_LAYERS
     by_quality: bool = False
     rays: str = NONE
     through: str = NONE
@@ -279,9 +279,9 @@ class Show:
         for name, node in self.stage.cameras.items():
             with_image = pictures is not None and "images" in choice.layers
             shown = with_image and "cameras" in choice.layers and name != choice.through
-            node.show(pictures.read(name, time, stage.SMALL) if shown and pictures is not None else None)
+            node.show(pictures.read(name, time, stage.FRUSTUM_IMAGE_PX) if shown and pictures is not None else None)
             through = choice.through == name and pictures is not None
-            node.look(pictures.read(name, time, stage.LARGE) if through and pictures is not None else None)
+            node.look(pictures.read(name, time, stage.BACKGROUND_IMAGE_PX) if through and pictures is not None else None)
 
 
 def nearest(times: NDArray, time: float, rate: float) -> int | None:

@@ -23,7 +23,8 @@ from kinefit.viewers.pictures import PinholeView, flat_view
 if TYPE_CHECKING:
     import viser
 
-SMALL, LARGE = 320, 1080  # [px] longer side of a camera's picture on its frustum, and when looked through
+FRUSTUM_IMAGE_PX = 320  # longer side of a camera's image on its frustum
+BACKGROUND_IMAGE_PX = 1080  # the same, behind the scene when looking through the camera
 _PLANES = {"x": "yz", "y": "xz", "z": "xy"}
 _SHADE = (70, 75, 85)
 POLICY = (
@@ -125,7 +126,7 @@ class CameraNode:
 
     def __init__(self, scene: Any, camera: Camera, *, size: float, far: float) -> None:
         self.camera, self.far = camera, far
-        self.view: PinholeView = flat_view(camera, SMALL)
+        self.view: PinholeView = flat_view(camera, FRUSTUM_IMAGE_PX)
         T = camera.T_world_camera
         self.wxyz, self.position = se3.quaternion(T[:3, :3]), T[:3, 3]
         tx, ty = self.view.tangents
