@@ -280,8 +280,9 @@ class Show:
             with_image = pictures is not None and "images" in choice.layers
             shown = with_image and "cameras" in choice.layers and name != choice.through
             node.show(pictures.read(name, time, stage.FRUSTUM_IMAGE_PX) if shown and pictures is not None else None)
-            through = choice.through == name and pictures is not None
-            node.look(pictures.read(name, time, stage.BACKGROUND_IMAGE_PX) if through and pictures is not None else None)
+            through = choice.through == name
+            behind = pictures.read(name, time, stage.BACKGROUND_IMAGE_PX) if through and pictures is not None else None
+            node.look(behind)
 
 
 def nearest(times: NDArray, time: float, rate: float) -> int | None:
