@@ -345,6 +345,7 @@ OPTIONS = {
     "realtime": "--realtime", "verbose": "-v", "lag": "--lag=0.1", "pictures": "--pictures=none",
     "person": "--person=2", "out": None, "take": None, "restart": None,  # tests/cli/test_resume.py
     "hide_faces": None,  # tests/preparing/test_faces.py
+    "quiet": None, "as_json": None,  # tests/cli/tracking/test_track.py
 }  # fmt: skip
 
 
