@@ -206,7 +206,7 @@ def _tile(name: str, make: Callable[[], Case]) -> NDArray:
             if len(shown) == 1 or people[k].views[frame]:
                 _draw(own, motion, camera, k, frame)
         print(f"# {name}: person {k + 1}: {_told(motion)}")
-    followed = PersonKeypoints((), tuple(people), 1, RATE).as_told()
+    followed = PersonKeypoints((), tuple(people), 1, RATE).as_record()
     for sentence in sentences(followed, asked=True)[1:]:
         print(f"# {name}: {sentence}")
     print(f"# {name}: {said}; who is who in {FRAMES} frames: {spent:.2f} s of CPU", flush=True)

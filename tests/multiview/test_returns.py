@@ -118,11 +118,11 @@ def test_nobody_walks_faster_than_people_do():
 def test_what_is_said_of_those_who_come_back():
     _, keypoints, _ = exchanged(sized(0.92), sized(1.06))
     found = people_of(RIG, keypoints)
-    said = sentences(PersonKeypoints(tuple(keypoints), tuple(found), 1, RATE).as_told(), asked=False)
+    said = sentences(PersonKeypoints(tuple(keypoints), tuple(found), 1, RATE).as_record(), asked=False)
     assert any("leaves at 2.0 s, and who comes at 7.0 s is taken for the same, by size, way (odds " in s for s in said)
     _, keypoints, _ = exchanged(BODY, BODY)
     found = people_of(RIG, keypoints)
-    said = sentences(PersonKeypoints(tuple(keypoints), tuple(found), 1, RATE).as_told(), asked=False)
+    said = sentences(PersonKeypoints(tuple(keypoints), tuple(found), 1, RATE).as_record(), asked=False)
     assert sum("leaves it open" in s for s in said) == 2
 
 

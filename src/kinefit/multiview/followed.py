@@ -38,7 +38,7 @@ class PersonKeypoints:
     number: int = 1
     rate: float = 1.0
 
-    def as_told(self) -> dict[str, Any]:
+    def as_record(self) -> dict[str, Any]:
         """Entry of `Motion.provenance`: people in view and their returns; empty with a single person."""
         if len(self.people) < 2:
             return {}

@@ -22,7 +22,7 @@ LEFT_OUT = "cameras left out"
 _MIN_MOTION = 1e-9  # [m, rad] below which a camera stayed where it was
 
 
-def as_told(found: Sequence[SubjectFit]) -> dict[str, Any]:
+def as_record(found: Sequence[SubjectFit]) -> dict[str, Any]:
     """How far the last of several fits that sought cameras moved them, for `Motion.provenance`."""
     for fit in reversed(found):
         first = 0
@@ -38,13 +38,13 @@ def as_told(found: Sequence[SubjectFit]) -> dict[str, Any]:
 
 
 def between(rig: Rig, other: Rig) -> dict[str, Any]:
-    """How the cameras of a rig that stand elsewhere in another one were moved there, as `as_told` has it."""
+    """How the cameras of a rig that stand elsewhere in another one were moved there, as `as_record` has it."""
     moved = {c.name: se3.log(other[c.name].T_camera_world @ se3.inverse(c.T_camera_world)) for c in rig}
     return {name: {"moved": twist.tolist()} for name, twist in moved.items() if np.any(np.abs(twist) > _MIN_MOTION)}
 
 
 def composed(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[str, Any]:
-    """What two moves in turn amount to, each as `as_told` has it."""
+    """What two moves in turn amount to, each as `as_record` has it."""
     out = {**first, **then}
     for name in first.keys() & then.keys():
         T = se3.exp(np.array(then[name]["moved"])) @ se3.exp(np.array(first[name]["moved"]))

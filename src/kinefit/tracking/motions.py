@@ -30,7 +30,7 @@ from kinefit.smoothing.uncertainty import MOTION_CORRELATION_TIME, pixel_informa
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.tracking.agreement import LOOKS, cameras_apart, contradictions
-from kinefit.tracking.cameras import CAMERAS, as_told, composed
+from kinefit.tracking.cameras import CAMERAS, as_record, composed
 from kinefit.tracking.recording import spread
 
 
@@ -121,7 +121,7 @@ def motion_of(
 
     scale = None if others is None else others.scale
     answers = [partial(shape_errors, one, settings, weighed, scale=scale) for one in found]
-    if cameras := as_told(found):
+    if cameras := as_record(found):
         provenance[CAMERAS] = composed(provenance.get(CAMERAS, {}), cameras)
     elsewhere = any(one.cameras is not None for one in found)
     last, detectors = with_systematic_errors(
@@ -131,7 +131,7 @@ def motion_of(
     if channels.sources:
         provenance["detector noise"] = detectors.summary("px", 2, channels.sources)
     if channels.view_bias is not None and subject.view_bias is not None:
-        provenance["view bias"] = subject.view_bias.as_told()
+        provenance["view bias"] = subject.view_bias.as_record()
     provenance["length_std_m"] = subject.length_std
     provenance["estimate"] = "smoothed" if smooth else "filtered" if lag is None else "fixed lag"
     return Motion(
@@ -178,7 +178,7 @@ def _behind(
     take(behind.finish())
     angles = unwrap(body.tree, np.stack([r.state.angles for r in out]))
     out = [replace(r, state=BodyState(r.state.T_world_root, q)) for r, q in zip(out, angles)]
-    return out, matched, {"seconds": round(behind.seconds, 4), **behind.noise.as_told(body)}
+    return out, matched, {"seconds": round(behind.seconds, 4), **behind.noise.as_record(body)}
 
 
 def _residuals(

@@ -98,7 +98,7 @@ def track(
         view_bias=person.subject.view_bias, poses=person.poses, progress=progress, checkpoint=checkpoint,
     )  # fmt: skip
     tracker = tracked.tracker
-    others = {} if recording.followed is None else recording.followed.as_told()
+    others = {} if recording.followed is None else recording.followed.as_record()
     more = {**person.provenance, **others, "frames": {"dropped": tracker.dropped, "late": tracker.late}}
     if (family := person.subject.body.family) is not None:
         more["body shape"] = {name: round(value, 3) for name, value in family.shape.items()}

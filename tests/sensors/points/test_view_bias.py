@@ -52,7 +52,7 @@ def test_left_is_the_mirror_image_of_right():
 
 def test_what_is_told_is_read_back_and_no_bias_changes_no_channels():
     bias = ViewBias({"BODY_25B": {"LHip": np.full((TERMS, 3), 0.01)}})
-    again = ViewBias.from_record(bias.as_told())
+    again = ViewBias.from_record(bias.as_record())
     np.testing.assert_allclose(again.sets["BODY_25B"]["LHip"], 0.01)
     channels = channels_of()
     assert ViewBias().known_to(channels) is channels

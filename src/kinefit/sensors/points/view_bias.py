@@ -69,13 +69,13 @@ class ViewBias:
                 bias[k], followed[k] = known.get(point, 0.0), share.get(point, 0.0)
         return replace(channels, view_bias=bias[channels.column], view_followed=followed[channels.column])
 
-    def as_told(self) -> dict[str, Any]:
+    def as_record(self) -> dict[str, Any]:
         """The same [m] as lists, for `Motion.provenance`."""
         return {s: {n: np.round(c, 5).tolist() for n, c in points.items()} for s, points in self.sets.items()}
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> ViewBias:
-        """Of what `as_told` gave."""
+        """Of what `as_record` gave."""
         return cls({s: {n: np.array(c, float) for n, c in points.items()} for s, points in record.items()})
 
 

@@ -58,7 +58,7 @@ class KnownNoise:
         acceleration = np.maximum(np.array([found[name] for name in names]), 1e-3)
         return cls(acceleration, smoothing.get("pixel_sigma", {}), smoothing.get("sigma_factor", {}))
 
-    def as_told(self, body: Body) -> dict[str, Any]:
+    def as_record(self, body: Body) -> dict[str, Any]:
         """The noise as a provenance record by name, readable by `of_take`."""
         names = ("root_shift", "root_turn", *body.tree.coordinates)
         values = [self.acceleration[0], *self.acceleration[5:]]
