@@ -92,6 +92,15 @@ def test_what_is_before_the_background_without_its_shadow():
 def test_a_camera_that_changes_its_exposure_shows_nobody():
     brighter = np.clip(1.15 * scene(3).astype(float), 0, 255).astype(np.uint8)
     assert BackgroundPlate(scene()).mask(brighter).max() == 0
+    assert BackgroundPlate(scene(), noise=3.0).mask(brighter).mean() < 1.0  # of 255
+
+
+def test_a_person_is_found_as_well_at_another_exposure():
+    picture, person, _ = with_person()
+    darker = np.rint(0.7 * picture.astype(float)).astype(np.uint8)
+    for noise in (None, 3.0):
+        mask = BackgroundPlate(scene(), noise=noise).mask(darker) > 0
+        assert (mask & person).sum() / (mask | person).sum() > 0.9
 
 
 def test_a_background_learnt_from_pictures_with_somebody_in_them():

@@ -75,8 +75,8 @@ class BackgroundPlate:
             problem = f"a picture of {smoothed.shape[1::-1]} px, the background has {self.size}"
             raise ObservationError(problem, remedy="Take both with the same camera and settings.")
         alpha = np.einsum("ijk,ijk->ij", smoothed, self.plate) / self._square
-        alpha /= max(float(np.median(alpha[::4, ::4])), 1e-3)  # the camera's own exposure
         difference = smoothed - alpha[..., None] * self.plate
+        alpha /= max(float(np.median(alpha[::4, ::4])), 1e-3)  # the camera's own exposure
         d = np.sqrt(np.einsum("ijk,ijk->ij", difference, difference))
         noise = max(1.4826 * float(np.median(d[::4, ::4])), _MIN_NOISE) if self.noise is None else self.noise
         change = np.abs(alpha - 1.0) * np.sqrt(self._square)
