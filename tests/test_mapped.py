@@ -13,7 +13,7 @@ from kinefit.observations.arrays import frozen, sealed
 
 @pytest.fixture
 def small(monkeypatch):
-    monkeypatch.setattr(_mapped, "LARGE", 1000)
+    monkeypatch.setattr(_mapped, "MIN_MAPPED_BYTES", 1000)
 
 
 def owner_of(array):
