@@ -2,10 +2,10 @@
 
 `walk_ts` of `video_mono_opencap` is a walk before one camera, with markers, which tell the vertical and when an ankle
 rests. The rooms of `phones_rooms` have a true floor: all their telephones, whose cameras are found from the people,
-and the first telephone alone. They are the first three rooms with one person: among two, drawn as a detector
-sees them, one camera does not keep them apart. The balancing trial's calibration has its own vertical; who balances stands on a beam.
-The motion is laid on the truth as a whole; vertical and floor are then compared. A foot rests while its ankle (of
-markers) or all points of its sole (of rooms) move less than 0.15 m/s for 0.2 s.
+and the first telephone alone. They are the first three rooms with one person: among two, drawn as a detector sees
+them, one camera does not keep them apart. The balancing trial's calibration has its own vertical; who balances stands
+on a beam. The motion is laid on the truth as a whole; vertical and floor are then compared. A foot rests while its
+ankle (of markers) or all points of its sole (of rooms) move less than 0.15 m/s for 0.2 s.
 """
 
 from __future__ import annotations
