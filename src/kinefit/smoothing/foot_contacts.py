@@ -23,6 +23,8 @@ _MIN_SWING_S = 0.15  # that a foot is in the air between two stances; where poin
 _MAX_OFF_PLANE_M = 0.10  # of a sole before one camera, whose depth is that unsure: beyond, it rests on something else
 _STANCE_SIGMA_M = 0.02  # of the height of a foot that stands, all its points together
 _CAMERA_SIGMA = np.radians(6.0)  # by which one camera that is taken to look level is tilted
+_MAX_CAMERA_TILT = 3.0 * _CAMERA_SIGMA  # beyond, its plane is no better than the prior was: feet stay where they seem
+# to rest (balancing, two cameras turned by 25 and 31 degrees: joints 63 and 60 mm off, on the plane 71 and 77)
 _BODY_SIGMA = np.radians(4.0)  # by which a person leans on average over a take
 
 
@@ -93,7 +95,7 @@ def find_contacts(
     The height of a level floor is estimated for each point, since its place on the sole is not known to the centimetre:
     the median over its slow frames near the lowest one. If the vertical is not measured, the floor is the plane through
     all contacts. One camera alone observes neither height nor depth speed: there a point is in contact if it hardly
-    moves across its ray, and its place is where its ray meets the plane.
+    moves across its ray, and its place is where its ray meets the plane, unless the camera is tilted by far too much.
 
     Parameters
     ----------
@@ -131,6 +133,8 @@ def find_contacts(
         return Contacts(points, places, weight)
     middles, above = np.array([places[run.start, p] for p, run in rests]), _above_sole(body, points)
     floor = fit_floor(body, roots, angles, middles, above[[p for p, _ in rests]], up, eye)
+    if eye is not None and np.arccos(np.clip(floor.normal @ axis, -1.0, 1.0)) > _MAX_CAMERA_TILT:
+        return Contacts(points, places, weight, floor)
     for (p, run), middle in zip(rests, middles, strict=True):
         off = float(floor.height(middle)) - above[p]
         if abs(off) < (_MAX_CONTACT_HEIGHT if eye is None else _MAX_OFF_PLANE_M):
