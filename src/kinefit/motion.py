@@ -63,7 +63,7 @@ class Residuals:
         Robust weight in 0..1 with which the point took part; 0 for an outlier or an unseen point.
     unit : "px" or "m"
     measured : (F, K, N)
-        The measurements as used (people chosen, left and right put right), same frame and unit as the values.
+        The measurements as used (people chosen, left-right swaps corrected), same frame and unit as the values.
     swapped : (F,) bool
         Frames in which the detector took left for right.
     rms, count : (F, K), optional

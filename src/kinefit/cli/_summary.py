@@ -29,7 +29,7 @@ def print_summary(motion: Motion, *, points: bool = False) -> None:
 
     seconds = len(motion) / motion.rate
     say(f"\n{motion.name}: {len(motion)} frames at {motion.rate:g} Hz ({seconds:.2f} s), body {motion.body.name}")
-    table = Table("sensor", "median residual", "points left out", "left/right put right", box=None, pad_edge=False)
+    table = Table("sensor", "median residual", "rejected points", "left/right swaps", box=None, pad_edge=False)
     for name, r in motion.residuals.items():
         table.add_row(name, _median(r), f"{100 * _left_out(r):.1f} %", f"{int(r.swapped.sum())} frames")
     if motion.residuals:

@@ -203,7 +203,8 @@ def summary(motion: Motion, frame: int) -> str:
         scale, unit = (1.0, "px") if residuals.unit == "px" else (1000.0, "mm")
         middle = f"{scale * np.median(norms[seen]):.1f} {unit}" if seen.any() else "nothing seen"
         out = int((seen & (residuals.weights[frame] < scene.OUTLIER_WEIGHT)).sum())
-        extra = (f", {out} left out" if out else "") + (", left/right put right" if residuals.swapped[frame] else "")
+        extra = f", {out} rejected" if out else ""
+        extra += ", left/right swap corrected" if residuals.swapped[frame] else ""
         lines.append(f"{name}: {middle}{extra}")
     return "\n\n".join(lines)
 

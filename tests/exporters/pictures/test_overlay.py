@@ -96,7 +96,7 @@ def test_lost_segments_turn_grey_and_are_named(motion, monkeypatch):
     assert f"median {np.nanmedian(norms):.1f}, mean {np.nanmean(norms):.1f} px" in told[1]
     assert told[2] == "lost: thigh_r"
     assert told[3:5] == ["cam 0   frame 99", "no motion here"]
-    assert "0 points" in told[6] and "left out" in told[6] and "put right" in told[7] and told[8] == "not tracked"
+    assert "0 points" in told[6] and "rejected" in told[6] and "corrected" in told[7] and told[8] == "not tracked"
 
 
 def test_a_lost_bone_is_dashed_and_grey(motion):

@@ -120,7 +120,7 @@ def test_a_limb_that_most_views_show_elsewhere_for_a_while_is_told():
     assert moment.what == ("Most views show right hand more than 8 cm beside the body.",)
     assert moment.causes == (
         "67 % of its keypoints were left out as outliers, most of them in cam0.",
-        "The detector took left for right in cam1 (put right).",
+        "The detector swapped left and right in cam1 (corrected).",
     )
     one = changed_residuals(good_motion(), "cam2", slice(40, 60), hand, values=300.0, weights=0.0)
     assert not doubtful_moments(one)

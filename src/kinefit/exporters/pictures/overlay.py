@@ -187,13 +187,13 @@ def _told(residuals: Residuals, frame: int) -> str:
     if not seen.any():
         return "no keypoints"
     text = f"residual: median {np.median(norms[seen]):.1f}, mean {np.mean(norms[seen]):.1f} px, {used.sum()} points"
-    return text + (f", {int((seen & ~used).sum())} left out" if (seen & ~used).any() else "")
+    return text + (f", {int((seen & ~used).sum())} rejected" if (seen & ~used).any() else "")
 
 
 def _notes(motion: Motion, residuals: Residuals | None, frame: int) -> list[str]:
     notes = []
     if residuals is not None and residuals.swapped[frame]:
-        notes.append("left and right were taken for each other: put right")
+        notes.append("left and right were swapped: corrected")
     if motion.quality[frame] <= 0:
         return [*notes, "not tracked"]
     lost = [name for name, gone in zip(motion.body.tree.segments, motion.lost[frame]) if gone]

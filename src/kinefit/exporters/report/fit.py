@@ -59,8 +59,8 @@ def overall_median(motion: Motion, unit: str = "px") -> float:
 
 def sensor_table(motion: Motion, fits: Sequence[SensorFit]) -> Html:
     """One row a sensor."""
-    columns = ["sensor", "median", "95 % below", "shift u or x", "v or y", "z", "points seen", "left out"]
-    columns.append("left/right exchanged")
+    columns = ["sensor", "median", "95 % below", "shift u or x", "v or y", "z", "points seen", "rejected"]
+    columns.append("left/right swaps")
     flat = all(len(f.shift) < 3 for f in fits)
     rows = []
     for f in fits:

@@ -260,7 +260,7 @@ def causes(motion: Motion, moment: Moment) -> tuple[str, ...]:
             out.append(text.format(listed(spoken_segments(motion.body, names))) + ".")
     swapped = [name for name, r in pixels.items() if np.any(np.asarray(r.swapped)[frames])]
     if swapped:
-        out.append(f"The detector took left for right in {listed(swapped)} (put right).")
+        out.append(f"The detector swapped left and right in {listed(swapped)} (corrected).")
     return tuple(out)
 
 

@@ -165,7 +165,7 @@ def _summary(
     if shifted:
         shifts = ", ".join(f"{f.name} ({f.shift[0]:+.1f}, {f.shift[1]:+.1f}) px" for f in shifted)
         text = (
-            "Much of what is left over is one and the same shift in every frame. This points to the calibration or the "
+            "A large part of the residuals is the same shift in every frame. This points to the calibration or the "
             "image size, not to the person: run kinefit check on the take."
         )
         parts.append(p.callout("warning", f"Constant shift in {shifts}.", text))
@@ -180,10 +180,10 @@ def _summary(
         each = [f"{spoken(name)} (±{2 * std:.0f}°)" for name, std in shared.items()]
         title = f"Shared by the prior posture: {listed(each, 8)}."
         text = (
-            "Measured is how far they bend together, hardly how each takes part: points at a joint's centre do not "
-            "tell how the segments turn about it. How people usually share a bend decides; ±, two standard deviations, "
-            "says how far one person departs from it. Changes within a take are surer than the values. Whatever shows "
-            "how the segment between them turns would tell, such as markers on the front and the back of a pelvis."
+            "Their sum is measured, their shares are not: points at joint centres do not determine the rotation of the "
+            "segment between them. The default posture sets the shares; ± (two standard deviations) is how far people "
+            "differ from it. Changes within a take are more certain than the values. Markers on the front and the back "
+            "of the pelvis would determine the shares."
         )
         parts.append(p.callout("note", title, text))
     body = motion.body

@@ -1,4 +1,4 @@
-"""2D keypoints of all cameras at one time: points of the body on rays, left and right put right (P2 2.3)."""
+"""2D keypoints of all cameras at one time: points of the body on rays, left-right swaps corrected (P2 2.3)."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ class KeypointMeasurement(Measurement):
 
 @dataclass(frozen=True, eq=False)
 class KeypointMatched(Matched):
-    """Keypoints with left and right put right.
+    """Keypoints with left-right swaps corrected.
 
     Parameters
     ----------

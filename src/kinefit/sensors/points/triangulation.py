@@ -1,4 +1,4 @@
-"""Points in space on which several cameras agree, left and right put right."""
+"""Points in space on which several cameras agree, left-right swaps corrected."""
 
 from __future__ import annotations
 
