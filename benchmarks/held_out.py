@@ -27,7 +27,7 @@ def sides_right(motion: Motion, rig: Rig, people: Sequence[Keypoints]) -> tuple[
     """Keypoints of one person as channels with left and right as the motion has them, and (F, N, 2) [px] where it has
     each of them, bias by view included."""
     channels = make_channels(motion.body, rig, people, [_SIGMA] * len(people))
-    channels = ViewBias.from_told(motion.provenance.get("view bias", {})).known_to(channels)
+    channels = ViewBias.from_record(motion.provenance.get("view bias", {})).known_to(channels)
     layout, groups = Layout(channels, motion.body), limb_groups(motion.body, channels)
     fitted = np.empty(channels.uv.shape)
     uv, confidence = np.array(channels.uv), np.array(channels.confidence)
