@@ -11,11 +11,11 @@ import numpy as np
 from kinefit.calibration.people.skeletons import LiftedSkeleton, match_skeletons, skeletons_of
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera
+from kinefit.images.detectors.pose_model import MIRROR
 from kinefit.observations import MEDIAPIPE_33, Detections, Keypoints
 from kinefit.readers.detections import read_detections
 from kinefit.readers.take.cameras import assumed_camera, is_uncalibrated
 from kinefit.readers.take.file import Take
-from kinefit.sensors.channels import mirror_name
 
 _RATE, _SECONDS = 15.0, 30.0  # [Hz], [s] of each video that are compared
 _CLOCKS_S = 2.0  # that cameras may be early or late
@@ -94,15 +94,13 @@ def _skeleton(camera: Camera, seen: Detections, begin: float, speed: int = 1, mi
     length = min((float(times[-1]) - begin) / speed, _SECONDS)
     wanted = begin + np.arange(0.0, max(length, 0.0) + 1e-9, 1.0 / _RATE) * speed
     at = np.minimum(np.searchsorted(times, wanted - 0.5 / seen.rate), count - 1)
-    names = MEDIAPIPE_33
     assert seen.lifted is not None
     points, confidence, lifted = (np.asarray(v[at], float) for v in (seen.points, seen.confidence, seen.lifted))
-    record = Keypoints(camera.name, "MEDIAPIPE_33", names, _RATE, points, confidence, lifted=lifted)
+    record = Keypoints(camera.name, "MEDIAPIPE_33", MEDIAPIPE_33, _RATE, points, confidence, lifted=lifted)
     if mirrored:
-        order = [names.index(mirror_name(name) or name) for name in names]
         record = replace(
-            record, points=points[:, :, order] * _FLIP[:2] + [camera.size[0] - 1.0, 0.0],
-            confidence=confidence[:, :, order], lifted=lifted[:, :, order] * _FLIP,
+            record, points=points[:, :, MIRROR] * _FLIP[:2] + [camera.size[0] - 1.0, 0.0],
+            confidence=confidence[:, :, MIRROR], lifted=lifted[:, :, MIRROR] * _FLIP,
         )  # fmt: skip
     return skeletons_of(camera, record)[0]
 

@@ -1,4 +1,4 @@
-"""Masks of the people in an image: others painted over, masks of one region in another, their run lengths."""
+"""Masks of people in an image: paint over other people, resample a mask to another region, encode run lengths."""
 
 from __future__ import annotations
 
@@ -12,42 +12,42 @@ from kinefit.images.detectors.pose_model import SIZE
 from kinefit.images.detectors.roi import Roi
 
 MIN_MASK = 0.5
-"""Probability from which on a pixel is the person's."""
+"""Probability of a pixel of the person."""
 
-_MIN_COVERED = 0.3  # probability from which on a pixel is painted over
-_DILATION_PX = 7  # of the crop, around it
-_GREY = 128  # the paint
-_MIN_DISTANCE = 0.3  # between the middles of the hips of two people, in sides; one who is followed twice has less
+_MIN_COVERED_PROBABILITY = 0.3  # of a pixel that is painted over
+_DILATION = np.ones((7, 7), np.uint8)  # [px of the crop] of masks that are painted over
+_PAINT_GREY = 128
+_MIN_HIP_DISTANCE = 0.3  # [sides of the region] between two people; one person tracked twice has less
 
 
 def without_others(
     crop: NDArray[np.uint8], roi: Roi, own: tuple[Roi, NDArray] | None, others: Sequence[tuple[Roi, NDArray]]
 ) -> NDArray[np.uint8]:
-    """A region with other people in it painted over, but for pixels that were the person's own.
+    """Paint over other people in a crop, except for pixels of the person's own last mask.
 
-    Those at the very same place are not: they may be the same person, followed twice.
+    People at the same position are not painted over: they may be duplicates of this person.
     """
-    beside = [
+    other_people = [
         shape for shape in others
-        if np.linalg.norm(shape[0].centre - roi.centre) > _MIN_DISTANCE * min(shape[0].side, roi.side)
+        if np.linalg.norm(shape[0].centre - roi.centre) > _MIN_HIP_DISTANCE * min(shape[0].side, roi.side)
     ]  # fmt: skip
-    theirs = [cv2.dilate(moved_mask(shape, roi), np.ones((_DILATION_PX, _DILATION_PX), np.uint8)) for shape in beside]
-    theirs = [mask for mask in theirs if mask.any()]
-    if theirs:
-        mine = moved_mask(own, roi) if own else np.zeros(crop.shape[:2], np.uint8)
-        crop[(np.maximum.reduce(theirs) > 0) & (mine == 0)] = _GREY
+    masks = [cv2.dilate(moved_mask(shape, roi), _DILATION) for shape in other_people]
+    masks = [mask for mask in masks if mask.any()]
+    if masks:
+        own_mask = moved_mask(own, roi) if own else np.zeros(crop.shape[:2], np.uint8)
+        crop[(np.maximum.reduce(masks) > 0) & (own_mask == 0)] = _PAINT_GREY
     return crop
 
 
 def moved_mask(shape: tuple[Roi, NDArray], roi: Roi) -> NDArray[np.uint8]:
-    """Pixels of a region (SIZE, SIZE), 0 or 1, that a mask of another region holds for likely."""
+    """Resample the mask of one region to another: (SIZE, SIZE), 1 where its probability exceeds `MIN_MASK`."""
     A_roi_image = cv2.invertAffineTransform(roi.A_image_crop(SIZE))
     A = A_roi_image @ np.vstack([shape[0].A_image_crop(SIZE), [0, 0, 1]])
     return (cv2.warpAffine(shape[1], A, (SIZE, SIZE)) > MIN_MASK).astype(np.uint8)
 
 
 def mask_runs(mask: NDArray[np.float32], roi: Roi, shape: tuple[int, int]) -> NDArray[np.uint32]:
-    """Run lengths, down the columns of a picture (height, width), of the pixels that are likely the person's."""
+    """Encode a mask (256, 256) of a region as run lengths, down the columns of an image (height, width) [px]."""
     height, width = shape
     nothing = np.array([width * height], np.uint32)
     rows, columns = (np.flatnonzero((mask > MIN_MASK).any(axis=axis)) for axis in (1, 0))
@@ -59,7 +59,7 @@ def mask_runs(mask: NDArray[np.float32], roi: Roi, shape: tuple[int, int]) -> ND
     u1, v1 = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 1, 0, [width, height])
     if u0 >= u1 or v0 >= v1:
         return nothing
-    A = roi.A_image_crop(SIZE)[::-1]  # each row of what is drawn is a column of the picture, between two empty pixels
+    A = roi.A_image_crop(SIZE)[::-1]  # each row of `soft` is a column of the image, between two empty pixels
     A[:, 2] -= v0 - 1, u0
     soft = cv2.warpAffine(mask, A, (int(v1 - v0) + 2, int(u1 - u0)), flags=cv2.INTER_LINEAR)
     inside = soft > MIN_MASK
@@ -70,13 +70,13 @@ def mask_runs(mask: NDArray[np.float32], roi: Roi, shape: tuple[int, int]) -> ND
 
 
 def cover(image: NDArray[np.uint8], shapes: Iterable[tuple[Roi, NDArray]]) -> NDArray[np.uint8]:
-    """The picture with those who are known painted over, so that the detector sees whoever else is there.
+    """Paint over the tracked people in an image (H, W, 3), so that the detector finds other people.
 
-    It was made for one person in the picture and overlooks those beside another.
+    The detector was made for images of one person and misses a second one close by.
     """
     covered = image.copy()
     for roi, mask in shapes:
-        wide = cv2.dilate((mask > _MIN_COVERED).astype(np.uint8), np.ones((_DILATION_PX, _DILATION_PX), np.uint8))
+        wide = cv2.dilate((mask > _MIN_COVERED_PROBABILITY).astype(np.uint8), _DILATION)
         size = (image.shape[1], image.shape[0])
-        covered[cv2.warpAffine(wide, roi.A_image_crop(SIZE), size, flags=cv2.INTER_NEAREST) > 0] = _GREY
+        covered[cv2.warpAffine(wide, roi.A_image_crop(SIZE), size, flags=cv2.INTER_NEAREST) > 0] = _PAINT_GREY
     return covered

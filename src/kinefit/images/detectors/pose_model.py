@@ -97,9 +97,9 @@ class PoseModel:
 
 
 def mean_with_mirrored(seen: PersonLandmarks, mirrored: PersonLandmarks) -> PersonLandmarks:
-    """Mean of what a network sees in a crop and in its mirror image: errors that lean to one side cancel.
+    """Average the landmarks of a crop and of its mirror image: errors to one side cancel.
 
-    What it sees in the crop counts alone where there is nobody in the mirror image, or left and right are exchanged.
+    Those of the crop are returned if the mirror image shows no person, or if left and right are swapped in it.
     """
 
     def back(points: NDArray) -> NDArray:
