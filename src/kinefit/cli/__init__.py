@@ -129,5 +129,6 @@ def _meant(error: click.UsageError, words: Sequence[str]) -> str:
 
 @click.group("kinefit", cls=_Commands, epilog=_EPILOG, context_settings=_SETTINGS)
 @click.version_option(__version__, "-V", "--version")
+@_screen.events_option
 def main() -> None:
     """Fit one articulated body to whatever the sensors saw."""

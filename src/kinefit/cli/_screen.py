@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import _thread
+import contextlib
 import errno
+import json
+import os
+import sys
+import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -25,7 +32,8 @@ INTERRUPTED = 130
 REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
 """Errors of the system for which nobody is to blame but the disk."""
 
-_VERBOSE, _QUIET = "kinefit.verbose", "kinefit.quiet"
+_VERBOSE, _QUIET, _EVENTS = "kinefit.verbose", "kinefit.quiet", "kinefit.events"
+_EVENT_INTERVAL_S = 0.1  # between two events of the progress of one piece of work
 _STYLES = {"fault": "bold red", "doubt": "yellow", "note": "cyan", "good": "green"}
 
 
@@ -55,6 +63,32 @@ def quiet_options(command: Callable) -> Callable:
     return quiet(click.option("--json", "as_json", is_flag=True, callback=_remember(_QUIET), help=text)(command))
 
 
+def events_option(command: Callable) -> Callable:
+    """Add `--events` to the group of all commands."""
+    text = (
+        "For programs that run kinefit: print progress, notes and errors as JSON lines on the standard error, and stop "
+        "as by Ctrl-C at the end of the standard input."
+    )
+
+    def remember(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
+        if value:
+            ctx.find_root().meta[_EVENTS] = True
+            threading.Thread(target=_interrupt_at_end_of_input, daemon=True).start()
+
+    return click.option("--events", is_flag=True, expose_value=False, callback=remember, help=text)(command)
+
+
+def _interrupt_at_end_of_input() -> None:
+    with contextlib.suppress(OSError):
+        while os.read(0, 1024):  # not by sys.stdin, whose lock a thread must not hold when Python ends
+            pass
+    _thread.interrupt_main()
+
+
+def _emit(event: str, **content: Any) -> None:
+    print(json.dumps({"event": event, **content}, ensure_ascii=False), file=sys.stderr, flush=True)
+
+
 def token_option(command: Callable) -> Callable:
     """Add `--token` to a command that opens a server."""
     text = "Of the page's address: 16 characters or more.  [default: a new one each time]"
@@ -80,8 +114,6 @@ def console(*, stderr: bool = False, always: bool = False) -> Console:
 
 def print_json(result: Mapping[str, Any]) -> None:
     """Print the result of a command that was given --json."""
-    import json
-
     click.echo(json.dumps(result, indent=2, ensure_ascii=False))
 
 
@@ -94,12 +126,18 @@ def say(text: str = "", *, style: str = "", stderr: bool = False) -> None:
 
 def note(text: str) -> None:
     """Print a line on stderr."""
-    say(text, stderr=True)
+    if _is_set(_EVENTS):
+        _emit("note", text=text)
+    else:
+        say(text, stderr=True)
 
 
 def _complain(problem: str, **lines: str) -> None:
     from rich.text import Text
 
+    if _is_set(_EVENTS):
+        _emit("error", problem=problem, **lines)
+        return
     text = Text.assemble(("error: ", "bold red"), problem)
     for name, line in lines.items():
         if line:
@@ -171,6 +209,9 @@ hide_faces_option = click.option(
 @contextmanager
 def bars() -> Iterator[Step]:
     """Progress bars on stderr, one for each thing that is done."""
+    if _is_set(_EVENTS):
+        yield _step_events()
+        return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (TextColumn("{task.description:<14}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -183,3 +224,16 @@ def bars() -> Iterator[Step]:
             progress.update(tasks[what], completed=done, total=total or None)
 
         yield step
+
+
+def _step_events() -> Step:
+    """Progress as events: a tenth of a second apart for each piece of work, and always its begin and its end."""
+    printed: dict[str, float] = {}
+
+    def step(what: str, done: int, total: int) -> None:
+        now = time.monotonic()
+        if what not in printed or done == total or now - printed[what] > _EVENT_INTERVAL_S:
+            printed[what] = now
+            _emit("step", what=what, done=done, total=total)
+
+    return step

@@ -1,0 +1,155 @@
+"""Gather what a viewer shows of a motion, a take or a folder of results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kinefit.batch.results import Step
+from kinefit.errors import ObservationError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from kinefit.motion import Motion
+    from kinefit.preparing.each_video import Tell
+    from kinefit.readers.take.file import Take
+    from kinefit.readers.take.load import Observations
+    from kinefit.viewers.show import ViewerContent
+
+
+def gather(
+    sources: Sequence[Path], take_file: Path | None = None, *, hide_faces: bool = False, step: Step, tell: Tell
+) -> ViewerContent:
+    """Read everything that is to be shown.
+
+    Parameters
+    ----------
+    sources : motion files, folders of results, or one take file
+    take_file : whose cameras and markers are shown; default: the take beside the first folder of results
+    hide_faces : whether all faces are hidden in the cameras' images; a take may say so, too
+
+    Raises
+    ------
+    KinefitError
+        A file is missing or invalid, or two takes are given.
+    """
+    from kinefit.calibration.people.of_take import find_cameras
+    from kinefit.readers.motion import read_motion
+    from kinefit.readers.take.find import takes_in
+    from kinefit.readers.take.load import load_observations
+    from kinefit.viewers.show import ViewerContent
+
+    motions: list[Motion] = []
+    beside: Path | None = None
+    for source in sources:
+        if source.suffix.lower() == ".toml":
+            if take_file is not None:
+                raise ObservationError("two take files", file=source, remedy="Give one: one take is shown at a time.")
+            take_file = source
+            continue
+        if source.is_dir() and not (source / "motion.npz").is_file() and takes_in(source) and take_file is None:
+            take_file = source
+            continue
+        if source.is_dir():
+            source, there = _in_folder(source)
+            beside = beside or there
+        motions.append(read_motion(source))
+    if take_file is not None:
+        take = find_cameras(take_file, tell=tell)
+        seen = load_observations(take)
+    elif found := _fitting(beside, motions[0].name, tell):
+        take, seen = found
+    else:
+        return ViewerContent(tuple(motions), name=motions[0].name)
+    return content_of(motions, replace(take, hide_faces=take.hide_faces or hide_faces), seen, step=step, tell=tell)
+
+
+def content_of(
+    motions: Sequence[Motion], take: Take, seen: Observations, *, step: Step, tell: Tell
+) -> ViewerContent:
+    """Motions of a take, with its cameras, images and markers; without motions with its triangulated keypoints."""
+    import numpy as np
+
+    from kinefit.preparing.faces import ensure_faces, shown_video
+    from kinefit.viewers.pictures import CameraImages
+    from kinefit.viewers.show import ViewerContent
+
+    cameras = {camera.name: camera for camera in seen.rig or ()}
+    offsets = {entry.name: entry.time_offset for entry in take.cameras}
+    for motion in motions:
+        if motion.up != take.up:
+            tell(f"{motion.name} has {motion.up} up, the take {take.up}: it is turned to the take's world.")
+    if take.hide_faces and seen.videos:
+        ensure_faces(take, step, tell)
+    videos = {name: shown_video(take, seen, name) for name in seen.videos}
+    return ViewerContent(
+        tuple(motions), rig=seen.rig, up=take.up, name=take.name, steps=np.arange(*seen.frames) / seen.rate,
+        points=None if motions else _triangulated(take, seen, tell),
+        pictures=CameraImages(cameras, videos, seen.images, offsets, rate=seen.rate) if videos else None,
+        markers=seen.markers, marker_offsets=tuple(entry.time_offset for entry in take.markers),
+    )  # fmt: skip
+
+
+def _fitting(file: Path | None, name: str, tell: Tell) -> tuple[Take, Observations] | None:
+    """The take beside a folder of results and what its sensors saw, where it can be read and is the motion's."""
+    from kinefit.calibration.people.of_take import find_cameras
+    from kinefit.errors import KinefitError
+    from kinefit.readers.take.file import read_take
+    from kinefit.readers.take.load import load_observations
+
+    if file is None:
+        return None
+    try:
+        take = read_take(file)
+        if take.name != name:
+            tell(f"Without {file}, which is of '{take.name}' and not of '{name}'; --take names another.")
+            return None
+        take = find_cameras(take, tell=tell)
+        seen = load_observations(take)
+    except KinefitError as error:
+        tell(f"Without the take beside it: {error}")
+        return None
+    tell(f"With the take {file}; --take names another.")
+    return take, seen
+
+
+def _in_folder(folder: Path) -> tuple[Path, Path | None]:
+    """The motion file in a folder of results, and the take that it probably came from."""
+    from kinefit.errors import FileError
+
+    file = folder / "motion.npz"
+    if not file.is_file():
+        remedy = "Give the folder that `kinefit track` wrote, or a motion file."
+        raise FileError("there is no motion.npz in this folder", file=folder, remedy=remedy)
+    name = folder.absolute().name
+    places = [folder.absolute().with_name(f"{name.removesuffix('-kinefit')}.toml"), folder / "take" / "take.toml"]
+    return file, next((place for place in places if place.is_file()), None)
+
+
+def _triangulated(take: Take, seen: Observations, tell: Tell) -> NDArray | None:
+    """(F, K, 3) [m] keypoints of the person where two cameras agree; None, and a note, where there is nobody."""
+    import numpy as np
+
+    from kinefit.bodies import load_body
+    from kinefit.errors import TrackingError
+    from kinefit.multiview.association import choose_people, person_records
+    from kinefit.multiview.followed import follow
+    from kinefit.readers.take.pictures import TakePictures
+    from kinefit.sensors.channels import make_channels
+    from kinefit.sensors.points.triangulation import triangulated
+
+    if seen.rig is None or not seen.keypoints:
+        return None
+    try:
+        with TakePictures(take, seen) as pictures:
+            keypoints = follow(seen.rig, seen.keypoints, take.person, images=pictures).keypoints
+        people = choose_people(seen.rig, keypoints)
+    except TrackingError as error:
+        tell(f"Only cameras are shown: {error.problem}.")
+        return None
+    sigma = [entry.sigma for entry in take.keypoints]
+    channels = make_channels(load_body(take.body), seen.rig, person_records(keypoints, people), sigma)
+    return triangulated(channels, np.arange(len(channels.uv)))
