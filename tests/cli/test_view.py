@@ -7,15 +7,15 @@ import subprocess
 import sys
 import urllib.request
 
-import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from tests.cli.stopping import STOPPABLE
 from tests.viewers.recordings import write_take
 
-from kinefit.cli.view import gather, view
-from kinefit.errors import ExportError, FileError
+from kinefit.batch.viewed import gather
+from kinefit.cli.view import view
+from kinefit.errors import ExportError, FileError, ObservationError
 from kinefit.exporters import write_motion
 from kinefit.simulation import cut, squat_and_wave
 
@@ -36,27 +36,30 @@ def run(*args):
     return CliRunner().invoke(view, [str(arg) for arg in args])
 
 
-def test_a_folder_of_results_finds_its_take(folder, capsys):
-    recording = gather((folder / "take-kinefit",), None)
+def test_a_folder_of_results_finds_its_take(folder):
+    said = []
+    recording = gather((folder / "take-kinefit",), tell=said.append)
     assert len(recording.motions) == 1 and len(recording.rig) == 2
-    assert "With the take" in capsys.readouterr().err
+    assert "With the take" in said[0]
 
 
-def test_a_take_of_another_name_is_not_taken(folder, tmp_path, motion, capsys):
+def test_a_take_of_another_name_is_not_taken(folder, tmp_path, motion):
     (tmp_path / "x.toml").write_text((folder / "take.toml").read_text().replace(motion.name, "another"))
     for file in folder.iterdir():
         if file.is_file() and file.name != "take.toml":
             (tmp_path / file.name).write_bytes(file.read_bytes())
     write_motion(motion, tmp_path / "x-kinefit" / "motion.npz")
-    assert gather((tmp_path / "x-kinefit",), None).rig is None
-    assert "'another'" in capsys.readouterr().err
+    said = []
+    assert gather((tmp_path / "x-kinefit",), tell=said.append).rig is None
+    assert "'another'" in said[0]
 
 
-def test_a_damaged_take_beside_results_is_told_and_left_out(tmp_path, motion, capsys):
+def test_a_damaged_take_beside_results_is_told_and_left_out(tmp_path, motion):
     (tmp_path / "x.toml").write_text("[take\n")
     write_motion(motion, tmp_path / "x-kinefit" / "motion.npz")
-    assert gather((tmp_path / "x-kinefit",), None).rig is None
-    assert "not TOML" in capsys.readouterr().err
+    said = []
+    assert gather((tmp_path / "x-kinefit",), tell=said.append).rig is None
+    assert "not TOML" in said[0]
 
 
 def test_a_take_alone_shows_its_keypoints_in_space(folder, motion):
@@ -99,7 +102,7 @@ def test_what_cannot_be_shown_is_told(name, tmp_path):
 
 
 def test_two_takes_are_too_many(folder):
-    with pytest.raises(click.UsageError, match="One take"):
+    with pytest.raises(ObservationError, match="two take files"):
         gather((folder / "take.toml", folder / "take.toml"), None)
 
 

@@ -14,6 +14,11 @@ if TYPE_CHECKING:
 Step = Callable[[str, int, int], None]
 """Called with the name of the work, the number of steps done, and the number of all steps (0: unknown)."""
 
+
+def silent(*_: object) -> None:
+    """Report nothing: in place of a `Step` or a function for sentences."""
+
+
 NAMES = {
     "motion": "motion.npz", "csv": "tables", "bvh": "motion.bvh", "glb": "motion.glb", "trc": "motion.trc",
     "mot": "motion.mot", "osim": "body.osim", "parquet": "tables", "c3d": "motion.c3d", "usd": "motion.usdc",

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kinefit.batch.results import Step
+from kinefit.batch.results import Step, silent
 from kinefit.errors import ObservationError
 
 if TYPE_CHECKING:
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 
 
 def gather(
-    sources: Sequence[Path], take_file: Path | None = None, *, hide_faces: bool = False, step: Step, tell: Tell
-) -> ViewerContent:
+    sources: Sequence[Path], take_file: Path | None = None, *, hide_faces: bool = False, step: Step = silent,
+    tell: Tell = silent,
+) -> ViewerContent:  # fmt: skip
     """Read everything that is to be shown.
 
     Parameters
@@ -68,8 +69,8 @@ def gather(
 
 
 def content_of(
-    motions: Sequence[Motion], take: Take, seen: Observations, *, step: Step, tell: Tell
-) -> ViewerContent:
+    motions: Sequence[Motion], take: Take, seen: Observations, *, step: Step = silent, tell: Tell = silent
+) -> ViewerContent:  # fmt: skip
     """Motions of a take, with its cameras, images and markers; without motions with its triangulated keypoints."""
     import numpy as np
 

@@ -15,6 +15,7 @@ from kinefit.batch.find import RECORD
 from kinefit.batch.one import Choices, asked_take, people_of, track_person
 from kinefit.batch.outcome import DONE, Range, Row, failed
 from kinefit.batch.people_report import write_people_report
+from kinefit.batch.results import silent
 from kinefit.errors import KinefitError
 from kinefit.findings import of_provenance
 
@@ -90,7 +91,7 @@ def _warnings_in(said: list[str]) -> Iterator[None]:
 def _tracked(job: TakeJob, take: Take, start: Row, said: list[str]) -> tuple[tuple[Row, ...], list[str]]:
     """Track all people of a take; returns a row for each, and the written files relative to the folder of results."""
     try:
-        view, people = people_of(take, job.out, _silent, said.append)
+        view, people = people_of(take, job.out, silent, said.append)
     except KinefitError as error:
         return (failed(start, str(error)),), []
     rows, made = [], []
@@ -103,7 +104,7 @@ def _tracked(job: TakeJob, take: Take, start: Row, said: list[str]) -> tuple[tup
             folder.mkdir(parents=True, exist_ok=True)
         files: dict[str, Path] = {}
         try:
-            done = track_person(person, folder, job.choices, view=view, step=_silent, tell=_silent, files=files)
+            done = track_person(person, folder, job.choices, view=view, step=silent, tell=silent, files=files)
         except KinefitError as error:  # the other people are tracked nevertheless
             rows.append(failed(msgspec.structs.replace(row, folder=""), str(error)))
             continue
@@ -113,10 +114,6 @@ def _tracked(job: TakeJob, take: Take, start: Row, said: list[str]) -> tuple[tup
         page_rows = [msgspec.structs.replace(r, take=take.name, folder=r.folder and f"person-{r.person}") for r in rows]
         made.append(write_people_report(page_rows, job.out, pictures=job.choices.draws).name)
     return tuple(rows), made
-
-
-def _silent(*arguments: object) -> None:
-    pass
 
 
 def _of_session(row: Row, take: Take) -> Row:

@@ -23,7 +23,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: its threads 
 COMMANDS = {
     "demo": "tracking.demo", "init": "init", "calibrate": "calibration.calibrate", "detect": "detect",
     "check": "checks.check", "track": "tracking.track", "live": "tracking.live", "batch": "tracking.batch",
-    "markers": "markers.markers", "surface": "surfaces.surface", "body": "body", "view": "view",
+    "markers": "markers.markers", "surface": "surfaces.surface", "body": "body", "view": "view", "app": "app",
     "replay": "motions.replay", "export": "motions.export", "retarget": "motions.retarget",
     "simulate": "motions.simulate", "evaluate": "motions.evaluate", "warmup": "warmup",
 }  # fmt: skip

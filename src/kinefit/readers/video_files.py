@@ -31,7 +31,7 @@ class VideoFile:
             self._index = {pts: i for i, pts in enumerate(self._pts)}
             self._restart()
             first = self._decode(0)
-            self._quarter_turns = round(_rotation(first) / 90) % 4
+            self._quarter_turns = _quarter_turns(first)
         except BaseException:
             self.close()
             raise
@@ -50,8 +50,7 @@ class VideoFile:
 
     def image(self, i: int) -> NDArray[np.uint8]:
         """Frame `i` as (H, W, 3) uint8 RGB, upright."""
-        image = self._decode(i).to_ndarray(format="rgb24")
-        return np.ascontiguousarray(np.rot90(image, self._quarter_turns)) if self._quarter_turns else image
+        return _upright(self._decode(i), self._quarter_turns)
 
     def _restart(self, i: int = 0) -> None:
         """Restart the decoder at or before frame `i`."""
@@ -92,6 +91,24 @@ class VideoFile:
             raise FileError("the video states no frame rate", file=self.path, remedy="Give it: ffmpeg -r RATE -i ...")
         even = (rate for rate in (stated, measured) if rate and is_even(self.times, rate))
         return next(even, 0.0) or nominal_rate(self.times)
+
+
+def first_image(path: Path) -> NDArray[np.uint8]:
+    """The first image (H, W, 3) of a video file, RGB and upright; its frames are not counted, however long it is.
+
+    Raises
+    ------
+    FileError
+        Not readable, or no image in it.
+    """
+    container = _open(path)
+    try:
+        frame = next(container.decode(video=0))
+    except (av.FFmpegError, StopIteration, ValueError) as error:
+        raise FileError(f"no image can be decoded ({error})", file=path, remedy=_REMEDY) from error
+    finally:
+        container.close()
+    return _upright(frame, _quarter_turns(frame))
 
 
 def open_container(path: Path) -> Any:
@@ -183,6 +200,15 @@ def _decoded_times(path: Path) -> list[int | None]:
     if None in pts:
         raise FileError("frames without times", file=path, remedy="Repack it: ffmpeg -i IN -c copy OUT.mp4.")
     return pts
+
+
+def _upright(frame: Any, quarter_turns: int) -> NDArray[np.uint8]:
+    image = frame.to_ndarray(format="rgb24")
+    return np.ascontiguousarray(np.rot90(image, quarter_turns)) if quarter_turns else image
+
+
+def _quarter_turns(frame: Any) -> int:
+    return round(_rotation(frame) / 90) % 4
 
 
 def _rotation(frame: Any) -> float:

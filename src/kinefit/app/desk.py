@@ -1,0 +1,55 @@
+"""The state of the app that no file holds: whether faces are hidden, the queue of jobs, the results that are open."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from kinefit.app.jobs import Job, JobQueue
+from kinefit.app.review import Review
+
+
+class Desk:
+    """What one running app has.
+
+    Parameters
+    ----------
+    root : folder of the session
+    prefix : of the paths of all pages: "/" and the token
+
+    Attributes
+    ----------
+    hide_faces : bool or None
+        The user's choice at the start; None until it is made, and nothing of a video is shown before.
+    jobs : JobQueue
+    """
+
+    def __init__(self, root: Path, prefix: str) -> None:
+        self.root, self.prefix = root, prefix
+        self.hide_faces: bool | None = None
+        self.jobs = JobQueue()
+        self._reviews: dict[Path, Review] = {}
+
+    def start(self, take: Path, *command: str) -> Job:
+        """Ask for a command on a take, with the choice of faces."""
+        hidden = ["--hide-faces"] * bool(self.hide_faces and command[0] in ("check", "track"))
+        return self.jobs.add(take, [*command, *hidden])
+
+    def review(self, take: Path, folder: Path) -> Review:
+        """An open result; read anew if its motion was written since. Slow: call it in a thread."""
+        known = self._reviews.get(folder)
+        if known is not None and known.is_current(bool(self.hide_faces)):
+            return known
+        if known is not None:
+            known.close()
+        self._reviews[folder] = Review(take, folder, hide_faces=bool(self.hide_faces))
+        return self._reviews[folder]
+
+    def opened(self, folder: Path) -> Review | None:
+        """The result in a folder, if it is open."""
+        return self._reviews.get(folder)
+
+    async def close(self) -> None:
+        """Pause all jobs and close all results."""
+        for review in self._reviews.values():
+            review.close()
+        await self.jobs.close()

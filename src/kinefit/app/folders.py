@@ -1,0 +1,98 @@
+"""What lies in the folders of a session: takes, their results, and how far each is."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from kinefit.errors import FileError, KinefitError
+from kinefit.readers.guess.files import VIDEOS
+from kinefit.readers.take.find import takes_in
+
+NEW, UNFINISHED, TRACKED = "new", "unfinished", "tracked"
+"""States of a take: not tracked yet, stopped before its end, tracked."""
+
+_MAX_DEPTH = 3  # of folders below the session's in which takes are looked for
+_MAX_FOLDERS = 2000  # that are looked into, so that a whole disk ends in a moment
+
+
+@dataclass(frozen=True)
+class TakeFolder:
+    """A take file with its folder of results.
+
+    Parameters
+    ----------
+    file : Path, absolute
+    """
+
+    file: Path
+
+    @property
+    def out(self) -> Path:
+        """Folder of the results, as `kinefit track` names it."""
+        return self.file.with_name(f"{self.file.stem}-kinefit")
+
+    @property
+    def check_page(self) -> Path:
+        """Page that `kinefit check` writes."""
+        return self.file.with_name(f"{self.file.stem}-check.html")
+
+    @property
+    def people(self) -> tuple[Path, ...]:
+        """Folders of results, one a person, that hold a motion."""
+        many = sorted(self.out.glob("person-*/motion.npz"), key=lambda p: int(p.parent.name.rpartition("-")[2]))
+        alone = self.out / "motion.npz"
+        return (self.out,) if alone.is_file() and not many else tuple(motion.parent for motion in many)
+
+    @property
+    def state(self) -> str:
+        """NEW, UNFINISHED or TRACKED."""
+        if any(self.out.glob("**/unfinished")):
+            return UNFINISHED
+        return TRACKED if self.people else NEW
+
+
+def subfolders(folder: Path) -> list[Path]:
+    """Folders in a folder that may hold recordings, by name, without hidden ones and results.
+
+    Raises
+    ------
+    FileError
+        The folder is missing, or may not be read.
+    """
+    try:
+        with os.scandir(folder) as entries:
+            found = [Path(entry.path) for entry in entries if entry.is_dir() and not entry.name.startswith(".")]
+    except OSError as error:
+        remedy = "Choose a folder that is there: it was moved, or its drive is not connected."
+        raise FileError(f"this folder cannot be opened ({error.strerror})", file=folder, remedy=remedy) from error
+    return sorted((path for path in found if not is_result(path)), key=lambda path: path.name.lower())
+
+
+def is_result(folder: Path) -> bool:
+    """Whether kinefit made a folder: results, detections, session of `kinefit live`."""
+    return folder.name.endswith(("-kinefit", "-detect"))
+
+
+def video_files(folder: Path) -> list[Path]:
+    """Video files directly in a folder, by name; empty if it cannot be read."""
+    try:
+        return sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEOS and path.is_file())
+    except OSError:
+        return []
+
+
+def takes_below(root: Path) -> list[TakeFolder]:
+    """Takes in a folder and the folders below it, by path."""
+    found: list[TakeFolder] = []
+    at, looked = [(root, 0)], 0
+    while at and looked < _MAX_FOLDERS:
+        folder, depth = at.pop(0)
+        looked += 1
+        try:
+            found += [TakeFolder(take.absolute()) for take in takes_in(folder)]
+            at += [(sub, depth + 1) for sub in subfolders(folder)] if depth < _MAX_DEPTH else []
+        except (KinefitError, OSError):
+            continue
+    return sorted(found, key=lambda take: take.file)

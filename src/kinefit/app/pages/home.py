@@ -1,0 +1,130 @@
+"""The first page: the choice of faces, then a recording from this computer or by dropping its videos."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from nicegui import ui
+
+from kinefit.app.desk import Desk
+from kinefit.app.folders import subfolders, takes_below, video_files
+from kinefit.app.pages.shell import card, in_thread, link, shell, short, show_error, texts
+from kinefit.app.texts import Texts
+from kinefit.errors import KinefitError
+from kinefit.exporters.atomic import writing
+
+_MAX_UPLOAD_BYTES = 2**30  # of a dropped video; larger ones are opened where they are
+_MAX_NAMES = 6  # of videos that are listed
+
+
+async def home_page(desk: Desk) -> None:
+    """Build the page."""
+    t = texts()
+    with shell(desk, t, t("shell.home")):
+        if desk.hide_faces is None:
+            _ask_faces(desk, t)
+            return
+        with ui.row().classes("w-full items-stretch"):
+            with ui.column().classes("flex-1 min-w-[300px]"), card(t("home.open_title")):
+                ui.label(t("home.open_text"))
+                _FolderChoice(desk, t)
+            with ui.column().classes("flex-1 min-w-[300px]"), card(t("home.drop_title")):
+                _drop_area(desk, t)
+        with card(t("home.session_title", folder=desk.root)):
+            await _takes(desk, t)
+
+
+def _ask_faces(desk: Desk, t: Texts) -> None:
+    def choose(hide: bool) -> None:
+        desk.hide_faces = hide
+        ui.navigate.reload()
+
+    with card(t("home.faces_title")):
+        ui.label(t("home.faces_text"))
+        with ui.row():
+            ui.button(t("home.hide"), icon="visibility_off", on_click=lambda: choose(True)).mark("hide")
+            ui.button(t("home.show"), icon="visibility", on_click=lambda: choose(False)).props("outline").mark("show")
+
+
+class _FolderChoice:
+    """A list of folders to walk through by clicks, with a field for a path."""
+
+    def __init__(self, desk: Desk, t: Texts) -> None:
+        self._t, self._at = t, desk.root
+        self._field = ui.input(t("home.path"), value=str(self._at)).classes("w-full")
+        self._field.on("keydown.enter", lambda: self._go(Path(self._field.value).expanduser()))
+        self._list()
+
+    @ui.refreshable_method
+    def _list(self) -> None:
+        t = self._t
+        try:
+            inside = subfolders(self._at)
+        except KinefitError as error:
+            show_error(t, error)
+            inside = []
+        videos = video_files(self._at)
+        with ui.scroll_area().classes("w-full h-48 border"), ui.list().props("dense").classes("w-full"):
+            if self._at.parent != self._at:
+                self._entry("arrow_upward", t("home.up"), self._at.parent)
+            for folder in inside:
+                self._entry("folder", folder.name, folder)
+        names = ", ".join(video.name for video in videos[:_MAX_NAMES]) + (" ..." if len(videos) > _MAX_NAMES else "")
+        ui.label(t("home.videos_here", count=len(videos), names=names) if videos else t("home.no_videos"))
+        ui.button(t("home.use"), icon="folder_open", on_click=self._open).mark("open")
+
+    def _entry(self, icon: str, name: str, folder: Path) -> None:
+        with ui.item(on_click=lambda: self._go(folder)):
+            with ui.item_section().props("avatar"):
+                ui.icon(icon)
+            with ui.item_section():
+                ui.item_label(name)
+
+    def _go(self, folder: Path) -> None:
+        self._at = folder
+        self._field.value = str(folder)
+        self._list.refresh()
+
+    def _open(self) -> None:
+        ui.navigate.to(link("/take", path=Path(self._field.value).expanduser()))
+
+
+def _drop_area(desk: Desk, t: Texts) -> None:
+    folder = desk.root / f"recording-{time.strftime('%Y%m%d-%H%M%S')}"
+    ui.label(t("home.drop_text", folder=folder))
+
+    async def keep(event: Any) -> None:
+        for file in event.files:
+            name = Path(file.name).name  # of a browser that sends a path
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+                with writing(folder / name) as temporary:
+                    await file.save(temporary)
+            except (OSError, KinefitError) as error:
+                ui.notify(t("home.drop_failed", name=name, folder=folder, reason=error), type="negative", timeout=0)
+                return
+        ui.navigate.to(link("/take", path=folder))
+
+    def refuse(_: Any) -> None:
+        ui.notify(t("home.drop_refused", name=""), type="negative", timeout=0)
+
+    ui.upload(
+        label=t("home.drop_label"), multiple=True, auto_upload=True, max_file_size=_MAX_UPLOAD_BYTES,
+        on_multi_upload=keep, on_rejected=refuse,
+    ).props("accept='video/*,.mkv,.mts,.m2ts,.mxf'").classes("w-full").mark("drop")  # fmt: skip
+
+
+async def _takes(desk: Desk, t: Texts) -> None:
+    takes = await in_thread(takes_below, desk.root)
+    if not takes:
+        ui.label(t("home.session_none"))
+    for take in takes:
+        job = desk.jobs.open(take.file)
+        with ui.row().classes("items-center w-full"):
+            ui.link(short(take.file.parent, desk.root), link("/take", path=take.file)).classes("flex-1")
+            ui.label(t(f"state.{job.state if job else take.state}"))
+    if takes:
+        ui.link(t("home.session"), "/session")
+    ui.link(t("home.live"), "/live")

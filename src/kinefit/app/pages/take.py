@@ -1,0 +1,265 @@
+"""One take: what was found, the person, the check with its remedies, and the computation with its progress."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from nicegui import ui
+
+from kinefit.app.desk import Desk
+from kinefit.app.folders import NEW, TakeFolder, video_files
+from kinefit.app.jobs import DONE, FAILED, PAUSED, RUNNING, WAITING, Job
+from kinefit.app.pages.shell import COLOURS, card, in_thread, link, shell, short, show_error, texts
+from kinefit.app.texts import Texts
+from kinefit.batch import corrections
+from kinefit.errors import KinefitError
+from kinefit.exporters.atomic import write_text
+from kinefit.readers.guess.draft import Note
+from kinefit.readers.guess.folder import guess_take
+from kinefit.readers.take.file import Take, read_take
+from kinefit.readers.take.find import find_take, takes_in
+from kinefit.rendering.colours import to_hex
+
+_REFRESH_S = 0.5  # between two looks at the job
+_MAX_NOTES = 8  # of a job that are shown
+_ICONS = {"fault": "error", "doubt": "help", "note": "info", "good": "check_circle"}
+_CONFIDENCE = {"sure": "good", "likely": "note", "guess": "doubt", "open": "fault"}
+_REMEDIES = {"bias": ("refine",), "lens": ("refine_focal",), "time": ("refine_time",)}
+"""Kinds of findings for which `kinefit check --refine` helps: keys of texts and of `_REFINE`."""
+_REFINE = {
+    "refine": ("--refine",), "refine_time": ("--refine", "--time-offsets"), "refine_focal": ("--refine", "--focal"),
+}  # fmt: skip
+
+
+async def take_page(desk: Desk, path: str) -> None:
+    """Build the page of a take file, or of a folder, whose take file is written where there is none."""
+    t = texts()
+    with shell(desk, t, short(Path(path), desk.root)):
+        if desk.hide_faces is None:
+            ui.navigate.to("/")
+            return
+        first_images(Path(path))
+        waiting = ui.label(t("take.reading"))
+        await ui.context.client.connected()
+        try:
+            file, take, notes = await in_thread(opened_take, Path(path))
+        except KinefitError as error:
+            show_error(t, error)
+            return
+        finally:
+            waiting.delete()
+        _TakePage(desk, t, TakeFolder(file), take, notes)
+
+
+def first_images(path: Path) -> None:
+    """The first image of each video, before anything else is read."""
+    videos = video_files(path if path.is_dir() else path.parent)
+    with ui.row().classes("w-full"):
+        for video in videos:
+            with ui.column().classes("gap-0"):
+                ui.image(link("/image/first", path=video)).classes("w-48 min-h-[6rem]").props(f'alt="{video.stem}"')
+                ui.label(video.name).classes("text-sm")
+
+
+def opened_take(path: Path) -> tuple[Path, Take, tuple[Note, ...]]:
+    """The take file at a path, what it says, and what was guessed for it; a folder without one gets its first.
+
+    Raises
+    ------
+    KinefitError
+        Nothing is there, or nothing of which a take can be made; a take file that is invalid.
+    """
+    notes: tuple[Note, ...] = ()
+    if path.is_dir() and not takes_in(path):
+        guess = guess_take(path)
+        write_text(path / "take.toml", guess.text)
+        notes = guess.notes
+    file = find_take(path).absolute()
+    return file, read_take(file), notes
+
+
+class _TakePage:
+    """The parts of the page below the images."""
+
+    def __init__(self, desk: Desk, t: Texts, folder: TakeFolder, take: Take, notes: tuple[Note, ...]) -> None:
+        self._desk, self._t, self._folder, self._take, self._notes = desk, t, folder, take, notes
+        self._shown: tuple[object, ...] = ()
+        with ui.expansion(t("take.found_title"), value=bool(notes)).classes("w-full"):
+            self._found()
+        with card(t("take.person_title")):
+            self._person()
+        with ui.row():
+            ui.button(t("take.track"), icon="play_arrow", on_click=self._track).mark("track")
+            ui.button(t("take.check"), icon="fact_check", on_click=self._check).props("outline").mark("check")
+        self._work()
+        self._findings()
+        ui.timer(_REFRESH_S, self._look)
+
+    def _found(self) -> None:
+        t = self._t
+        ui.label(t("take.file", file=self._folder.file)).classes("text-sm break-all")
+        for note in self._notes:
+            with ui.row().classes("items-center no-wrap"):
+                severity = _CONFIDENCE[note.sure]
+                ui.icon(_ICONS[severity]).style(f"color: {to_hex(COLOURS[severity])}").tooltip(t(f"take.{note.sure}"))
+                ui.label(f"{note.about}: {note.text}").classes("text-sm")
+
+    def _person(self) -> None:
+        t = self._t
+        with ui.row().classes("items-end"):
+            height = ui.number(t("take.height"), value=self._take.height, min=0.3, max=3, step=0.01, format="%.2f")
+            height.classes("w-64").tooltip(t("take.height_text")).on("blur", lambda: self._set_height(height.value))
+            who = {"": t("take.everybody"), "first": t("take.first"), "moving": t("take.moving")}
+            who |= {"largest": t("take.largest")}
+            self._who = ui.select(who, label=t("take.who"), value="").classes("w-64")
+            qualities = {"best": t("take.best"), "balanced": t("take.balanced")}
+            self._quality = ui.select(qualities, label=t("take.quality"), value="best").classes("w-40")
+
+    def _set_height(self, height: float | None) -> None:
+        if height and height != self._take.height:
+            self._edit(lambda: corrections.set_height(self._folder.file, height), self._t("take.height_saved"))
+
+    def _edit(self, edit: Callable[[], object], said: str) -> None:
+        try:
+            edit()
+            self._take = read_take(self._folder.file)
+            ui.notify(said, type="positive")
+        except KinefitError as error:
+            ui.notify(str(error), type="negative", timeout=0, close_button=True)
+
+    def _detect(self) -> None:
+        """Ask for the faster detection, where it was chosen and nothing is detected yet."""
+        if self._quality.value == "balanced" and self._folder.state == NEW:
+            self._desk.start(self._folder.file, "detect", str(self._folder.file), "--quality", "balanced")
+
+    def _track(self, *options: str) -> None:
+        self._detect()
+        who = ("--person", self._who.value) if self._who.value else ()
+        self._desk.start(self._folder.file, "track", str(self._folder.file), "--json", *who, *options)
+
+    def _check(self, *options: str) -> None:
+        self._detect()
+        self._desk.start(self._folder.file, "check", str(self._folder.file), "--json", *options)
+
+    def _look(self) -> None:
+        """Show what changed since the last look."""
+        if not self._folder.file.exists():
+            state: tuple[object, ...] = ("gone",)
+        else:
+            jobs = [job for job in self._desk.jobs.jobs if job.take == self._folder.file]
+            state = (self._folder.state, *((job.kind, job.state, len(job.notes)) for job in jobs))
+        if state != self._shown:
+            self._shown = state
+            self._work.refresh()
+            self._findings.refresh()
+        else:
+            for update in self._updates:
+                update()
+
+    @ui.refreshable_method
+    def _work(self) -> None:
+        """Jobs of the take with their progress, and what they made."""
+        t, file = self._t, self._folder.file
+        self._updates: list[Callable[[], None]] = []
+        if not file.exists():
+            ui.label(t("take.no_take", file=file)).props('role="alert"')
+            return
+        jobs = [job for job in self._desk.jobs.jobs if job.take == file]
+        for job in jobs:
+            if job.state != DONE:
+                with card(f"{t('take.progress_title')}: {t(f'state.{job.state}')}"):
+                    self._job(job)
+        open_jobs = any(job.is_open for job in jobs)
+        if not open_jobs and self._folder.state == "unfinished" and not any(job.state == PAUSED for job in jobs):
+            with card(t("state.unfinished")):
+                ui.label(t("take.paused_text"))
+                self._resume_buttons()
+        if self._folder.people and not open_jobs:
+            self._results()
+
+    def _job(self, job: Job) -> None:
+        t = self._t
+        if job.state == WAITING:
+            before = next((other for other in self._desk.jobs.jobs if other.state == RUNNING), None)
+            if before is not None and before is not job:
+                ui.label(t("take.waiting_for", name=short(before.take, self._desk.root)))
+        steps = ui.column().classes("w-full gap-1").mark("progress")
+        bars: dict[str, tuple[Any, Any]] = {}
+
+        def update() -> None:
+            for what, progress in job.steps.items():
+                if what not in bars:
+                    with steps, ui.row().classes("w-full items-center no-wrap"):
+                        ui.label(self._step_name(what)).classes("w-64 text-sm")
+                        bar = ui.linear_progress(0.0, show_value=False).classes("flex-1")
+                        bars[what] = bar, ui.label().classes("w-40 text-sm")
+                bar, left = bars[what]
+                bar.value = round(progress.share, 3)
+                seconds = progress.seconds_left
+                left.text = "" if seconds is None or progress.share >= 1.0 else _time_left(t, seconds)
+
+        update()
+        self._updates.append(update)
+        for note in job.notes[-_MAX_NOTES:]:
+            ui.label(note).classes("text-sm text-grey-8")
+        if job.state == FAILED and job.error is not None:
+            show_error(t, job.error)
+        if job.is_open:
+            ui.button(t("take.pause"), icon="pause", on_click=job.pause).props("outline").mark("pause")
+        elif job.state == PAUSED:
+            ui.label(t("take.paused_text"))
+            if job.kind == "track":
+                self._resume_buttons()
+
+    def _resume_buttons(self) -> None:
+        with ui.row():
+            ui.button(self._t("take.resume"), icon="play_arrow", on_click=lambda: self._track()).mark("resume")
+            ui.button(self._t("take.restart"), icon="restart_alt", on_click=lambda: self._track("--restart")).props("flat")
+
+    def _step_name(self, what: str) -> str:
+        kind, _, name = what.partition(" ")
+        return self._t.get(f"step.{what}") or (self._t.get(f"step.{kind}") or what).format(name=name)
+
+    def _results(self) -> None:
+        t, people = self._t, self._folder.people
+        with ui.row():
+            for k, folder in enumerate(people, start=1):
+                said = t("take.result") if len(people) == 1 else t("take.result_of", number=k)
+                to = link("/result", path=self._folder.file, folder=folder)
+                ui.button(said, icon="accessibility_new", on_click=lambda to=to: ui.navigate.to(to)).mark("result")
+                if (folder / "report.html").is_file():
+                    report = self._desk.prefix + link("/file", path=folder / "report.html")
+                    ui.link(t("take.report"), report, new_tab=True).mark("report")
+
+    @ui.refreshable_method
+    def _findings(self) -> None:
+        """What the last check found, each with the buttons that mend it."""
+        job = self._desk.jobs.of(self._folder.file, "check")
+        if job is None or job.state != DONE or job.result is None:
+            return
+        t = self._t
+        with card(t("take.check_title")):
+            shown = [found for found in job.result["findings"] if found["severity"] != "good"]
+            if not shown:
+                ui.label(t("take.check_none"))
+            for found in shown:
+                with ui.row().classes("items-start no-wrap"):
+                    colour = to_hex(COLOURS[found["severity"]])
+                    ui.icon(_ICONS[found["severity"]], size="sm").style(f"color: {colour}")
+                    with ui.column().classes("gap-0"):
+                        ui.label(found["text"])
+                        ui.label(found["remedy"]).classes("text-sm text-grey-8")
+                        with ui.row():
+                            for remedy in _REMEDIES.get(found["kind"], ()) if found["severity"] != "note" else ():
+                                ui.button(t(f"take.{remedy}"), on_click=lambda r=remedy: self._check(*_REFINE[r]))
+            page = self._desk.prefix + link("/file", path=self._folder.check_page)
+            ui.element("iframe").props(f'src="{page}" title="{t("take.check_page")}"').classes("w-full h-[36rem] border")
+            ui.link(t("take.check_page"), page, new_tab=True)
+
+
+def _time_left(t: Texts, seconds: float) -> str:
+    if seconds < 90:
+        return t("take.left_seconds", seconds=max(1, round(seconds)))
+    return t("take.left", minutes=round(seconds / 60))

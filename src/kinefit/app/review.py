@@ -1,0 +1,120 @@
+"""One result that is open: its motion, the images of its cameras with the fit drawn on them, and its 3D viewer."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kinefit.batch.viewed import content_of
+from kinefit.calibration.people.of_take import find_cameras
+from kinefit.errors import ObservationError
+from kinefit.exporters.pictures.overlay import draw_overlay
+from kinefit.preparing.faces import shown_video
+from kinefit.readers.motion import read_motion
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
+from kinefit.readers.video import Video
+from kinefit.serving.access import Access
+from kinefit.viewers.player import Player
+from kinefit.viewers.stage import open_server, quiet
+
+_DOUBTFUL_QUALITY = 0.5  # of a frame: fewer than half of its measurements agree with the fit
+_MIN_DOUBTFUL_S = 0.1  # of moments that are marked; shorter ones within this time are one
+
+
+class Review:
+    """A motion with everything to look at it.
+
+    Parameters
+    ----------
+    take : Path of the take file
+    folder : Path of the person's results
+    hide_faces : whether faces are hidden in all images
+
+    Attributes
+    ----------
+    motion : Motion
+    player : Player of the 3D scene, whose clock is that of the page
+    address : of the 3D scene
+
+    Raises
+    ------
+    KinefitError
+        The take or its results cannot be read.
+    """
+
+    def __init__(self, take: Path, folder: Path, *, hide_faces: bool) -> None:
+        self.folder, self._hide_faces = folder, hide_faces
+        file = folder / "motion.npz"
+        self._written = file.stat().st_mtime_ns if file.exists() else 0
+        self.motion = read_motion(file)
+        self.take = find_cameras(replace(read_take(take), hide_faces=hide_faces))
+        self.seen = load_observations(self.take)
+        self._videos: dict[str, Video] = {}
+        self._reading = threading.Lock()
+        access = Access()
+        self._server = open_server(0, access, label=self.motion.name)
+        self.address = access.url(self._server.get_port())
+        self.player = Player(self._server, content_of([self.motion], self.take, self.seen))
+        self._ended = threading.Event()
+        threading.Thread(target=self.player.run, args=(self._ended.is_set,), daemon=True).start()
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Cameras with a video."""
+        return tuple(self.seen.videos)
+
+    def size(self, camera: str) -> tuple[int, int]:
+        """(width, height) [px] of a camera's video."""
+        return self.seen.images[camera].size
+
+    def is_current(self, hide_faces: bool) -> bool:
+        """Whether the motion was not written since, and faces are shown as they were."""
+        file = self.folder / "motion.npz"
+        return file.exists() and file.stat().st_mtime_ns == self._written and hide_faces == self._hide_faces
+
+    def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
+        """A camera's image (H, W, 3) at a frame of the motion, with the fit drawn on it.
+
+        Raises
+        ------
+        KinefitError
+            No such camera or frame, or its video cannot be read.
+        """
+        if camera not in self.seen.videos or self.seen.rig is None or not 0 <= frame < len(self.motion):
+            raise ObservationError(f"no image of camera {camera} at frame {frame}", remedy="Open the result again.")
+        offset = next(entry.time_offset for entry in self.take.cameras if entry.name == camera)
+        with self._reading:
+            if camera not in self._videos:
+                self._videos[camera] = shown_video(self.take, self.seen, camera)
+            video = self._videos[camera]
+            at = video.frame_at(float(self.motion.times[frame]) - offset)
+            image = video.read(at) if at is not None else np.full((*video.size[::-1], 3), 60, np.uint8)
+        residuals = self.motion.residuals.get(camera)
+        return draw_overlay(
+            image, self.motion, frame, self.seen.rig[camera], image_frame=self.seen.images[camera],
+            residuals=residuals,
+        )  # fmt: skip
+
+    def doubtful(self) -> list[tuple[int, int]]:
+        """Frames (first, one after the last) of moments in which most measurements contradict the fit."""
+        gap = max(1, round(_MIN_DOUBTFUL_S * self.motion.rate))
+        moments: list[tuple[int, int]] = []
+        for frame in np.flatnonzero(self.motion.quality < _DOUBTFUL_QUALITY):
+            if moments and frame - moments[-1][1] < gap:
+                moments[-1] = moments[-1][0], int(frame) + 1
+            else:
+                moments.append((int(frame), int(frame) + 1))
+        return [moment for moment in moments if moment[1] - moment[0] >= gap]
+
+    def close(self) -> None:
+        """Close the viewer and all videos."""
+        self._ended.set()
+        with quiet():
+            self._server.stop()
+        for video in self._videos.values():
+            video.close()

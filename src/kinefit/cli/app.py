@@ -1,0 +1,45 @@
+"""`kinefit app`: all of it in a page of the browser, without a typed word."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from kinefit.cli import _screen
+
+_EXAMPLES = """\b
+Examples:
+  kinefit app                       recordings in this folder and below it
+  kinefit app my_sessions           recordings in another folder
+"""
+
+
+@click.command("app", short_help="Do all of it in a page of the browser.", epilog=_EXAMPLES)
+@click.argument("folder", type=click.Path(path_type=Path), default=".")
+@click.option("--port", type=click.IntRange(0, 65535), default=8090, show_default=True, help="0: any free one.")
+@_screen.token_option
+@click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page.")
+@_screen.verbose_option
+def app(folder: Path, port: int, token: str | None, browser: bool) -> None:
+    """Do all of it in a page of the browser: from a folder of videos to a report, corrections and exports.
+
+    FOLDER is where your recordings are, and where dropped videos are put. Only this computer can open the page; nothing
+    is sent anywhere. Everything it makes is a file that the commands make, too. Closing the page stops nothing; Ctrl-C
+    here ends the app, and what is computed goes on from there the next time. Needs the extra `app`:
+    pip install 'kinefit[app]'.
+    """
+    from kinefit.app.server import serve
+    from kinefit.errors import FileError
+    from kinefit.serving.access import Access
+
+    root = folder.absolute()
+    if not root.is_dir():
+        raise FileError("no such folder", file=folder, remedy="Name the folder with your recordings.")
+
+    def opened(address: str) -> None:
+        _screen.say(f"kinefit app at {address}  (Ctrl-C ends)")
+        if browser:
+            click.launch(address)
+
+    serve(root, port, Access(token=token), opened)
