@@ -105,11 +105,7 @@ def _is_face(entry: KeypointsEntry) -> bool:
 
 def with_detections(take: Take, progress: Step | None = None, tell: Tell = warn) -> Take:
     """The take with the built-in detector's keypoints where it asks for them, or has nothing but videos."""
-    asked = any(entry.format == "detect" and entry.file is None for entry in take.keypoints)
-    videos = any(camera.video for camera in take.cameras) and not (
-        take.depth or take.stereo or take.silhouettes or take.regions or take.trackers
-    )
-    if not asked and (take.keypoints or take.skin or take.lines or take.surface_points or not videos):
+    if not uses_detector(take):
         return take
     outlines = any(entry.format == "detect" and entry.file is None for entry in take.silhouettes)
     files = ensure_detections(take, masks=True if outlines else None, progress=progress, tell=tell)
@@ -122,6 +118,15 @@ def with_detections(take: Take, progress: Step | None = None, tell: Tell = warn)
         if not seen:
             tell("The detector finds no face: jaw and eyes are lost. It wants faces of 40 px or more in view.")
     return replace(take, keypoints=tuple(entries))
+
+
+def uses_detector(take: Take) -> bool:
+    """Whether a take asks for the built-in detector's keypoints, or has nothing but videos and so gets them."""
+    if any(entry.format == "detect" and entry.file is None for entry in take.keypoints):
+        return True
+    others = (take.depth, take.stereo, take.silhouettes, take.regions, take.trackers, take.keypoints, take.skin)
+    others += take.lines, take.surface_points
+    return any(camera.video for camera in take.cameras) and not any(others)
 
 
 def _with_file(entry: KeypointsEntry, take: Take) -> KeypointsEntry:

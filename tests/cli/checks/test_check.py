@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from kinefit.bodies import load_body
-from kinefit.cli.checks._refine import free_name, with_calibration, with_keys
+from kinefit.cli.checks._refine import free_name
 from kinefit.cli.checks.check import check
 from kinefit.errors import KinefitError
 from kinefit.exporters.marker_files import write_markers
@@ -151,19 +151,6 @@ def test_a_refined_calibration_never_takes_a_name_that_is_there(tmp_path):
         (tmp_path / name).touch()
     assert free_name(old).name == "Calib_refined2.qca.txt"
     assert free_name(tmp_path).name == f"{tmp_path.name}_refined"
-
-
-def test_a_copy_of_the_take_differs_in_what_was_refined_only(take):
-    text = take.read_text()
-    new = with_keys(with_calibration(text, "calibration_refined.toml"), "camera", 1, {"time_offset": "0.0125"})
-    shutil.copy(take.with_name("calibration.toml"), take.with_name("calibration_refined.toml"))
-    take.write_text(new)
-    read = read_take(take)
-    assert read.calibration.file.name == "calibration_refined.toml"
-    assert [camera.time_offset for camera in read.cameras] == [0.0, 0.0125, 0.0, 0.0]
-    again = with_keys(with_calibration(new, "calibration.toml"), "camera", 1, {"time_offset": "0.02"})
-    assert again.count("time_offset") == 1
-    assert text.splitlines()[0] == new.splitlines()[0]
 
 
 def walker():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +11,7 @@ from kinefit.calibration.check.sensors import fit_sensors
 from kinefit.cli import _screen
 from kinefit.diagnostics.keypoints import Check
 from kinefit.diagnostics.sensor_fit import SensorAlignment, marker_index
-from kinefit.errors import TakeError, command
+from kinefit.errors import FileError, TakeError, command
 from kinefit.geometry.camera import Rig
 
 if TYPE_CHECKING:
@@ -97,6 +96,7 @@ def write_refined(found: Check, refined: Refined, path: Path) -> None:
     Raises TakeError where the form of [calibration] cannot be changed.
     """
     from kinefit.exporters.atomic import write_text
+    from kinefit.exporters.take_text import quoted, with_keys
     from kinefit.readers.calibration.write import write_calibration_like
     from kinefit.readers.take.file import read_take
 
@@ -118,7 +118,7 @@ def write_refined(found: Check, refined: Refined, path: Path) -> None:
     if len(rig):
         file = _relative(new, path.absolute().parent)
         changed.append(f'file = "{file}" in [calibration]')
-        text = with_calibration(text, file)
+        text = with_keys(text, "calibration", None, {"file": quoted(file)})
     for number, lines in markers.items():
         changed.append(f"{' and '.join(lines)} in [[markers]] {number + 1}")
         text = with_keys(text, "markers", number, dict(line.split(" = ") for line in lines))
@@ -130,11 +130,12 @@ def write_refined(found: Check, refined: Refined, path: Path) -> None:
             text = with_keys(text, "camera", number, {"time_offset": value})
     beside = free_name(path)
     write_text(beside, text)
-    used = read_take(beside)
-    if len(rig) and (used.calibration is None or used.calibration.file != new.absolute()):
+    try:
+        read_take(beside)
+    except FileError as error:  # [calibration] twice: the take has it in another form
         beside.unlink()
         remedy = f"Write into it: {'; '.join(changed)}."
-        raise TakeError("a form of [calibration] that cannot be changed here", file=path, remedy=remedy)
+        raise TakeError("a form of [calibration] that cannot be changed here", file=path, remedy=remedy) from error
     _screen.say(f"\nWritten: {beside}, a copy of {path.name} with {', '.join(changed)}.")
     _screen.say(f"Next:\n  {command('track', beside)}")
 
@@ -152,22 +153,3 @@ def free_name(path: Path) -> Path:
         number += 1
         candidate = path.with_name(f"{stem}_refined{number}{dot}{endings}")
     return candidate
-
-
-def with_calibration(text: str, file: str) -> str:
-    """The text of a take file with another calibration file."""
-    quoted = '"' + file.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    return re.sub(
-        r"(?ms)(^\[calibration\][^\[]*?^\s*file\s*=\s*)(\"[^\"\n]*\"|'[^'\n]*')", lambda m: m[1] + quoted, text
-    )
-
-
-def with_keys(text: str, table: str, number: int, keys: dict[str, str]) -> str:
-    """The text of a take file with keys of the `number`-th (from 0) `[[table]]` set to values as TOML has them."""
-    tables = re.split(r"(?m)(?=^[ \t]*\[)", text)
-    own = [i for i, t in enumerate(tables) if re.match(rf"[ \t]*\[\[\s*{table}\s*\]\]", t)][number]
-    for key in keys:
-        tables[own] = re.sub(rf"(?m)^[ \t]*{key}[ \t]*=[^\n]*\n", "", tables[own])
-    head, rest = tables[own].split("\n", 1) if "\n" in tables[own] else (tables[own], "")
-    tables[own] = "\n".join([head, *(f"{key} = {value}" for key, value in keys.items()), rest])
-    return "".join(tables)

@@ -17,6 +17,7 @@ from kinefit.readers.keypoint_sets import FACE_SET, KEYPOINT_SETS, MEDIAPIPE_SET
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.entries import SKIN_SETS, CalibrationEntry, StartEntry
 from kinefit.readers.take.streams import odd_streams, refuse_streams
+from kinefit.readers.take.values import wrong_ranges
 from kinefit.readers.units import LENGTHS, worth
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ _ONLY: dict[str, dict[str, tuple[str, ...]]] = {
     "keypoints": {
         "file": ("openpose", "mediapipe", "caliscope", "detect"), "frame": ("openpose", "mediapipe", "caliscope"),
         "rate": ("openpose", "mediapipe", "caliscope"), "face": ("skin",), "stream": ("openpose",),
+        **dict.fromkeys(("excluded", "swapped"), ("openpose", "mediapipe", "caliscope", "detect")),
     },
     "silhouette": {
         "file": ("masks", "background", "detect"), "frame": ("masks",), "rate": ("masks",),
@@ -34,7 +36,6 @@ _ONLY: dict[str, dict[str, tuple[str, ...]]] = {
 }  # fmt: skip
 """Formats for which a key means something: with any other it is refused."""
 
-_MAX_STEPS = 10**9  # steps of a take
 ONE_CAMERA = "keypoints of one camera do not tell how far a person is; two cameras do, or one beside depth or markers"
 _SETS = {"openpose": tuple(KEYPOINT_SETS), "skin": SKIN_SETS, "detect": (*MEDIAPIPE_SETS, FACE_SET)}
 
@@ -105,8 +106,8 @@ def _values(take: Take) -> None:
         _calibration(take, take.calibration, refuse)
     if take.pose is not None:
         _pose(take, take.pose, refuse)
-    if take.frames is not None and not -_MAX_STEPS < take.frames[0] < take.frames[1] < _MAX_STEPS:
-        refuse(f"frames {list(take.frames)}", "[take] frames", "Give [first, one after the last].")
+    if not 0 < take.click_sigma < 1e4:
+        refuse(f"click_sigma = {take.click_sigma:g} px", "[start]", "Give a positive number.")
     for camera in take.cameras:
         if not abs(camera.time_offset) < 1e6 or (camera.size and not _is_size(camera.size)):
             refuse(f"size {camera.size}, time offset {camera.time_offset} s", f"camera {camera.name}", "Give px and s.")
@@ -120,8 +121,6 @@ def _values(take: Take) -> None:
             refuse(f"no file of {source.format} keypoints", place, 'Write file = "...", or format = "detect".')
         if source.face is not None and not all(v > 0 for v in source.face[2:]):
             refuse(f"face = {list(source.face)}", place, "Give [left, top, width, height] in pixels of the video.")
-        if source.frames is not None and not -_MAX_STEPS < source.frames[0] < source.frames[1] < _MAX_STEPS:
-            refuse(f"frames {list(source.frames)}", place, "Give [first, one after the last].")
     pixels: dict[str, tuple[Any, ...]] = {"keypoints": (*take.keypoints, *take.skin), "lines": take.lines}
     for kind, entries in (pixels | {"silhouette": take.silhouettes, "region": take.regions}).items():
         for e in entries:
@@ -156,7 +155,7 @@ def _values(take: Take) -> None:
         shift, turn = getattr(table, "shift", (0.0,)), getattr(table, "turn", (0.0,))
         if not (all(abs(v) < 1e4 for v in shift) and all(abs(v) <= 360 for v in turn)):
             refuse(f"shift {list(shift)}, turn {list(turn)}", place, "Give metres and degrees.")
-    for problem, place, remedy in (*odd_streams(take), *_odd_depth(take)):
+    for problem, place, remedy in (*wrong_ranges(take), *odd_streams(take), *_odd_depth(take)):
         refuse(problem, place, remedy)
 
 
@@ -191,8 +190,8 @@ def _pose(take: Take, pose: StartEntry, refuse: Callable[[str, str, str], None])
     if take.start is not None:
         refuse("[start] has no use with start = ... in [take]", "[start]", "Leave one of both out.")
     up = np.array(pose.upward or UP_AXES[take.up], float)
-    if not 0 < pose.click_sigma < 1e4:
-        refuse(f"click_sigma = {pose.click_sigma:g} px", "[start]", "Give a positive number.")
+    if pose.at is None or pose.forward is None:
+        return refuse("no `at` and `forward`", "[start]", "Give both; clicks alone need none, and no other key.")
     numbers = np.concatenate([pose.at, pose.forward, up, list(pose.angles.values())])
     if not np.isfinite(numbers).all() or np.abs(numbers).max() > 1e6:
         refuse("numbers that are no place, direction or angle", "[start]", "Give metres, directions and degrees.")
@@ -237,7 +236,7 @@ def _uses(take: Take) -> None:
     for table, entries in given.items():
         for entry in entries:
             for key, formats in _ONLY[table].items():
-                if getattr(entry, key) is not None and entry.format not in formats:  # type: ignore[attr-defined]
+                if getattr(entry, key) not in (None, ()) and entry.format not in formats:  # type: ignore[attr-defined]
                     raise TakeError(
                         f"'{key}' has no use with format = \"{entry.format}\"", file=take.path,  # type: ignore[attr-defined]
                         place=f"{table} of camera {entry.camera}",  # type: ignore[attr-defined]
@@ -333,7 +332,7 @@ def _files(take: Take) -> None:
     named += [(f"keypoints of camera {entry.camera}", entry.file) for entry in take.keypoints]
     named += [(f"silhouette of camera {entry.camera}", entry.file) for entry in take.silhouettes]
     named += [(f"lines of camera {entry.camera}", entry.file) for entry in take.lines]
-    named += [("[start] clicks", take.pose.clicks if take.pose else None)]
+    named += [("[start] clicks", take.clicks)]
     named += [("[take] subject", take.subject), ("[take] start", take.start), ("[session] norms", take.session.norms)]
     named += [(kind, table.file) for kind, table in _of_places(take)]
     named += [(f"markers {entry.file.name}, model", entry.model) for entry in take.markers]

@@ -31,14 +31,19 @@ RENAMED: dict[str, dict[str, str]] = {
 class StartEntry(_Entry, frozen=True, kw_only=True):
     """`[start]`: where the body is at one step, for sensors that alone cannot find it."""
 
-    at: tuple[float, float, float]  # [m] of the root's origin in the world
-    forward: tuple[float, float, float]  # direction in the world in which the root's x looks
+    at: tuple[float, float, float] | None = None  # [m] of the root's origin in the world; of clicks alone: none
+    forward: tuple[float, float, float] | None = None  # direction in the world in which the root's x looks
     upward: tuple[float, float, float] | None = None  # and its y; default: the take's `up`
     angles: dict[str, float] = {}  # [deg] or, of joints that slide, [m]; others are the body's usual ones
     step: int | None = None  # of the common time; default: the first
     low_pass: bool = True  # whether silhouettes are also fitted with low-pass approximations of the surface first
-    clicks: Path | None = None  # joints clicked at this step and at others, which are measurements of their steps
+    clicks: Path | None = None  # joints clicked at any steps, which are measurements of their steps
     click_sigma: float = 3.0  # [px] standard deviation of a click along each axis, in the calibration's image
+
+    @property
+    def is_clicks_alone(self) -> bool:
+        """Whether it states clicks, and no pose."""
+        return self.clicks is not None and self == StartEntry(clicks=self.clicks, click_sigma=self.click_sigma)
 
 
 class SessionEntry(_Entry, frozen=True, kw_only=True):
@@ -94,6 +99,8 @@ class KeypointsEntry(_Entry, frozen=True, kw_only=True):
     rate: float | None = None  # [Hz]; default: the camera's video, or the take
     sigma: float = KEYPOINT_SIGMA  # [px] standard deviation, in the calibration's image
     frames: tuple[int, int] | None = None  # steps (start, stop) at which they count; default: all
+    excluded: tuple[tuple[int, int], ...] = ()  # ranges (start, stop) of steps at which they do not count
+    swapped: tuple[tuple[int, int], ...] = ()  # ranges (start, stop) of steps at which left is right
     face: tuple[float, float, float, float] | None = None  # [px] of "skin": left, top, width, height in the video
 
 

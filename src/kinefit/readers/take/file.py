@@ -104,6 +104,10 @@ class Take:
         Motion file (`motion.npz`) that gives body and pose of the first step; None: they are sought.
     pose : StartEntry or None
         Where the body is at one step.
+    clicks : Path or None
+        Joints that were clicked in images, see `read_clicks`.
+    click_sigma : float [px]
+        Standard deviation of a click along each axis.
     size : bool or None
         Whether the body is fitted to the person's size and shape; None: unless `start` tells it.
     frames : (start, stop) or None
@@ -134,6 +138,8 @@ class Take:
     regions: tuple[RegionEntry, ...] = ()
     start: Path | None = None
     pose: StartEntry | None = None
+    clicks: Path | None = None
+    click_sigma: float = StartEntry().click_sigma
     size: bool | None = None
     person: int | str | None = None
     skin: tuple[KeypointsEntry, ...] = ()
@@ -182,7 +188,7 @@ def read_take(path: str | PathLike[str]) -> Take:
         content = msgspec.convert(raw, _TakeFile, dec_hook=_path_in(folder))
     except msgspec.ValidationError as error:
         raise wrong_value(error, TABLES, path) from error
-    head = content.take
+    head, start = content.take, content.start or StartEntry()
     body = str(folder / head.body) if head.body.endswith((".toml", ".npz")) else head.body
     take = Take(
         path=path, name=head.name or path.stem, rate=head.rate, up=head.up, body=body, height=head.height,
@@ -191,7 +197,8 @@ def read_take(path: str | PathLike[str]) -> Take:
         depth=content.depth, stereo=content.stereo,
         silhouettes=content.silhouette, regions=content.region,
         skin=tuple(k for k in content.keypoints if k.format == "skin"), lines=content.lines, start=head.start,
-        pose=content.start, size=head.size, person=head.person, session=content.session,
+        pose=None if start.is_clicks_alone else content.start, clicks=start.clicks, click_sigma=start.click_sigma,
+        size=head.size, person=head.person, session=content.session,
         surface_points=content.surface_points, trackers=content.tracker, hide_faces=head.hide_faces,
     )  # fmt: skip
     check_take(take)

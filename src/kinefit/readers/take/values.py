@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
 
 from kinefit.errors import TakeError
 
+if TYPE_CHECKING:
+    from kinefit.readers.take.file import Take
+
+_MAX_STEPS = 10**9  # steps of a take
 _WORDS = {
     "float": "a number", "int": "a whole number", "str": "a text", "bool": "true or false", "array": "a list",
     "object": "a table", "null": "nothing", "date": "a date",
@@ -28,6 +32,25 @@ def wrong_value(error: msgspec.ValidationError, tables: Mapping[str, type[msgspe
     known = listed and ("enum" in message or "Invalid" in message)
     remedy = f"There are: {listed}." if known else _form(message, key)
     return TakeError(_plain(message), file=path, place=place.rstrip(", ") if at else None, remedy=remedy)
+
+
+def wrong_ranges(take: Take) -> Iterator[tuple[str, str, str]]:
+    """Ranges of steps that cannot be: problem, place, remedy."""
+    form = "Give [first, one after the last]"
+    if take.frames is not None and not _is_range(take.frames):
+        yield f"frames {list(take.frames)}", "[take] frames", f"{form}."
+    for source in (*take.keypoints, *take.skin):
+        place = f"keypoints of camera {source.camera}"
+        if source.frames is not None and not _is_range(source.frames):
+            yield f"frames {list(source.frames)}", place, f"{form}."
+        for key in ("excluded", "swapped"):
+            for steps in getattr(source, key):
+                if steps[0] < 0 or not _is_range(steps):
+                    yield f"{key} has {list(steps)}", place, f"{form}, counted from 0, for every range."
+
+
+def _is_range(steps: tuple[int, int]) -> bool:
+    return -_MAX_STEPS < steps[0] < steps[1] < _MAX_STEPS
 
 
 def _plain(message: str) -> str:
@@ -60,6 +83,8 @@ def _form(message: str, key: str) -> str | None:
         return 'Write it in quotes: unit = "mm", "cm" or "m".'
     if key in ("unit", "time_unit") and "str" in given:
         return "Write mm, cm or m in quotes, or a number of metres." if key == "unit" else 'Write "s", "ms" or "us".'
+    if key.startswith(("excluded", "swapped")):
+        return f"Write a list of ranges: {key.partition('[')[0]} = [[0, 100], [150, 200]]."
     if key == "frames":
         return "Write the first and the one after the last: frames = [0, 100]."
     if "str" in given and ("float" in wanted or "int" in wanted):
