@@ -70,7 +70,7 @@ class Review:
 
     def size(self, camera: str) -> tuple[int, int]:
         """(width, height) [px] of a camera's video."""
-        return self.seen.images[camera].size
+        return self._video(camera).size
 
     def is_current(self, hide_faces: bool) -> bool:
         """Whether the motion was not written since, and faces are shown as they were."""
@@ -89,9 +89,7 @@ class Review:
             raise ObservationError(f"no image of camera {camera} at frame {frame}", remedy="Open the result again.")
         offset = next(entry.time_offset for entry in self.take.cameras if entry.name == camera)
         with self._reading:
-            if camera not in self._videos:
-                self._videos[camera] = shown_video(self.take, self.seen, camera)
-            video = self._videos[camera]
+            video = self._video(camera)
             at = video.frame_at(float(self.motion.times[frame]) - offset)
             image = video.read(at) if at is not None else np.full((*video.size[::-1], 3), 60, np.uint8)
         residuals = self.motion.residuals.get(camera)
@@ -99,6 +97,11 @@ class Review:
             image, self.motion, frame, self.seen.rig[camera], image_frame=self.seen.images[camera],
             residuals=residuals,
         )  # fmt: skip
+
+    def _video(self, camera: str) -> Video:
+        if camera not in self._videos:
+            self._videos[camera] = shown_video(self.take, self.seen, camera)
+        return self._videos[camera]
 
     def doubtful(self) -> list[tuple[int, int]]:
         """Frames (first, one after the last) of moments in which most measurements contradict the fit."""

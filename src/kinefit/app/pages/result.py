@@ -178,7 +178,7 @@ class _ResultPage:
                 self._camera_buttons(which)
         with ui.row().classes("items-center"):
             ui.label(t("result.drag"))
-            names = list(self._review.motion.body.landmarks)
+            names = list(self._review.motion.body.landmarks.names)
             self._joint = ui.select(names, label=t("result.joint"), with_input=True, clearable=True).classes("w-48")
         self._list()
 
