@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 WAITING, RUNNING, DONE, PAUSED, FAILED = "waiting", "running", "done", "paused", "failed"
-State = Literal["waiting", "running", "done", "paused", "failed"]
+"""States of a job."""
 
 _INTERRUPTED = 130  # exit code of a command that was stopped as by Ctrl-C
 _MAX_LINE_BYTES = 2**22  # of an event, or of a line of a result
@@ -54,7 +54,7 @@ class Job:
 
     Attributes
     ----------
-    state : "waiting", "running", "done", "paused" or "failed"
+    state : of WAITING, RUNNING, DONE, PAUSED and FAILED
     steps : {name of the work: Progress}, in the order of their begin
     notes : sentences of the command
     error : {"problem", "at", "try"} of a command that failed
@@ -63,7 +63,7 @@ class Job:
 
     take: Path
     command: tuple[str, ...]
-    state: State = WAITING
+    state: str = WAITING
     steps: dict[str, Progress] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     error: dict[str, str] | None = None

@@ -60,6 +60,7 @@ class Review:
         self._server = open_server(0, access, label=self.motion.name)
         self.address = access.url(self._server.get_port())
         self.player = Player(self._server, content_of([self.motion], self.take, self.seen))
+        self._server.gui.main_panel.minimize()
         self._ended = threading.Event()
         threading.Thread(target=self.player.run, args=(self._ended.is_set,), daemon=True).start()
 

@@ -21,6 +21,7 @@ from kinefit.rendering.colours import to_hex
 
 _REFRESH_S = 0.1  # between two looks at the clock of the 3D figure
 _IMAGE_PX = 720  # longer side of a camera's image
+_IMAGE_AREA_REM = 16.0  # side of a square with as much area as each image has on the page
 _MAX_POINTS = 2000  # of a curve
 
 
@@ -54,11 +55,13 @@ class _ResultPage:
         motion = review.motion
         with ui.row().classes("w-full items-stretch"):
             figure = ui.element("iframe").props(f'src="{review.address}" title="3D"')
-            figure.classes("flex-1 min-w-[320px] h-[28rem] border")
+            figure.classes("flex-1 min-w-[320px] min-h-[28rem] border")
             with ui.row().classes("flex-1 min-w-[320px] content-start gap-1"):
                 for camera in review.cameras:
+                    width, height = review.size(camera)
                     image = ui.interactive_image(on_mouse=lambda event, camera=camera: self._click(camera, event))
-                    self._images[camera] = image.classes("w-[calc(50%-4px)]").props(f'alt="{camera}"')
+                    image.style(f"width: min(100%, {_IMAGE_AREA_REM * (width / height) ** 0.5:.1f}rem)")
+                    self._images[camera] = image.props(f'alt="{camera}"')
         self._time_line()
         with card(t("result.angle")):
             names = motion.body.tree.coordinates
@@ -86,7 +89,7 @@ class _ResultPage:
         )
         ui.html(f'<div style="position:relative;height:8px">{marks}</div>', sanitize=False).classes("w-full")
         self._slider = ui.slider(min=0, max=last, step=1, value=0).classes("w-full").mark("time")
-        self._slider.props(f'aria-label="{t("result.time", time="", frame="", count="")}"')
+        self._slider.props(f'aria-label="{t("result.frame")}"')
         self._slider.on("update:model-value", lambda event: self._go(event.args), throttle=0.05)
         with ui.row().classes("items-center"):
             self._play = ui.button(t("result.play"), icon="play_arrow", on_click=self._toggle).props("outline")
@@ -124,9 +127,10 @@ class _ResultPage:
             return
         self._shown = frame = clock.frame
         self._slider.value = frame
-        quality = f"{100 * motion.quality[frame]:.0f} %"
-        time = f"{motion.times[frame]:.2f}"
-        self._now.text = f"{t('result.time', time=time, frame=frame, count=len(motion))}, {quality} {t('result.quality')}"
+        self._now.text = t(
+            "result.time", time=f"{motion.times[frame]:.2f}", frame=frame, count=len(motion),
+            quality=f"{100 * motion.quality[frame]:.0f}",
+        )  # fmt: skip
         for camera, image in self._images.items():
             image.set_source(
                 link("/image/frame", folder=self._review.folder, camera=camera, frame=frame, longest=_IMAGE_PX)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import quote
 
-from nicegui import run, ui
+from nicegui import ui
 
 from kinefit.app.desk import Desk
 from kinefit.app.texts import Texts, preferred_language
@@ -85,7 +86,7 @@ def show_error(t: Texts, error: KinefitError | dict[str, str]) -> None:
 
 async def in_thread(function: Callable[..., Value], *arguments: Any, **options: Any) -> Value:
     """Call something slow in a thread, so that the pages answer meanwhile."""
-    return await run.io_bound(function, *arguments, **options)
+    return await asyncio.to_thread(function, *arguments, **options)
 
 
 def short(path: Path, root: Path) -> str:

@@ -216,7 +216,8 @@ class _TakePage:
     def _resume_buttons(self) -> None:
         with ui.row():
             ui.button(self._t("take.resume"), icon="play_arrow", on_click=lambda: self._track()).mark("resume")
-            ui.button(self._t("take.restart"), icon="restart_alt", on_click=lambda: self._track("--restart")).props("flat")
+            restart = ui.button(self._t("take.restart"), icon="restart_alt", on_click=lambda: self._track("--restart"))
+            restart.props("flat")
 
     def _step_name(self, what: str) -> str:
         kind, _, name = what.partition(" ")
@@ -255,7 +256,8 @@ class _TakePage:
                             for remedy in _REMEDIES.get(found["kind"], ()) if found["severity"] != "note" else ():
                                 ui.button(t(f"take.{remedy}"), on_click=lambda r=remedy: self._check(*_REFINE[r]))
             page = self._desk.prefix + link("/file", path=self._folder.check_page)
-            ui.element("iframe").props(f'src="{page}" title="{t("take.check_page")}"').classes("w-full h-[36rem] border")
+            frame = ui.element("iframe").props(f'src="{page}" title="{t("take.check_page")}"')
+            frame.classes("w-full h-[36rem] border")
             ui.link(t("take.check_page"), page, new_tab=True)
 
 
