@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.batch.viewed import content_of
-from kinefit.calibration.people.of_take import find_cameras
+from kinefit.batch.viewed import content_of, has_same_cameras
+from kinefit.calibration.people.of_take import last_found
 from kinefit.errors import ObservationError
 from kinefit.exporters.pictures.overlay import draw_overlay
 from kinefit.preparing.faces import shown_video
@@ -38,6 +38,7 @@ class Review:
     Attributes
     ----------
     motion : Motion
+    has_cameras : whether the calibration is still the motion's; if not, images are shown without the fit
     player : Player of the 3D scene, whose clock is that of the page
     address : of the 3D scene
 
@@ -52,14 +53,15 @@ class Review:
         file = folder / "motion.npz"
         self._written = file.stat().st_mtime_ns if file.exists() else 0
         self.motion = read_motion(file)
-        self.take = find_cameras(replace(read_take(take), hide_faces=hide_faces))
+        self.take = last_found(replace(read_take(take), hide_faces=hide_faces))
         self.seen = load_observations(self.take)
+        self.has_cameras = has_same_cameras(self.motion, self.take)
         self._videos: dict[str, Video] = {}
         self._reading = threading.Lock()
         access = Access()
         self._server = open_server(0, access, label=self.motion.name)
         self.address = access.url(self._server.get_port())
-        self.player = Player(self._server, content_of([self.motion], self.take, self.seen))
+        self.player = Player(self._server, content_of([self.motion], self.take, self.seen, find=False))
         self._server.gui.main_panel.minimize()
         self._ended = threading.Event()
         threading.Thread(target=self.player.run, args=(self._ended.is_set,), daemon=True).start()
@@ -79,7 +81,7 @@ class Review:
         return file.exists() and file.stat().st_mtime_ns == self._written and hide_faces == self._hide_faces
 
     def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
-        """A camera's image (H, W, 3) at a frame of the motion, with the fit drawn on it.
+        """A camera's image (H, W, 3) at a frame of the motion, with the fit drawn on it if `has_cameras`.
 
         Raises
         ------
@@ -93,6 +95,8 @@ class Review:
             video = self._video(camera)
             at = video.frame_at(float(self.motion.times[frame]) - offset)
             image = video.read(at) if at is not None else np.full((*video.size[::-1], 3), 60, np.uint8)
+        if not self.has_cameras:
+            return image
         residuals = self.motion.residuals.get(camera)
         return draw_overlay(
             image, self.motion, frame, self.seen.rig[camera], image_frame=self.seen.images[camera],
@@ -101,7 +105,7 @@ class Review:
 
     def _video(self, camera: str) -> Video:
         if camera not in self._videos:
-            self._videos[camera] = shown_video(self.take, self.seen, camera)
+            self._videos[camera] = shown_video(self.take, self.seen, camera, find=False)
         return self._videos[camera]
 
     def doubtful(self) -> list[tuple[int, int]]:

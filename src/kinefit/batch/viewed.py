@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -69,9 +70,13 @@ def gather(
 
 
 def content_of(
-    motions: Sequence[Motion], take: Take, seen: Observations, *, step: Step = silent, tell: Tell = silent
+    motions: Sequence[Motion], take: Take, seen: Observations, *, step: Step = silent, tell: Tell = silent,
+    find: bool = True,
 ) -> ViewerContent:  # fmt: skip
-    """Motions of a take, with its cameras, images and markers; without motions with its triangulated keypoints."""
+    """Motions of a take, with its cameras, images and markers; without motions with its triangulated keypoints.
+
+    Where faces are hidden, they are looked for first; without `find`, images in which they are unknown are blurred.
+    """
     import numpy as np
 
     from kinefit.preparing.faces import ensure_faces, shown_video
@@ -83,15 +88,26 @@ def content_of(
     for motion in motions:
         if motion.up != take.up:
             tell(f"{motion.name} has {motion.up} up, the take {take.up}: it is turned to the take's world.")
-    if take.hide_faces and seen.videos:
+    if take.hide_faces and seen.videos and find:
         ensure_faces(take, step, tell)
-    videos = {name: shown_video(take, seen, name) for name in seen.videos}
+    rig, videos = seen.rig, {name: shown_video(take, seen, name, find=find) for name in seen.videos}
+    if any(not has_same_cameras(motion, take) for motion in motions):
+        tell("Cameras and images are left out: the calibration changed since the motion was computed. Track it again.")
+        rig, videos = None, {}
     return ViewerContent(
-        tuple(motions), rig=seen.rig, up=take.up, name=take.name, steps=np.arange(*seen.frames) / seen.rate,
+        tuple(motions), rig=rig, up=take.up, name=take.name, steps=np.arange(*seen.frames) / seen.rate,
         points=None if motions else _triangulated(take, seen, tell),
         pictures=CameraImages(cameras, videos, seen.images, offsets, rate=seen.rate) if videos else None,
         markers=seen.markers, marker_offsets=tuple(entry.time_offset for entry in take.markers),
     )  # fmt: skip
+
+
+def has_same_cameras(motion: Motion, take: Take) -> bool:
+    """Whether a take's calibration is still the file with which the motion was computed, as far as the motion says."""
+    stated = motion.provenance.get("calibration", {}).get("sha256")
+    if stated is None or take.calibration is None or not take.calibration.file.is_file():
+        return True
+    return bool(stated == hashlib.sha256(take.calibration.file.read_bytes()).hexdigest())
 
 
 def _fitting(file: Path | None, name: str, tell: Tell) -> tuple[Take, Observations] | None:

@@ -100,8 +100,10 @@ class HiddenVideo(Video):
         return hide_all(image) if circles is None else hide_circles(image, np.concatenate([circles, self._more(i)]))
 
 
-def shown_video(take: Take, seen: Observations, camera: str) -> Video:
+def shown_video(take: Take, seen: Observations, camera: str, *, find: bool = True) -> Video:
     """A camera's video as images for others show it: with faces hidden, where the take says so.
+
+    Without `find`, videos in which faces were not looked for yet are blurred as a whole.
 
     Raises
     ------
@@ -111,7 +113,8 @@ def shown_video(take: Take, seen: Observations, camera: str) -> Video:
     path = seen.videos[camera]
     if not take.hide_faces:
         return Video(path, rate=seen.rate)
-    heads = ensure_faces(take, cameras=(camera,))[camera]
+    none = Heads(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 5)))
+    heads = ensure_faces(take, cameras=(camera,), find=find).get(camera, none)
     offset = next(entry.time_offset for entry in take.cameras if entry.name == camera)
 
     def of_keypoints(frame: int) -> NDArray:
@@ -133,9 +136,11 @@ def shown_video(take: Take, seen: Observations, camera: str) -> Video:
 
 def ensure_faces(
     take: Take, progress: Step | None = None, tell: Tell = lambda text: None, *,
-    cameras: Collection[str] | None = None,
+    cameras: Collection[str] | None = None, find: bool = True,
 ) -> dict[str, Heads]:  # fmt: skip
-    """{camera: Heads} of the videos of a take, or of some of its cameras; looked for where that was not done yet.
+    """{camera: Heads} of the videos of a take, or of some of its cameras.
+
+    Heads are looked for where that was not done yet; without `find`, these videos are missing.
 
     Raises
     ------
@@ -148,7 +153,7 @@ def ensure_faces(
 
     chosen = [job for job in jobs_of_take(take) if cameras is None or job.camera in cameras]
     jobs = {job: _seconds_key(job, f"{MODELS_PACKAGE} {_METHOD}") for job in chosen}
-    todo = [job for job, key in jobs.items() if _read(_file(job), key) is None]
+    todo = [job for job, key in jobs.items() if find and _read(_file(job), key) is None]
     if todo:
         from kinefit.images.detectors.face_detector import FaceDetector
         from kinefit.preparing.detecting import hushed

@@ -1,5 +1,7 @@
 """A take with several cameras and no calibration: these are found once, kept, and used by everything."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.calibration.people.test_skeletons import FRAMES, LATE, seen, turn_errors
@@ -7,7 +9,7 @@ from tests.calibration.people_data import BODY, room, walker
 
 from kinefit import read_take, track_take
 from kinefit.calibration.people import of_take
-from kinefit.calibration.people.of_take import cameras_file, find_cameras
+from kinefit.calibration.people.of_take import _holds_for, cameras_file, find_cameras, last_found
 from kinefit.errors import TakeError
 from kinefit.exporters.pictures.detections import write_detections
 from kinefit.observations import Detections
@@ -58,6 +60,9 @@ def test_what_was_found_is_used_again_until_something_changes(folder, monkeypatc
     monkeypatch.setattr(of_take, "calibrate_people", never)
     take = find_cameras(folder / "take.toml", tell=lambda text: None)
     assert take.calibration.file.name == "take-cameras.toml" and take.calibration.position_sigma > 0
+    trimmed = replace(read_take(folder / "take.toml"), frames=(2, FRAMES - 2))
+    assert find_cameras(trimmed, tell=lambda text: None).calibration == take.calibration
+    assert last_found(replace(trimmed, height=1.5)).calibration == take.calibration
     (folder / "take.toml").write_text(take_text("height = 1.6"))
     with pytest.raises(AssertionError, match="found anew"):
         find_cameras(folder / "take.toml", tell=lambda text: None)
@@ -94,3 +99,11 @@ def test_clocks_start_from_sound(folder, tmp_path, monkeypatch):
     np.testing.assert_allclose((np.array(found.time_offsets) - found.time_offsets[0]) * 30.0, truth * 30.0, atol=0.25)
     assert turn_errors(found.rig).max() < 1.0 and any("Clocks by sound" in note for note in found.notes)
     assert [camera.time_offset for camera in take.cameras] == pytest.approx(found.time_offsets)
+
+
+@pytest.mark.parametrize("known, asked, holds", [
+    ("h all", "h all", True), ("h all", "h 3 9", True), ("h 3 9", "h 4 9", True), ("h 3 9", "h 2 9", False),
+    ("h 3 9", "h all", False), ("h all", "g all", False), ("h", "h 3 9", False),
+])  # fmt: skip
+def test_cameras_of_more_steps_hold_for_fewer(known, asked, holds):
+    assert _holds_for(known, asked) == holds

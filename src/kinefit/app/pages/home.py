@@ -44,8 +44,8 @@ def _ask_faces(desk: Desk, t: Texts) -> None:
     with card(t("home.faces_title")):
         ui.label(t("home.faces_text"))
         with ui.row():
-            ui.button(t("home.hide"), icon="visibility_off", on_click=lambda: choose(True)).mark("hide")
-            ui.button(t("home.show"), icon="visibility", on_click=lambda: choose(False)).props("outline").mark("show")
+            ui.button(t("home.hide"), icon="visibility_off", on_click=lambda: choose(True))
+            ui.button(t("home.show"), icon="visibility", on_click=lambda: choose(False)).props("outline")
 
 
 class _FolderChoice:
@@ -73,7 +73,7 @@ class _FolderChoice:
                 self._entry("folder", folder.name, folder)
         names = ", ".join(video.name for video in videos[:_MAX_NAMES]) + (" ..." if len(videos) > _MAX_NAMES else "")
         ui.label(t("home.videos_here", count=len(videos), names=names) if videos else t("home.no_videos"))
-        ui.button(t("home.use"), icon="folder_open", on_click=self._open).mark("open")
+        ui.button(t("home.use"), icon="folder_open", on_click=self._open)
 
     def _entry(self, icon: str, name: str, folder: Path) -> None:
         with ui.item(on_click=lambda: self._go(folder)):
@@ -113,7 +113,7 @@ def _drop_area(desk: Desk, t: Texts) -> None:
     ui.upload(
         label=t("home.drop_label"), multiple=True, auto_upload=True, max_file_size=_MAX_UPLOAD_BYTES,
         on_multi_upload=keep, on_rejected=refuse,
-    ).props("accept='video/*,.mkv,.mts,.m2ts,.mxf'").classes("w-full").mark("drop")  # fmt: skip
+    ).props("accept='video/*,.mkv,.mts,.m2ts,.mxf'").classes("w-full")  # fmt: skip
 
 
 async def _takes(desk: Desk, t: Texts) -> None:

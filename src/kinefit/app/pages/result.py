@@ -21,7 +21,7 @@ from kinefit.rendering.colours import to_hex
 
 _REFRESH_S = 0.1  # between two looks at the clock of the 3D figure
 _IMAGE_PX = 720  # longer side of a camera's image
-_IMAGE_AREA_REM = 16.0  # side of a square with as much area as each image has on the page
+_IMAGES_REM = 25.0  # side of a square with as much area as all images have together
 _MAX_POINTS = 2000  # of a curve
 
 
@@ -52,16 +52,18 @@ class _ResultPage:
         self._shown = -1
         self._range: list[int | None] = [None, None]
         self._images: dict[str, ui.interactive_image] = {}
+        self._large: str | None = None
         motion = review.motion
+        if not review.has_cameras:
+            ui.label(t("result.other_cameras")).props('role="alert"')
         with ui.row().classes("w-full items-stretch"):
             figure = ui.element("iframe").props(f'src="{review.address}" title="3D"')
             figure.classes("flex-1 min-w-[320px] min-h-[28rem] border")
             with ui.row().classes("flex-1 min-w-[320px] content-start gap-1"):
                 for camera in review.cameras:
-                    width, height = review.size(camera)
                     image = ui.interactive_image(on_mouse=lambda event, camera=camera: self._click(camera, event))
-                    image.style(f"width: min(100%, {_IMAGE_AREA_REM * (width / height) ** 0.5:.1f}rem)")
                     self._images[camera] = image.props(f'alt="{camera}"')
+                    self._enlarge(camera, False)
         self._time_line()
         with card(t("result.angle")):
             names = motion.body.tree.coordinates
@@ -77,6 +79,13 @@ class _ResultPage:
         self._follow()
         ui.timer(_REFRESH_S, self._follow)
 
+    def _enlarge(self, camera: str, large: bool) -> None:
+        """Show a camera's image as wide as there is room, or as small as all of them fit."""
+        width, height = self._review.size(camera)
+        side = _IMAGES_REM * (width / height / len(self._review.cameras)) ** 0.5
+        self._images[camera].style(f"width: {'100%' if large else f'min(100%, {side:.1f}rem)'}")
+        self._large = camera if large else None
+
     def _time_line(self) -> None:
         """The slider with the marks of doubtful moments, and the keys that move it."""
         t, motion = self._t, self._review.motion
@@ -88,7 +97,7 @@ class _ResultPage:
             for a, b in moments
         )
         ui.html(f'<div style="position:relative;height:8px">{marks}</div>', sanitize=False).classes("w-full")
-        self._slider = ui.slider(min=0, max=last, step=1, value=0).classes("w-full").mark("time")
+        self._slider = ui.slider(min=0, max=last, step=1, value=0).classes("w-full")
         self._slider.props(f'aria-label="{t("result.frame")}"')
         self._slider.on("update:model-value", lambda event: self._go(event.args), throttle=0.05)
         with ui.row().classes("items-center"):
@@ -176,7 +185,7 @@ class _ResultPage:
         cameras = list(self._review.cameras)
         with ui.row().classes("items-center"):
             ui.button(t("result.trim"), icon="content_cut", on_click=self._in_range(
-                lambda a, b: corrections.trim(self._take, a, b))).mark("trim")
+                lambda a, b: corrections.trim(self._take, a, b)))
             if cameras:
                 which = ui.select(cameras, value=cameras[0], label=t("result.which")).classes("w-32")
                 self._camera_buttons(which)
@@ -189,9 +198,9 @@ class _ResultPage:
     def _camera_buttons(self, which: ui.select) -> None:
         t = self._t
         exchange = ui.button(icon="swap_horiz", on_click=self._in_range(
-            lambda a, b: corrections.exchange_sides(self._take, which.value, a, b))).mark("exchange")
+            lambda a, b: corrections.exchange_sides(self._take, which.value, a, b)))
         exclude = ui.button(icon="videocam_off", on_click=self._in_range(
-            lambda a, b: corrections.exclude_view(self._take, which.value, a, b))).mark("exclude")
+            lambda a, b: corrections.exclude_view(self._take, which.value, a, b)))
         exchange.bind_text_from(which, "value", lambda camera: t("result.exchange", camera=camera))
         exclude.bind_text_from(which, "value", lambda camera: t("result.exclude", camera=camera))
 
@@ -209,9 +218,9 @@ class _ResultPage:
             ui.label(t("result.none")).classes("text-sm")
             return
         with ui.row():
-            ui.button(t("result.again"), icon="play_arrow", on_click=self._again).mark("again")
+            ui.button(t("result.again"), icon="play_arrow", on_click=self._again)
             undo = ui.button(t("result.undo"), icon="undo", on_click=lambda: self._edit(corrections.undo, self._take))
-            undo.props("flat").mark("undo")
+            undo.props("flat")
 
     def _again(self) -> None:
         self._desk.start(self._take, "track", str(self._take), "--json")
@@ -251,6 +260,11 @@ class _ResultPage:
         """Take a click in an image as the place of the chosen joint."""
         joint = self._joint.value
         if not joint:
+            before = self._large
+            if before is not None:
+                self._enlarge(before, False)
+            if before != camera:
+                self._enlarge(camera, True)
             return
         width, _ = self._review.size(camera)
         share = max(1.0, max(self._review.size(camera)) / _IMAGE_PX)  # of the video's image to the one that is shown
@@ -275,7 +289,7 @@ class _ResultPage:
         with ui.row():
             for format in NAMES:
                 button = ui.button(format, on_click=lambda format=format: write(format)).props("outline no-caps")
-                button.tooltip(DESCRIPTIONS[format]).mark(f"export-{format}")
+                button.tooltip(DESCRIPTIONS[format])
 
 
 def _numbers(values: np.ndarray) -> list[float | None]:

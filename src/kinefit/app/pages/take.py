@@ -91,8 +91,8 @@ class _TakePage:
         with card(t("take.person_title")):
             self._person()
         with ui.row():
-            ui.button(t("take.track"), icon="play_arrow", on_click=self._track).mark("track")
-            ui.button(t("take.check"), icon="fact_check", on_click=self._check).props("outline").mark("check")
+            ui.button(t("take.track"), icon="play_arrow", on_click=self._track)
+            ui.button(t("take.check"), icon="fact_check", on_click=self._check).props("outline")
         self._work()
         self._findings()
         ui.timer(_REFRESH_S, self._look)
@@ -185,7 +185,7 @@ class _TakePage:
             before = next((other for other in self._desk.jobs.jobs if other.state == RUNNING), None)
             if before is not None and before is not job:
                 ui.label(t("take.waiting_for", name=short(before.take, self._desk.root)))
-        steps = ui.column().classes("w-full gap-1").mark("progress")
+        steps = ui.column().classes("w-full gap-1")
         bars: dict[str, tuple[Any, Any]] = {}
 
         def update() -> None:
@@ -207,7 +207,7 @@ class _TakePage:
         if job.state == FAILED and job.error is not None:
             show_error(t, job.error)
         if job.is_open:
-            ui.button(t("take.pause"), icon="pause", on_click=job.pause).props("outline").mark("pause")
+            ui.button(t("take.pause"), icon="pause", on_click=job.pause).props("outline")
         elif job.state == PAUSED:
             ui.label(t("take.paused_text"))
             if job.kind == "track":
@@ -215,7 +215,7 @@ class _TakePage:
 
     def _resume_buttons(self) -> None:
         with ui.row():
-            ui.button(self._t("take.resume"), icon="play_arrow", on_click=lambda: self._track()).mark("resume")
+            ui.button(self._t("take.resume"), icon="play_arrow", on_click=lambda: self._track())
             restart = ui.button(self._t("take.restart"), icon="restart_alt", on_click=lambda: self._track("--restart"))
             restart.props("flat")
 
@@ -229,10 +229,10 @@ class _TakePage:
             for k, folder in enumerate(people, start=1):
                 said = t("take.result") if len(people) == 1 else t("take.result_of", number=k)
                 to = link("/result", path=self._folder.file, folder=folder)
-                ui.button(said, icon="accessibility_new", on_click=lambda to=to: ui.navigate.to(to)).mark("result")
+                ui.button(said, icon="accessibility_new", on_click=lambda to=to: ui.navigate.to(to))
                 if (folder / "report.html").is_file():
                     report = self._desk.prefix + link("/file", path=folder / "report.html")
-                    ui.link(t("take.report"), report, new_tab=True).mark("report")
+                    ui.link(t("take.report"), report, new_tab=True)
 
     @ui.refreshable_method
     def _findings(self) -> None:

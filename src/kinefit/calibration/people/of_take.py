@@ -68,17 +68,29 @@ def find_cameras(
     file = cameras_file(take.path)
     made_from = _made_from(take)
     found = read_found(file)
-    if found is None or found.made_from != made_from:
+    if found is None or not _holds_for(found.made_from, made_from):
         found = _find(take, made_from, progress)
         write_found(found, file)
         tell("\n".join(found.notes))
+    return _with(take, found)
+
+
+def last_found(take: Take) -> Take:
+    """The take with the cameras that were found last, whatever changed in it since; as it is where there are none."""
+    found = read_found(cameras_file(take.path)) if is_uncalibrated(take) else None
+    if found is None:
+        return take
+    return _with(replace(take, cameras=tuple(c for c in take.cameras if c.name in found.rig.names)), found)
+
+
+def _with(take: Take, found: FoundCameras) -> Take:
     offsets = dict(zip(found.rig.names, found.time_offsets, strict=True))
     cameras = tuple(
         msgspec.structs.replace(e, field_of_view=None, time_offset=e.time_offset + offsets[e.name])
         for e in take.cameras
     )
     entry = CalibrationEntry(
-        file=file, position_sigma=found.position_sigma, rotation_sigma=found.rotation_sigma
+        file=cameras_file(take.path), position_sigma=found.position_sigma, rotation_sigma=found.rotation_sigma
     )
     return replace(take, cameras=cameras, calibration=entry)
 
@@ -125,8 +137,8 @@ def _find(take: Take, made_from: str, progress: Step | None) -> FoundCameras:
 
 
 def _made_from(take: Take) -> str:
-    """A hash of everything that the cameras are found from."""
-    digest = hashlib.sha256(repr((take.height, take.up, take.rate, take.frames, take.body)).encode())
+    """A hash of everything that the cameras are found from, and the steps: "HASH first stop", or "HASH all"."""
+    digest = hashlib.sha256(repr((take.height, take.up, take.rate, take.body)).encode())
     for camera in take.cameras:
         lens = camera.field_of_view or DEFAULT_FIELD_OF_VIEW
         digest.update(repr((camera.name, lens, camera.size, camera.time_offset)).encode())
@@ -134,7 +146,16 @@ def _made_from(take: Take) -> str:
         files = [] if entry.file is None else sorted(entry.file.rglob("*")) if entry.file.is_dir() else [entry.file]
         for file in files:
             digest.update(f"{file.name} {_content(file)}".encode())
-    return digest.hexdigest()[:32]
+    steps = "all" if take.frames is None else f"{take.frames[0]} {take.frames[1]}"
+    return f"{digest.hexdigest()[:32]} {steps}"
+
+
+def _holds_for(known: str, asked: str) -> bool:
+    """Whether cameras that were found from `known` hold for `asked`: for the same steps, and for some of them."""
+    (a, *steps), (b, *fewer) = known.split(), asked.split()
+    if a != b or steps == fewer or steps == ["all"]:
+        return a == b
+    return len(steps) == len(fewer) == 2 and int(steps[0]) <= int(fewer[0]) and int(fewer[1]) <= int(steps[1])
 
 
 def _content(file: Path) -> str:
