@@ -16,6 +16,7 @@ from kinefit.observations import Keypoints
 from kinefit.preparing import faces
 from kinefit.preparing.faces import Heads, ensure_faces, shown_video
 from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
 from kinefit.readers.video import Video
 
 
@@ -141,12 +142,21 @@ def test_overlays_and_report_of_a_track_show_no_face(how, copy_take, found, tmp_
 
 
 def test_a_scene_shows_no_face(copy_take, found, tmp_path):
-    from kinefit.cli.view import gather
+    from kinefit.batch.viewed import gather
 
     path = copy_take(tmp_path / "take")
     shown = [gather((path,), None, hide_faces=hide).pictures.read("cam01", 0.5, 200) for hide in (False, True)]
     changed = (shown[0] != shown[1]).any(axis=2)
     assert changed.any() and changed.mean() < 0.2
+
+
+def test_images_in_which_faces_were_not_looked_for_are_blurred_as_a_whole(copy_take, tmp_path):
+    path = copy_take(tmp_path / "take")
+    take = replace(read_take(path), hide_faces=True)
+    seen = load_observations(take)
+    with shown_video(take, seen, "cam01", find=False) as hidden, Video(seen.videos["cam01"]) as video:
+        assert (hidden.read(0) != video.read(0)).any(axis=2).mean() > 0.8
+    assert not list(path.parent.rglob("*-faces.npz"))
 
 
 def run(path, out, *more):

@@ -58,7 +58,8 @@ def face_switch(desk: Desk, t: Texts) -> None:
         ui.navigate.reload()
 
     said = "shell.faces_hidden" if desk.hide_faces else "shell.faces_shown"
-    ui.switch(t(said), value=desk.hide_faces, on_change=change).props("dark color=white").tooltip(t("shell.faces_change"))
+    switch = ui.switch(t(said), value=desk.hide_faces, on_change=change)
+    switch.props("dark color=white").tooltip(t("shell.faces_change"))
 
 
 def card(title: str) -> ui.card:
