@@ -48,7 +48,7 @@ def exclude_view(take: TakePath, camera: str, first: int, stop: int) -> None:
 
 
 def exchange_sides(take: TakePath, camera: str, first: int, stop: int) -> None:
-    """Exchange left and right of a camera's keypoints in the steps [first, stop); where they are, exchange them back."""
+    """Exchange left and right of a camera's keypoints in the steps [first, stop); a second time, exchange them back."""
     _set_ranges(take, camera, "swapped", (first, stop))
 
 

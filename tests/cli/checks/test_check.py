@@ -1,7 +1,6 @@
 """`kinefit check`, whole: the page, the refined calibration beside the old one, bad takes."""
 
 import re
-import shutil
 from dataclasses import replace
 
 import numpy as np

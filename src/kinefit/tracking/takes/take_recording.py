@@ -89,7 +89,7 @@ def recording_of(
         sensors=_own_sensors(take, seen, body),
     )  # fmt: skip
     if seen.keypoints:
-        bare = not (videos or marked or recording.sensors)  # else what a network lifted adds nothing
+        bare = set(videos) <= set(seen.clicks) and not (marked or recording.sensors)  # else what is lifted adds nothing
         keypoints = seen.keypoints if bare else [replace(k, lifted=None) for k in seen.keypoints]
         pixels = Recording.of_keypoints(
             rig, keypoints, sigma=[entry.sigma for entry in take.keypoints], person=take.person, people=people
@@ -123,8 +123,7 @@ def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict
     out |= {entry.name: stereo_sigma(entry, video, seen) for entry, video in zip(take.stereo, stereo)}
     out |= {f"silhouette {entry.camera}": entry.sigma for entry in take.silhouettes}
     out |= {f"region {entry.camera}": entry.sigma for entry in take.regions if entry.sigma is not None}
-    if take.pose is not None and take.pose.clicks is not None:
-        out |= {f"lines {video.sensor}": take.pose.click_sigma for video in seen.lines}
+    out |= {f"clicks {video.sensor}": take.click_sigma for video in seen.clicks}
     out |= {f"lines {entry.camera}": entry.sigma for entry in take.lines}
     out |= {entry.camera: entry.sigma for entry in (*take.skin, *take.keypoints)}
     return out | {sensor_name("markers", take.markers, k): entry.sigma for k, entry in enumerate(take.markers)}
@@ -159,7 +158,7 @@ def posed_start(take: Take, body: Body, frames: tuple[int, int]) -> tuple[int, B
         A step that is not there, or angles that the body does not have.
     """
     pose, tree = take.pose, body.tree
-    if pose is None:
+    if pose is None or pose.at is None or pose.forward is None:
         return None
     step = frames[0] if pose.step is None else pose.step
 
