@@ -19,7 +19,7 @@ from kinefit.images.depth_scene import background_model
 from kinefit.initialization.from_silhouettes import coarse_to_fine
 from kinefit.motion import UP_AXES
 from kinefit.multiview.people import PersonTrack
-from kinefit.observations import DepthFrame, DepthVideo, KeypointVideo, NamedMarkers, SilhouetteFrame, by_record
+from kinefit.observations import ClickFrame, DepthFrame, DepthVideo, KeypointVideo, NamedMarkers, SilhouetteFrame, by_record
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.cameras import is_level
 from kinefit.readers.take.entries import sensor_name
@@ -96,9 +96,29 @@ def recording_of(
         )
         recording = replace(
             recording, keypoints=pixels.keypoints, followed=pixels.followed, sigma={**recording.sigma, **pixels.sigma},
-            steps=lambda i: [*steps(i), *pixels.steps(i)],
+            steps=lambda i: [*_clicked_on_person(steps(i), i, seen, pixels), *pixels.steps(i)],
         )  # fmt: skip
     return recording, body
+
+
+def _clicked_on_person(frames: Sequence[Any], i: int, seen: Observations, of_person: Recording) -> Sequence[Any]:
+    """Frames of a step without clicks on others: the person with the nearest keypoint in the image was clicked on."""
+    who = of_person.followed
+    if who is None or len(who.people) < 2 or not any(isinstance(f, ClickFrame) for f in frames):
+        return frames
+    out = []
+    for frame in frames:
+        if isinstance(frame, ClickFrame):
+            uv, distance = frame.ends.mean(axis=1), np.full((len(frame.names), len(who.people)), np.inf)
+            for q, k in enumerate(seen.keypoints):
+                for p, one in enumerate(who.people if k.camera == frame.sensor else ()):
+                    own = k.points[i, one.chosen[q][i]] if one.chosen[q][i] >= 0 else np.full((1, 2), np.inf)
+                    away = np.linalg.norm(uv[:, None] - own, axis=2)
+                    distance[:, p] = np.fmin(distance[:, p], np.fmin.reduce(away, axis=1))
+            on_other = distance[:, who.number - 1] > distance.min(axis=1)
+            frame = replace(frame, ends=np.where(on_other[:, None, None], np.nan, frame.ends))
+        out.append(frame)
+    return out
 
 
 def from_afar(
