@@ -177,7 +177,7 @@ def test_clicks_are_measurements_of_their_frames(folder, tmp_path):
     take = read_take(folder / "take.toml")
     assert take.pose.step == 3 and take.pose.clicks == folder / "clicks.json"
     seen = load_observations(take)
-    video = next(video for video in seen.lines if video.sensor == "cam02")
+    video = next(video for video in seen.clicks if video.sensor == "cam02")
     name, (u, v) = next(iter(looks[1]["points"]["cam02"].items()))
     k = video.names.index(f"{name} u")
     np.testing.assert_allclose(video.frame(1).ends[k, :, 0], u, atol=0.01)
@@ -185,7 +185,7 @@ def test_clicks_are_measurements_of_their_frames(folder, tmp_path):
     assert video.landmarks[k] == video.landmarks[k + 1] == (name,)
     body = load_body(take.body)
     recording, body = recording_of(take, seen, body)
-    assert recording.sigma["lines cam02"] == 3.0
+    assert recording.sigma["clicks cam02"] == 3.0
     first, tracker = seen.frames[0], kinefit.Tracker(body, recording.rig, rate=30.0, up="z", sigma=recording.sigma)
     tracker.start_at(recording.start[1])
     frames = [[f for f in recording.steps(step - first) if isinstance(f, LineFrame)] for step in (3, 20)]

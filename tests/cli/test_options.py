@@ -128,7 +128,7 @@ OWN = {
     "keypoints": {
         "sigma": "sigma = 20.0", "frames": "frames = [0, 3]", "rate": "rate = 15.0", "set": 'set = "BODY_25"',
         "frame": 'frame = "calibration"', "face": "face = [1.0, 1.0, 9.0, 9.0]",
-        "stream": 'stream = "coming"',
+        "stream": 'stream = "coming"', "excluded": "excluded = [[1, 3], [4, 5]]", "swapped": "swapped = [[0, 2]]",
     },
     "markers": {
         "sigma": "sigma = 0.05", "unit": 'unit = "mm"', "set": 'set = "no such"', "model": 'model = "none.npz"',
@@ -213,7 +213,7 @@ def test_a_key_of_a_sensor_acts_or_is_refused(kind, key, take, usual):
 
 def test_every_key_is_tried():
     assert set(HEAD) | {"hide_faces"} == set(TABLES["take"].__struct_fields__)  # tests/preparing/test_faces.py
-    elsewhere = {"low_pass", "clicks", "click_sigma"}  # tests/tracking/takes/test_starts.py, tests/cli/test_init.py
+    elsewhere = {"low_pass", "clicks", "click_sigma"}  # takes/test_starts.py, test_init.py, batch/test_corrections.py
     assert set(START) | elsewhere == set(TABLES["start"].__struct_fields__)
     for kind, table in TABLE.items():
         assert set(OWN[kind]) | NAMING | {"name"} >= set(TABLES[table].__struct_fields__) - {"camera", "name"}

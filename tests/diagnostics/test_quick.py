@@ -102,7 +102,7 @@ def test_a_large_scale_of_a_lens_is_not_taken_for_a_unit():
 
 
 def test_exchanged_names_of_left_and_right_show_in_face_toes_and_knees():
-    from kinefit.sensors.channels import mirror_name
+    from kinefit.observations.recordings import mirror_name
 
     def exchanged(k):
         order = [k.names.index(mirror_name(n) or n) for n in k.names]

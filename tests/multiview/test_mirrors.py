@@ -9,7 +9,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.multiview.followed import follow, sentences
 from kinefit.multiview.mirrors import mark_mirror_images
 from kinefit.multiview.people import people_of
-from kinefit.sensors.channels import mirror_name
+from kinefit.observations.recordings import mirror_name
 
 PLACES = [(4.0 * np.sin(a), 0.3 * k, -4.0 * np.cos(a)) for k, a in enumerate(np.radians([-60.0, -20.0, 20.0, 60.0]))]
 RIG = Rig(tuple(look_at(f"cam{k}", np.array(place), np.zeros(3)) for k, place in enumerate(PLACES)))

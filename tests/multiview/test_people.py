@@ -155,7 +155,7 @@ def test_who_is_seen_by_too_few_at_first_has_their_beginning_too():
 
 
 def test_a_view_whose_sides_the_detector_exchanged_stays_with_its_person():
-    from kinefit.sensors.channels import mirror_name
+    from kinefit.observations.recordings import mirror_name
 
     a = along(line((0.0, 0.0, 0.0), (0.4, 0.0, 0.0), 60), 1)
     b = along(line((1.0, 0.0, 0.6), (0.8, 0.0, 0.6), 60), 2)

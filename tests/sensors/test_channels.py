@@ -8,7 +8,8 @@ from kinefit.bodies import load_body
 from kinefit.errors import KinefitError, ObservationError
 from kinefit.multiview.association import person_records
 from kinefit.observations import Keypoints
-from kinefit.sensors.channels import exchange, fitted_pixels, joined, make_channels, mirror_name
+from kinefit.observations.recordings import mirror_name
+from kinefit.sensors.channels import exchange, fitted_pixels, joined, make_channels
 
 BODY = load_body("humanoid")
 RIG = rig_around((0.0, 0.0, 0.0), cameras=3)

@@ -27,6 +27,7 @@ TakePath = str | PathLike[str]
 Range = tuple[int, int]
 CLICKS = "clicks.json"
 """File beside the take that new clicks are written to; with the take's name before it where another take has it."""
+_CLICK_SIGMA = "1.0"  # [px] well below the noise of any detector, so that the joint goes where it was placed
 
 
 def trim(take: TakePath, first: int, stop: int) -> None:
@@ -48,7 +49,7 @@ def exclude_view(take: TakePath, camera: str, first: int, stop: int) -> None:
 
 
 def exchange_sides(take: TakePath, camera: str, first: int, stop: int) -> None:
-    """Exchange left and right of a camera's keypoints in the steps [first, stop), back where they are exchanged."""
+    """Exchange left and right of a camera's keypoints in the steps [first, stop); a second time, exchange them back."""
     _set_ranges(take, camera, "swapped", (first, stop))
 
 
@@ -93,7 +94,7 @@ def add_click(take: TakePath, step: int, camera: str, landmark: str, uv: Sequenc
     file = read.clicks or read.path.with_name(CLICKS)
     if read.clicks is None:
         file = file.with_name(f"{read.path.stem}-{CLICKS}") if file.exists() else file
-        text = with_keys(text, "start", None, {"clicks": quoted(file.name)})
+        text = with_keys(text, "start", None, {"clicks": quoted(file.name), "click_sigma": _CLICK_SIGMA})
     _write(read.path, text, (file, clicks_text([steps[k] for k in sorted(steps)])))
 
 

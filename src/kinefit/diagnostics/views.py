@@ -12,7 +12,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.multiview.association import choose_people
 from kinefit.observations import Keypoints
-from kinefit.sensors.channels import mirror_name
+from kinefit.observations.recordings import mirror_name
 
 MAX_ERROR_SHARE = 0.03  # of the image's diagonal: cameras that differ by more did not detect the same point
 _MIN_CONFIDENCE = 0.3  # of a point; detectors give occluded points less

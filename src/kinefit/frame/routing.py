@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from kinefit._records import restore_state, save_state
 from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Camera, Rig
+from kinefit.losses import SQUARED
 from kinefit.observations import (
     KEYPOINTS,
+    ClickFrame,
     ColourFrame,
     DepthFrame,
     KeypointFrame,
@@ -99,7 +101,7 @@ class Sensors:
         self._makers: dict[type, Callable[[str], Sensor]] = {
             KeypointFrame: self._keypoints, MarkerFrame: self._markers, DepthFrame: self._depth,
             PointCloud: self._cloud, SilhouetteFrame: self._silhouette, LineFrame: self._lines,
-            ColourFrame: self._region, LiftedFrame: self._lifted,
+            ClickFrame: self._clicks, ColourFrame: self._region, LiftedFrame: self._lifted,
         }  # fmt: skip
 
     def __iter__(self) -> Any:
@@ -271,6 +273,10 @@ class Sensors:
     def _lines(self, name: str) -> ImageLineSensor:
         s, own = self.settings, f"lines {name}"
         return ImageLineSensor(own, self.sigma.get(own, s.line), s.loss, s.near)
+
+    def _clicks(self, name: str) -> ImageLineSensor:
+        own = f"clicks {name}"
+        return ImageLineSensor(own, self.sigma.get(own, self.settings.line), SQUARED, self.settings.near)
 
     def _region(self, name: str) -> RegionSensor:
         return RegionSensor(self.rig[name], self.sigma.get(f"region {name}"), self.settings)

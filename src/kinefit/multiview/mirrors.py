@@ -16,7 +16,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.multiview.people import PersonTrack
 from kinefit.observations import Keypoints
-from kinefit.sensors.channels import mirror_name
+from kinefit.observations.recordings import mirror_name
 
 _MAX_FRAMES = 40  # of those in which both are visible
 _MIN_FRAMES = 10

@@ -23,7 +23,7 @@ from kinefit.multiview.likeness import ImageSource
 from kinefit.multiview.medians import distances, medians
 from kinefit.multiview.returns import MAX_SHORT_ABSENCE_S, Chain, PresenceSpan, Return, link_spans
 from kinefit.observations import MEDIAPIPE_478, Keypoints
-from kinefit.sensors.channels import mirror_name
+from kinefit.observations.recordings import mirror_name
 from kinefit.solvers.assignment import assign
 
 _MAX_DETECTION_DISTANCE = 0.25  # relative to the detection's height, plus the motion of ...

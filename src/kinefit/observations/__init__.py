@@ -8,20 +8,18 @@ from kinefit.observations.body_trackers import BodyTrackerFrame, BodyTrackerVide
 from kinefit.observations.colours import ColourVideo
 from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.observations.detections import MEDIAPIPE_33, MEDIAPIPE_75, MEDIAPIPE_478, MEDIAPIPE_HAND_21, Detections
-from kinefit.observations.features import KeypointVideo, LineVideo, NamedMarkers
+from kinefit.observations.features import ClickVideo, KeypointVideo, LineVideo, NamedMarkers
+from kinefit.observations.frame_kinds import KEYPOINTS, Frame, by_record, sensor_of
 from kinefit.observations.frames import (
-    KEYPOINTS,
+    ClickFrame,
     ColourFrame,
     DepthFrame,
-    Frame,
     KeypointFrame,
     LiftedFrame,
     LineFrame,
     MarkerFrame,
     PointCloud,
     SilhouetteFrame,
-    by_record,
-    sensor_of,
 )
 from kinefit.observations.recordings import KEYPOINT_SIGMA, Keypoints, MarkerEvent, Markers, SkeletonMotion
 from kinefit.observations.silhouettes import SilhouetteVideo
@@ -36,6 +34,8 @@ __all__ = [
     "MEDIAPIPE_HAND_21",
     "BodyTrackerFrame",
     "BodyTrackerVideo",
+    "ClickFrame",
+    "ClickVideo",
     "CloudVideo",
     "ColourFrame",
     "ColourVideo",

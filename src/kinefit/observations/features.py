@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
 from kinefit.observations.depth import _Recording, checked_times
-from kinefit.observations.frames import KeypointFrame, LineFrame, MarkerFrame
+from kinefit.observations.frames import ClickFrame, KeypointFrame, LineFrame, MarkerFrame
 from kinefit.observations.recordings import Markers
 
 
@@ -104,6 +104,15 @@ class LineVideo(_Recording):
         """Frame number `i`; a negative number counts from the end."""
         i = range(len(self))[i]
         return LineFrame(self.sensor, float(self.times[i]), self.names, self.landmarks, self.ends[i])
+
+
+class ClickVideo(LineVideo):
+    """Points of the body that a person clicked in images of one camera, each as two lines that cross in it."""
+
+    def frame(self, i: int) -> ClickFrame:
+        """Frame number `i`; a negative number counts from the end."""
+        i = range(len(self))[i]
+        return ClickFrame(self.sensor, float(self.times[i]), self.names, self.landmarks, self.ends[i])
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,6 +116,8 @@ class KeypointFrame:
     confidence : (K,) in 0..1, 0 for undetected keypoints
     keypoint_set : str
         The body's keypoint set that has the names; "" for names of the body's landmarks.
+    sides_known : bool
+        Whether left and right are stated: no correction of swapped sides exchanges them.
 
     Raises
     ------
@@ -131,6 +131,7 @@ class KeypointFrame:
     uv: NDArray
     confidence: NDArray
     keypoint_set: str = ""
+    sides_known: bool = False
 
     @classmethod
     def of_record(cls, record: Keypoints, frame: int, time: float) -> KeypointFrame:
@@ -140,6 +141,7 @@ class KeypointFrame:
         freeze(
             out, sensor=record.camera, time=time, names=record.names, uv=uv, confidence=confidence,
             keypoint_set=record.keypoint_set,
+            sides_known=record.sides_known is not None and bool(record.sides_known[frame]),
         )  # fmt: skip
         return out
 
@@ -258,6 +260,10 @@ class LineFrame:
         object.__setattr__(self, "ends", ends)
 
 
+class ClickFrame(LineFrame):
+    """Points of the body that a person clicked in one image, each as two lines that cross in it."""
+
+
 @dataclass(frozen=True, eq=False)
 class ColourFrame:
     """One colour image.
@@ -320,28 +326,3 @@ class LiftedFrame:
         what, count = f"lifted landmarks of {self.sensor}", len(self.names)
         uv = frozen(self.uv, float, f"pixels of {what}", (count, 2))
         freeze(self, x=frozen(self.x, float, what, (count, 3)), uv=uv)
-
-
-Frame = DepthFrame | PointCloud | KeypointFrame | MarkerFrame | SilhouetteFrame | LineFrame | ColourFrame | LiftedFrame
-
-
-KEYPOINTS = "keypoints"
-"""Name of the one sensor of the keypoint detectors of all cameras."""
-
-_NAMES = {
-    KeypointFrame: KEYPOINTS, SilhouetteFrame: "silhouette {}", LineFrame: "lines {}", ColourFrame: "region {}",
-    LiftedFrame: "lifted {}",
-}  # fmt: skip
-
-
-def sensor_of(frame: object) -> str:
-    """Name of a frame's sensor: its `sensor`, with a prefix for kinds that may share a camera."""
-    return _NAMES.get(type(frame), "{}").format(getattr(frame, "sensor", ""))
-
-
-def by_record(frames: Iterable[Any]) -> Mapping[type, list[Any]]:
-    """Frames of one time by class: `by_record(frames)[DepthFrame]`; an empty list for a class without frames."""
-    out = defaultdict[type, list[Any]](list)
-    for frame in frames:
-        out[type(frame)].append(frame)
-    return out

@@ -14,6 +14,15 @@ KEYPOINT_SIGMA = 8.0
 which a person fills half of the height."""
 
 
+def mirror_name(name: str) -> str:
+    """Name of the point on the other side, in the detectors' spellings; the same name for one in the middle."""
+    if name[:1] in "LR" and name[1:2].isupper():
+        return ("R" if name[0] == "L" else "L") + name[1:]
+    if "left" in name:
+        return name.replace("left", "right")
+    return name.replace("right", "left")
+
+
 @dataclass(frozen=True, eq=False)
 class Keypoints:
     """2D keypoints of all people that a detector found in one camera.
@@ -37,6 +46,8 @@ class Keypoints:
         File or folder, for messages.
     lifted : (F, P, K, 3) [m], optional
         3D landmarks of a network, see `LiftedFrame`; NaN for undetected ones.
+    sides_known : (F,) bool, optional
+        Frames whose left and right are stated: no correction of swapped sides exchanges them.
 
     Raises
     ------
@@ -53,6 +64,7 @@ class Keypoints:
     time_offset: float = 0.0
     source: str = ""
     lifted: NDArray | None = None
+    sides_known: NDArray | None = None
 
     def __post_init__(self) -> None:
         check_seen(self.camera, self.rate, self.names)
@@ -62,7 +74,10 @@ class Keypoints:
         confidence = frozen(self.confidence, float, f"the confidence of {what}", shape, self.source)
         if lifted is not None:
             lifted = frozen(lifted, float, f"lifted {what}", (*shape, 3), self.source)
-        freeze(self, points=points, confidence=confidence, lifted=lifted)
+        sides_known = self.sides_known
+        if sides_known is not None:
+            sides_known = frozen(sides_known, bool, f"the known sides of {what}", shape[:1], self.source)
+        freeze(self, points=points, confidence=confidence, lifted=lifted, sides_known=sides_known)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -70,8 +85,28 @@ class Keypoints:
     def rows(self, frames: slice, time_offset: float) -> Keypoints:
         """The keypoints of some frames; `time_offset` [s] is the time of the first."""
         lifted = None if self.lifted is None else self.lifted[frames]
-        points, confidence = self.points[frames], self.confidence[frames]
-        return replace(self, points=points, confidence=confidence, lifted=lifted, time_offset=time_offset)
+        sides_known = None if self.sides_known is None else self.sides_known[frames]
+        return replace(
+            self, points=self.points[frames], confidence=self.confidence[frames], lifted=lifted,
+            time_offset=time_offset, sides_known=sides_known,
+        )  # fmt: skip
+
+    def without(self, frames: NDArray) -> Keypoints:
+        """The keypoints without the detections of some frames; `frames` (F,) bool."""
+        points, confidence = np.array(self.points), np.array(self.confidence)
+        points[frames], confidence[frames] = np.nan, 0.0
+        lifted = None if self.lifted is None else np.where(frames[:, None, None, None], np.nan, self.lifted)
+        return replace(self, points=points, confidence=confidence, lifted=lifted)
+
+    def exchanged(self, frames: NDArray) -> Keypoints:
+        """The keypoints with left and right of everybody exchanged in some frames, (F,) bool, and known there."""
+        order = [self.names.index(m) if (m := mirror_name(n)) in self.names else k for k, n in enumerate(self.names)]
+        arrays = {"points": self.points, "confidence": self.confidence, "lifted": self.lifted}
+        for name, values in arrays.items():
+            if values is not None:
+                arrays[name] = values.copy()
+                arrays[name][frames] = values[frames][:, :, order]
+        return replace(self, **arrays, sides_known=frames)
 
     def first_points(self, keypoint_set: str, names: tuple[str, ...]) -> Keypoints:
         """The first points alone, as another keypoint set with these names."""

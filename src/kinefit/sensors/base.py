@@ -101,6 +101,7 @@ class Matched(ABC):
     of_points : whether rows are single points with independent errors; else the rows of one segment err alike.
     shows_surface : whether it shows a surface as a whole, so that a missing surface contradicts the body.
     lasts : share 0..1 of a point's stated variance that is systematic, and so does not average out over time
+    sigma_known : whether the stated standard deviation holds, and is not estimated from the residuals of a take
     independent : whether channels err independently, so that residuals show the systematic share
     turns : {segment: (3,) [rad] in its frame}, standard deviation of the rotation of a segment's measured surface about
         its bone, the same for the whole take
@@ -114,6 +115,7 @@ class Matched(ABC):
     of_points: bool = True
     shows_surface: bool = False
     lasts: float = 0.0
+    sigma_known: bool = False
     independent: bool = False
     turns: Mapping[int, NDArray] = MappingProxyType({})
     places: Sequence[tuple[str, str]] | None = None

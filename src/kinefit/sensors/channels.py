@@ -13,6 +13,7 @@ from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError, choices
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Keypoints
+from kinefit.observations.recordings import mirror_name
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +33,7 @@ class Channels:
     sigma : (N,) [px] standard deviation at full confidence.
     uv : (F, N, 2) [px], NaN where unobserved.
     confidence : (F, N) in 0..1
+    sides_known : (F, N) bool, channels whose left and right are stated and stay; None: no channel's
     view_bias : (N, 5, 3) [m] bias of keypoints seen from each side of the body, see `ViewBias`; None if unknown.
     view_followed : (N,) share of a channel's systematic error that the bias has absorbed, and residuals no longer show.
     """
@@ -47,6 +49,7 @@ class Channels:
     sigma: NDArray
     uv: NDArray
     confidence: NDArray
+    sides_known: NDArray | None = None
     view_bias: NDArray | None = None
     view_followed: NDArray | None = None
 
@@ -60,7 +63,8 @@ class Channels:
         """The same channels in some frames."""
         if len(frames) == len(self.uv) and np.array_equal(frames, np.arange(len(self.uv))):
             return self
-        return replace(self, uv=self.uv[frames], confidence=self.confidence[frames])
+        sides_known = None if self.sides_known is None else self.sides_known[frames]
+        return replace(self, uv=self.uv[frames], confidence=self.confidence[frames], sides_known=sides_known)
 
     @classmethod
     def none(cls, rig: Rig, frames: int) -> Channels:
@@ -91,15 +95,6 @@ def joined(parts: Sequence[PointSet]) -> PointSet:
         np.concatenate([p.segments for p in parts]),
         np.concatenate([p.points for p in parts]),
     )
-
-
-def mirror_name(name: str) -> str:
-    """Name of the point on the other side, in the detectors' spellings; the same name for one in the middle."""
-    if name[:1] in "LR" and name[1:2].isupper():
-        return ("R" if name[0] == "L" else "L") + name[1:]
-    if "left" in name:
-        return name.replace("left", "right")
-    return name.replace("right", "left")
 
 
 def known_names(body: Body, rig: Rig, keypoints: Sequence[Keypoints]) -> dict[str, list[str]]:
@@ -162,11 +157,14 @@ def make_channels(
         uv[:, own] = np.where(lacking[:, None], np.nan, record.points[:, 0, columns])
         confidence[:, own] = np.where(lacking, 0.0, np.nan_to_num(record.confidence[:, 0, columns]))
         release(record.points, record.confidence, uv, confidence)
+    stated = [record.sides_known for record in keypoints]
+    sides = [np.zeros(len(uv), bool) if known is None else known for known in stated]
     twice = {r.camera for r in keypoints if sum(o.camera == r.camera for o in keypoints) > 1}
     labels = tuple(f"{r.camera} {r.keypoint_set}" if r.camera in twice else r.camera for r in keypoints)
     return Channels(
         rig, joined(parts), sets, labels, np.array(source), np.array(camera), np.array(column), np.array(partner),
         np.array(spread), uv, confidence,
+        np.stack([sides[q] for q in source], axis=1) if any(known is not None for known in stated) else None,
     )  # fmt: skip
 
 

@@ -9,8 +9,8 @@ from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import Motion, rotation_between_up
 from kinefit.observations import Keypoints
+from kinefit.observations.recordings import mirror_name
 from kinefit.readers.keypoint_sets import keypoint_names
-from kinefit.sensors.channels import mirror_name
 
 _MARGIN_SHARE = 0.04  # of the image, free around the person
 _MIN_DISTANCE = 3.0  # [m]

@@ -249,7 +249,7 @@ def sensor_scales(takes: list[SmoothTake]) -> dict[str, float]:
         for f, matched in enumerate(take.linear.matched):
             scene = take.others.scene(f, take.roots, take.angles)
             for m in matched:
-                if m.sensor in skipped:
+                if m.sensor in skipped or m.sigma_known:
                     continue
                 made = [(len(rows), *squares_of(rows)) for rows in rows_at(m, scene)]
                 if any(count for count, _, _ in made) and not any(len(square) for _, square, _ in made):

@@ -234,7 +234,8 @@ def _swaps(take: SmoothTake) -> NDArray:
         uv, confidence = correct_swaps(given, np.zeros(fitted.shape[:2], bool))
         uv = without_bias(take.body, channels, uv, take.roots[some], take.angles[some])
         weight = confidence / np.square(channels.sigma)
-        out[some] = [find_swaps(channels, groups, *of_frame) for of_frame in zip(uv, weight, fitted)]
+        sides_known = given.sides_known if given.sides_known is not None else [None] * len(fitted)
+        out[some] = [find_swaps(channels, groups, *of_frame) for of_frame in zip(uv, weight, fitted, sides_known)]
     return out
 
 

@@ -43,7 +43,7 @@ class TrackedFrames:
     def pixels(self) -> tuple[Channels, NDArray]:
         """Keypoints of all frames as measured, and (F, N) bool: channels whose left and right the tracker swapped."""
         F, layout, swapped = len(self.results), None, np.zeros((len(self.results), 0), bool)
-        uv, confidence = room((F, 0, 2)), room((F, 0))
+        uv, confidence, sides_known = room((F, 0, 2)), room((F, 0)), None
         for f, result in enumerate(self.results):
             if f % STRETCH == 0:
                 release(uv, confidence)
@@ -53,9 +53,12 @@ class TrackedFrames:
                     uv, confidence, swapped = room((F, N, 2)), room((F, N)), np.zeros((F, N), bool)
                     uv[:] = np.nan
                 uv[f], confidence[f], swapped[f] = m.measurement.uv, m.measurement.confidence, m.swapped
+                if m.measurement.sides_known is not None:
+                    sides_known = np.zeros((F, N), bool) if sides_known is None else sides_known
+                    sides_known[f] = m.measurement.sides_known
         if layout is None:
             return Channels.none(self.scene_of(self.results[0].state, 0.0).rig, F), swapped
-        return replace(layout.channels, uv=uv, confidence=confidence), swapped
+        return replace(layout.channels, uv=uv, confidence=confidence, sides_known=sides_known), swapped
 
 
 def correct_swaps(channels: Channels, swapped: NDArray) -> tuple[NDArray, NDArray]:

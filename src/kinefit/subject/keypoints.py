@@ -93,7 +93,11 @@ def fit_subject(
     weight = _weights(near, sized, states)
     sensor, layout = KeypointSensor(channels.rig, {}, 0.0, geman_mcclure(), joint.REACH[0]), Layout(channels, body)
     variance = np.square(channels.sigma)
-    steps = [[KeypointMeasurement(sensor, layout, channels.uv[f], w * variance, 0.0)] for f, w in zip(states, weight)]
+    sides = channels.sides_known
+    steps = [
+        [KeypointMeasurement(sensor, layout, channels.uv[f], w * variance, 0.0, None if sides is None else sides[f])]
+        for f, w in zip(states, weight)
+    ]
     whole = height / body.stature if height and body.stature else None
     lengths = SegmentScales(body, whole, about=float(np.median(scales)))
     if trial is not None and trial.covariance is not None:
@@ -188,7 +192,10 @@ def _without_bias(
     frames = SeenFrames(sized, channels, found.states, uv, weight * np.square(channels.sigma))
     bias = learn_view_bias([frames])
     layout = Layout(bias.known_to(channels), body)
-    return bias, [[KeypointMeasurement(m.of, layout, m.uv, m.confidence, m.time) for m in several] for several in steps]
+    return bias, [
+        [KeypointMeasurement(m.of, layout, m.uv, m.confidence, m.time, m.sides_known) for m in several]
+        for several in steps
+    ]
 
 
 def _by_detector(
@@ -208,7 +215,8 @@ def _by_detector(
     for span, median in zip(spans, medians, strict=True):
         factor[span] = medians.min() / median if median > 0 else 1.0
     return [
-        [KeypointMeasurement(m.of, m.layout, m.uv, m.confidence * factor, m.time) for m in several] for several in steps
+        [KeypointMeasurement(m.of, m.layout, m.uv, m.confidence * factor, m.time, m.sides_known) for m in several]
+        for several in steps
     ]
 
 
@@ -241,5 +249,6 @@ def _weights(body: Body, channels: Channels, states: dict[int, BodyState]) -> ND
     groups = limb_groups(body, channels)
     weight = channels.weight[list(states)]
     for row, (f, state) in zip(weight, states.items(), strict=True):
-        row[find_swaps(channels, groups, channels.uv[f], row, fitted_pixels(body, channels, state))] = 0.0
+        sides = None if channels.sides_known is None else channels.sides_known[f]
+        row[find_swaps(channels, groups, channels.uv[f], row, fitted_pixels(body, channels, state), sides)] = 0.0
     return weight

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.sensors.channels import Channels, mirror_name
+from kinefit.observations.recordings import mirror_name
+from kinefit.sensors.channels import Channels
 from kinefit.sensors.points.view_bias import MIRRORED, TERMS, ViewBias, directions, trunks
 
 _COEFFICIENT_PRIOR_STD = 0.01  # [m]: of 1, 1.4 and 2 cm the best on three recordings of the built-in network

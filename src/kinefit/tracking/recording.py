@@ -23,6 +23,7 @@ from kinefit.multiview.people import PersonTrack
 from kinefit.observations import (
     KEYPOINT_SIGMA,
     KEYPOINTS,
+    ClickFrame,
     DepthFrame,
     Frame,
     KeypointFrame,
@@ -160,8 +161,10 @@ class Recording:
 
     @property
     def sees_more(self) -> bool:
-        """Whether in the first steps any other sensor than the keypoints' detectors sees something."""
-        return any(len(self.steps(i)) > len(self.keypoints_at(i)) for i in range(min(len(self), _FIRST_STEPS)))
+        """Whether in the first steps any other sensor than the keypoints' detectors sees something; clicks are none."""
+        first = range(min(len(self), _FIRST_STEPS))
+        others = (sum(not isinstance(f, ClickFrame) for f in self.steps(i)) - len(self.keypoints_at(i)) for i in first)
+        return any(count > 0 for count in others)
 
     @property
     def markers_alone(self) -> bool:
@@ -323,7 +326,9 @@ def keypoint_records(steps: Sequence[Sequence[Any]], rate: float, *, start: floa
     for (camera, name), frames in frames_by_source(steps)[KeypointFrame].items():
         names, uv, confidence = _stacked(frames, len(steps), "uv", "confidence")
         seen = np.nan_to_num(confidence[:, None])
-        out.append(Keypoints(camera, name, names, rate, uv[:, None], seen, time_offset=start))
+        sides_known = np.array([i in frames and frames[i].sides_known for i in range(len(steps))])
+        known = {"sides_known": sides_known} if sides_known.any() else {}
+        out.append(Keypoints(camera, name, names, rate, uv[:, None], seen, time_offset=start, **known))
     return tuple(out)
 
 

@@ -149,12 +149,14 @@ def _together(
     """Matches of one time in another layout."""
     N = len(layout.points)
     uv, confidence, swapped, hidden = np.full((N, 2), np.nan), np.zeros(N), np.zeros(N, bool), []
+    sides_known = np.zeros(N, bool)
     for m in several:
         column, of = columns[id(m.measurement.layout)], m.measurement
         seen = of.confidence > 0.0
         uv[column[seen]], confidence[column[seen]], swapped[column] = of.uv[seen], of.confidence[seen], m.swapped
+        sides_known[column] = False if of.sides_known is None else of.sides_known
         hidden += [replace(h, index=column[h.index], far=column[h.far]) for h in m.hidden]
-    measurement = KeypointMeasurement(several[0].measurement.of, layout, uv, confidence, time)
+    measurement = KeypointMeasurement(several[0].measurement.of, layout, uv, confidence, time, sides_known)
     order = np.where(swapped, layout.channels.partner, np.arange(N))
     return KeypointMatched(
         measurement, np.ascontiguousarray(measurement.uv[order]), np.ascontiguousarray(measurement.weight[order]),

@@ -15,7 +15,7 @@ from kinefit.diagnostics.views import make_views, with_sides_right
 from kinefit.findings import Finding, listed, ranked
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
-from kinefit.sensors.channels import mirror_name
+from kinefit.observations.recordings import mirror_name
 from kinefit.simulation import (
     DepthSensor,
     cut,

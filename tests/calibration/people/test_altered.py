@@ -13,8 +13,8 @@ from kinefit.calibration.people.altered import refuse_videos
 from kinefit.errors import CalibrationError, ObservationError
 from kinefit.exporters.pictures.detections import write_detections
 from kinefit.observations import Detections
+from kinefit.observations.recordings import mirror_name
 from kinefit.readers.take.load import load_observations
-from kinefit.sensors.channels import mirror_name
 
 
 def mirrored(record, camera):

@@ -143,6 +143,8 @@ def _made_from(take: Take) -> str:
         lens = camera.field_of_view or DEFAULT_FIELD_OF_VIEW
         digest.update(repr((camera.name, lens, camera.size, camera.time_offset)).encode())
     for entry in take.keypoints:
+        if entry.excluded or entry.swapped:
+            digest.update(repr((entry.camera, entry.excluded, entry.swapped)).encode())
         files = [] if entry.file is None else sorted(entry.file.rglob("*")) if entry.file.is_dir() else [entry.file]
         for file in files:
             digest.update(f"{file.name} {_content(file)}".encode())

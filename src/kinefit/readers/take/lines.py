@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kinefit.errors import FileError, KinefitError, ObservationError, TakeError, choices
 from kinefit.geometry.camera import ImageFrame
-from kinefit.observations import LineVideo
+from kinefit.observations import ClickVideo, LineVideo
 from kinefit.readers.clicks import read_clicks
 from kinefit.readers.take.entries import LinesEntry
 from kinefit.readers.take.file import Take
@@ -76,7 +76,7 @@ def _rows(path: Path) -> Iterable[tuple[str, Mapping[str, Any]]]:
 def load_lines(
     take: Take, images: Mapping[str, ImageFrame], rate: float | None, clocks: Mapping[str, NDArray]
 ) -> tuple[LineVideo, ...]:
-    """All `[[lines]]` of a take, then its clicked joints; `rate` [Hz] of its steps, `clocks` (N,) [s] of its videos.
+    """All `[[lines]]` of a take; `rate` [Hz] of its steps, `clocks` (N,) [s] of its videos.
 
     Raises
     ------
@@ -92,18 +92,28 @@ def load_lines(
         except KinefitError as error:
             place = ", ".join(part for part in (f"lines of camera {entry.camera}", error.place) if part)
             raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error
-    return (*out, *_clicks(take, images, rate))
+    return tuple(out)
 
 
-def _clicks(take: Take, images: Mapping[str, ImageFrame], rate: float | None) -> list[LineVideo]:
-    """Joints that were clicked: each is two image lines that cross in it, along u and v, with its landmark on both."""
-    if take.pose is None or take.pose.clicks is None:
-        return []
-    steps, out = read_clicks(take.pose.clicks), []
+def load_clicks(take: Take, images: Mapping[str, ImageFrame], rate: float | None) -> tuple[ClickVideo, ...]:
+    """Joints that were clicked: each is two image lines that cross in it, along u and v, with its landmark on both.
+
+    `rate` [Hz] is that of the take's steps.
+
+    Raises
+    ------
+    TakeError
+        Nothing states the rate; a camera that the take does not have.
+    FileError
+        As `read_clicks`.
+    """
+    if take.clicks is None:
+        return ()
+    steps, out = read_clicks(take.clicks), []
     for camera in dict.fromkeys(camera for of in steps for camera in of.points):
-        if camera not in images or camera in {entry.camera for entry in take.lines}:
-            problem = choices("camera", camera, images) if camera not in images else f"{camera} has [[lines]] too"
-            raise TakeError(problem, file=take.pose.clicks, place="[start] clicks", remedy="Leave out its clicks.")
+        if camera not in images:
+            problem = choices("camera", camera, images)
+            raise TakeError(problem, file=take.clicks, place="[start] clicks", remedy="Leave out its clicks.")
         if rate is None:
             raise TakeError("nothing states the rate", file=take.path, remedy="Write rate = ... into [take].")
         mine = [of for of in steps if of.points.get(camera)]
@@ -115,8 +125,8 @@ def _clicks(take: Take, images: Mapping[str, ImageFrame], rate: float | None) ->
         times = offset + np.array([round(of.step - offset * rate) for of in mine]) / rate
         titles = tuple(f"{name} {axis}" for name in names for axis in "uv")
         landmarks = tuple((name,) for name in names for _ in "uv")
-        out.append(LineVideo(camera, rate, times, titles, landmarks, ends, source=str(take.pose.clicks)))
-    return out
+        out.append(ClickVideo(camera, rate, times, titles, landmarks, ends, source=str(take.clicks)))
+    return tuple(out)
 
 
 def _lines(

@@ -17,6 +17,7 @@ from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.observations import (
     MEDIAPIPE_33,
     BodyTrackerVideo,
+    ClickVideo,
     CloudVideo,
     ColourVideo,
     DepthVideo,
@@ -45,7 +46,7 @@ from kinefit.readers.take.cameras import (
 from kinefit.readers.take.depth import load_depth
 from kinefit.readers.take.entries import MarkersEntry, sensor_name
 from kinefit.readers.take.file import KeypointsEntry, Take
-from kinefit.readers.take.lines import load_lines
+from kinefit.readers.take.lines import load_clicks, load_lines
 from kinefit.readers.take.silhouettes import load_regions, load_silhouettes
 from kinefit.readers.take.skin import load_skin
 from kinefit.readers.take.streams import refuse_streams
@@ -88,6 +89,8 @@ class Observations:
         In the order of `take.skin`: face and hands by colour, followed as their frames are asked for.
     lines : tuple of LineVideo
         In the order of `take.lines`, those frames that have lines.
+    clicks : tuple of ClickVideo
+        Clicked joints, by camera, of cameras with clicks at `frames`.
     surface_points : tuple of SurfacePointVideo
         In the order of `take.surface_points`, whole, at their own rates.
     trackers : tuple of BodyTrackerVideo
@@ -109,6 +112,7 @@ class Observations:
     regions: tuple[ColourVideo, ...] = ()
     skin: tuple[KeypointVideo, ...] = ()
     lines: tuple[LineVideo, ...] = ()
+    clicks: tuple[ClickVideo, ...] = ()
     surface_points: tuple[SurfacePointVideo, ...] = ()
     trackers: tuple[BodyTrackerVideo, ...] = ()
     notes: tuple[str, ...] = ()
@@ -119,8 +123,8 @@ class Observations:
     ) -> tuple[_Whole, ...]:
         """Every recording with `at_step(step, rate)` and `frame(i)`: all but keypoints and markers."""
         return (
-            *self.depth, *self.clouds, *self.silhouettes, *self.regions, *self.skin, *self.lines, *self.surface_points,
-            *self.trackers,
+            *self.depth, *self.clouds, *self.silhouettes, *self.regions, *self.skin, *self.lines, *self.clicks,
+            *self.surface_points, *self.trackers,
         )  # fmt: skip
 
 
@@ -188,7 +192,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         streams[f"silhouettes {outlines.sensor}"] = outlines.times
     fastest = take.rate or max(rates.values(), default=None)
     skin = load_skin(take, images, {e.name: e.video for e in take.cameras if e.video is not None}, fastest)
-    lines = load_lines(take, images, fastest, clocks)
+    lines, clicks = load_lines(take, images, fastest, clocks), load_clicks(take, images, fastest)
     surfaces = load_surface_points(take)
     trackers = tuple(
         read_body_trackers(e.file, e.points, sensor_name("trackers", take.trackers, k), time_offset=e.time_offset,
@@ -196,10 +200,10 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         for k, e in enumerate(take.trackers)
     )  # fmt: skip
     recordings: tuple[_Timed, ...] = (*sensors.depth, *sensors.clouds, *surfaces, *trackers)
-    if not (streams or lines or markers or recordings):
+    if not (streams or lines or clicks or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
         raise TakeError("cameras, but nothing that they saw", file=take.path, remedy=remedy)
-    own = [*(recording.rate for recording in (*recordings, *lines)), *(m.rate for m in markers)]
+    own = [*(recording.rate for recording in (*recordings, *lines, *clicks)), *(m.rate for m in markers)]
     rate = fastest or own[0]
     if streams:
         overlap = is_uncalibrated(take) or bool(found)
@@ -215,8 +219,8 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         common, whole = (frames[1] - frames[0]) / rate, max(float(np.ptp(t)) for t in streams.values()) + 1.0 / rate
         if overlap and not take.frames and whole > 1.1 * common:
             notes.append(f"all cameras saw {common:.3g} s, the longest {whole:.3g} s")
-    elif recordings or lines:
-        frames = take.frames or _span(recordings or lines, rate)
+    elif recordings or lines or clicks:
+        frames = take.frames or _span(recordings or lines or clicks, rate)
     else:
         frames = take.frames or (0, max(round(len(m) * rate / m.rate) for m in markers))
     _check_times((*recordings, *lines, *skin), frames, rate, take)
@@ -224,10 +228,12 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     return Observations(
         rate=rate, frames=frames, rig=Rig(cameras) if cameras else None,
         markers=markers,
-        keypoints=tuple(_cut(*k, rate, frames, entry.frames) for k, entry in zip(keypoints, take.keypoints)),
+        keypoints=tuple(_cut(*k, rate, frames, entry) for k, entry in zip(keypoints, take.keypoints)),
         videos={entry.name: entry.video for entry in take.cameras if entry.video is not None}, images=images,
         depth=sensors.depth, clouds=sensors.clouds, silhouettes=silhouettes,
-        regions=load_regions(take, rig, images), skin=skin, lines=lines, surface_points=surfaces, trackers=trackers,
+        regions=load_regions(take, rig, images), skin=skin, lines=lines,
+        clicks=tuple(c for c in clicks if _within(np.rint(c.times * rate), [frames]).any()),
+        surface_points=surfaces, trackers=trackers,
         notes=(*notes, *sensors.notes(rate), *found, *what_is_assumed(take)),
     )
 
@@ -306,19 +312,24 @@ def _read_markers(entry: MarkersEntry) -> Markers:
 
 
 def _cut(
-    keypoints: Keypoints, times: NDArray, rate: float, frames: tuple[int, int], used: tuple[int, int] | None
+    keypoints: Keypoints, times: NDArray, rate: float, frames: tuple[int, int], entry: KeypointsEntry
 ) -> Keypoints:
-    """Keypoints at the steps [start, stop) of the common time; seen are only those at the steps that are used."""
+    """Keypoints at the steps [start, stop) of the common time, with what their entry states of ranges of steps."""
     if is_even(times, rate):
         begin = frames[0] - round(keypoints.time_offset * rate)
         rows = slice(begin, begin + frames[1] - frames[0])
         cut = replace(keypoints.rows(rows, keypoints.time_offset + begin / rate), rate=rate)
     else:
         cut = on_steps(keypoints, times, rate, frames)
-    if used is None:
-        return cut
     steps = np.arange(*frames)
-    unused = (steps < used[0]) | (steps >= used[1])
-    points, confidence = np.array(cut.points), np.array(cut.confidence)
-    points[unused], confidence[unused] = np.nan, 0.0
-    return replace(cut, points=points, confidence=confidence)
+    if entry.swapped:
+        cut = cut.exchanged(_within(steps, entry.swapped))
+    unused = _within(steps, entry.excluded)
+    if entry.frames is not None:
+        unused |= ~_within(steps, [entry.frames])
+    return cut.without(unused) if unused.any() else cut
+
+
+def _within(steps: NDArray, ranges: Sequence[tuple[int, int]]) -> NDArray:
+    """(F,) bool: steps (F,) that are in one of some ranges [start, stop)."""
+    return np.any([(steps >= start) & (steps < stop) for start, stop in ranges] or [np.zeros(len(steps), bool)], axis=0)

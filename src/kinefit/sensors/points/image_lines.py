@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, PointSet
 from kinefit.correspondences import _kernels
 from kinefit.geometry.camera import Camera
-from kinefit.losses import Loss
+from kinefit.losses import SQUARED, Loss
 from kinefit.observations import LineFrame
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor
@@ -109,6 +109,11 @@ class ImageLineMatched(Matched):
     def sensor(self) -> str:  # type: ignore[override]
         """Name of the sensor."""
         return self.measurement.sensor
+
+    @property
+    def sigma_known(self) -> bool:  # type: ignore[override]
+        """Whether they are clicks, which have no robust loss: how far the fit is off says nothing about these."""
+        return self.loss.kind == SQUARED.kind
 
     @property
     def channels(self) -> Sequence[str]:

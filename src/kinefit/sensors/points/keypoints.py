@@ -65,7 +65,9 @@ class KeypointSensor(Sensor):
         uv = np.concatenate([*(f.uv for f in frame), [[np.nan, np.nan]]])[place]
         confidence = np.concatenate([*(f.confidence for f in frame), [0.0]])[place]
         time = float(np.mean([f.time for f in frame]))
-        return KeypointMeasurement(self, layout, uv, np.where(confidence < np.inf, confidence, 0.0), time)
+        sides_known = np.concatenate([*(np.full(len(f.names), f.sides_known) for f in frame), [False]])[place]
+        confidence = np.where(confidence < np.inf, confidence, 0.0)
+        return KeypointMeasurement(self, layout, uv, confidence, time, sides_known if sides_known.any() else None)
 
     def layout(self, body: Body, streams: Sequence[Stream]) -> tuple[Layout, NDArray]:
         """The layout of frames of these streams, made once.
@@ -105,14 +107,19 @@ class KeypointMeasurement(Measurement):
     uv : (N, 2) [px], NaN where unseen
     confidence : (N,)
     time : float [s]
+    sides_known : (N,) bool, channels that `match` exchanges with no partner; None: none
     """
 
-    def __init__(self, sensor: KeypointSensor, layout: Layout, uv: NDArray, confidence: NDArray, time: float) -> None:
+    def __init__(
+        self, sensor: KeypointSensor, layout: Layout, uv: NDArray, confidence: NDArray, time: float,
+        sides_known: NDArray | None = None,
+    ) -> None:  # fmt: skip
         self.sensor, self.time, self.of, self.layout = KEYPOINTS, time, sensor, layout
         seen = np.isfinite(uv).all(axis=1) & (confidence > 0)
         self.confidence = np.where(seen, confidence, 0.0)
         self.weight = self.confidence / np.square(layout.channels.sigma)
         self.uv = np.where(seen[:, None], uv, np.nan)
+        self.sides_known = sides_known
 
     def match(self, scene: Scene, reach: float) -> KeypointMatched:
         """Left and right of each source as they fit the body better; which points another sensor saw to be hidden."""
@@ -120,7 +127,7 @@ class KeypointMeasurement(Measurement):
         fitted = projected(scene, self.layout)
         beside = self.layout.beside(scene)
         looked_for = fitted if beside is None else fitted + beside
-        swapped = find_swaps(channels, self.layout.groups, self.uv, self.weight, looked_for)
+        swapped = find_swaps(channels, self.layout.groups, self.uv, self.weight, looked_for, self.sides_known)
         order = np.where(swapped, channels.partner, np.arange(len(swapped)))
         uv, weight = np.ascontiguousarray(self.uv[order]), np.ascontiguousarray(self.weight[order])
         if beside is not None:

@@ -27,7 +27,10 @@ def limb_groups(body: Body, channels: Channels) -> NDArray:
     return out
 
 
-def find_swaps(channels: Channels, groups: NDArray, uv: NDArray, weight: NDArray, fitted: NDArray) -> NDArray:
+def find_swaps(
+    channels: Channels, groups: NDArray, uv: NDArray, weight: NDArray, fitted: NDArray,
+    sides_known: NDArray | None = None,
+) -> NDArray:  # fmt: skip
     """(N,) bool: channels of one frame to exchange with their partner.
 
     Parameters
@@ -35,13 +38,15 @@ def find_swaps(channels: Channels, groups: NDArray, uv: NDArray, weight: NDArray
     groups : (N,) int from `limb_groups`.
     uv, fitted : (N, 2) [px] measured, and where the body would be seen.
     weight : (N,) [1/px²], 0 where unseen.
+    sides_known : (N,) bool, channels that stay as they are; None: none
     """
     partner = channels.partner
     paired = partner != np.arange(len(partner))
     as_is, turned = _cost(uv - fitted, weight), _cost(uv - fitted[partner], weight)
     key = channels.source * (groups.max(initial=0) + 1) + groups
     gain = np.bincount(key[paired], (as_is - turned)[paired], minlength=key.max(initial=0) + 1)
-    return paired & (gain[key] > _ODDS)
+    swapped: NDArray = paired & (gain[key] > _ODDS)
+    return swapped if sides_known is None else swapped & ~sides_known
 
 
 def _cost(gap: NDArray, weight: NDArray) -> NDArray:

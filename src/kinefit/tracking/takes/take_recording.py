@@ -19,7 +19,7 @@ from kinefit.images.depth_scene import background_model
 from kinefit.initialization.from_silhouettes import coarse_to_fine
 from kinefit.motion import UP_AXES
 from kinefit.multiview.people import PersonTrack
-from kinefit.observations import DepthFrame, DepthVideo, KeypointVideo, NamedMarkers, SilhouetteFrame, by_record
+from kinefit.observations import ClickFrame, DepthFrame, DepthVideo, KeypointVideo, NamedMarkers, SilhouetteFrame, by_record
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.cameras import is_level
 from kinefit.readers.take.entries import sensor_name
@@ -89,16 +89,36 @@ def recording_of(
         sensors=_own_sensors(take, seen, body),
     )  # fmt: skip
     if seen.keypoints:
-        bare = not (videos or marked or recording.sensors)  # else what a network lifted adds nothing
+        bare = set(videos) <= set(seen.clicks) and not (marked or recording.sensors)  # else what is lifted adds nothing
         keypoints = seen.keypoints if bare else [replace(k, lifted=None) for k in seen.keypoints]
         pixels = Recording.of_keypoints(
             rig, keypoints, sigma=[entry.sigma for entry in take.keypoints], person=take.person, people=people
         )
         recording = replace(
             recording, keypoints=pixels.keypoints, followed=pixels.followed, sigma={**recording.sigma, **pixels.sigma},
-            steps=lambda i: [*steps(i), *pixels.steps(i)],
+            steps=lambda i: [*_clicked_on_person(steps(i), i, seen, pixels), *pixels.steps(i)],
         )  # fmt: skip
     return recording, body
+
+
+def _clicked_on_person(frames: Sequence[Any], i: int, seen: Observations, of_person: Recording) -> Sequence[Any]:
+    """Frames of a step without clicks on others: the person with the nearest keypoint in the image was clicked on."""
+    who = of_person.followed
+    if who is None or len(who.people) < 2 or not any(isinstance(f, ClickFrame) for f in frames):
+        return frames
+    out = []
+    for frame in frames:
+        if isinstance(frame, ClickFrame):
+            uv, distance = frame.ends.mean(axis=1), np.full((len(frame.names), len(who.people)), np.inf)
+            for q, k in enumerate(seen.keypoints):
+                for p, one in enumerate(who.people if k.camera == frame.sensor else ()):
+                    own = k.points[i, one.chosen[q][i]] if one.chosen[q][i] >= 0 else np.full((1, 2), np.inf)
+                    away = np.linalg.norm(uv[:, None] - own, axis=2)
+                    distance[:, p] = np.fmin(distance[:, p], np.fmin.reduce(away, axis=1))
+            on_other = distance[:, who.number - 1] > distance.min(axis=1)
+            frame = replace(frame, ends=np.where(on_other[:, None, None], np.nan, frame.ends))
+        out.append(frame)
+    return out
 
 
 def from_afar(
@@ -123,8 +143,7 @@ def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict
     out |= {entry.name: stereo_sigma(entry, video, seen) for entry, video in zip(take.stereo, stereo)}
     out |= {f"silhouette {entry.camera}": entry.sigma for entry in take.silhouettes}
     out |= {f"region {entry.camera}": entry.sigma for entry in take.regions if entry.sigma is not None}
-    if take.pose is not None and take.pose.clicks is not None:
-        out |= {f"lines {video.sensor}": take.pose.click_sigma for video in seen.lines}
+    out |= {f"clicks {video.sensor}": take.click_sigma for video in seen.clicks}
     out |= {f"lines {entry.camera}": entry.sigma for entry in take.lines}
     out |= {entry.camera: entry.sigma for entry in (*take.skin, *take.keypoints)}
     return out | {sensor_name("markers", take.markers, k): entry.sigma for k, entry in enumerate(take.markers)}
@@ -159,7 +178,7 @@ def posed_start(take: Take, body: Body, frames: tuple[int, int]) -> tuple[int, B
         A step that is not there, or angles that the body does not have.
     """
     pose, tree = take.pose, body.tree
-    if pose is None:
+    if pose is None or pose.at is None or pose.forward is None:
         return None
     step = frames[0] if pose.step is None else pose.step
 
