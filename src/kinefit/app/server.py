@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import warnings
 from collections.abc import Awaitable, Callable, MutableMapping
 from pathlib import Path
@@ -19,7 +20,6 @@ Send = Callable[[Scope], Awaitable[None]]
 Application = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 _POLICY_VIOLATION = 1008  # close code of a WebSocket
-_MAX_UPLOAD_BYTES = 2**30  # of one request: a dropped video; larger ones are opened where they are
 
 
 class Gate:
@@ -78,15 +78,14 @@ def serve(root: Path, port: int, access: Access, opened: Callable[[str], None]) 
     from kinefit.app.desk import Desk
     from kinefit.app.pages.routes import add_pages
 
-    port = free_port(access.host, port)
+    listener = socket.create_server((access.host, free_port(access.host, port)))
     desk = Desk(root, prefix=f"/{access.token}")
     add_pages(desk)
     outer = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     pages.on_shutdown(desk.close)
     ui.run_with(outer, title="kinefit", mount_path=desk.prefix, show_welcome_message=False)
-    pages.on_startup(lambda: opened(access.url(port)))
+    pages.on_startup(lambda: opened(access.url(listener.getsockname()[1])))
     config = uvicorn.Config(
-        Gate(outer, access), host=access.host, port=port, log_level="error", ws="websockets-sansio",
-        timeout_graceful_shutdown=2,
+        Gate(outer, access), log_level="error", ws="websockets-sansio", timeout_graceful_shutdown=2
     )  # fmt: skip
-    uvicorn.Server(config).run()
+    uvicorn.Server(config).run(sockets=[listener])

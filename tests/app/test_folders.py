@@ -1,0 +1,52 @@
+"""Takes and results in the folders of a session."""
+
+import pytest
+
+from kinefit.app.folders import NEW, TRACKED, UNFINISHED, TakeFolder, subfolders, takes_below, video_files
+from kinefit.errors import FileError
+
+
+def take_in(folder):
+    folder.mkdir(parents=True)
+    (folder / "take.toml").write_text('[take]\nname = "x"\n')
+    return TakeFolder(folder / "take.toml")
+
+
+def test_states_of_a_take(tmp_path):
+    take = take_in(tmp_path / "a")
+    assert take.state == NEW and take.people == ()
+    (take.out / "unfinished").mkdir(parents=True)
+    assert take.state == UNFINISHED
+    (take.out / "unfinished").rmdir()
+    (take.out / "motion.npz").write_bytes(b"")
+    assert take.state == TRACKED and take.people == (take.out,)
+
+
+def test_people_are_in_the_order_of_their_numbers(tmp_path):
+    take = take_in(tmp_path / "a")
+    for number in (10, 2, 1):
+        (take.out / f"person-{number}").mkdir(parents=True)
+        (take.out / f"person-{number}" / "motion.npz").write_bytes(b"")
+    assert [folder.name for folder in take.people] == ["person-1", "person-2", "person-10"]
+    assert take.state == TRACKED
+    (take.out / "person-2" / "unfinished").mkdir()
+    assert take.state == UNFINISHED
+
+
+def test_takes_below_a_folder_without_results_hidden_and_deep_ones(tmp_path):
+    for place in ("monday/a", "monday/b", ".hidden/c", "monday/a/take-kinefit/d", "1/2/3/4/deep"):
+        take_in(tmp_path / place)
+    found = [take.file.parent.relative_to(tmp_path).as_posix() for take in takes_below(tmp_path)]
+    assert found == ["monday/a", "monday/b"]
+
+
+def test_folders_and_videos_of_a_folder(tmp_path):
+    for name in ("B", "a", ".git", "take-detect"):
+        (tmp_path / name).mkdir()
+    for name in ("1.MP4", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    assert [folder.name for folder in subfolders(tmp_path)] == ["a", "B"]
+    assert [video.name for video in video_files(tmp_path)] == ["1.MP4"]
+    assert video_files(tmp_path / "gone") == []
+    with pytest.raises(FileError, match="cannot be opened.*moved"):
+        subfolders(tmp_path / "gone")
