@@ -104,7 +104,7 @@ def test_a_form_that_cannot_be_edited_is_refused(take):
 
 def test_ranges_of_steps_are_joined_and_sides_exchanged_back(take):
     def ranges(key):
-        return [getattr(entry, key) for entry in read_take(take).keypoints if entry.camera == "cam02"][0]
+        return next(getattr(entry, key) for entry in read_take(take).keypoints if entry.camera == "cam02")
 
     for first, stop in ((10, 20), (30, 40), (15, 30), (50, 51)):
         exclude_view(take, "cam02", first, stop)
@@ -145,8 +145,7 @@ def test_person_and_height_are_taken_away_again(take):
 
 def without_keypoints(take):
     """The take as it is where the built-in detector looks through its videos."""
-    head, *tables = take.read_text().split("[[keypoints]]")
-    take.write_text(head)
+    take.write_text(take.read_text().partition("[[keypoints]]")[0])
     return take
 
 
