@@ -8,8 +8,9 @@ from kinefit.geometry.camera import Camera as Camera, ImageFrame as ImageFrame, 
 # What sensors saw: whole takes, and frames of one time
 from kinefit.observations import Keypoints as Keypoints, Markers as Markers
 from kinefit.observations import BodyTrackerFrame as BodyTrackerFrame
-from kinefit.observations import ColourFrame as ColourFrame, DepthFrame as DepthFrame, KeypointFrame as KeypointFrame
-from kinefit.observations import LineFrame as LineFrame, MarkerFrame as MarkerFrame, PointCloud as PointCloud
+from kinefit.observations import ClickFrame as ClickFrame, ColourFrame as ColourFrame, DepthFrame as DepthFrame
+from kinefit.observations import KeypointFrame as KeypointFrame, LineFrame as LineFrame
+from kinefit.observations import MarkerFrame as MarkerFrame, PointCloud as PointCloud
 from kinefit.observations import SilhouetteFrame as SilhouetteFrame, SurfacePointFrame as SurfacePointFrame
 
 # A sensor of one's own

@@ -1,6 +1,7 @@
 """Corrections of a take by its user: what each writes, that it acts, and that it can be undone."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,15 @@ from kinefit.batch.corrections import (
     trim,
     undo,
 )
+from kinefit.bodies import load_body
 from kinefit.errors import FileError, KinefitError, TakeError
+from kinefit.multiview.people import PersonTrack
+from kinefit.observations import ClickFrame
 from kinefit.observations.recordings import mirror_name
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.tracking.takes.take import track_take
+from kinefit.tracking.takes.take_recording import recording_of
 
 
 @pytest.fixture
@@ -99,7 +104,7 @@ def test_a_form_that_cannot_be_edited_is_refused(take):
 
 def test_ranges_of_steps_are_joined_and_sides_exchanged_back(take):
     def ranges(key):
-        return [getattr(entry, key) for entry in read_take(take).keypoints if entry.camera == "cam02"][0]
+        return next(getattr(entry, key) for entry in read_take(take).keypoints if entry.camera == "cam02")
 
     for first, stop in ((10, 20), (30, 40), (15, 30), (50, 51)):
         exclude_view(take, "cam02", first, stop)
@@ -140,8 +145,7 @@ def test_person_and_height_are_taken_away_again(take):
 
 def without_keypoints(take):
     """The take as it is where the built-in detector looks through its videos."""
-    head, *tables = take.read_text().split("[[keypoints]]")
-    take.write_text(head)
+    take.write_text(take.read_text().partition("[[keypoints]]")[0])
     return take
 
 
@@ -249,3 +253,21 @@ def test_sides_that_all_views_exchange_are_set_right_by_the_user(fitted, short):
     motion, _ = track_take(short)
     apart = np.linalg.norm(motion.joint_centres - fitted[1].joint_centres, axis=2)
     assert apart.max() < 0.005
+
+
+def test_a_click_is_of_the_person_with_the_nearest_keypoint(take):
+    add_click(take, 12, "cam02", "r_knee", (0.0, 0.0))
+    seen, read, body = load_observations(read_take(take)), read_take(take), load_body("humanoid")
+    one = seen.keypoints[1].points[12, 0, 0]
+    two = [replace(k, points=np.concatenate([k.points, k.points + [200.0, 0.0]], axis=1),
+                   confidence=np.repeat(k.confidence, 2, axis=1)) for k in seen.keypoints]  # fmt: skip
+    count = len(two[0])
+    people = [PersonTrack((np.full(count, p),) * 4, np.full(count, 4), 1.0, 0.0, 300.0, np.zeros(3)) for p in (0, 1)]
+    for offset, owner in ((-20.0, 1), (220.0, 2)):
+        add_click(take, 12, "cam02", "r_knee", one + [offset, 0.0])
+        seen = replace(load_observations(read_take(take)), keypoints=tuple(two))
+        for person in (1, 2):
+            recording, _ = recording_of(replace(read, person=person), seen, body, people)
+            (click,) = (f for f in recording.steps(12) if isinstance(f, ClickFrame))
+            assert np.isfinite(click.ends).all() == np.isfinite(click.ends).any() == (person == owner)
+    assert not recording.sees_more  # clicks part nobody

@@ -47,7 +47,7 @@ def whole(text):
 
 def read(kind, text, folder):
     """What reads a file of that kind makes of it, beside empty files of the names in it."""
-    for name in re.findall(r'(?:file|video|norms|model) = "(.+?)"', text):
+    for name in re.findall(r'(?:file|video|norms|model|clicks) = "(.+?)"', text):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()

@@ -22,6 +22,7 @@ from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoint_sets import FACE_SET
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import Take, read_take
+from kinefit.readers.take.find import find_take
 
 TakePath = str | PathLike[str]
 Range = tuple[int, int]
@@ -118,12 +119,12 @@ def corrections_of(take: TakePath) -> tuple[str, ...]:
 
 def undo(take: TakePath) -> bool:
     """Take the last edit back, and what was changed in the take file since; False where there is none."""
-    path = read_take(take).path
+    path = find_take(take).absolute()
     kept = sorted(_before(path).glob("*.txt"))
     if not kept:
         return False
-    clicks, file = kept[-1].with_suffix(".json"), read_take(path).clicks
-    if clicks.exists() and file is not None:
+    clicks = kept[-1].with_suffix(".json")
+    if clicks.exists() and (file := read_take(path).clicks) is not None:
         _put(file, clicks.read_bytes())
     write_bytes(path, kept[-1].read_bytes())
     for done in (kept[-1], clicks):
@@ -181,6 +182,9 @@ def _set(take: TakePath, table: str, keys: dict[str, str | None]) -> None:
 def _set_ranges(take: TakePath, camera: str, key: str, steps: Range) -> None:
     """Add steps to those of all keypoints of a camera; of "swapped" take those away that are there."""
     read, text = _opened(take)
+    if not 0 <= steps[0] < steps[1]:
+        problem, remedy = f"{key} has {list(steps)}", "Give the first step and the one after the last, from 0."
+        raise TakeError(problem, file=read.path, place=f"keypoints of camera {camera}", remedy=remedy)
     if uses_detector(read) and not read.keypoints:
         text = _with_detector(read, text)
     tables: list[dict[str, Any]] = tomllib.loads(text).get("keypoints", [])
@@ -189,8 +193,8 @@ def _set_ranges(take: TakePath, camera: str, key: str, steps: Range) -> None:
         seeing = dict.fromkeys(k["camera"] for k in tables)
         raise TakeError(choices("camera with keypoints", camera, seeing), file=read.path)
     for n in own:
-        former = _united([*map(tuple, tables[n].get(key, []))])
-        both = _united([*former, steps]) if key == "excluded" or steps[0] >= steps[1] else _either(former, steps)
+        former = _united(tables[n].get(key, []))
+        both = _united([*former, steps]) if key == "excluded" else _either(former, steps)
         text = with_keys(text, "keypoints", n, {key: _listed(both) if both else None})
     _write(read.path, text)
 
@@ -211,10 +215,10 @@ def _with_detector(read: Take, text: str) -> str:
 
 
 def _united(ranges: Sequence[Any]) -> list[Range]:
-    """Ranges of steps in order, those that touch as one; ranges without a step stay, and are refused later."""
+    """Ranges of steps in order, those that touch as one."""
     out: list[Range] = []
     for first, stop in sorted((int(a), int(b)) for a, b in ranges):
-        if out and first <= out[-1][1] and first < stop:
+        if out and first <= out[-1][1]:
             out[-1] = out[-1][0], max(out[-1][1], stop)
         else:
             out.append((first, stop))

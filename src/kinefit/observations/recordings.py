@@ -101,12 +101,16 @@ class Keypoints:
     def exchanged(self, frames: NDArray) -> Keypoints:
         """The keypoints with left and right of everybody exchanged in some frames, (F,) bool, and known there."""
         order = [self.names.index(m) if (m := mirror_name(n)) in self.names else k for k, n in enumerate(self.names)]
-        arrays = {"points": self.points, "confidence": self.confidence, "lifted": self.lifted}
-        for name, values in arrays.items():
-            if values is not None:
-                arrays[name] = values.copy()
-                arrays[name][frames] = values[frames][:, :, order]
-        return replace(self, **arrays, sides_known=frames)
+
+        def other(values: NDArray) -> NDArray:
+            out = values.copy()
+            out[frames] = values[frames][:, :, order]
+            return out
+
+        return replace(
+            self, points=other(self.points), confidence=other(self.confidence),
+            lifted=None if self.lifted is None else other(self.lifted), sides_known=frames,
+        )  # fmt: skip
 
     def first_points(self, keypoint_set: str, names: tuple[str, ...]) -> Keypoints:
         """The first points alone, as another keypoint set with these names."""

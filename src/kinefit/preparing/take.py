@@ -124,9 +124,9 @@ def uses_detector(take: Take) -> bool:
     """Whether a take asks for the built-in detector's keypoints, or has nothing but videos and so gets them."""
     if any(entry.format == "detect" and entry.file is None for entry in take.keypoints):
         return True
-    others = (take.depth, take.stereo, take.silhouettes, take.regions, take.trackers, take.keypoints, take.skin)
-    others += take.lines, take.surface_points
-    return any(camera.video for camera in take.cameras) and not any(others)
+    bodies = (take.depth, take.stereo, take.silhouettes, take.regions, take.trackers)
+    points = (take.keypoints, take.skin, take.lines, take.surface_points)
+    return any(camera.video for camera in take.cameras) and not (any(bodies) or any(points))
 
 
 def _with_file(entry: KeypointsEntry, take: Take) -> KeypointsEntry:

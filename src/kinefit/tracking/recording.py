@@ -327,8 +327,8 @@ def keypoint_records(steps: Sequence[Sequence[Any]], rate: float, *, start: floa
         names, uv, confidence = _stacked(frames, len(steps), "uv", "confidence")
         seen = np.nan_to_num(confidence[:, None])
         sides_known = np.array([i in frames and frames[i].sides_known for i in range(len(steps))])
-        known = {"sides_known": sides_known} if sides_known.any() else {}
-        out.append(Keypoints(camera, name, names, rate, uv[:, None], seen, time_offset=start, **known))
+        record = Keypoints(camera, name, names, rate, uv[:, None], seen, time_offset=start)
+        out.append(replace(record, sides_known=sides_known) if sides_known.any() else record)
     return tuple(out)
 
 

@@ -70,6 +70,8 @@ CAMERA = '[calibration]\nfile = "c"\n[[camera]]\nname = "a"\nvideo = "v"\n'
         ('[[keypoints]]\ncamera = "a"\nformat = "detect"\nframe = "video"', "frame"),
         ('[[keypoints]]\ncamera = "a"\nfile = "v"\nface = [1, 2, 3, 4]', "face"),
         ('[[keypoints]]\ncamera = "a"\nformat = "skin"\nfile = "v"', "file"),
+        ('[[keypoints]]\ncamera = "a"\nformat = "skin"\nexcluded = [[0, 3]]', "excluded"),
+        ('[[keypoints]]\ncamera = "a"\nformat = "skin"\nswapped = [[0, 3]]', "swapped"),
         ('[[silhouette]]\ncamera = "a"\nfile = "v"\nsmooth = 2', "smooth"),
         ('[[silhouette]]\ncamera = "a"\nformat = "background"\nrate = 30', "rate"),
         ('[[silhouette]]\ncamera = "a"\nformat = "background"\nlow = [1, 1, 1]', "low"),
@@ -80,6 +82,36 @@ CAMERA = '[calibration]\nfile = "c"\n[[camera]]\nname = "a"\nvideo = "v"\n'
 def test_a_key_without_use_is_refused(tmp_path, entry, key):
     with pytest.raises(TakeError, match=f"'{key}' has no use with format"):
         take(tmp_path, CAMERA + entry, files=("c", "v"))
+
+
+@pytest.mark.parametrize("key", ["excluded", "swapped"])
+@pytest.mark.parametrize(("value", "words"), [
+    ("[[5, 3]]", r"has \[5, 3\]"), ("[[3, 3]]", r"has \[3, 3\]"), ("[[-1, 3]]", r"has \[-1, 3\]"),
+    ("[[0, 3], [9, 4]]", r"has \[9, 4\]"), ("[[0.5, 3]]", "whole number"), ("[0, 3]", "Write a list of ranges"),
+    ("[[0, 3, 4]]", "Write a list of ranges"), ('"all"', "Write a list of ranges"),
+])  # fmt: skip
+def test_ranges_of_steps_that_cannot_be_are_refused(key, value, words, tmp_path):
+    entry = f'[[keypoints]]\ncamera = "a"\nformat = "detect"\n{key} = {value}'
+    with pytest.raises(TakeError, match=words) as caught:
+        take(tmp_path, CAMERA + entry, files=("c", "v"))
+    assert "keypoints" in str(caught.value) and key in str(caught.value)
+
+
+def test_ranges_of_steps_have_no_use_with_a_stream(tmp_path):
+    with pytest.raises(TakeError, match="'swapped' has no use with a stream"):
+        take(tmp_path, '[[camera]]\nname = "a"\n[[keypoints]]\ncamera = "a"\nstream = "s"\nswapped = [[0, 1]]')
+
+
+def test_a_start_has_a_place_and_a_direction_or_clicks_alone(tmp_path):
+    (tmp_path / "clicks.json").write_text("{}")
+    read = take(tmp_path, CAMERA + '[start]\nclicks = "clicks.json"\nclick_sigma = 0.5', files=("c", "v"))
+    assert read.pose is None and read.click_sigma == 0.5 and read.clicks == tmp_path / "clicks.json"
+    clicks = 'clicks = "clicks.json"\n'
+    for lines in (f"{clicks}at = [0, 0, 1]", f"{clicks}step = 3", "click_sigma = 2.0", ""):
+        with pytest.raises(TakeError, match="no `at` and `forward`"):
+            take(tmp_path, f"{CAMERA}[start]\n{lines}", files=("c", "v"))
+    with pytest.raises(TakeError, match="click_sigma = 0 px"):
+        take(tmp_path, CAMERA + '[start]\nclicks = "clicks.json"\nclick_sigma = 0', files=("c", "v"))
 
 
 def test_markers_are_put_into_the_world_by_shift_and_turn(tmp_path):

@@ -81,6 +81,14 @@ def test_what_was_not_seen_has_no_say():
     assert not nothing.any()
 
 
+def test_sides_that_are_known_stay():
+    channels, uv, weight, fitted = scene(1)
+    groups, mine = limb_groups(BODY, channels), channels.camera == 2
+    other = np.where((mine | (channels.camera == 1))[:, None], uv[channels.partner], uv)
+    found = find_swaps(channels, groups, other, weight, fitted, mine)
+    assert not found[mine].any() and found[channels.camera == 1].any()
+
+
 def test_one_wild_point_is_no_exchange():
     channels, uv, weight, fitted = scene(2)
     n = [channels.points.names[c] for c in channels.column].index("LWrist")

@@ -1,10 +1,13 @@
 """One camera alone: a take of one video without calibration, whose detections were lifted to space by a network."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from kinefit.batch.corrections import add_click
+from kinefit.bodies import load_body
 from kinefit.errors import TakeError, TrackingError
 from kinefit.exporters.motion_file import write_motion
 from kinefit.exporters.pictures.detections import write_detections
@@ -18,6 +21,7 @@ from kinefit.simulation import squat_and_wave
 from kinefit.smoothing.foot_contacts import soles
 from kinefit.tracking.takes.in_view import people_in_view
 from kinefit.tracking.takes.take import track_take
+from kinefit.tracking.takes.take_recording import recording_of
 
 SIZE, RATE = (720, 1280), 30.0
 HEAD = f"[take]\nrate = {RATE}\n"
@@ -157,3 +161,16 @@ def test_bad_input_is_told(case, folder):
     with pytest.raises(kind) as told:
         track_take(folder / "bad.toml")
     assert problem in str(told.value)
+
+
+def test_a_click_leaves_the_landmarks_in_space(folder, tmp_path):
+    """A joint that is placed by hand is no other sensor: the only camera still tells depth."""
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    plain = load_observations(read_take(tmp_path / "take.toml"))
+    wrist = plain.keypoints[0].points[5, 0, MEDIAPIPE_33.index("right_wrist")]
+    add_click(tmp_path / "take.toml", 5, "phone", "r_wrist", wrist)
+    take = read_take(tmp_path / "take.toml")
+    recording, _ = recording_of(take, load_observations(take), load_body(take.body))
+    assert recording.keypoints[0].lifted is not None and recording.alone is not None
+    assert [type(f).__name__ for f in recording.steps(5)] == ["ClickFrame", "LiftedFrame", "KeypointFrame"]
+    assert [type(f).__name__ for f in recording.steps(6)] == ["LiftedFrame", "KeypointFrame"]

@@ -44,6 +44,8 @@ def wrong_ranges(take: Take) -> Iterator[tuple[str, str, str]]:
         if source.frames is not None and not _is_range(source.frames):
             yield f"frames {list(source.frames)}", place, f"{form}."
         for key in ("excluded", "swapped"):
+            if source.stream is not None and getattr(source, key):
+                yield f"'{key}' has no use with a stream", place, "Leave it out."
             for steps in getattr(source, key):
                 if steps[0] < 0 or not _is_range(steps):
                     yield f"{key} has {list(steps)}", place, f"{form}, counted from 0, for every range."

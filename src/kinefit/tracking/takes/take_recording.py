@@ -19,7 +19,15 @@ from kinefit.images.depth_scene import background_model
 from kinefit.initialization.from_silhouettes import coarse_to_fine
 from kinefit.motion import UP_AXES
 from kinefit.multiview.people import PersonTrack
-from kinefit.observations import ClickFrame, DepthFrame, DepthVideo, KeypointVideo, NamedMarkers, SilhouetteFrame, by_record
+from kinefit.observations import (
+    ClickFrame,
+    DepthFrame,
+    DepthVideo,
+    KeypointVideo,
+    NamedMarkers,
+    SilhouetteFrame,
+    by_record,
+)
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.cameras import is_level
 from kinefit.readers.take.entries import sensor_name
