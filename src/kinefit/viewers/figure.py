@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.geometry import se3
 from kinefit.motion import BELIEVED
+from kinefit.rendering import looks
 from kinefit.rendering.tubes import body_mesh
 from kinefit.viewers import scene as content
 
@@ -39,7 +40,7 @@ class Figure:
     def __init__(self, scene: Any, name: str, body: Body, *, colour: content.RGB | None = None) -> None:
         self.body = body
         S = len(body.tree.segments)
-        self.usual = content.side_colours(body) if colour is None else np.tile(np.array(colour, np.uint8), (S, 1))
+        self.usual = looks.side_colours(body) if colour is None else np.tile(np.array(colour, np.uint8), (S, 1))
         self._root = scene.add_frame(f"/world/{name}", show_axes=False)
         self._segments = [scene.add_frame(f"/world/{name}/{s}", show_axes=False) for s in body.tree.segments]
         self._parts: dict[str, list[Any]] = {part: [] for part in PARTS}
@@ -83,7 +84,7 @@ class Figure:
     def _add_skin(self, scene: Any, name: str) -> None:
         """Add the skin, a mesh for each segment, so that each can have its own colour and opacity."""
         rest = self.body.tree.rest
-        for piece in content.skin_pieces(body_mesh(self.body)):
+        for piece in looks.skin_pieces(body_mesh(self.body)):
             unturned = np.tile([1.0, 0.0, 0.0, 0.0], (len(piece.followed), 1))
             node = scene.add_mesh_skinned(
                 f"/world/{name}/skin_{self.body.tree.segments[piece.segment]}", piece.mesh.vertices, piece.mesh.faces,
@@ -129,8 +130,8 @@ class Figure:
             node.wxyz, node.position = q, t
         for bone, s in self._followers:
             bone.wxyz, bone.position = wxyz[s], x[s]
-        uncertain = None if joint_std is None else content.uncertain_segments(self.body, joint_std)
-        colours, opacities = content.segment_looks(
+        uncertain = None if joint_std is None else looks.uncertain_segments(self.body, joint_std)
+        colours, opacities = looks.segment_looks(
             np.ones(len(x)) if quality is None else quality, self.usual, by_quality=by_quality and quality is not None,
             uncertain=uncertain,
         )  # fmt: skip
@@ -182,7 +183,7 @@ class ScenePoints:
                 ball.position = x
 
 
-def _ball(radius: float) -> content.Mesh:
+def _ball(radius: float) -> looks.Mesh:
     """A small sphere about the origin."""
     return content.capsule(np.zeros(3), np.zeros(3), (radius, radius))
 
