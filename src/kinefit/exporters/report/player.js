@@ -11,7 +11,7 @@ document.querySelectorAll(".player").forEach(place => {
   const size = Math.hypot(...high.map((h, i) => h - low[i])), tall = high[2] - low[2];
   const home = { turn: 0.7, tilt: 0.22, zoom: 1 };
   const view = { ...home, follow: size > 2.2 * tall, cameras: false, cylinders: !skin };
-  let at = 0, playing = false, speed = 1, before = 0, moved = null;  // moved: a live figure's poses, lost and uncertain segments
+  let at = 0, playing = false, speed = 1, before = 0, waiting = null, moved = null;  // moved: a live figure's poses, lost and uncertain segments
 
   const make = (tag, parent, fields = {}) => parent.appendChild(Object.assign(document.createElement(tag), fields));
   const canvas = make("canvas", place), pen = canvas.getContext("2d");
@@ -181,7 +181,7 @@ document.querySelectorAll(".player").forEach(place => {
     [low, high] = [Math.min, Math.max].map(most => [0, 1, 2].map(k => most(...now.map(p => p[k]))));
     floor = first ? lowest : Math.min(floor, lowest);
     if (first) Object.assign(view, { turn: heading() + 0.6, follow: true });
-    draw();
+    waiting ??= requestAnimationFrame(() => { waiting = null; draw(); });
   };
   const fingers = new Map();
   canvas.addEventListener("pointerdown", e => { fingers.set(e.pointerId, [e.clientX, e.clientY]); canvas.setPointerCapture(e.pointerId); });
@@ -276,6 +276,7 @@ function painter(data, bytes) {
     }
     canvas.width = Math.round(W * scale); canvas.height = Math.round(H * scale);
     gl.viewport(0, 0, canvas.width, canvas.height);
+    gl.colorMask(true, true, true, true); gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     for (const [buffer, array] of buffers) { gl.bindBuffer(gl.ARRAY_BUFFER, buffer); gl.bufferData(gl.ARRAY_BUFFER, array, gl.DYNAMIC_DRAW); }
     gl.uniform3f(uniform("middle"), ...c); gl.uniform4f(uniform("turn"), ct, st, cu, su);
     gl.uniform3f(uniform("lens"), 2 * focal / W, 2 * focal / H, far);
