@@ -383,7 +383,12 @@ def test_a_live_view_follows_states(rig):
         view.show(state, time=1.25, images={"cam 0": image})
         assert np.allclose(node(view.server, "body/pelvis").position, (0.3, 0.9, 0.1))
         assert node(view.server, "cameras/cam 0").image.max() == 90
-        assert "1.250 s" in view._time.content
+        assert "1.250 s" in view._time.content and " Hz" in view._time.content
+        assert [line.split()[0] for line in view._angles.content.split("\n\n")] == list(body.tree.coordinates)
+        bent = np.full(len(state.angles), np.pi / 6)
+        view._told -= 1.0
+        view.show(BodyState(state.T_world_root, bent))
+        assert "knee_angle_r **30.0**°" in view._angles.content
         with urllib.request.urlopen(view.address, timeout=10) as answer:
             assert answer.status == 200
         with pytest.raises(BodyError, match="3 angles"):

@@ -20,7 +20,7 @@ _FORM = (
     'Ask for {"sensor": ..., "use": true or false}, {"sensor": ..., "sigma": ...}, {"body": ...}, {"person": ...}, '
     '{"pause": true or false} or {"stop": true}.'
 )
-_ALONE = "body", "person", "pause", "stop"
+_SINGLE_FIELDS = "body", "person", "pause", "stop"
 
 
 class Wish(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -66,6 +66,6 @@ def read_wish(given: bytes | Mapping[str, Any]) -> Wish:
     except msgspec.DecodeError as error:
         raise ObservationError(f"no wish: {error}", remedy=_FORM) from error
     asked = {name for name in wish.__struct_fields__ if getattr(wish, name) is not None}
-    if asked not in ({"sensor", "use"}, {"sensor", "sigma"}, *({one} for one in _ALONE)) or wish.stop is False:
+    if asked not in ({"sensor", "use"}, {"sensor", "sigma"}, *({one} for one in _SINGLE_FIELDS)) or wish.stop is False:
         raise ObservationError(f"a message with {', '.join(sorted(asked)) or 'nothing'} is no wish", remedy=_FORM)
     return wish
