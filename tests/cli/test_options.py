@@ -341,7 +341,8 @@ def test_sensors_of_a_take_that_share_no_time_are_told(take):
 # The command line
 
 OPTIONS = {
-    "overlays": "--overlays", "overlay_skin": "--overlay-skin", "formats": "--formats=motion,csv", "report": "--no-report", "contacts": "--contacts",
+    "overlays": "--overlays", "overlay_skin": "--overlay-skin", "formats": "--formats=motion,csv",
+    "report": "--no-report", "contacts": "--contacts",
     "realtime": "--realtime", "verbose": "-v", "lag": "--lag=0.1", "pictures": "--pictures=none",
     "person": "--person=2", "out": None, "take": None, "restart": None,  # tests/cli/test_resume.py
     "hide_faces": None,  # tests/preparing/test_faces.py

@@ -50,7 +50,8 @@ class LivePerson:
 
     def __init__(self, rig: Rig, person: int | str | None = None) -> None:
         self.rig, self.wanted = rig, PersonChoice.of(person)
-        self.camera, self.count, self.number = "", 0, None
+        self.camera, self.count = "", 0
+        self.number: int | None = None
         self._cameras, self._people = set[str](), list[NDArray]()  # so far; (K, 2) [px] of each person, from the left
         self._chosen: NDArray | None = None  # (K, 2) [px] in `camera`: of a choice, until the tracker has a pose
         self._tries = self._absent = 0  # steps

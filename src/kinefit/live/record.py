@@ -23,8 +23,8 @@ _SPOOL = "poses.unfinished"
 class MotionRecord:
     """A receiver that records poses, and writes them as a motion at the end.
 
-    Dropped steps, and a pause, become untracked frames. A client's choice of another person restarts the record. If the body changed, the motion has the last body's lengths, for earlier
-    poses, too.
+    Dropped steps and pauses become untracked frames. A client's choice of another person restarts the record. If the
+    body changed, the motion has the last body's lengths, for earlier poses, too.
 
     Parameters
     ----------

@@ -68,7 +68,8 @@ def test_lost_and_uncertain_segments_are_marked_frame_by_frame(motion):
     quality[3, lost], std[5, unsure] = 0.0, 0.2
     data = content(figure(replace(motion, segment_quality=quality, joint_std=std)))
     S = len(motion.body.tree.segments)
-    bits = {key: np.unpackbits(unpacked(data[key], "u1", 1)[:, 0])[: 20 * S].reshape(20, S) for key in ("lost", "uncertain")}
+    marks = {key: unpacked(data[key], "u1", 1)[:, 0] for key in ("lost", "uncertain")}
+    bits = {key: np.unpackbits(packed)[: 20 * S].reshape(20, S) for key, packed in marks.items()}
     assert np.argwhere(bits["lost"]).tolist() == [[3, lost]]
     assert np.argwhere(bits["uncertain"]).tolist() == [[5, motion.body.tree.parents[unsure]], [5, unsure]]
     clean = content(figure(replace(motion, segment_quality=np.ones_like(quality), joint_std=0 * std)))

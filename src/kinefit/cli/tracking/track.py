@@ -84,7 +84,7 @@ def choices_options(command: Callable) -> Callable:
 
         chosen = {parameter: given.pop(parameter) for parameter in _CHOICES}
         source = click.get_current_context().get_parameter_source("overlays")
-        wanted = chosen["overlays"] and source == click.core.ParameterSource.COMMANDLINE or chosen["overlay_skin"]
+        wanted = (chosen["overlays"] and source == click.core.ParameterSource.COMMANDLINE) or chosen["overlay_skin"]
         if chosen["pictures"] == "blurred":
             _screen.note("--pictures blurred is now --hide-faces, which hides everybody's face.")
             chosen |= {"pictures": "full", "hide_faces": True}

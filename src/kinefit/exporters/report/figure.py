@@ -72,7 +72,8 @@ def _player(body: Body, Ts: NDArray, **more: Any) -> Html:
         "ends": capsules.points.points, "owners": owners, "radii": capsules.radii, "skin": _skin(body),
         "colours": [to_hex(side_colour(name)) for name in names],
         "sides": [name.endswith("_r") - name.endswith("_l") for name in names], "lost_colour": to_hex(LOST),
-        "opacities": [LOST_OPACITY, UNCERTAIN_OPACITY], "cameras": [], "start": 0.0, "lost": "", "uncertain": "", **more,
+        "opacities": [LOST_OPACITY, UNCERTAIN_OPACITY], "cameras": [], "start": 0.0, "lost": "", "uncertain": "",
+        **more,
     }  # fmt: skip
     return Html(f'<div class="player" id="figure"><script type="application/json">{to_json(data)}</script></div>')
 
