@@ -44,11 +44,12 @@ class Figure:
         self._root = scene.add_frame(f"/world/{name}", show_axes=False)
         self._segments = [scene.add_frame(f"/world/{name}/{s}", show_axes=False) for s in body.tree.segments]
         self._parts: dict[str, list[Any]] = {part: [] for part in PARTS}
+        self._on, self._dashes = set(PARTS), list[Any]()  # layers that are shown; a lost segment's line, on a skin, too
         self._looks: list[tuple[Any, ...]] = [()] * S
         self._shaded: list[list[tuple[Any, str, float]]] = [[] for _ in range(S)]  # node, its part, full opacity
         self._followers: list[tuple[Any, int]] = []  # bones of the skin's pieces, and their segments
         self._add_skin(scene, name)
-        bare = not self._parts["skin"]  # a body without surfaces: its bones stand for the skin
+        self._bare = bare = not self._parts["skin"]  # a body without surfaces: its bones stand for the skin
         balls = [_ball(radius) for radius in content.joint_radii(body)]
         (dashes, gaps), surfaces = content.bone_meshes(body), content.surface_meshes(body)
         for s, segment in enumerate(body.tree.segments):
@@ -65,6 +66,7 @@ class Figure:
                 node = scene.add_mesh_simple(f"{at}/{part}", mesh.vertices, mesh.faces, color=colour_of, **more)
                 layer = "skin" if bare and part != "surface" else "bones" if part == "gaps" else part
                 self._parts[layer].append(node)
+                self._dashes += [node] if part == "bones" else []
                 if part != "joints":
                     self._shaded[s].append((node, part, float(more.get("opacity", 1.0))))
             mine = body.landmarks.points[body.landmarks.segments == s]
@@ -96,9 +98,12 @@ class Figure:
             self._followers += zip(node.bones, piece.followed.tolist(), strict=True)
 
     def show(self, part: str, visible: bool) -> None:
-        """Show or hide one of `PARTS`."""
+        """Show or hide one of `PARTS`, from the next pose on."""
+        (self._on.add if visible else self._on.discard)(part)
         for node in self._parts[part]:
             node.visible = visible
+        for node in self._dashes:
+            node.visible = bool(self._on & {"skin", "bones"})
 
     def show_all(self, visible: bool) -> None:
         """Show or hide the whole figure."""
@@ -135,12 +140,14 @@ class Figure:
             np.ones(len(x)) if quality is None else quality, self.usual, by_quality=by_quality and quality is not None,
             uncertain=uncertain,
         )  # fmt: skip
+        bones = self._bare or "bones" in self._on
         for s, (colour, opacity) in enumerate(zip(colours.tolist(), opacities.tolist(), strict=True)):
-            if self._looks[s] != (*colour, opacity, see_through):
-                self._looks[s] = (*colour, opacity, see_through)
+            if self._looks[s] != (*colour, opacity, see_through, bones):
+                self._looks[s] = (*colour, opacity, see_through, bones)
                 lost = quality is not None and quality[s] < BELIEVED
+                hidden = {"gaps"} if lost else set() if bones else {"bones"}
                 for node, part, full in self._shaded[s]:
-                    full = 0.0 if part == "gaps" and lost else _SEEN_THROUGH if part == "skin" and see_through else full
+                    full = 0.0 if part in hidden else _SEEN_THROUGH if part == "skin" and see_through else full
                     share = full * (1.0 if part in ("bones", "gaps") else opacity)
                     node.color, node.opacity = tuple(colour), None if share == 1.0 else share
         axes = np.zeros((len(x), 3)) if joint_std is None else content.ellipsoids(self.body, joint_std)
