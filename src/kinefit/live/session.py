@@ -168,7 +168,8 @@ class LiveSession:
         packet = posed.to_json()
         for receiver in self.receivers:
             receiver.pose(posed, packet)
-        self.latencies.append(time.monotonic() - at)
+        if not self._paused:
+            self.latencies.append(time.monotonic() - at)
         if self.size is not None and (body := self.size.after(frames, result)) is not None:
             self.change_body(body)
         return result
