@@ -135,7 +135,7 @@ def test_the_skin_moves_with_the_segments_and_shows_what_is_lost_or_uncertain(se
     assert 0 < lost.opacity < unsure.opacity < 1 and lost.color == LOST and unsure.color == RIGHT
     dashes, solid = node(server, "body0/shank_l/bones"), node(server, "body0/thigh_l/bones")
     gaps = node(server, "body0/shank_l/gaps")
-    assert gaps.opacity == 0.0 and not gaps.visible and solid.opacity == 0.0  # in the skin, only what is lost has a line
+    assert gaps.opacity == 0.0 and not gaps.visible and solid.opacity == 0.0  # in the skin, only a lost one has a line
     assert dashes.visible and dashes.opacity is None and dashes.color == LOST
     show.frame(3, Choice(CYLINDERS))
     assert gaps.opacity == 0.0 and gaps.visible and solid.opacity is None and dashes.opacity is None
