@@ -9,9 +9,8 @@ import pytest
 from kinefit.bodies import load_body
 from kinefit.exporters.report.figure import live_figure
 from kinefit.exporters.report.page import CENTRE, LEFT, RIGHT
-from kinefit.rendering import colours
+from kinefit.rendering import colours, looks
 from kinefit.rendering.tubes import body_mesh
-from kinefit.viewers import scene
 
 # Machado, Oliveira and Fernandes, IEEE TVCG 15 (2009), severity 1: of linear RGB.
 DEFICIENCIES = {
@@ -46,8 +45,8 @@ def test_every_place_uses_the_same_colours():
     body = load_body("humanoid")
     sides = {"_l": colours.LEFT, "_r": colours.RIGHT}
     expected = [sides.get(name[-2:], colours.CENTRE) for name in body.tree.segments]
-    assert [tuple(c) for c in scene.side_colours(body)] == expected
+    assert [tuple(c) for c in looks.side_colours(body)] == expected
     assert {tuple(c) for c in body_mesh(body).colours} == set(expected)
     assert (LEFT, RIGHT, CENTRE) == tuple(map(colours.to_hex, (colours.LEFT, colours.RIGHT, colours.CENTRE)))
-    page = str(live_figure(body)[0])
+    page = str(live_figure(body))
     assert all(colour in page for colour in (LEFT, RIGHT, CENTRE, colours.to_hex(colours.LOST)))

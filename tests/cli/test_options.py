@@ -341,7 +341,8 @@ def test_sensors_of_a_take_that_share_no_time_are_told(take):
 # The command line
 
 OPTIONS = {
-    "overlays": "--overlays", "formats": "--formats=motion,csv", "report": "--no-report", "contacts": "--contacts",
+    "overlays": "--overlays", "overlay_skin": "--overlay-skin", "formats": "--formats=motion,csv",
+    "report": "--no-report", "contacts": "--contacts",
     "realtime": "--realtime", "verbose": "-v", "lag": "--lag=0.1", "pictures": "--pictures=none",
     "person": "--person=2", "out": None, "take": None, "restart": None,  # tests/cli/test_resume.py
     "hide_faces": None,  # tests/preparing/test_faces.py
@@ -374,8 +375,14 @@ def test_an_option_acts_or_is_refused(kind, take):
         with_report = run(path, "--no-overlays")
         assert with_report[1] == ["motion.npz", "report.html"]
         code, drawn, said, _ = run(path, "--overlays", "--no-report")
-        assert run(path, "--pictures", "none")[1] == ["motion.npz", "report.html"]
+        plain = (path.with_name("out") / "montage.png").read_bytes() if kind == "keypoints" else b""
         assert (code == 0 and "montage.png" in drawn) if kind == "keypoints" else (code != 0 and "overlays" in said)
+        code, _, said, _ = run(path, "--overlay-skin", "--no-report")
+        assert code == 0 if kind == "keypoints" else (code != 0 and "a skin on overlays" in said)
+        if kind == "keypoints":
+            assert (path.with_name("out") / "montage.png").read_bytes() != plain
+        assert run(path, "--overlay-skin", "--no-overlays")[0] != 0
+        assert run(path, "--pictures", "none")[1] == ["motion.npz", "report.html"]
         assert "tables/angles.csv" in run(path, "--formats", "csv", "--no-overlays", "--no-report")[1]
         assert digest(run(path, "--realtime", "--no-overlays", "--no-report")[3]) != digest(motion)
         assert "contacts" in run(path, "--contacts", "--no-overlays", "--no-report")[3].provenance["smoothing"]

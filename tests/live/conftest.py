@@ -1,7 +1,12 @@
 """A simulated person in front of four cameras, as a recording that sessions replay."""
 
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
 import pytest
 
+from kinefit.geometry import se3
 from kinefit.live.replay import Replay
 from kinefit.motion import UP_AXES
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
@@ -25,6 +30,21 @@ class Scene:
 
     def replay(self, speed=0.0):
         return Replay(self.recording, self.keypoints, speed=speed)
+
+    @cached_property
+    def two(self):
+        """Keypoints of the person, the second in every record, and of one in the same pose a metre beside."""
+        other = replace(self.motion, Ts_world_root=self.aside @ self.motion.Ts_world_root)
+        return [
+            replace(k, points=np.concatenate([o.points, k.points], axis=1),
+                    confidence=np.concatenate([o.confidence, k.confidence], axis=1))
+            for k, o in zip(self.keypoints, simulate_keypoints(other, self.rig, "BODY_25B"))
+        ]  # fmt: skip
+
+    @property
+    def aside(self):
+        """(4, 4) from the person to the other one: a metre along a level axis."""
+        return se3.transform(np.eye(3), -np.roll(UP_AXES[self.motion.up], 1))
 
 
 @pytest.fixture(scope="session")

@@ -65,6 +65,21 @@ def test_the_take_has_what_was_seen(recorded, scene):
     assert sorted(p.suffix for p in recorded.folder.iterdir()) == [".npz"] * 4 + [".toml"] * 2
 
 
+def test_what_came_before_a_restart_is_in_no_take(scene, tmp_path, recorded):
+    record = SeenRecord(tmp_path / "again", recorded.take, scene.rig, rate=scene.motion.rate, alone=False)
+    first, second = scene.rig.names[:2]
+    for f in range(20):
+        uv = np.full((len(MEDIAPIPE_33), 2), 10.0 * f)
+        for camera in (first, second) if f < 10 else (first,):
+            record.keep([KeypointFrame(camera, f / 30.0, MEDIAPIPE_33, uv, np.ones(len(uv)))])
+        if f == 9:
+            record.restart()
+    record.close()
+    (k,) = load_observations(read_take(record.path)).keypoints
+    assert k.camera == first and len(k) == 10 and k.points[0, 0, 0, 0] == 100.0
+    assert not (record.folder / f"{second}.npz").exists()
+
+
 def test_a_take_of_ones_own_is_not_written_over(scene, tmp_path, recorded):
     own = recorded.take.path
     own.rename(own.with_name("take.toml"))

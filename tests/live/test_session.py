@@ -14,9 +14,12 @@ from kinefit.frame.routing import MAX_SIGMA, MIN_SIGMA
 from kinefit.live.cameras import CameraSource, SessionClock
 from kinefit.live.inbox import Arrived
 from kinefit.live.people import LivePerson
+from kinefit.live.record import MotionRecord
+from kinefit.live.replay import Replay
 from kinefit.live.session import LiveSession
 from kinefit.motion import UP_AXES
 from kinefit.observations import MarkerFrame
+from kinefit.readers.motion import read_motion
 from kinefit.tracking.tracker import Tracker
 
 
@@ -161,3 +164,83 @@ def test_a_source_that_fails_ends_the_session_with_its_error(scene, collected):
     with pytest.raises(ObservationError, match="images of 10x10 px"):
         session.run()
     assert collected.closed
+
+
+class Asking:
+    """A receiver that asks for something after some steps."""
+
+    def __init__(self, wishes):
+        self.wishes, self.count, self.answers = wishes, 0, []
+
+    def hello(self, body, packet):
+        pass
+
+    def pose(self, posed, packet):
+        if self.count in self.wishes:
+            self.session.ask(self.wishes[self.count], self.answers.append)
+        self.count += 1
+
+    def close(self):
+        pass
+
+
+def asked(scene, keypoints, wishes, *receivers):
+    asking = Asking(wishes)
+    replay = Replay(scene.recording, keypoints, speed=0.0)
+    asking.session = LiveSession(scene.tracker(), [replay], [*receivers, asking])
+    asking.session.run()
+    return asking
+
+
+def test_a_pause_is_a_gap_in_the_recorded_motion(scene, collected, tmp_path):
+    record = MotionRecord(tmp_path, rate=scene.motion.rate, up=scene.motion.up, name="paused")
+    asking = asked(scene, scene.keypoints, {9: {"pause": True}, 19: {"pause": False}}, collected, record)
+    paused = [json.loads(packet)["paused"] for packet in collected.packets]
+    assert paused == [False] * 10 + [True] * 10 + [False] * 10
+    assert [p.result is None for p in collected.poses] == paused and asking.session.processed == 20
+    motion = read_motion(record.path)
+    assert np.array_equal(motion.quality == 0.0, paused)
+    x = scene.motion.segment_poses()[..., :3, 3]
+    assert np.linalg.norm(motion.segment_poses()[-1, :, :3, 3] - x[-1], axis=1).mean() < 0.02
+
+
+def test_another_person_is_tracked_and_recorded_alone(scene, collected, tmp_path):
+    record = MotionRecord(tmp_path, rate=scene.motion.rate, up=scene.motion.up, name="other")
+    first = asked(scene, scene.two, {}, collected)
+    number = json.loads(collected.packets[9])["person"]
+    asking = asked(scene, scene.two, {9: {"person": number}, 12: {"person": 3 - number}, 14: {"person": 7}},
+                   collected := type(collected)(), record)  # fmt: skip
+    assert [a["type"] for a in asking.answers] == ["done", "done", "refused"]
+    packets = [json.loads(packet) for packet in collected.packets]
+    assert {p["people"] for p in packets} == {2} and {p["camera"] for p in packets} == {scene.rig.names[0]}
+    assert [p["person"] for p in packets] == [number] * 13 + [3 - number] * 17
+    assert first.session.found == asking.session.found == len(scene.recording)
+    motion = read_motion(record.path)
+    roots = np.stack([scene.motion.Ts_world_root, scene.aside @ scene.motion.Ts_world_root])[:, 13:, :3, 3]
+    gaps = np.linalg.norm(motion.Ts_world_root[:, :3, 3] - roots, axis=2)
+    assert len(motion) == 17 and sorted(gaps.max(axis=1) < 0.05) == [False, True]
+
+
+def test_sizes_and_detections_of_another_person_are_not_mixed(scene):
+    class Part:
+        restarts = 0
+
+        def restart(self):
+            self.restarts += 1
+
+        def keep(self, frames):
+            pass
+
+        def after(self, frames, result):
+            return None
+
+        def close(self):
+            pass
+
+    seen, size, asking = Part(), Part(), Asking({9: {"person": 1}, 11: {"person": 2}})
+    asking.session = LiveSession(
+        scene.tracker(), [Replay(scene.recording, scene.two, speed=0.0)], [asking], seen=seen, size=size
+    )  # fmt: skip
+    size.outcome = ""
+    asking.session.run()
+    assert seen.restarts == size.restarts == 2

@@ -45,4 +45,7 @@ def test_a_process_that_was_ended_holds_no_session_up(broken):
         if size.outcome:
             break
     assert "its process ended" in size.outcome
-    assert size.after(frames, result) is None  # and it is not tried again
+    assert size.after(frames, result) is None and not size._steps  # and it is not tried again
+    size.restart()  # until there is another person
+    assert size.after(frames, result) is None and size._steps == [frames] and not size.outcome
+    size.close()

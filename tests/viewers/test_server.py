@@ -133,7 +133,12 @@ def test_the_skin_moves_with_the_segments_and_shows_what_is_lost_or_uncertain(se
     lost, unsure, good = (node(server, f"body0/skin_{name}") for name in ("shank_l", "hand_r", "thigh_l"))
     assert good.opacity is None and good.color == LEFT
     assert 0 < lost.opacity < unsure.opacity < 1 and lost.color == LOST and unsure.color == RIGHT
-    assert node(server, "body0/shank_l/gaps").opacity == 0.0 and node(server, "body0/shank_l/bones").opacity is None
+    dashes, solid = node(server, "body0/shank_l/bones"), node(server, "body0/thigh_l/bones")
+    gaps = node(server, "body0/shank_l/gaps")
+    assert gaps.opacity == 0.0 and not gaps.visible and solid.opacity == 0.0  # in the skin, only a lost one has a line
+    assert dashes.visible and dashes.opacity is None and dashes.color == LOST
+    show.frame(3, Choice(CYLINDERS))
+    assert gaps.opacity == 0.0 and gaps.visible and solid.opacity is None and dashes.opacity is None
     show.frame(0)
     assert lost.opacity is None and lost.color == LEFT and node(server, "body0/shank_l/gaps").opacity is None
     show.frame(0, Choice(through="cam 0"))
@@ -308,7 +313,7 @@ def test_the_player_plays_steps_and_obeys_its_boxes(server, motion, rig):
     assert not player._boxes["bones"].value and player._boxes["skin"].value
     player._rays.value, player._look.value, player._colour.value = ALL, "cam 1", "quality"
     player.tick(0.0)
-    assert not node(server, "body0/thigh_l/bones").visible and node(server, "rays").visible
+    assert node(server, "body0/thigh_l/bones").opacity == 0.0 and node(server, "rays").visible
     assert not node(server, "cameras/cam 1").visible and node(server, "cameras/cam 0").visible
     player._plots[0].box.value = "elbow_flex_l"
     player.tick(0.0)
@@ -383,7 +388,12 @@ def test_a_live_view_follows_states(rig):
         view.show(state, time=1.25, images={"cam 0": image})
         assert np.allclose(node(view.server, "body/pelvis").position, (0.3, 0.9, 0.1))
         assert node(view.server, "cameras/cam 0").image.max() == 90
-        assert "1.250 s" in view._time.content
+        assert "1.250 s" in view._time.content and " Hz" in view._time.content
+        assert [line.split()[0] for line in view._angles.content.split("\n\n")] == list(body.tree.coordinates)
+        bent = np.full(len(state.angles), np.pi / 6)
+        view._told -= 1.0
+        view.show(BodyState(state.T_world_root, bent))
+        assert "knee_angle_r **30.0**°" in view._angles.content
         with urllib.request.urlopen(view.address, timeout=10) as answer:
             assert answer.status == 200
         with pytest.raises(BodyError, match="3 angles"):

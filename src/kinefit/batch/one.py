@@ -25,6 +25,7 @@ class Choices:
     ----------
     formats : of `results.NAMES`
     overlays : bool, whether overlay videos are written
+    overlay_skin : bool, whether they show the person's skin, too
     report : bool, whether report.html is written
     pictures : images in report and overlays: "full" or "none"
     smooth : bool, whether the whole take is smoothed
@@ -37,6 +38,7 @@ class Choices:
 
     formats: tuple[str, ...] = DEFAULT_FORMATS
     overlays: bool = True
+    overlay_skin: bool = False
     report: bool = True
     pictures: str = "full"
     smooth: bool = True
@@ -91,15 +93,18 @@ def asked_take(path: Path, choices: Choices) -> Take:
     return take
 
 
-def check_drawable(take: Take) -> None:
-    """Check that a take has images for overlays.
+def check_drawable(take: Take, *, skin: bool = False) -> None:
+    """Check that a take has images for overlays, or for overlays with a skin.
 
     Raises
     ------
     TakeError
-        It has neither videos nor depth.
+        It has neither videos nor depth; for a skin, no videos.
     """
-    if not (take.depth or any(camera.video for camera in take.cameras)):
+    videos = any(camera.video for camera in take.cameras)
+    if skin and not videos:
+        raise TakeError("a skin on overlays, but no video", file=take.path, remedy="Leave --overlay-skin out.")
+    if not (take.depth or videos):
         raise TakeError("overlays, but no video or depth to draw on", file=take.path, remedy="Leave --overlays out.")
 
 
@@ -171,7 +176,7 @@ def track_person(
         motion = replace(motion, provenance=provenance(take, **motion.provenance))
         write_results(motion, out, choices.formats, step, files)
         if choices.draws and not total:
-            write_overlays(motion, take, seen, out, step, files)
+            write_overlays(motion, take, seen, out, step, files, skin=choices.overlay_skin)
         if choices.report and not total:
             write_track_report(motion, take, seen, out, step, files, choices.pictures, notes)
         if not total:

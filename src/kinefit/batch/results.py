@@ -82,9 +82,13 @@ def write_results(motion: Motion, folder: Path, formats: Iterable[str], step: St
 
 
 def write_overlays(
-    motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path]
+    motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path], *,
+    skin: bool = False,
 ) -> None:  # fmt: skip
-    """Write overlay videos of all cameras and depth sensors, and a montage; written files are added to `files`."""
+    """Write overlay videos of all cameras and depth sensors, and a montage; written files are added to `files`.
+
+    With `skin` the body's skin is drawn on the videos of cameras, too.
+    """
     import numpy as np
 
     from kinefit.exporters import depth_picture, draw_overlay, write_depth_overlay, write_montage, write_overlay
@@ -96,7 +100,7 @@ def write_overlays(
     pictures, middle = {}, motion.times[len(motion) // 2]
     for name in seen.videos:
         offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
-        given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name)}
+        given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name), "skin": skin}
         with shown_video(take, seen, name) as colour:
             shown = colour.frame_at(float(np.clip(middle - offset, 0.0, colour.times[-1]))) or 0
             at = nearest_frame(motion, colour.times[shown] + offset)

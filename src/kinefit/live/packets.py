@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.exporters.pose_lines import pose
 from kinefit.frame.results import FrameResult
+from kinefit.rendering.looks import uncertain_segments
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +30,11 @@ class PosePacket:
     latency : float [s] from the arrival of the newest frame in the step to this packet
     dropped : {sensor: int} frames dropped so far
     silent : sensors without new frames
+    paused : whether the session ignores what its sensors see
+    people : int, in view
+    person : int, number of the tracked one as `LivePerson.people` counts them, from 1; None while nobody is tracked
+    camera : in whose image the people are numbered; "" before the first detection
+    choice : int, how many times a client has chosen another person
     """
 
     number: int
@@ -39,6 +45,11 @@ class PosePacket:
     latency: float
     dropped: Mapping[str, int] = field(default_factory=dict)
     silent: Sequence[str] = ()
+    paused: bool = False
+    people: int = 0
+    person: int | None = None
+    camera: str = ""
+    choice: int = 0
 
     def to_json(self) -> bytes:
         """The packet as JSON."""
@@ -46,6 +57,7 @@ class PosePacket:
         out: dict[str, Any] = {
             "type": "pose" if r is not None else "waiting", "number": self.number, "time": round(self.time, 6),
             "latency": round(self.latency, 6), "dropped": dict(self.dropped), "silent": list(self.silent),
+            "paused": self.paused, "people": self.people, "person": self.person, "camera": self.camera,
         }  # fmt: skip
         if r is not None:
             out |= pose(
@@ -53,4 +65,5 @@ class PosePacket:
                 lost=r.lost,
             )  # fmt: skip
             out["hidden"] = np.flatnonzero(r.hidden).tolist()
+            out["uncertain"] = np.flatnonzero(uncertain_segments(self.body, r.joint_std)).tolist()
         return msgspec.json.encode(out)

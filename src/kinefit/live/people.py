@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.errors import TakeError, TrackingError
+from kinefit.errors import ObservationError, TakeError, TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.multiview.association import choose_people, confidences, meeting_points
 from kinefit.observations import KeypointFrame, Keypoints, LiftedFrame
@@ -20,6 +20,8 @@ from kinefit.sensors.channels import known_points
 # detection of 0.1 s; two people side by side are half a height apart.
 _MAX_DISTANCE = 0.35
 _MIN_POINTS = 4
+_NEAR_M = 0.5  # of the middles of one person by two pairs of cameras
+_MAX_TRIES = 60  # steps in which a chosen person, or the camera of the numbers, is waited for
 _LIVE_WAYS = "first", "nearest", "largest"
 
 
@@ -34,6 +36,12 @@ class LivePerson:
     rig : Rig
     person : "first" (the default), "largest" or "nearest X Y Z" [m]
 
+    Attributes
+    ----------
+    camera : str, the one in whose image people are numbered: it shows most of them; "" before the first detection
+    count : int, people in its latest image
+    number : int, of the tracked person, from 1 at the left of the image; None while it does not show that person
+
     Raises
     ------
     TakeError
@@ -42,6 +50,11 @@ class LivePerson:
 
     def __init__(self, rig: Rig, person: int | str | None = None) -> None:
         self.rig, self.wanted = rig, PersonChoice.of(person)
+        self.camera, self.count = "", 0
+        self.number: int | None = None
+        self._cameras, self._people = set[str](), list[NDArray]()  # so far; (K, 2) [px] of each person, from the left
+        self._chosen: NDArray | None = None  # (K, 2) [px] in `camera`: of a choice, until the tracker has a pose
+        self._tries = self._absent = 0  # steps
         if self.wanted.way not in _LIVE_WAYS:
             problem = f'person = "{person}" is known only when all is over'
             raise TakeError(problem, place="person", remedy='Live: "first", "largest" or "nearest X Y Z".')
@@ -60,15 +73,67 @@ class LivePerson:
         seen = [k for k in records if confidences(k, 1).any()]
         chosen = [-1] * len(seen)
         if state is not None:
+            self._chosen = None
             sets = {k.keypoint_set: known_points(body, k.keypoint_set) for k in seen}
             places = {name: (points.names, body.positions(state, points)) for name, points in sets.items()}
             chosen = [self._fitting(k, *places[k.keypoint_set]) for k in seen]
-        if seen and not any(p >= 0 for p in chosen):
+        if self._chosen is not None:
+            chosen = self._with_chosen(seen, self._chosen)
+        elif seen and not any(p >= 0 for p in chosen):
             chosen = self._anew(seen)
+        self._number_people(records, dict(zip((k.camera for k in seen), chosen)))
         out: list[KeypointFrame | LiftedFrame] = [_frame(k, p) for k, p in zip(seen, chosen) if p >= 0]
         if len(self.rig) == 1:
             out += [_lifted(k, k.lifted, p) for k, p in zip(seen, chosen) if p >= 0 and k.lifted is not None]
         return out
+
+    def choose(self, number: int) -> None:
+        """Track another person from the next frame on; the tracker must start anew.
+
+        Raises
+        ------
+        ObservationError
+            No such number among the people in view.
+        """
+        if not 0 < number <= self.count:
+            problem = f"person {number} of {self.count} in view"
+            raise ObservationError(problem, remedy="Choose a number from 1, counted from the left.")
+        self._chosen, self._tries = self._people[number - 1], 0
+
+    def _number_people(self, records: Sequence[Keypoints], chosen: Mapping[str, int]) -> None:
+        """Number the people in the image with most of them, with the index of the tracked one by camera."""
+        self._cameras.update(k.camera for k in records)
+        there = [(len(found := np.flatnonzero(confidences(k, 1)[0])), k.camera == self.camera, found) for k in records]
+        most = max(range(len(records)), key=lambda i: there[i][:2], default=None)
+        self._absent = 0 if any(same for _, same, _ in there) else self._absent + 1
+        if most is None or (0 < self._absent < _MAX_TRIES and there[most][0] <= self.count):
+            return  # the camera of the numbers has no image in this step
+        k, found = records[most], there[most][2]
+        uv = [np.where(k.confidence[0, p, :, None] > 0.1, k.points[0, p], np.nan) for p in found]
+        order = sorted(range(len(uv)), key=lambda p: float(np.nanmedian(uv[p][:, 0])))
+        self._people, self.camera, self.count, self._absent = [uv[p] for p in order], k.camera, len(uv), 0
+        self.number = next((n for n, p in enumerate(order, 1) if found[p] == chosen.get(k.camera)), None)
+
+    def _with_chosen(self, seen: Sequence[Keypoints], expected: NDArray) -> list[int]:
+        """The chosen person, last at (K, 2) [px] in `camera`: an index for each record, -1 for none."""
+        out = [-1] * len(seen)
+        self._tries += 1
+        for i, k in enumerate(seen):
+            if k.camera == self.camera and k.points.shape[2] == len(expected):
+                cost = [_apart(uv, confidence, expected) for uv, confidence in zip(k.points[0], k.confidence[0])]
+                if min(cost) < _MAX_DISTANCE:
+                    out[i] = int(np.argmin(cost))
+                    self._chosen = k.points[0, out[i]]
+                    pairs = meeting_points(self.rig, seen, [confidences(s, 1) for s in seen], 1).items()
+                    places = [x[0] for _, x in pairs if np.isfinite(x[0, 0])]
+                    own = [x[0] for pair, x in pairs if (i, out[i]) in pair and np.isfinite(x[0, 0])]
+                    if own:  # where most pairs of images agree: two people may be in line with a camera
+                        near = np.linalg.norm(np.subtract(np.array(own)[:, None], places), axis=2) < _NEAR_M
+                        out = self._nearest(seen, own[int(near.sum(axis=1).argmax())])
+        if self._tries == _MAX_TRIES:
+            self._chosen = None
+        enough = sum(p >= 0 for p in out) >= min(len(self._cameras), 2)
+        return out if enough else [-1] * len(seen)
 
     def _fitting(self, record: Keypoints, names: tuple[str, ...], places: NDArray) -> int:
         """Index of the person at the body's last pose, with points by name and position (K, 3) [m]; -1 for none."""

@@ -23,8 +23,8 @@ _SPOOL = "poses.unfinished"
 class MotionRecord:
     """A receiver that records poses, and writes them as a motion at the end.
 
-    Dropped steps become untracked frames. If the body changed, the motion has the last body's lengths, for earlier
-    poses, too.
+    Dropped steps and pauses become untracked frames. A client's choice of another person restarts the record. If the
+    body changed, the motion has the last body's lengths, for earlier poses, too.
 
     Parameters
     ----------
@@ -50,20 +50,21 @@ class MotionRecord:
             raise ExportError(problem, file=self.folder, remedy="Name another folder by --out.") from error
         self._last: NDArray | None = None
         self._first = 0.0
-        self.dropped = 0
+        self._choice = self.dropped = 0
 
     def hello(self, body: Body, packet: bytes) -> None:
         """Set the body; one with other coordinates restarts the record."""
         if self._body is not None and body.tree.coordinates != self._body.tree.coordinates:
-            self._file.seek(0)
-            self._file.truncate()
-            self._last = None
+            self._restart()
         self._body = body
 
     def pose(self, posed: PosePacket, packet: bytes) -> None:
         """Record a pose at the step of its time."""
         r = posed.result
         self.dropped = sum(posed.dropped.values())
+        if posed.choice != self._choice:
+            self._choice = posed.choice
+            self._restart()
         if r is None or self._body is None:
             return
         row = np.concatenate([
@@ -97,6 +98,11 @@ class MotionRecord:
             write_motion(motion, target)
             self.path = target
         spool.unlink(missing_ok=True)
+
+    def _restart(self) -> None:
+        self._file.seek(0)
+        self._file.truncate()
+        self._last = None
 
     def _write(self, row: NDArray) -> None:
         try:

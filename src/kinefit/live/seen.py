@@ -72,6 +72,13 @@ class SeenRecord:
                 except OSError as error:
                     raise self._write_error(error) from error
 
+    def restart(self) -> None:
+        """Discard what is recorded, detections of another person."""
+        for name, file in self._files.items():
+            file.close()
+            self._spool(name).unlink()
+        self._files = {}
+
     def close(self) -> None:
         """Write detections, calibration and take file."""
         for file in self._files.values():

@@ -99,7 +99,8 @@ class LiveSession:
         self.wishes: queue.Queue[tuple[Wish, Answer]] = queue.Queue(_MAX_WAITING_WISHES)
         self._replaced: tuple[Body, Wish, Answer] | None = None  # until a step is fitted with the requested body
         self._off: set[str] = set()
-        self._over = False
+        self._choices = 0  # of another person
+        self._paused = self._over = False
 
     @property
     def names(self) -> list[str]:
@@ -150,7 +151,7 @@ class LiveSession:
 
     def step(self, arrived: Sequence[Arrived]) -> FrameResult | None:
         """Fit the arrived frames, and send the pose to all receivers."""
-        frames, result = self._fit(*self._sort(arrived))
+        frames, result = ([], None) if self._paused else self._fit(*self._sort(arrived))
         if self.seen is not None:
             self.seen.keep(frames)
         at = max(frame.at for frame in arrived)
@@ -161,13 +162,14 @@ class LiveSession:
             poses = self.tracker.body.tree.segment_poses(state.T_world_root[None], state.angles[None])[0]
         posed = PosePacket(
             self.processed, self.tracker.body, result, poses, now, time.monotonic() - at, self.inbox.dropped,
-            self.inbox.silent(),
+            self.inbox.silent(), self._paused, self.person.count, self.person.number, self.person.camera, self._choices,
         )  # fmt: skip
-        self.processed, self.found = self.processed + 1, self.found + (result is not None)
+        self.processed, self.found = self.processed + (not self._paused), self.found + (result is not None)
         packet = posed.to_json()
         for receiver in self.receivers:
             receiver.pose(posed, packet)
-        self.latencies.append(time.monotonic() - at)
+        if not self._paused:
+            self.latencies.append(time.monotonic() - at)
         if self.size is not None and (body := self.size.after(frames, result)) is not None:
             self.change_body(body)
         return result
@@ -179,7 +181,8 @@ class LiveSession:
         ----------
         wish : as JSON or as a mapping
             {"sensor": name, "use": bool}: whether to use a sensor; {"sensor": name, "sigma": value}: its standard
-            deviation [px, m]; {"body": name}: another body of the catalogue; {"stop": true}.
+            deviation [px, m]; {"body": name}: another body of the catalogue; {"person": number}: track another person,
+            and record that person alone; {"pause": true or false}; {"stop": true}.
         answer : called with {"type": "done"} or {"type": "refused", "why": text}, with the wish as "asked"
         """
         try:
@@ -256,9 +259,23 @@ class LiveSession:
             else:
                 answer({"type": "done", "asked": msgspec.to_builtins(wish)})
 
+    def _choose(self, number: int) -> None:
+        """Track another person, with files and size of that person alone."""
+        if number != self.person.number:
+            self.person.choose(number)
+            self._choices += 1
+            self.tracker.start_over()
+            for part in (self.seen, self.size):
+                if part is not None:
+                    part.restart()
+
     def _fulfil(self, wish: Wish, answer: Answer) -> None:
         if wish.stop:
             self.stop()
+        elif wish.pause is not None:
+            self._paused = wish.pause
+        elif wish.person is not None:
+            self._choose(wish.person)
         elif wish.body is not None:
             if wish.body not in catalogue():  # no file of this computer
                 raise BodyError(choices("body of the catalogue", wish.body, catalogue()))

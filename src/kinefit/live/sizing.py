@@ -80,6 +80,11 @@ class LiveSize:
             self._steps = []
         return None
 
+    def restart(self) -> None:
+        """Forget all steps, those of another person."""
+        self.close()
+        self._steps, self._future, self._next, self.outcome = [], None, -float("inf"), ""
+
     def close(self) -> None:
         """Cancel an unfinished fit."""
         if self._pool is not None:

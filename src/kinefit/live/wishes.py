@@ -16,7 +16,11 @@ MAX_WISH_BYTES = 4096
 """Largest size of a wish as JSON; valid ones have less than 300 bytes."""
 
 _Name = Annotated[str, msgspec.Meta(max_length=200)]
-_FORM = 'Ask for {"sensor": ..., "use": true or false}, {"sensor": ..., "sigma": ...}, {"body": ...} or {"stop": true}.'
+_FORM = (
+    'Ask for {"sensor": ..., "use": true or false}, {"sensor": ..., "sigma": ...}, {"body": ...}, {"person": ...}, '
+    '{"pause": true or false} or {"stop": true}.'
+)
+_SINGLE_FIELDS = "body", "person", "pause", "stop"
 
 
 class Wish(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -28,6 +32,8 @@ class Wish(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
     use : whether the session uses the sensor
     sigma : standard deviation of the sensor, [px] or [m]
     body : name of a body in the catalogue
+    person : number of the person to track from now on, counted as in `LivePerson.people`, from 1
+    pause : whether the session ignores what its sensors see
     stop : True to end the session
     """
 
@@ -35,6 +41,8 @@ class Wish(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
     use: bool | None = None
     sigma: float | None = None
     body: _Name | None = None
+    person: int | None = None
+    pause: bool | None = None
     stop: bool | None = None
 
 
@@ -58,6 +66,6 @@ def read_wish(given: bytes | Mapping[str, Any]) -> Wish:
     except msgspec.DecodeError as error:
         raise ObservationError(f"no wish: {error}", remedy=_FORM) from error
     asked = {name for name in wish.__struct_fields__ if getattr(wish, name) is not None}
-    if asked not in ({"sensor", "use"}, {"sensor", "sigma"}, {"body"}, {"stop"}) or wish.stop is False:
+    if asked not in ({"sensor", "use"}, {"sensor", "sigma"}, *({one} for one in _SINGLE_FIELDS)) or wish.stop is False:
         raise ObservationError(f"a message with {', '.join(sorted(asked)) or 'nothing'} is no wish", remedy=_FORM)
     return wish

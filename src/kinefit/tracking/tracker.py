@@ -148,6 +148,13 @@ class Tracker:
         self._recovery.started(state)
         self._seen[:] = -np.inf
 
+    def start_over(self) -> None:
+        """Forget where the body is: the next frames may show another person, somewhere else."""
+        self._wear(self.body)
+        self._last = None
+        if self._session is not None:
+            self._session.clear()
+
     def backwards(self, state: BodyState) -> Tracker:
         """A tracker of the same body and sensors that knows the same background, for the time before a state."""
         out = Tracker(

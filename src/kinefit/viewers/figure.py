@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.geometry import se3
 from kinefit.motion import BELIEVED
+from kinefit.rendering import looks
 from kinefit.rendering.tubes import body_mesh
 from kinefit.viewers import scene as content
 
@@ -39,15 +40,16 @@ class Figure:
     def __init__(self, scene: Any, name: str, body: Body, *, colour: content.RGB | None = None) -> None:
         self.body = body
         S = len(body.tree.segments)
-        self.usual = content.side_colours(body) if colour is None else np.tile(np.array(colour, np.uint8), (S, 1))
+        self.usual = looks.side_colours(body) if colour is None else np.tile(np.array(colour, np.uint8), (S, 1))
         self._root = scene.add_frame(f"/world/{name}", show_axes=False)
         self._segments = [scene.add_frame(f"/world/{name}/{s}", show_axes=False) for s in body.tree.segments]
         self._parts: dict[str, list[Any]] = {part: [] for part in PARTS}
+        self._on, self._dashes = set(PARTS), list[Any]()  # layers that are shown; a lost segment's line, on a skin, too
         self._looks: list[tuple[Any, ...]] = [()] * S
         self._shaded: list[list[tuple[Any, str, float]]] = [[] for _ in range(S)]  # node, its part, full opacity
         self._followers: list[tuple[Any, int]] = []  # bones of the skin's pieces, and their segments
         self._add_skin(scene, name)
-        bare = not self._parts["skin"]  # a body without surfaces: its bones stand for the skin
+        self._bare = bare = not self._parts["skin"]  # a body without surfaces: its bones stand for the skin
         balls = [_ball(radius) for radius in content.joint_radii(body)]
         (dashes, gaps), surfaces = content.bone_meshes(body), content.surface_meshes(body)
         for s, segment in enumerate(body.tree.segments):
@@ -64,6 +66,7 @@ class Figure:
                 node = scene.add_mesh_simple(f"{at}/{part}", mesh.vertices, mesh.faces, color=colour_of, **more)
                 layer = "skin" if bare and part != "surface" else "bones" if part == "gaps" else part
                 self._parts[layer].append(node)
+                self._dashes += [node] if part == "bones" else []
                 if part != "joints":
                     self._shaded[s].append((node, part, float(more.get("opacity", 1.0))))
             mine = body.landmarks.points[body.landmarks.segments == s]
@@ -83,7 +86,7 @@ class Figure:
     def _add_skin(self, scene: Any, name: str) -> None:
         """Add the skin, a mesh for each segment, so that each can have its own colour and opacity."""
         rest = self.body.tree.rest
-        for piece in content.skin_pieces(body_mesh(self.body)):
+        for piece in looks.skin_pieces(body_mesh(self.body)):
             unturned = np.tile([1.0, 0.0, 0.0, 0.0], (len(piece.followed), 1))
             node = scene.add_mesh_skinned(
                 f"/world/{name}/skin_{self.body.tree.segments[piece.segment]}", piece.mesh.vertices, piece.mesh.faces,
@@ -95,9 +98,12 @@ class Figure:
             self._followers += zip(node.bones, piece.followed.tolist(), strict=True)
 
     def show(self, part: str, visible: bool) -> None:
-        """Show or hide one of `PARTS`."""
+        """Show or hide one of `PARTS`, from the next pose on."""
+        (self._on.add if visible else self._on.discard)(part)
         for node in self._parts[part]:
             node.visible = visible
+        for node in self._dashes:
+            node.visible = bool(self._on & {"skin", "bones"})
 
     def show_all(self, visible: bool) -> None:
         """Show or hide the whole figure."""
@@ -129,17 +135,19 @@ class Figure:
             node.wxyz, node.position = q, t
         for bone, s in self._followers:
             bone.wxyz, bone.position = wxyz[s], x[s]
-        uncertain = None if joint_std is None else content.uncertain_segments(self.body, joint_std)
-        colours, opacities = content.segment_looks(
+        uncertain = None if joint_std is None else looks.uncertain_segments(self.body, joint_std)
+        colours, opacities = looks.segment_looks(
             np.ones(len(x)) if quality is None else quality, self.usual, by_quality=by_quality and quality is not None,
             uncertain=uncertain,
         )  # fmt: skip
+        bones = self._bare or "bones" in self._on
         for s, (colour, opacity) in enumerate(zip(colours.tolist(), opacities.tolist(), strict=True)):
-            if self._looks[s] != (*colour, opacity, see_through):
-                self._looks[s] = (*colour, opacity, see_through)
+            if self._looks[s] != (*colour, opacity, see_through, bones):
+                self._looks[s] = (*colour, opacity, see_through, bones)
                 lost = quality is not None and quality[s] < BELIEVED
+                hidden = {"gaps"} if lost else set() if bones else {"bones"}
                 for node, part, full in self._shaded[s]:
-                    full = 0.0 if part == "gaps" and lost else _SEEN_THROUGH if part == "skin" and see_through else full
+                    full = 0.0 if part in hidden else _SEEN_THROUGH if part == "skin" and see_through else full
                     share = full * (1.0 if part in ("bones", "gaps") else opacity)
                     node.color, node.opacity = tuple(colour), None if share == 1.0 else share
         axes = np.zeros((len(x), 3)) if joint_std is None else content.ellipsoids(self.body, joint_std)
@@ -182,7 +190,7 @@ class ScenePoints:
                 ball.position = x
 
 
-def _ball(radius: float) -> content.Mesh:
+def _ball(radius: float) -> looks.Mesh:
     """A small sphere about the origin."""
     return content.capsule(np.zeros(3), np.zeros(3), (radius, radius))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from time import monotonic
 from types import TracebackType
 
 import numpy as np
@@ -14,6 +15,8 @@ from kinefit.errors import BodyError, CalibrationError, choices
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.serving.access import Access
 from kinefit.viewers import figure, pictures, stage
+
+_TELL_INTERVAL_S, _RATE_INTERVAL_S = 0.2, 2.0  # of the words on the page; of the mean of the frame rate
 
 
 class View:
@@ -74,6 +77,9 @@ class View:
         self._frames = dict(image_frames or {})
         self._maps: dict[str, NDArray] = {}
         self._time = self.server.gui.add_markdown("waiting for the first state")
+        with self.server.gui.add_folder("Angles", expand_by_default=False):
+            self._angles = self.server.gui.add_markdown("")
+        self._shown, self._told, self._since = 0, 0.0, monotonic()  # states, and [s] of the last words about them
         boxes = {part: self.server.gui.add_checkbox(part, part in figure.DEFAULT_PARTS) for part in figure.PARTS}
         self._boxes = boxes
 
@@ -129,8 +135,16 @@ class View:
             for name, image in (images or {}).items():
                 picture = self._flat(name, image)
                 self._stage.cameras[name].show(picture)
-            if time is not None:
-                self._time.content = f"**{time:.3f} s**"
+        self._shown += 1
+        if (now := monotonic()) - self._told > _TELL_INTERVAL_S:
+            rate, self._told = self._shown / max(now - self._since, 1e-3), now
+            self._time.content = f"**{time:.3f} s**, {rate:.0f} Hz" if time is not None else f"{rate:.0f} Hz"
+            tree = self.body.tree
+            scales = np.where(tree.prismatic, 1000.0, 180 / np.pi)
+            values = zip(tree.coordinates, scales * state.angles, tree.prismatic, strict=True)
+            self._angles.content = "\n\n".join(f"{n} **{v:.1f}**{' mm' if slides else '°'}" for n, v, slides in values)
+            if now - self._since > _RATE_INTERVAL_S:
+                self._shown, self._since = 0, now
 
     def _flat(self, name: str, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if self._rig is None or name not in self._rig:

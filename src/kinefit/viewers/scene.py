@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, PointSet, TaperedCylinder
 from kinefit.geometry.camera import Camera
-from kinefit.motion import BELIEVED, UP_AXES, Motion, Residuals
-from kinefit.rendering.colours import LOST, RGB, quality_ramp, side_colour
-from kinefit.rendering.tubes import TubeMesh
+from kinefit.motion import UP_AXES, Motion, Residuals
+from kinefit.rendering.colours import RGB, quality_ramp
+from kinefit.rendering.looks import Mesh
 
 OTHERS: tuple[RGB, ...] = ((204, 121, 167), (86, 180, 233), (230, 159, 0), (120, 90, 60))
 """Colours of the second, third ... motion, which have one colour for both sides."""
@@ -21,19 +21,9 @@ OTHERS: tuple[RGB, ...] = ((204, 121, 167), (86, 180, 233), (230, 159, 0), (120,
 OUTLIER_WEIGHT = 0.05  # robust weight below which a measurement had no say
 OUTLIER = (255, 30, 30)
 LARGEST_ELLIPSOID = 0.5  # [m] half axis beyond which "somewhere there" says nothing more, and hides the rest
-_MAX_SIGMA = 0.11  # [m] of a joint, all directions together, above which its limb may lie beside itself
-_LOST_OPACITY, _UNCERTAIN_OPACITY = 0.45, 0.6
 _PIECES = 5  # of a bone: dashes and gaps of a lost one in turn
 _JOINT = 0.016  # [m] radius of the ball at a joint, of one on thin segments less
 _AROUND, _CAP = 14, 4  # vertices around a capsule, rings of a rounded end
-
-
-@dataclass(frozen=True, eq=False)
-class Mesh:
-    """Triangles: vertices (V, 3) [m], faces (T, 3) int, counterclockwise from outside."""
-
-    vertices: NDArray
-    faces: NDArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,48 +68,6 @@ def joined(meshes: Sequence[Mesh]) -> Mesh | None:
     return Mesh(np.concatenate([m.vertices for m in meshes]), faces)
 
 
-@dataclass(frozen=True, eq=False)
-class SkinPiece:
-    """The part of a skin that one segment carries.
-
-    Parameters
-    ----------
-    segment : int
-    mesh : Mesh, its vertices in the root's frame at rest
-    followed : (B,) int, segments that its vertices follow
-    weights : (V, B) how much each vertex follows these; they sum to 1
-    """
-
-    segment: int
-    mesh: Mesh
-    followed: NDArray
-    weights: NDArray
-
-
-def skin_pieces(skin: TubeMesh) -> list[SkinPiece]:
-    """A skin cut along the borders of the segments.
-
-    A triangle belongs to the segment that the ends of its longest edge follow most. Both halves of a quadrilateral
-    share this edge, so borders have no teeth.
-    """
-    every = np.zeros((len(skin.vertices), int(skin.segments.max(initial=-1)) + 1))
-    np.add.at(every, (np.arange(len(every))[:, None], skin.segments), skin.weights)
-    corners = skin.vertices[skin.triangles]
-    longest = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).argmax(axis=1)
-    rows = np.arange(len(longest))
-    ends = [skin.triangles[rows, (longest + k) % 3] for k in range(2)]
-    owners = (every[ends[0]] + every[ends[1]]).argmax(axis=1) if len(rows) else rows
-    out = []
-    for s in np.unique(owners):
-        used, faces = np.unique(skin.triangles[owners == s], return_inverse=True)
-        segments, shares = skin.segments[used], skin.weights[used]
-        followed, columns = np.unique(np.where(shares > 0, segments, s), return_inverse=True)
-        weights = np.zeros((len(used), len(followed)))
-        np.add.at(weights, (np.arange(len(used))[:, None], columns.reshape(shares.shape)), shares)
-        out.append(SkinPiece(int(s), Mesh(skin.vertices[used], faces.reshape(-1, 3)), followed, weights))
-    return out
-
-
 def bone_meshes(body: Body) -> tuple[list[Mesh | None], list[Mesh | None]]:
     """Dashes and gaps between them, thin meshes of every segment in its frame; together they are solid bones.
 
@@ -160,34 +108,6 @@ def surface_meshes(body: Body) -> list[Mesh | None]:
         else:
             found[c.segment].append(Mesh(c.vertices, c.faces))
     return [joined(meshes) for meshes in found]
-
-
-def side_colours(body: Body) -> NDArray:
-    """(S, 3) uint8: left blue, right orange, the middle green."""
-    return np.array([side_colour(name) for name in body.tree.segments], np.uint8).reshape(-1, 3)
-
-
-def segment_looks(
-    quality: NDArray, usual: NDArray, *, by_quality: bool, uncertain: NDArray | None = None
-) -> tuple[NDArray, NDArray]:
-    """Colours (S, 3) uint8 and opacities (S,) of the segments by their quality (S,) in 0..1.
-
-    A segment that is lost is grey and translucent whatever the colours mean; one that is `uncertain` (S,) bool is a
-    little translucent.
-    """
-    lost = np.asarray(quality) < BELIEVED
-    colours = quality_ramp(1.0 - np.asarray(quality, float)) if by_quality else usual
-    opacities = np.where(False if uncertain is None else uncertain, _UNCERTAIN_OPACITY, 1.0)
-    shades = np.where(lost[:, None], np.array(LOST, np.uint8), colours)
-    return shades, np.where(lost, _LOST_OPACITY, np.broadcast_to(opacities, lost.shape))
-
-
-def uncertain_segments(body: Body, joint_std: NDArray) -> NDArray:
-    """(S,) bool: segments of which a joint, at either end, has standard deviations (S, 3) [m] above 11 cm in all."""
-    sigmas = np.sqrt(np.sum(np.square(np.nan_to_num(joint_std, nan=np.inf, posinf=np.inf)), axis=1))
-    out, parents = sigmas > _MAX_SIGMA, body.tree.parents
-    np.logical_or.at(out, parents[parents >= 0], (sigmas > _MAX_SIGMA)[parents >= 0])
-    return out
 
 
 def ellipsoids(body: Body, joint_std: NDArray, *, sigmas: float = 2.0) -> NDArray:

@@ -99,6 +99,45 @@ def test_lost_segments_turn_grey_and_are_named(motion, monkeypatch):
     assert "0 points" in told[6] and "rejected" in told[6] and "corrected" in told[7] and told[8] == "not tracked"
 
 
+def test_the_skin_covers_the_body_shaded_and_lost_or_uncertain_parts_less(motion):
+    motion, tree = replace(motion, residuals={}), motion.body.tree
+    small = ImageFrame.scaled(CAMERA.size, (160, 240))
+    quality, std = np.array(motion.segment_quality), np.full_like(motion.joint_std, 0.01)
+    quality[3, tree.segment("thigh_r")], std[3, tree.segment("hand_l")] = 0, 0.2
+    told = replace(motion, segment_quality=quality, joint_std=std)
+    knee, hip, elbow, wrist = CAMERA.project(
+        motion.positions(motion.body.landmarks.select(("r_knee", "r_hip", "l_elbow", "l_wrist")))[3]
+    )
+    plain, skin = draw_overlay(GREY, told, 3, CAMERA), draw_overlay(GREY, told, 3, CAMERA, skin=True)
+    covered = (plain != skin).any(axis=2)
+    bones = (plain != 90).any(axis=2)[70:]  # below the label
+    assert 0.5 * bones.sum() < covered.sum() < 0.3 * covered.size
+    image = skin.astype(int)
+    sure = draw_overlay(GREY, replace(motion, joint_std=0 * std), 3, CAMERA, skin=True).astype(int)
+    thigh = beside(0.5 * (knee + hip), knee - hip, covered & ~(plain != 90).any(axis=2))
+    assert np.ptp(image[thigh]) <= 2 and sure[thigh][0] > sure[thigh][1] + 40 > sure[thigh][2] + 40  # grey, not orange
+    hand = np.rint(1.2 * wrist - 0.2 * elbow).astype(int)
+    arm = np.s_[hand[1] - 12 : hand[1] + 12, hand[0] - 12 : hand[0] + 12]
+    changed = (image[arm] != sure[arm]).any(axis=2)
+    blue, before = (np.mean((view[..., 2] - view[..., 0])[arm][changed]) for view in (image, sure))
+    assert changed.sum() > 10 and 20 < blue < before - 5
+    half = draw_overlay(GREY[::2, ::2], told, 3, CAMERA, image_frame=small, skin=True)
+    assert np.abs(half[120:] - cv2.resize(skin, (160, 240), interpolation=cv2.INTER_AREA)[120:].astype(int)).mean() < 6
+    bare = replace(motion, body=replace(motion.body, surfaces=()))
+    assert np.array_equal(draw_overlay(GREY, bare, 3, CAMERA), draw_overlay(GREY, bare, 3, CAMERA, skin=True))
+
+
+def beside(middle, along, free):
+    """(row, column) of the nearest free pixel at right angles to a bone."""
+    across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+    for k in range(1, 30):
+        for side in (k, -k):
+            u, v = np.rint(middle + side * across).astype(int)
+            if free[v, u]:
+                return v, u
+    raise AssertionError("the bone has no skin")
+
+
 def test_a_lost_bone_is_dashed_and_grey(motion):
     thigh = motion.body.tree.segment("thigh_r")
     quality = np.array(motion.segment_quality)

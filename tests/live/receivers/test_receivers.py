@@ -155,7 +155,7 @@ def test_answers_that_nobody_reads_end_the_connection(scene, played):
 
 def test_the_page_has_the_body_and_escapes_the_name(served):
     html = urlopen(served.url).read().decode()
-    assert "<h1>trial &lt;1&gt;</h1>" in html and 'id="capsules"' in html and "WebSocket" in html
+    assert "<h1>trial &lt;1&gt;</h1>" in html and 'class="player"' in html and "WebSocket" in html
     assert " style=" not in html and not re.search(r"<[^>]* on\w+=", html)
     with pytest.raises(OSError, match="404"):
         urlopen(f"{served.url}etc/passwd")

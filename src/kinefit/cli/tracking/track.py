@@ -48,6 +48,7 @@ def choices_options(command: Callable) -> Callable:
     """
     options = (
         click.option("--overlays/--no-overlays", default=True, show_default=True, help="Draw the fit on every video."),
+        click.option("--overlay-skin", is_flag=True, help="Draw the person's skin on the videos, too."),
         click.option(
             "--formats", default=",".join(results.DEFAULT_FORMATS), show_default=True, callback=chosen_formats,
             metavar="LIST",
@@ -83,7 +84,7 @@ def choices_options(command: Callable) -> Callable:
 
         chosen = {parameter: given.pop(parameter) for parameter in _CHOICES}
         source = click.get_current_context().get_parameter_source("overlays")
-        wanted = chosen["overlays"] and source == click.core.ParameterSource.COMMANDLINE
+        wanted = (chosen["overlays"] and source == click.core.ParameterSource.COMMANDLINE) or chosen["overlay_skin"]
         if chosen["pictures"] == "blurred":
             _screen.note("--pictures blurred is now --hide-faces, which hides everybody's face.")
             chosen |= {"pictures": "full", "hide_faces": True}
@@ -98,7 +99,8 @@ def choices_options(command: Callable) -> Callable:
 
 
 _CHOICES = (
-    "overlays", "formats", "report", "pictures", "contacts", "realtime", "lag", "person", "restart", "hide_faces",
+    "overlays", "overlay_skin", "formats", "report", "pictures", "contacts", "realtime", "lag", "person", "restart",
+    "hide_faces",
 )  # fmt: skip
 
 
@@ -109,6 +111,8 @@ def _check(choices: Choices, wanted: bool) -> None:
     if choices.lag is not None and (choices.contacts or not choices.smooth):
         other = "--contacts needs the whole take" if choices.contacts else "--realtime knows of no later frame"
         raise click.UsageError(f"{other}, --lag SECONDS only of the frames so far ahead: choose one of both.")
+    if choices.overlay_skin and not choices.draws:
+        raise click.UsageError("--overlay-skin draws on overlays; --no-overlays and --pictures none write none.")
     if choices.pictures == "none" and wanted:
         raise click.UsageError("--overlays draws on the videos, --pictures none shows nothing of them: choose one.")
 
@@ -164,7 +168,7 @@ def run(
 
     take = asked_take(path, choices)
     if wanted:
-        check_drawable(take)
+        check_drawable(take, skin=choices.overlay_skin)
     _results.check_folder(out)
     with _screen.bars() as step:
         view, people = people_of(take, out, step, _screen.note)

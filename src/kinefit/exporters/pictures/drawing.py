@@ -17,6 +17,8 @@ from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
 from kinefit.rendering import Canvas
 from kinefit.rendering.colours import LOST, side_colour
+from kinefit.rendering.looks import segment_looks, side_colours, triangle_segments, uncertain_segments
+from kinefit.rendering.tubes import TubeMesh, body_mesh
 
 DARK, WHITE = (15, 15, 15), (255, 255, 255)
 MEASURED, OUTLIER, WAY = (255, 240, 60), (255, 40, 40), (255, 90, 220)
@@ -24,6 +26,8 @@ OUTLIER_WEIGHT = 0.05
 _SAMPLES = np.linspace(0.0, 1.0, 6)[:, None]  # along a bone, which a lens may bend
 _LIMB_WIDTH, _FINGER_WIDTH = 0.022, 0.007  # [m] of a bone as drawn
 _SUBPIXEL_BITS, _MAX_DRAWN_PX = 4, 20000.0  # OpenCV's sub-pixel bits; [px] beyond which nothing is drawn
+_SKIN_OPACITY = 0.75
+_TO_LIGHT = np.array([-0.36, -0.48, -0.8])  # in the camera's frame
 _DASH_WIDTHS = 3.0  # length of a dash, and of a gap, over the width of its line: its ends are round
 
 
@@ -68,6 +72,40 @@ def draw_bones(image: NDArray, motion: Motion, frame: int, camera: Camera, image
         draw_line(image, uv[b], LOST if lost else colours[b], width, dash)
     for b in np.flatnonzero(~motion.lost[frame, list(owners)]):
         _dot(image, uv[b, 0], 0.36 * thick[b], WHITE, -1)
+
+
+@lru_cache(maxsize=8)
+def _skin(body: Body) -> tuple[TubeMesh, NDArray]:
+    """The skin as viewer and report show it, and the segment of each triangle."""
+    mesh = body_mesh(body)
+    return mesh, triangle_segments(mesh)
+
+
+def draw_skin(image: NDArray, motion: Motion, frame: int, camera: Camera, image_frame: ImageFrame) -> None:
+    """Lay the shaded skin over an image (H, W, 3) uint8 RGB; lost parts are grey, uncertain ones more translucent."""
+    (mesh, owners), tree = _skin(motion.body), motion.body.tree
+    if not len(owners):
+        return
+    Ts = tree.segment_poses(motion.Ts_world_root[frame][None], motion.angles[frame][None])[0][:, :3].copy()
+    Ts[..., 3] -= np.einsum("sij,sj->si", Ts[..., :3], tree.rest)  # from the root's frame at rest
+    followed = np.einsum("vk,vkij->vij", mesh.weights, Ts[mesh.segments])
+    vertices = np.einsum("vij,vj->vi", followed[..., :3], mesh.vertices) + followed[..., 3]
+    normals = np.einsum("vij,vj->vi", followed[..., :3], mesh.normals)[mesh.triangles].mean(axis=1)
+    light = 0.5 + 0.6 * np.maximum(normals @ (camera.T_camera_world[:3, :3].T @ _TO_LIGHT), 0.0)
+    colours, opacities = segment_looks(
+        motion.segment_quality[frame], side_colours(motion.body), by_quality=False,
+        uncertain=uncertain_segments(motion.body, motion.joint_std[frame]),
+    )  # fmt: skip
+    shades = np.column_stack([np.minimum(colours[owners] * light[:, None], 255.0), np.full(len(owners), 255.0)])
+    shades *= _SKIN_OPACITY * opacities[owners][:, None]
+    face = Canvas(camera.size).draw_for(camera, vertices, mesh.triangles, cull=True).face
+    layer = np.zeros((*face.shape, 4), np.uint8)
+    layer[face >= 0] = shades.astype(np.uint8)[face[face >= 0]]
+    layer = cv2.warpAffine(layer, image_frame.T_image_calibration[:2], image.shape[1::-1])
+    rows, columns = layer[..., 3].any(axis=1).nonzero()[0], layer[..., 3].any(axis=0).nonzero()[0]
+    if len(rows):
+        box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        image[box] = image[box] * (1.0 - layer[box][..., 3:] / 255.0) + layer[box][..., :3]
 
 
 @lru_cache(maxsize=8)

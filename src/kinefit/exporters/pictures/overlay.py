@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kinefit._threads import ahead
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes, writing
-from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT, WHITE, draw_body, draw_residuals, write_lines
+from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT, WHITE, draw_body, draw_residuals, draw_skin, write_lines
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
 from kinefit.readers.video import Video
@@ -35,6 +35,7 @@ def write_overlay(
     image_frame: ImageFrame | None = None,
     residuals: Residuals | None = None,
     time_offset: float = 0.0,
+    skin: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> None:
     """Write a video (H.264 where the codec is there, else MPEG-4) of a motion's pictures with the fit drawn on them.
@@ -55,6 +56,8 @@ def write_overlay(
         By default those that the motion holds under the camera's name.
     time_offset : float [s]
         Added to frame / rate to get the time of the take.
+    skin : bool
+        Whether the body's skin is drawn below its bones, translucent.
     progress : callable, optional
         Called with the number of pictures done.
 
@@ -71,7 +74,7 @@ def write_overlay(
             frame = nearest_frame(motion, video.times[i] + time_offset)
             label = f"frame {i}"
             yield draw_overlay(
-                image, motion, frame, camera, image_frame=image_frame, residuals=residuals, label=label
+                image, motion, frame, camera, image_frame=image_frame, residuals=residuals, label=label, skin=skin
             )[:height, :width]
 
     write_pictures(drawn(), path, video.rate, (width, height), progress, times=video.times[span.start : span.stop])
@@ -125,13 +128,14 @@ def draw_overlay(
     image_frame: ImageFrame | None = None,
     residuals: Residuals | None = None,
     label: str | None = None,
+    skin: bool = False,
 ) -> NDArray[np.uint8]:
     """One picture with the fit drawn on it.
 
     Parameters
     ----------
     image : (H, W, 3) uint8 RGB; left as it is.
-    motion, camera, image_frame, residuals : see `write_overlay`.
+    motion, camera, image_frame, residuals, skin : see `write_overlay`.
     frame : frame of the motion, None for a picture outside of it.
     label : str, optional
         By default the number of the frame.
@@ -149,6 +153,8 @@ def draw_overlay(
     if frame is None:
         write_lines(out, [*lines, ("no motion here", _NOTE)])
         return out
+    if skin:
+        draw_skin(out, motion, frame, camera, image_frame)
     draw_body(out, motion, frame, camera, image_frame)
     if residuals is not None:
         draw_residuals(out, residuals, frame, image_frame)

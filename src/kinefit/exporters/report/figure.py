@@ -1,4 +1,4 @@
-"""The moving 3D figure of a page: capsules over time, a floor and cameras, drawn on a canvas by `player.js`."""
+"""The moving 3D figure of a page: skin or cylinders over time, a floor and cameras, drawn by `player.js`."""
 
 from __future__ import annotations
 
@@ -15,83 +15,84 @@ from kinefit.exporters.report.page import Html, to_json
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion, rotation_between_up
-from kinefit.rendering.colours import LEFT, LOST, RIGHT, side_colour, to_hex
-from kinefit.rendering.tubes import is_last
+from kinefit.rendering.colours import LOST, side_colour, to_hex
+from kinefit.rendering.looks import LOST_OPACITY, UNCERTAIN_OPACITY, triangle_segments, uncertain_segments
+from kinefit.rendering.tubes import body_mesh, is_last
 
 RATE = 15.0  # [Hz] of the figure: enough for the eye to follow, the player goes smoothly between
 MAX_FIGURE_FRAMES = 3000  # frames: longer takes are shown at a lower rate
+_MAX_VERTICES, _MAX_SEGMENTS = 65535, 256  # of a skin: a page stays small; larger ones are drawn as cylinders
 _BONE = 0.02  # [m] radius of a bone that has no surface
 _PYRAMID_DEPTH_M = 0.35  # [m] how far a camera's pyramid reaches
 
 
 class Capsules(NamedTuple):
-    """C capsules: points (2 C) on the body, their ends two by two; radii (C, 2) [m] of both; colours (C) "#0072b2"."""
+    """C capsules: points (2 C) on the body, their ends two by two; radii (C, 2) [m] of both."""
 
     points: PointSet
     radii: NDArray
-    colours: list[str]
 
 
 def figure(motion: Motion, rig: Rig | None = None) -> Html:
     """The body as it moves, with the cameras of a rig; the floor lies under the lowest foot."""
     R = rotation_between_up(motion.up, "z")
-    capsules = _capsules(motion.body)
     step = max(1, round(motion.rate / RATE), -(-len(motion) // MAX_FIGURE_FRAMES))
     frames = np.arange(0, len(motion), step)
     T = se3.transform(R, np.zeros(3))
-    x = motion.body.trajectories(T @ motion.Ts_world_root[frames], motion.angles[frames], capsules.points)
-    floor = float(np.percentile((x[..., 2] - capsules.radii.ravel()).min(axis=1), 5))
+    Ts = motion.body.tree.segment_poses(T @ motion.Ts_world_root[frames], motion.angles[frames])
     cameras = [] if rig is None else [_pyramid(camera.name, camera, R) for camera in rig]
-    lost = motion.lost[frames][:, capsules.points.segments[::2]]
-    return player(
-        x, capsules, rate=motion.rate / step, start=float(motion.times[0]), floor=floor, cameras=cameras, dimmed=lost
+    looks = {"lost": motion.lost[frames], "uncertain": uncertain_segments(motion.body, motion.joint_std[frames])}
+    return _player(
+        motion.body, Ts, rate=motion.rate / step, start=float(motion.times[0]), cameras=cameras,
+        **{look: _packed(np.packbits(segments)) if segments.any() else "" for look, segments in looks.items()},
     )  # fmt: skip
 
 
-def live_figure(body: Body) -> tuple[Html, PointSet]:
-    """A figure that a page moves by `move(points, lost)`, at rest; and its capsules' ends on the body, two by two."""
-    capsules = _capsules(body)
-    T = se3.transform(rotation_between_up("y", "z"), np.zeros(3))
-    x = body.trajectories(T[None], body.rest_state().angles[None], capsules.points)
-    floor = float((x[0, :, 2] - capsules.radii.ravel()).min())
-    return player(x, capsules, rate=1.0, floor=floor), capsules.points
+def live_figure(body: Body, up: str = "y") -> Html:
+    """A figure at rest that a page moves by `move(poses, lost, uncertain)`, in a world with the vertical axis `up`."""
+    rest = se3.transform(rotation_between_up("y", "z"), np.zeros(3))
+    Ts = body.tree.segment_poses(rest[None], body.rest_state().angles[None])
+    return _player(body, Ts, rate=1.0, turn=rotation_between_up(up, "z"))
 
 
-def player(
-    x: NDArray,
-    capsules: Capsules,
-    *,
-    rate: float,
-    start: float = 0.0,
-    floor: float = 0.0,
-    cameras: list[dict[str, Any]] | None = None,
-    dimmed: NDArray | None = None,
-) -> Html:
-    """A moving figure of capsules, z up.
-
-    Parameters
-    ----------
-    x : (F, 2 C, 3) [m] ends of the capsules over time.
-    capsules : Capsules
-    rate : float [Hz]
-    start : float [s] time of the first frame.
-    floor : float [m] height of the floor's grid.
-    cameras : list of {"name", "points": (5, 3) centre and corners}, optional
-    dimmed : (F, C) bool, optional
-        Capsules that are shown as lost.
-    """
+def _player(body: Body, Ts: NDArray, **more: Any) -> Html:
+    """The figure that `player.js` draws: segments' poses (F, S, 4, 4), z up, and more entries as it reads them."""
+    capsules, names = _capsules(body), body.tree.segments
+    owners = capsules.points.segments
+    x = np.einsum("fkij,kj->fki", Ts[:, owners, :3], np.insert(capsules.points.points, 3, 1.0, axis=1))
     low, high = x.min(axis=(0, 1)), x.max(axis=(0, 1))
-    quantum = max(float((high - low).max()) / 60000.0, 1e-4)
-    whole = np.round((x - 0.5 * (low + high)) / quantum).astype("<i2")
+    floor = float(np.percentile((x[..., 2] - capsules.radii.ravel()).min(axis=1), 5))
+    at = Ts[..., :3, 3]
+    quantum = max(float((np.maximum(high, at.max((0, 1))) - np.minimum(low, at.min((0, 1)))).max()) / 30000.0, 1e-4)
+    turns = np.rint(32767 * se3.quaternion(Ts[..., :3, :3])[..., 1:])  # the first, w, is the root of the rest
+    poses = np.concatenate([np.rint((at - 0.5 * (low + high)) / quantum), turns], axis=-1).astype("<i2")
     data = {
-        "rate": rate, "start": start, "frames": len(x), "points": x.shape[1], "quantum": quantum,
-        "middle": 0.5 * (low + high), "low": low, "high": high, "floor": floor, "radii": capsules.radii,
-        "ends": np.arange(x.shape[1]).reshape(-1, 2), "colours": capsules.colours,
-        "sides": [(c == to_hex(RIGHT)) - (c == to_hex(LEFT)) for c in capsules.colours], "lost": to_hex(LOST),
-        "cameras": cameras or [], "x": _packed(whole),
-        "dimmed": _packed(np.packbits(dimmed)) if dimmed is not None and dimmed.any() else "",
+        "frames": len(Ts), "segments": len(names), "poses": _packed(poses), "quantum": quantum,
+        "middle": 0.5 * (low + high), "low": low, "high": high, "floor": floor, "rest": body.tree.rest,
+        "ends": capsules.points.points, "owners": owners, "radii": capsules.radii, "skin": _skin(body),
+        "colours": [to_hex(side_colour(name)) for name in names],
+        "sides": [name.endswith("_r") - name.endswith("_l") for name in names], "lost_colour": to_hex(LOST),
+        "opacities": [LOST_OPACITY, UNCERTAIN_OPACITY], "cameras": [], "start": 0.0, "lost": "", "uncertain": "",
+        **more,
     }  # fmt: skip
     return Html(f'<div class="player" id="figure"><script type="application/json">{to_json(data)}</script></div>')
+
+
+def _skin(body: Body) -> dict[str, Any] | None:
+    """The skin as `player.js` reads it, each vertex once for every segment that it shows; None without one."""
+    mesh = body_mesh(body)
+    V = len(mesh.vertices)
+    pairs, faces = np.unique(triangle_segments(mesh)[:, None] * V + mesh.triangles, return_inverse=True)
+    if not 0 < len(pairs) <= _MAX_VERTICES or len(body.tree.segments) > _MAX_SEGMENTS:
+        return None
+    shown, used = np.divmod(pairs, V)
+    grain = max(float(np.abs(mesh.vertices).max()) / 32767.0, 1e-6)
+    return {
+        "grain": grain, "vertices": _packed(np.rint(mesh.vertices[used] / grain).astype("<i2")),
+        "normals": _packed(np.rint(127 * mesh.normals[used]).astype("i1")), "faces": _packed(faces.astype("<u2")),
+        "shown": _packed(shown.astype("u1")), "owners": _packed(mesh.segments[used].astype("u1")),
+        "weights": _packed(np.rint(255 * mesh.weights[used]).astype("u1")),
+    }  # fmt: skip
 
 
 def _packed(array: NDArray) -> str:
@@ -100,18 +101,13 @@ def _packed(array: NDArray) -> str:
 
 def _capsules(body: Body) -> Capsules:
     """Those of a body's surfaces, or of its bones."""
-    tree = body.tree
     limbs = [limb for c in body.surfaces for limb in _limbs(c, body)]
-    if limbs:
-        segments = np.repeat([segment for segment, _, _ in limbs], 2)
-        tips = np.concatenate([both for _, both, _ in limbs])
-        radii = np.array([r for _, _, r in limbs])
-        points = PointSet(tuple(f"{k}" for k in range(len(tips))), segments, tips)
-    else:
+    if not limbs:
         points = bones(body)[0]
-        radii = np.full((len(points) // 2, 2), _BONE)
-    colours = [to_hex(side_colour(tree.segments[s])) for s in points.segments[::2]]
-    return Capsules(points, radii, colours)
+        return Capsules(points, np.full((len(points) // 2, 2), _BONE))
+    segments = np.repeat([segment for segment, _, _ in limbs], 2)
+    tips = np.concatenate([both for _, both, _ in limbs])
+    return Capsules(PointSet(tuple(f"{k}" for k in range(len(tips))), segments, tips), np.array([r for *_, r in limbs]))
 
 
 def _limbs(c: Surface, body: Body) -> list[tuple[int, NDArray, NDArray]]:

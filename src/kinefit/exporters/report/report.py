@@ -109,8 +109,8 @@ def write_report(
         _summary(motion, moments, list(findings), date),
         p.section("Moving figure", figure(motion, rig), p.paragraph(
             "Drag to turn, click and use the wheel (or two fingers) to zoom. Blue is left, orange right; what is "
-            "grey and dashed was not seen. Times anywhere on this page, and clicks into plots over time, move the "
-            "figure there.", small=True)),
+            "grey and dashed was not seen, what is translucent is uncertain. Cylinders shows the surfaces of the fit. "
+            "Times anywhere on this page, and clicks into plots over time, move the figure there.", small=True)),
         p.section("Angles", *_angles(motion)),
         p.section("Cycles", *_cycles(motion, cycles, norms or {})),
         p.section("Doubtful moments", *flagged(motion, moments, shown, width)),
