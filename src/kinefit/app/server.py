@@ -19,6 +19,7 @@ Receive = Callable[[], Awaitable[Scope]]
 Send = Callable[[Scope], Awaitable[None]]
 Application = Callable[[Scope, Receive, Send], Awaitable[None]]
 
+_RECONNECT_S = 60.0  # that a page may be away, as on a machine that sleeps or computes, and goes on as it was
 _POLICY_VIOLATION = 1008  # close code of a WebSocket
 
 
@@ -83,7 +84,9 @@ def serve(root: Path, port: int, access: Access, opened: Callable[[str], None]) 
     add_pages(desk)
     outer = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     pages.on_shutdown(desk.close)
-    ui.run_with(outer, title="kinefit", mount_path=desk.prefix, show_welcome_message=False)
+    ui.run_with(
+        outer, title="kinefit", mount_path=desk.prefix, show_welcome_message=False, reconnect_timeout=_RECONNECT_S
+    )  # fmt: skip
     pages.on_startup(lambda: opened(access.url(listener.getsockname()[1])))
     config = uvicorn.Config(
         Gate(outer, access), log_level="error", ws="websockets-sansio", timeout_graceful_shutdown=2
