@@ -127,7 +127,7 @@ def test_every_video_of_a_take_is_looked_through_once(take, networks):
     done = networks.pictures
     again = run(take)
     assert again.exit_code == 0 and networks.pictures == done
-    assert again.stdout.count("(already there)") == 4
+    assert again.stdout.count("(existing results)") == 4
     assert run(take, "--force").exit_code == 0 and networks.pictures == 2 * done
 
 
@@ -135,10 +135,10 @@ def test_another_video_or_setting_is_done_anew_and_only_that(take, networks):
     run(take)
     write_video(take.with_name("cam02.mp4"), 9)
     told = run(take)
-    assert told.stdout.count("(already there)") == 3
+    assert told.stdout.count("(existing results)") == 3
     assert "cam02: 9 pictures, person 1 in 9\n" in told.stdout
-    assert run(take, "--people", 1).stdout.count("(already there)") == 0
-    assert run(take, "--people", 1, "--no-masks").stdout.count("(already there)") == 0
+    assert run(take, "--people", 1).stdout.count("(existing results)") == 0
+    assert run(take, "--people", 1, "--no-masks").stdout.count("(existing results)") == 0
     assert read_detections(detections_file(take, "cam02")).mask(0, 0) is None
     before = networks.pictures
     assert set(ensure_detections(read_take(take))) == set(CAMERAS)
@@ -156,7 +156,7 @@ def test_what_was_interrupted_goes_on_with_the_others(take, networks, monkeypatc
         ensure_detections(read_take(take), masks=True, progress=stop)
     assert [path.name for path in (take.parent / "take-detect").iterdir()] == ["cam01.npz"]
     told = run(take)
-    assert told.exit_code == 0 and told.stdout.count("(already there)") == 1
+    assert told.exit_code == 0 and told.stdout.count("(existing results)") == 1
 
 
 def test_ctrl_c_says_how_much_is_kept(take, monkeypatch):
@@ -233,8 +233,8 @@ def test_a_take_reads_what_was_found(take):
     [
         (("none.toml",), FileError, "no such take"),
         (("none.mp4",), FileError, "none.mp4.*cannot be read"),
-        (("take.toml", "more.mp4"), click.UsageError, "one take alone"),
-        (("a/x.mp4", "b/x.mp4", "--out", "c"), click.UsageError, "two videos of one name"),
+        (("take.toml", "more.mp4"), click.UsageError, "give one take without --out"),
+        (("a/x.mp4", "b/x.mp4", "--out", "c"), click.UsageError, "two videos have the same name"),
     ],
 )
 def test_wrong_inputs_are_told(args, error, message, tmp_path, monkeypatch):

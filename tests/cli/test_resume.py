@@ -41,7 +41,7 @@ def test_the_command_goes_on_after_ctrl_c(take, tmp_path, monkeypatch):
 
     monkeypatch.setattr(Tracker, "update", until)
     told = CliRunner().invoke(main, [*words, str(tmp_path / "out")])
-    assert told.exit_code == 130 and "The same command goes on" in told.output
+    assert told.exit_code == 130 and "Run the same command to continue" in told.output
     assert len(read_motion(tmp_path / "out" / "motion.npz")) == 29
     told = CliRunner().invoke(main, [*words, str(tmp_path / "out")])
     assert told.exit_code == 0 and "going on with what an earlier run left" in told.output, told.output

@@ -11,9 +11,9 @@ from kinefit.errors import ExportError
 
 def no_format(name: str, valid: Iterable[str]) -> str:
     """What to say of a format that there is not."""
-    problem = f"there is no format '{name}'; there are: {', '.join(valid)}"
+    problem = f"no format '{name}'; there are: {', '.join(valid)}"
     if name.lower().strip(".") == "fbx":
-        problem += ". FBX is a closed format: write glb or bvh, which Blender, Unity and Unreal read"
+        problem += ". kinefit does not write FBX: use glb or bvh, which Blender, Unity and Unreal import"
     return problem
 
 

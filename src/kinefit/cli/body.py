@@ -13,17 +13,17 @@ from kinefit.cli._group import CommandGroup
 _FILE = click.Path(path_type=Path)
 
 
-@click.group(cls=CommandGroup, short_help="List, copy and draw bodies; check closed chains.",
+@click.group(cls=CommandGroup, short_help="List, copy and render bodies; check closed chains.",
              invoke_without_command=True, epilog="""\b
 Examples:
-  kinefit body                                   what comes along: people, and people with gear
-  kinefit body copy snowboarder                  snowboarder.toml, to change and to name in a take
-  kinefit body check snowboarder.toml            degrees of freedom, closures, what contradicts what
-  kinefit body picture cyclist -o cyclist.png    the body in a closed pose
+  kinefit body                                   list the bodies: people, and people with gear
+  kinefit body copy snowboarder                  write snowboarder.toml, to edit and to use in a take
+  kinefit body check snowboarder.toml            degrees of freedom, closures, contradictions
+  kinefit body picture cyclist -o cyclist.png    an image of the body with its closures satisfied
 """)  # fmt: skip
 @click.pass_context
 def body(ctx: click.Context) -> None:
-    """List, copy and draw bodies; check closed chains. Without a command: list."""
+    """List, copy and render bodies; check closed chains. Without a command: list."""
     if ctx.invoked_subcommand is not None:
         return
     from kinefit.bodies import catalogue, load_body
@@ -38,18 +38,18 @@ def body(ctx: click.Context) -> None:
         _screen.say(f"{name:18s} {parts}")
 
 
-@body.command(short_help="A body file of the catalogue, to change.")
+@body.command(short_help="Copy a body file of the catalogue, to edit.")
 @click.argument("name")
 @click.argument("file", type=_FILE, required=False)
 def copy(name: str, file: Path | None) -> None:
-    """Write a body of the catalogue as a TOML file of your own."""
+    """Write a body of the catalogue as a TOML file that you can edit."""
     from kinefit.bodies.toml.bodies import catalogue_text
     from kinefit.cli._results import check_file
     from kinefit.errors import FileError
 
     text, target = catalogue_text(name), file or Path(f"{name}.toml")
     if target.exists():
-        raise FileError("this file exists already", file=target, remedy="Name another file, or move it away.")
+        raise FileError("this file already exists", file=target, remedy="Give another --out, or move this file.")
     check_file(target, "FILE")
     target.write_text(text, encoding="utf-8")
     _screen.say(f"{target}: name it in the take, body = \"{target}\"")

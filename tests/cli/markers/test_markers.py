@@ -67,7 +67,7 @@ def test_learn_from_one_frame(folder, tmp_path):
     assert (tmp_path / "one.json").is_file()
     code, text = call("learn", folder / "labelled.c3d", "--frame", 99999, "-o", tmp_path / "two.json")
     assert code == 2
-    assert "no frame 99999" in text
+    assert "--frame 99999 does not exist" in text
     assert not (tmp_path / "two.json").exists()
 
 
