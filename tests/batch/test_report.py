@@ -39,7 +39,7 @@ def test_the_report_lies_beside_the_results_and_links_to_them(tracked, tmp_path)
     write_track_report(motion, take, seen, tmp_path, silent, files)
     text = files["report"].read_text("utf-8")
     assert files["report"] == tmp_path / "report.html" and files["report"].stat().st_size < 8e6
-    assert 'href="motion.npz"' in text and 'href="overlays"' in text and "videos with the skeleton" in text
+    assert 'href="motion.npz"' in text and 'href="overlays"' in text and "videos with the fitted skeleton" in text
     assert text.count("data:image/jpeg") >= 4 * 3
     assert str(tmp_path) not in text
 

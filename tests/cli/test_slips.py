@@ -163,7 +163,7 @@ def test_an_out_that_cannot_be_written_is_refused_before_any_work(take, words):
     names = {"take": take, "file": take.with_name("calibration.toml"), "folder": take.parent}
     told = run(*(word.format(**names) for word in words))
     assert told.exit_code == 2 and "in the way" in told.stderr, told.output
-    assert "Name a" in told.stderr and words[-2] in told.stderr
+    assert "Give another" in told.stderr and words[-2] in told.stderr
 
 
 def test_fbx_is_answered_with_glb_and_bvh():

@@ -215,12 +215,12 @@ class Nothing:
 
 
 def test_an_error_of_tracking_tells_the_fault_as_its_cause():
-    error = TrackingError("the body is found in none of the first 60 steps", remedy="Check units.")
+    error = TrackingError("the person is not found in the first 60 steps", remedy="Check units.")
     assert with_cause(error, ()) is error
     told = with_cause(error, (Finding("fault", "scale", "The person would be 3 mm tall.", remedy="Write unit."),))
     assert isinstance(told, TrackingError)
     assert str(told) == (
-        "the body is found in none of the first 60 steps; the inputs have a fault: The person would be 3 mm tall. "
+        "the person is not found in the first 60 steps; the inputs have a fault: The person would be 3 mm tall. "
         "Write unit."
     )
 

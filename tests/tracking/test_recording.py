@@ -55,7 +55,7 @@ def test_two_frames_of_one_name_are_told():
     """Markers of two systems that are both called mocap; two sets of keypoints of one camera are two sensors."""
     names = BODY.landmarks.names
     steps = [[marker_frame(i, names), marker_frame(i, names, shift=0.1)] for i in range(3)]
-    with pytest.raises(ObservationError, match=r"two frames of sensor 'mocap' in step 0.*own name"):
+    with pytest.raises(ObservationError, match=r"step 0 has two frames of sensor 'mocap'.*own name"):
         Recording.of_frames(steps, a_rig(), rate=RATE)
     other = [[keypoint_frame(0, "left"), replace(keypoint_frame(0, "left"), keypoint_set="BODY_25B")]]
     assert len(Recording.of_frames(other, a_rig(), rate=RATE).keypoints) == 2

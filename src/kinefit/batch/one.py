@@ -100,7 +100,7 @@ def check_drawable(take: Take) -> None:
         It has neither videos nor depth.
     """
     if not (take.depth or any(camera.video for camera in take.cameras)):
-        raise TakeError("overlays, but no video or depth to draw on", file=take.path, remedy="Leave --overlays out.")
+        raise TakeError("the take has no video or depth for overlays", file=take.path, remedy="Leave out --overlays.")
 
 
 def people_of(take: Take, out: Path, step: Step, tell: Tell) -> tuple[InView | None, list[tuple[Take, Path]]]:
