@@ -37,7 +37,7 @@ def test_everybody_in_view_is_tracked(take, tmp_path):
     assert sorted(gaps.argmin(axis=1)) == [0, 1] and gaps.min(axis=1).max() < 0.03
     for k, one in enumerate(found, start=1):
         assert one.provenance["people"]["in view"] == 2 and one.provenance["people"]["followed"] == k
-        assert f"2 people are in view, person {k} is followed" in told.stdout
+        assert f"2 people are in view; person {k} is tracked" in told.stdout
 
 
 def test_what_the_cameras_saw_is_read_once_for_all(take, tmp_path, monkeypatch):

@@ -106,7 +106,7 @@ def test_one_wish_is_done_a_step_and_those_too_many_are_refused(scene, collected
     session, answers = LiveSession(scene.tracker(), [scene.replay()], [collected]), []
     for _ in range(100):
         session.ask({"sensor": scene.rig.names[0], "use": True}, answers.append)
-    assert len(answers) == 36 and all("64 wishes wait already" in a["why"] for a in answers)
+    assert len(answers) == 36 and all("64 requests are waiting" in a["why"] for a in answers)
     session.run()
     assert [a["type"] for a in answers[36:]] == ["done"] * len(scene.recording)
 

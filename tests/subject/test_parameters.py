@@ -100,7 +100,7 @@ def test_markers_shift_one_by_one():
     assert np.diag(offsets.information)[[0, -1]] == pytest.approx([0.005**-2, 0.03**-2])
     with pytest.raises(BodyError, match="no set of points .* 'foot'; there are: .*worn"):
         PointOffsets(ARM, "foot")
-    with pytest.raises(BodyError, match="standard deviations"):
+    with pytest.raises(BodyError, match="does not fit the"):
         PointOffsets(ARM, "worn", np.ones(3))
 
 

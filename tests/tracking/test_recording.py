@@ -69,7 +69,7 @@ def test_a_time_that_is_not_the_frames_is_told_and_does_no_harm(frame):
     tracker = Tracker(BODY, a_rig(), rate=RATE, up=(0, 1, 0), settings=STILL)
     tracker.start_at(a_motion().state(0))
     before = tracker.update([depth_frame(0)])
-    with pytest.raises(ObservationError, match=r"has a frame of 0\.\d+ s in a step of 1000\.000 s.*one clock"):
+    with pytest.raises(ObservationError, match=r"is at 0\.\d+ s, its step at 1000\.000 s.*one clock"):
         tracker.update([frame(1)], 1000.0)
     np.testing.assert_array_equal(tracker.state.angles, before.state.angles)
     assert tracker.update([frame(1)], 1 / RATE).time == pytest.approx(1 / RATE)

@@ -43,8 +43,8 @@ class LivePerson:
     def __init__(self, rig: Rig, person: int | str | None = None) -> None:
         self.rig, self.wanted = rig, PersonChoice.of(person)
         if self.wanted.way not in _LIVE_WAYS:
-            problem = f'person = "{person}" is known only when all is over'
-            raise TakeError(problem, place="person", remedy='Live: "first", "largest" or "nearest X Y Z".')
+            problem = f'person = "{person}" needs the whole recording'
+            raise TakeError(problem, place="person", remedy='For live: "first", "largest" or "nearest X Y Z".')
 
     def frames(
         self, records: Sequence[Keypoints], body: Body, state: BodyState | None

@@ -16,7 +16,7 @@ MAX_WISH_BYTES = 4096
 """Largest size of a wish as JSON; valid ones have less than 300 bytes."""
 
 _Name = Annotated[str, msgspec.Meta(max_length=200)]
-_FORM = 'Ask for {"sensor": ..., "use": true or false}, {"sensor": ..., "sigma": ...}, {"body": ...} or {"stop": true}.'
+_FORM = 'Send {"sensor": ..., "use": true or false}, {"sensor": ..., "sigma": ...}, {"body": ...} or {"stop": true}.'
 
 
 class Wish(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -52,12 +52,12 @@ def read_wish(given: bytes | Mapping[str, Any]) -> Wish:
         if isinstance(given, Mapping):
             wish = msgspec.convert(dict(given), Wish)
         elif len(given) > MAX_WISH_BYTES:
-            raise ObservationError(f"a wish of {len(given)} bytes, more than {MAX_WISH_BYTES}", remedy=_FORM)
+            raise ObservationError(f"the request has {len(given)} bytes, more than {MAX_WISH_BYTES}", remedy=_FORM)
         else:
             wish = msgspec.json.decode(given, type=Wish)
     except msgspec.DecodeError as error:
-        raise ObservationError(f"no wish: {error}", remedy=_FORM) from error
+        raise ObservationError(f"not a request: {error}", remedy=_FORM) from error
     asked = {name for name in wish.__struct_fields__ if getattr(wish, name) is not None}
     if asked not in ({"sensor", "use"}, {"sensor", "sigma"}, {"body"}, {"stop"}) or wish.stop is False:
-        raise ObservationError(f"a message with {', '.join(sorted(asked)) or 'nothing'} is no wish", remedy=_FORM)
+        raise ObservationError(f"a message with {', '.join(sorted(asked)) or 'nothing'} is not a request", remedy=_FORM)
     return wish

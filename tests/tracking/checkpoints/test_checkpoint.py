@@ -122,7 +122,7 @@ def test_a_file_cut_off_anywhere_is_gone_on_with_from_its_last_state(session, wh
 def test_another_take_and_another_format_are_computed_anew(session, whole, tmp_path):
     file = killed(tmp_path / "take", session)
     again, looked, said = followed(file.parent, False, key="another", smooth=False)
-    assert looked[0] == 1 and "another take" in said and "every frame is tracked again" in said
+    assert looked[0] == 1 and "another take" in said and "all frames are tracked again" in said
     assert_same(again, whole)
     file = killed(tmp_path / "format", session)
     file.write_bytes(file.read_bytes().replace(b"frames 2", b"frames 1", 1))
