@@ -26,7 +26,7 @@ def test_every_camera_has_a_picture_of_every_frame_to_show(tracked):
     motion, seen, take = tracked
     told = []
     pictures = take_pictures(motion, take, seen, lambda *step: told.append(step))
-    assert set(pictures) == set(seen.videos) and told[-1] == ("pictures", 4, 4)
+    assert set(pictures) == set(seen.videos) and told[-1] == ("images", 4, 4)
     for frames in pictures.values():
         assert set(frames) == set(report_frames(motion))
         for picture in frames.values():

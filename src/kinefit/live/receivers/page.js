@@ -32,7 +32,7 @@
       const names = p.lost.map(s => body.segments[s]);
       tell(p, `quality ${Math.round(100 * p.quality)} %` + (names.length ? `, lost: ${names.join(", ")}` : ""));
     },
-    waiting(p) { tell(p, "nobody is found"); },
+    waiting(p) { tell(p, "person not found"); },
     refused(p) { status.textContent = p.why; },
     done() {},
   };
@@ -40,14 +40,14 @@
     const now = performance.now(), rate = at ? 1000 / (now - at) : 0;
     at = now;
     const dropped = Object.values(p.dropped).reduce((a, b) => a + b, 0);
-    status.textContent = `${p.time.toFixed(2)} s, ${(1000 * p.latency).toFixed(0)} ms after the image, ${rate.toFixed(0)} a second, `
-      + `${dropped} dropped, ${what}`;
+    status.textContent = `${p.time.toFixed(2)} s, ${(1000 * p.latency).toFixed(0)} ms after the image, ${rate.toFixed(0)} poses per second, `
+      + `${dropped} frames dropped, ${what}`;
     for (const label of list.children) label.className = p.silent.includes(label.dataset.sensor) ? "silent" : "";
   }
   function open() {
     socket = new WebSocket(location.href.replace(/^http/, "ws"));
     socket.onmessage = event => { const p = JSON.parse(event.data); (act[p.type] || (() => {}))(p); };
-    socket.onclose = () => { status.textContent = "the session is over; a next one with the same token is shown here"; setTimeout(open, 1000); };
+    socket.onclose = () => { status.textContent = "the session has ended; the next session with the same token appears here"; setTimeout(open, 1000); };
   }
   open();
 })();
