@@ -158,6 +158,6 @@ def test_a_source_that_fails_ends_the_session_with_its_error(scene, collected):
     stream = CameraSource("cam", (64, 48), SessionClock())
     session = LiveSession(scene.tracker(), [stream], [collected])
     stream._run = lambda inbox: stream._put(inbox, np.zeros((10, 10, 3), np.uint8), 0.0)
-    with pytest.raises(ObservationError, match="images of 10x10 px"):
+    with pytest.raises(ObservationError, match="images have 10x10 px"):
         session.run()
     assert collected.closed

@@ -370,7 +370,7 @@ CHANNELS = {
         lambda i: RowsOf(lambda s: s.along(one("neck"), (0.0, 1.0, 0.0), [0.0], 0.01, group=np.array([i]))),
         "their number changes",
     ),
-    "a name too few": (lambda i: several(2, ["a"]), "names 1 channels .* id 1"),
+    "a name too few": (lambda i: several(2, ["a"]), "names 1 channels, .* id 1"),
     "one name twice": (lambda i: several(2, ["a", "a"]), "two channels 'a'"),
     "numbers as names": (lambda i: several(2, [1, 2]), "are not text"),
     "a text as names": (lambda i: several(2, "ab"), "are not text"),

@@ -78,7 +78,7 @@ class CameraSource(ThreadSource):
         if image.shape[1::-1] != self.size:
             raise ObservationError(
                 f"images have {image.shape[1]}x{image.shape[0]} px instead of {self.size[0]}x{self.size[1]}",
-                place=f"camera {self.name}", remedy="Set the camera to this size, or size and image in [[camera]].",
+                place=f"camera {self.name}", remedy="Set the camera to this size, or set size and image in [[camera]].",
             )  # fmt: skip
         return inbox.put(Arrived(self.name, when, time.monotonic(), image), wait=wait)
 

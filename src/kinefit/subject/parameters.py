@@ -207,7 +207,7 @@ class PointOffsets:
     def __post_init__(self) -> None:
         sets = {**self.body.keypoint_sets, **self.body.marker_sets}
         if self.name not in sets:
-            raise BodyError(choices(f"point set of body '{self.body.name}'", self.name, sets))
+            raise BodyError(choices(f"point set of body '{self.body.name}' named", self.name, sets))
         std = np.asarray(self.std, float)
         if std.shape not in ((), (len(self.points),)) or not np.all(std > 0):
             problem = f"std of shape {std.shape} does not fit the {len(self.points)} points of '{self.name}'"

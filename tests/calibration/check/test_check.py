@@ -101,7 +101,7 @@ MISTAKES = {
     "nobody in one": (RIG, [replace(k, points=k.points * np.nan, confidence=0 * k.confidence)
                             if k.camera == "cam03" else k for k in SEEN], "coverage", "video and keypoints"),
     "nobody at all": (RIG, [replace(k, points=k.points * np.nan, confidence=0 * k.confidence) for k in SEEN], "nobody",
-                      "belong to this recording"),
+                      "are of this recording"),
 }  # fmt: skip
 
 

@@ -38,7 +38,7 @@ Examples:
 )
 @click.option(
     "--flat", type=click.FloatRange(min=0, min_open=True), metavar="MM",
-    help="One camera that faces a flat surface; MM is the width of a pixel on the surface.",
+    help="One camera that faces a flat surface; MM is the width of a pixel on it, in mm.",
 )  # fmt: skip
 @click.option(
     "--motion", type=click.Path(path_type=Path),
