@@ -121,7 +121,7 @@ def test_every_video_of_a_take_is_looked_through_once(take, networks):
     told = run(take)
     assert told.exit_code == 0, told.output
     assert {path.name for path in (take.parent / "take-detect").iterdir()} == {f"{c}.npz" for c in CAMERAS}
-    assert "cam03: 12 pictures, person 1 in 12\n" in told.stdout
+    assert "cam03: 12 images, person 1 in 12\n" in told.stdout
     found = read_detections(detections_file(take, "cam03"))
     assert len(found) == 12 and found.rate == 30 and found.size == (544, 960) and found.mask(5, 0).any()
     done = networks.pictures
@@ -136,7 +136,7 @@ def test_another_video_or_setting_is_done_anew_and_only_that(take, networks):
     write_video(take.with_name("cam02.mp4"), 9)
     told = run(take)
     assert told.stdout.count("(existing results)") == 3
-    assert "cam02: 9 pictures, person 1 in 9\n" in told.stdout
+    assert "cam02: 9 images, person 1 in 9\n" in told.stdout
     assert run(take, "--people", 1).stdout.count("(existing results)") == 0
     assert run(take, "--people", 1, "--no-masks").stdout.count("(existing results)") == 0
     assert read_detections(detections_file(take, "cam02")).mask(0, 0) is None

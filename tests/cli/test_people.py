@@ -75,7 +75,7 @@ def test_a_person_that_cannot_be_is_told(wrong, take, tmp_path):
 
 def test_a_number_too_many_is_told(take, tmp_path):
     told = run("track", take, "--person", "3", "--out", tmp_path)
-    assert told.exit_code == 2 and "person 3, but 2 people are in view" in told.stderr
+    assert told.exit_code == 2 and "no person 3: 2 people are in view" in told.stderr
 
 
 def test_of_one_who_cannot_be_tracked_the_others_still_are(take, tmp_path, monkeypatch):

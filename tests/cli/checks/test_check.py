@@ -82,7 +82,7 @@ BAD = {
     "broken video": (without_video, "cam02.mp4", "re-encode"),
     "nobody": (
         lambda t: landmarks(t, "cam02", np.zeros_like),
-        "no person is seen", "detector",
+        "nobody is seen", "detector",
     ),
 }  # fmt: skip
 

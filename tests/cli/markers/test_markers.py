@@ -74,7 +74,7 @@ def test_learn_from_one_frame(folder, tmp_path):
 def test_audit_finds_the_swap(folder):
     code, text = call("audit", folder / "labelled.c3d", folder / "swapped.c3d", "--strict")
     assert code == 2
-    assert "labelled.c3d: nothing found" in text
+    assert "labelled.c3d: no wrong labels found" in text
     assert "LKNE" in text.split("swapped.c3d")[1]
 
 

@@ -254,9 +254,9 @@ def test_a_real_board_from_seeds_by_hand_is_flat(data_dir, tmp_path):
         (["a={0}/a", "b={0}/b.avi"], ObservationError, "1 videos"),
         (["a={0}/a", "nose={0}/b"], CalibrationError, "no camera 'nose'"),
         (["a={0}/a", "b={0}/nothing*"], FileError, "no images"),
-        (["a={0}/a", "b={0}/b", "--window", "even"], ObservationError, "window of 'even'"),
+        (["a={0}/a", "b={0}/b", "--window", "even"], ObservationError, "--window 'even'"),
         (["a={0}/a", "b={0}/b", "--window", "14"], ObservationError, "odd number"),
-        (["a={0}/a", "b={0}/b", "--still", "7"], ObservationError, "state 7 of 3"),
+        (["a={0}/a", "b={0}/b", "--still", "7"], ObservationError, "--still 7 does not exist"),
         (["a={0}/a", "b={0}/b", "--seeds", "{0}/calib.toml"], FileError, "line 2: 'name = \"a\"' is no number"),
     ],
 )

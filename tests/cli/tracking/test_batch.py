@@ -64,4 +64,4 @@ def test_ctrl_c_names_what_goes_on(take, tmp_path, monkeypatch):
 
 def test_files_that_are_no_takes_are_named(done, take):
     told = run(take.parent / "*.toml")
-    assert "1 TOML files that match are no takes: calibration.toml" in told.output
+    assert "1 matching TOML files are no takes, and skipped: calibration.toml" in told.output
