@@ -39,7 +39,7 @@ def run(*args):
 def test_a_folder_of_results_finds_its_take(folder, capsys):
     recording = gather((folder / "take-kinefit",), None)
     assert len(recording.motions) == 1 and len(recording.rig) == 2
-    assert "With the take" in capsys.readouterr().err
+    assert "Cameras are from the take" in capsys.readouterr().err
 
 
 def test_a_take_of_another_name_is_not_taken(folder, tmp_path, motion, capsys):
@@ -99,7 +99,7 @@ def test_what_cannot_be_shown_is_told(name, tmp_path):
 
 
 def test_two_takes_are_too_many(folder):
-    with pytest.raises(click.UsageError, match="One take"):
+    with pytest.raises(click.UsageError, match="Only one take"):
         gather((folder / "take.toml", folder / "take.toml"), None)
 
 

@@ -40,7 +40,7 @@ def test_a_body_with_a_jaw_has_its_face_looked_for(tmp_path, monkeypatch):
     assert asked["face"] is True and asked["hands"] is None and not said
     assert [(k.camera, k.set) for k in take.keypoints] == [("cam", None), ("back", None), ("cam", "MEDIAPIPE_478")]
     take, _, said = prepare(tmp_path, monkeypatch, "humanoid_face", faces=())
-    assert [k.set for k in take.keypoints] == [None, None] and "no face" in said[0]
+    assert [k.set for k in take.keypoints] == [None, None] and "No face" in said[0]
 
 
 def test_a_take_that_names_faces_has_them_looked_for(tmp_path, monkeypatch):

@@ -69,5 +69,5 @@ def test_images_in_folders_are_refused(take):
     first = text.index('video = "')
     end = text.index("\n", first)
     take.write_text(text[:first] + 'video = "images"' + text[end:])
-    with pytest.raises(TakeError, match="copies without faces"):
+    with pytest.raises(TakeError, match="copies only video files"):
         hide_in_copies(take, None, print)

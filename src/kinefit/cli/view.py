@@ -21,24 +21,24 @@ if TYPE_CHECKING:
 
 _EXAMPLES = """\b
 Examples:
-  kinefit view my_take-kinefit                  a folder of results, with the take beside it
-  kinefit view motion.npz --take take.toml      a motion with the cameras that saw it
+  kinefit view my_take-kinefit                  a folder of results, with its take
+  kinefit view motion.npz --take take.toml      a motion with the cameras of its take
   kinefit view motion.npz other.npz             two motions in one scene
   kinefit view take.toml                        cameras and keypoints before anything is tracked
-  kinefit view motion.npz --html scene.html     one file to keep or to send
+  kinefit view motion.npz --html scene.html     the scene as one HTML file
 """
 
 
 @click.command(short_help="Show a motion, a take or a folder of results in 3D.", epilog=_EXAMPLES)
 @click.argument("sources", metavar="SOURCE [OTHER]...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--take", type=click.Path(path_type=Path), help="Take file whose cameras and markers are shown.")
-@click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="0: any free one.")
-@click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 lets other computers look in, too.")
+@click.option("--take", type=click.Path(path_type=Path), help="Take file that gives cameras and markers.")
+@click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="0: any free port.")
+@click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 admits other computers.")
 @_screen.token_option
-@click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page.")
+@click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page in the browser.")
 @_screen.hide_faces_option
-@click.option("--cylinders", is_flag=True, help="Show the body's cylinders and bones in place of a skin.")
-@click.option("--html", type=click.Path(path_type=Path), help="Write one self-contained page instead.")
+@click.option("--cylinders", is_flag=True, help="Show the body's cylinders and bones instead of a skin.")
+@click.option("--html", type=click.Path(path_type=Path), help="Write one self-contained page instead of serving it.")
 @_screen.verbose_option
 def view(
     sources: tuple[Path, ...], take: Path | None, port: int, host: str, token: str | None, browser: bool,
@@ -46,8 +46,8 @@ def view(
 ) -> None:
     """Show a motion, a take or a folder of results as a 3D scene in the browser.
 
-    SOURCE is a motion file (.npz), a take file (.toml) or a folder that `kinefit track` wrote; further motions are
-    shown beside the first one. Ctrl-C ends it.
+    SOURCE is a motion file (.npz), a take file (.toml) or a folder that `kinefit track` wrote. Further motions are
+    shown in the same scene. Ctrl-C ends the command.
     """
     from kinefit.cli._results import check_file
     from kinefit.serving.access import Access
@@ -78,7 +78,7 @@ def gather(sources: tuple[Path, ...], take_file: Path | None, *, hide_faces: boo
     for source in sources:
         if source.suffix.lower() == ".toml":
             if take_file is not None:
-                raise click.UsageError("One take is shown at a time: give one .toml file.")
+                raise click.UsageError("Only one take can be shown: give one .toml file.")
             take_file = source
             continue
         if source.is_dir() and not (source / "motion.npz").is_file() and takes_in(source) and take_file is None:
@@ -100,7 +100,7 @@ def gather(sources: tuple[Path, ...], take_file: Path | None, *, hide_faces: boo
     offsets = {entry.name: entry.time_offset for entry in take.cameras}
     for motion in motions:
         if motion.up != take.up:
-            _screen.note(f"{motion.name} has {motion.up} up, the take {take.up}: it is turned to the take's world.")
+            _screen.note(f"{motion.name} is rotated from up = {motion.up} to the take's up = {take.up}.")
     with _screen.bars() as step:
         if take.hide_faces and seen.videos:
             ensure_faces(take, step, _screen.note)
@@ -125,14 +125,14 @@ def _fitting(file: Path | None, name: str) -> tuple[Take, Observations] | None:
     try:
         take = read_take(file)
         if take.name != name:
-            _screen.note(f"Without {file}, which is of '{take.name}' and not of '{name}'; --take names another.")
+            _screen.note(f"{file} is not shown: it is take '{take.name}', not '{name}'. Give another by --take.")
             return None
         take = find_cameras(take, tell=_screen.note)
         seen = load_observations(take)
     except KinefitError as error:
-        _screen.note(f"Without the take beside it: {error}")
+        _screen.note(f"The take of these results is not shown: {error}")
         return None
-    _screen.note(f"With the take {file}; --take names another.")
+    _screen.note(f"Cameras are from the take {file}; --take gives another.")
     return take, seen
 
 
@@ -143,7 +143,7 @@ def _in_folder(folder: Path) -> tuple[Path, Path | None]:
     file = folder / "motion.npz"
     if not file.is_file():
         remedy = "Give the folder that `kinefit track` wrote, or a motion file."
-        raise FileError("there is no motion.npz in this folder", file=folder, remedy=remedy)
+        raise FileError("this folder has no motion.npz", file=folder, remedy=remedy)
     name = folder.absolute().name
     places = [folder.absolute().with_name(f"{name.removesuffix('-kinefit')}.toml"), folder / "take" / "take.toml"]
     return file, next((place for place in places if place.is_file()), None)
@@ -185,7 +185,7 @@ def _serve(recording: ViewerContent, port: int, access: Access, browser: bool, c
         player = Player(server, recording, layers=CYLINDERS if cylinders else DEFAULT_LAYERS)
         player.tick(0.0)
         if port and server.get_port() != port:
-            _screen.note(f"Port {port} is in use: another one is taken.")
+            _screen.note(f"Port {port} is in use; port {server.get_port()} is used instead.")
         if access.warning:
             _screen.note(f"warning: {access.warning}")
         address = access.url(server.get_port())
@@ -205,7 +205,7 @@ def _write(recording: ViewerContent, html: Path, cylinders: bool) -> None:
     from kinefit.viewers.page import page
     from kinefit.viewers.show import CYLINDERS, DEFAULT_LAYERS, Choice
 
-    _screen.note("Drawing the scene ...")
+    _screen.note("Rendering the scene ...")
     text, frames = page(recording, choice=Choice(CYLINDERS if cylinders else DEFAULT_LAYERS))
     write_text(html, text)
     thinned = f" of {len(recording.times)}" if frames < len(recording.times) else ""

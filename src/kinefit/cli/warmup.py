@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 _EXAMPLES = """\b
 Examples:
   kinefit warmup
-  KINEFIT_CACHE=/var/cache/kinefit kinefit warmup     keep them in another folder
+  KINEFIT_CACHE=/var/cache/kinefit kinefit warmup     store them in another folder
 """
 _PARTS = "surfaces", "keypoints", "depth"  # the longest first
 _PROCESSES = 2  # more would compile the kernels that the parts share once more, instead of loading them
 
 
-@click.command(short_help="Compile the kernels now, so that the first track does not wait.", epilog=_EXAMPLES)
+@click.command(short_help="Compile the kernels now, so that the first run starts at once.", epilog=_EXAMPLES)
 @_screen.verbose_option
 def warmup() -> None:
-    """Compile the kernels now, so that the first track does not wait; they are kept for later runs."""
+    """Compile the kernels now and store them, so that later commands start at once."""
     from kinefit._jit import kernel_folder
 
     begin = perf_counter()
@@ -36,7 +36,7 @@ def warmup() -> None:
             part.result()
             step("compiling", done, len(_PARTS))
     kept = kernel_folder()
-    where = f"the kernels lie in {kept.parent}" if kept else "none can be kept: set KINEFIT_CACHE"
+    where = f"kernels are in {kept.parent}" if kept else "not stored: set KINEFIT_CACHE to a writable folder"
     _screen.say(f"ready after {perf_counter() - begin:.1f} s; {where}")
 
 

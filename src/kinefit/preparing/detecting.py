@@ -93,7 +93,7 @@ def jobs_of_take(take: Take) -> list[DetectionJob]:
     ]  # fmt: skip
     if not found:
         raise TakeError(
-            "no camera of this take has a video", file=take.path, remedy='Add video = "..." to its [[camera]] entries.'
+            "no camera of the take has a video", file=take.path, remedy='Add video = "..." to its [[camera]] entries.'
         )
     return found
 
@@ -231,10 +231,10 @@ def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced"
 
     def report(done: int, total: int) -> None:
         if not fetched:
-            tell(f"Fetching the networks of the built-in detector, once: {MODELS_CREDIT}.")
+            tell(f"Downloading the networks of the built-in detector, once: {MODELS_CREDIT}.")
         fetched.append(done)
         if progress:
-            progress("fetching MB", done // 10**6, total // 10**6)
+            progress("download MB", done // 10**6, total // 10**6)
 
     folder = detector_models(report)
     if isinstance(quality, Path):
@@ -244,7 +244,7 @@ def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced"
     try:
         return Networks(folder, landmark_models(report) / QUALITIES[quality], quality)
     except AssetError as error:
-        tell(f"{error} Until then people are seen by the network of quality 'balanced'.")
+        tell(f"{error} Until then, the network of quality 'balanced' is used.")
         return Networks(folder, folder / LANDMARKS, "balanced")
 
 
@@ -255,7 +255,7 @@ def _name_of(quality: str | Path) -> str:
     try:
         return hashlib.sha256(quality.read_bytes()).hexdigest()[:16]
     except OSError as error:
-        raise FileError(f"cannot be read ({error.strerror})", file=quality, remedy="Check the path.") from error
+        raise FileError(f"cannot be read ({error.strerror})", file=quality, remedy="Check --network.") from error
 
 
 def detection_key(job: DetectionJob) -> str:

@@ -51,7 +51,7 @@ def studio_rig(
         `cameras` is below 1.
     """
     if cameras < 1:
-        raise ObservationError(f"a rig of {cameras} cameras", remedy="Give one or more.")
+        raise ObservationError(f"cameras is {cameras}", remedy="Give one or more.")
     up = up or (motion.up if motion is not None else "y")
     R_world = rotation_between_up("y", up)  # built y up, then turned
     if motion is None:
@@ -153,9 +153,9 @@ def simulate_keypoints(
             raise ObservationError(f"{name} is {share}", remedy="Give a share between 0 and 1.")
     for name, size in (("noise_px", noise_px), ("drift_px", drift_px)):
         if not 0.0 <= size < np.inf:
-            raise ObservationError(f"{name} is {size}", remedy="Give a standard deviation in pixels.")
+            raise ObservationError(f"{name} is {size}", remedy="Give a standard deviation in pixels, 0 or more.")
     if not 0.0 < drift_time < np.inf:
-        raise ObservationError(f"drift_time is {drift_time}", remedy="Give a time in seconds.")
+        raise ObservationError(f"drift_time is {drift_time}", remedy="Give a time in seconds, above 0.")
     keep = float(np.exp(-1.0 / (motion.rate * drift_time)))
     names = keypoint_names(keypoint_set)
     random = np.random.default_rng(seed)

@@ -87,8 +87,8 @@ def fit_subject(
             progress("bone lengths", i + 1, len(chosen) + 1)
     if not states:
         raise TrackingError(
-            "no frame shows enough of the person in two cameras to start from",
-            remedy="Check the calibration and that the cameras are in step (kinefit track -v).",
+            "no frame shows enough of the person in two cameras",
+            remedy="Check calibration and clocks of the cameras with kinefit check.",
         )
     weight = _weights(near, sized, states)
     sensor, layout = KeypointSensor(channels.rig, {}, 0.0, geman_mcclure(), joint.REACH[0]), Layout(channels, body)

@@ -108,17 +108,17 @@ def fitted_to_person(
     cameras, others = len({k.camera for k in recording.keypoints}), recording.sees_more
     if cameras == 1 and not (others or recording.start):
         name = recording.keypoints[0].camera
-        problem = f"the keypoints are of one camera only, {name}"
-        remedy = "Tracking needs two cameras or more, another sensor beside it, or points lifted to space"
-        raise TrackingError(problem, remedy=f"{remedy}: kinefit detect --force finds them in the video.")
+        problem = f"only one camera, {name}, has keypoints"
+        remedy = "Add a second camera or another sensor; or run kinefit detect --force, which also estimates 3D points"
+        raise TrackingError(problem, remedy=f"{remedy}.")
     ignored = {"a height": height, "a trial of the same person": trial, "shape_frames": frames}
     for what, given in ignored.items():
         if given is not None and subject is not None:
-            problem = f"{what} with a subject that is known already, or a body that is taken as it is"
-            raise ObservationError(problem, remedy=f"Leave {what} out: it would be ignored.")
+            problem = f"{what} has no effect: the size of the body is given"
+            raise ObservationError(problem, remedy=f"Leave out {what}, or the given subject.")
         if given is not None and cameras < 2 and given is not height:
-            problem = f"{what} is for lengths from keypoints, and this recording has none of two cameras"
-            raise ObservationError(problem, remedy="Leave it out, or add [[keypoints]] of two cameras.")
+            problem = f"{what} needs keypoints of two cameras, which this recording does not have"
+            raise ObservationError(problem, remedy=f"Leave out {what}, or add [[keypoints]] of two cameras.")
     person = SizedPerson(recording, Subject.as_is(body), recording.start, calibrated=recording.rig)
     unknown = any(s.unknowns for s in recording.sensors) or has_unknown_gear(body if subject is None else subject.body)
     if subject is not None:

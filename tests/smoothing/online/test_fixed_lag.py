@@ -200,9 +200,9 @@ def test_track_takes_a_lag_and_another_take_s_noise():
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        ({"lag": 0.001}, "a lag of 0.001 s"), ({"lag": np.nan}, "a lag of nan s"), ({"lag": 0.5}, "for 10 frames"),
-        ({"lag": 0.1, "contacts": True}, "contacts"), ({"lag": 0.1, "smooth": False}, "no smoothing"),
-        ({"noise": CALM}, "without a lag"),
+        ({"lag": 0.001}, "lag is 0.001 s"), ({"lag": np.nan}, "lag is nan s"), ({"lag": 0.5}, "take of 10 frames"),
+        ({"lag": 0.1, "contacts": True}, "contacts"), ({"lag": 0.1, "smooth": False}, "smooth=False"),
+        ({"noise": CALM}, "needs a lag"),
     ],
 )  # fmt: skip
 def test_what_makes_no_sense_is_refused(more, said):

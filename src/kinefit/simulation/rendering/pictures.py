@@ -67,8 +67,8 @@ class ColourSensor:
 
     def __post_init__(self) -> None:
         if self.samples < 1 or not 0.0 <= self.noise < np.inf:
-            problem = f"a camera {self.name} of {self.samples} samples and noise {self.noise}"
-            raise ObservationError(problem, remedy="Give one sample or more, and noise of zero or more.")
+            problem = f"camera {self.name} has samples = {self.samples} and noise = {self.noise}"
+            raise ObservationError(problem, remedy="Give at least one sample, and noise of 0 or more.")
 
     def camera(self, T_camera_world: NDArray | None = None, *, name: str | None = None) -> Camera:
         """The sensor as a camera of a rig, with the pose T_camera_world (4, 4) [m]."""

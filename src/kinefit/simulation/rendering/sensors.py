@@ -72,8 +72,8 @@ class DepthSensor:
     def __post_init__(self) -> None:
         if not 0.0 < self.near < self.far or self.samples < 1 or min(*self.noise, self.focal, *self.size) < 0:
             raise ObservationError(
-                f"a sensor {self.name} of {self.near} to {self.far} m, {self.samples} samples, noise {self.noise}",
-                remedy="Give 0 < near < far, one sample or more, and nothing negative.",
+                f"sensor {self.name}: near {self.near} m, far {self.far} m, {self.samples} samples, noise {self.noise}",
+                remedy="Give 0 < near < far, at least one sample, and no negative values.",
             )
 
     def sigma(self, z: NDArray | float) -> NDArray | float:
