@@ -251,7 +251,7 @@ def _provenance(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, 
     speeds = {} if take.speed_std is None else dict(zip(take.body.dof_names, take.speed_std.round(4).tolist()))
     scale = {} if take.others is None else {name: round(v, 2) for name, v in take.others.scale.items()}
     return {
-        "acceleration": {name: round(float(v), 2) for name, v in zip(coordinates, values, strict=True)},
+        "acceleration": {name: float(f"{v:.4g}") for name, v in zip(coordinates, values, strict=True)},
         "acceleration_memory": take.memory[0],
         "velocity_memory": take.memory[1],
         "speed_std": speeds,
