@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, PointSet, TaperedCylinder
 from kinefit.geometry.camera import Camera
 from kinefit.motion import BELIEVED, UP_AXES, Motion, Residuals
-from kinefit.rendering.colours import LOST, RGB, quality_ramp, side_colour
+from kinefit.rendering.colours import LOST_COLOUR, RGB, quality_ramp, side_colour
 from kinefit.rendering.tubes import TubeMesh
 
 OTHERS: tuple[RGB, ...] = ((204, 121, 167), (86, 180, 233), (230, 159, 0), (120, 90, 60))
@@ -178,7 +178,7 @@ def segment_looks(
     lost = np.asarray(quality) < BELIEVED
     colours = quality_ramp(1.0 - np.asarray(quality, float)) if by_quality else usual
     opacities = np.where(False if uncertain is None else uncertain, _UNCERTAIN_OPACITY, 1.0)
-    shades = np.where(lost[:, None], np.array(LOST, np.uint8), colours)
+    shades = np.where(lost[:, None], np.array(LOST_COLOUR, np.uint8), colours)
     return shades, np.where(lost, _LOST_OPACITY, np.broadcast_to(opacities, lost.shape))
 
 

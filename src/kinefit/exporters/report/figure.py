@@ -15,7 +15,7 @@ from kinefit.exporters.report.page import Html, to_json
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion, rotation_between_up
-from kinefit.rendering.colours import LEFT, LOST, RIGHT, side_colour, to_hex
+from kinefit.rendering.colours import LEFT_COLOUR, LOST_COLOUR, RIGHT_COLOUR, side_colour, to_hex
 from kinefit.rendering.tubes import is_last
 
 RATE = 15.0  # [Hz] of the figure: enough for the eye to follow, the player goes smoothly between
@@ -87,7 +87,8 @@ def player(
         "rate": rate, "start": start, "frames": len(x), "points": x.shape[1], "quantum": quantum,
         "middle": 0.5 * (low + high), "low": low, "high": high, "floor": floor, "radii": capsules.radii,
         "ends": np.arange(x.shape[1]).reshape(-1, 2), "colours": capsules.colours,
-        "sides": [(c == to_hex(RIGHT)) - (c == to_hex(LEFT)) for c in capsules.colours], "lost": to_hex(LOST),
+        "sides": [(c == to_hex(RIGHT_COLOUR)) - (c == to_hex(LEFT_COLOUR)) for c in capsules.colours],
+        "lost": to_hex(LOST_COLOUR),
         "cameras": cameras or [], "x": _packed(whole),
         "dimmed": _packed(np.packbits(dimmed)) if dimmed is not None and dimmed.any() else "",
     }  # fmt: skip
