@@ -28,6 +28,7 @@ def plots(text):
 
 @pytest.fixture
 def plotly_js():
+    p._plotly.cache_clear()  # another test may have had no network
     script, packed = p._plotly()
     if not packed and "could not fetch" in script:
         pytest.skip(f"the package index cannot be reached: {script}")
