@@ -410,7 +410,7 @@ def drawn(drawn_take, tmp_path):
     return take
 
 
-def look(job, networks, people, masks, key, tell, threads, hands, face):
+def look(job, networks, settings, key, tell, threads):
     landmarks = np.load(job.video.with_name(f"mediapipe_{job.camera}.npy"))[:, None]
     points = np.where(landmarks[..., 2:] > 0, landmarks[..., :2], 0.5)
     nothing = np.zeros(0, np.uint32), np.zeros(len(points) + 1, int)

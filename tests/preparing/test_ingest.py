@@ -23,7 +23,7 @@ class SeesMiddle:
         return np.array([[image.shape[1] / 2, image.shape[0] / 2, 30.0, 0.0]])
 
 
-def look(job, networks, people, masks, key, tell, threads, hands, face):
+def look(job, networks, settings, key, tell, threads):
     """One person whose face is near the upper left corner."""
     with Video(job.video) as video:
         frames, size = len(video), video.size

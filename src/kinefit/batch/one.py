@@ -103,7 +103,8 @@ def check_drawable(take: Take, *, skin: bool = False) -> None:
     """
     videos = any(camera.video for camera in take.cameras)
     if skin and not videos:
-        raise TakeError("the take has no video for a skin on overlays", file=take.path, remedy="Leave out --overlay-skin.")
+        problem = "the take has no video for a skin on overlays"
+        raise TakeError(problem, file=take.path, remedy="Leave out --overlay-skin.")
     if not (take.depth or videos):
         raise TakeError("the take has no video or depth for overlays", file=take.path, remedy="Leave out --overlays.")
 

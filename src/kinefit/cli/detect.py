@@ -66,10 +66,8 @@ def detect(
     if out is not None:
         check_folder(out)
     with _screen.bars() as step:
-        done = detecting.detect(
-            jobs, people=people, masks=masks, hands=hands, face=face, quality=network or quality, force=force,
-            progress=step, tell=_screen.note,
-        )
+        settings = detecting.DetectionSettings(people, masks, hands, face, network or quality)
+        done = detecting.detect(jobs, settings, force=force, progress=step, tell=_screen.note)
     _show(jobs, done)
     somebody(jobs, _screen.note)
 

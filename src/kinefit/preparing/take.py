@@ -11,7 +11,7 @@ import msgspec
 
 from kinefit.bodies import load_body
 from kinefit.errors import ObservationError
-from kinefit.preparing.detecting import DetectionJob, detect, jobs_of_take
+from kinefit.preparing.detecting import DetectionJob, DetectionSettings, detect, jobs_of_take
 from kinefit.preparing.each_video import Step, Tell
 from kinefit.preparing.faces import ensure_faces
 from kinefit.readers.detections import detections_file, read_detections
@@ -84,7 +84,7 @@ def ensure_detections(
     """
     jobs = jobs_of_take(take)
     hands, face = has_fingers(take.body) or None, has_face(take.body) or any(map(_is_face, take.keypoints)) or None
-    detect(jobs, people=people, masks=masks, hands=hands, face=face, force=force, progress=progress, tell=tell)
+    detect(jobs, DetectionSettings(people, masks, hands, face), force=force, progress=progress, tell=tell)
     return somebody(jobs, tell)
 
 

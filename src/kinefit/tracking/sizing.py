@@ -17,7 +17,7 @@ from kinefit.findings import INVERTED
 from kinefit.frame.results import FrameResult
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.initialization.from_depth import Start, sized_start, start_from_points
+from kinefit.initialization.from_depth import Start, StartSearch, sized_start, start_from_points
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import Channels, known_names, make_channels
@@ -129,7 +129,7 @@ def fitted_to_person(
         for last in (False,) * _MOVES + (True,):
             by_keypoints = fit_subject(
                 body, channels_of(person.recording, body, settings), frames=frames or 25, height=height, trial=trial,
-                cameras=settings.camera_errors, moved=moved, view_bias=settings.view_bias and not others,
+                cameras=moved or settings.camera_errors, view_bias=settings.view_bias and not others,
                 progress=progress,
             )  # fmt: skip
             if last or not (errors := by_keypoints.camera_errors):
@@ -229,7 +229,8 @@ def _is_inverted(
     if np.mean(scores) > _MIN_UPRIGHT:
         return False
     try:
-        turned = [start_from_points(body, None, camera, d, background=empty, up=-up, attempts=1)[0] for d in depths]
+        how = StartSearch(attempts=1)
+        turned = [start_from_points(body, None, camera, d, background=empty, up=-up, search=how)[0] for d in depths]
     except KinefitError:
         return False
     return bool(np.mean([start.score for start in turned]) > np.mean(scores) + _MIN_INVERTED_GAIN)

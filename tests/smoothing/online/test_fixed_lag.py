@@ -215,6 +215,12 @@ def test_usual_noise_is_better_than_no_lag_at_all():
     assert error([r.state for r in behind(tracker, results, 0.1, None)]) < 0.9 * error([r.state for r in results])
 
 
+def test_known_noise_is_written_and_read_again_however_small():
+    noise = KnownNoise(CALM.acceleration / 700.0)
+    again = KnownNoise.of_take(BODY, {"smoothing": noise.as_record(BODY)})
+    np.testing.assert_allclose(again.acceleration, noise.acceleration, rtol=1e-3)
+
+
 def test_noise_of_a_motion_that_was_not_smoothed_is_refused():
     with pytest.raises(ObservationError, match="root_shift"):
         KnownNoise.of_take(BODY, {"estimate": "filtered"})

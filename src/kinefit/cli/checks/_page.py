@@ -115,7 +115,7 @@ def _plan(check: Check, up: str) -> p.Section:
             corners = [camera.centre_world + 0.45 * reach * camera.ray(np.array(uv)) for uv in _sides(camera)]
             outline = np.stack([corners[0], camera.centre_world, corners[1]])
             bad = any(found.severity == "fault" for found in check.of(camera.name))
-            colour = p.RIGHT if bad else p.LEFT
+            colour = p.RIGHT_COLOUR if bad else p.LEFT_COLOUR
             traces.append({
                 "x": outline @ a, "y": outline @ b, "mode": "lines", "type": "scatter", "showlegend": False,
                 "line": {"color": colour, "width": 1}, "hoverinfo": "skip",

@@ -16,7 +16,7 @@ from kinefit.motion import UP_AXES
 from kinefit.rendering import scaled
 from kinefit.simulation.placing import beside
 from kinefit.simulation.rendering.room import PARTS
-from kinefit.simulation.rendering.scenes import RenderedView, SimulatedScene
+from kinefit.simulation.rendering.scenes import RenderedView, SimulatedScene, centred_camera
 
 SKIN = (130, 160, 210)  # BGR, as all colours here
 _COLOURS = {
@@ -72,9 +72,7 @@ class ColourSensor:
 
     def camera(self, T_camera_world: NDArray | None = None, *, name: str | None = None) -> Camera:
         """The sensor as a camera of a rig, with the pose T_camera_world (4, 4) [m]."""
-        (w, h), f = self.size, self.focal
-        K = np.array([[f, 0, 0.5 * (w - 1)], [0, f, 0.5 * (h - 1)], [0, 0, 1.0]])
-        return Camera(name or self.name, self.size, K, (), "radtan", T_camera_world)  # type: ignore[arg-type]
+        return centred_camera(name or self.name, self.size, self.focal, T_camera_world)
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ class KnownNoise:
         names = ("root_shift", "root_turn", *body.tree.coordinates)
         values = [self.acceleration[0], *self.acceleration[5:]]
         return {
-            "acceleration": {name: round(float(v), 2) for name, v in zip(names, values)},
+            "acceleration": {name: float(f"{v:.4g}") for name, v in zip(names, values)},
             "pixel_sigma": {source: dict(of) for source, of in self.pixel_sigma.items()},
             "sigma_factor": dict(self.scale),
         }  # fmt: skip
