@@ -49,4 +49,5 @@ def test_every_place_uses_the_same_colours():
     assert {tuple(c) for c in body_mesh(body).colours} == set(expected)
     assert (LEFT_COLOUR, RIGHT_COLOUR, CENTRE_COLOUR) == tuple(map(colours.to_hex, (colours.LEFT_COLOUR, colours.RIGHT_COLOUR, colours.CENTRE_COLOUR)))
     page = str(live_figure(body))
-    assert all(colour in page for colour in (LEFT_COLOUR, RIGHT_COLOUR, CENTRE_COLOUR, colours.to_hex(colours.LOST_COLOUR)))
+    lost = colours.to_hex(colours.LOST_COLOUR)
+    assert all(colour in page for colour in (LEFT_COLOUR, RIGHT_COLOUR, CENTRE_COLOUR, lost))
