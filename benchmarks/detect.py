@@ -51,7 +51,7 @@ def run() -> None:
 
 def _detect(videos: dict[str, Path], folder: Path) -> dict[str, Detections]:
     jobs = [detecting.DetectionJob(name, video, folder / f"{name}.npz") for name, video in videos.items()]
-    detecting.detect(jobs, masks=True, quality="balanced", force=True, tell=print)
+    detecting.detect(jobs, detecting.DetectionSettings(masks=True, quality="balanced"), force=True, tell=print)
     return {job.camera: read_detections(job.file) for job in jobs}
 
 

@@ -53,7 +53,7 @@ def _measured(trial: Path, quality: str) -> dict[str, float]:
             for c in CAMERAS
         ]  # fmt: skip
         spent = time.process_time()
-        detecting.detect(jobs, masks=False, quality=quality, tell=print)
+        detecting.detect(jobs, detecting.DetectionSettings(masks=False, quality=quality), tell=print)
         spent = time.process_time() - spent
         found = [read_detections(job.file) for job in jobs]
     rig = read_calibration(trial / "Calib_refined_static.toml").select(CAMERAS)

@@ -92,7 +92,7 @@ def faults(inputs: Inputs) -> Iterator[tuple[str, Fault]]:
     yield "translations times 1.8", Fault(_cameras(_translated(1.8)), r"would be [\d.]+ m tall")
     yield "metres called millimetres", Fault(lambda i: replace(i, unit="mm"), r'unit = "m", not "mm"')
     yield "wrong vertical axis", Fault(lambda i: replace(i, up=i.wrong_up), r"up = .* is wrong")
-    yield "left and right exchanged", Fault(sides, r"Left and right are exchanged")
+    yield "left and right exchanged", Fault(sides, r"Left and right are swapped")
     yield "all images mirrored", Fault(image, r"All images are mirrored left to right")
     yield "one image mirrored", Fault(one_image, r"image is mirrored left to right", 3)
     yield "fx and fy of all halved", Fault(_cameras(_zoomed), r"focal lengths of all cameras are about half")
@@ -102,11 +102,11 @@ def faults(inputs: Inputs) -> Iterator[tuple[str, Fault]]:
     yield "the x of a translation negated", Fault(
         _cameras(_translated(x), inputs.shifted), r"the x of the translation has the wrong sign", inputs.shifted
     )
-    yield "a camera turned", Fault(_cameras(_turned(inputs.turn), 2), r"has moved or turned|does not agree", 2)
+    yield "a camera turned", Fault(_cameras(_turned(inputs.turn), 2), r"has moved or rotated|disagrees with", 2)
     yield "a camera out of step", Fault(_late(0, inputs.late), r"frames \(\d+ ms\) later", 0)
-    yield "names of two cameras exchanged", Fault(_swapped, r"are exchanged\.")
+    yield "names of two cameras exchanged", Fault(_swapped, r"are swapped\.")
     if inputs.name in DISTORTED:
         ideal = _cameras(lambda c: replace(c, distortion=np.zeros(4)))
         yield "lens distortion left out", Fault(ideal, r"no lens distortion")
     if inputs.boxed:
-        yield LETTERBOXED, Fault(lambda i: replace(i, image="scaled"), r"cam01 is said to be scaled, but")
+        yield LETTERBOXED, Fault(lambda i: replace(i, image="scaled"), r"cam01 is scaled by the take, but")

@@ -1,4 +1,4 @@
-"""What a fresh installation takes on disk: all of it, and without what only the viewer and the report need."""
+"""What a fresh installation takes on disk: all of it, and without what only the viewer needs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from benchmarks.figures import LEFT_OUT, figure, quick
 
 ROOT = Path(__file__).parents[1]
-SHOWING = ("viser", "plotly")
+SHOWING = ("viser",)
 _GOALS = {"install_all": "<= 600", "install_core": "<= 350"}
 
 

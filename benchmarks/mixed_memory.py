@@ -56,7 +56,7 @@ def run(quick: bool = False) -> None:
 
 def peak(recording: Recording, body: Body) -> int:
     """Bytes that tracking and smoothing need at most, beyond those before."""
-    small = partial(smooth_results, window=WINDOW, overlap=OVERLAP)
+    small = partial(smooth_results, windows=(WINDOW, OVERLAP))
     with patch.object(spool, "IN_MEMORY", BUFFER), patch.object(motions, "smooth_results", small):
         tracemalloc.start(1)
         try:

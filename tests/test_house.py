@@ -48,7 +48,7 @@ OUTPUTS = {"exporters", "viewers"}  # see everything up to rows
 SEEN_ONLY_BY = {
     "exporters": {"recipes", "batch", "live", "app", "cli", "preparing"},
     "viewers": {"recipes", "batch", "app", "cli"},
-    "assets": {"cli", "preparing"},
+    "assets": {"cli", "preparing", "exporters"},
 }
 MOST_FILES = 15  # of a folder, without its __init__.py
 LONGEST = {"src/kinefit/recipes": 150, "src/kinefit": 350, "examples": 80}  # lines; the first that fits holds

@@ -8,7 +8,7 @@ import pytest
 
 from kinefit.bodies import load_body
 from kinefit.exporters.report.figure import live_figure
-from kinefit.exporters.report.page import CENTRE, LEFT, RIGHT
+from kinefit.exporters.report.page import CENTRE_COLOUR, LEFT_COLOUR, RIGHT_COLOUR
 from kinefit.rendering import colours, looks
 from kinefit.rendering.tubes import body_mesh
 
@@ -29,7 +29,7 @@ def lab(rgb, deficiency):
 
 @pytest.mark.parametrize("deficiency", DEFICIENCIES)
 def test_sides_and_lost_differ_for_everybody(deficiency):
-    named = (colours.LEFT, colours.RIGHT, colours.CENTRE, colours.LOST)
+    named = (colours.LEFT_COLOUR, colours.RIGHT_COLOUR, colours.CENTRE_COLOUR, colours.LOST_COLOUR)
     gaps = [np.linalg.norm(lab(a, deficiency) - lab(b, deficiency)) for a, b in combinations(named, 2)]
     print(deficiency, np.round(gaps, 1))
     assert min(gaps) > 12.0
@@ -43,10 +43,11 @@ def test_good_and_bad_quality_differ_for_everybody(deficiency):
 
 def test_every_place_uses_the_same_colours():
     body = load_body("humanoid")
-    sides = {"_l": colours.LEFT, "_r": colours.RIGHT}
-    expected = [sides.get(name[-2:], colours.CENTRE) for name in body.tree.segments]
+    sides = {"_l": colours.LEFT_COLOUR, "_r": colours.RIGHT_COLOUR}
+    expected = [sides.get(name[-2:], colours.CENTRE_COLOUR) for name in body.tree.segments]
     assert [tuple(c) for c in looks.side_colours(body)] == expected
     assert {tuple(c) for c in body_mesh(body).colours} == set(expected)
-    assert (LEFT, RIGHT, CENTRE) == tuple(map(colours.to_hex, (colours.LEFT, colours.RIGHT, colours.CENTRE)))
+    assert (LEFT_COLOUR, RIGHT_COLOUR, CENTRE_COLOUR) == tuple(map(colours.to_hex, (colours.LEFT_COLOUR, colours.RIGHT_COLOUR, colours.CENTRE_COLOUR)))
     page = str(live_figure(body))
-    assert all(colour in page for colour in (LEFT, RIGHT, CENTRE, colours.to_hex(colours.LOST)))
+    lost = colours.to_hex(colours.LOST_COLOUR)
+    assert all(colour in page for colour in (LEFT_COLOUR, RIGHT_COLOUR, CENTRE_COLOUR, lost))

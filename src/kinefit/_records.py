@@ -22,7 +22,7 @@ import numpy as np
 from kinefit.errors import FileError
 
 _PLAIN_TYPES = {type(None), bool, float, str, bytes}
-_LIST, _TUPLE, _MAPPING, _ARRAY, _SCALAR, _LARGE, _REFERENCE, _RECORD = range(8)  # _RECORD + k: the k-th class
+_LIST, _TUPLE, _MAPPING, _ARRAY, _SCALAR, _LARGE_INTEGER, _REFERENCE, _RECORD = range(8)  # _RECORD + k: the k-th class
 _INT64 = 2**63  # what msgpack holds of whole numbers; a generator of random numbers has longer ones
 _HEAD = struct.Struct("<IBI16s")  # bytes that follow, tag, number, checksum
 _NO_CHECKSUM = bytes(16)
@@ -86,7 +86,7 @@ class Codec:
         if kind in _PLAIN_TYPES:
             return thing
         if kind is int:
-            return thing if -_INT64 <= thing < _INT64 else [_LARGE, str(thing)]
+            return thing if -_INT64 <= thing < _INT64 else [_LARGE_INTEGER, str(thing)]
         code = self._codes.get(kind)
         if code is not None:
             out = [code]
@@ -118,7 +118,7 @@ class Codec:
             return resolve(tree[1])
         if code == _SCALAR:
             return np.frombuffer(tree[2], _dtype(tree[1]))[0]
-        if code == _LARGE:
+        if code == _LARGE_INTEGER:
             return int(tree[1])
         if code >= _RECORD:
             thing = object.__new__(self.classes[code - _RECORD])

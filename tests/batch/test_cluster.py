@@ -50,16 +50,16 @@ def test_workers_with_another_kinefit_are_refused(cluster, monkeypatch):
     from kinefit.batch import cluster as module
 
     monkeypatch.setattr(module, "code_digest", lambda calls=[]: calls.append(1) or len(calls))
-    with pytest.raises(ExportError, match="another kinefit"):
+    with pytest.raises(ExportError, match="another version of kinefit"):
         results(jobs.square, [1], cluster)
 
 
 def test_no_scheduler_is_told(monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr("kinefit.batch.cluster._CONNECT_TIMEOUT", 0.3)
-    with pytest.raises(ExportError, match="no scheduler answers"):
+    with pytest.raises(ExportError, match="no Dask scheduler answers"):
         results(jobs.square, [1], "tcp://127.0.0.1:9")
-    with pytest.raises(ExportError, match="no scheduler answers"):
+    with pytest.raises(ExportError, match="no Dask scheduler answers"):
         results(jobs.square, [1], "nonsense://x")
 
 
@@ -81,7 +81,7 @@ def test_a_worker_that_dies_is_tried_again_then_told(processes, tmp_path):
     assert results(jobs.dies_once, [str(tmp_path / "mark")], address, retries=1) == {0: "alive"}
     found = results(jobs.killed, [0, 1, 2, 3], address, retries=1)
     assert [found[k] for k in (0, 2, 3)] == [0, 2, 3]
-    assert isinstance(found[1], Failure) and found[1] == "the worker died, again and again"
+    assert isinstance(found[1], Failure) and found[1] == "the worker died in every attempt"
 
 
 @pytest.mark.slow
@@ -93,7 +93,7 @@ def test_jobs_on_the_same_worker_as_one_that_kills_it_are_not_blamed():
         n_workers=1, threads_per_worker=2, processes=True, dashboard_address=":0", protocol="tcp://"
     ) as made:
         found = results(jobs.killed_later, [0, 1], made.scheduler_address)
-    assert found == {0: 0, 1: "the worker died, again and again"}
+    assert found == {0: 0, 1: "the worker died in every attempt"}
 
 
 @pytest.mark.slow

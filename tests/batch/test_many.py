@@ -129,7 +129,7 @@ def test_done_takes_are_done_again_only_where_something_changed(sessions, tmp_pa
     with pytest.raises(Again):
         work(job(take, out))
     other = shutil.copytree(take.parent, tmp_path / "other") / "take.toml"
-    assert "results of another take lie in a" in work(job(other, out))[0].error
+    assert "a has the results of another take" in work(job(other, out))[0].error
     with pytest.raises(Again):
         work(job(other, out, Choices(**{**vars(CHOICES), "restart": True})))
     (out / RECORD).write_text("{")

@@ -26,7 +26,7 @@ def test_every_camera_has_a_picture_of_every_frame_to_show(tracked):
     motion, seen, take = tracked
     told = []
     pictures = take_pictures(motion, take, seen, lambda *step: told.append(step))
-    assert set(pictures) == set(seen.videos) and told[-1] == ("pictures", 4, 4)
+    assert set(pictures) == set(seen.videos) and told[-1] == ("images", 4, 4)
     for frames in pictures.values():
         assert set(frames) == set(report_frames(motion))
         for picture in frames.values():
@@ -39,7 +39,7 @@ def test_the_report_lies_beside_the_results_and_links_to_them(tracked, tmp_path)
     write_track_report(motion, take, seen, tmp_path, silent, files)
     text = files["report"].read_text("utf-8")
     assert files["report"] == tmp_path / "report.html" and files["report"].stat().st_size < 8e6
-    assert 'href="motion.npz"' in text and 'href="overlays"' in text and "videos with the skeleton" in text
+    assert 'href="motion.npz"' in text and 'href="overlays"' in text and "videos with the fitted skeleton" in text
     assert text.count("data:image/jpeg") >= 4 * 3
     assert str(tmp_path) not in text
 

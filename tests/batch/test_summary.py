@@ -54,7 +54,7 @@ def test_the_page_links_reports_and_tells_means_over_takes(tmp_path):
     assert "s&lt;1&gt;" in text and "s<1>" not in text
     assert "<td>60 ± 2</td><td>50 ± 1*</td><td>10 ± 2</td>" in text  # of one take: left, right, left less right
     assert "<td>2</td><td>62 ± 3</td><td>45 ± 7</td><td>17 ± 10</td>" in text  # of both takes of a session
-    assert "not observed" in text and "camera 1 is off" in text and "3 of 4 takes are done; 2 subjects" in text
+    assert "unobserved" in text and "camera 1 is off" in text and "3 of 4 takes are done. 2 subjects" in text
     assert "Knee flexion" in text and "Lumbar extension" in text
 
 

@@ -27,7 +27,7 @@ def test_a_copy_is_a_body_and_overwrites_nothing(kinefit, tmp_path):
     assert kinefit("copy", "snowboarder").exit_code == 0
     assert load_body(tmp_path / "snowboarder.toml").closures == load_body("snowboarder").closures
     again = kinefit("copy", "snowboarder")
-    assert again.exit_code == 2 and "exists already" in again.output
+    assert again.exit_code == 2 and "already exists" in again.output
     assert kinefit("copy", "surfer").exit_code == 2
 
 

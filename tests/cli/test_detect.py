@@ -121,13 +121,13 @@ def test_every_video_of_a_take_is_looked_through_once(take, networks):
     told = run(take)
     assert told.exit_code == 0, told.output
     assert {path.name for path in (take.parent / "take-detect").iterdir()} == {f"{c}.npz" for c in CAMERAS}
-    assert "cam03: 12 pictures, person 1 in 12\n" in told.stdout
+    assert "cam03: 12 images, person 1 in 12\n" in told.stdout
     found = read_detections(detections_file(take, "cam03"))
     assert len(found) == 12 and found.rate == 30 and found.size == (544, 960) and found.mask(5, 0).any()
     done = networks.pictures
     again = run(take)
     assert again.exit_code == 0 and networks.pictures == done
-    assert again.stdout.count("(already there)") == 4
+    assert again.stdout.count("(existing results)") == 4
     assert run(take, "--force").exit_code == 0 and networks.pictures == 2 * done
 
 
@@ -135,10 +135,10 @@ def test_another_video_or_setting_is_done_anew_and_only_that(take, networks):
     run(take)
     write_video(take.with_name("cam02.mp4"), 9)
     told = run(take)
-    assert told.stdout.count("(already there)") == 3
-    assert "cam02: 9 pictures, person 1 in 9\n" in told.stdout
-    assert run(take, "--people", 1).stdout.count("(already there)") == 0
-    assert run(take, "--people", 1, "--no-masks").stdout.count("(already there)") == 0
+    assert told.stdout.count("(existing results)") == 3
+    assert "cam02: 9 images, person 1 in 9\n" in told.stdout
+    assert run(take, "--people", 1).stdout.count("(existing results)") == 0
+    assert run(take, "--people", 1, "--no-masks").stdout.count("(existing results)") == 0
     assert read_detections(detections_file(take, "cam02")).mask(0, 0) is None
     before = networks.pictures
     assert set(ensure_detections(read_take(take))) == set(CAMERAS)
@@ -156,7 +156,7 @@ def test_what_was_interrupted_goes_on_with_the_others(take, networks, monkeypatc
         ensure_detections(read_take(take), masks=True, progress=stop)
     assert [path.name for path in (take.parent / "take-detect").iterdir()] == ["cam01.npz"]
     told = run(take)
-    assert told.exit_code == 0 and told.stdout.count("(already there)") == 1
+    assert told.exit_code == 0 and told.stdout.count("(existing results)") == 1
 
 
 def test_ctrl_c_says_how_much_is_kept(take, monkeypatch):
@@ -166,7 +166,7 @@ def test_ctrl_c_says_how_much_is_kept(take, monkeypatch):
 
     monkeypatch.setattr(each_video, "cores", lambda: 1)
     monkeypatch.setattr(each_video, "wait", interrupted)
-    with pytest.raises(KeyboardInterrupt, match=r"[1-4] of 4 videos are done and kept"):
+    with pytest.raises(KeyboardInterrupt, match=r"[1-4] of 4 videos are done"):
         ensure_detections(read_take(take))
     assert detections_file(take, "cam01").is_file()
 
@@ -196,9 +196,9 @@ def test_a_camera_that_sees_nobody_is_left_out_with_a_note(take, monkeypatch):
     see_nobody_in(monkeypatch, "cam02.mp4")
     told = run(take)
     assert told.exit_code == 0
-    assert "cam02: 12 pictures, nobody" in told.stdout
-    assert "finds nobody in camera cam02 (12 pictures)" in told.stderr and "left out" in told.stderr
-    with pytest.warns(UserWarning, match="nobody in camera cam02"):  # in Python
+    assert "cam02: 12 images, no person" in told.stdout
+    assert "finds no person in camera cam02 (12 images)" in told.stderr and "not used" in told.stderr
+    with pytest.warns(UserWarning, match="no person in camera cam02"):  # in Python
         assert set(ensure_detections(read_take(take))) == {"cam01", "cam03", "cam04"}
 
 
@@ -206,7 +206,7 @@ def test_nobody_at_all_is_an_error_that_names_the_cameras(take, monkeypatch):
     see_nobody_in(monkeypatch, *(f"{name}.mp4" for name in CAMERAS))
     told = run(take)
     assert isinstance(told.exception, ObservationError)
-    assert "finds nobody in cam01 (12 pictures), cam02" in str(told.exception) and told.exception.remedy
+    assert "finds no person in cam01 (12 images), cam02" in str(told.exception) and told.exception.remedy
 
 
 def test_videos_alone_go_beside_themselves_or_where_they_are_wanted(take, tmp_path):
@@ -233,8 +233,8 @@ def test_a_take_reads_what_was_found(take):
     [
         (("none.toml",), FileError, "no such take"),
         (("none.mp4",), FileError, "none.mp4.*cannot be read"),
-        (("take.toml", "more.mp4"), click.UsageError, "one take alone"),
-        (("a/x.mp4", "b/x.mp4", "--out", "c"), click.UsageError, "two videos of one name"),
+        (("take.toml", "more.mp4"), click.UsageError, "give one take without --out"),
+        (("a/x.mp4", "b/x.mp4", "--out", "c"), click.UsageError, "two videos have the same name"),
     ],
 )
 def test_wrong_inputs_are_told(args, error, message, tmp_path, monkeypatch):
@@ -253,7 +253,7 @@ def test_a_take_without_videos_is_told(take):
     lines = take.read_text().splitlines()
     take.write_text("\n".join(line for line in lines if not line.startswith("video")))
     told = run(take)
-    assert isinstance(told.exception, TakeError) and "no camera of this take has a video" in str(told.exception)
+    assert isinstance(told.exception, TakeError) and "no camera of the take has a video" in str(told.exception)
 
 
 def test_the_missing_extra_is_told_before_anything_is_fetched(monkeypatch):
@@ -279,7 +279,7 @@ def test_the_licence_is_shown_when_the_networks_are_fetched(monkeypatch, tmp_pat
     steps, said = [], []
     assert detecting.networks(lambda *step: steps.append(step), said.append).folder == tmp_path
     assert len(said) == 1 and "Apache-2.0" in said[0] and "MediaPipe" in said[0]
-    assert steps == [("fetching MB", 0, 36), ("fetching MB", 36, 36)]
+    assert steps == [("download MB", 0, 36), ("download MB", 36, 36)]
     monkeypatch.setattr("kinefit.assets.detector_models", lambda progress: tmp_path)
     detecting.networks(None, pytest.fail)  # nothing is said when they are there already
 
@@ -410,7 +410,7 @@ def drawn(drawn_take, tmp_path):
     return take
 
 
-def look(job, networks, people, masks, key, tell, threads, hands, face):
+def look(job, networks, settings, key, tell, threads):
     landmarks = np.load(job.video.with_name(f"mediapipe_{job.camera}.npy"))[:, None]
     points = np.where(landmarks[..., 2:] > 0, landmarks[..., :2], 0.5)
     nothing = np.zeros(0, np.uint32), np.zeros(len(points) + 1, int)

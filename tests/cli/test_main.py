@@ -104,4 +104,4 @@ def test_ctrl_c_is_code_130(failing):
     failing(KeyboardInterrupt())
     told = CliRunner().invoke(main, ["warmup"])
     assert told.exit_code == 130
-    assert told.stderr == "Stopped. Nothing half written is left.\n"
+    assert told.stderr == "Stopped. No incomplete files remain.\n"

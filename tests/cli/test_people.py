@@ -37,7 +37,7 @@ def test_everybody_in_view_is_tracked(take, tmp_path):
     assert sorted(gaps.argmin(axis=1)) == [0, 1] and gaps.min(axis=1).max() < 0.03
     for k, one in enumerate(found, start=1):
         assert one.provenance["people"]["in view"] == 2 and one.provenance["people"]["followed"] == k
-        assert f"2 people are in view, person {k} is followed" in told.stdout
+        assert f"2 people are in view; person {k} is tracked" in told.stdout
 
 
 def test_what_the_cameras_saw_is_read_once_for_all(take, tmp_path, monkeypatch):
@@ -75,7 +75,7 @@ def test_a_person_that_cannot_be_is_told(wrong, take, tmp_path):
 
 def test_a_number_too_many_is_told(take, tmp_path):
     told = run("track", take, "--person", "3", "--out", tmp_path)
-    assert told.exit_code == 2 and "person 3, but 2 people are in view" in told.stderr
+    assert told.exit_code == 2 and "no person 3: 2 people are in view" in told.stderr
 
 
 def test_of_one_who_cannot_be_tracked_the_others_still_are(take, tmp_path, monkeypatch):

@@ -30,7 +30,7 @@ def test_the_command_goes_on_after_ctrl_c(take, tmp_path, monkeypatch):
     left.mkdir(mode=0o700, parents=True)
     (left / "frames.kinefit").write_bytes(b"damaged")
     told = CliRunner().invoke(main, [*words, str(tmp_path / "whole")])
-    assert told.exit_code == 0 and "every frame is computed again" in " ".join(told.output.split()), told.output
+    assert told.exit_code == 0 and "all frames are tracked again" in " ".join(told.output.split()), told.output
     update, count = Tracker.update, []
 
     def until(self, frames, time=None, **more):
@@ -41,10 +41,10 @@ def test_the_command_goes_on_after_ctrl_c(take, tmp_path, monkeypatch):
 
     monkeypatch.setattr(Tracker, "update", until)
     told = CliRunner().invoke(main, [*words, str(tmp_path / "out")])
-    assert told.exit_code == 130 and "The same command goes on" in told.output
+    assert told.exit_code == 130 and "Run the same command to continue" in told.output
     assert len(read_motion(tmp_path / "out" / "motion.npz")) == 29
     told = CliRunner().invoke(main, [*words, str(tmp_path / "out")])
-    assert told.exit_code == 0 and "going on with what an earlier run left" in told.output, told.output
+    assert told.exit_code == 0 and "continuing the run in" in told.output, told.output
     assert len(count) == 30 + 60 - 28
     assert_same(*(read_motion(tmp_path / name / "motion.npz") for name in ("out", "whole")))
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["motion.npz"]
@@ -64,6 +64,6 @@ def test_restart_begins_anew(take, tmp_path, monkeypatch):
 
     monkeypatch.setattr(Tracker, "update", counting)
     told = CliRunner().invoke(main, [*words, "--restart"])
-    assert told.exit_code == 0 and "going on" not in told.output
+    assert told.exit_code == 0 and "continuing" not in told.output
     assert len(counted) == 60
     assert not (tmp_path / "out" / "unfinished").exists()

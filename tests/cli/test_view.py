@@ -40,7 +40,7 @@ def test_a_folder_of_results_finds_its_take(folder):
     said = []
     recording = gather((folder / "take-kinefit",), tell=said.append)
     assert len(recording.motions) == 1 and len(recording.rig) == 2
-    assert "With the take" in said[0]
+    assert "Cameras are from the take" in said[0]
 
 
 def test_a_take_of_another_name_is_not_taken(folder, tmp_path, motion):

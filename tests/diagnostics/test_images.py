@@ -34,7 +34,7 @@ def video(tmp_path):
     [
         ("scaled", 20, ("fault", "letterboxed"), 'Write image = "letterboxed" into [[camera]] a.'),
         ("letterboxed", 0, ("fault", "picture"), 'Write image = "scaled" into [[camera]] a.'),
-        ("letterboxed", 45, ("doubt", "picture"), 'Is it image = "scaled" in [[camera]] a?'),  # a dark scene
+        ("letterboxed", 45, ("doubt", "picture"), 'Try image = "scaled" in [[camera]] a.'),  # a dark scene
         ("letterboxed", 20, ("note", "letterboxed"), ""),
         ("scaled", 0, ("note", "picture"), ""),
         ("as calibrated", 20, ("fault", "letterboxed"), 'Write image = "letterboxed" into [[camera]] a.'),
@@ -88,7 +88,7 @@ def test_a_covered_depth_camera_is_named_with_its_time_and_its_images_are_left_o
     other = replace(depth, sensor="other")
     seen, (found,) = without_covered(NONE, seen_by(other, changed(depth, frames, ON_LENS[how])))
     assert (found.severity, found.kind, found.cameras) == ("doubt", "covered", ("depth",))
-    assert f"depth sees nothing from {frames[0] / 10:.2f} to {frames[-1] / 10:.2f} s" in found.text
+    assert f"lens of depth is probably covered from {frames[0] / 10:.2f} to {frames[-1] / 10:.2f} s" in found.text
     left = [k for k in range(30) if seen.depth[1].at_step(k, 10.0) is not None]
     assert seen.depth[0] is other and left == [k for k in range(30) if k not in frames]
     np.testing.assert_array_equal(seen.depth[1].frame(left.index(20)).depth, depth.frame(20).depth)
@@ -122,7 +122,7 @@ def test_a_covered_video_camera_is_named_where_nobody_is_detected(tmp_path, how)
     take = SimpleNamespace(rate=10.0, cameras=(CameraEntry(name="b", video=tmp_path),), depth=())
     found = without_covered(take, seen_by(keypoints=(points,), paths={"b": tmp_path}))[1]
     assert [f.cameras for f in found] == ([("b",)] if how in ("dark", "a hand") else [])
-    assert not found or "b sees nothing from 1.10 to 1.90 s: its image is flat" in found[0].text
+    assert not found or "lens of b is probably covered from 1.10 to 1.90 s: its image is flat" in found[0].text
 
 
 def stripes(depth, random, generator):

@@ -98,7 +98,7 @@ def test_a_person_of_a_size_that_few_adults_have_is_questioned(scale):
 def test_a_large_scale_of_a_lens_is_not_taken_for_a_unit():
     """All focal lengths halved make a person of twice the size, where the cameras look at her middle."""
     found = quick(changed(zoomed(0.5)))
-    assert "half what the keypoints need" in found[0].text
+    assert "half those that fit the keypoints" in found[0].text
 
 
 def test_exchanged_names_of_left_and_right_show_in_face_toes_and_knees():
@@ -110,7 +110,7 @@ def test_exchanged_names_of_left_and_right_show_in_face_toes_and_knees():
 
     found = quick(keypoints=[exchanged(k) for k in SEEN])
     assert [f.kind for f in found] == ["mirrored"]
-    assert "Exchange the names of left and right" in found[0].remedy
+    assert "swap the names of left and right" in found[0].remedy
     without = [replace(k, confidence=np.where([n.endswith(("ear", "heel", "foot_index")) for n in k.names], 0.0,
                                               exchanged(k).confidence), points=exchanged(k).points)
                for k in SEEN]  # fmt: skip
@@ -128,7 +128,7 @@ def parted(who):
 def test_two_cameras_that_go_on_with_another_motion_are_told_with_their_frames(who):
     found = quick(keypoints=parted(who))
     assert [f.kind for f in found] == ["groups"]
-    assert "in frames 80 to 119; in frames 0 to 39 all show the same" in found[0].text
+    assert "in frames 80 to 119; in frames 0 to 39 all cameras show the same motion" in found[0].text
     assert "frames = [0, 40]" in found[0].remedy
     others = tuple(n for n in RIG.names if n not in who)
     assert {found[0].cameras[:2], found[0].cameras[2:]} == {who, others}
@@ -215,12 +215,12 @@ class Nothing:
 
 
 def test_an_error_of_tracking_tells_the_fault_as_its_cause():
-    error = TrackingError("the body is found in none of the first 60 steps", remedy="Check units.")
+    error = TrackingError("the person is not found in the first 60 steps", remedy="Check units.")
     assert with_cause(error, ()) is error
     told = with_cause(error, (Finding("fault", "scale", "The person would be 3 mm tall.", remedy="Write unit."),))
     assert isinstance(told, TrackingError)
     assert str(told) == (
-        "the body is found in none of the first 60 steps; the inputs have a fault: The person would be 3 mm tall. "
+        "the person is not found in the first 60 steps; the inputs have a fault: The person would be 3 mm tall. "
         "Write unit."
     )
 

@@ -72,7 +72,7 @@ def test_a_body_of_free_parts_is_graded_as_the_tree_it_was_cut_from():
 
 def test_motions_that_cannot_be_compared_are_told():
     short = movement("bow", rate=5.0)
-    with pytest.raises(ObservationError, match="20 tracked frames of 40"):
+    with pytest.raises(ObservationError, match="20 of 40 frames have a pose"):
         grade(TRUTH, short)
     arm = replace(load_body("arm"), landmarks=PointSet((), np.zeros(0, int), np.zeros((0, 3))))
     zeros = np.zeros((40, len(arm.tree.coordinates)))

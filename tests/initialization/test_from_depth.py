@@ -8,7 +8,7 @@ from tests.tracking.depth_oracle import ARMS, BODY, UP, camera, depth_of, facing
 
 from kinefit.errors import BodyError, ObservationError, TrackingError
 from kinefit.images.depth import to_points
-from kinefit.initialization.from_depth import start_from_points
+from kinefit.initialization.from_depth import StartSearch, start_from_points
 from kinefit.rendering import render_body
 from kinefit.simulation.movements import movement
 from kinefit.simulation.placing import in_front
@@ -53,7 +53,7 @@ def noisy():
 
 def test_a_posture_is_found_in_a_time_of_flight_image_of_a_room(noisy):
     camera_tof, state, depth = noisy
-    start = start_from_points(BODY, None, camera_tof, depth, up=UP, attempts=1)[0]
+    start = start_from_points(BODY, None, camera_tof, depth, up=UP, search=StartSearch(attempts=1))[0]
     assert np.mean(np.linalg.norm(joints(start.state) - joints(state), axis=1) < 0.15) >= 0.9
 
 
@@ -73,7 +73,7 @@ def test_the_upper_body_alone_is_enough():
     cut = camera(height=135)
     K = np.array(cut.matrix)
     K[1, 2] = CAMERA.matrix[1, 2]
-    start = start_from_points(BODY, None, replace(cut, matrix=K), depth[:135], up=UP, count=1)[0]
+    start = start_from_points(BODY, None, replace(cut, matrix=K), depth[:135], up=UP, search=StartSearch(count=1))[0]
     upper = [BODY.tree.segment(n) for n in ("head", "upperarm_r", "forearm_r", "upperarm_l", "forearm_l")]
     assert np.mean(np.linalg.norm(joints(start.state) - joints(STATE), axis=1)[upper] < 0.12) >= 0.8
     assert np.all(start.visible[[BODY.tree.segment("shank_r"), BODY.tree.segment("shank_l")]] < 0.2)
@@ -82,7 +82,7 @@ def test_the_upper_body_alone_is_enough():
 @pytest.mark.slow
 def test_points_alone_do_and_the_same_seed_gives_the_same():
     points = to_points(DEPTH, CAMERA, step=2)
-    one, other = (start_from_points(BODY, points, CAMERA, up=UP, count=1)[0] for _ in range(2))
+    one, other = (start_from_points(BODY, points, CAMERA, up=UP, search=StartSearch(count=1))[0] for _ in range(2))
     assert np.array_equal(one.state.angles, other.state.angles)
     assert np.mean(np.linalg.norm(joints(one.state) - joints(STATE), axis=1) < 0.1) >= 0.8
 

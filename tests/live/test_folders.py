@@ -71,7 +71,7 @@ def test_units_ranges_and_damage_of_depth_images(tmp_path):
     with pytest.raises(ObservationError, match="which is no depth"):
         stream.read(tmp_path / "d.png", 0.0)
     cv2.imwrite(str(tmp_path / "e.png"), counts[:20])
-    with pytest.raises(ObservationError, match="images of 64x20 px, expected are 64x48"):
+    with pytest.raises(ObservationError, match="images have 64x20 px instead of 64x48"):
         stream.read(tmp_path / "e.png", 0.0)
 
 
@@ -93,7 +93,7 @@ def test_a_folder_that_is_taken_away_ends_the_session_with_its_name(tmp_path):
     stream = DepthFolderStream("tof", tmp_path / "gone", (64, 48), SessionClock())
     (tmp_path / "gone").rmdir()
     stream.start(inbox)
-    with pytest.raises(FileError, match="gone.*cannot be listed any more"):
+    with pytest.raises(FileError, match="gone.*can no longer be read"):
         taken(inbox, 1)
     stream.stop()
 

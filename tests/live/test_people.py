@@ -46,7 +46,7 @@ def test_nobody_gives_no_frames(scene):
 
 @pytest.mark.parametrize("who", ["moving", 2])
 def test_who_is_known_only_when_all_is_over_is_refused(scene, who):
-    with pytest.raises(TakeError, match="only when all is over"):
+    with pytest.raises(TakeError, match="needs the whole recording"):
         LivePerson(scene.rig, who)
 
 

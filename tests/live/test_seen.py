@@ -83,5 +83,5 @@ def test_what_came_before_a_restart_is_in_no_take(scene, tmp_path, recorded):
 def test_a_take_of_ones_own_is_not_written_over(scene, tmp_path, recorded):
     own = recorded.take.path
     own.rename(own.with_name("take.toml"))
-    with pytest.raises(ExportError, match="would be written over"):
+    with pytest.raises(ExportError, match="would overwrite this take"):
         SeenRecord(own.parent, recorded.take, scene.rig, rate=30.0, alone=False)

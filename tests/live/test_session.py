@@ -109,7 +109,7 @@ def test_one_wish_is_done_a_step_and_those_too_many_are_refused(scene, collected
     session, answers = LiveSession(scene.tracker(), [scene.replay()], [collected]), []
     for _ in range(100):
         session.ask({"sensor": scene.rig.names[0], "use": True}, answers.append)
-    assert len(answers) == 36 and all("64 wishes wait already" in a["why"] for a in answers)
+    assert len(answers) == 36 and all("64 requests are waiting" in a["why"] for a in answers)
     session.run()
     assert [a["type"] for a in answers[36:]] == ["done"] * len(scene.recording)
 
@@ -161,7 +161,7 @@ def test_a_source_that_fails_ends_the_session_with_its_error(scene, collected):
     stream = CameraSource("cam", (64, 48), SessionClock())
     session = LiveSession(scene.tracker(), [stream], [collected])
     stream._run = lambda inbox: stream._put(inbox, np.zeros((10, 10, 3), np.uint8), 0.0)
-    with pytest.raises(ObservationError, match="images of 10x10 px"):
+    with pytest.raises(ObservationError, match="images have 10x10 px"):
         session.run()
     assert collected.closed
 

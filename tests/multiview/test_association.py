@@ -152,7 +152,7 @@ def test_nobody_anywhere_is_told():
         Keypoints(c.name, SET, NAMES, 25.0, np.full((3, 2, len(NAMES), 2), np.nan), np.zeros((3, 2, len(NAMES))))
         for c in RIG
     ]
-    with pytest.raises(TrackingError, match=r"nobody is seen.*keypoints belong"):
+    with pytest.raises(TrackingError, match="no person is seen.*keypoints are of this"):
         choose_people(RIG, nothing)
 
 

@@ -37,7 +37,7 @@ def test_the_image_in_a_mirror_is_nobody_else(listed_first):
     assert [one.image_of for one in told] == [None, 0]
     assert np.mean(told[0].chosen[0] == truth[0][:, 0]) > 0.9
     followed = follow(RIG, keypoints)
-    assert sentences(followed.as_record(), asked=False)[-1] == "person 2 is person 1 in a mirror"
+    assert sentences(followed.as_record(), asked=False)[-1] == "person 2 is the mirror image of person 1"
 
 
 @pytest.mark.parametrize("alike", ["the same side", "half a second later", "still"])

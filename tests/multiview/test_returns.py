@@ -119,11 +119,11 @@ def test_what_is_said_of_those_who_come_back():
     _, keypoints, _ = exchanged(sized(0.92), sized(1.06))
     found = people_of(RIG, keypoints)
     said = sentences(PersonKeypoints(tuple(keypoints), tuple(found), 1, RATE).as_record(), asked=False)
-    assert any("leaves at 2.0 s, and who comes at 7.0 s is taken for the same, by size, way (odds " in s for s in said)
+    assert any("leaves at 2.0 s and is re-identified at 7.0 s by size, way (odds " in s for s in said)
     _, keypoints, _ = exchanged(BODY, BODY)
     found = people_of(RIG, keypoints)
     said = sentences(PersonKeypoints(tuple(keypoints), tuple(found), 1, RATE).as_record(), asked=False)
-    assert sum("leaves it open" in s for s in said) == 2
+    assert sum("re-identification is undecided" in s for s in said) == 2
 
 
 def test_what_few_views_took_for_somebody_beside_who_follows_is_left_out():

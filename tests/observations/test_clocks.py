@@ -86,6 +86,7 @@ def test_somebody_else_is_not_the_same_person():
 
 def test_rates_and_what_is_said_of_them():
     assert is_even(ALL + 5.0, RATE) and not is_even(DROPPED, RATE) and unevenness(ALL, RATE) == ""
+    assert is_even(ALL[:0], RATE) and is_even(ALL[:1], RATE) and unevenness(ALL[:0], RATE) == ""
     milliseconds = np.round(np.arange(500) / 240, 3)
     assert nominal_rate(milliseconds) == pytest.approx(240, rel=1e-3) and is_even(milliseconds, 240.0)
     assert nominal_rate(DROPPED) == pytest.approx(60)

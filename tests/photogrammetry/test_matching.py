@@ -109,9 +109,9 @@ def test_what_cannot_be_matched_says_why():
     noise = np.random.default_rng(1).normal(size=(2, 120, 160))
     told = match(SplineImage.of(90 + noise[0]), SplineImage.of(90 + noise[1]), AT)
     assert not (told.found & (told.correlation > 0.8)).any()
-    assert match(first, second, [[3.0, 3.0], [np.nan, 50.0]]).status.tolist() == [kernels.OUTSIDE] * 2
+    assert match(first, second, [[3.0, 3.0], [np.nan, 50.0]]).status.tolist() == [kernels.OUTSIDE_IMAGE] * 2
     gone = match(first, second, [[80.0, 60.0]], [[400.0, 60.0]])
-    assert gone.status[0] == kernels.OUTSIDE and np.isnan(gone.uv).all()
+    assert gone.status[0] == kernels.OUTSIDE_IMAGE and np.isnan(gone.uv).all()
 
 
 @pytest.mark.parametrize("window", [12, 3, 999, [13, 13]])

@@ -12,7 +12,7 @@ from kinefit.readers.detections import read_detections
 KEPT = [0, 1, 2, 4, 6, 8, 9, 10]  # steps of 50 Hz
 
 
-def look(images, models, *, camera, rate, people, masks, source, with_hands, with_faces):
+def look(images, models, *, camera, rate, people, masks, with_hands, with_faces):
     """Nobody, in every image."""
     count = len(list(images))
     nothing = np.zeros(0, np.uint32), np.zeros(count + 1, int)
@@ -28,7 +28,7 @@ def found(write_frames, tmp_path, monkeypatch):
         video = write_frames(tmp_path / "a.mp4", steps, size=(64, 48))
         job = detecting.DetectionJob("a", video, tmp_path / "a.npz", seconds=seconds)
         files = detecting.Networks(tmp_path, tmp_path, "best")
-        detecting._look_through(job, files, 1, False, "key", lambda *said: None, 1, False, False)
+        detecting._look_through(job, files, detecting.DetectionSettings(1), "key", lambda *said: None, 1)
         return read_detections(job.file)
 
     return run

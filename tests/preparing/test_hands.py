@@ -1,5 +1,6 @@
 """Hands and faces are looked for where the take's body has them, faces also where the take names them."""
 
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,7 +13,7 @@ from kinefit.readers.take.file import read_take
 @pytest.mark.parametrize(("body", "hands"), [("humanoid", None), ("humanoid_hands", True), ("anny", None)])
 def test_a_body_with_fingers_has_its_hands_looked_for(tmp_path, monkeypatch, body, hands):
     asked = {}
-    monkeypatch.setattr(preparing, "detect", lambda jobs, **how: asked.update(how))
+    monkeypatch.setattr(preparing, "detect", lambda jobs, settings, **how: asked.update(asdict(settings)))
     monkeypatch.setattr(preparing, "somebody", lambda jobs, tell: {"cam": Path("cam.npz")})
     (tmp_path / "cam.mp4").touch()
     (tmp_path / "take.toml").write_text(f'[take]\nbody = "{body}"\n[[camera]]\nname = "cam"\nvideo = "cam.mp4"\n')
@@ -24,7 +25,7 @@ def prepare(tmp_path, monkeypatch, body, more="", faces=("cam",)):
     """The take with its keypoints, what was asked of the detector, and what was said; `faces`: cameras that see one."""
     asked, said = {}, []
     cameras = {name: tmp_path / f"{name}.npz" for name in ("cam", "back")}
-    monkeypatch.setattr(preparing, "detect", lambda jobs, **how: asked.update(how))
+    monkeypatch.setattr(preparing, "detect", lambda jobs, settings, **how: asked.update(asdict(settings)))
     monkeypatch.setattr(preparing, "somebody", lambda jobs, tell: cameras)
     monkeypatch.setattr(preparing, "read_detections", lambda file: SimpleNamespace(has_faces=file.stem in faces))
     text = f'[take]\nbody = "{body}"\n'
@@ -40,7 +41,7 @@ def test_a_body_with_a_jaw_has_its_face_looked_for(tmp_path, monkeypatch):
     assert asked["face"] is True and asked["hands"] is None and not said
     assert [(k.camera, k.set) for k in take.keypoints] == [("cam", None), ("back", None), ("cam", "MEDIAPIPE_478")]
     take, _, said = prepare(tmp_path, monkeypatch, "humanoid_face", faces=())
-    assert [k.set for k in take.keypoints] == [None, None] and "no face" in said[0]
+    assert [k.set for k in take.keypoints] == [None, None] and "No face" in said[0]
 
 
 def test_a_take_that_names_faces_has_them_looked_for(tmp_path, monkeypatch):

@@ -23,7 +23,7 @@ class SeesMiddle:
         return np.array([[image.shape[1] / 2, image.shape[0] / 2, 30.0, 0.0]])
 
 
-def look(job, networks, people, masks, key, tell, threads, hands, face):
+def look(job, networks, settings, key, tell, threads):
     """One person whose face is near the upper left corner."""
     with Video(job.video) as video:
         frames, size = len(video), video.size
@@ -69,5 +69,5 @@ def test_images_in_folders_are_refused(take):
     first = text.index('video = "')
     end = text.index("\n", first)
     take.write_text(text[:first] + 'video = "images"' + text[end:])
-    with pytest.raises(TakeError, match="copies without faces"):
+    with pytest.raises(TakeError, match="copies only video files"):
         hide_in_copies(take, None, print)

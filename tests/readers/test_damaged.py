@@ -209,7 +209,7 @@ def test_a_thin_ball_beside_thick_ones_is_drawn():
 
 @pytest.mark.parametrize(
     ("text", "told"),
-    [("1,2,3,4\n1,2,3\n", "line 2: 3 columns for 2 views"), ("u,v,u,v\n\n1,2,x,4\n", "line 3: 'x' is no number"),
+    [("1,2,3,4\n1,2,3\n", "line 2: 3 columns, not 4"), ("u,v,u,v\n\n1,2,x,4\n", "line 3: 'x' is no number"),
      ("1,2,3,4\0\n", "no number"), ("u,v,u,v\n", "no points"), ('1,2,3,"' + "4" * 140_000, "field larger")],
 )  # fmt: skip
 def test_a_table_of_seeds_that_is_none_is_told(tmp_path, text, told):

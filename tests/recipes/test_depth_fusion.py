@@ -54,8 +54,8 @@ def test_with_nothing_given(wave):
 
 
 def test_nothing_seen_is_refused(wave):
-    with pytest.raises(ObservationError, match="no step with a frame"):
+    with pytest.raises(ObservationError, match="no step has a frame"):
         depth_fusion([[], []], wave.truth.body, wave.rig, rate=10.0)
-    with pytest.raises(TrackingError, match="found in none"):
+    with pytest.raises(TrackingError, match="not found in the first"):
         nobody = [[type(seen[0])("depth", seen[0].time, np.zeros_like(seen[0].depth))] for seen in wave.seen("3d")[:3]]
         depth_fusion(nobody, wave.truth.body, wave.rig, rate=10.0, size=False)

@@ -329,7 +329,7 @@ BAD = {
         ),
         "negative",
     ),
-    "a match that is no match": (lambda m, s, r: {"a": 1}, "gave is a dict"),
+    "a match that is no match": (lambda m, s, r: {"a": 1}, "is a dict"),
     "rows that are no rows": (lambda m, s, r: RowsOf(lambda scene: np.zeros(3)), "ndarray"),
     "nothing": (lambda m, s, r: RowsOf(lambda scene: None), "NoneType"),
 }  # fmt: skip
@@ -370,12 +370,12 @@ CHANNELS = {
         lambda i: RowsOf(lambda s: s.along(one("neck"), (0.0, 1.0, 0.0), [0.0], 0.01, group=np.array([i]))),
         "their number changes",
     ),
-    "a name too few": (lambda i: several(2, ["a"]), "names 1 channels .* id 1"),
+    "a name too few": (lambda i: several(2, ["a"]), "names 1 channels, .* id 1"),
     "one name twice": (lambda i: several(2, ["a", "a"]), "two channels 'a'"),
-    "numbers as names": (lambda i: several(2, [1, 2]), "are no names"),
-    "a text as names": (lambda i: several(2, "ab"), "are no names"),
-    "names at some times": (lambda i: several(2, ["a", "b"] if i % 2 else None), "at some times only"),
-    "new names at every time": (lambda i: several(2, [f"a{i}", f"b{i}"]), "anew at every time: a9, b9"),
+    "numbers as names": (lambda i: several(2, [1, 2]), "are not text"),
+    "a text as names": (lambda i: several(2, "ab"), "are not text"),
+    "names at some times": (lambda i: several(2, ["a", "b"] if i % 2 else None), "in some measurements"),
+    "new names at every time": (lambda i: several(2, [f"a{i}", f"b{i}"]), "new channel names at every time: a9, b9"),
 }
 
 
@@ -405,7 +405,7 @@ def test_two_measurements_of_one_name_and_time_are_told():
     with pytest.raises(ObservationError, match="'mocap' at 0 s have a channel 'neck'.*its own"):
         a_tracker().update([marker_frame(0, HELD), named])
     numbered = Told("mocap", 0.0, None, lambda m, s, r: several(1, None))
-    with pytest.raises(ObservationError, match="'mocap' name their channels at some times only"):
+    with pytest.raises(ObservationError, match="'mocap' names its channels in some measurements"):
         a_tracker().update([marker_frame(0, HELD), numbered])
 
 

@@ -155,7 +155,7 @@ def test_probes_print_nothing(server, capfd, caplog):
 
 @pytest.mark.parametrize("host", ["no.such.host.invalid", "a" * 70 + ".invalid", "203.0.113.7"])
 def test_a_host_that_is_none_is_told(host):
-    with pytest.raises(ExportError, match="nothing can be served at"):
+    with pytest.raises(ExportError, match="server cannot start at"):
         PageServer(Access(host), 0, page=PAGES.get, talk=echo)
 
 

@@ -130,6 +130,8 @@ def test_wrong_requests_are_told(wrong):
         simulate_keypoints(MOTION, RIG, **wrong)
     with pytest.raises(ObservationError, match="cameras"):
         studio_rig(cameras=0)
+    with pytest.raises(ObservationError, match="from which camera 1 sees all of the motion"):
+        studio_rig(MOTION, focal=50_000.0)
 
 
 def test_the_squat_stands_on_the_floor_and_keeps_the_limits():

@@ -197,7 +197,7 @@ def test_windows_agree_with_all_at_once(squats, tracked):
     truth, _, _ = squats
     settings = TrackSettings(smooth_rounds=0)
     whole, _ = smoothed_of(truth, tracked, settings)
-    cut, _ = smoothed_of(truth, tracked, settings, window=40, overlap=20)
+    cut, _ = smoothed_of(truth, tracked, settings, windows=(40, 20))
     moved = joint_errors(as_motion(truth, whole), as_motion(truth, cut))
     assert 0 < moved.max() < 5e-4
     for a, b in zip(whole, cut, strict=True):

@@ -81,9 +81,9 @@ def test_it_does_not_run_away_on_rubbish():
 
 def test_bad_input_is_told():
     cloud = seen(BODY)[0].cloud
-    with pytest.raises(ObservationError, match="2 clouds with 1"):
+    with pytest.raises(ObservationError, match="2 clouds but 1"):
         fit_surfaces(BODY, [cloud, cloud], POSES[:1])
-    with pytest.raises(ObservationError, match="without points"):
+    with pytest.raises(ObservationError, match="has no points"):
         fit_surfaces(BODY, [np.full((5, 3), np.nan)], POSES[:1])
     with pytest.raises(BodyError, match="surfaces"):
         fit_surfaces(replace(BODY, surfaces=()), [cloud], POSES[:1])

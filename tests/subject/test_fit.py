@@ -210,7 +210,7 @@ def test_a_sensor_whose_rows_change_is_named():
 def test_what_cannot_be_fitted_is_refused():
     states = measured.arms(1)
     steps = measured.markers(ARM, states)
-    with pytest.raises(ObservationError, match="1 frames of measurements with 2 states"):
+    with pytest.raises(ObservationError, match="1 frames of measurements but 2 states"):
         fit_subject(ARM, RIG, steps, states * 2, [SegmentScales(ARM)])
     with pytest.raises(ObservationError, match="no parameters"):
         fit_subject(ARM, RIG, steps, states, [])

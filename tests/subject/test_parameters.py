@@ -98,9 +98,9 @@ def test_markers_shift_one_by_one():
     assert np.allclose(body.markers("worn").points - ARM.markers("worn").points, values.reshape(-1, 3))
     assert np.array_equal(body.landmarks.points, ARM.landmarks.points)
     assert np.diag(offsets.information)[[0, -1]] == pytest.approx([0.005**-2, 0.03**-2])
-    with pytest.raises(BodyError, match="no set of points .* 'foot'; there are: .*worn"):
+    with pytest.raises(BodyError, match="no point set .* 'foot'; there are: .*worn"):
         PointOffsets(ARM, "foot")
-    with pytest.raises(BodyError, match="standard deviations"):
+    with pytest.raises(BodyError, match="does not fit the"):
         PointOffsets(ARM, "worn", np.ones(3))
 
 
@@ -156,7 +156,7 @@ def test_what_a_sensor_does_not_know_of_itself_goes_into_the_world_beside_what_i
     assert world.values == {"rope": {"stiffness": 5.0, "length": 1.2}, "watch": {"delay": 0.004}}
     assert own.names == ("rope length", "watch delay")
     assert np.allclose(own.step, [3e-4, 1e-5])
-    with pytest.raises(ObservationError, match="sensor 'rope'.*'length'"):
+    with pytest.raises(ObservationError, match="'length' of sensor 'rope'"):
         OwnUnknowns({"rope": {"length": Unknown(1.0, 0.0)}})
 
 

@@ -93,7 +93,7 @@ def test_no_file_is_left_behind(stop, tmp_path, monkeypatch):
 def test_a_frame_needs_little_memory(depth, monkeypatch):
     """Twice the 15 kB that keypoints of two cameras need on this body; what depth images add goes to the file."""
     monkeypatch.setattr(spool, "IN_MEMORY", 2**18)
-    monkeypatch.setattr(motions, "smooth_results", partial(smooth_results, window=12, overlap=6))
+    monkeypatch.setattr(motions, "smooth_results", partial(smooth_results, windows=(12, 6)))
     peaks, counts = [], (16, 16, 40)  # the first makes what is made once
     for count in counts:
         whole = recording(count, depth)

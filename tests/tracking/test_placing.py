@@ -69,6 +69,6 @@ def test_a_turned_depth_camera_is_moved_and_named(scene):
 def test_a_depth_camera_upside_down_is_left_out_and_named(scene):
     motion = track(recording(scene, (0.0, 0.0, 180.0)), load_body("humanoid"), smooth=False)
     assert list(motion.provenance[LEFT_OUT]) == ["depth"]
-    (sentence,) = [s for s in sentences(motion.provenance, PRIOR) if "left out" in s]
-    assert "depth camera depth was left out" in sentence and "turned by 1" in sentence
+    (sentence,) = [s for s in sentences(motion.provenance, PRIOR) if "excluded" in s]
+    assert "depth camera depth was excluded" in sentence and "rotation by 1" in sentence
     assert "depth" not in motion.residuals

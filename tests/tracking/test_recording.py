@@ -55,7 +55,7 @@ def test_two_frames_of_one_name_are_told():
     """Markers of two systems that are both called mocap; two sets of keypoints of one camera are two sensors."""
     names = BODY.landmarks.names
     steps = [[marker_frame(i, names), marker_frame(i, names, shift=0.1)] for i in range(3)]
-    with pytest.raises(ObservationError, match=r"two frames of sensor 'mocap' in step 0.*own name"):
+    with pytest.raises(ObservationError, match=r"step 0 has two frames of sensor 'mocap'.*own name"):
         Recording.of_frames(steps, a_rig(), rate=RATE)
     other = [[keypoint_frame(0, "left"), replace(keypoint_frame(0, "left"), keypoint_set="BODY_25B")]]
     assert len(Recording.of_frames(other, a_rig(), rate=RATE).keypoints) == 2
@@ -69,7 +69,7 @@ def test_a_time_that_is_not_the_frames_is_told_and_does_no_harm(frame):
     tracker = Tracker(BODY, a_rig(), rate=RATE, up=(0, 1, 0), settings=STILL)
     tracker.start_at(a_motion().state(0))
     before = tracker.update([depth_frame(0)])
-    with pytest.raises(ObservationError, match=r"has a frame of 0\.\d+ s in a step of 1000\.000 s.*one clock"):
+    with pytest.raises(ObservationError, match=r"is at 0\.\d+ s, its step at 1000\.000 s.*one clock"):
         tracker.update([frame(1)], 1000.0)
     np.testing.assert_array_equal(tracker.state.angles, before.state.angles)
     assert tracker.update([frame(1)], 1 / RATE).time == pytest.approx(1 / RATE)

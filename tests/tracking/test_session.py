@@ -102,5 +102,5 @@ def test_what_cannot_be_a_motion_is_told():
         a_tracker().motion()
     with pytest.raises(ObservationError, match="not found"):
         a_tracker(keep=True).motion()
-    with pytest.raises(ObservationError, match="contacts without smoothing"):
+    with pytest.raises(ObservationError, match="contacts=True needs smoothing"):
         run([seen(0)]).motion(smooth=False, contacts=True)

@@ -78,7 +78,7 @@ def test_tables_that_are_none(tmp_path, text, error, said):
         ("sigma = 0.003", "slide = 0.003", "no key 'slide'"),
         ("sigma = 0.003", "time_offset = 50.0", "points"),
         ("points.csv", "nothing.csv", "no such file"),
-        ("[start]\nat = [0, 0, 0]\nforward = [1, 0, 0]\nangles", "[session]\n#", "alone do not show"),
+        ("[start]\nat = [0, 0, 0]\nforward = [1, 0, 0]\nangles", "[session]\n#", "alone do not determine"),
     ],
 )
 def test_takes_that_are_refused(taken, old, new, said):

@@ -6,6 +6,7 @@ import pytest
 from tests.exporters.synthetic import a_camera
 from tests.viewers.recordings import write_video
 
+from kinefit import viewers
 from kinefit.errors import FileError
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.geometry.triangulation import triangulate_robust
@@ -143,3 +144,9 @@ def test_points_of_a_real_person_are_on_the_person_in_every_flat_picture(data_di
         uv = np.rint(view.pixels(x @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3])).astype(int)
         on = flat[uv[:, 1], uv[:, 0], 0] > 128
         assert on.mean() >= 5 / 6, camera.name
+
+
+@pytest.mark.parametrize(("old", "new"), [("Recording", "ViewerContent"), ("Pictures", "CameraImages")])
+def test_an_old_name_is_the_new_one_with_a_warning_that_names_it(old, new):
+    with pytest.warns(FutureWarning, match=f"{old} is {new} now"):
+        assert getattr(viewers, old) is getattr(viewers, new)

@@ -22,12 +22,12 @@ from kinefit.errors import BodyError, CalibrationError, ExportError, Observation
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Markers
-from kinefit.rendering.colours import LEFT, LOST, RIGHT
+from kinefit.rendering.colours import LEFT_COLOUR, LOST_COLOUR, RIGHT_COLOUR
 from kinefit.serving.access import Access
 from kinefit.simulation import cut
 from kinefit.viewers import CameraImages, Choice, Player, View, ViewerContent, page
 from kinefit.viewers.page import MOST_FRAMES, chosen_frames
-from kinefit.viewers.show import ALL, CYLINDERS, Show
+from kinefit.viewers.show import ALL_CAMERAS, CYLINDERS, Show
 from kinefit.viewers.stage import free_port, open_server, quiet
 
 ACCESS = Access()
@@ -131,16 +131,16 @@ def test_the_skin_moves_with_the_segments_and_shows_what_is_lost_or_uncertain(se
         assert np.allclose(bone.position, motion.segment_poses()[3, s, :3, 3], atol=1e-5)
         assert np.allclose(se3.rotation_from_quaternion(bone.wxyz), motion.segment_poses()[3, s, :3, :3], atol=1e-5)
     lost, unsure, good = (node(server, f"body0/skin_{name}") for name in ("shank_l", "hand_r", "thigh_l"))
-    assert good.opacity is None and good.color == LEFT
-    assert 0 < lost.opacity < unsure.opacity < 1 and lost.color == LOST and unsure.color == RIGHT
+    assert good.opacity is None and good.color == LEFT_COLOUR
+    assert 0 < lost.opacity < unsure.opacity < 1 and lost.color == LOST_COLOUR and unsure.color == RIGHT_COLOUR
     dashes, solid = node(server, "body0/shank_l/bones"), node(server, "body0/thigh_l/bones")
     gaps = node(server, "body0/shank_l/gaps")
     assert gaps.opacity == 0.0 and not gaps.visible and solid.opacity == 0.0  # in the skin, only a lost one has a line
-    assert dashes.visible and dashes.opacity is None and dashes.color == LOST
+    assert dashes.visible and dashes.opacity is None and dashes.color == LOST_COLOUR
     show.frame(3, Choice(CYLINDERS))
     assert gaps.opacity == 0.0 and gaps.visible and solid.opacity is None and dashes.opacity is None
     show.frame(0)
-    assert lost.opacity is None and lost.color == LEFT and node(server, "body0/shank_l/gaps").opacity is None
+    assert lost.opacity is None and lost.color == LEFT_COLOUR and node(server, "body0/shank_l/gaps").opacity is None
     show.frame(0, Choice(through="cam 0"))
     assert good.opacity == 0.5
 
@@ -205,7 +205,7 @@ def test_the_backdrop_is_where_its_pixels_are_seen(server, motion, rig, tmp_path
 def test_rays_of_one_camera_or_of_all(server, motion, rig):
     show = Show(server, ViewerContent((motion,), rig=rig))
     one, other = show.rays(2, "cam 0"), show.rays(2, "cam 1")
-    assert len(show.rays(2, ALL).points) == len(one.points) + len(other.points)
+    assert len(show.rays(2, ALL_CAMERAS).points) == len(one.points) + len(other.points)
     show.frame(2, Choice(rays="cam 1"))
     assert np.allclose(node(server, "rays").points, other.points, atol=1e-5) and node(server, "rays").visible
     show.frame(2, Choice())
@@ -311,7 +311,7 @@ def test_the_player_plays_steps_and_obeys_its_boxes(server, motion, rig):
     player.tick(0.0)
     assert player.clock.frame == 6
     assert not player._boxes["bones"].value and player._boxes["skin"].value
-    player._rays.value, player._look.value, player._colour.value = ALL, "cam 1", "quality"
+    player._rays.value, player._look.value, player._colour.value = ALL_CAMERAS, "cam 1", "quality"
     player.tick(0.0)
     assert node(server, "body0/thigh_l/bones").opacity == 0.0 and node(server, "rays").visible
     assert not node(server, "cameras/cam 1").visible and node(server, "cameras/cam 0").visible

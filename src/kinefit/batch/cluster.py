@@ -39,12 +39,12 @@ def run_there(
         from distributed import Client
     except ImportError as error:
         remedy = "Install it: pip install 'kinefit[cluster]'."
-        raise ExportError("a cluster needs the package distributed", place="--cluster", remedy=remedy) from error
+        raise ExportError("--cluster needs the package distributed", place="--cluster", remedy=remedy) from error
     try:
         client = Client(address, timeout=_CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, ValueError) as error:  # TimeoutError is an OSError
-        remedy = "Start one with `dask scheduler`, workers with `dask worker ADDRESS --nthreads 1`."
-        raise ExportError(f"no scheduler answers at {address}", place="--cluster", remedy=remedy) from error
+        remedy = "Start it with `dask scheduler`, and workers with `dask worker ADDRESS --nthreads 1`."
+        raise ExportError(f"no Dask scheduler answers at {address}", place="--cluster", remedy=remedy) from error
     with client:
         _check_workers(client, address)
         run = uuid.uuid4().hex
@@ -69,12 +69,13 @@ def _check_workers(client: Any, address: str) -> None:
     try:
         codes = client.run(code_digest)
     except Exception as error:
-        remedy = "Install the same kinefit on all of them."
+        remedy = "Install this version of kinefit on all workers."
         raise ExportError(f"a worker cannot import kinefit ({error})", place=address, remedy=remedy) from error
     other = [worker for worker, code in codes.items() if code != code_digest()]
     if other:
-        remedy = "Install the same kinefit on all of them, and start them anew."
-        raise ExportError(f"another kinefit on {len(other)} of the workers ({other[0]})", place=address, remedy=remedy)
+        remedy = "Install this version on all workers, and restart them."
+        problem = f"{len(other)} workers have another version of kinefit ({other[0]})"
+        raise ExportError(problem, place=address, remedy=remedy)
 
 
 def _ended(client: Any, futures: list[Any]) -> Iterator[tuple[Any, Any]]:
@@ -88,7 +89,7 @@ def _result(future: Any, result: Any) -> Any:
     if future.status == "finished":
         return result
     error = _error(result)
-    return Failure("the worker died, again and again" if _killed(error) else f"{type(error).__name__}: {error}")
+    return Failure("the worker died in every attempt" if _killed(error) else f"{type(error).__name__}: {error}")
 
 
 def _error(result: Any) -> Any:

@@ -60,8 +60,8 @@ def find_takes(patterns: Sequence[str | os.PathLike[str]]) -> Found:
         takes = [take for hit in hits for take in _takes_at(hit) if not _is_result(take, base)]
         good = [take for take in takes if _may_be_take(take)]
         if not good:
-            problem = f"no take file among the {len(hits)} files and folders that match" if hits else "nothing matches"
-            remedy = f"Name take files, such as 'sessions/**/take.toml'; one is written by {command('init')} FOLDER."
+            problem = f"no take file among the {len(hits)} matches" if hits else "nothing matches"
+            remedy = f"Give take files, such as 'sessions/**/take.toml'; {command('init')} FOLDER writes one."
             raise FileError(problem, file=pattern, remedy=remedy)
         bases.append(base)
         files |= {take.resolve(): take for take in good}

@@ -55,8 +55,8 @@ def track_takes(
         `workers` is below 1 or `retries` below 0; the cluster cannot be used; the summary cannot be written.
     """
     if workers < 1 or retries < 0:
-        problem = f"{workers} workers, {retries} retries"
-        raise ExportError(problem, remedy="Give one worker or more, and no negative number.")
+        problem = f"workers = {workers} or retries = {retries} is too small"
+        raise ExportError(problem, remedy="Give at least one worker, and retries of 0 or more.")
     if isinstance(patterns, str | PathLike):
         patterns = [patterns]
     found = patterns if isinstance(patterns, Found) else find_takes(patterns)

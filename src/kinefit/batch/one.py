@@ -103,9 +103,10 @@ def check_drawable(take: Take, *, skin: bool = False) -> None:
     """
     videos = any(camera.video for camera in take.cameras)
     if skin and not videos:
-        raise TakeError("a skin on overlays, but no video", file=take.path, remedy="Leave --overlay-skin out.")
+        problem = "the take has no video for a skin on overlays"
+        raise TakeError(problem, file=take.path, remedy="Leave out --overlay-skin.")
     if not (take.depth or videos):
-        raise TakeError("overlays, but no video or depth to draw on", file=take.path, remedy="Leave --overlays out.")
+        raise TakeError("the take has no video or depth for overlays", file=take.path, remedy="Leave out --overlays.")
 
 
 def people_of(take: Take, out: Path, step: Step, tell: Tell) -> tuple[InView | None, list[tuple[Take, Path]]]:

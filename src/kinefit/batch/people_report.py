@@ -31,7 +31,7 @@ def write_people_report(rows: Sequence[Row], folder: Path, *, pictures: bool) ->
     from kinefit.exporters.report import page as p
 
     done = [row for row in rows if row.status == DONE]
-    text = f"{len(done)} of {len(rows)} people in view were tracked; each has results and a report of their own."
+    text = f"{len(done)} of {len(rows)} people in view were tracked. Each of them has its own results and report."
     parts: list[p.Section | str] = [
         *fault_boxes(rows), p.callout("good" if len(done) == len(rows) else "warning" if done else "bad", text),
         _people(rows, folder),

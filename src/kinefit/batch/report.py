@@ -64,7 +64,7 @@ def take_pictures(
         return out
     frames = sorted(report_frames(motion))
     for number, name in enumerate(seen.videos):
-        step("pictures", number, len(seen.videos))
+        step("images", number, len(seen.videos))
         offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
         given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name)}
         with shown_video(take, seen, name) as video:
@@ -73,7 +73,7 @@ def take_pictures(
                 if shown is not None:
                     picture = close_up(video.read(shown), motion, frame, seen.rig[name], **given)
                     out.setdefault(name, {})[frame] = picture
-    step("pictures", len(seen.videos), len(seen.videos))
+    step("images", len(seen.videos), len(seen.videos))
     return out
 
 

@@ -30,7 +30,7 @@ DEFAULT_FORMATS = ("motion", "csv", "bvh", "glb", "trc", "mot", "osim")
 """Formats that are written by default."""
 
 DESCRIPTIONS = {
-    "motion": "everything, for kinefit export and kinefit.read_motion",
+    "motion": "all results, for kinefit view, kinefit export and kinefit.read_motion",
     "csv": "tables of angles, joint centres, landmarks, quality, residuals",
     "parquet": "the same tables as Parquet",
     "bvh": "animated skeleton for animation programs",
@@ -45,9 +45,9 @@ DESCRIPTIONS = {
     "mcap": "joint states and transforms for ROS 2",
     "jsonl": "poses as JSON lines, as kinefit live sends them; for the Blender add-on",
     "rrd": "joints, error bars and angles for the viewer of Rerun",
-    "overlays": "videos with the skeleton drawn on them",
-    "montage": "one picture of all cameras",
-    "report": "what came out and how far to trust it, on one page for a browser",
+    "overlays": "videos with the fitted skeleton",
+    "montage": "one image of all cameras",
+    "report": "results with error bars and findings, as a page for the browser",
 }
 """Use of each kind of result."""
 

@@ -36,7 +36,7 @@ def write_summary(rows: Sequence[Row], folder: Path) -> None:
     from kinefit.exporters.atomic import write_text
 
     if not rows:
-        raise ExportError("no take to summarise", file=folder, remedy="Name takes by a pattern that matches some.")
+        raise ExportError("there are no takes to summarise", file=folder, remedy="Give a pattern that matches takes.")
     table = [(*_ids(row), row.frames or "", *map(_number, (row.seconds, row.quality, row.lost)), row.status, row.error,
               " ".join(found.text for found in row.findings), row.folder) for row in rows]  # fmt: skip
     ranges = [
@@ -55,7 +55,7 @@ def summary_page(rows: Sequence[Row], folder: Path) -> str:
     done = [row for row in rows if row.status == DONE]
     takes, bad = len({row.take for row in rows}), len({row.take for row in rows if row.status != DONE})
     named = len({row.subject for row in rows if row.subject})
-    text = f"{takes - bad} of {takes} takes are done; {named} subjects are named."
+    text = f"{takes - bad} of {takes} takes are done. {named} subjects are named."
     parts: list[p.Section | str] = [
         *fault_boxes(rows),
         p.callout("bad" if not done else "warning" if bad else "good", text),
@@ -80,9 +80,9 @@ def fault_boxes(rows: Iterable[Row]) -> list[Html]:
 
 
 _RANGES_NOTE = (
-    "Degrees, as the report of each take has them: highest less lowest angle, ± two standard deviations. Subjects and "
-    "sessions: mean over takes, and the standard deviation between them (of the takes, not of the measurement) where "
-    "there are two or more. * marks takes in which the angle was not observed all the time."
+    "In degrees, as in the report of each take: highest minus lowest angle, ± two standard deviations. Subjects and "
+    "sessions: mean over takes, and the standard deviation between takes (not of the measurement) if there are two or "
+    "more. * marks takes in which the angle was unobserved in some frames."
 )
 
 

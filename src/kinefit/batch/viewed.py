@@ -87,7 +87,7 @@ def content_of(
     offsets = {entry.name: entry.time_offset for entry in take.cameras}
     for motion in motions:
         if motion.up != take.up:
-            tell(f"{motion.name} has {motion.up} up, the take {take.up}: it is turned to the take's world.")
+            tell(f"{motion.name} is rotated from up = {motion.up} to the take's up = {take.up}.")
     if take.hide_faces and seen.videos and find:
         ensure_faces(take, step, tell)
     rig, videos = seen.rig, {name: shown_video(take, seen, name, find=find) for name in seen.videos}
@@ -122,14 +122,14 @@ def _fitting(file: Path | None, name: str, tell: Tell) -> tuple[Take, Observatio
     try:
         take = read_take(file)
         if take.name != name:
-            tell(f"Without {file}, which is of '{take.name}' and not of '{name}'; --take names another.")
+            tell(f"{file} is not shown: it is take '{take.name}', not '{name}'. Give another by --take.")
             return None
         take = find_cameras(take, tell=tell)
         seen = load_observations(take)
     except KinefitError as error:
-        tell(f"Without the take beside it: {error}")
+        tell(f"The take of these results is not shown: {error}")
         return None
-    tell(f"With the take {file}; --take names another.")
+    tell(f"Cameras are from the take {file}; --take gives another.")
     return take, seen
 
 
@@ -140,7 +140,7 @@ def _in_folder(folder: Path) -> tuple[Path, Path | None]:
     file = folder / "motion.npz"
     if not file.is_file():
         remedy = "Give the folder that `kinefit track` wrote, or a motion file."
-        raise FileError("there is no motion.npz in this folder", file=folder, remedy=remedy)
+        raise FileError("this folder has no motion.npz", file=folder, remedy=remedy)
     name = folder.absolute().name
     places = [folder.absolute().with_name(f"{name.removesuffix('-kinefit')}.toml"), folder / "take" / "take.toml"]
     return file, next((place for place in places if place.is_file()), None)

@@ -67,8 +67,8 @@ def work(job: TakeJob) -> tuple[Row, ...]:
         return (failed(start, str(error)),)
     known = None if job.choices.restart else _read(job.out / RECORD)
     if known is not None and known.take != str(job.take):
-        problem = f"the results of another take lie in {job.folder} ({known.take})"
-        return (failed(start, f"{problem}. Name another folder by --out, or write over them by --restart."),)
+        problem = f"{job.folder} has the results of another take ({known.take})"
+        return (failed(start, f"{problem}. Give another folder with --out, or overwrite them with --restart."),)
     if known is not None and known.key == key and all((job.out / name).exists() for name in known.files):
         return known.rows
     rows, made = _tracked(job, take, start, said)

@@ -31,23 +31,23 @@ COMMANDS = {
 
 _EPILOG = """\b
 Examples:
-  kinefit demo                          four videos of a person, done in a minute
+  kinefit demo                          track a person in four sample videos, within a minute
   kinefit init my_take                  a take file for a recording of your own
-  kinefit check my_take/take.toml       what is wrong with it, and what would fix it
-  kinefit track my_take/take.toml       angles, figures, videos and a report
-  kinefit live my_take/take.toml        the same while it happens, streamed to avatars and programs
-  kinefit batch 'sessions/**/take.toml' many takes, side by side, with one summary
-  kinefit markers --help                points without names: labelled takes, joint angles
+  kinefit check my_take/take.toml       faults of the recording, and how to correct them
+  kinefit track my_take/take.toml       joint angles, tables, overlay videos and a report
+  kinefit live my_take/take.toml        track live, and stream poses to avatars and programs
+  kinefit batch 'sessions/**/take.toml' track many takes in parallel, with one summary
+  kinefit markers --help                optical markers: label them, fit a body to them
   kinefit surface --help                photographs of a textured surface: points, strain
-  kinefit export motion.npz --to bvh    a result in another format
-  kinefit COMMAND --help                what a command takes, with examples
+  kinefit export motion.npz --to bvh    write a motion in another format
+  kinefit COMMAND --help                options of a command, with examples
 
 \b
 Exit codes:
   0    done
-  1    a fault of kinefit's own; -v shows where
-  2    the input or the command line is wrong, or a result cannot be written: the message says what would work
-  130  stopped by Ctrl-C; what was done is kept and named
+  1    an error in kinefit itself; -v shows the traceback
+  2    the input or the command line is wrong, or a result cannot be written; the message says what to do
+  130  stopped by Ctrl-C; finished results are kept and listed
 """
 _WORDS = "kinefit.words"
 _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
@@ -131,4 +131,4 @@ def _meant(error: click.UsageError, words: Sequence[str]) -> str:
 @click.version_option(__version__, "-V", "--version")
 @_screen.events_option
 def main() -> None:
-    """Fit one articulated body to whatever the sensors saw."""
+    """Fit one articulated body to measurements of any sensors."""

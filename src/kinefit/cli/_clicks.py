@@ -41,7 +41,8 @@ def start_from_clicks(out: Path, points: Path | None, step: int | None, body: st
     take = read_take(out)
     seen, generic = load_observations(take), load_body(body)
     if seen.rig is None or (not seen.videos and points is None):
-        raise TakeError("no videos of calibrated cameras, in which to click", file=out, remedy="Leave out --click.")
+        remedy = "Add [calibration] and videos, or leave out --click."
+        raise TakeError("--click needs videos of calibrated cameras; the take has none", file=out, remedy=remedy)
     if points is not None:
         _screen.say(_started(out, take, seen, generic, read_clicks(points)))
         return
@@ -61,14 +62,14 @@ def _ask(out: Path, take: Take, seen: Observations, body: Body, step: int, brows
 
     page = ClickPage(_pictures(take, seen, step), clickable(body), taken, step=step)
     try:
-        _screen.say(f"Click the joints at {page.url} ; Ctrl-C leaves the take without a start.")
+        _screen.say(f"Click the joints at {page.url} ; Ctrl-C ends without a [start].")
         if browser:
             webbrowser.open(page.url)
         while not page.done.wait(0.5):
             pass
     finally:
         page.close()
-    _screen.say(f"{out}: start written, from {out.with_name(CLICKS)}")
+    _screen.say(f"{out}: [start] written from the clicks in {out.with_name(CLICKS)}")
 
 
 def _pictures(take: Take, seen: Observations, step: int) -> dict[str, bytes]:
@@ -78,8 +79,8 @@ def _pictures(take: Take, seen: Observations, step: int) -> dict[str, bytes]:
     from kinefit.preparing.faces import shown_video
 
     if not seen.frames[0] <= step < seen.frames[1]:
-        problem = f"step {step} of a recording of the steps {seen.frames[0]} to {seen.frames[1] - 1}"
-        raise TakeError(problem, file=take.path, remedy="Name one of these by --step.")
+        problem = f"step {step} is outside the recording's steps {seen.frames[0]} to {seen.frames[1] - 1}"
+        raise TakeError(problem, file=take.path, remedy="Give one of these steps with --step.")
     out = {}
     for entry in take.cameras:
         if entry.name in seen.videos:
@@ -90,8 +91,8 @@ def _pictures(take: Take, seen: Observations, step: int) -> dict[str, bytes]:
                 picture = cv2.cvtColor(video.read(frame), cv2.COLOR_RGB2BGR)
             out[entry.name] = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes()
     if len(out) < 2:
-        problem = f"at step {step} {len(out)} of {len(seen.videos)} cameras took an image, and joints need two"
-        raise TakeError(problem, file=take.path, remedy="Name a step by --step at which more had begun.")
+        problem = f"{len(out)} of {len(seen.videos)} cameras have an image at step {step}; --click needs two"
+        raise TakeError(problem, file=take.path, remedy="With --step, give a step at which two cameras recorded.")
     return out
 
 
@@ -138,13 +139,13 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, steps: Seque
     write_text(out.with_name(CLICKS), clicks_text(steps))
     write_text(out, f"{text.rstrip()}\n\n{start}\n")
     known = np.isfinite(x_world).all(axis=1).sum()
-    text = f"{known} points known in space, {100 * left:.1f} cm from the pose (median)."
+    text = f"{known} points triangulated, {100 * left:.1f} cm from the pose (median)."
     if once:
-        text += f" Clicked in one image alone, and no part of the start: {', '.join(once)}."
+        text += f" Not used, as clicked in one image only: {', '.join(once)}."
     off = np.linalg.norm(fitted.positions(state, fitted.landmarks.select(names)) - x_world, axis=1)
     if np.nanmax(off) > _MAX_CLICK_ERROR_M:
         worst = np.argsort(-np.nan_to_num(off))[:_MAX_LISTED_JOINTS].tolist()
-        text += " Warning: no pose of this body has them; the worst are "
+        text += " Warning: no pose of this body fits the clicks; the largest errors are "
         text += ", ".join(f"{names[n]} ({100 * off[n]:.0f} cm)" for n in worst)
-        text += ". Look whether left and right are exchanged, the same in every image."
+        text += ". Check whether left and right are swapped, in the same way in every image."
     return text

@@ -11,9 +11,9 @@ from kinefit.errors import ExportError
 
 def no_format(name: str, valid: Iterable[str]) -> str:
     """What to say of a format that there is not."""
-    problem = f"there is no format '{name}'; there are: {', '.join(valid)}"
+    problem = f"no format '{name}'; there are: {', '.join(valid)}"
     if name.lower().strip(".") == "fbx":
-        problem += ". FBX is a closed format: write glb or bvh, which Blender, Unity and Unreal read"
+        problem += ". kinefit does not write FBX: use glb or bvh, which Blender, Unity and Unreal import"
     return problem
 
 
@@ -22,7 +22,7 @@ def check_folder(folder: Path, option: str = "--out") -> None:
     there = folder.absolute()
     while not there.exists() and there != there.parent:
         there = there.parent
-    remedy = f"Name another place by {option}."
+    remedy = f"Give another path with {option}."
     if not there.is_dir():
         raise ExportError("a file of that name is in the way", file=there, remedy=remedy)
     try:
@@ -35,12 +35,12 @@ def check_folder(folder: Path, option: str = "--out") -> None:
 def check_file(path: Path, option: str = "--out") -> None:
     """Raise ExportError for a file that cannot be written, before anything is computed; leave nothing there."""
     if path.is_dir():
-        raise ExportError("a folder of that name is in the way", file=path, remedy=f"Name a file by {option}.")
+        raise ExportError("a folder of that name is in the way", file=path, remedy=f"Give another file with {option}.")
     check_folder(path.absolute().parent, option)
 
 
-def check_new(path: Path, overwrite: bool = False, remedy: str = "Add --overwrite, or name another.") -> None:
+def check_new(path: Path, overwrite: bool = False, remedy: str = "Add --overwrite, or give another --out.") -> None:
     """Raise ExportError for a file that cannot be written, or that exists."""
     if path.exists() and not overwrite:
-        raise ExportError("there is a file of this name already", file=path, remedy=remedy)
+        raise ExportError("the file already exists", file=path, remedy=remedy)
     check_file(path)

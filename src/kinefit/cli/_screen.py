@@ -49,7 +49,7 @@ def _remember(key: str) -> Callable[[click.Context, click.Parameter, bool], bool
 
 def verbose_option(command: Callable) -> Callable:
     """Add `-v` to a command, which asks `is_verbose` for it."""
-    text = "Show more: the points of every camera, and where an error arose."
+    text = "Show details: residuals of every point in every camera, and the traceback of an error."
     option = click.option("-v", "--verbose", is_flag=True, expose_value=False, callback=_remember(_VERBOSE), help=text)
     return option(command)
 
@@ -57,9 +57,9 @@ def verbose_option(command: Callable) -> Callable:
 def quiet_options(command: Callable) -> Callable:
     """Add `-q` and `--json` (parameter `as_json`) to a command; both let it print nothing else but errors."""
     quiet = click.option(
-        "-q", "--quiet", is_flag=True, expose_value=False, callback=_remember(_QUIET), help="Print errors alone."
+        "-q", "--quiet", is_flag=True, expose_value=False, callback=_remember(_QUIET), help="Print only errors."
     )
-    text = "Print the result as one JSON object, and nothing else but errors."
+    text = "Print only the result, as one JSON object, and errors."
     return quiet(click.option("--json", "as_json", is_flag=True, callback=_remember(_QUIET), help=text)(command))
 
 
@@ -91,7 +91,7 @@ def _emit(event: str, **content: Any) -> None:
 
 def token_option(command: Callable) -> Callable:
     """Add `--token` to a command that opens a server."""
-    text = "Of the page's address: 16 characters or more.  [default: a new one each time]"
+    text = "Secret part of the page's address, 16 to 128 characters.  [default: a new random one each time]"
     return click.option("--token", envvar=TOKEN_VARIABLE, show_envvar=True, metavar="TEXT", help=text)(command)
 
 
@@ -160,29 +160,29 @@ def tell_error(error: KinefitError) -> None:
 
 
 def tell_finding(found: Finding) -> None:
-    """Print what a check found, how sure that is, and what to do."""
+    """Print what a check found, its confidence, and what to do."""
     from rich.text import Text
 
     console().print(
         Text.assemble("\n", (f"{found.severity}: ", _STYLES[found.severity]), found.text), soft_wrap=True
     )
-    for what, text in (("how sure", found.confidence), ("try", found.remedy)):
+    for what, text in (("confidence", found.confidence), ("try", found.remedy)):
         if text:
             say(f"   {what}: {text}")
 
 
 def tell_interrupted(text: str) -> None:
     """Say that Ctrl-C came, and what is there."""
-    note(f"Stopped. {text or 'Nothing half written is left.'}")
+    note(f"Stopped. {text or 'No incomplete files remain.'}")
 
 
 def tell_refused(error: OSError) -> None:
     """Say that the system let something of the cache not be written: results have messages of their own."""
     from kinefit._jit import cache_directory
 
-    cache = f"kinefit keeps compiled kernels and fetched recordings in {cache_directory()}"
-    remedy = "Free some space there, or let KINEFIT_CACHE name another folder."
-    _complain(f"the system refuses to write: {error.strerror}", **{"at": str(error.filename or cache), "try": remedy})
+    cache = f"{cache_directory()} (compiled kernels and downloaded recordings)"
+    remedy = "Free some space there, or set KINEFIT_CACHE to another folder."
+    _complain(f"a file cannot be written: {error.strerror}", **{"at": str(error.filename or cache), "try": remedy})
     if is_verbose():
         _traceback(error)
 
@@ -192,16 +192,16 @@ def tell_bug(error: Exception) -> None:
     import platform
 
     versions = f"kinefit {__version__}, Python {platform.python_version()}, {platform.platform()}"
-    remedy = "Run the same with -v for the traceback; send it with the take file to those who keep kinefit"
+    remedy = "Run the command again with -v for the traceback; send it with the take file to the developers of kinefit"
     if is_verbose():
         _traceback(error)
-        remedy = "Send this traceback with the take file to those who keep kinefit"
-    _complain(f"a fault of kinefit's own: {type(error).__name__}: {error}", **{"at": versions, "try": remedy + "."})
+        remedy = "Send this traceback with the take file to the developers of kinefit"
+    _complain(f"an error in kinefit itself: {type(error).__name__}: {error}", **{"at": versions, "try": remedy + "."})
 
 
 hide_faces_option = click.option(
     "--hide-faces", is_flag=True,
-    help="Hide everybody's face in what is shown of the videos, as far as it is found.  [default: as the take says]",
+    help="Blur detected faces in all shown video images.  [default: hide_faces of the take]",
 )
 """For commands that show what cameras saw."""
 

@@ -46,13 +46,13 @@ def print_summary(motion: Motion, *, points: bool = False) -> None:
         say(f"uncertain in most frames, at the far end (2 σ): {throughout}")
     nobody = np.flatnonzero(motion.quality <= 0)
     if len(nobody):
-        say(f"nobody seen: frames {frame_ranges(nobody)}")
+        say(f"person not found: frames {frame_ranges(nobody)}")
     bare = without_markers(motion)
     for label, gone in (("no markers", bare), ("lost", lost_segments(motion))):
         never = [name for name, frames in gone.items() if len(frames) == len(motion) - len(nobody)]
         if never:
             names = ", ".join(_hands_together(motion, {n: gone[n] for n in never}))
-            say(f"{'nothing supports' if label == 'lost' else label + ' on'}: {names} (no frame)")
+            say(f"{'lost in all frames' if label == 'lost' else 'no markers in any frame on'}: {names}")
         for name, frames in _hands_together(motion, {n: f for n, f in gone.items() if n not in never}).items():
             say(f"{label}: {name} in frames {frame_ranges(frames)}")
     lengths = [f"{name} {label}" for name, label in bone_lengths(motion).items()]
@@ -136,7 +136,7 @@ def bone_lengths(motion: Motion) -> dict[str, str]:
 
 def _median(r: Residuals) -> str:
     (factor, unit), median = _UNITS[r.unit], _median_of(r)
-    return "nothing seen" if median is None else f"{factor * median:.1f} {unit}"
+    return "no points" if median is None else f"{factor * median:.1f} {unit}"
 
 
 def _median_of(r: Residuals) -> float | None:

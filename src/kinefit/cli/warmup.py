@@ -1,4 +1,4 @@
-"""`kinefit warmup`: compile the kernels before they are needed."""
+"""`kinefit warmup`: compile the kernels, and fetch what draws the plots of reports, before they are needed."""
 
 from __future__ import annotations
 
@@ -17,17 +17,22 @@ if TYPE_CHECKING:
 _EXAMPLES = """\b
 Examples:
   kinefit warmup
-  KINEFIT_CACHE=/var/cache/kinefit kinefit warmup     keep them in another folder
+  KINEFIT_CACHE=/var/cache/kinefit kinefit warmup     store them in another folder
 """
 _PARTS = "surfaces", "keypoints", "depth"  # the longest first
 _PROCESSES = 2  # more would compile the kernels that the parts share once more, instead of loading them
 
 
-@click.command(short_help="Compile the kernels now, so that the first track does not wait.", epilog=_EXAMPLES)
+@click.command(short_help="Compile the kernels now, so that the first run starts at once.", epilog=_EXAMPLES)
 @_screen.verbose_option
 def warmup() -> None:
-    """Compile the kernels now, so that the first track does not wait; they are kept for later runs."""
+    """Compile the kernels now and store them, so that later commands start at once.
+
+    Also downloads plotly.js (10 MB), which draws the plots of reports: afterwards a computer needs no network.
+    """
+    from kinefit import assets
     from kinefit._jit import kernel_folder
+    from kinefit.errors import AssetError
 
     begin = perf_counter()
     with _screen.bars() as step, ProcessPoolExecutor(_PROCESSES, multiprocessing.get_context("spawn")) as pool:
@@ -35,8 +40,12 @@ def warmup() -> None:
         for done, part in enumerate(as_completed([pool.submit(_compile, name) for name in _PARTS]), 1):
             part.result()
             step("compiling", done, len(_PARTS))
+        try:
+            assets.fetch(assets.PLOTLY_PACKAGE, lambda got, total: step("download MB", got // 10**6, total // 10**6))
+        except AssetError as error:
+            _screen.note(f"Reports have no plots until plotly.js is there. {error}")
     kept = kernel_folder()
-    where = f"the kernels lie in {kept.parent}" if kept else "none can be kept: set KINEFIT_CACHE"
+    where = f"kernels are in {kept.parent}" if kept else "not stored: set KINEFIT_CACHE to a writable folder"
     _screen.say(f"ready after {perf_counter() - begin:.1f} s; {where}")
 
 

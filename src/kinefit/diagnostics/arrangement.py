@@ -124,12 +124,15 @@ def stranger_findings(views: KeypointViews) -> list[Finding]:
     bad, known = views.limit / 2, ~np.isnan(misses)
     if not known.any():
         return [
-            Finding("fault", "apart", "No two cameras see the same points.", remedy="Point the cameras at one place.")
+            Finding(
+                "fault", "apart", "No two cameras see the same points.",
+                remedy="Point the cameras at the same place, and check that their keypoints are of one recording.",
+            )
         ]
     odd, names = odd_camera(views), views.rig.names
     if odd is not None:
         error = share_against_others(views, odd) * views.limit
-        text = f"{names[odd]} does not agree with the other cameras: it misses their points by {error:.0f} px or more."
+        text = f"{names[odd]} disagrees with the other cameras: its keypoints are {error:.0f} px or more off theirs."
         return [_stranger_finding(names[odd], text)]
     agree = misses <= bad
     strange = [c for c in range(len(views.rig)) if known[c].any() and not agree[c].any()]
@@ -138,29 +141,29 @@ def stranger_findings(views: KeypointViews) -> list[Finding]:
         return [_session_finding(views, misses)]  # two may agree by chance: a pair has one residual a point
     if len(rest) > 2 and disagreement_share(views.rig.select(tuple(rest)), sample(views.select(rest))) > FOREIGN_ERROR:
         return [_session_finding(views, misses)]
-    text = "{} agrees with no other camera: it misses their points by {:.0f} px or more."
+    text = "{} disagrees with every other camera: its keypoints are {:.0f} px or more off theirs."
     return [_stranger_finding(names[c], text.format(names[c], np.nanmin(misses[c]))) for c in strange]
 
 
 def _stranger_finding(name: str, text: str) -> Finding:
     remedy = (
-        f"{name} was moved far, has another camera's video or calibration, or follows another person: calibrate it "
-        "anew, or take it out of the take."
+        f"{name} was moved far, has another camera's video or calibration, or tracks another person. Calibrate it "
+        "again, or remove it from the take."
     )
-    return Finding("fault", "stranger", text, (name,), "Sure: the other cameras agree with each other.", remedy)
+    return Finding("fault", "stranger", text, (name,), "Certain: the other cameras agree with each other.", remedy)
 
 
 def _session_finding(views: KeypointViews, misses: NDArray) -> Finding:
     least = float(np.nanmin(misses))
     agreement = (
-        f"even two of them alone miss by {least:.0f} px or more" if np.isfinite(least) else "no two of them meet at all"
+        f"the best pair is {least:.0f} px or more apart" if np.isfinite(least) else "no two cameras see the same points"
     )
     return Finding(
-        "fault", "session", f"The cameras do not agree on where the person is: {agreement}.", (),
-        "Sure that something is wrong; exchanged cameras, inverted poses, wrong signs, mirrored images and other focal "
-        "lengths were tried.",
-        "The calibration is of another session or of other cameras, or the keypoints are of different people: name the "
-        "calibration made with these cameras as they stood, or calibrate anew (kinefit calibrate people or board).",
+        "fault", "session", f"The cameras disagree on where the person is: {agreement}.", (),
+        "Certain, but not from swapped cameras, inverted poses, wrong signs, mirrored images or other focal lengths: "
+        "these were tried.",
+        "The calibration is of another session or of other cameras, or the keypoints are of different people. Use the "
+        "calibration of this session, or calibrate again (kinefit calibrate people or board).",
     )  # fmt: skip
 
 
@@ -193,8 +196,8 @@ def frame_findings(
     if not fits:
         return [], views
     right = "calibration" if stated[fits[0]] == "video" else "video"
-    text = f"The keypoints of {listed(fits)} are not in the {stated[fits[0]]}'s image, but in the {right}'s."
-    confidence = f"Sure: the cameras' mean error falls to {100 * least / before:.0f} %."
+    text = f"Keypoints of {listed(fits)} are in pixels of the {right}'s image, not of the {stated[fits[0]]}'s."
+    confidence = f"Certain: the cameras' mean error falls to {100 * least / before:.0f} %."
     remedy = f'Write frame = "{right}" into [[keypoints]] of {listed(fits)}.'
     return [Finding("fault", "frame", text, tuple(fits), confidence, remedy)], best
 

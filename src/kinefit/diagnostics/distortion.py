@@ -45,9 +45,9 @@ def distortion_findings(views: KeypointViews) -> list[Finding]:
     bent = [n for n in np.argsort(-explained) if explained[n] >= 0.5 * np.max(explained)]
     names = tuple(views.rig.names[ideal[n]] for n in bent)
     coefficients = listed(f"{name} as if k1 were {k1[n]:+.2f}" for n, name in zip(bent, names))
-    text = f"The calibration has no lens distortion for {listed(names)}, and the keypoints lie bent: {coefficients}."
-    confidence = f"Sure: with it the cameras' median error falls from {before:.1f} to {after:.1f} px."
-    remedy = "Write the distortion coefficients that the lenses were calibrated with into the calibration."
+    text = f"The calibration has no lens distortion for {listed(names)}, but the keypoints show it: {coefficients}."
+    confidence = f"Certain: with it the cameras' median error falls from {before:.1f} to {after:.1f} px."
+    remedy = "Add the distortion coefficients of these lenses to the calibration."
     return [Finding("fault", "distortion", text, names, confidence, remedy)]
 
 

@@ -108,11 +108,11 @@ def _finding(rig: Rig, group: tuple[int, ...], good: _FrameRun, bad: _FrameRun, 
     text = (
         f"{listed(names)} show another motion than {listed(others)} in frames {first + bad.start} to "
         f"{first + bad.stop - 1}; in frames "
-        f"{first + good.start} to {first + good.stop - 1} all show the same."
+        f"{first + good.start} to {first + good.stop - 1} all cameras show the same motion."
     )
-    confidence = "Sure: no shift in time brings them together there, while the cameras of one group still agree."
+    confidence = "Certain: no time shift makes the two groups agree there, while the cameras within a group agree."
     remedy = (
-        "Look whether videos are cut, have lost frames or go on with another take. Until then write "
+        "Check whether videos are cut, have dropped frames or continue with another take. Until it is corrected, write "
         f"frames = [{first + good.start}, {first + good.stop}] into [take]."
     )
     return Finding("fault", "groups", text, (*names, *others), confidence, remedy)

@@ -91,26 +91,26 @@ def fit_image(
     with_bars = f"{sizes}, with bars of {max(expected):.1f} px {where}"
     if size == turned:
         if bars > _MAX_DARK_BORDER * max(size):
-            remedy = "Nothing, if it was calibrated with the bars; else calibrate on the same images."
-            add("doubt", "picture", f"has black bars of {bars} px, though its video has the calibration's size", remedy)
+            remedy = "If it was calibrated without the bars, calibrate it again on images with bars."
+            add("doubt", "picture", f"has black bars of {bars} px, but its video has the calibration's size", remedy)
     elif entry.image == "letterboxed" and boxed:
         add("note", "letterboxed", f"is letterboxed against the calibration, as the take says: {with_bars}")
     elif entry.image == "letterboxed":
         shows = bars < max(expected) - tolerance  # dark scenes only widen them
         line = 'image = "scaled"'
-        remedy = f"Write {line} into [[camera]] {entry.name}." if shows else f"Is it {line} in [[camera]] {entry.name}?"
-        text = f"is said to be letterboxed ({with_bars}), but its black bars have {bars} px"
+        remedy = f"Write {line} into [[camera]] {entry.name}." if shows else f"Try {line} in [[camera]] {entry.name}."
+        text = f"is letterboxed by the take ({with_bars}), but its black bars have {bars} px"
         add("fault" if shows else "doubt", "picture", text, remedy)
     elif entry.image == "scaled" and boxed and max(expected) >= _MIN_BAR_ERROR_PX:
         remedy = f'Write image = "letterboxed" into [[camera]] {entry.name}.'
-        add("fault", "letterboxed", f"is said to be scaled, but is letterboxed: {with_bars}", remedy)
+        add("fault", "letterboxed", f"is scaled by the take, but its video is letterboxed: {with_bars}", remedy)
         return msgspec.structs.replace(entry, image="letterboxed"), findings
     elif entry.image == "scaled":
         add("note", "picture", f"is scaled against the calibration, as the take says: {sizes}")
     elif guessed:
         is_boxed = "image" in guessed and guessed["image"].value == "letterboxed"
         lines = [f'{k} = "{v.value}"' if isinstance(v.value, str) else f"{k} = {v.value}" for k, v in guessed.items()]
-        what = f"is letterboxed against the calibration: {with_bars}" if is_boxed else f"has another image: {sizes}"
+        what = f"is letterboxed against the calibration: {with_bars}" if is_boxed else f"has another size: {sizes}"
         sure = "; ".join(f"{v.sure.capitalize()}: {v.why}" for v in guessed.values()) + "."
         remedy = f"Write {' and '.join(lines)} into [[camera]] {entry.name}."
         add("fault", "letterboxed" if is_boxed else "picture", f"{what}; the take does not say so", remedy, sure)
@@ -152,7 +152,7 @@ def without_covered(take: Take, seen: Observations) -> tuple[Observations, list[
     for video in seen.depth:
         runs = _covered_runs(video)
         for a, b in runs:
-            what = f"its images are empty or nearer than {_cover_distance(video):.2f} m, and are left out"
+            what = f"its images are empty or nearer than {_cover_distance(video):.2f} m, and excluded"
             findings.append(_covered(video.sensor, video.times[a], video.times[b - 1], what))
         depth.append(video.without(np.concatenate([np.arange(*run) for run in runs])) if runs else video)
     with TakePictures(take, seen) as pictures:
@@ -165,8 +165,8 @@ def without_covered(take: Take, seen: Observations) -> tuple[Observations, list[
 
 
 def _covered(camera: str, start: float, stop: float, what: str) -> Finding:
-    text = f"{camera} sees nothing from {start:.2f} to {stop:.2f} s: {what}. Was its lens covered?"
-    remedy = "Keep hands and cloths off the lens, or cut the take with frames = [first, last] in [take]."
+    text = f"The lens of {camera} is probably covered from {start:.2f} to {stop:.2f} s: {what}."
+    remedy = "Keep the lens free, or cut the take with frames = [first, last] in [take]."
     return Finding("doubt", "covered", text, (camera,), remedy=remedy)
 
 
@@ -248,13 +248,13 @@ def noise_findings(take: Take, videos: Sequence[DepthVideo]) -> list[Finding]:
         if noise < _MAX_NOISE_RATIO and unstable < _MAX_UNSTABLE_SHARE:
             continue
         how = "flickers" if noise < _MAX_NOISE_RATIO else f"is noisier than stated, by a factor of {noise:.1f}"
-        text = f"{entry.name} {how}: from image to image {100 * unstable:.0f} % of the pixels at rest are lost or jump"
+        text = f"{entry.name} {how}: from image to image {100 * unstable:.0f} % of the static pixels are lost or jump"
         both = np.array([any(v.times[0] <= t <= v.times[-1] for v in others) for t in times])
         if min(both.sum(), (~both).sum()) >= _MIN_TRIPLES:
             a, b = (100.0 * np.median(values[which, 1]) for which in (both, ~both))
             text += f" ({a:.0f} % while {listed(v.sensor for v in others)} runs, {b:.0f} % else)"
-        remedy = "Run depth cameras in turn or in step, point them apart, keep sunlight out; or state a larger sigma."
-        text += ". Is other light of the same kind in view?"
+        remedy = "Avoid overlapping views or stagger the cameras in time, and avoid sunlight; or set a larger sigma."
+        text += ". Infrared light of another source is the most common cause."
         out.append(Finding("doubt", "noise", text, (entry.name,), remedy=remedy))
     return out
 

@@ -160,7 +160,7 @@ def check_keypoints(
     x, _ = meet(sampled)
     if not np.isfinite(x).any():
         findings.append(
-            Finding("fault", "apart", "No two cameras see a point together.", remedy="Point the cameras at one place.")
+            Finding("fault", "apart", "No two cameras see the same point.", remedy="Point all at the same place.")
         )
         return ended(views, times=times)
     biases = camera_biases(sampled)
@@ -211,8 +211,8 @@ def _with_person(views: KeypointViews) -> tuple[KeypointViews, list[Finding]]:
     detected = np.isfinite(views.uv).any(axis=(0, 1, 3))
     out = []
     for name in (n for n, s in zip(views.rig.names, detected, strict=True) if not s):
-        remedy = "Check its video and keypoints; or leave it out of the take."
-        out.append(Finding("fault", "coverage", f"Nobody was detected in {name}.", (name,), remedy=remedy))
+        remedy = "Check its video and keypoints, or remove it from the take."
+        out.append(Finding("fault", "coverage", f"No person was detected in {name}.", (name,), remedy=remedy))
     return views.select([n for n, s in zip(views.rig.names, detected, strict=True) if s]), out
 
 

@@ -81,10 +81,10 @@ class Mistake:
 
     def finding(self, names: Sequence[str], limit: float) -> Finding:
         """The finding; `names` of all cameras, `limit` [px] of the shares."""
-        word = "Sure" if self.explains(lenient=False) else "Likely"
+        word = "Certain" if self.explains(lenient=False) else "Likely"
         confidence = (
-            f"{word}: it was tried, and the cameras' mean error falls from {100 * self.before:.0f} % to "
-            f"{100 * self.after:.0f} % of the {limit:.0f} px within which two views count as one point."
+            f"{word}: with this corrected, the cameras' mean error falls from {100 * self.before:.0f} % to "
+            f"{100 * self.after:.0f} % of the {limit:.0f} px within which two views agree."
         )
         text = self.text if self.text.startswith(tuple(names)) else self.text[:1].upper() + self.text[1:]
         return Finding("fault", self.kind, f"{text}.", self.cameras, confidence, self.remedy)
@@ -172,13 +172,13 @@ def _trials_of_one(views: KeypointViews, c: int) -> Iterator[tuple[Mistake, Came
         seen = sample(replace(views, uv=views.uv[:, views.partner]))[:, c] if sides else uv
         yield _of_image(kind, text, name), camera, _reversed(camera, seen, axes)
     for text, change in _signs():
-        remedy = f"Correct the sign in the calibration of {name}, or calibrate it anew."
+        remedy = f"Correct the sign in the calibration of {name}, or calibrate it again."
         mistake = _of_sign(f"{name}: {text}", remedy, (name,))
         if "world" in text:
             mistake = replace(mistake, over_pose=_MAX_FREE_POSE_RATIO_IN_WORLD)
         yield mistake, _posed(camera, change), uv
     for factor, whole in _FOCAL_TRIALS:
-        text = f"{name}: its focal length is about {_times(1 / factor)} what the keypoints need"
+        text = f"{name}: its focal length is about {_times(1 / factor)} the one that fits the keypoints"
         yield Mistake("focal", text, _focal_remedy(name), (name,)), _zoomed(camera, factor, whole), uv
 
 
@@ -188,11 +188,11 @@ def _trials(rig: Rig, uv: NDArray, take_file: str) -> Iterator[tuple[Mistake, Ri
         moved = [c for c in range(len(rig)) if order[c] != c]
         names = tuple(rig.names[c] for c in moved)
         renamed = ", ".join(f"{rig.names[c]} to {rig.names[order[c]]}" for c in moved)
-        remedy = f"In [[camera]] and [[keypoints]] of {take_file} rename {renamed}; the calibration keeps its names."
+        remedy = f"In [[camera]] and [[keypoints]] of {take_file}, rename {renamed}. Do not rename the calibration's."
         cameras = Rig(tuple(replace(rig.cameras[o], name=rig.names[c]) for c, o in enumerate(order)))
-        yield Mistake("swapped", f"{listed(names)} are exchanged", remedy, names), cameras, uv
+        yield Mistake("swapped", f"{listed(names)} are swapped", remedy, names), cameras, uv
     poses: dict[str, Callable[[NDArray], NDArray]] = {
-        "the poses are camera to world, where world to camera is meant": inverse,
+        "the poses are camera to world instead of world to camera": inverse,
         "the camera axes are those of computer graphics (y up, z backward), not y down, z ahead":
             _FROM_OPENGL.__matmul__,
         "the poses are camera to world with the axes of computer graphics (y up, z backward)":
@@ -202,7 +202,7 @@ def _trials(rig: Rig, uv: NDArray, take_file: str) -> Iterator[tuple[Mistake, Ri
     for text, change in poses.items():
         yield Mistake("poses", text, remedy, ()), Rig(tuple(_posed(c, change) for c in rig)), uv
     for text, change in _signs() if len(rig) > 2 else ():  # two cameras nearly agree whatever they are
-        mistake = _of_sign(f"in all cameras {text}", "Correct the signs in the calibration, or calibrate anew.", ())
+        mistake = _of_sign(f"in all cameras {text}", "Correct the signs in the calibration, or calibrate again.", ())
         yield mistake, Rig(tuple(_posed(c, change) for c in rig)), uv
     for axis, way in ((1, "upside down (or the world is left-handed)"), (0, "left to right (or the world is)")):
         mistake = Mistake("mirrored", f"all images are mirrored {way}", _MIRRORED.format("the images were"), ())
@@ -219,7 +219,7 @@ def _trials(rig: Rig, uv: NDArray, take_file: str) -> Iterator[tuple[Mistake, Ri
 def _focal_lengths(rig: Rig) -> Iterator[tuple[Mistake, Rig]]:
     """Candidate focal lengths of another image size for all cameras, with or without the principal points."""
     for factor, whole in _FOCAL_TRIALS:
-        text = f"the focal lengths of all cameras are about {_times(1 / factor)} what the keypoints need"
+        text = f"the focal lengths of all cameras are about {_times(1 / factor)} those that fit the keypoints"
         mistake = Mistake("focal", text, _focal_remedy("the cameras"), ())
         yield mistake, Rig(tuple(_zoomed(camera, factor, whole) for camera in rig))
 
@@ -230,7 +230,7 @@ def _of_sign(text: str, remedy: str, cameras: tuple[str, ...]) -> Mistake:
 
 def _of_image(kind: str, text: str, name: str) -> Mistake:
     """Mistake of one camera with a reversed image."""
-    turned = f'Write rotation = 180 into [[camera]] {name}; its keypoints are then frame = "video".'
+    turned = f'Write rotation = 180 into [[camera]] {name}, and frame = "video" into its [[keypoints]].'
     remedy = _MIRRORED.format(f"{name} was") if kind == "mirrored" else turned
     return Mistake(kind, f"{name}'s image {text}", remedy, (name,))
 
@@ -251,7 +251,7 @@ def _signs() -> Iterator[tuple[str, Callable[[NDArray], NDArray]]]:
     """Changes of the sign of one coordinate of the translation, or of the position in the world."""
     for axis, name in enumerate("xyz"):
         yield f"the {name} of the translation has the wrong sign", partial(_negated, axis=axis)
-        inverted = f"the {name} of the place in the world has the wrong sign"
+        inverted = f"the {name} of the position in the world has the wrong sign"
         yield inverted, partial(_negated, axis=axis, in_world=True)
 
 
@@ -291,6 +291,6 @@ def _focal_remedy(who: str) -> str:
 
 
 _MIRRORED = (
-    "If {} recorded mirrored, mirror the video back (ffmpeg -i IN -vf hflip OUT) and detect anew; if the calibration "
+    "If {} recorded mirrored, mirror the video back (ffmpeg -i IN -vf hflip OUT) and detect again. If the calibration "
     "comes from a left-handed world (Unity, Unreal), export it right-handed."
 )

@@ -46,16 +46,16 @@ def upright_findings(rig: Rig, x: NDArray, names: Sequence[str], up: str) -> lis
         evidence = " and ".join(f"{why} ({angle:.0f} degrees off)" for why, angle in angles.items())
         remedy = f'Write up = "{right}" into [take].'
         if off > _MAX_LEAN:
-            remedy += f" It leans by {off:.0f} degrees."
-        out = [Finding("fault", "up", f'up = "{up}" is wrong: {how}.', (), f"Sure: by {evidence}.", remedy)]
+            remedy += f" The person leans from this axis by {off:.0f} degrees."
+        out = [Finding("fault", "up", f'up = "{up}" is wrong: {how}.', (), f"Certain, by {evidence}.", remedy)]
         axis = np.array(UP_AXES[right])
     elif wrong:
         evidence = " and ".join(f"{why} show {nearest_axis(ways[why])[0]}" for why in wrong)
-        remedy = "Look whether the person lies, or a camera stands on its side."
-        out = [Finding("doubt", "up", f'up = "{up}" is not sure: {evidence}.', remedy=remedy)]
+        remedy = "Check up in [take], unless the person lies or a camera is rotated by 90 degrees."
+        out = [Finding("doubt", "up", f'up = "{up}" is uncertain: {evidence}.', remedy=remedy)]
     elif min(angles.values()) > _MAX_LEAN:
         text = f'up = "{up}", but person and cameras lean by {min(angles.values()):.0f} degrees or more.'
-        out = [Finding("doubt", "up", text, remedy="Is the floor of the calibration level?")]
+        out = [Finding("doubt", "up", text, remedy="Check that the calibration's floor is level.")]
     else:
         out = [Finding("good", "up", f'up = "{up}" is right, by {" and ".join(angles)}.')]
     return out + _floor_findings(x, names, axis) + _hand_findings(x, names)
@@ -68,10 +68,10 @@ def _floor_findings(x: NDArray, names: Sequence[str], up: NDArray) -> list[Findi
     if len(heights) < 10:
         return []
     floor = float(np.percentile(heights, 5))
-    text = f"The lowest foot points are {100 * floor:+.0f} cm from the world's zero height"
+    text = f"The lowest foot points are {100 * floor:+.0f} cm from height zero of the world"
     if abs(floor) < _MAX_FLOOR_HEIGHT:
         return [Finding("good", "floor", f"{text}: the floor is at zero.")]
-    remedy = "Nothing, unless heights above the floor are wanted: then move the world's origin."
+    remedy = "For heights above the floor, move the origin of the calibration onto the floor. Else nothing."
     return [Finding("note", "floor", f"{text}: the floor is not at zero.", remedy=remedy)]
 
 
@@ -99,11 +99,11 @@ def _hand_findings(x: NDArray, names: Sequence[str]) -> list[Finding]:
     votes = votes[np.isfinite(votes)]
     if len(votes) < 10 or votes.mean() > -0.5:
         return []
-    text = "Left and right are exchanged: the person's face, toes and knees point backwards."
-    confidence = f"Sure: so in {100 * np.mean(votes < 0):.0f} % of the frames, while the cameras agree."
+    text = "Left and right are swapped: the person's face, toes and knees point backwards."
+    confidence = f"Certain: in {100 * np.mean(votes < 0):.0f} % of the frames, while the cameras agree."
     remedy = (
-        "Exchange the names of left and right in the keypoints of all cameras (is their format or set another?); or, "
-        "if images and calibration were mirrored together, mirror the videos back, calibrate and detect anew."
+        "Check format and set in [[keypoints]], or swap the names of left and right there. If images and calibration "
+        "were mirrored together, mirror the videos back, then calibrate and detect again."
     )
     return [Finding("fault", "mirrored", text, (), confidence, remedy)]
 
@@ -148,11 +148,11 @@ def size_findings(height: float | None, stated: float | None) -> list[Finding]:
     stated : float [m] as the take states it; None if it does not.
     """
     if height is None:
-        return [Finding("note", "scale", "Too few bones are seen to estimate the person's size.")]
+        return [Finding("note", "scale", "Too few bones are visible to estimate the person's size.")]
     ratio = 0.0 if stated is None else abs(np.log(height / stated))
     if ratio > _MAX_STATURE_ERROR:
-        text = f"The person measures {height:.3g} m by the long bones, and the take says {stated:.2f} m."
-        confidence = "Likely: a detector's points are a few per cent off the joints, not more."
+        text = f"The person is {height:.3g} m tall by the long bones, but height = {stated:.2f} m in the take."
+        confidence = "Likely: the error of detected joints is a few per cent at most."
         remedy = f"Check height in [take], and the scale of the calibration{_unit_remedy(height / (stated or 1.0))}."
         return [Finding("fault" if ratio > _MIN_SCALE_FAULT else "doubt", "scale", text, (), confidence, remedy)]
     if stated is None and not _MIN_STATURE <= height <= _MAX_STATURE:
@@ -161,19 +161,19 @@ def size_findings(height: float | None, stated: float | None) -> list[Finding]:
             f"{_MIN_STATURE} to {_MAX_STATURE} m tall."
         )
         remedy = (
-            "Check the unit of the calibration, and the size of the board's squares that it was made with"
-            f"{_unit_remedy(height / 1.75)}. Of a child, write height = ... into [take]."
+            "Check the unit of the calibration, and the size of the board's squares"
+            f"{_unit_remedy(height / 1.75)}. For a child, write height = ... into [take]."
         )
-        return [Finding("fault", "scale", text, (), "Sure, unless it is a child, a doll or an animal.", remedy)]
+        return [Finding("fault", "scale", text, (), "Certain, unless it is a child, a doll or an animal.", remedy)]
     if stated is None and not _MIN_ADULT_STATURE <= height <= _MAX_ADULT_STATURE:
         limits = f"below {_MIN_ADULT_STATURE} m or above {_MAX_ADULT_STATURE} m"
         text = f"The person would be {height:.2f} m tall. Few adults are {limits}."
         remedy = (
-            "Either the scale is wrong (check the size of the calibration's board squares; nothing measures it where "
-            "cameras are not calibrated), or a child is in view. Write height = ... into [take]."
+            "Either the scale is wrong (check the size of the board's squares; without a calibration the scale is "
+            "unknown), or a child is in view. Write height = ... into [take]."
         )
         return [Finding("doubt", "scale", text, (), "", remedy)]
-    return [Finding("good", "scale", f"The person measures about {height:.2f} m by the long bones: the unit is right.")]
+    return [Finding("good", "scale", f"The person is about {height:.2f} m tall by the long bones: the unit is right.")]
 
 
 def _unit_remedy(ratio: float) -> str:

@@ -96,7 +96,7 @@ def motion_findings(motion: Motion, height: float | None) -> tuple[Finding, ...]
         how = "hangs head down" if lean > _MIN_INVERTED_ANGLE else f"moves {way:.1f} m lying"
         text = f'up = "{motion.up}" is wrong: the person {how}, with the trunk {lean:.0f} degrees off it.'
         remedy = f'Write up = "{nearest_axis(middle)[0]}" into [take].'
-        findings.append(Finding("fault", "up", text, (), "Sure, unless that is what the person does.", remedy))
+        findings.append(Finding("fault", "up", text, (), "Certain, unless the person really does so.", remedy))
     return faults_of(findings)
 
 
@@ -130,7 +130,7 @@ def inverted_findings(provenance: Mapping[str, Any], up: str) -> list[Finding]:
     if INVERTED not in provenance:
         return []
     name, other = provenance[INVERTED], nearest_axis(-np.array(UP_AXES[up]))[0]
-    text = f'up = "{up}" is wrong, or {name} hangs upside down: people are explained better the other way round.'
+    text = f'up = "{up}" is wrong, or {name} is upside down: an inverted vertical fits the people better.'
     remedy = f'Write up = "{other}" into [take], or turn the images by 180 degrees.'
     return [Finding("fault", "up", text, (name,), "Likely, unless the person does a handstand.", remedy)]
 

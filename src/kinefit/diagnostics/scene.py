@@ -59,13 +59,13 @@ def lens_findings(rig: Rig) -> list[Finding]:
     if len(sizes) == 1 and len(rig) > 2:
         off = np.abs(np.log(focal / np.median(focal)))
         for c in np.flatnonzero(off > _MAX_FOCAL_DIFFERENCE):
-            text = f"{rig.names[c]}: focal length {focal[c]:.0f} px, that of the others {np.median(focal):.0f} px"
-            remedy = "As it should be where its lens or zoom is another; else calibrate it anew."
+            text = f"{rig.names[c]}: focal length {focal[c]:.0f} px, other cameras {np.median(focal):.0f} px"
+            remedy = "Nothing if it has another lens or zoom; else calibrate it again."
             out.append(Finding("note", "lens", f"{text}.", (rig.names[c],), remedy=remedy))
     if not out:
         views = [_view(camera) for camera in rig]
         angles = f"{min(views):.0f} to {max(views):.0f}" if max(views) - min(views) > 1 else f"{views[0]:.0f}"
-        text = f"Lenses are plausible: fields of view of {angles} degrees, distortion without folds."
+        text = f"Lenses are plausible: fields of view of {angles} degrees, distortion invertible over the image."
         out.append(Finding("good", "lens", text))
     return out
 
@@ -81,18 +81,18 @@ def _view(camera: Camera) -> float:
 def _lens_problems(camera: Camera) -> list[tuple[str, str]]:
     fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
     size, centre, view = np.array(camera.size), camera.matrix[:2, 2], _view(camera)
-    again, out = "Calibrate its lens anew, or check the image size in the calibration.", []
+    again, out = "Calibrate its lens again, or check the image size in the calibration.", []
     if not _FIELD_OF_VIEW_RANGE[0] <= view <= (_FIELD_OF_VIEW_RANGE[1] if camera.model != "fisheye" else 220.0):
-        out.append((f"a field of view of {view:.0f} degrees (focal length {fx:.0f} px) is no common lens", again))
+        out.append((f"a field of view of {view:.0f} degrees (focal length {fx:.0f} px) is implausible", again))
     if abs(np.log(fx / fy)) > _MAX_ASPECT_ERROR:
         out.append(
-            (f"its pixels would not be square (fx {fx:.0f}, fy {fy:.0f} px)", "Was its image stretched? " + again)
+            (f"its pixels are not square (fx {fx:.0f}, fy {fy:.0f} px)", "Is its image stretched? " + again)
         )
     off = np.abs(centre - 0.5 * (size - 1)) / size
     if np.any(off > _MAX_CENTRE_OFFSET):
         where = f"({centre[0]:.0f}, {centre[1]:.0f}) of {size[0]}x{size[1]} px"
         out.append(
-            (f"its principal point {where} is far from the middle", "Was its image cropped or turned? " + again)
+            (f"its principal point {where} is far from the middle", "Is its image cropped or rotated? " + again)
         )
     edge = np.linspace(0.0, 1.0, 9)
     border = np.array([(a, b) for a in edge for b in edge if a in (0, 1) or b in (0, 1)]) * (size - 1)
@@ -102,7 +102,7 @@ def _lens_problems(camera: Camera) -> list[tuple[str, str]]:
     if lost.any():
         share = f"{100 * lost.mean():.0f} % of the image's border"
         out.append(
-            (f"its distortion folds back: no ray reaches {share}", "Calibrate it with boards up to the corners.")
+            (f"its distortion model is not invertible at {share}", "Calibrate it with boards up to the corners.")
         )
     return out
 
@@ -123,20 +123,21 @@ def placement_findings(rig: Rig, x: NDArray) -> list[Finding]:
         names = (rig.names[a], rig.names[b])
         if _MIN_ANGLE <= angle <= _MAX_ANGLE:
             continue
-        how = "stand beside each other" if angle < _MIN_ANGLE else "stand opposite each other"
+        how = "are side by side" if angle < _MIN_ANGLE else "face each other"
         gap = f"{angle:.0f} degrees and {np.linalg.norm(centres[a] - centres[b]):.2f} m apart"
-        text = f"{listed(names)} {how} ({gap}): these two alone do not show how far away a point is"
+        text = f"{listed(names)} {how} ({gap}): these two alone do not determine depth"
         if enough:
-            out.append(Finding("note", "placement", f"{text}; others do.", names))
+            out.append(Finding("note", "placement", f"{text}; other pairs do.", names))
         else:
-            remedy = "Put one of them 60 to 120 degrees round the person."
-            out.append(Finding("doubt", "placement", f"{text}, and no others show it well.", names, remedy=remedy))
+            remedy = "Place one of them 60 to 120 degrees around the person."
+            out.append(Finding("doubt", "placement", f"{text}, and no other pair does well.", names, remedy=remedy))
     if across:
         best = max(across, key=lambda v: min(v, 180 - v))
         severity: Severity = "good" if enough else "doubt"
-        text = f"The best angle between two views is {best:.0f} degrees; a point is known {anisotropy:.1f} times worse "
-        remedy = "" if enough else "Spread the cameras round the person."
-        out.append(Finding(severity, "placement", text + "along its worst direction than its best.", remedy=remedy))
+        text = f"The best angle between two views is {best:.0f} degrees. A point's standard deviation is "
+        text += f"{anisotropy:.1f} times larger in its worst direction than in its best."
+        remedy = "" if enough else "Spread the cameras around the person."
+        out.append(Finding(severity, "placement", text, remedy=remedy))
     return out
 
 
@@ -171,12 +172,12 @@ def coverage_findings(seen: Sequence[CameraCoverage]) -> list[Finding]:
     out = []
     for c in seen:
         if c.seen < 0.5 or c.volume < 0.5:
-            text = f"{c.camera} saw {100 * c.seen:.0f} % of the keypoints; it has {100 * c.volume:.0f} % of the volume."
-            remedy = "Turn it towards the person, or put it farther away."
+            text = f"{c.camera} sees {100 * c.seen:.0f} % of the keypoints and {100 * c.volume:.0f} % of the volume."
+            remedy = "Point it at the person, or move it farther away."
             out.append(Finding("doubt", "coverage", text, (c.camera,), remedy=remedy))
         elif c.height_px < _MIN_HEIGHT_PX:
-            text = f"The person is only {c.height_px:.0f} px tall in {c.camera}: keypoints are coarse."
-            remedy = "Put it nearer, or record at a higher resolution."
+            text = f"The person is only {c.height_px:.0f} px tall in {c.camera}: keypoints are inaccurate."
+            remedy = "Move the camera nearer, or record at a higher resolution."
             out.append(Finding("note", "coverage", text, (c.camera,), remedy=remedy))
     if not out and seen:
         least = 100 * min(c.volume for c in seen)
@@ -184,7 +185,7 @@ def coverage_findings(seen: Sequence[CameraCoverage]) -> list[Finding]:
             Finding(
                 "good",
                 "coverage",
-                f"Every camera has at least {least:.0f} % of the volume that the person used in view.",
+                f"Every camera sees at least {least:.0f} % of the volume in which the person moves.",
             )
         )
     return out

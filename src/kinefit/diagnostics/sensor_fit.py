@@ -112,9 +112,9 @@ def doubts_of(
     if far:
         s, t = max(far)
         amount = f"{np.degrees(t):.1f}° and {1e3 * s:.0f} mm"
-        out.append(f"another place, {amount} from there, fits about as well")
+        out.append(f"another pose, {amount} away, fits about as well")
     if not fit.falls:
-        out.append("the person then lies no nearer to what it measured")
+        out.append("its measurements then lie no nearer to the person")
     moved = float(np.linalg.norm(se3.apply(fit.T, origin) - origin))
     if moved > MISFIT_SIGMAS * POSE_SIGMAS[0] or fit.turn > MISFIT_SIGMAS * POSE_SIGMAS[1]:
         limit = f"{1e2 * MISFIT_SIGMAS * POSE_SIGMAS[0]:.0f} cm or {np.degrees(MISFIT_SIGMAS * POSE_SIGMAS[1]):.0f}°"
@@ -124,7 +124,7 @@ def doubts_of(
     if between > MISFIT_SIGMAS:
         out.append(f"two halves of the frames disagree by {between:.1f} standard deviations")
     elif not fit.misfit:
-        out.append("by what two halves of the frames disagree, it may fit")
+        out.append("the misfit is within the disagreement of two halves of the frames")
     return tuple(out)
 
 

@@ -49,8 +49,8 @@ def bias_findings(
         if b.count and np.isfinite(b.bias).all():
             out += _bias_finding(b, accuracy.get(b.camera, _DEFAULT_SIGMA_PX), take)
         if b.outliers > _MAX_OUTLIERS:
-            text = f"{100 * b.outliers:.0f} % of {b.camera}'s points agree with no other camera."
-            remedy = "Look at its keypoints (the image below): another person, a poster, or exchanged sides?"
+            text = f"{100 * b.outliers:.0f} % of the keypoints of {b.camera} agree with no other camera."
+            remedy = "Check its keypoints in the images of the page: another person, a poster, or swapped sides."
             out.append(Finding("doubt", "outliers", text, (b.camera,), remedy=remedy))
     sizes = [b.size for b in biases if np.isfinite(b.size)]
     if parts is not None:
@@ -76,7 +76,7 @@ def _bias_finding(b: CameraBias, accuracy: float, take: Path) -> list[Finding]:
         for v, names in zip(b.bias, (("left", "right"), ("up", "down")), strict=True) if abs(v) >= 0.25 * b.size
     )  # fmt: skip
     text = (
-        f"{b.camera}: the calibration places the points {way} of where the camera sees them "
+        f"{b.camera}: points projected with the calibration lie {way} of the keypoints "
         f"(bias {b.bias[0]:+.1f}, {b.bias[1]:+.1f} ± {b.std.max():.1f} px, spread {b.spread:.1f} px"
     )
     alone = (
@@ -84,9 +84,9 @@ def _bias_finding(b: CameraBias, accuracy: float, take: Path) -> list[Finding]:
         if np.isfinite(b.alone).all()
         else ""
     )
-    words = "Sure" if significance > 2 * _MIN_SIGMAS else "Likely" if significance >= _MIN_SIGMAS else "Not sure"
-    confidence = f"{words}: {significance:.0f} standard errors, from {b.count} points"
-    more = f"; more than the keypoints' standard deviation ({accuracy:g} px) and scatter" if is_fault else ""
+    words = "Certain" if significance > 2 * _MIN_SIGMAS else "Likely" if significance >= _MIN_SIGMAS else "Uncertain"
+    confidence = f"{words}: {significance:.0f} standard errors, from {b.count} keypoints"
+    more = f"; larger than the keypoints' standard deviation ({accuracy:g} px) and scatter" if is_fault else ""
     remedy = f"Run: {command('check', take, '--refine')}"
     return [Finding(severity, "bias", f"{text}{alone}).", (b.camera,), f"{confidence}{more}.", remedy)]
 
@@ -100,7 +100,7 @@ def _moved_cameras(parts: Disagreement, accuracy: float, take: Path, noticed: bo
     cameras = range(len(parts.cameras))
     whole = parts.explained(parts.of(*cameras))
     refine = f"Run: {command('check', take, '--refine')}"
-    text = f"The cameras disagree by {whole:.1f} px (root mean square) in a way that does not change over the recording"
+    text = f"The cameras disagree by {whole:.1f} px (root mean square), constant over the recording"
     for count in (1, 2):
         if len(cameras) < 2 + count:
             break
@@ -120,13 +120,13 @@ def _moved_cameras(parts: Disagreement, accuracy: float, take: Path, noticed: bo
         others = listed(parts.cameras[c] for c in second)
         confidence = (
             f"{'Likely' if clear else 'A guess'}: it would explain {100 * shares[best]:.0f} % of the squared "
-            f"disagreement, {others} instead {100 * shares[second]:.0f} %."
+            f"disagreement, {others} only {100 * shares[second]:.0f} %."
         )
         verb = "has" if count == 1 else "have"
-        text = f"{text}: {listed(names)} {verb} moved or turned since the calibration ({lines})."
+        text = f"{text}: {listed(names)} {verb} moved or rotated since the calibration ({lines})."
         return Finding("note" if noticed else "doubt", "moved", text, names, confidence, refine)
     return Finding(
-        "note", "moved", f"{text}; no one or two cameras explain it: the calibration as a whole is inaccurate.", (), "",
+        "note", "moved", f"{text}; no one or two cameras explain it: the whole calibration is inaccurate.", (), "",
         f"{refine}; or calibrate again.",
     )  # fmt: skip
 
@@ -136,7 +136,7 @@ def _image_change(parts: Disagreement, c: int, values: np.ndarray) -> str:
     focal = parts.explained(parts.of(c)) ** 2
     changes = [f"{parts.cameras[c]}: shifted by {values[0]:+.1f}, {values[1]:+.1f} px"]
     if parts.explained(parts.of(c, parts=[SHIFT, TURN])) ** 2 > 1.05 * parts.explained(parts.of(c, parts=[SHIFT])) ** 2:
-        changes.append(f"turned about its axis by {np.degrees(values[2]):+.2f} degrees")
+        changes.append(f"rotated about its axis by {np.degrees(values[2]):+.2f} degrees")
     if focal > 1.05 * parts.explained(parts.of(c, parts=[SHIFT, TURN])) ** 2:
         changes.append(f"scaled by {100 * values[3]:+.1f} % (focal length, image size, or distance)")
     return ", ".join(changes)
@@ -157,12 +157,11 @@ def time_findings(
     out: list[Finding] = []
     known = np.isfinite(times.offsets) & (times.std * times.rate < _MAX_OFFSET_SIGMA)
     if not known.any():
-        text = "Whether the cameras are in step cannot be determined: too little motion that several cameras see."
+        text = "Too little motion is visible in several cameras to check their clocks."
         return [Finding("note", "time", text, remedy="Clap, jump or swing the arms once at the start of a recording.")]
     undetermined = [name for name, fine in zip(times.cameras, known, strict=True) if not fine]
     if undetermined:
-        verb = "is" if len(undetermined) == 1 else "are"
-        text = f"Whether {listed(undetermined)} {verb} in step cannot be determined: too little motion."
+        text = f"Too little motion to check the clock of {listed(undetermined)}."
         out.append(Finding("note", "time", text, tuple(undetermined)))
     largest = float(np.max(np.abs(times.frames[known])))
     least = _MIN_OFFSET_FAULT if known.sum() > 2 else _MIN_OFFSET_FAULT_OF_TWO
@@ -173,14 +172,14 @@ def time_findings(
         value = take_offsets.get(name, 0.0) + times.offsets[c]
         way = "later" if late > 0 else "earlier"
         text = (
-            f"{name} runs {abs(late):.2f} ± {std:.2f} frames ({1e3 * abs(times.offsets[c]):.0f} ms) {way} than the "
-            f"take says: a fast point is {abs(late) * whole.get(name, np.nan):.0f} px off by that."
+            f"{name} is {abs(late):.2f} ± {std:.2f} frames ({1e3 * abs(times.offsets[c]):.0f} ms) {way} than the take "
+            f"states, which moves a fast point by {abs(late) * whole.get(name, np.nan):.0f} px."
         )
         is_fault = confirmed and abs(late) >= max(least + 3.0 * std, _MIN_SHARE_OF_LARGEST * largest)
         severity: Severity = "fault" if is_fault else "doubt" if abs(late) >= _MIN_OFFSET_DOUBT else "note"
-        confidence = "Sure" if abs(late) >= 2 * max(_MIN_OFFSET_NOTE, _MIN_SIGMAS * std) else "Likely"
+        confidence = "Certain" if abs(late) >= 2 * max(_MIN_OFFSET_NOTE, _MIN_SIGMAS * std) else "Likely"
         if abs(late) < 1.0:
-            confidence += "; a detector that smooths over time, or a rolling shutter, can also delay by part of a frame"
+            confidence += "; but temporal smoothing in a detector, or a rolling shutter, also delays by part of a frame"
         out.append(Finding(
             severity, "time", text, (name,), f"{confidence}.",
             f"Write time_offset = {value:.4f} into [[camera]] {name}.",
@@ -188,26 +187,26 @@ def time_findings(
     if not out:
         worst = float(np.max(np.abs(times.frames[known])))
         std = float(np.max(times.std[known])) * times.rate
-        out.append(Finding("good", "time", f"The cameras are in step to {max(worst, std):.2f} frames (± {std:.2f})."))
+        out.append(Finding("good", "time", f"The cameras are synchronised to {max(worst, std):.2f} frames."))
     return out
 
 
 def side_findings(views: KeypointViews) -> list[Finding]:
     """Findings on frames in which the detector swapped left and right."""
     if len(views.rig) < 3:
-        return [Finding("note", "sides", "With two cameras it is undecided which of them takes left for right.")]
+        return [Finding("note", "sides", "Left/right swaps cannot be assigned to a camera: only two cameras.")]
     found = {name: np.flatnonzero(views.swapped[:, c]) for c, name in enumerate(views.rig.names)}
     found = {name: frames for name, frames in found.items() if len(frames)}
     if not found:
-        return [Finding("good", "sides", "Left and right agree in all cameras and frames.")]
+        return [Finding("good", "sides", "No left/right swaps in any camera.")]
     exchanges = [f"{len(f)} of {len(views)} frames of {name} ({frame_ranges(f, 6)})" for name, f in found.items()]
     most = max(found, key=lambda name: len(found[name]))
     mostly = len(found[most]) > 0.5 * len(views)
     remedy = (
-        f"Is the image of {most} mirrored?" if mostly else "Nothing: tracking puts it right from the other cameras."
+        f"Check whether the image of {most} is mirrored." if mostly else "Nothing: tracking corrects it."
     )
-    text = f"The detector took left for right in {listed(exchanges)}."
-    confidence = "Sure: exchanged, they fit the other cameras."
+    text = f"The detector swapped left and right in {listed(exchanges)}."
+    confidence = "Certain: after correction they fit the other cameras."
     return [Finding("doubt" if mostly else "note", "sides", text, tuple(found), confidence, remedy)]
 
 
@@ -219,6 +218,6 @@ def explained(findings: Sequence[Finding]) -> list[Finding]:
     biases = [found for found in findings if found.kind == "bias" and found.cameras]
     worst = min((found.severity for found in biases if set(found.cameras) <= set(moved.cameras)),
                 key=SEVERITIES.index, default=moved.severity)  # fmt: skip
-    follows = f"Nothing: it follows from {listed(moved.cameras)}."
+    follows = f"Nothing: the motion of {listed(moved.cameras)} explains it."
     out = [replace(f, severity="note", remedy=follows) if f in biases else f for f in findings if f is not moved]
     return [*out, replace(moved, severity=worst)]

@@ -113,11 +113,11 @@ def _comparable(truth: Motion, result: Motion) -> Motion:
     if a.segments != b.segments or a.coordinates != b.coordinates:
         raise ObservationError(
             f"the bodies '{truth.body.name}' and '{result.body.name}' have different segments",
-            remedy="Compare motions of one kind of body.",
+            remedy="Compare motions of bodies with the same segments.",
         )
     if len(truth) != len(result) or not np.isclose(truth.rate, result.rate):
         raise ObservationError(
-            f"{len(truth)} frames at {truth.rate:g} Hz against {len(result)} at {result.rate:g} Hz",
+            f"the truth has {len(truth)} frames at {truth.rate:g} Hz, the result {len(result)} at {result.rate:g} Hz",
             remedy="Cut and resample one of them (kinefit.simulation).",
         )
     return result if result.up == truth.up else result.turned(truth.up)

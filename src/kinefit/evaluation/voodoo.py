@@ -113,11 +113,11 @@ def point_errors(truth: Motion, fitted: Motion) -> NDArray:
         Motions of different lengths, or bodies without such points in common.
     """
     if len(truth) != len(fitted):
-        problem = f"{len(fitted)} tracked frames of {len(truth)}"
-        raise ObservationError(problem, remedy="Give a pose for every frame, lost ones as they were before.")
+        problem = f"{len(fitted)} of {len(truth)} frames have a pose"
+        raise ObservationError(problem, remedy="Give a pose for every frame; for lost frames, the previous pose.")
     names = tuple(n for n in POINTS if n in truth.body.landmarks.names and n in fitted.body.landmarks.names)
     if not names:
-        raise ObservationError("two bodies without a joint in common", remedy=f"Name landmarks: {', '.join(POINTS)}.")
+        raise ObservationError("the bodies share no landmark", remedy=f"Add landmarks named {', '.join(POINTS)}.")
     a, b = (m.positions(m.body.landmarks.select(names)) for m in (truth, fitted))
     return np.asarray(np.linalg.norm(b - a, axis=-1))
 

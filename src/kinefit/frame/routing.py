@@ -82,13 +82,13 @@ class Sensors:
         self.rig, self.rate, self.sigma, self.settings = rig, rate, dict(sigma), settings
         bad = [f"{name}: {value}" for name, value in self.sigma.items() if not 0.0 < value < np.inf]
         if bad:
-            raise ObservationError(f"standard deviations of {', '.join(bad)}", remedy="Give positive ones.")
+            raise ObservationError(f"sigma is not positive: {', '.join(bad)}", remedy="Give positive values.")
         self._sensors: dict[str, Sensor] = {}
         for sensor in own:
-            of_kind(sensor, Sensor, "a sensor of one's own", "Derive it from Sensor, and give it a name.")
+            of_kind(sensor, Sensor, "a custom sensor", "Derive it from Sensor, and give it a name.")
             if not isinstance(getattr(sensor, "name", None), str) or not sensor.name:
-                problem = f"a sensor of one's own, {type(sensor).__name__}, has no name"
-                raise ObservationError(problem, remedy="Give it one, as its frames have it in `sensor`.")
+                problem = f"the custom sensor {type(sensor).__name__} has no name"
+                raise ObservationError(problem, remedy="Set name to the value of `sensor` in its frames.")
             if sensor.name in self._sensors:
                 raise ObservationError(f"two sensors are named '{sensor.name}'", remedy="Give each its own name.")
             self._sensors[sensor.name] = sensor
@@ -168,9 +168,9 @@ class Sensors:
         """
         if not is_number(sigma) or not MIN_SIGMA <= sigma <= MAX_SIGMA or isinstance(sigma, bool):
             remedy = f"Give a number from {MIN_SIGMA:g} to {MAX_SIGMA:g}, in metres or pixels."
-            raise ObservationError(f"a standard deviation of {sigma} of '{name}'", remedy=remedy)
+            raise ObservationError(f"sigma of '{name}' is {sigma}", remedy=remedy)
         if name in self._own:
-            raise ObservationError(f"'{name}' is a sensor of one's own", remedy="Change it where it was made.")
+            raise ObservationError(f"'{name}' is a custom sensor", remedy="Change sigma in the sensor itself.")
         self.sigma[name] = float(sigma)
         for sensor in (KEYPOINTS, name):  # made again for its next frame; a camera's learnt background stays
             self._sensors.pop(sensor, None)
@@ -211,8 +211,8 @@ class Sensors:
         """
         camera = self.rig[sensor]
         if np.shape(depth) != camera.size[::-1]:
-            problem = f"a background of shape {np.shape(depth)}, camera {sensor} has {camera.size}"
-            raise ObservationError(problem, remedy="Give an image of this camera.")
+            problem = f"the background has shape {np.shape(depth)}, images of {sensor} have {camera.size[::-1]}"
+            raise ObservationError(problem, remedy="Give a depth image of this camera.")
         background = self.background(camera)
         if background is not None:
             background.know(depth)
@@ -291,11 +291,11 @@ class Sensors:
 
 def _checked(m: Any, sensor: str) -> Measurement:
     remedy = "It must return a Measurement with the name of its `sensor`."
-    of_kind(m, Measurement, f"what `prepare` of sensor '{sensor}' gave", remedy)
+    of_kind(m, Measurement, f"the result of `prepare` of sensor '{sensor}'", remedy)
     if getattr(m, "sensor", None) != sensor:
-        raise ObservationError(f"`prepare` of sensor '{sensor}' gave a measurement of another", remedy=remedy)
+        raise ObservationError(f"`prepare` of sensor '{sensor}' returned another sensor's measurement", remedy=remedy)
     if not np.isfinite(getattr(m, "time", np.nan)):
-        raise ObservationError(f"a measurement of sensor '{sensor}' has no time", remedy="Give it in seconds.")
+        raise ObservationError(f"a measurement of sensor '{sensor}' has no time", remedy="Set time, in seconds.")
     return m
 
 
@@ -310,32 +310,32 @@ def time_of(frames: Sequence[Any], time: float | None, own: Sensors) -> float:
     """
     names = [sensor.name for sensor in own]
     if isinstance(frames, str) or not isinstance(frames, Sequence):
-        problem = f"a {type(frames).__name__} in place of a list of frames"
-        raise ObservationError(problem, remedy="Give a list, also of one: tracker.update([frame]).")
+        problem = f"frames is a {type(frames).__name__}, not a list"
+        raise ObservationError(problem, remedy="Give a list, even of one frame: tracker.update([frame]).")
     if time is not None and not is_number(time):
-        raise ObservationError(f"a time that is a {type(time).__name__}", remedy="Give seconds.")
+        raise ObservationError(f"time is a {type(time).__name__}", remedy="Give seconds.")
     for frame in frames:
         if type(frame) in own._makers:
             continue
         if not is_number(getattr(frame, "time", 0.0)):
-            raise ObservationError(f"a frame whose time is a {type(frame.time).__name__}", remedy="Give seconds.")
+            raise ObservationError(f"the time of a frame is a {type(frame.time).__name__}", remedy="Give seconds.")
         if isinstance(frame, Measurement):
             continue
         if not isinstance(getattr(frame, "sensor", None), str):
             kinds = ", ".join(kind.__name__ for kind in own._makers)
-            problem = f"a {type(frame).__name__} among the frames"
-            raise ObservationError(problem, remedy=f"Give {kinds}, a Measurement, or a frame of a sensor of your own.")
+            problem = f"a {type(frame).__name__} is not a frame"
+            raise ObservationError(problem, remedy=f"Give {kinds}, a Measurement, or a frame of a custom sensor.")
         if frame.sensor not in own._own:
-            remedy = "Give it to the tracker: sensors=[...]."
+            remedy = "Correct its name, or give the custom sensor to the tracker: sensors=[...]."
             raise ObservationError(choices("sensor", frame.sensor, names), remedy=remedy)
     if time is None:
         time = float(np.mean([f.time for f in frames])) if len(frames) else np.nan
     if not np.isfinite(time):
-        problem = "frames whose time is not finite" if len(frames) else "no frame"
-        raise ObservationError(problem, remedy="Give what the sensors saw, each with its time in seconds.")
+        problem = "the time of the frames is not finite" if len(frames) else "no frames"
+        raise ObservationError(problem, remedy="Give frames of sensors, each with its time in seconds; or time.")
     for frame in frames:  # beyond a pause no velocity is known that would take the body from one time to the other
         own_time = getattr(frame, "time", time)
         if not abs(own_time - time) <= own.settings.pause:
-            problem = f"sensor '{frame.sensor}' has a frame of {own_time:.3f} s in a step of {time:.3f} s"
-            raise ObservationError(problem, remedy="Give all sensors and the step times of one clock.")
+            problem = f"a frame of sensor '{frame.sensor}' is at {own_time:.3f} s, its step at {time:.3f} s"
+            raise ObservationError(problem, remedy="Give times of all sensors and steps on one clock.")
     return time

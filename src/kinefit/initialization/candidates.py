@@ -18,7 +18,7 @@ from kinefit.correspondences import prior_rows
 from kinefit.errors import KinefitError, TrackingError
 from kinefit.geometry.camera import Camera
 from kinefit.initialization.depth_search import PostureSearch
-from kinefit.initialization.from_depth import Start, starts_by_attempt
+from kinefit.initialization.from_depth import Start, StartSearch, starts_by_attempt
 from kinefit.initialization.from_points import pose_from_points
 from kinefit.observations import DepthFrame, PointCloud, by_record
 from kinefit.rows import AnyRows
@@ -81,7 +81,8 @@ def starts_from_views(
     for view in _views(scene, frames):
         empty = (backgrounds or {}).get(view[1].name)
         with suppress(KinefitError):
-            for starts in starts_by_attempt(scene.body, *view, background=empty, up=up, count=count, forward=forward):
+            search = StartSearch(count, forward=forward)
+            for starts in starts_by_attempt(scene.body, *view, background=empty, up=up, search=search):
                 if known.any():
                     starts.sort(key=distance_of)
                 yield [start.state for start in starts]

@@ -54,6 +54,28 @@ class Start:
     visible: NDArray
 
 
+@dataclass(frozen=True, eq=False)
+class StartSearch:
+    """How poses are searched.
+
+    Parameters
+    ----------
+    count : most poses that are returned
+    attempts : int
+        Most attempts until a good pose is found: about 1.1 s of one core each.
+    seed : of the random search; the same seed gives the same poses
+    forward : (3,) heading of the root a moment ago; people rarely turn around within a second. Default: unknown
+    """
+
+    count: int = 5
+    attempts: int = 2
+    seed: int = 0
+    forward: ArrayLike | None = None
+
+
+DEFAULT_SEARCH = StartSearch()
+
+
 def start_from_points(
     body: Body,
     points: ArrayLike | None,
@@ -62,10 +84,7 @@ def start_from_points(
     *,
     background: NDArray | None = None,
     up: ArrayLike = (0.0, 1.0, 0.0),
-    count: int = 5,
-    attempts: int = 2,
-    seed: int = 0,
-    forward: ArrayLike | None = None,
+    search: StartSearch = DEFAULT_SEARCH,
 ) -> list[Start]:
     """Find poses of a body in one depth image or point cloud, the best first.
 
@@ -81,11 +100,7 @@ def start_from_points(
     background : (H, W) [m], optional
         Depth of the empty scene, 0 where unknown: the person is searched in the foreground only.
     up : (3,) upwards, in the world
-    count : most poses
-    attempts : int
-        Most attempts until a good pose is found: about 1.1 s of one core each.
-    seed : of the random search; the same seed gives the same poses
-    forward : (3,) heading of the root a moment ago; people rarely turn around within a second. Default: unknown
+    search : number of poses and attempts, seed, heading
 
     Raises
     ------
@@ -96,28 +111,25 @@ def start_from_points(
     BodyError
         The body has no surfaces.
     """
-    *_, found = starts_by_attempt(
-        body, points, camera, depth, background=background, up=up, count=count, attempts=attempts, seed=seed,
-        forward=forward,
-    )  # fmt: skip
+    *_, found = starts_by_attempt(body, points, camera, depth, background=background, up=up, search=search)
     return found
 
 
 def starts_by_attempt(
     body: Body, points: ArrayLike | None, camera: Camera, depth: NDArray | None = None, *,
-    background: NDArray | None = None, up: ArrayLike = (0.0, 1.0, 0.0), count: int = 5, attempts: int = 2,
-    seed: int = 0, forward: ArrayLike | None = None,
+    background: NDArray | None = None, up: ArrayLike = (0.0, 1.0, 0.0), search: StartSearch = DEFAULT_SEARCH,
 ) -> Iterator[list[Start]]:  # fmt: skip
     """Yield the best poses after each attempt, until one is good; parameters and errors as in `start_from_points`."""
     found: list[tuple[PostureSearch, BodyState]] = []
     views: list[DepthView] = []
     view_batches = _views(body, points, camera, depth, up, background)
-    for attempt in range(max(attempts, 1)):
+    for attempt in range(max(search.attempts, 1)):
         views += next(view_batches, [])
-        searches = _searches(body, views, up, seed + attempt, forward)
-        found += [(search, state) for search in searches for state in search.best(count)]
+        postures = _searches(body, views, up, search.seed + attempt, search.forward)
+        found += [(posture, state) for posture in postures for state in posture.best(search.count)]
         found.sort(key=lambda f: -_person_score(*f))
-        yield [Start(state, search.value(state), search.score.visible(state)) for search, state in found[:count]]
+        best = found[: search.count]
+        yield [Start(state, posture.value(state), posture.score.visible(state)) for posture, state in best]
         if _person_score(*found[0]) > _MIN_GOOD_SCORE:
             return
 

@@ -77,8 +77,8 @@ class CameraSource(ThreadSource):
     def _put(self, inbox: Inbox, image: NDArray[np.uint8], when: float, *, wait: bool = False) -> bool:
         if image.shape[1::-1] != self.size:
             raise ObservationError(
-                f"images of {image.shape[1]}x{image.shape[0]} px, expected are {self.size[0]}x{self.size[1]}",
-                place=f"camera {self.name}", remedy="Set the camera to that size, or state size and image in the take.",
+                f"images have {image.shape[1]}x{image.shape[0]} px instead of {self.size[0]}x{self.size[1]}",
+                place=f"camera {self.name}", remedy="Set the camera to this size, or set size and image in [[camera]].",
             )  # fmt: skip
         return inbox.put(Arrived(self.name, when, time.monotonic(), image), wait=wait)
 

@@ -48,7 +48,7 @@ class FolderSource(ThreadSource):
         super().__init__(name, clock)
         self.folder, self.endings = folder, endings
         if not folder.is_dir():
-            raise FileError("no such folder", file=folder, place=name, remedy="Make it, or correct stream.")
+            raise FileError("no such folder", file=folder, place=name, remedy="Create it, or correct stream.")
         self._known = {entry.name for entry in os.scandir(folder)}
         self._changed, self._waiting = -1.0, True
 
@@ -84,7 +84,7 @@ class FolderSource(ThreadSource):
                 return []
             entries = list(os.scandir(self.folder))
         except OSError as error:
-            problem, remedy = f"the folder cannot be listed any more ({error.strerror})", "Make it again."
+            problem, remedy = f"the folder can no longer be read ({error.strerror})", "Create it again."
             raise FileError(problem, file=self.folder, place=self.name, remedy=remedy) from error
         self._changed, self._waiting = changed, False
         for entry in entries:
@@ -214,6 +214,6 @@ def check_size(size: tuple[int, ...], wanted: tuple[int, int], path: Path, place
         Another size.
     """
     if tuple(size) != tuple(wanted):
-        problem = f"images of {size[0]}x{size[1]} px, expected are {wanted[0]}x{wanted[1]}"
-        remedy = "Set the camera to that size, or calibrate it at the size that it has."
+        problem = f"images have {size[0]}x{size[1]} px instead of {wanted[0]}x{wanted[1]}"
+        remedy = "Set the camera to this size, or calibrate it at its present size."
         raise ObservationError(problem, file=path, place=place, remedy=remedy)

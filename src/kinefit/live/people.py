@@ -56,8 +56,8 @@ class LivePerson:
         self._chosen: NDArray | None = None  # (K, 2) [px] in `camera`: of a choice, until the tracker has a pose
         self._tries = self._absent = 0  # steps
         if self.wanted.way not in _LIVE_WAYS:
-            problem = f'person = "{person}" is known only when all is over'
-            raise TakeError(problem, place="person", remedy='Live: "first", "largest" or "nearest X Y Z".')
+            problem = f'person = "{person}" needs the whole recording'
+            raise TakeError(problem, place="person", remedy='For live: "first", "largest" or "nearest X Y Z".')
 
     def frames(
         self, records: Sequence[Keypoints], body: Body, state: BodyState | None

@@ -47,7 +47,7 @@ class MotionRecord:
             self._file: BinaryIO = open(self.folder / _SPOOL, "wb")
         except OSError as error:
             problem = f"cannot be written ({error.strerror})"
-            raise ExportError(problem, file=self.folder, remedy="Name another folder by --out.") from error
+            raise ExportError(problem, file=self.folder, remedy="Give another folder with --out.") from error
         self._last: NDArray | None = None
         self._first = 0.0
         self._choice = self.dropped = 0

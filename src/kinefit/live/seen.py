@@ -19,7 +19,7 @@ from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.take.file import Take
 
 _TAKE_FILE = "take.toml"
-_TAKE_HEAD = "# What a live session saw: kinefit track fits it as a whole."
+_TAKE_HEAD = "# Recorded by kinefit live: kinefit track fits the whole session."
 _K = len(MEDIAPIPE_33)
 _ROW_LENGTH = 1 + 2 * _K + _K + 3 * _K  # time, pixels, confidence, lifted
 _MAX_IMAGE_GAP = 1.5  # frames between two images, up to which a step between them is interpolated
@@ -52,8 +52,8 @@ class SeenRecord:
             self.folder.mkdir(parents=True, exist_ok=True)
             other = self.folder / _TAKE_FILE
             if other.exists() and not other.read_text(errors="replace").startswith(_TAKE_HEAD):
-                remedy = "Name another folder by --out."
-                raise ExportError("this take would be written over", file=other, remedy=remedy)
+                remedy = "Give another folder with --out."
+                raise ExportError("the session would overwrite this take", file=other, remedy=remedy)
         except OSError as error:
             raise self._write_error(error) from error
 
@@ -101,7 +101,7 @@ class SeenRecord:
         return self.folder / f"{camera}.unfinished"
 
     def _write_error(self, error: OSError) -> ExportError:
-        remedy = "Free some space, or name another folder by --out."
+        remedy = "Free some space, or give another folder with --out."
         return ExportError(f"cannot be written ({error.strerror})", file=self.folder, remedy=remedy)
 
     def _detections(self, camera: str, rows: NDArray) -> Detections:

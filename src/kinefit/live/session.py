@@ -190,7 +190,7 @@ class LiveSession:
         except KinefitError as error:
             answer({"type": "refused", "why": str(error)})
         except queue.Full:
-            answer({"type": "refused", "why": f"{_MAX_WAITING_WISHES} wishes wait already. Ask again later."})
+            answer({"type": "refused", "why": f"{_MAX_WAITING_WISHES} requests are waiting. Send it again later."})
 
     def change_body(self, body: Body) -> None:
         """Continue with another body.

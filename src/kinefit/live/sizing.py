@@ -98,10 +98,10 @@ class LiveSize:
             lengths = body.segment_lengths()
             bones = {"thigh": "thigh_r-shank_r", "shank": "shank_r-foot_r", "forearm": "forearm_r-hand_r"}
             listed = ", ".join(f"{what} {100 * lengths[bone]:.1f}" for what, bone in bones.items() if bone in lengths)
-            self.outcome = f"the person's size was found ({listed} cm)" if listed else "the person's size was found"
+            self.outcome = f"the person's size is estimated ({listed} cm)" if listed else "the person's size is known"
             return body
         except KinefitError as error:
-            self.outcome = f"the person's size was not found, the default is used ({error.problem})"
+            self.outcome = f"the person's size is not estimated, the default is used ({error.problem})"
         except BrokenProcessPool:
             self._give_up()
         finally:
@@ -110,7 +110,7 @@ class LiveSize:
 
     def _give_up(self) -> None:
         """Go on without a fit after its process has ended."""
-        self.outcome = "the person's size was not found, the default is used (its process ended)"
+        self.outcome = "the person's size is not estimated, the default is used (its process ended)"
         self.close()
 
 

@@ -103,8 +103,8 @@ def _videos(take: Take, body: Body, speed: float, threads: int, tell: Tell) -> O
     """Videos with the built-in detector."""
     entries = [entry for entry in take.cameras if entry.video is not None]
     if not entries:
-        remedy = "Give its cameras a stream or a video."
-        raise TakeError("cameras, but nothing that they saw", file=take.path, remedy=remedy)
+        remedy = "Write stream or video into its [[camera]] entries."
+        raise TakeError("no camera of the take has a stream or video", file=take.path, remedy=remedy)
     clock, sources = SessionClock(), []
     for entry in entries:
         assert entry.video is not None
@@ -160,8 +160,8 @@ def opened_streams(take: Take, body: Body, threads: int, tell: Tell) -> Opened:
     for keypoints in take.keypoints:
         assert keypoints.stream is not None
         if rig is None:
-            remedy = 'Add [calibration] with file = "..."; one camera alone needs a stream of its images.'
-            raise TakeError("keypoints without calibration", file=take.path, place=keypoints.camera, remedy=remedy)
+            remedy = 'Add [calibration] with file = "..."; for a single camera, stream its images instead.'
+            raise TakeError("keypoints need a calibration", file=take.path, place=keypoints.camera, remedy=remedy)
         entry = next(camera for camera in take.cameras if camera.name == keypoints.camera)
         frame = image_frame(entry, rig, None, take) if keypoints.frame == "video" else None
         sources.append(KeypointFolderStream(
@@ -204,7 +204,7 @@ def with_detector(
     if is_alone(take):
         rig = Rig((assumed_camera(take.cameras[0], sizes.get(take.cameras[0].name), take),))
     if rig is None:
-        raise TakeError("cameras without calibration", file=take.path, remedy='Add [calibration] with file = "...".')
+        raise TakeError("the cameras need a calibration", file=take.path, remedy='Add [calibration] with file = "...".')
     images = dict[str, ImageFrame]()
     for entry in take.cameras:
         if entry.name in sizes:
@@ -224,7 +224,7 @@ def _size(entry: CameraEntry, rig: Rig | None, take: Take) -> tuple[int, int]:
     """(width, height) [px] of a camera's image."""
     size = entry.size or (rig[entry.name].size if rig is not None else None)
     if size is None:
-        remedy = "Write size = [width, height], or a calibration."
+        remedy = "Write size = [width, height] into its [[camera]], or add [calibration]."
         raise TakeError("the size of its image is unknown", file=take.path, place=f"camera {entry.name}",
                         remedy=remedy)  # fmt: skip
     return size
@@ -245,7 +245,7 @@ def _depth_camera(entry: DepthEntry, rig: Rig | None, take: Take) -> Camera:
     try:
         camera = stated_camera(entry, entry.size, rig)
         if camera is None:
-            raise CalibrationError("nothing states its intrinsics", remedy=remedy)
+            raise CalibrationError("its intrinsics are unknown", remedy=remedy)
     except (CalibrationError, TakeError) as error:
         place = f"depth {entry.name}"
         raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error

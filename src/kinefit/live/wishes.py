@@ -17,7 +17,7 @@ MAX_WISH_BYTES = 4096
 
 _Name = Annotated[str, msgspec.Meta(max_length=200)]
 _FORM = (
-    'Ask for {"sensor": ..., "use": true or false}, {"sensor": ..., "sigma": ...}, {"body": ...}, {"person": ...}, '
+    'Send {"sensor": ..., "use": true or false}, {"sensor": ..., "sigma": ...}, {"body": ...}, {"person": ...}, '
     '{"pause": true or false} or {"stop": true}.'
 )
 _SINGLE_FIELDS = "body", "person", "pause", "stop"
@@ -60,12 +60,12 @@ def read_wish(given: bytes | Mapping[str, Any]) -> Wish:
         if isinstance(given, Mapping):
             wish = msgspec.convert(dict(given), Wish)
         elif len(given) > MAX_WISH_BYTES:
-            raise ObservationError(f"a wish of {len(given)} bytes, more than {MAX_WISH_BYTES}", remedy=_FORM)
+            raise ObservationError(f"the request has {len(given)} bytes, more than {MAX_WISH_BYTES}", remedy=_FORM)
         else:
             wish = msgspec.json.decode(given, type=Wish)
     except msgspec.DecodeError as error:
-        raise ObservationError(f"no wish: {error}", remedy=_FORM) from error
+        raise ObservationError(f"not a request: {error}", remedy=_FORM) from error
     asked = {name for name in wish.__struct_fields__ if getattr(wish, name) is not None}
     if asked not in ({"sensor", "use"}, {"sensor", "sigma"}, *({one} for one in _SINGLE_FIELDS)) or wish.stop is False:
-        raise ObservationError(f"a message with {', '.join(sorted(asked)) or 'nothing'} is no wish", remedy=_FORM)
+        raise ObservationError(f"a message with {', '.join(sorted(asked)) or 'nothing'} is not a request", remedy=_FORM)
     return wish

@@ -64,7 +64,7 @@ def choose_people(rig: Rig, keypoints: Sequence[Keypoints]) -> list[NDArray]:
             chosen[q] = np.where(is_own, chosen[q], by_box)
     out = [chosen[q] for q in range(len(keypoints))]
     if all(np.all(c < 0) for c in out):
-        raise TrackingError("nobody is seen in any frame", remedy="Check that the keypoints belong to this recording.")
+        raise TrackingError("no person is seen in any frame", remedy="Check that the keypoints are of this recording.")
     return out
 
 

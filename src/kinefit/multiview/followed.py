@@ -107,7 +107,7 @@ def choose(people: Sequence[PersonTrack], person: int | str | None) -> int:
     wanted = PersonChoice.of(person)
     if wanted.way == "number" and wanted.number > max(len(people), 1):
         count = f"{len(people)} people are" if len(people) > 1 else "one person is"
-        raise TrackingError(f"person {wanted.number}, but {count} in view", remedy=f"Give {FORMS}.")
+        raise TrackingError(f"no person {wanted.number}: {count} in view", remedy=f"Give {FORMS}.")
     if not people:
         return 0
     if wanted.way == "moving":
@@ -128,17 +128,17 @@ def sentences(provenance: Mapping[str, Any], *, asked: bool) -> list[str]:
         f"{k} near ({', '.join(f'{v:.1f}' for v in one['place_m'])}) m moves {one['speed_m_s']:.2f} m/s, "
         f"{one['height_px']:.0f} px tall" for k, one in enumerate(entry["each"], start=1)
     )  # fmt: skip
-    why = "" if asked else ", the most visible one"
-    out = [f"{entry['in view']} people are in view, person {entry['followed']} is followed{why} ({listed})"]
+    why = "" if asked else ", as the most visible"
+    out = [f"{entry['in view']} people are in view; person {entry['followed']} is tracked{why} ({listed})"]
     for k, one in enumerate(entry["each"], start=1):
         for away in one.get("returns", ()):
             out.append(
-                f"person {k} leaves at {away['left_s']:.1f} s, and who comes at {away['came_s']:.1f} s is taken for "
-                f"the same, by {', '.join(away['by'])} (odds {min(away['odds'], 1000):.0f} to 1)"
+                f"person {k} leaves at {away['left_s']:.1f} s and is re-identified at {away['came_s']:.1f} s by "
+                f"{', '.join(away['by'])} (odds {min(away['odds'], 1000):.0f} to 1)"
             )
         if one.get("maybe"):
             others = " or ".join(map(str, one["maybe"]))
-            out.append(f"person {k} may be person {others}, who left before: what was seen leaves it open")
+            out.append(f"person {k} may be person {others}, who left before: re-identification is undecided")
         if one.get("image_of"):
-            out.append(f"person {k} is person {one['image_of']} in a mirror")
+            out.append(f"person {k} is the mirror image of person {one['image_of']}")
     return out

@@ -20,7 +20,7 @@ _MIN_MOVE_PX = 20.0  # [px] of that distance is always allowed: some people have
 
 def is_even(times: NDArray, rate: float) -> bool:
     """Whether frames at `times` (N,) [s] follow each other at `rate` [Hz], each within 0.15 of a step."""
-    off = (times - times[0]) * rate - np.arange(len(times))
+    off = (times - times[:1]) * rate - np.arange(len(times))
     return bool(np.all(np.abs(off) <= _MAX_JITTER_STEPS))
 
 

@@ -12,6 +12,8 @@ from kinefit.errors import ObservationError
 FORMS = '"first", "moving", "largest", "nearest X Y Z" [m], or a number from 1'
 """Allowed forms, for messages."""
 
+_MAX_DIGITS = 6  # of a person's number; Python refuses to read some thousand of them
+
 
 @dataclass(frozen=True, eq=False)
 class PersonChoice:
@@ -43,8 +45,8 @@ class PersonChoice:
         if isinstance(person, bool) or not isinstance(person, int | str):
             raise _wrong(person)
         word, *more = str(person).split() or [""]
-        if word.isascii() and word.isdigit() and not more and 0 < int(word[:6]):
-            return cls("number", int(word[:6]))
+        if word.isascii() and word.isdigit() and not more and len(word) <= _MAX_DIGITS and int(word) > 0:
+            return cls("number", int(word))
         if word in ("first", "moving", "largest") and not more:
             return cls(word)
         if word == "nearest" and len(more) == 3:

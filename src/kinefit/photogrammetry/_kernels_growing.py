@@ -9,8 +9,8 @@ from kinefit.photogrammetry.matching._kernels_matching import (
     CORRELATION,
     DIVERGED,
     FOUND,
-    NOT_TRIED,
-    OUTSIDE,
+    NOT_VISITED,
+    OUTSIDE_IMAGE,
     STATUS,
     A,
     U,
@@ -66,7 +66,7 @@ def grow(first, second, at, columns, seeds, starts, halves, steps, tolerance, sh
     start, tried = np.empty(6), 0
     for k in range(count):
         out[k, :] = np.nan
-        out[k, STATUS] = NOT_TRIED
+        out[k, STATUS] = NOT_VISITED
     for s in range(seeds.shape[0]):
         k = seeds[s]
         if out[k, STATUS] == FOUND or not (abs(at[k, 0]) < np.inf and abs(at[k, 1]) < np.inf):
@@ -94,7 +94,7 @@ def grow(first, second, at, columns, seeds, starts, halves, steps, tolerance, sh
             else:
                 continue
             state = out[other, STATUS]
-            if not (state == NOT_TRIED or state == DIVERGED or state == OUTSIDE):
+            if not (state == NOT_VISITED or state == DIVERGED or state == OUTSIDE_IMAGE):
                 continue
             x, y = at[other, 0] - at[k, 0], at[other, 1] - at[k, 1]
             if not (abs(x) < np.inf and abs(y) < np.inf):

@@ -8,7 +8,7 @@ import shutil
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -61,6 +61,30 @@ class DetectionJob:
 
 
 @dataclass(frozen=True)
+class DetectionSettings:
+    """What is detected; None: as in a file of detections that is there, else the default.
+
+    Parameters
+    ----------
+    people : int
+        Largest number at a time; default: `PEOPLE`.
+    masks, hands, face : bool
+        Whether these are detected too; default: no.
+    quality : str or Path
+        One of `QUALITIES`, or the file of a landmark network of one's own; default: `QUALITY`.
+    """
+
+    people: int | None = None
+    masks: bool | None = None
+    hands: bool | None = None
+    face: bool | None = None
+    quality: str | Path | None = None
+
+
+DEFAULT_SETTINGS = DetectionSettings()
+
+
+@dataclass(frozen=True)
 class Networks:
     """Files of the detector's networks.
 
@@ -93,7 +117,7 @@ def jobs_of_take(take: Take) -> list[DetectionJob]:
     ]  # fmt: skip
     if not found:
         raise TakeError(
-            "no camera of this take has a video", file=take.path, remedy='Add video = "..." to its [[camera]] entries.'
+            "no camera of the take has a video", file=take.path, remedy='Add video = "..." to its [[camera]] entries.'
         )
     return found
 
@@ -119,14 +143,10 @@ def _seconds(take: Take, camera: CameraEntry, rate: float) -> tuple[float, float
 
 
 def detect(
-    jobs: Sequence[DetectionJob], *, people: int | None = None, masks: bool | None = None, hands: bool | None = None,
-    face: bool | None = None, quality: str | Path | None = None, force: bool = False, progress: Step | None = None,
-    tell: Tell,
-) -> list[DetectionJob]:
+    jobs: Sequence[DetectionJob], settings: DetectionSettings = DEFAULT_SETTINGS, *, force: bool = False,
+    progress: Step | None = None, tell: Tell,
+) -> list[DetectionJob]:  # fmt: skip
     """Look through the videos whose file is not there yet, or is of another video or other settings; returns these.
-
-    `quality` is one of `QUALITIES`, or the file of a landmark network of one's own. What is None is as it is where a
-    file is there, and else as is usual.
 
     Every file is written as soon as its video is done, so that what was interrupted goes on with the others.
     """
@@ -134,23 +154,24 @@ def detect(
     from kinefit.readers.detections import detections_key
 
     keys = {job: detection_key(job) for job in jobs}
-    wanted = {"people": people, "masks": masks, "hands": hands, "face": face, "quality": quality and _name_of(quality)}
+    wanted = {**asdict(settings), "quality": settings.quality and _name_of(settings.quality)}
     if not force:
         for job in jobs:
             _from_beside(job, keys[job], wanted)
     todo = [job for job in jobs if force or not _fits(detections_key(job.file), keys[job], wanted, job.seconds)]
     if not todo:
         return []
-    files = networks(progress, tell, QUALITY if quality is None else quality)
+    files = networks(progress, tell, settings.quality or QUALITY)
     if files.name == "best" and len(jobs) == 1:  # depths of one camera gain by it; several give the same motion
         files = replace(files, mirrored=True)
-    number, outlines = PEOPLE if people is None else people, bool(masks)
+    s = settings
+    full = DetectionSettings(PEOPLE if s.people is None else s.people, bool(s.masks), bool(s.hands), bool(s.face))
     threads = max(cores() // len(todo), 1)  # cameras run side by side; what cores are left help them
 
     def work(job: DetectionJob, step: Step) -> None:
-        key = f"{keys[job]} {_settings(number, outlines, bool(hands), bool(face), job.seconds)}"
+        key = f"{keys[job]} {_settings(full, job.seconds)}"
         key += f"{' mirrored=True' * files.mirrored} quality={files.name}"
-        _look_through(job, files, number, outlines, key, step, threads, bool(hands), bool(face))
+        _look_through(job, files, full, key, step, threads)
 
     with hushed():
         Models(files.folder, landmarks=files.landmarks)
@@ -181,15 +202,7 @@ def seconds_of(job: DetectionJob, video: Video) -> tuple[int, int]:
 
 
 def _look_through(
-    job: DetectionJob,
-    files: Networks,
-    people: int,
-    masks: bool,
-    key: str,
-    tell: Step,
-    threads: int,
-    hands: bool,
-    face: bool,
+    job: DetectionJob, files: Networks, settings: DetectionSettings, key: str, tell: Step, threads: int
 ) -> None:
     from kinefit.exporters.pictures.detections import write_detections
     from kinefit.images.detectors.detection import detect_people
@@ -209,11 +222,13 @@ def _look_through(
             tell(job.camera, last - first, last - first)
 
         found = detect_people(
-            counted(video.frames(first, last)), models, camera=job.camera, rate=video.rate, people=people, masks=masks,
-            source=str(job.video), with_hands=HandFollower(HandModels(files.folder, threads)) if hands else None,
-            with_faces=FaceFinder(FaceModels(files.folder, threads)) if face else None,
-        )
-        found = replace(found.within(first, len(video)), times=video.times if video.unevenness else None)
+            counted(video.frames(first, last)), models, camera=job.camera, rate=video.rate,
+            people=settings.people or 0, masks=bool(settings.masks),
+            with_hands=HandFollower(HandModels(files.folder, threads)) if settings.hands else None,
+            with_faces=FaceFinder(FaceModels(files.folder, threads)) if settings.face else None,
+        )  # fmt: skip
+        times = video.times if video.unevenness else None
+        found = replace(found.within(first, len(video)), times=times, source=str(job.video))
     write_detections(found, job.file, key=key)
 
 
@@ -231,10 +246,10 @@ def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced"
 
     def report(done: int, total: int) -> None:
         if not fetched:
-            tell(f"Fetching the networks of the built-in detector, once: {MODELS_CREDIT}.")
+            tell(f"Downloading the networks of the built-in detector, once: {MODELS_CREDIT}.")
         fetched.append(done)
         if progress:
-            progress("fetching MB", done // 10**6, total // 10**6)
+            progress("download MB", done // 10**6, total // 10**6)
 
     folder = detector_models(report)
     if isinstance(quality, Path):
@@ -244,7 +259,7 @@ def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced"
     try:
         return Networks(folder, landmark_models(report) / QUALITIES[quality], quality)
     except AssetError as error:
-        tell(f"{error} Until then people are seen by the network of quality 'balanced'.")
+        tell(f"{error} Until then, the network of quality 'balanced' is used.")
         return Networks(folder, folder / LANDMARKS, "balanced")
 
 
@@ -255,7 +270,7 @@ def _name_of(quality: str | Path) -> str:
     try:
         return hashlib.sha256(quality.read_bytes()).hexdigest()[:16]
     except OSError as error:
-        raise FileError(f"cannot be read ({error.strerror})", file=quality, remedy="Check the path.") from error
+        raise FileError(f"cannot be read ({error.strerror})", file=quality, remedy="Check --network.") from error
 
 
 def detection_key(job: DetectionJob) -> str:
@@ -265,9 +280,9 @@ def detection_key(job: DetectionJob) -> str:
     return video_key(job.video, job.rate, f"{MODELS_PACKAGE} {_METHOD}")
 
 
-def _settings(people: int, masks: bool, hands: bool, face: bool, seconds: tuple[float, float] | None) -> str:
+def _settings(s: DetectionSettings, seconds: tuple[float, float] | None) -> str:
     part = "" if seconds is None else " seconds={}:{}".format(*seconds)
-    return f"people={people} masks={masks}{' hands=True' * hands}{' face=True' * face}{part}"
+    return f"people={s.people} masks={s.masks}{' hands=True' * bool(s.hands)}{' face=True' * bool(s.face)}{part}"
 
 
 def _fits(

@@ -52,7 +52,7 @@ def each_video(jobs: Sequence[J], work: Callable[[J, Step], None], progress: Ste
             done, _ = wait(futures, return_when=FIRST_EXCEPTION)
         except KeyboardInterrupt as stopped:
             kept = of - len(jobs) + sum(future.done() for future in futures)
-            message = f"{kept} of {of} videos are done and kept; the same command goes on with the others."
+            message = f"{kept} of {of} videos are done. Run the same command to continue with the others."
             raise KeyboardInterrupt(message) from stopped
         finally:  # after an error, or Ctrl-C: those that run end at their next picture
             stop.set()

@@ -75,10 +75,11 @@ def _check(take: Take) -> None:
     """Refuse videos that cannot be copied as they are."""
     for camera in take.cameras:
         if camera.video is not None and not camera.video.is_file():
-            problem = "copies without faces are made of video files, not of images in folders or recordings"
-            raise TakeError(problem, file=take.path, place=f"camera {camera.name}", remedy="Make videos of them first.")
+            problem = "--hide-faces copies only video files, not images in folders or recordings"
+            remedy = "Convert them to videos first."
+            raise TakeError(problem, file=take.path, place=f"camera {camera.name}", remedy=remedy)
         if camera.video is not None:
             with Video(camera.video) as video:
                 if video.size[0] % 2 or video.size[1] % 2:
-                    problem = f"a video of {video.size[0]} x {video.size[1]} px: sides of copies are even"
-                    raise TakeError(problem, file=camera.video, remedy="Set hide_faces = true in the take instead.")
+                    problem = f"the video has {video.size[0]} x {video.size[1]} px; copies need even numbers"
+                    raise TakeError(problem, file=camera.video, remedy="Set hide_faces = true in [take] instead.")

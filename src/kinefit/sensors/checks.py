@@ -46,16 +46,16 @@ def check_rows(rows: Any, sensor: str, body: Body) -> list[AnyRows]:
     if not isinstance(parts, Sequence) or not all(isinstance(p, AnyRows) for p in parts):
         kinds = type(rows).__name__
         remedy = "`rows` must return Rows, PairRows, ParameterRows or DofRows, or a list of them."
-        raise ObservationError(f"sensor '{sensor}' gave a {kinds}", remedy=remedy)
+        raise ObservationError(f"`rows` of sensor '{sensor}' returned a {kinds}", remedy=remedy)
     count, n = len(body.tree.segments), body.tree.n_dofs
     for p in parts:
         if isinstance(p, Rows) and not p.segment.shape == p.group.shape == p.data.shape[1:] == (p.data.size // 8,):
             shapes = p.data.shape, p.segment.shape, p.group.shape
-            raise ObservationError(f"sensor '{sensor}' has rows of shapes {shapes}", remedy="Make them with Rows.of.")
+            raise ObservationError(f"sensor '{sensor}' has rows of shapes {shapes}", remedy="Create them with Rows.of.")
         if isinstance(p, Rows) and _kernels_checks.sound(p.data, p.segment, count):
             continue
         if isinstance(p, Rows) and not math.isfinite(p.data.sum()):
-            remedy = "Leave out what was not measured."
+            remedy = "Leave out rows that were not measured."
             raise ObservationError(f"sensor '{sensor}' has rows that are not finite", remedy=remedy)
         if p.weight.ndim == 1 and len(p) and p.weight.min() < 0.0:
             raise ObservationError(f"sensor '{sensor}' has rows of negative weight", remedy="Weights are 1/σ².")

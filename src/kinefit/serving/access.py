@@ -60,8 +60,8 @@ class Access:
         self.host = host
         self.token = secrets.token_urlsafe(_TOKEN_BYTES) if token is None else token
         if not _TOKEN.fullmatch(self.token):
-            remedy = f"Give 16 to 128 letters, digits, - and _, by --token or {TOKEN_VARIABLE}; or leave it out."
-            raise ExportError(f"a token of {len(self.token)} characters that cannot be used", remedy=remedy)
+            remedy = f"Give 16 to 128 letters, digits, - and _, with --token or {TOKEN_VARIABLE}; or leave it out."
+            raise ExportError(f"a token of {len(self.token)} characters is not valid", remedy=remedy)
         self.is_local = host == "localhost" or (_is_number(host) and ipaddress.ip_address(host).is_loopback)
         self._readers = readers and self.is_local
 
@@ -71,8 +71,8 @@ class Access:
         if self.is_local:
             return None
         return (
-            f"The server at {self.host or 'all addresses'} is open to the network: whoever has its token sees and "
-            "changes what you see, and as it is not encrypted, the network's other computers can read the token."
+            f"The server at {self.host or 'all addresses'} is open to the network: everyone with its token can see and "
+            "control this session. The connection is not encrypted, so other computers in reach can read the token."
         )
 
     def url(self, port: int) -> str:
@@ -91,7 +91,7 @@ class Access:
         """
         hosts = [host.lower() for host in headers.get_all("Host")]
         if len(hosts) != 1 or not self._is_own(hosts[0], address, port):
-            return Refusal(HTTPStatus.MISDIRECTED_REQUEST, f"This host is not served here; the port is {port}.")
+            return Refusal(HTTPStatus.MISDIRECTED_REQUEST, f"This host name is not served; the port is {port}.")
         origins = [origin.lower() for origin in headers.get_all("Origin")]
         if origins and origins != [f"http://{hosts[0]}"]:
             return Refusal(HTTPStatus.FORBIDDEN, "Pages of other servers may not connect.")

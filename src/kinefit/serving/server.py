@@ -197,9 +197,9 @@ class PageServer:
             listener = socket.create_server(found[0][4], family=found[0][0])
         except (OSError, UnicodeError) as error:  # a host that is no name at all is the second
             reason = getattr(error, "strerror", None) or error
-            remedy = "Name another port, or stop what uses it."
+            remedy = "Give another port with --port, or stop the program that uses it."
             raise ExportError(
-                f"nothing can be served at {access.host}:{port} ({reason})", place="--port", remedy=remedy
+                f"the server cannot start at {access.host}:{port} ({reason})", place="--port", remedy=remedy
             ) from error
         self.port: int = listener.getsockname()[1]
         self._loop = asyncio.SelectorEventLoop()  # which asks the listener, on every system

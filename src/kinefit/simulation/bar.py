@@ -55,7 +55,7 @@ def wave_bar(
         `length` or `count` is not positive.
     """
     if not (length > 0 and count > 0):
-        raise ObservationError(f"a bar of {length} m at {count} places", remedy="Give positive numbers.")
+        raise ObservationError(f"length is {length} m, count is {count}", remedy="Give positive numbers.")
     rng = np.random.default_rng(seed)
     middle = rng.uniform(np.asarray(low, float), np.asarray(high, float), (count, 3))
     direction = rng.normal(size=(count, 3))

@@ -65,7 +65,7 @@ def portrait(body: Body, azimuth: float = 40.0, size: tuple[int, int] = (900, 90
         Closures contradict each other; the body has no surfaces.
     """
     if not body.surfaces:
-        raise BodyError(f"body '{body.name}' has no surfaces to draw", remedy="Give its segments some.")
+        raise BodyError(f"body '{body.name}' has no surfaces to render", remedy="Add a surface to its segments.")
     state = closed_poses(body, most=1)[0] if body.closures else body.usual_state()
     count = len(body.tree.segments)
     motion = Motion(

@@ -13,7 +13,7 @@ from kinefit.observations.recordings import mirror_name
 from kinefit.readers.keypoint_sets import keypoint_names
 
 _MARGIN_SHARE = 0.04  # of the image, free around the person
-_MIN_DISTANCE = 3.0  # [m]
+_MIN_DISTANCE, _MAX_DISTANCE = 3.0, 60.0  # [m]
 _MEAN_SWAP_FRAMES = 8  # length of a left-right swap
 _DEFAULT_VOLUME = np.array([[-0.8, 0.0, -0.8], [0.8, 2.0, 0.8]])  # [m], y up
 
@@ -48,10 +48,10 @@ def studio_rig(
     Raises
     ------
     ObservationError
-        `cameras` is below 1.
+        `cameras` is below 1; a camera sees all of the motion from no place within 60 m.
     """
     if cameras < 1:
-        raise ObservationError(f"a rig of {cameras} cameras", remedy="Give one or more.")
+        raise ObservationError(f"cameras is {cameras}", remedy="Give one or more.")
     up = up or (motion.up if motion is not None else "y")
     R_world = rotation_between_up("y", up)  # built y up, then turned
     if motion is None:
@@ -65,12 +65,18 @@ def studio_rig(
     for k in range(cameras):
         azimuth = 2 * np.pi * (k + 0.5) / cameras + (0.22 if k % 2 else -0.12)
         height = low[1] + (1.3, 1.9, 1.5, 2.2)[k % 4]
-        for distance in np.arange(_MIN_DISTANCE, 60.0, 0.1):
+        for distance in np.arange(_MIN_DISTANCE, _MAX_DISTANCE, 0.1):
             place = centre + distance * np.array([np.cos(azimuth), 0.0, np.sin(azimuth)])
             place[1] = height
             camera = _camera(f"cam{k + 1:02d}", size, focal, place, centre)
             if _sees(camera, corners):
                 break
+        else:
+            extent = " x ".join(f"{size:.1f}" for size in high - low)
+            raise ObservationError(
+                f"no place within {_MAX_DISTANCE:.0f} m from which camera {k + 1} sees all of the motion ({extent} m)",
+                remedy="Give a shorter focal length, or a part of the motion.",
+            )
         placed.append(camera.with_pose(camera.T_camera_world @ _turn(R_world.T)))
     return Rig(tuple(placed))
 
@@ -153,9 +159,9 @@ def simulate_keypoints(
             raise ObservationError(f"{name} is {share}", remedy="Give a share between 0 and 1.")
     for name, size in (("noise_px", noise_px), ("drift_px", drift_px)):
         if not 0.0 <= size < np.inf:
-            raise ObservationError(f"{name} is {size}", remedy="Give a standard deviation in pixels.")
+            raise ObservationError(f"{name} is {size}", remedy="Give a standard deviation in pixels, 0 or more.")
     if not 0.0 < drift_time < np.inf:
-        raise ObservationError(f"drift_time is {drift_time}", remedy="Give a time in seconds.")
+        raise ObservationError(f"drift_time is {drift_time}", remedy="Give a time in seconds, above 0.")
     keep = float(np.exp(-1.0 / (motion.rate * drift_time)))
     names = keypoint_names(keypoint_set)
     random = np.random.default_rng(seed)

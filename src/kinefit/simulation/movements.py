@@ -62,7 +62,7 @@ def movement(name: str, body: Body | None = None, *, rate: float = 30.0, speed: 
     if name not in MOVEMENTS:
         raise ObservationError(choices("movement", name, MOVEMENTS))
     if not (0.0 < rate < np.inf and 0.0 < speed < np.inf):
-        problem = f"a movement at {rate} Hz and speed {speed}"
+        problem = f"rate is {rate} Hz, speed is {speed}"
         raise ObservationError(problem, remedy="Give positive numbers.")
     body = load_body("humanoid10") if body is None else body
     count = max(round(rate * DURATION / speed), 2)

@@ -57,8 +57,8 @@ def in_front(
             return placed
     depth = float(np.ptp(points @ ahead))
     raise ObservationError(
-        f"{camera.name} sees this motion, {depth:.1f} m deep, from nowhere as a whole within {near:g} to {far:g} m",
-        remedy="Choose frames in which the person stays in one place, or give a distance.",
+        f"no place of {camera.name} has the whole motion ({depth:.1f} m deep) in view from {near:g} to {far:g} m",
+        remedy="Choose frames in which the person moves less, or give a distance.",
     )
 
 

@@ -112,7 +112,7 @@ def write_recording(
         if name not in SENSORS:
             raise ObservationError(choices("sensor", name, SENSORS))
     if not chosen:
-        raise ObservationError("no sensor is named", remedy=f"Name some of: {', '.join(SENSORS)}.")
+        raise ObservationError("no sensor is given", remedy=f"Give at least one of: {', '.join(SENSORS)}.")
     cameras = _cameras(motion, chosen, distance, azimuth, height)
     scene = SimulatedScene.of(motion)
     if room:
@@ -134,7 +134,7 @@ def write_recording(
     except OSError as error:  # PyAV's file errors are OSErrors too
         raise ExportError(
             f"the recording cannot be written ({error.strerror or error})", file=folder,
-            remedy="Name a folder that can be written, on a disk with free space.",
+            remedy="Give a folder that can be written, on a disk with free space.",
         ) from error
     return folder / "take.toml"
 
@@ -195,7 +195,7 @@ def _write_depth(job: _Job, sensor: DepthSensor, folder: Path) -> list[str]:
 
 def _save(path: Path, image: NDArray) -> None:
     if not cv2.imwrite(str(path), image):
-        raise OSError(f"no picture could be written to {path.name}")
+        raise OSError(f"no image could be written to {path.name}")
 
 
 def _write_video(job: _Job, name: str, sensor: ColourSensor, path: Path, *, grey: bool) -> None:

@@ -44,7 +44,7 @@ def replayed(
         A number is not finite; the slope is 90 degrees or more.
     """
     if not np.isfinite([slope, heading, speed, gain]).all() or abs(slope) >= 90.0:
-        problem = f"a slope of {slope:g} deg with {speed:g} m/s and {gain:g} m/s²"
+        problem = f"slope is {slope:g} degrees, speed {speed:g} m/s, gain {gain:g} m/s²"
         raise ObservationError(problem, remedy="Give a slope below 90 degrees, and finite numbers.")
     down, T = _ground(motion, slope, heading)
     t = motion.times - motion.times[0]
@@ -99,7 +99,7 @@ def film(
     """
     target = Path(path)
     if target.suffix.lower() != ".mp4":
-        raise ExportError("a video is an .mp4 file", file=path, remedy=f"Call it {target.stem}.mp4.")
+        raise ExportError("videos are written only as .mp4", file=path, remedy=f"Write to {target.stem}.mp4.")
     lines, (up, _, R) = _lines(motion, slope, heading), _inclined(motion, slope, heading)
     codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
     try:
@@ -112,7 +112,7 @@ def film(
             container.mux(stream.encode())
     except OSError as error:
         problem = f"the video cannot be written ({error.strerror or error})"
-        raise ExportError(problem, file=path, remedy="Name a folder that can be written, with room.") from error
+        raise ExportError(problem, file=path, remedy="Give a writable folder with free space.") from error
 
 
 def _cameras(motion: Motion, heading: float, azimuth: float, size: tuple[int, int]) -> list[Camera]:

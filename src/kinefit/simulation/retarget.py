@@ -176,7 +176,7 @@ def _targets(body: Body, bones: BoneDirections) -> tuple[PointSet, NDArray, NDAr
     if lacking:
         raise BodyError(
             choices("segment or landmark", lacking[0], (*tree.segments, *body.landmarks.names)),
-            remedy="Motions are retargeted to bodies made like the catalogue's humanoid.",
+            remedy="Use the humanoid of the catalogue, or a body with its segments and landmarks.",
         )
     offset = {name: tree.offsets[tree.segment(name)] for name in tree.segments}
     local = {name: body.landmarks.points[body.landmarks.index(name)] for name in _POINTS}
@@ -252,8 +252,8 @@ def cut(motion: Motion, start: int, stop: int | None = None) -> Motion:
     rows = slice(start, stop)
     if not len(motion.times[rows]):
         raise ObservationError(
-            f"no frames between {start} and {stop} of '{motion.name}'",
-            remedy=f"It has the frames 0 to {len(motion) - 1}.",
+            f"'{motion.name}' has no frames between {start} and {stop}",
+            remedy=f"Give frames from 0 to {len(motion) - 1}.",
         )
     residuals = {
         name: replace(

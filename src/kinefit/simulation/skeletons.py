@@ -71,7 +71,7 @@ def steps(frames: int, rate: float, new_rate: float) -> NDArray:
         The new rate is not positive.
     """
     if not 0 < new_rate < np.inf:
-        raise ObservationError(f"the rate {new_rate} is not positive", remedy="Give frames a second.")
+        raise ObservationError(f"the rate {new_rate} is not positive", remedy="Give frames per second.")
     return np.arange(int((frames - 1) / rate * new_rate + 1e-6) + 1) * (rate / new_rate)
 
 

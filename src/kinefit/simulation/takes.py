@@ -60,7 +60,7 @@ def write_synthetic_take(folder: str | os.PathLike[str], seed: int = 0) -> Path:
     except OSError as error:  # PyAV's file errors are OSErrors too
         raise ExportError(
             f"the synthetic take cannot be written ({error.strerror or error})", file=folder,
-            remedy="Name a folder that can be written and has 10 MB free.",
+            remedy="Give a folder that can be written, on a disk with 10 MB free.",
         ) from error
     return folder / "take.toml"
 
@@ -85,7 +85,7 @@ def _landmarks(keypoints: Keypoints) -> np.ndarray:
 
 def _take(motion: Motion, rig: Rig) -> str:
     parts = [
-        "# A drawn figure that squats and waves, in four cameras. No recording of a person.\n",
+        "# A simulated figure that squats and waves, in four cameras. No recording of a person.\n",
         f'[take]\nname = "{motion.name}"\nrate = {motion.rate}\nup = "{motion.up}"\nbody = "{motion.body.name}"\n',
         '[calibration]\nfile = "calibration.toml"\n',
     ]

@@ -40,8 +40,8 @@ def on_body(motion: Motion, body: Body) -> Motion:
     names = tuple(name for name in body.landmarks.names if name in motion.body.landmarks.names)
     if len(names) < _MIN_LANDMARKS:
         raise BodyError(
-            f"the bodies '{motion.body.name}' and '{body.name}' have {len(names)} landmarks in common",
-            remedy=f"Take a body with {_MIN_LANDMARKS} or more of: {', '.join(motion.body.landmarks.names)}.",
+            f"the bodies '{motion.body.name}' and '{body.name}' have only {len(names)} landmarks in common",
+            remedy=f"Use a body with {_MIN_LANDMARKS} or more of: {', '.join(motion.body.landmarks.names)}.",
         )
     points, scale = body.landmarks.select(names), 1.0
     if body.stature > 0 and motion.body.stature > 0:

@@ -63,7 +63,7 @@ class SmoothedTake:
 
 def smooth_results(
     body: Body, frames: TrackedFrames, settings: TrackSettings, *, contacts: bool = False, up: str = "z",
-    eye: NDArray | None = None, level: bool = True, window: int = 300, overlap: int = 60,
+    eye: NDArray | None = None, level: bool = True, windows: tuple[int, int] = (300, 60),
 ) -> SmoothedTake:  # fmt: skip
     """Smooth tracked frames of any sensors jointly.
 
@@ -77,21 +77,21 @@ def smooth_results(
     eye : (3,) [m] centre of the camera, if it is the only sensor, see `find_contacts`. The noise of its keypoints is
         then never estimated below the stated one, since no other view shows their systematic errors.
     level : bool, `up` is measured, so that the floor is level
-    window, overlap : number of frames that are solved at a time, and that two neighbouring windows share
+    windows : number of frames that are solved at a time, and that two neighbouring windows share
     """
     take = replace(_take(as_tracked(body, frames, settings), settings), one_view=eye is not None)
     channels, swapped, others = take.channels, take.swapped, take.others
-    strength, take, rounds = _estimate(take, settings, window, overlap)
-    take, covariances, others_matched = solved_with_covariances(take, strength, window, overlap)
+    strength, take, rounds = _estimate(take, settings, *windows)
+    take, covariances, others_matched = solved_with_covariances(take, strength, *windows)
     new_swaps = _swaps(take)
     if not np.array_equal(new_swaps, swapped):
         uv, confidence = correct_swaps(channels, new_swaps)
         uv = without_bias(body, channels, uv, take.roots, take.angles)
         take, swapped = replace(take, uv=uv, confidence=confidence, swapped=new_swaps), new_swaps
-        take, covariances, others_matched = solved_with_covariances(take, strength, window, overlap)
+        take, covariances, others_matched = solved_with_covariances(take, strength, *windows)
     for _ in range(_CONTACT_ROUNDS if contacts else 0):  # covariances stay those without: a contact is no measurement
         found = find_contacts(body, take.roots, take.angles, frames.rate, up, eye, level=level)
-        take, others_matched = solved(replace(take, contacts=found), strength, window, overlap)
+        take, others_matched = solved(replace(take, contacts=found), strength, *windows)
     take = replace(take, angles=unwrap(body.tree, take.angles))
     hard = hard_equations(body)
     take = take if hard is None else _closed(take, hard)
@@ -252,7 +252,7 @@ def _provenance(take: SmoothTake, strength: Strength, rounds: int) -> dict[str, 
     speeds = {} if take.speed_std is None else dict(zip(take.body.dof_names, take.speed_std.round(4).tolist()))
     scale = {} if take.others is None else {name: round(v, 2) for name, v in take.others.scale.items()}
     return {
-        "acceleration": {name: round(float(v), 2) for name, v in zip(coordinates, values, strict=True)},
+        "acceleration": {name: float(f"{v:.4g}") for name, v in zip(coordinates, values, strict=True)},
         "acceleration_memory": take.memory[0],
         "velocity_memory": take.memory[1],
         "speed_std": speeds,

@@ -83,8 +83,8 @@ def normal_equations(
     rows, pairs, parameters, dense = sort_out(parts)
     tree = body.tree
     n = tree.n_dofs
-    _within("segment", len(tree.segments), body, rows.segment, *(q.segments for q in pairs))
-    _within("degree of freedom", n, body, *(p.index for p in parameters))
+    check_indices("segment", len(tree.segments), body, rows.segment, *(q.segments for q in pairs))
+    check_indices("degree of freedom", n, body, *(p.index for p in parameters))
     _, screws = tree.forward(state.T_world_root, state.angles)
     centre = np.ascontiguousarray(state.T_world_root[:3, 3])
     chain, depth = tree.chain, tree.depth
@@ -209,8 +209,14 @@ def design(body: Body, state: BodyState, rows: Rows | DofRows) -> NDArray:
     return out
 
 
-def _within(what: str, count: int, body: Body, *indices: NDArray) -> None:
-    """Check indices before kernels use them: kernels check no bounds."""
+def check_indices(what: str, count: int, body: Body, *indices: NDArray) -> None:
+    """Check indices (N,) or (N, 2) of rows before kernels use them: kernels check no bounds.
+
+    Raises
+    ------
+    ObservationError
+        An index is negative, or `count` or more.
+    """
     for index in indices:
         if index.size and not 0 <= index.min() <= index.max() < count:
             raise ObservationError(

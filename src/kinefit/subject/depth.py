@@ -79,10 +79,10 @@ def fit_surfaces(
         The body has no surfaces.
     """
     if not len(clouds) or len(clouds) != len(states):
-        raise ObservationError(f"{len(clouds)} clouds with {len(states)} states", remedy="Give one state a cloud.")
+        raise ObservationError(f"{len(clouds)} clouds but {len(states)} states", remedy="Give one state a cloud.")
     given = [x[np.isfinite(x).all(axis=1)] for x in (np.asarray(c, float).reshape(-1, 3) for c in clouds)]
     if not all(map(len, given)):
-        raise ObservationError("a cloud without points", remedy="Leave that frame out.")
+        raise ObservationError("a cloud has no points", remedy="Leave out this frame.")
     if camera is not None and not views:
         views = [_view(x, camera) for x in given]
     settings = replace(TrackSettings(), points=points)

@@ -80,19 +80,19 @@ def fit_subject(
         No frames, other numbers of frames than of poses; rows of a sensor that cannot be used.
     """
     if not steps or len(steps) != len(states) or not all(len(several) for several in steps):
-        problem = f"{len(steps)} frames of measurements with {len(states)} states"
+        problem = f"{len(steps)} frames of measurements but {len(states)} states, or a frame without measurements"
         raise ObservationError(problem, remedy="Give one state for each frame, and measurements in each.")
     given = {"times": times, "velocities": velocities}
     wrong = [name for name, values in given.items() if values is not None and len(values) != len(steps)]
     if wrong:
-        raise ObservationError(f"other {wrong[0]} than frames", remedy=f"Give {len(steps)}, one for each frame.")
+        raise ObservationError(f"{wrong[0]} and frames differ in number", remedy=f"Give {len(steps)} {wrong[0]}.")
     if rounds < 1 or not reach or (looks is not None and not looks > 0):
-        problem = f"{rounds} rounds, {len(reach)} reaches, {looks} looks"
-        raise ObservationError(problem, remedy="Give one round and one reach at least, and looks above 0.")
+        problem = f"rounds = {rounds}, {len(reach)} values of reach, looks = {looks}: too few"
+        raise ObservationError(problem, remedy="Give at least one round and one value of reach, and looks above 0.")
     names, mean, information, step = stacked(parameters)
     worlds, prior = Worlds(World(body, rig), parameters), Prior(mean, information)
     theta = np.array(mean if start is None else start, float)
-    check_shape(theta, mean.shape, f"a start for {', '.join(names)}")
+    check_shape(theta, mean.shape, f"the start for {', '.join(names)}")
     sensors = tuple({m.sensor: None for several in steps for m in several})
     rematched = not all(m.settled for several in steps for m in several)
     shares = {} if looks is None else dict.fromkeys(sensors, min(looks / len(steps), 1.0))

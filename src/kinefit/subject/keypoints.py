@@ -47,8 +47,7 @@ def fit_subject(
     frames: int = 25,
     height: float | None = None,
     trial: Subject | None = None,
-    cameras: CameraErrors | None = None,
-    moved: CameraExtrinsics | None = None,
+    cameras: CameraErrors | CameraExtrinsics | None = None,
     view_bias: bool = False,
     progress: Progress | None = None,
 ) -> Subject:
@@ -61,8 +60,8 @@ def fit_subject(
     frames : int, number of frames used, spread over the take
     height : float [m] of the person: lengths that no two points measure scale with it
     trial : subject of another trial of the same person: its lengths and their covariance are the prior
-    cameras : standard deviations of the calibration: cameras are fitted too; default: the calibration is exact
-    moved : camera parameters of an earlier fit, if the rig already has the poses that it found
+    cameras : standard deviations of the calibration, or camera parameters of an earlier fit if the rig already has the
+        poses that it found: cameras are fitted too; default: the calibration is exact
     view_bias : whether the detectors' bias by direction of view is estimated, of points that three cameras detect
     progress : called with the name of the work, the steps done and all steps
 
@@ -87,8 +86,8 @@ def fit_subject(
             progress("bone lengths", i + 1, len(chosen) + 1)
     if not states:
         raise TrackingError(
-            "no frame shows enough of the person in two cameras to start from",
-            remedy="Check the calibration and that the cameras are in step (kinefit track -v).",
+            "no frame shows enough of the person in two cameras",
+            remedy="Check calibration and clocks of the cameras with kinefit check.",
         )
     weight = _weights(near, sized, states)
     sensor, layout = KeypointSensor(channels.rig, {}, 0.0, geman_mcclure(), joint.REACH[0]), Layout(channels, body)
@@ -103,9 +102,11 @@ def fit_subject(
     if trial is not None and trial.covariance is not None:
         known = trial.covariance[: len(scales), : len(scales)]
         lengths = KnownLengths(body, scales=trial.scales, covariance=known)
-    found, covariance, bias = _fitted(
-        body, channels, steps, list(states.values()), lengths, scales, cameras, moved, view_bias
-    )  # fmt: skip
+    if isinstance(cameras, CameraErrors):
+        cameras = CameraExtrinsics.of(
+            cameras, channels.rig, tuple(channels.rig.names[c] for c in np.unique(channels.camera))
+        )  # fmt: skip
+    found, covariance, bias = _fitted(body, channels, steps, list(states.values()), lengths, scales, cameras, view_bias)
     if progress:
         progress("bone lengths", len(chosen) + 1, len(chosen) + 1)
     sets = tuple(name for name in channels.sets if name)
@@ -115,8 +116,7 @@ def fit_subject(
 
 def _fitted(
     body: Body, channels: Channels, steps: Sequence[Sequence[KeypointMeasurement]], states: Sequence[BodyState],
-    lengths: SegmentScales, scales: NDArray, errors: CameraErrors | None,
-    known: CameraExtrinsics | None, by_view: bool,
+    lengths: SegmentScales, scales: NDArray, cameras: CameraExtrinsics | None, by_view: bool,
 ) -> tuple[SubjectFit, NDArray, ViewBias]:  # fmt: skip
     """Fit lengths, points, gear and cameras; returns the fit, its covariance, and the detectors' bias by view.
 
@@ -128,11 +128,8 @@ def _fitted(
     spread, excess_of, start, gear, bias = np.array(_OFFSET_PRIOR_STDS), 1.0, None, Gear(body), ViewBias()
     sets = [name for name in channels.sets if name]
     shares = [body.offset_shares[body.keypoints(name).segments] for name in sets]
-    cameras: CameraExtrinsics | None = None
     bare = body if body.morphs else replace(body, surfaces=(), skin=None)  # saves scaling surfaces
-    used = tuple(channels.rig.names[c] for c in np.unique(channels.camera))
-    if errors is not None:
-        cameras = replace(known or CameraExtrinsics.of(errors, channels.rig, used), rig=channels.rig)
+    cameras = cameras and replace(cameras, rig=channels.rig)
     for k in range(_ROUNDS):
         offsets = [
             PointOffsets(body, name, spread[(own < 1.0).astype(int)] * own) for name, own in zip(sets, shares)

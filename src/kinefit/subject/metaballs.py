@@ -179,8 +179,8 @@ def fit_balls(
     s = np.broadcast_to(np.asarray(sigma, float), len(x))
     count = limb.radii.size + len(limb.weights) * weights
     if x.ndim != 2 or x.shape[1:] != (3,) or len(x) < count or not np.isfinite(x).all() or not (s > 0).all():
-        problem = f"{len(x)} points of shape {x.shape} for {count} numbers of a limb"
-        raise ObservationError(problem, remedy="Give more points (N, 3) about it, finite, with positive deviations.")
+        problem = f"points of shape {x.shape} do not determine the limb's {count} parameters"
+        raise ObservationError(problem, remedy=f"Give (N, 3) finite points, N >= {count}, with positive sigma.")
     prior = _prior(limb, weights, girth)
     theta, H, r, tried = _least_squares(
         lambda t: _distances(unmeshed(limb, t, weights), x, weights), np.zeros(count), prior, s**-2.0,
@@ -253,8 +253,8 @@ def _least_squares(
             damping *= 10.0
             if damping > 1e8:
                 k = int(np.argmin(trial[:radii])) // 3
-                problem = f"ball {k + 1} collapses: a radius falls below {np.exp(lowest):.2g} of what it was"
-                raise BodyError(problem, remedy="Give points about all of the limb, or fewer balls.")
+                problem = f"ball {k + 1} collapses: a radius falls below {np.exp(lowest):.2g} of its start"
+                raise BodyError(problem, remedy="Give points all around the limb, or fewer balls.")
             continue
         H2, b2, cost2, r2 = normal(trial)
         if cost2 <= cost:

@@ -109,8 +109,8 @@ class SegmentScales:
 
     def __post_init__(self) -> None:
         if not ((self.size is None or self.size > 0) and self.about > 0 and self.proportions > 0):
-            problem = f"a size of {self.size} about {self.about} with proportions of {self.proportions}"
-            raise BodyError(problem, remedy="Give shares of the body's size above 0.")
+            problem = f"size = {self.size}, about = {self.about}, proportions = {self.proportions}: not all positive"
+            raise BodyError(problem, remedy="Give values above 0.")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -207,11 +207,11 @@ class PointOffsets:
     def __post_init__(self) -> None:
         sets = {**self.body.keypoint_sets, **self.body.marker_sets}
         if self.name not in sets:
-            raise BodyError(choices(f"set of points of body '{self.body.name}' named", self.name, sets))
+            raise BodyError(choices(f"point set of body '{self.body.name}' named", self.name, sets))
         std = np.asarray(self.std, float)
         if std.shape not in ((), (len(self.points),)) or not np.all(std > 0):
-            problem = f"standard deviations of shape {std.shape} for the {len(self.points)} points of '{self.name}'"
-            raise BodyError(problem, remedy="Give one, or one for each point, in metres above 0.")
+            problem = f"std of shape {std.shape} does not fit the {len(self.points)} points of '{self.name}'"
+            raise BodyError(problem, remedy="Give one value, or one for each point, in metres above 0.")
 
     @property
     def points(self) -> PointSet:
@@ -316,7 +316,7 @@ def stacked(parameters: Sequence[Parameters]) -> tuple[tuple[str, ...], NDArray,
     twice = sorted({name for name in names if names.count(name) > 1})
     if not names or twice:
         problem = f"two parameters named '{twice[0]}'" if twice else "no parameters to fit"
-        raise ObservationError(problem, remedy="Give every kind of parameter once, such as SegmentScales(body).")
+        raise ObservationError(problem, remedy="Give each kind of parameter once, such as SegmentScales(body).")
     information, first = np.zeros((len(names), len(names))), 0
     for kind in parameters:
         own = slice(first, first := first + len(kind.names))

@@ -67,7 +67,7 @@ class CameraExtrinsics:
         for name in (*(self.cameras or ()), *(() if self.held is None else (self.held,))):
             self.rig.index(name)
         if not all(std > 0 for std in self.std):
-            raise ObservationError(f"standard deviations of {self.std}", remedy="Give metres and radians above 0.")
+            raise ObservationError(f"std is {self.std}", remedy="Give values above 0, in metres and radians.")
 
     @classmethod
     def of(
@@ -230,7 +230,7 @@ class SensorFrames:
 
     def __post_init__(self) -> None:
         if not all(std > 0 for std in self.std):
-            raise ObservationError(f"standard deviations of {self.std}", remedy="Give m, rad and s above 0.")
+            raise ObservationError(f"std is {self.std}", remedy="Give values above 0, in metres, radians and seconds.")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -285,8 +285,8 @@ class OwnUnknowns:
         for sensor, own in self.unknowns.items():
             for name, unknown in own.items():
                 if not (np.isfinite(unknown.mean) and 0.0 < unknown.std < np.inf):
-                    problem = f"sensor '{sensor}' knows '{name}' as {unknown.mean} ± {unknown.std}"
-                    raise ObservationError(problem, remedy="Give a mean, and a standard deviation above 0.")
+                    problem = f"unknown '{name}' of sensor '{sensor}' is {unknown.mean} ± {unknown.std}"
+                    raise ObservationError(problem, remedy="Give a finite mean and a standard deviation above 0.")
 
     @classmethod
     def of(cls, sensors: Iterable[Sensor]) -> OwnUnknowns:

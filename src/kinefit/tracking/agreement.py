@@ -78,10 +78,10 @@ def sentences(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """The same in words, one for each sensor."""
     return [
         f"{sensor} contradicts the other cameras: half of its keypoints lie {t['median_px']:.0f} px or more from the "
-        f"fit, those of the others {t['others_px']:.0f} px; it counts for little. kinefit check tells more"
+        f"fit, those of the others {t['others_px']:.0f} px. It has a low weight; see kinefit check"
         if "median_px" in t else
         f"{sensor} contradicts the other sensors: half of its residuals exceed {1000 * t['median_m']:.0f} mm, "
-        f"{t['deviations']:.1f} of its standard deviations; it is shifted by "
+        f"{t['deviations']:.1f} of its standard deviations. It is shifted by "
         f"({', '.join(f'{1000 * v:+.0f}' for v in t['shift_m'])}) mm"
         for sensor, t in found.items()
     ]

@@ -66,13 +66,13 @@ def sentences(provenance: Mapping[str, Any], errors: CameraErrors | None) -> lis
         if np.any(np.abs(moved) > most):
             shift, turn = 1e3 * np.linalg.norm(moved[:3]), np.degrees(np.linalg.norm(moved[3:]))
             out.append(
-                f"camera {name} was found {shift:.0f} mm and {turn:.2f} degrees from its calibration, more than it may "
-                "be off by: `kinefit check` looks closer"
+                f"camera {name} was found {shift:.0f} mm and {turn:.2f} degrees from its calibration, more than the "
+                "calibration's error allows: run kinefit check"
             )
     for name, (shift, turn) in provenance.get(LEFT_OUT, {}).items():
         out.append(
-            f"depth camera {name} was left out: what it sees lies on the person only where the camera is turned by "
-            f"{np.degrees(turn):.0f} degrees and moved by {1e3 * shift:.0f} mm. Correct its pose in the calibration"
+            f"depth camera {name} was excluded: its images fit the person only after a rotation by "
+            f"{np.degrees(turn):.0f} degrees and a shift by {1e3 * shift:.0f} mm. Correct its pose in the calibration"
         )
     return out
 

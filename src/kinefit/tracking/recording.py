@@ -96,19 +96,19 @@ class Recording:
         of_kind(self.rig, Rig, "the rig of a recording", "Give a Rig, such as read_calibration returns.")
         of_kind(self.rate, Real, "the rate of a recording", "Give it in Hz.")
         if not len(self.times) or not 0.0 < self.rate < np.inf:
-            problem = f"a recording of {len(self.times)} steps at {self.rate} Hz"
-            raise ObservationError(problem, remedy="Give sensors that share some time, and a positive rate.")
+            problem = f"the recording has {len(self.times)} steps at {self.rate} Hz"
+            raise ObservationError(problem, remedy="Give sensors that overlap in time, and a positive rate.")
         if self.up not in UP_AXES:
             raise ObservationError(choices("vertical axis", self.up, UP_AXES))
         if self.start is not None and not 0 <= self.start[0] < len(self.times):
-            problem = f"a start at step {self.start[0]} of {len(self.times)}"
-            raise ObservationError(problem, remedy="Start at a step of the recording.")
+            problem = f"start is at step {self.start[0]}, but the recording has {len(self.times)} steps"
+            raise ObservationError(problem, remedy=f"Start at a step from 0 to {len(self.times) - 1}.")
         for name in (*self.on_body, *self.backgrounds):
             self.rig.index(name)
         names = [s.name for s in self.sensors]
         for name in names:
             if names.count(name) > 1:
-                raise ObservationError(f"two sensors are named '{name}'", remedy="Give each its own name.")
+                raise ObservationError(f"two sensors are named '{name}'", remedy="Give each sensor its own name.")
 
     def __len__(self) -> int:
         return len(self.times)
@@ -143,14 +143,14 @@ class Recording:
             Nobody is seen in any frame, or fewer people than the number.
         """
         given = () if keypoints is None else keypoints
-        of_kind(given, Sequence, "keypoints", "Give a list of Keypoints, one a camera.", each=Keypoints)
+        of_kind(given, Sequence, "keypoints", "Give a list of Keypoints, one for each camera.", each=Keypoints)
         if not given:
-            remedy = "Name at least one [[keypoints]] in the take."
+            remedy = "Add at least one [[keypoints]] to the take."
             raise ObservationError("there are no keypoints to track", remedy=remedy)
         lengths, rates = {len(k) for k in keypoints}, {k.rate for k in keypoints}
         if len(lengths) > 1 or len(rates) > 1:
             streams = ", ".join(f"{k.camera}: {len(k)} frames at {k.rate:g} Hz" for k in keypoints)
-            raise ObservationError(f"keypoint streams differ ({streams})", remedy="Set frames or rate in the take.")
+            raise ObservationError(f"keypoint streams differ ({streams})", remedy="Set frames or rate in [take].")
         sigmas = _sigmas(sigma, len(keypoints))
         one = follow(rig, keypoints, person, people)
         records, times = person_records(one.keypoints, choose_people(rig, one.keypoints)), keypoints[0].times
@@ -208,12 +208,12 @@ class Recording:
         of_kind(rig, Rig, "the rig", "Give a Rig; without cameras Rig(()).")
         of_kind(steps, Sequence, "steps", "Give a list of steps, each a list of frames.", each=Sequence)
         if not (is_number(rate) and 0.0 < rate < np.inf):
-            raise ObservationError(f"steps at {rate} Hz", remedy="Give a positive rate.")
+            raise ObservationError(f"rate is {rate} Hz", remedy="Give a positive rate.")
         by_source = frames_by_source(steps)
         mean_times = [float(np.mean([f.time for f in seen])) if len(seen) else np.nan for seen in steps]
         timed = np.flatnonzero(np.isfinite(mean_times))
         if not len(timed):
-            raise ObservationError("no step with a frame", remedy="Give what the sensors saw, a list of frames a step.")
+            raise ObservationError("no step has a frame", remedy="Give a list of frames for each step.")
         times = np.interp(np.arange(len(mean_times)), timed, np.array(mean_times)[timed])
         if len(timed) < len(mean_times):  # evenly beyond the ends
             even = times[timed[0]] + (np.arange(len(mean_times)) - timed[0]) / rate
@@ -228,7 +228,7 @@ class Recording:
         there |= {f"{m.sensor} {name}" for m in worn for name in m.markers.names}
         for name in sigma:
             if name not in there:
-                remedy = "Leave its standard deviation out, or correct its name."
+                remedy = "Correct its name in sigma, or leave it out."
                 raise ObservationError(choices("sensor", name, sorted(there)), remedy=remedy)
         records = keypoint_records(steps, rate, start=float(times[0]))
         others = [[f for f in seen if sensor_of(f) != KEYPOINTS] for seen in steps]
@@ -283,7 +283,7 @@ def frames_by_source(steps: Sequence[Sequence[Any]]) -> Mapping[type, Mapping[tu
                 part = next((getattr(f, name) for name in _PARTS if hasattr(f, name)), "") or ""
                 own = out[record].setdefault((f.sensor, part), {})
                 if i in own:
-                    problem = f"two frames of sensor '{f.sensor}' in step {i}"
+                    problem = f"step {i} has two frames of sensor '{f.sensor}'"
                     raise ObservationError(problem, remedy="Give each sensor its own name, or each time its own step.")
                 own[i] = f
     return out
@@ -310,8 +310,8 @@ def _sigmas(sigma: float | Sequence[float], count: int) -> tuple[float, ...]:
     """One standard deviation [px] for each of the records."""
     values = np.asarray(sigma, float).ravel()
     if len(values) not in (1, count) or not np.all((values > 0) & np.isfinite(values)):
-        problem = f"standard deviations {values}"
-        raise ObservationError(problem, remedy=f"Give one positive number of pixels, or {count}.")
+        problem = f"sigma is {values}"
+        raise ObservationError(problem, remedy=f"Give one positive number of pixels, or {count} of them.")
     return tuple(float(v) for v in np.broadcast_to(values, count))
 
 

@@ -168,9 +168,9 @@ def run(
             if progress:
                 progress("frames", i + 1 - begin, len(times))
         if not frames.place:
-            remedy = "Begin with a step that shows the whole person, or say where it stands: start=(step, state). "
-            remedy += "Check units, calibration and the range gate."
-            raise TrackingError(f"the body is found in none of the first {i + 1 - begin} steps", remedy=remedy)
+            remedy = "Start with a step that shows the whole person, or give the first pose: [start], or in Python "
+            remedy += "start=(step, state). Check units, calibration and the range of depth cameras."
+            raise TrackingError(f"the person is not found in the first {i + 1 - begin} steps", remedy=remedy)
         if checkpoint is not None and len(times) > at:
             tracker = frames.keep(checkpoint, tracker, len(times), anew)
         first = min(frames.place)
@@ -236,5 +236,5 @@ def restore_tracker(tracker: Tracker, state: Mapping[str, Any]) -> None:
         restore_state(tracker._recovery, state["recovery"])
         tracker.sensors.restore_state(state["sensors"])
     except (TypeError, ValueError, LookupError, AttributeError) as error:
-        remedy = "Run again: every frame is then computed anew."
-        raise FileError("a state of a tracker that kinefit did not write", remedy=remedy) from error
+        remedy = "Run again: all frames are then tracked again."
+        raise FileError("the stored state is not one of this tracker", remedy=remedy) from error

@@ -17,7 +17,7 @@ from kinefit.findings import INVERTED
 from kinefit.frame.results import FrameResult
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.initialization.from_depth import Start, sized_start, start_from_points
+from kinefit.initialization.from_depth import Start, StartSearch, sized_start, start_from_points
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import Channels, known_names, make_channels
@@ -108,17 +108,17 @@ def fitted_to_person(
     cameras, others = len({k.camera for k in recording.keypoints}), recording.sees_more
     if cameras == 1 and not (others or recording.start):
         name = recording.keypoints[0].camera
-        problem = f"the keypoints are of one camera only, {name}"
-        remedy = "Tracking needs two cameras or more, another sensor beside it, or points lifted to space"
-        raise TrackingError(problem, remedy=f"{remedy}: kinefit detect --force finds them in the video.")
+        problem = f"only one camera, {name}, has keypoints"
+        remedy = "Add a second camera or another sensor; or run kinefit detect --force, which also estimates 3D points"
+        raise TrackingError(problem, remedy=f"{remedy}.")
     ignored = {"a height": height, "a trial of the same person": trial, "shape_frames": frames}
     for what, given in ignored.items():
         if given is not None and subject is not None:
-            problem = f"{what} with a subject that is known already, or a body that is taken as it is"
-            raise ObservationError(problem, remedy=f"Leave {what} out: it would be ignored.")
+            problem = f"{what} has no effect: the size of the body is given"
+            raise ObservationError(problem, remedy=f"Leave out {what}, or the given subject.")
         if given is not None and cameras < 2 and given is not height:
-            problem = f"{what} is for lengths from keypoints, and this recording has none of two cameras"
-            raise ObservationError(problem, remedy="Leave it out, or add [[keypoints]] of two cameras.")
+            problem = f"{what} needs keypoints of two cameras, which this recording does not have"
+            raise ObservationError(problem, remedy=f"Leave out {what}, or add [[keypoints]] of two cameras.")
     person = SizedPerson(recording, Subject.as_is(body), recording.start, calibrated=recording.rig)
     unknown = any(s.unknowns for s in recording.sensors) or has_unknown_gear(body if subject is None else subject.body)
     if subject is not None:
@@ -129,7 +129,7 @@ def fitted_to_person(
         for last in (False,) * _MOVES + (True,):
             by_keypoints = fit_subject(
                 body, channels_of(person.recording, body, settings), frames=frames or 25, height=height, trial=trial,
-                cameras=settings.camera_errors, moved=moved, view_bias=settings.view_bias and not others,
+                cameras=moved or settings.camera_errors, view_bias=settings.view_bias and not others,
                 progress=progress,
             )  # fmt: skip
             if last or not (errors := by_keypoints.camera_errors):
@@ -229,7 +229,8 @@ def _is_inverted(
     if np.mean(scores) > _MIN_UPRIGHT:
         return False
     try:
-        turned = [start_from_points(body, None, camera, d, background=empty, up=-up, attempts=1)[0] for d in depths]
+        how = StartSearch(attempts=1)
+        turned = [start_from_points(body, None, camera, d, background=empty, up=-up, search=how)[0] for d in depths]
     except KinefitError:
         return False
     return bool(np.mean([start.score for start in turned]) > np.mean(scores) + _MIN_INVERTED_GAIN)

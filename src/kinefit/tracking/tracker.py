@@ -75,16 +75,16 @@ class Tracker:
         of_kind(sigma or {}, Mapping, "sigma", 'Give {"cam01": 8.0}: a number for each sensor.', each=Real)
         of_kind(values or {}, Mapping, "values", 'Give {sensor: {name: value}}.', each=Mapping)
         of_kind(sensors, Sequence, "sensors", "Give a list of sensors.")
-        of_kind(on_body, Collection, "on_body", "Give a list of names, also of one.")
+        of_kind(on_body, Collection, "on_body", "Give a list of names, even of one.")
         if not (is_number(rate) and 0.0 < rate < np.inf):
-            raise ObservationError(f"frames at {rate} Hz", remedy="Give a positive rate.")
+            raise ObservationError(f"rate is {rate} Hz", remedy="Give a positive rate.")
         self.rig, self.rate, self.up = rig, rate, up_vector(up)
         self.settings, self.values = settings or TrackSettings(), values or {}
         self.sensors = Sensors(rig, rate, sigma or {}, self.settings, sensors, tuple(on_body))
         unknown = [name for name in self.values if name not in {sensor.name for sensor in self.sensors.own}]
         if unknown:
             names = [sensor.name for sensor in self.sensors.own]
-            raise ObservationError(choices("sensor of one's own", unknown[0], names), remedy="Leave its values out.")
+            raise ObservationError(choices("custom sensor", unknown[0], names), remedy="Leave it out of values.")
         self.others: tuple[Scene, ...] = ()
         self.dropped = self.late = 0
         self._last: FrameResult | None = None
@@ -140,9 +140,9 @@ class Tracker:
 
     def start_at(self, state: BodyState) -> None:
         """Take a state as that of the last frame; its velocity is unknown. BodyError for another body's."""
-        of_kind(state, BodyState, "the state", "Give one as body.usual_state(T_world_root), or of a Motion.")
+        of_kind(state, BodyState, "the state", "Give body.usual_state(T_world_root), or a state of a Motion.")
         if len(state.angles) != len(self.body.tree.coordinates):
-            problem = f"a state of {len(state.angles)} angles, the body has {len(self.body.tree.coordinates)}"
+            problem = f"the state has {len(state.angles)} angles, the body {len(self.body.tree.coordinates)}"
             raise BodyError(problem, remedy="Give a state of this body.")
         self._prediction.start(state)
         self._recovery.started(state)
@@ -196,12 +196,12 @@ class Tracker:
             A tracker that keeps nothing, or has found nothing; contacts without smoothing.
         """
         if self._session is None:
-            raise ObservationError("this tracker keeps no frames", remedy="Make it with keep=True.")
+            raise ObservationError("this tracker stores no frames", remedy="Create it with keep=True.")
         if not len(self._session):
-            remedy = "Update it until it gives a result, or give it a start with start_at."
-            raise ObservationError("a session in which the body was not found", remedy=remedy)
+            remedy = "Call update until it returns a result, or give the first pose with start_at."
+            raise ObservationError("the person was not found in this session", remedy=remedy)
         if contacts and not smooth:
-            raise ObservationError("contacts without smoothing", remedy="Leave smooth as it is: contacts need it.")
+            raise ObservationError("contacts=True needs smoothing", remedy="Leave out smooth=False.")
         frames = self._session.frames(self.body, self.scene_of, self.apart)
         subject, how = Subject.as_is(self.body), Estimation(smooth=smooth, contacts=contacts)
         more = {"frames": {"dropped": self.dropped, "late": self.late}}
@@ -234,7 +234,7 @@ class Tracker:
             A camera, segment or keypoint set that is not known.
         """
         time = time_of(frames, time, self.sensors)
-        of_kind(others, Sequence, "others", "Give a list of scenes, as `scene_of` returns them.", each=Scene)
+        of_kind(others, Sequence, "others", "Give a list of scenes of `scene_of`.", each=Scene)
         kept = copy(self._prediction), self._last, self._seen.copy()
         before = self._time, self._recovery.clocks(), self.dropped, *kept
         learnt, self.others = self.sensors.learnt(), tuple(others)

@@ -72,23 +72,22 @@ def track(
     of_kind(recording, Recording, "the recording", "Give a Recording: Recording.of_keypoints(rig, keypoints).")
     of_kind(body, Body, "the body", 'Load it: load_body("humanoid").')
     if contacts and not smooth:
-        remedy = "Leave smooth as it is: contacts need the whole take."
-        raise ObservationError("contacts without smoothing", remedy=remedy)
+        raise ObservationError("contacts=True needs smoothing over the whole take", remedy="Leave out smooth=False.")
     if lag is not None and (contacts or not smooth):
-        what = "contacts, which need the whole take" if contacts else "no smoothing at all"
-        raise ObservationError(f"a lag of {lag:g} s together with {what}", remedy="Choose one of both.")
+        what = "contacts=True" if contacts else "smooth=False"
+        raise ObservationError(f"lag = {lag:g} s and {what} exclude each other", remedy="Leave out one of them.")
     if noise is not None and lag is None:
-        raise ObservationError("known noise without a lag", remedy="Leave it out: a whole take tells its own.")
+        raise ObservationError("noise needs a lag", remedy="Leave out noise: it is estimated from the whole take.")
     if lag is not None and lag_frames(lag, recording.rate) >= len(recording):
-        problem = f"a lag of {lag:g} s for {len(recording)} frames at {recording.rate:g} Hz"
-        raise ObservationError(problem, remedy="Smooth the whole take instead: leave the lag out.")
+        problem = f"lag = {lag:g} s is longer than the take of {len(recording)} frames at {recording.rate:g} Hz"
+        raise ObservationError(problem, remedy="Leave out the lag, to smooth over the whole take.")
     if height is not None and not 0.3 < height < 3.0:
-        raise ObservationError(f"a height of {height:g} m", remedy="Give the person's height in metres.")
+        raise ObservationError(f"height is {height:g} m", remedy="Give a height in metres, from 0.3 to 3.")
     settings = settings or TrackSettings()
     foreign = [sensor for sensor in recording.sensors if type(sensor).__module__.partition(".")[0] != "kinefit"]
     if checkpoint is not None and foreign:
-        problem = "a checkpoint with sensors of one's own, whose state nobody can keep"
-        raise ObservationError(problem, remedy="Leave the checkpoint out.")
+        problem = "a checkpoint cannot store the state of custom sensors"
+        raise ObservationError(problem, remedy="Leave out checkpoint.")
     known = Subject.as_is(body) if subject is None and not size else subject
     person = fitted_to_person(
         recording, body, settings, subject=known, trial=trial, height=height, frames=shape_frames, progress=progress

@@ -11,8 +11,11 @@ from kinefit.viewers.show import Choice, ViewerContent
 __all__ = ["CameraImages", "Choice", "Player", "View", "ViewerContent", "page"]
 
 
-def __getattr__(name: str) -> type[ViewerContent]:
-    if name != "Recording":
+_RENAMED = {"Recording": ViewerContent, "Pictures": CameraImages}
+
+
+def __getattr__(name: str) -> type[ViewerContent | CameraImages]:
+    if name not in _RENAMED:
         raise AttributeError(f"module 'kinefit.viewers' has no attribute '{name}'")
-    warnings.warn("kinefit.viewers.Recording is ViewerContent now", FutureWarning, stacklevel=2)
-    return ViewerContent
+    warnings.warn(f"kinefit.viewers.{name} is {_RENAMED[name].__name__} now", FutureWarning, stacklevel=2)
+    return _RENAMED[name]

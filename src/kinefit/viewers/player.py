@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.motion import Motion
 from kinefit.viewers import figure, scene
-from kinefit.viewers.show import ALL, DEFAULT_LAYERS, LAYERS, NONE, Choice, Show, ViewerContent
+from kinefit.viewers.show import ALL_CAMERAS, DEFAULT_LAYERS, LAYERS, NO_CAMERA, Choice, Show, ViewerContent
 from kinefit.viewers.stage import look_through
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ class Player:
         self._shown: tuple[int, Choice] | None = None
         self._sent: tuple[Any, ...] = ()
         self._since_sent = 0.0
-        self._through = NONE
+        self._through = NO_CAMERA
         self._before: dict[int, tuple[NDArray, NDArray, NDArray, float]] = {}  # each browser's own view
         self._slider_shows = 0
         self._slider: Any = None
@@ -92,8 +92,8 @@ class Player:
         return Choice(
             frozenset(layer for layer, box in self._boxes.items() if box.value),
             by_quality=self._colour.value == "quality" if self._colour else False,
-            rays=self._rays.value if self._rays else NONE,
-            through=self._look.value if self._look else NONE,
+            rays=self._rays.value if self._rays else NO_CAMERA,
+            through=self._look.value if self._look else NO_CAMERA,
             follow=bool(self._follow and self._follow.value),
         )
 
@@ -154,9 +154,9 @@ class Player:
         self._rays = self._look = self._colour = self._follow = None
         with gui.add_folder("Show"):
             if cameras:
-                self._look = gui.add_dropdown("look through", (NONE, *cameras))
-            if cameras and motions and self.show.rays(0, ALL) is not None:
-                self._rays = gui.add_dropdown("rays of", (NONE, ALL, *cameras))
+                self._look = gui.add_dropdown("look through", (NO_CAMERA, *cameras))
+            if cameras and motions and self.show.rays(0, ALL_CAMERAS) is not None:
+                self._rays = gui.add_dropdown("rays of", (NO_CAMERA, ALL_CAMERAS, *cameras))
             if motions:
                 self._colour = gui.add_dropdown("colours", ("side", "quality"))
             if motions or self.recording.markers or self.recording.points is not None:
@@ -166,7 +166,7 @@ class Player:
             gui.add_markdown(_HELP)
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        if self._through != NONE:
+        if self._through != NO_CAMERA:
             self._aim(client)
 
     def _aim(self, client: viser.ClientHandle) -> None:

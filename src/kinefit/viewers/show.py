@@ -29,7 +29,7 @@ DEFAULT_LAYERS = figure.DEFAULT_PARTS | frozenset(LAYERS) - set(figure.PARTS)
 CYLINDERS = DEFAULT_LAYERS - figure.DEFAULT_PARTS | figure.CYLINDERS
 """The same with the body's cylinders and bones in place of a skin."""
 
-ALL, NONE = "all cameras", "none"
+ALL_CAMERAS, NO_CAMERA = "all cameras", "none"
 _POINT, _MARKER, _PATH = (245, 205, 40), (225, 60, 120), (110, 120, 135)
 
 
@@ -142,17 +142,17 @@ class Choice:
     by_quality : bool
         Colours tell the segments' quality, not left from right.
     rays : str
-        Camera whose rays are shown, `ALL` or `NONE`.
+        Camera whose rays are shown, `ALL_CAMERAS` or `NO_CAMERA`.
     through : str
-        Camera that is looked through, or `NONE`.
+        Camera that is looked through, or `NO_CAMERA`.
     follow : bool
         The person stays in place and the floor glides beneath it (not while looking through a camera).
     """
 
     layers: frozenset[str] = DEFAULT_LAYERS
     by_quality: bool = False
-    rays: str = NONE
-    through: str = NONE
+    rays: str = NO_CAMERA
+    through: str = NO_CAMERA
     follow: bool = False
 
 
@@ -196,9 +196,9 @@ class Show:
                 if f is not None:
                     fig.pose(
                         self._poses[n][f], joint_std=motion.joint_std[f], quality=motion.segment_quality[f],
-                        by_quality=choice.by_quality and n == 0, see_through=choice.through != NONE,
+                        by_quality=choice.by_quality and n == 0, see_through=choice.through != NO_CAMERA,
                     )  # fmt: skip
-            follow = choice.follow and choice.through == NONE
+            follow = choice.follow and choice.through == NO_CAMERA
             self.stage.shift(self._way[0] - self._way[i] if follow else np.zeros(3))
             self._show_points(time, choice)
             self._show_rays(i, choice)
@@ -255,14 +255,16 @@ class Show:
             self._rays.points, self._rays.colors, self._rays.visible = found.points, found.colours, True
 
     def rays(self, i: int, camera: str) -> scene.Rays | None:
-        """Rays of a camera, of `ALL` or of `NONE` in frame `i` of the first motion."""
-        if camera == NONE or self.recording.rig is None or not self.recording.motions:
+        """Rays of a camera, of `ALL_CAMERAS` or of `NO_CAMERA` in frame `i` of the first motion."""
+        if camera == NO_CAMERA or self.recording.rig is None or not self.recording.motions:
             return None
         motion, found = self.recording.motions[0], []
         for name, residuals in motion.residuals.items():
             points = self._fitted[0][name]
             seen_by = next((c for c in self.recording.rig if name == c.name or name.startswith(f"{c.name} ")), None)
-            if residuals.unit == "px" and points is not None and seen_by is not None and camera in (ALL, seen_by.name):
+            if residuals.unit != "px" or points is None or seen_by is None:
+                continue
+            if camera in (ALL_CAMERAS, seen_by.name):
                 x = motion.body.positions(motion.state(i), points)
                 found.append(
                     scene.camera_rays(

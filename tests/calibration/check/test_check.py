@@ -101,7 +101,7 @@ MISTAKES = {
     "nobody in one": (RIG, [replace(k, points=k.points * np.nan, confidence=0 * k.confidence)
                             if k.camera == "cam03" else k for k in SEEN], "coverage", "video and keypoints"),
     "nobody at all": (RIG, [replace(k, points=k.points * np.nan, confidence=0 * k.confidence) for k in SEEN], "nobody",
-                      "belong to this recording"),
+                      "are of this recording"),
 }  # fmt: skip
 
 
@@ -168,7 +168,7 @@ def test_exchanged_sides_are_put_right_in_their_frames():
     assert views.swapped.sum(axis=0).tolist() == [0, 24, 0, 0]
     check = check_keypoints(RIG, mixed)
     assert not kinds(check)
-    assert "left for right in 24 of 60 frames of cam02" in next(f.text for f in check.findings if f.kind == "sides")
+    assert "left and right in 24 of 60 frames of cam02" in next(f.text for f in check.findings if f.kind == "sides")
 
 
 def test_biases_of_two_cameras_have_nothing_to_compare_with():
@@ -186,11 +186,11 @@ def camera(**changes):
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"matrix": np.array([[64e3, 0, 639.5], [0, 64e3, 359.5], [0, 0, 1]])}, "no common lens"),
-        ({"matrix": np.array([[200.0, 0, 639.5], [0, 200.0, 359.5], [0, 0, 1]])}, "no common lens"),
-        ({"matrix": np.array([[1000.0, 0, 639.5], [0, 1300.0, 359.5], [0, 0, 1]])}, "not be square"),
+        ({"matrix": np.array([[64e3, 0, 639.5], [0, 64e3, 359.5], [0, 0, 1]])}, "implausible"),
+        ({"matrix": np.array([[200.0, 0, 639.5], [0, 200.0, 359.5], [0, 0, 1]])}, "implausible"),
+        ({"matrix": np.array([[1000.0, 0, 639.5], [0, 1300.0, 359.5], [0, 0, 1]])}, "not square"),
         ({"matrix": np.array([[1000.0, 0, 200.0], [0, 1000.0, 359.5], [0, 0, 1]])}, "principal point"),
-        ({"distortion": np.array([-1.5, 0, 0, 0])}, "folds back"),
+        ({"distortion": np.array([-1.5, 0, 0, 0])}, "not invertible"),
     ],
 )
 def test_lenses_that_cannot_be_are_told(changes, told):
@@ -213,7 +213,7 @@ def looking(name, centre):
 POINTS = np.random.default_rng(0).normal([0, 0, 1], 0.3, (50, 3))
 
 
-@pytest.mark.parametrize(("place", "word"), [((4.0, 0.3, 1.0), "beside"), ((-4.0, 0.1, 1.0), "opposite")])
+@pytest.mark.parametrize(("place", "word"), [((4.0, 0.3, 1.0), "side by side"), ((-4.0, 0.1, 1.0), "face each other")])
 def test_cameras_beside_or_opposite_each_other_matter_unless_others_see_the_depth(place, word):
     two = Rig((looking("a", (4.0, 0.0, 1.0)), looking("b", place)))
     found = placement_findings(two, POINTS)
@@ -301,4 +301,4 @@ def test_a_depth_camera_alone_that_hangs_upside_down_is_named(tmp_path, over):
     check = check_take(tmp_path / "take.toml")
     assert [(f.kind, f.cameras) for f in check.faults] == ([("up", ("front",))] if over else [])
     for found in check.faults:
-        assert "front hangs upside down" in found.text and 'up = "y"' in found.remedy
+        assert "front is upside down" in found.text and 'up = "y"' in found.remedy

@@ -83,12 +83,12 @@ def test_a_sensor_is_moved_only_where_nothing_speaks_against_it():
     halves = one, fit(x=0.031, ry=0.05)
     why = lambda *args: "; ".join(doubts_of(*args))
     assert why(one, origin, halves, (np.zeros(7),)) == ""
-    assert "another place, 1.1° and 0 mm from there" in why(one, origin, halves, (fit(ry=0.02).twist,))
+    assert "another pose, 1.1° and 0 mm away" in why(one, origin, halves, (fit(ry=0.02).twist,))
     assert "no nearer" in why(replace(one, falls=False), origin, halves)
     assert "more than 30 cm or 15°" in why(fit(x=0.31), origin, halves)
     assert "more than 30 cm or 15°" in why(fit(ry=0.11), origin, halves)  # 3 m from what it sees
     assert "two halves of the frames disagree by 5.2" in why(one, origin, (one, fit(x=0.06, z=0.02, ry=0.05)))
-    assert "it may fit" in why(replace(one, covariance=1e2 * one.covariance), origin, halves)
+    assert "misfit is within" in why(replace(one, covariance=1e2 * one.covariance), origin, halves)
 
 
 def test_a_doubtful_sensor_is_named_and_not_refined():

@@ -67,7 +67,7 @@ def test_usage(words):
     assert call(*words).exit_code == 2
 
 
-@pytest.mark.parametrize(("floor", "said"), [("soon", "is no frame"), ("2.5s", "pictures have no times")])
+@pytest.mark.parametrize(("floor", "said"), [("soon", "is not a frame"), ("2.5s", "images in folders have no times")])
 def test_floor_is_a_frame_or_a_time(tmp_path, floor, said):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "1.png").write_bytes(cv2.imencode(".png", np.zeros((48, 64), np.uint8))[1].tobytes())
@@ -99,7 +99,7 @@ def test_a_drawn_bar_becomes_a_calibration(waved, tmp_path):
     for camera, expected in zip(found, rig, strict=True):
         assert camera.matrix[0, 0] == pytest.approx(expected.matrix[0, 0], rel=0.01)
         assert camera.centre_world[2] == pytest.approx(expected.centre_world[2] - 0.2, abs=0.03)
-    assert "A target is seen to 0.0" in told.output and "nothing here can check" not in told.output
+    assert "Target detection: sigma 0.0" in told.output and "was not checked" not in told.output
     with (tmp_path / "room.csv").open() as file:
         rows = {(row["camera"], row["parameter"]): row for row in csv.DictReader(file)}
     assert len(rows) == 3 * 15 and rows["cam1", "fx"]["from"] == "recording" and float(rows["cam1", "fx"]["std"]) > 0
@@ -117,7 +117,7 @@ def test_a_table_of_centroids_becomes_a_calibration(waved, tmp_path):
     table, out = tmp_path / "spots.csv", tmp_path / "t.toml"
     table.write_text("camera,frame,u,v\n" + "\n".join(rows))
     told = call("bar", table, "--length", 0.9, "--size", "640x480", "-o", out)
-    assert told.exit_code == 0 and "nothing here can check" in told.output, told.output
+    assert told.exit_code == 0 and "was not checked" in told.output, told.output
     assert read_calibration(out).names == rig.names
     for words in (("--size", "big"), (), ("--distance", "a:b", "--size", "640x480"), ("--floor", "x")):
         assert call("bar", table, "--length", 0.9, *words, "-o", tmp_path / "u.toml").exit_code == 2

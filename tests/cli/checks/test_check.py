@@ -66,12 +66,12 @@ def without_video(take):
 
 
 BAD = {
-    "exchanged": (lambda t: exchange(t, "cam01", "cam03"), "cam01 and cam03 are exchanged", "rename cam01 to cam03"),
-    "five frames": (lambda t: late(t, "cam02", 5), r"cam02 runs (4\.9|5\.0)\d .* later", "time_offset = 0.1"),
+    "exchanged": (lambda t: exchange(t, "cam01", "cam03"), "cam01 and cam03 are swapped", "rename cam01 to cam03"),
+    "five frames": (lambda t: late(t, "cam02", 5), r"cam02 is (4\.9|5\.0)\d .* later", "time_offset = 0.1"),
     "upside down": (lambda t: swap(t, 'up = "z"', 'up = "-z"'), "the floor would be the ceiling", 'up = "z"'),
     "size": (
         lambda t: swap(t.with_name("calibration.toml"), "^size = .*", "size = [1088.0, 1920.0]", count=1),
-        "cam01 has another image", 'image = "scaled"',
+        "cam01 has another size", 'image = "scaled"',
     ),
     "lengths": (
         lambda t: landmarks(t, "cam02", lambda a: a[:-7]),
@@ -121,7 +121,7 @@ def test_refining_is_refused_before_gross_faults_are_fixed(take):
     exchange(take, "cam01", "cam03")
     told = run(take, "--refine")
     assert isinstance(told.exception, KinefitError)
-    assert "before the faults are fixed" in str(told.exception)
+    assert "needs a recording without faults" in str(told.exception)
     assert take.with_name("take-check.html").exists()
     assert not take.with_name("calibration_refined.toml").exists()
 

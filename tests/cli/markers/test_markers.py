@@ -67,14 +67,14 @@ def test_learn_from_one_frame(folder, tmp_path):
     assert (tmp_path / "one.json").is_file()
     code, text = call("learn", folder / "labelled.c3d", "--frame", 99999, "-o", tmp_path / "two.json")
     assert code == 2
-    assert "no frame 99999" in text
+    assert "--frame 99999 does not exist" in text
     assert not (tmp_path / "two.json").exists()
 
 
 def test_audit_finds_the_swap(folder):
     code, text = call("audit", folder / "labelled.c3d", folder / "swapped.c3d", "--strict")
     assert code == 2
-    assert "labelled.c3d: nothing found" in text
+    assert "labelled.c3d: no wrong labels found" in text
     assert "LKNE" in text.split("swapped.c3d")[1]
 
 

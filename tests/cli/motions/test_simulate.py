@@ -51,7 +51,7 @@ def test_a_recorded_skeleton(data_dir, tmp_path):
 @pytest.mark.parametrize(
     ("args", "word"),
     [
-        (("walk.avi",), "ends neither"), (("walk.amc",), "--asf"), (("walk.npz", "--asf", "a.asf"), "--asf"),
+        (("walk.avi",), "is not a .npz"), (("walk.amc",), "--asf"), (("walk.npz", "--asf", "a.asf"), "--asf"),
         (("none.npz",), "no such motion"), (("squat.npz", "--sensor", "radar"), "radar"),
         (("squat.npz", "--frames", "a:b"), "FIRST:LAST"), (("squat.npz", "--frames", "90:"), "no frames"),
         (("squat.npz", "--body", "dragon"), "dragon"), (("squat.npz", "--rate", "0"), "rate"),

@@ -39,9 +39,9 @@ def test_it_passes_on_what_track_takes_and_tells_every_take(done, take, tmp_path
 
 
 @pytest.mark.parametrize(("words", "said"), [
-    (["--workers", 2, "--cluster", "tcp://x:1"], "choose one"), (["--contacts", "--realtime"], "whole take"),
-    (["--workers", 0], "workers"), (["--formats", "docx"], "there is no format 'docx'"),
-    (["--lag", 1, "--realtime"], "choose one"), (["--overlays", "--pictures", "none"], "choose one"),
+    (["--workers", 2, "--cluster", "tcp://x:1"], "give one"), (["--contacts", "--realtime"], "whole take"),
+    (["--workers", 0], "workers"), (["--formats", "docx"], "no format 'docx'"),
+    (["--lag", 1, "--realtime"], "give one of them"), (["--overlays", "--pictures", "none"], "give one of them"),
 ])  # fmt: skip
 def test_wrong_options_are_told(done, take, words, said):
     told = run(take, *words)
@@ -59,9 +59,9 @@ def test_ctrl_c_names_what_goes_on(take, tmp_path, monkeypatch):
 
     monkeypatch.setattr("kinefit.batch.many.track_takes", stopped)
     told = run(take, "--out", tmp_path / "out")
-    assert told.exit_code == 130 and "the same command goes on" in told.output
+    assert told.exit_code == 130 and "run the same command to continue" in told.output
 
 
 def test_files_that_are_no_takes_are_named(done, take):
     told = run(take.parent / "*.toml")
-    assert "1 TOML files that match are no takes: calibration.toml" in told.output
+    assert "1 matching TOML files are no takes, and skipped: calibration.toml" in told.output

@@ -41,7 +41,7 @@ def test_where_the_recording_cannot_be_had_the_drawn_figure_takes_its_place(tmp_
     told = run("demo", "--out", tmp_path / "demo")
     assert told.exit_code == 0, told.output
     assert "error: the index cannot be reached\n   try Check the network." in told.stderr
-    assert "drawn figure instead" in told.stderr
+    assert "simulated figure is tracked instead" in told.stderr
     assert "squat_and_wave: 60 frames" in told.stdout
 
 
@@ -64,4 +64,4 @@ def test_the_real_recording_is_tracked_with_its_credit_on_screen(tmp_path, monke
 def test_warmup_says_how_long_it_took_and_where_the_kernels_are():
     told = run("warmup")
     assert told.exit_code == 0, told.output
-    assert re.fullmatch(r"ready after \d+\.\d s; the kernels lie in .*kernels\n", told.stdout)
+    assert re.fullmatch(r"ready after \d+\.\d s; kernels are in .*kernels\n", told.stdout)

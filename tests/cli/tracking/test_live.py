@@ -57,7 +57,7 @@ def test_seconds_end_a_session(run, take, tmp_path):
     ("words", "told"),
     [
         (("--vmc", "localhost"), "HOST:PORT"), (("--vmc", "localhost:99999"), "HOST:PORT"),
-        (("--host", "256.0.0.1"), "nothing can be served"), (("--speed", "-1"), "speed"),
+        (("--host", "256.0.0.1"), "server cannot start"), (("--speed", "-1"), "speed"),
         (("--json", "/"), "cannot be written"), (("--token", "short"), "16 to 128 letters"),
     ],
 )
@@ -70,7 +70,7 @@ def test_what_cannot_be_is_refused(run, take, words, told):
     ("old", "new", "told"),
     [
         ("[[camera]]", '[[camera]]\nstream = "0"', "a stream and a video"),
-        ('[take]\n', '[take]\nperson = "moving"\n', "only when all is over"),
+        ('[take]\n', '[take]\nperson = "moving"\n', "needs the whole recording"),
     ],
 )
 def test_takes_that_cannot_be_live_are_refused(run, take, change, old, new, told):

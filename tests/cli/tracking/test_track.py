@@ -69,7 +69,7 @@ def test_faults_of_the_inputs_stand_on_top_of_summary_and_report(take, tmp_path,
     assert told.exit_code == 0, told.output
     first, how, remedy = told.stdout.strip().splitlines()[:3]
     assert re.match(r"fault: The person would be 3\.\d+ m tall: the calibration's unit or scale is wrong\.", first)
-    assert how.startswith("   how sure: ")
+    assert how.startswith("   confidence: ")
     assert "size of the board's squares" in remedy
     assert told.stdout.index("fault: ") < told.stdout.index("median residual")
     page = (out / "report.html").read_text(encoding="utf-8")
@@ -127,7 +127,7 @@ def test_a_lag_knows_a_little_of_what_comes_and_stands_alone(take, tmp_path):
         refused = run("track", take, "--lag", "0.1", other)
         assert refused.exit_code == 2 and other in refused.stderr and "--lag SECONDS" in refused.stderr
     long = run("track", take, *quiet, "--lag", "5")
-    assert long.exit_code == 2 and "a lag of 5 s for 60 frames" in long.stderr
+    assert long.exit_code == 2 and "longer than the take of 60 frames" in long.stderr
 
 
 def test_an_unknown_format_is_told_before_anything_is_read():
@@ -343,7 +343,7 @@ def test_ctrl_c_keeps_the_frames_that_are_done(take, tmp_path):
             sent = True
     os.close(ours)
     assert process.wait() == 130, shown
-    done = int(re.search(r"Stopped\. (\d+) of 12000 frames are done and written", shown)[1])
+    done = int(re.search(r"Stopped\. (\d+) of 12000 frames are tracked and written", shown)[1])
     motion = kinefit.read_motion(out / "motion.npz")
     assert len(motion) == done
     assert 0 < done < 12000
@@ -394,7 +394,7 @@ def test_ctrl_c_during_overlays_lists_what_is_whole(take, tmp_path, monkeypatch)
     told = run("track", take, "--out", tmp_path / "out", "--formats", "bvh")
     assert told.exit_code == 130
     assert str(tmp_path / "out" / "motion.bvh") in told.stdout
-    assert "What is listed is whole" in told.stderr
+    assert "The files listed are complete" in told.stderr
 
 
 def test_frames_are_told_as_stretches():
@@ -416,12 +416,12 @@ def test_pictures_without_faces_or_none_at_all(take, tmp_path, monkeypatch):
     assert told.exit_code == 0, told.stderr
     monkeypatch.setattr(faces, "networks", absent)
     told = run("track", take, "--out", tmp_path / "blurred", "--formats", "bvh", "--pictures", "blurred")
-    assert told.exit_code == 2 and "is now --hide-faces" in told.stderr and "no networks here" in told.stderr
+    assert told.exit_code == 2 and "use --hide-faces" in told.stderr and "no networks here" in told.stderr
     assert not (tmp_path / "blurred" / "montage.png").exists()
     assert not (tmp_path / "none" / "montage.png").exists() and not (tmp_path / "none" / "overlays").exists()
     assert "<img" not in (tmp_path / "none" / "report.html").read_text()
     told = run("track", take, "--out", tmp_path / "c", "--pictures", "none", "--overlays")
-    assert told.exit_code == 2 and "choose one" in told.stderr
+    assert told.exit_code == 2 and "give one of them" in told.stderr
 
 
 def test_the_session_of_a_take_heads_its_report(take, tmp_path):

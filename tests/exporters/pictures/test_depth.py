@@ -6,7 +6,7 @@ import numpy as np
 from tests.exporters.synthetic import a_camera, smooth_motion
 
 from kinefit.exporters.pictures.depth import depth_picture
-from kinefit.rendering.colours import LOST
+from kinefit.rendering.colours import LOST_COLOUR
 
 
 def test_outlines_are_white_and_those_of_lost_segments_dashed_and_grey():
@@ -15,7 +15,7 @@ def test_outlines_are_white_and_those_of_lost_segments_dashed_and_grey():
     shown = []
     for quality in (np.ones_like(motion.segment_quality), np.zeros_like(motion.segment_quality)):
         picture = depth_picture(holes, replace(motion, segment_quality=quality), 1, camera)
-        near = [np.abs(picture.astype(int) - colour).max(-1) < 30 for colour in ((255, 255, 255), LOST)]
+        near = [np.abs(picture.astype(int) - colour).max(-1) < 30 for colour in ((255, 255, 255), LOST_COLOUR)]
         shown.append([int(there.sum()) for there in near])
     (white, none), (no_more, grey) = shown
     assert white > 500 and none == no_more == 0

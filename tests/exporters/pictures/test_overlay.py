@@ -16,7 +16,7 @@ from kinefit.exporters.pictures.drawing import bones
 from kinefit.exporters.pictures.overlay import frames_of, nearest_frame
 from kinefit.geometry.camera import ImageFrame
 from kinefit.readers.video import Video
-from kinefit.rendering.colours import CENTRE, LEFT, LOST, RIGHT
+from kinefit.rendering.colours import CENTRE_COLOUR, LEFT_COLOUR, LOST_COLOUR, RIGHT_COLOUR
 from kinefit.simulation import cut
 
 CAMERA = a_camera("cam 0", 0.3)
@@ -49,7 +49,10 @@ def at(image, uv):
 def test_bones_lie_where_the_camera_sees_them_in_the_colour_of_their_side(motion):
     image = draw_overlay(GREY, replace(motion, residuals={}), 3, CAMERA)
     body = motion.body
-    cases = {("r_hip", "r_knee"): RIGHT, ("l_elbow", "l_wrist"): LEFT, ("sacroiliac", "hip_centre"): CENTRE}
+    cases = {
+        ("r_hip", "r_knee"): RIGHT_COLOUR, ("l_elbow", "l_wrist"): LEFT_COLOUR,
+        ("sacroiliac", "hip_centre"): CENTRE_COLOUR,
+    }  # fmt: skip
     for names, colour in cases.items():
         a, b = CAMERA.project(motion.positions(body.landmarks.select(names))[3])
         assert np.abs(at(image, 0.5 * a + 0.5 * b) - colour).max() < 25, names
@@ -78,7 +81,7 @@ def test_a_lens_bends_bones_and_other_pictures_are_met(motion):
     grey = np.full((500, 400, 3), 90, np.uint8)
     image = draw_overlay(grey, replace(motion, residuals={}), 0, CAMERA, image_frame=frame)
     a, b = motion.positions(motion.body.landmarks.select(("r_knee", "r_ankle")))[0]
-    assert np.abs(at(image, frame.from_calibration(CAMERA.project(0.5 * (a + b)))) - RIGHT).max() < 25
+    assert np.abs(at(image, frame.from_calibration(CAMERA.project(0.5 * (a + b)))) - RIGHT_COLOUR).max() < 25
 
 
 def test_lost_segments_turn_grey_and_are_named(motion, monkeypatch):
@@ -147,10 +150,10 @@ def test_a_lost_bone_is_dashed_and_grey(motion):
     for values, share in ((motion.segment_quality, 0.0), (quality, 0.2)):
         image = draw_overlay(GREY, replace(motion, residuals={}, segment_quality=values), 3, CAMERA)
         shades = np.array([at(image, uv) for uv in along])
-        dashes, gaps = (np.abs(shades - colour).max(axis=1) < 25 for colour in (LOST, GREY[0, 0]))
+        dashes, gaps = (np.abs(shades - colour).max(axis=1) < 25 for colour in (LOST_COLOUR, GREY[0, 0]))
         assert dashes.mean() >= share and gaps.mean() >= share
         assert dashes.any() == gaps.any() == (share > 0)
-        assert (np.abs(shades - RIGHT).max(axis=1) < 25).mean() == (share == 0)
+        assert (np.abs(shades - RIGHT_COLOUR).max(axis=1) < 25).mean() == (share == 0)
 
 
 def test_keypoints_are_rings_and_outliers_crosses(motion):

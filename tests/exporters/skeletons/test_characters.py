@@ -258,7 +258,7 @@ def test_what_cannot_be_is_refused(motion, tmp_path):
     for words, problem in (
         (["--to", "glb", "--retarget", "c.glb"], "--to has no place beside --retarget"),
         (["--retarget", "c.glb", "--rest", "t"], "--rest has no place"),
-        (["--to", "glb", "--names-table", "n.toml"], "of a --retarget CHARACTER"), ([], "Missing option '--to'"),
+        (["--to", "glb", "--names-table", "n.toml"], "needs --retarget CHARACTER"), ([], "Missing option '--to'"),
     ):  # fmt: skip
         told = run(tmp_path, ["export", "m.npz", *words])
         assert told.exit_code == 2 and problem in told.stderr

@@ -9,7 +9,7 @@ from kinefit import assets
 from kinefit.errors import AssetError
 from kinefit.images.detectors.detection import PersonDetection, detect_people
 from kinefit.images.detectors.hands import (
-    ALONE,
+    HANDS_ONLY_COLUMN,
     HandFollower,
     HandLandmarks,
     HandModels,
@@ -96,7 +96,7 @@ def test_hands_alone_are_found_by_their_palms_and_followed_without():
     models = Seen({(200, 300): 0.9, (400, 300): 0.1, (300, 100): 0.2})
     follow = HandFollower(models)
     (seen,) = follow(IMAGE, [])
-    assert seen.column == ALONE and np.isnan(seen.points).all()
+    assert seen.column == HANDS_ONLY_COLUMN and np.isnan(seen.points).all()
     assert np.allclose(seen.hands[0][:, 0], [[200, 300], [400, 300]])  # of three hands the surest left and right one
     (again,) = follow(IMAGE, [])
     assert models.palms == 1 and np.allclose(again.hands[0], seen.hands[0])

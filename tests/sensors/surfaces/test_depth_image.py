@@ -283,7 +283,7 @@ def test_a_body_at_or_behind_the_camera_does_no_harm():
 
 
 def test_what_cannot_be_is_told():
-    with pytest.raises(ObservationError, match=r"\(80, 60\) px, its camera has \(160, 120\)"):
+    with pytest.raises(ObservationError, match=r"\(80, 60\) px, its camera \(160, 120\)"):
         measured(depth=np.ones((60, 80)))
     with pytest.raises(BodyError, match="no surfaces"):
         sensor().prepare(DepthFrame("depth", 0.0, clean()), Scene(replace(BODY, surfaces=()), TRUTH, a_rig()))

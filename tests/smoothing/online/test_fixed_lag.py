@@ -200,9 +200,9 @@ def test_track_takes_a_lag_and_another_take_s_noise():
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        ({"lag": 0.001}, "a lag of 0.001 s"), ({"lag": np.nan}, "a lag of nan s"), ({"lag": 0.5}, "for 10 frames"),
-        ({"lag": 0.1, "contacts": True}, "contacts"), ({"lag": 0.1, "smooth": False}, "no smoothing"),
-        ({"noise": CALM}, "without a lag"),
+        ({"lag": 0.001}, "lag is 0.001 s"), ({"lag": np.nan}, "lag is nan s"), ({"lag": 0.5}, "take of 10 frames"),
+        ({"lag": 0.1, "contacts": True}, "contacts"), ({"lag": 0.1, "smooth": False}, "smooth=False"),
+        ({"noise": CALM}, "needs a lag"),
     ],
 )  # fmt: skip
 def test_what_makes_no_sense_is_refused(more, said):
@@ -213,6 +213,12 @@ def test_what_makes_no_sense_is_refused(more, said):
 def test_usual_noise_is_better_than_no_lag_at_all():
     tracker, results = tracked(False, 60)
     assert error([r.state for r in behind(tracker, results, 0.1, None)]) < 0.9 * error([r.state for r in results])
+
+
+def test_known_noise_is_written_and_read_again_however_small():
+    noise = KnownNoise(CALM.acceleration / 700.0)
+    again = KnownNoise.of_take(BODY, {"smoothing": noise.as_record(BODY)})
+    np.testing.assert_allclose(again.acceleration, noise.acceleration, rtol=1e-3)
 
 
 def test_noise_of_a_motion_that_was_not_smoothed_is_refused():

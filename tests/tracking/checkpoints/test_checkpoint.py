@@ -103,7 +103,7 @@ def test_every_flipped_bit_is_noticed_and_computed_again(session, whole, tmp_pat
             opened.write(bytes([data[at] ^ (1 << int(rng.integers(8)))]))
         again, looked, said = followed(file.parent, False, smooth=False)
         states.append(looked[0])
-        assert str(file.name) in said and "computed again" in said
+        assert str(file.name) in said and "tracked again" in said
         assert_same(again, whole)
     assert set(states) == {1, 5, 9}
 
@@ -122,7 +122,7 @@ def test_a_file_cut_off_anywhere_is_gone_on_with_from_its_last_state(session, wh
 def test_another_take_and_another_format_are_computed_anew(session, whole, tmp_path):
     file = killed(tmp_path / "take", session)
     again, looked, said = followed(file.parent, False, key="another", smooth=False)
-    assert looked[0] == 1 and "another take" in said and "every frame is computed again" in said
+    assert looked[0] == 1 and "another take" in said and "all frames are tracked again" in said
     assert_same(again, whole)
     file = killed(tmp_path / "format", session)
     file.write_bytes(file.read_bytes().replace(b"frames 2", b"frames 1", 1))
@@ -160,7 +160,7 @@ def test_a_state_that_somebody_made_up_ends_once(state, whole, tmp_path):
     folder = tmp_path / "c"
     with Checkpoint(folder, "key") as checkpoint:
         checkpoint.frames.keep(4, state)
-    with pytest.raises(FileError, match="did not write"):
+    with pytest.raises(FileError, match="not one of this tracker"):
         followed(folder, False, smooth=False)
     assert_same(followed(folder, False, smooth=False)[0], whole)
 
@@ -173,7 +173,7 @@ def test_records_of_own_classes_are_refused(tmp_path):
             given = Recording.of_frames(steps, a_rig(), rate=RATE, sensors=(Rope(),), start=start, up="y")
             track(given, BODY, size=False, settings=STILL, checkpoint=checkpoint)
 
-    with pytest.raises(ObservationError, match="Leave the checkpoint out"):
+    with pytest.raises(ObservationError, match="Leave out checkpoint"):
         tracked()
 
 
@@ -186,7 +186,7 @@ def test_files_of_others_stay(session, tmp_path):
     assert sorted(p.name for p in folder.iterdir()) == ["lock", "results.bin"]
     for restart in (False, True):
         with Checkpoint(folder, "key", restart=restart) as checkpoint:
-            assert "results.bin, not of this kinefit: left as it is" in " ".join(checkpoint.said())
+            assert "does not change: results.bin" in " ".join(checkpoint.said())
             checkpoint.frames.keep(1, {})
     checkpoint.remove()
     assert sorted(p.name for p in folder.iterdir()) == ["lock", "results.bin"]
@@ -207,7 +207,7 @@ def test_nobody_else_works_in_it(tmp_path):
     folder = tmp_path / "c"
     with Checkpoint(folder, "key") as checkpoint:
         checkpoint.frames.keep(3, {"a": 1})
-        with pytest.raises(ExportError, match="another run is working there"), Checkpoint(folder, "key"):
+        with pytest.raises(ExportError, match="another run uses this folder"), Checkpoint(folder, "key"):
             pass
     with Checkpoint(folder, "key") as checkpoint:
         assert checkpoint.resumed and checkpoint.frames.at == 3 and checkpoint.frames.state == {"a": 1}
@@ -216,7 +216,7 @@ def test_nobody_else_works_in_it(tmp_path):
     assert not folder.exists()  # nothing to go on from
     folder.mkdir()
     folder.chmod(0o777)
-    with pytest.raises(ExportError, match="others can write"), Checkpoint(folder, "key"):
+    with pytest.raises(ExportError, match="other users can write"), Checkpoint(folder, "key"):
         pass
 
 

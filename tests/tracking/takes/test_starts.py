@@ -199,7 +199,7 @@ def test_a_rough_start_is_fitted_coarse_to_fine(tmp_path):
 
 WRONG = {
     "no such angle": ("angles = { knee = 3 }", "no angle of body 'pebble' 'knee'"),
-    "no such step": ("step = 8", r"step = 8, and the take has the steps \[0, 8\]"),
+    "no such step": ("step = 8", "step = 8 is outside the take's steps 0 to 7"),
     "one line": ("upward = [2, 0, 0.1]", "along one line"),
     "no numbers": ("upward = [nan, 0, 0.1]", "no place, direction or angle"),
     "a key": ("turn = [2, 0, 0.1]", "no key 'turn'"),

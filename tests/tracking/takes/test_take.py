@@ -88,7 +88,7 @@ def test_size_and_background_can_be_left_as_they_are(folder):
 @pytest.mark.parametrize(
     ("line", "match"),
     [
-        ('unit = 0.001', "millimetres|size|unit|none of the first"),
+        ('unit = 0.001', "millimetres|size|unit|not found in the first"),
         ('file = "few.trc"', "no such|does not exist|not there"),
     ],
 )

@@ -18,7 +18,7 @@ from kinefit.rendering import colours
 
 Value = TypeVar("Value")
 
-COLOURS = {"fault": colours.RIGHT, "doubt": (176, 132, 0), "note": colours.LEFT, "good": colours.CENTRE}
+COLOURS = {"fault": colours.RIGHT_COLOUR, "doubt": (176, 132, 0), "note": colours.LEFT_COLOUR, "good": colours.CENTRE_COLOUR}
 """RGB of the severities of findings: safe for the colour-blind, and dark enough for text."""
 
 
@@ -37,7 +37,7 @@ def link(page: str, **parameters: object) -> str:
 @contextmanager
 def shell(desk: Desk, t: Texts, title: str) -> Iterator[None]:
     """The frame of a page: a header with the way home and the choice of faces, and a column for the content."""
-    ui.colors(primary=colours.to_hex(colours.LEFT))
+    ui.colors(primary=colours.to_hex(colours.LEFT_COLOUR))
     ui.page_title(f"{title} - kinefit")
     with ui.header().classes("items-center justify-between q-py-xs"):
         ui.link("kinefit", "/").classes("text-white text-lg no-underline font-bold")

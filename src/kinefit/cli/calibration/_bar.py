@@ -27,29 +27,29 @@ Examples:
 _RESIDUAL_SCALE = 200  # a residual of 0.1 px is drawn 20 px long
 
 
-@click.command(short_help="Lenses, places and scale from a bar with two bright targets.", epilog=_EXAMPLES)
+@click.command(short_help="Intrinsics, poses and scale from a bar with two targets.", epilog=_EXAMPLES)
 @click.argument("sources", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="VIDEO_FOLDER_OR_CSV...")
-@click.option("--length", type=float, required=True, metavar="M", help="From centre to centre of the targets.")
+@click.option("--length", type=float, required=True, metavar="M", help="Distance of the targets' centres.")
 @click.option("--length-sigma", type=float, metavar="M", help="Standard deviation of the length.  [default: 0.0001]")
 @click.option("-o", "--out", type=click.Path(path_type=Path), default=Path("calibration.toml"), show_default=True,
-              help="File to write, Pose2Sim TOML; beside it a table of parameters and a picture of coverage.")
-@click.option("--interiors", type=click.Path(path_type=Path), metavar="FILE", help="Calibration whose lenses are kept.")
+              help="File to write, Pose2Sim TOML; with it a table of parameters and an image of the coverage.")
+@click.option("--interiors", type=click.Path(path_type=Path), metavar="FILE", help="Calibration with the intrinsics.")
 @click.option("--floor", metavar="FRAMES",
-              help="Frames in which the bar lies on the floor in two directions, as 12,80.")
-@click.option("--distance", metavar="A:B:M", help="A second length, from lens to lens of two cameras, as a check.")
-@click.option("--size", metavar="WxH", help="Of the images in which the centroids of a CSV file were measured.")
+              help="Frames in which the bar lies on the floor, in two directions: 12,80.")
+@click.option("--distance", metavar="A:B:M", help="Measured distance between the lenses of two cameras, as a check.")
+@click.option("--size", metavar="WxH", help="Image size for the centroids of a CSV file.")
 @click.option("--max-frames", type=click.IntRange(12), default=400, show_default=True,
-              help="Frames of each camera to look at, evenly over the recording.")
-@click.option("--overwrite", is_flag=True, help="Replace OUT if it exists.")
+              help="Frames of each camera to search, spread over the recording.")
+@click.option("--overwrite", is_flag=True, help="Overwrite an existing OUT.")
 @_screen.verbose_option
 def bar(
     sources: tuple[Path, ...], length: float, length_sigma: float | None, out: Path, interiors: Path | None,
     floor: str | None, distance: str | None, size: str | None, max_frames: int, overwrite: bool,
 ) -> None:
-    """Lenses, places and scale from a bar with two bright targets that is waved through the volume.
+    """Intrinsics, camera poses and scale from a bar with two bright targets, waved through the volume.
 
-    Give a synchronised video for each camera, named as the camera, or folders of images; frames of one number are of
-    one time. Or a CSV file of centroids: camera,frame,u,v, two rows an image.
+    Give a video for each camera, named like the camera, or folders of images. The videos must be synchronised: equal
+    frame numbers mean equal times. Or give a CSV file of centroids: camera,frame,u,v, with two rows for each image.
     """
     from kinefit.calibration.bar.calibrate import LENGTH_SIGMA, calibrate_bar, check_bar
     from kinefit.cli._results import check_new
@@ -89,7 +89,7 @@ def _seen(
 
     if not any(path.suffix.lower() == ".csv" for path in sources):
         if size is not None:
-            raise click.BadParameter("images have a size of their own; it is for a CSV file", param_hint="--size")
+            raise click.BadParameter("use it only with a CSV file of centroids", param_hint="--size")
         views = camera_sources(sources)
         check_cameras(views)
         return find_bars(views, max_frames=max_frames, include=include, progress=step)
@@ -98,10 +98,10 @@ def _seen(
     if size is not None:
         given = re.fullmatch(r"(\d+)[xX](\d+)", size)
         if given is None:
-            raise click.BadParameter(f"'{size}' is no size; write 1920x1080", param_hint="--size")
+            raise click.BadParameter(f"'{size}' is not an image size; write it as 1920x1080", param_hint="--size")
         return read_centroids(sources[0], (int(given[1]), int(given[2])))
     if not isinstance(kept, Rig):
-        problem = "needed with a CSV file, as 1920x1080, where no --interiors state it"
+        problem = "a CSV file needs the image size: give 1920x1080, or --interiors"
         raise click.BadParameter(problem, param_hint="--size")
     return read_centroids(sources[0], {camera.name: camera.size for camera in kept})
 
@@ -110,7 +110,7 @@ def _frames(floor: str | None) -> tuple[int, ...]:
     try:
         return tuple(int(part) for part in floor.split(",")) if floor else ()
     except ValueError:
-        raise click.BadParameter(f"'{floor}' names no frames; write 12,80", param_hint="--floor") from None
+        raise click.BadParameter(f"'{floor}' is not two frames; write them as 12,80", param_hint="--floor") from None
 
 
 def _distance(text: str | None) -> tuple[str, str, float] | None:
@@ -120,7 +120,7 @@ def _distance(text: str | None) -> tuple[str, str, float] | None:
         a, b, metres = text.rsplit(":", 2)
         return a, b, float(metres)
     except ValueError:
-        raise click.BadParameter(f"'{text}' is no distance; write cam01:cam03:4.21", param_hint="--distance") from None
+        raise click.BadParameter(f"'{text}' is not A:B:M; write cam01:cam03:4.21", param_hint="--distance") from None
 
 
 def _write_table(result: BarCalibration, file: Path) -> None:
@@ -155,7 +155,7 @@ def _write_picture(result: BarCalibration, file: Path) -> None:
             cv2.line(panel, _at(at), _at(at + off), (60, 140, 255), 1, cv2.LINE_AA)
             cv2.circle(panel, _at(at), 2, (90, 240, 255), -1, cv2.LINE_AA)
         report = result.cameras[camera.name]
-        title = f"{camera.name}: {report.used} places, {report.rms_px:.2f} px, residuals x {_RESIDUAL_SCALE}"
+        title = f"{camera.name}: {report.used} points, {report.rms_px:.2f} px, residuals x {_RESIDUAL_SCALE}"
         panels.append(_titled(panel, title))
     height = max(len(panel) for panel in panels)
     panels = [np.pad(panel, ((0, height - len(panel)), (4, 4), (0, 0))) for panel in panels]
@@ -183,7 +183,7 @@ def _tell(result: BarCalibration, checked: bool) -> None:
     from rich.table import Table
 
     table = Table(title=f"bar of {result.length:g} m", title_justify="left")
-    for column in ("camera", "focal px", "± px", "centre ± px", "places", "image covered", "rms px", "place ± mm"):
+    for column in ("camera", "focal px", "± px", "centre ± px", "bars", "image covered", "rms px", "position ± mm"):
         left = column == "camera"
         table.add_column(column, justify="left" if left else "right", no_wrap=left)
     for camera in result.rig:
@@ -198,17 +198,17 @@ def _tell(result: BarCalibration, checked: bool) -> None:
         )  # fmt: skip
     _screen.console().print(table)
     _screen.say(
-        f"A target is seen to {result.sigma_px:.3f} px; the bar's length scatters by {1e3 * result.scatter:.2f} mm "
-        f"over {len(result.frames)} places. Left out: {result.left_out} that do not fit, {result.ambiguous} in which "
-        "nothing tells the two targets apart."
+        f"Target detection: sigma {result.sigma_px:.3f} px. Bar length: scatter {1e3 * result.scatter:.2f} mm over "
+        f"{len(result.frames)} frames. Rejected: {result.left_out} outliers, {result.ambiguous} in which the two "
+        "targets cannot be distinguished."
     )
     for (a, b), distance in result.rig.distances.items():
         _screen.say(f"{a} to {b}: {distance:.4f} m")
     _screen.say(result.world)
     for line in result.advice:
-        _screen.say(f"More: {line}")
+        _screen.say(f"To improve: {line}")
     if not checked:
         _screen.say(
-            "The scale is that of --length and nothing here can check it: a length that is 1 % too long makes "
-            "everything 1 % too large. Measure the distance of two lenses with a tape and give --distance."
+            "The scale follows from --length and was not checked: a length that is 1 % too long makes everything 1 % "
+            "too large. Measure the distance between two lenses with a tape, and give it with --distance."
         )

@@ -15,21 +15,21 @@ Examples:
 """
 
 
-@click.command(short_help="Find where the cameras stand from the people in view.", epilog=_EXAMPLES)
+@click.command(short_help="Estimate camera poses from the people in view.", epilog=_EXAMPLES)
 @click.argument("take", type=click.Path(path_type=Path))
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="File to write.  [default: TAKE-people.toml]")
 @click.option(
-    "--height", type=float, metavar="M", help="Stature of the person: it sets the scale.  [default: the take's]"
+    "--height", type=float, metavar="M", help="Stature of the person, which sets the scale.  [default: the take's]"
 )
-@click.option("--focal", is_flag=True, help="Find the focal lengths too.")
-@click.option("--time-offsets", is_flag=True, help="Find the time offset of each camera too.")
+@click.option("--focal", is_flag=True, help="Estimate the focal lengths too.")
+@click.option("--time-offsets", is_flag=True, help="Estimate the time offset of each camera too.")
 @_screen.verbose_option
 def people(
     take: Path, out: Path | None, height: float | None, focal: bool, time_offsets: bool
 ) -> None:
-    """Find where the cameras stand from the people in view.
+    """Estimate camera poses from the people in view.
 
-    TAKE names a calibration for the intrinsics of its cameras; where that says they stand is not used.
+    The calibration of TAKE gives the intrinsics of its cameras. Its camera poses are not used.
     """
     from statistics import median
 
@@ -44,7 +44,7 @@ def people(
 
     take = find_take(take, wanted=("calibrate", "people"))
     out = out or take.with_name(f"{take.stem}-people.toml")
-    check_new(out, remedy="Name another one with --out.")
+    check_new(out, remedy="Give another file with --out.")
     entry = read_take(take)
     with _screen.bars() as step:
         entry = with_detections(entry, step, _screen.note)

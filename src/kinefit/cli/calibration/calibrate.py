@@ -50,17 +50,17 @@ def calibrate() -> None:
 @click.argument("sources", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="VIDEO_OR_FOLDER...")
 @click.option(
     "--board", "spec", required=True, metavar="SPEC",
-    help="checkerboard:9x6:0.025 (inner corners, square in m) or charuco:5x7:0.04:0.03[:DICTIONARY] (squares, square "
-    "and marker in m).",
+    help="checkerboard:9x6:0.025 (inner corners; side of a square in m) or charuco:5x7:0.04:0.03[:DICTIONARY] "
+    "(squares; sides of a square and of a marker in m).",
 )
 @click.option("-o", "--out", type=click.Path(path_type=Path), default=Path("calibration.toml"), show_default=True,
               help="File to write, Pose2Sim TOML.")
-@click.option("--interiors", type=click.Path(path_type=Path), metavar="FILE", help="Calibration whose lenses are kept.")
-@click.option("--interiors-only", is_flag=True, help="Lenses alone; the cameras need not see the board together.")
-@click.option("--floor", metavar="FRAME", help="Frame, or time as 3.5s, at which the board lies on the floor, face up.")
+@click.option("--interiors", type=click.Path(path_type=Path), metavar="FILE", help="Calibration with the intrinsics.")
+@click.option("--interiors-only", is_flag=True, help="Estimate only intrinsics; cameras may see the board one by one.")
+@click.option("--floor", metavar="FRAME", help="Frame (12) or time (3.5s) with the board face up on the floor.")
 @click.option("--max-frames", type=click.IntRange(4), default=200, show_default=True,
-              help="Frames of each camera to look at, evenly over the recording.")
-@click.option("--overwrite", is_flag=True, help="Replace OUT if it exists.")
+              help="Frames of each camera to search, spread over the recording.")
+@click.option("--overwrite", is_flag=True, help="Overwrite an existing OUT.")
 @_screen.verbose_option
 def board(
     sources: tuple[Path, ...], spec: str, out: Path, interiors: Path | None, interiors_only: bool, floor: str | None,
@@ -68,8 +68,9 @@ def board(
 ) -> None:
     """Intrinsics and extrinsics from a checkerboard or ChArUco board.
 
-    Give a synchronised video for each camera, named as the camera, or a folder of them; or folders of pictures. Frames
-    of one number are of one time. The board's square gives the scale, the board on the floor the origin and up.
+    Give a video for each camera, named like the camera, a folder of videos, or folders of images. The videos must be
+    synchronised: equal frame numbers mean equal times. The side of a square gives the scale; the board on the floor
+    (--floor) gives the origin and the vertical.
     """
     from kinefit.calibration.board.calibrate import calibrate_board
     from kinefit.calibration.board.detection import Board
@@ -105,11 +106,11 @@ def _frame(floor: str | None, sources: dict) -> int | None:
             return int(floor)
         seconds = float(floor[:-1])
     except ValueError:
-        raise click.BadParameter(f"'{floor}' is no frame; write 12, or 3.5s", param_hint="--floor") from None
+        raise click.BadParameter(f"'{floor}' is not a frame or time; write 12 or 3.5s", param_hint="--floor") from None
     rates = [0.0]
     for source in sources.values():
         if isinstance(source, dict):
-            raise click.BadParameter("pictures have no times; give the number of one", param_hint="--floor")
+            raise click.BadParameter("images in folders have no times; give a frame number", param_hint="--floor")
         with Video(source) as video:
             rates.append(video.rate)
     return round(seconds * max(rates))
@@ -119,7 +120,7 @@ def _tell(result: BoardCalibration) -> None:
     from rich.table import Table
 
     table = Table(title=f"{result.board}", title_justify="left")
-    for column in ("camera", "focal px", "± px", "views", "picture covered", "rms px", "lens alone px", "place ± mm"):
+    for column in ("camera", "focal px", "± px", "views", "image covered", "rms px", "lens alone px", "position ± mm"):
         left = column == "camera"
         table.add_column(column, justify="left" if left else "right", no_wrap=left)
     for camera in result.rig:
@@ -132,14 +133,13 @@ def _tell(result: BoardCalibration) -> None:
         table.add_row(camera.name, *cells)
     _screen.console().print(table)
     for (a, b), distance in result.rig.distances.items() if result.shared else ():
-        told_frames = f"{result.shared.get((a, b), 0)} frames agree"
-        _screen.say(f"{a} to {b}: {distance:.3f} m, {told_frames}")
+        _screen.say(f"{a} to {b}: {distance:.3f} m, {result.shared.get((a, b), 0)} frames agree")
     if result.jitter[0] > 5e-4:
         shift, turn = 1e3 * result.jitter[0], 57.3 * result.jitter[1]
         _screen.say(
-            f"Between cameras the board differs by {shift:.1f} mm and {turn:.2f} degrees: they are a little out of "
-            "step and the board moved, or it is not flat. Hold it still for a moment in each place."
+            f"The cameras disagree on the board's pose by {shift:.1f} mm and {turn:.2f} degrees: their clocks differ "
+            "while the board moved, or the board is not flat. Hold it still for a moment in each place."
         )
     _screen.say(result.world)
     for line in result.advice:
-        _screen.say(f"More: {line}")
+        _screen.say(f"To improve: {line}")

@@ -39,7 +39,7 @@ def verdict(check: Check) -> str:
     count = {s: sum(found.severity == s for found in check.findings) for s in ("fault", "doubt", "note")}
     counts = [f"{n} {s}{'s' if n > 1 else ''}" for s, n in count.items() if n]
     if count["fault"]:
-        rest = ": fix the faults before you trust results" if len(counts) > 1 else ""
+        rest = ": correct the faults before you use the results" if len(counts) > 1 else ""
         return f"{' and '.join(counts[:2])}{rest}."
     return f"No fault; {counts[0]}." if counts and count["doubt"] else "No fault and no doubt."
 
@@ -47,17 +47,17 @@ def verdict(check: Check) -> str:
 def _findings(check: Check) -> p.Section:
     shown = [finding_callout(found) for found in check.findings if found.severity != "good"]
     good = [found.text for found in check.findings if found.severity == "good"]
-    parts = shown or [p.callout("good", "Nothing is wrong that a check can find.")]
+    parts = shown or [p.callout("good", "The check found no faults and no doubts.")]
     if good:
-        parts.append(p.folded(f"In order: {len(good)} things looked at", p.bullets(good), opened=not shown))
+        parts.append(p.folded(f"In order: {len(good)} checks passed", p.bullets(good), opened=not shown))
     return p.section("Findings", *parts, anchor="findings")
 
 
 def camera_rows(check: Check) -> tuple[list[str], list[list[str]]]:
     """Columns and rows of the table of cameras."""
     columns = [
-        "camera", "bias u, v [px]", "±", "against the others", "spread", "agree with nobody", "late [frames]",
-        "l/r exchanged", "volume in view",
+        "camera", "bias u, v [px]", "±", "against the others", "spread", "outliers", "late [frames]",
+        "left/right swapped", "volume in view",
     ]  # fmt: skip
     rows = []
     for b in check.biases:
@@ -86,7 +86,10 @@ def _share(value: float) -> str:
 
 def _cameras(check: Check) -> p.Section:
     columns, rows = camera_rows(check)
-    caption = "Bias: where the calibration places the person's points minus where the camera sees them, median."
+    caption = (
+        "Bias: median of the projected points of the person minus their keypoints. Outliers: keypoints that agree "
+        "with no other camera."
+    )
     return p.section("Cameras", p.table(columns, rows), p.paragraph(caption, small=True), anchor="cameras")
 
 
@@ -112,7 +115,7 @@ def _plan(check: Check, up: str) -> p.Section:
             corners = [camera.centre_world + 0.45 * reach * camera.ray(np.array(uv)) for uv in _sides(camera)]
             outline = np.stack([corners[0], camera.centre_world, corners[1]])
             bad = any(found.severity == "fault" for found in check.of(camera.name))
-            colour = p.RIGHT if bad else p.LEFT
+            colour = p.RIGHT_COLOUR if bad else p.LEFT_COLOUR
             traces.append({
                 "x": outline @ a, "y": outline @ b, "mode": "lines", "type": "scatter", "showlegend": False,
                 "line": {"color": colour, "width": 1}, "hoverinfo": "skip",
@@ -128,7 +131,7 @@ def _plan(check: Check, up: str) -> p.Section:
         }  # fmt: skip
         plot = p.plot(traces, layout, height=420, label=f"Cameras and person {title.lower()}")
         plots.append(p.Html(f"<div>{p.heading(title)}{plot}</div>"))
-    note = "Lines: the middle of each picture's left and right side. Orange: cameras with a fault."
+    note = "Lines: rays through the middle of the image's left and right side. Orange: cameras with a fault."
     return p.section(
         "Where the cameras stand", p.gallery(plots, size="large"), p.paragraph(note, small=True), anchor="plan"
     )
@@ -147,25 +150,25 @@ def _times(check: Check) -> p.Section:
         for i, ((a, b), (shifts, cost)) in enumerate(check.times.curves.items())
     ]  # fmt: skip
     layout = {
-        "xaxis": {"title": "the second camera taken later by [frames]"},
-        "yaxis": {"title": "the rays miss by [px]", "rangemode": "tozero"},
+        "xaxis": {"title": "shift of the second camera [frames]"},
+        "yaxis": {"title": "distance of the rays [px]", "rangemode": "tozero"},
     }
     text = (
-        "How far the rays of two cameras miss each other when one is shifted in time against the other. In "
-        "step, the valley is at 0; a flat line means too little motion to decide."
+        "Distance between the rays of two cameras when one camera is shifted in time. Synchronised cameras have the "
+        "minimum at 0. A flat line means too little motion to decide."
     )
     return p.section(
-        "Time", text, p.plot(traces, layout, height=340, label="Misses against shift in time"), anchor="time"
+        "Time", text, p.plot(traces, layout, height=340, label="Distance of the rays by shift in time"), anchor="time"
     )
 
 
 def _words() -> p.Section:
     return p.section("How this was found", p.bullets([
-        "The points of one person are triangulated robustly from all cameras that agree; the bias of a camera is the "
-        "median of what is left, its standard error counts each keypoint once.",
-        "Who moved: the normal equations of all cameras' shifts, turns and scales, the points taken out, tell how much "
-        "of the disagreement one or two cameras alone explain.",
-        "Time: whole frames by the distance of rays, then parts from the points' speeds; standard errors by "
-        "leaving out tenths of the recording.",
-        "A detector errs alike in many frames, and otherwise in another view: biases of a few pixels are its own.",
+        "Bias: one person's points are triangulated robustly from all cameras that agree. The bias of a camera is the "
+        "median of its residuals; its standard error counts each keypoint once.",
+        "Which camera moved: normal equations of all cameras' shifts, rotations and scales, with the points "
+        "eliminated, give the share of the disagreement that one or two cameras alone explain.",
+        "Time: whole frames from the distance of rays, fractions from the points' speeds. Standard errors: jackknife "
+        "over tenths of the recording.",
+        "A detector's error is alike in many frames and differs between views: biases of a few pixels are normal.",
     ]), anchor="how")  # fmt: skip

@@ -40,18 +40,18 @@ def picture_section(check: Check) -> p.Section:
         pictures.append(
             p.picture(_points(ground, image, check.views.uv[frame, :, c], others, b), caption=_caption(b, frame))
         )
-        maps.append(p.picture(_map(check, c, ground, image), caption=f"{b.camera}: mean error by place"))
+        maps.append(p.picture(_map(check, c, ground, image), caption=f"{b.camera}: median error by place"))
     first = (
-        "One frame of each camera. Yellow rings: the points as the detector saw them. Blue dots: where the other "
-        f"cameras say they are. The red arrow shows the bias against the others, {_ARROW_SCALE} times as long."
+        "One frame of each camera. Yellow rings: detected keypoints. Blue dots: the same points as predicted from the "
+        f"other cameras. Red arrow: the bias against the other cameras, {_ARROW_SCALE} times as long."
     )
     second = (
-        f"The mean of (calibration minus seen) in each part of the picture, {_ARROW_SCALE} times as long. Arrows that "
-        "are alike: the camera was turned or moved. Arrows towards the middle or away: focal length. Curved "
-        "ones: distortion."
+        f"Median of projected minus detected points in each part of the image, {_ARROW_SCALE} times as long. "
+        "Parallel arrows: the camera was rotated or moved. Radial arrows: wrong focal length. Curved arrows: wrong "
+        "distortion."
     )
     return p.section(
-        "Pictures", first, p.gallery(pictures), p.paragraph(second), p.gallery(maps),
+        "Images", first, p.gallery(pictures), p.paragraph(second), p.gallery(maps),
         anchor="pictures",
     )  # fmt: skip
 

@@ -38,7 +38,7 @@ class Refined:
 
     def summary_lines(self) -> list[str]:
         """The result in plain words, a line each."""
-        stay = "The videos' cameras stay: nothing is wrong with them."
+        stay = "The videos' cameras stay as they are: they have no fault."
         if self.moved:
             stay = f"{stay[:-1]}, and {' and '.join(f.sensor for f in self.moved)} is moved to fit them."
         lines = self.cameras.summary_lines() if self.cameras is not None else [stay]
@@ -77,8 +77,8 @@ def _refine(
     seen, take = found.observations, found.take
     if found.views is None or not found.biases or seen is None or take is None:
         raise CalibrationError(
-            "the calibration cannot be refined before the faults are fixed",
-            remedy="Mend what is named as a fault first.",
+            "--refine needs a recording without faults",
+            remedy="Correct the faults listed above first.",
         )
     static = read_static_points(points, found.views.rig.names) if points else None
     sigma = min(entry.sigma for entry in take.keypoints)
@@ -134,8 +134,8 @@ def write_refined(found: Check, refined: Refined, path: Path) -> None:
         read_take(beside)
     except FileError as error:  # [calibration] twice: the take has it in another form
         beside.unlink()
-        remedy = f"Write into it: {'; '.join(changed)}."
-        raise TakeError("a form of [calibration] that cannot be changed here", file=path, remedy=remedy) from error
+        remedy = f"Write it yourself: {'; '.join(changed)}."
+        raise TakeError("the refined file cannot be written into [calibration]", file=path, remedy=remedy) from error
     _screen.say(f"\nWritten: {beside}, a copy of {path.name} with {', '.join(changed)}.")
     _screen.say(f"Next:\n  {command('track', beside)}")
 

@@ -17,38 +17,38 @@ if TYPE_CHECKING:
 _EXAMPLES = """\b
 Examples:
   kinefit check take.toml                    findings, and a page with images
-  kinefit check take.toml --refine           a better calibration and a take that uses it, beside the old ones
+  kinefit check take.toml --refine           also a refined calibration, and a take file that uses it
 """
-_PRINTED = ("camera", "bias u, v [px]", "±", "spread", "late [frames]", "l/r exchanged")
+_PRINTED = ("camera", "bias u, v [px]", "±", "spread", "late [frames]", "left/right swapped")
 
 
-@click.command(short_help="Find out what is wrong with a recording; refine its calibration.", epilog=_EXAMPLES)
+@click.command(short_help="Find faults of a recording; refine its calibration.", epilog=_EXAMPLES)
 @click.argument("take", type=click.Path(path_type=Path))
-@click.option("-o", "--out", type=click.Path(path_type=Path), help="Page to write.  [default: TAKE-check.html]")
-@click.option("--refine", is_flag=True, help="Write a refined calibration and a take that uses it, never over the old.")
-@click.option("--focal", is_flag=True, help="With --refine: focal lengths too.")
-@click.option("--distortion", is_flag=True, help="With --refine: lens distortion too.")
-@click.option("--time-offsets", is_flag=True, help="With --refine: time offsets too.")
+@click.option("-o", "--out", type=click.Path(path_type=Path), help="HTML page to write.  [default: TAKE-check.html]")
+@click.option("--refine", is_flag=True, help="Write a refined calibration and a take that uses it, as new files.")
+@click.option("--focal", is_flag=True, help="With --refine: refine focal lengths too.")
+@click.option("--distortion", is_flag=True, help="With --refine: refine lens distortion too.")
+@click.option("--time-offsets", is_flag=True, help="With --refine: refine time offsets too.")
 @click.option(
     "--points", type=click.Path(path_type=Path),
-    help="With --refine: TOML of static points, [name] and camera = [u, v] px in the calibration's image.",
+    help="With --refine: TOML file of static points: [NAME], then CAMERA = [u, v] px in the calibration's image.",
 )
 @_screen.hide_faces_option
-@click.option("--strict", is_flag=True, help="Exit code 2 where there is a fault.")
+@click.option("--strict", is_flag=True, help="End with exit code 2 if there is a fault.")
 @_screen.quiet_options
 @_screen.verbose_option
 def check(
     take: Path, out: Path | None, refine: bool, focal: bool, distortion: bool, time_offsets: bool,
     points: Path | None, strict: bool, hide_faces: bool, as_json: bool,
 ) -> None:  # fmt: skip
-    """Find out what is wrong with a recording, how sure that is, and what would fix it.
+    """Find faults of a recording, with their confidence and how to correct them.
 
-    TAKE is the recording's take file. Looked at are the calibration (which camera moved, lens, unit, poses), the order
-    of the cameras, their steps in time, pictures scaled or letterboxed after the calibration, left and right, floor and
-    up, what each camera sees, and whether depth cameras and marker systems fit the videos.
+    TAKE is the recording's take file. The check covers the calibration (moved cameras, lenses, unit, poses), the order
+    of the cameras, their clocks, images scaled or letterboxed after the calibration, left and right, floor and
+    vertical, the view of each camera, and whether depth cameras and marker systems fit the videos.
     """
     if (focal or distortion or time_offsets or points) and not refine:
-        raise click.UsageError("--focal, --distortion, --time-offsets and --points only go with --refine.")
+        raise click.UsageError("--focal, --distortion, --time-offsets and --points need --refine.")
     if points is not None and not points.is_file():
         raise click.BadParameter(f"no such file: {points}", param_hint="--points")
     from kinefit.calibration.check.check import check_take
@@ -75,7 +75,7 @@ def check(
         try:
             entry = with_detections(entry, step, _screen.note)
         except KinefitError as error:  # the rest can be checked without
-            _screen.note(f"note: no keypoints: {error}")
+            _screen.note(f"note: checked without keypoints: {error}")
         entry = find_cameras(entry, step, _screen.note)
         if entry.hide_faces and any(camera.video for camera in entry.cameras):
             ensure_faces(entry, step, _screen.note)
@@ -114,7 +114,7 @@ def _print(found: Check) -> None:
         _screen.tell_finding(one)
     good = [one for one in found.findings if one.severity == "good"]
     if good and not _screen.is_verbose():
-        _screen.say(f"\nin order: {', '.join(dict.fromkeys(one.kind for one in good))} (-v says more)")
+        _screen.say(f"\nin order: {', '.join(dict.fromkeys(one.kind for one in good))} (-v lists them)")
     columns, rows = camera_rows(found)
     if rows:
         shown = [at for at, name in enumerate(columns) if name in _PRINTED]

@@ -79,7 +79,7 @@ def fit_file(
     folder = out if out is not None else path.with_name(f"{path.stem}-kinefit")
     unknown = [name for name in formats if name not in (*results.NAMES, "markers")]
     if unknown:
-        raise ExportError(_results.no_format(unknown[0], (*results.NAMES, "markers")), remedy="Leave it out.")
+        raise ExportError(_results.no_format(unknown[0], (*results.NAMES, "markers")), remedy="Correct --formats.")
     _results.check_folder(folder)
     generic = load_body(options.body)
     people = split_people(read_markers(path, unit=unit))

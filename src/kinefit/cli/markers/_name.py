@@ -55,12 +55,13 @@ def learn_files(
     known = load_marker_set(marker_set) if marker_set else find_marker_set(markers.names)
     if known is None:
         raise ObservationError(
-            "no marker set of the catalogue knows the labels", file=str(paths[0]),
-            remedy="Name one (--set; `kinefit markers set` writes one), or learn from a take in which all joints move.",
+            "no marker set of the catalogue has these labels", file=str(paths[0]),
+            remedy="Give one with --set (`kinefit markers set` writes one), or learn without --frame, from a take in "
+            "which all joints move.",
         )
     if not -1 <= frame < len(markers):
-        problem = f"no frame {frame}: there are {len(markers)}"
-        raise ObservationError(problem, file=str(paths[0]), remedy="Count from 0.")
+        problem = f"--frame {frame} does not exist; the take has the frames 0 to {len(markers) - 1}"
+        raise ObservationError(problem, file=str(paths[0]), remedy="Give one of these, or -1.")
     chosen = int(np.argmax(np.isfinite(markers.positions[..., 0]).sum(1))) if frame < 0 else frame
     model = model_from_frame(markers.positions[chosen], markers.names, known, name=name)
     shown = replace(markers, positions=markers.positions[chosen : chosen + 1], residual=None)

@@ -19,22 +19,22 @@ MOST_DOUBTS = 12
 
 _EXAMPLES = """\b
 Examples:
-  kinefit markers learn labelled.c3d -o anna.json         what Anna's markers hold to each other
-  kinefit markers set labelled.c3d -o lab.toml            a first marker set for labels that are not known
-  kinefit markers identify walk.c3d anna.json             names for the points of an unlabelled take
-  kinefit markers fit walk-named.c3d                      body, joint angles, .mot, BVH, GLB
-  kinefit markers fit walk.c3d --subject anna.json        both in one
-  kinefit markers audit walk-named.c3d                    swapped labels of a take that somebody named
+  kinefit markers learn labelled.c3d -o anna.json         learn how Anna's markers lie on her segments
+  kinefit markers set labelled.c3d -o lab.toml            write a marker set for labels that the catalogue lacks
+  kinefit markers identify walk.c3d anna.json             label the points of an unlabelled take
+  kinefit markers fit walk-named.c3d                      fit a body: joint angles, .mot, BVH, GLB
+  kinefit markers fit walk.c3d --subject anna.json        label and fit in one command
+  kinefit markers audit walk-named.c3d                    find swapped labels of a labelled take
 """
 _FILE = click.Path(path_type=Path)
-_unit = click.option("--unit", metavar="UNIT", help="Of files that state none, or a wrong one: mm, cm, m ...")
+_unit = click.option("--unit", metavar="UNIT", help="Unit of the file, if it states none or a wrong one: mm, cm, m.")
 
 
 @click.group(
-    cls=CommandGroup, short_help="Name the markers of a take, fit a body to them, check labels.", epilog=_EXAMPLES
+    cls=CommandGroup, short_help="Label the markers of a take, fit a body to them, check labels.", epilog=_EXAMPLES
 )
 def markers() -> None:
-    """Name the markers of a take (C3D, TRC), fit a body to them, check labels."""
+    """Label the markers of a take (C3D, TRC), fit a body to them, check labels."""
 
 
 @markers.command(epilog="""\b
@@ -44,25 +44,25 @@ Examples:
   kinefit markers learn static.c3d --frame 100 --set cmu_41
 """)  # fmt: skip
 @click.argument("takes", nargs=-1, required=True, type=_FILE)
-@click.option("-o", "--out", type=_FILE, help="File of the subject.  [default: NAME.json]")
-@click.option("--name", help="Of the subject.  [default: of the first take]")
-@click.option("--set", "marker_set", metavar="NAME", help="Marker set, of the catalogue or a file.  [default: the one "
-              "that knows the labels]")  # fmt: skip
+@click.option("-o", "--out", type=_FILE, help="Subject file to write.  [default: NAME.json]")
+@click.option("--name", help="Name of the subject.  [default: name of the first take]")
+@click.option("--set", "marker_set", metavar="NAME", help="Marker set of the catalogue, or a file.  [default: the set "
+              "that has the labels]")  # fmt: skip
 @click.option("--no-set", is_flag=True, help="Find segments and joints from the motion alone.")
-@click.option("--frame", type=int, help="Learn from this one frame (from 0; -1: the one that shows most) and the set.")
+@click.option("--frame", type=int, help="Learn from the set and this frame alone (from 0; -1: the most complete).")
 @_unit
 @_screen.verbose_option
 def learn(
     takes: tuple[Path, ...], out: Path | None, name: str | None, marker_set: str | None, no_set: bool,
     frame: int | None, unit: str | None,
 ) -> None:  # fmt: skip
-    """Learn a subject's markers from labelled takes, best one in which every joint moves."""
+    """Learn a subject's markers from labelled takes, best from a take in which every joint moves."""
     from kinefit.cli._results import check_file
     from kinefit.cli.markers._name import learn_files
     from kinefit.identification.model.files import save_model
 
     if no_set and (marker_set or frame is not None):
-        raise click.UsageError("--no-set learns from motion alone: without --set and --frame.")
+        raise click.UsageError("--no-set learns from the motion alone: leave out --set and --frame.")
     if out is not None:
         check_file(out)
     model, findings = learn_files(takes, name=name, marker_set="" if no_set else marker_set, frame=frame, unit=unit)
@@ -74,7 +74,7 @@ def learn(
         on = "" if joint is None else f" on {model.names[joint.parent]}"
         _screen.say(f"  {segment}{on}: {', '.join(model.labels[m] for m in members)}")
     if findings:
-        _screen.say("\nWhat the training leaves open:")
+        _screen.say("\nNot determined by these takes:")
         for f in findings:
             _screen.say(f"  {f}")
     _screen.say(f"\nWritten: {out}")
@@ -86,16 +86,16 @@ Examples:
   kinefit markers learn range_of_motion.c3d --set lab.toml -o anna.json
 """)  # fmt: skip
 @click.argument("takes", nargs=-1, required=True, type=_FILE)
-@click.option("-o", "--out", type=_FILE, help="File of the set.  [default: TAKE.toml]")
-@click.option("--name", help="Of the set.  [default: of the file]")
+@click.option("-o", "--out", type=_FILE, help="Marker set to write.  [default: TAKE.toml]")
+@click.option("--name", help="Name of the set.  [default: name of the file]")
 @_unit
 @_screen.verbose_option
 def write_set(takes: tuple[Path, ...], out: Path | None, name: str | None, unit: str | None) -> None:
-    """Write a first marker set for labels that the catalogue does not know.
+    """Write a draft of a marker set for labels that the catalogue does not have.
 
-    TAKES are labelled takes of one subject in which joints move. Labels are paired left and right, those with words
-    that the catalogue knows are laid on the humanoid's landmarks, and every marker goes to the segment that it moves
-    with. Look through the file before you learn with it.
+    TAKES are labelled takes of one subject with moving joints. The command pairs left and right labels, places labels
+    with known words on the humanoid's landmarks, and assigns every marker to the segment that it moves with. Check the
+    file before you learn with it.
     """
     from kinefit.cli._results import check_file
     from kinefit.cli.markers._name import write_first_set
@@ -106,11 +106,11 @@ def write_set(takes: tuple[Path, ...], out: Path | None, name: str | None, unit:
     for segment, labels in found.segments.items():
         _screen.say(f"  {segment}: {', '.join(labels)}")
     if not found.placed:
-        _screen.say("Too few labels have words that the catalogue knows: the groups are what moved together. Give each")
-        _screen.say("the name of its body part and its parent; add [places] and [markers] if a body is to be fitted.")
+        _screen.say("Too few labels have known words: the groups are markers that moved together. Give each group the")
+        _screen.say("name of its body part and its parent; add [places] and [markers] to fit a body.")
     _screen.say(f"{len(found.paired)} pairs of left and right, {len(found.placed)} markers placed on the humanoid")
     _screen.say(f"\nWritten: {out}")
-    _screen.say(f"Next: look through it, then kinefit markers learn {takes[0].name} --set {out}")
+    _screen.say(f"Next: check it, then kinefit markers learn {takes[0].name} --set {out}")
 
 
 @markers.command(epilog="""\b
@@ -123,16 +123,16 @@ Examples:
 @click.argument("subjects", nargs=-1, required=True, type=_FILE)
 @click.option("-o", "--out", type=_FILE, help="Labelled take, .c3d or .trc.  [default: TAKE-named]")
 @click.option("--fill/--no-fill", default=True, show_default=True, help="Fill gaps of up to half a second.")
-@click.option("--rest", is_flag=True, help='Keep points that are nobody\'s, as "*1", "*2" ...')
+@click.option("--rest", is_flag=True, help='Also write unassigned points, as "*1", "*2" ...')
 @_unit
 @_screen.verbose_option
 def identify(
     take: Path, subjects: tuple[Path, ...], out: Path | None, fill: bool, rest: bool, unit: str | None
 ) -> None:
-    """Name the points of an unlabelled take.
+    """Label the points of an unlabelled take.
 
-    SUBJECTS are files of `kinefit markers learn`: one for each person in the take. Labels that the take may have are
-    not looked at. What is not certain has no name; doubtful frames are printed, and all of them written as a table.
+    SUBJECTS are files of `kinefit markers learn`, one for each person in the take. Existing labels of the take are
+    ignored. Points without a certain label stay unlabelled. The worst doubtful frames are printed; a table lists all.
     """
     from kinefit.cli.markers._name import identify_file
     from kinefit.identification.take.takes import TakeSettings
@@ -176,21 +176,21 @@ Examples:
 @click.argument("take", type=_FILE)
 @click.option("-o", "--out", type=_FILE, help="Folder of results.  [default: TAKE-kinefit]")
 @click.option("--subject", "subjects", multiple=True, type=_FILE,
-              help="Name the points first, by this file of `learn`; again for another person.")  # fmt: skip
+              help="Label the points first, with this file of `learn`; repeat for more people.")  # fmt: skip
 @click.option("--static", type=_FILE, help="Labelled static trial of the same subject.")
-@click.option("--body", default="humanoid", show_default=True, help="Of the catalogue, or a body file.")
-@click.option("--set", "marker_set", metavar="NAME", help="Marker set.  [default: the one that knows the labels]")
-@click.option("--height", type=click.FloatRange(0.5, 2.6), metavar="M", help="Of the subject, barefoot [m].")
-@click.option("--up", type=click.Choice(["x", "y", "z"]), help="Vertical axis.  [default: found]")
-@click.option("--limits/--no-limits", default=True, show_default=True, help="Keep joints within their ranges.")
-@click.option("--formats", metavar="LIST", help="What to write.  [default: motion,mot,osim,trc,bvh,glb,markers]")
+@click.option("--body", default="humanoid", show_default=True, help="Body of the catalogue, or a body file.")
+@click.option("--set", "marker_set", metavar="NAME", help="Marker set.  [default: the set that has the labels]")
+@click.option("--height", type=click.FloatRange(0.5, 2.6), metavar="M", help="Height of the subject, barefoot [m].")
+@click.option("--up", type=click.Choice(["x", "y", "z"]), help="Vertical axis.  [default: estimated]")
+@click.option("--limits/--no-limits", default=True, show_default=True, help="Keep joint angles within their limits.")
+@click.option("--formats", metavar="LIST", help="Formats to write.  [default: motion,mot,osim,trc,bvh,glb,markers]")
 @_unit
 @_screen.verbose_option
 def fit(
     take: Path, out: Path | None, subjects: tuple[Path, ...], static: Path | None, body: str, marker_set: str | None,
     height: float | None, up: str | None, limits: bool, formats: str | None, unit: str | None,
 ) -> None:  # fmt: skip
-    """Fit a body to markers: size and marker places from all frames, then angles in each."""
+    """Fit a body to markers: size and marker offsets from all frames, then joint angles of each frame."""
     from kinefit.cli._summary import print_summary
     from kinefit.cli.markers._fit import FORMATS, MarkerFitOptions, fit_file
     from kinefit.cli.markers._name import identify_file
@@ -223,9 +223,9 @@ Examples:
   kinefit markers audit walk.c3d --subject anna.json
 """)  # fmt: skip
 @click.argument("takes", nargs=-1, required=True, type=_FILE)
-@click.option("--subject", type=_FILE, help="File of `kinefit markers learn`: shows swaps that last through a take.")
-@click.option("--set", "marker_set", metavar="NAME", help="Marker set.  [default: the one that knows the labels]")
-@click.option("--strict", is_flag=True, help="Exit with 2 where a label is wrong.")
+@click.option("--subject", type=_FILE, help="File of `kinefit markers learn`, to find swaps of whole takes.")
+@click.option("--set", "marker_set", metavar="NAME", help="Marker set.  [default: the set that has the labels]")
+@click.option("--strict", is_flag=True, help="End with exit code 2 if a label is wrong.")
 @_unit
 @_screen.verbose_option
 @click.pass_context
@@ -233,7 +233,7 @@ def audit(
     ctx: click.Context, takes: tuple[Path, ...], subject: Path | None, marker_set: str | None, strict: bool,
     unit: str | None,
 ) -> None:  # fmt: skip
-    """Find swapped labels, and markers off their segment, in takes that somebody labelled."""
+    """Find swapped labels, and markers off their segment, in labelled takes."""
     from kinefit.bodies.marker_sets import load_marker_set
     from kinefit.identification.audit.audit import audit_take
     from kinefit.identification.model.files import load_model
@@ -245,7 +245,7 @@ def audit(
     for take in takes:
         findings = audit_take(read_markers(take, unit=unit), model=model, marker_set=known)
         wrong = wrong or any(f.kind in ("swapped", "throughout") for f in findings)
-        _screen.say(f"{take}: {'nothing found' if not findings else ''}".rstrip())
+        _screen.say(f"{take}: {'no wrong labels found' if not findings else ''}".rstrip())
         for f in findings:
             _screen.say(f"  {f}")
     if strict and wrong:

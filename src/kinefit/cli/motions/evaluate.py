@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _EXAMPLES = """\b
 Examples:
   kinefit evaluate                                 the fusion tracker on all 100 sequences
-  kinefit evaluate --method voodoo                 the published method, with three helps
+  kinefit evaluate --method voodoo                 the published method, with three improvements
   kinefit evaluate --sensor kinect --count 10      ten sequences, each movement and each person once
 """
 _NAMES = {"3d": "3D (depth)", "2d": "2D (face, hands)", "fusion": "fusion"}
@@ -22,23 +22,23 @@ _NAMES = {"3d": "3D (depth)", "2d": "2D (face, hands)", "fusion": "fusion"}
 
 @click.command(short_help="Grade a tracker on simulated sequences of known motion.", epilog=_EXAMPLES)
 @click.option("--suite", type=click.Choice(["voodoo"]), default="voodoo", show_default=True,
-              help="Ten movements by ten people, seen by a depth camera and as face and hands in 2D.")  # fmt: skip
-@click.option("--count", type=click.IntRange(1, 100), default=100, show_default=True, help="Sequences.")
+              help="Ten movements by ten people: depth images, and face and hands in 2D.")  # fmt: skip
+@click.option("--count", type=click.IntRange(1, 100), default=100, show_default=True, help="Number of sequences.")
 @click.option("--method", type=click.Choice(["fusion", "live", "voodoo"]), default="fusion", show_default=True,
-              help="The fusion tracker, smoothed or frame by frame; or VooDoo with three helps.")  # fmt: skip
+              help="The fusion tracker, smoothed or live; or VooDoo with three improvements.")  # fmt: skip
 @click.option("--sensor", type=click.Choice(["tof", "kinect"]), default="tof", show_default=True)
 @click.option("--start", type=click.Choice(["truth", "found"]), default="truth", show_default=True,
-              help="First pose: the true one, or found in the first depth image.")  # fmt: skip
-@click.option("--rate", type=click.FloatRange(1, 120), default=10.0, show_default=True, help="Frames a second.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the people and of the sensors' errors.")
+              help="First pose: the true one, or estimated from the first depth image.")  # fmt: skip
+@click.option("--rate", type=click.FloatRange(1, 120), default=10.0, show_default=True, help="Frames per second.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of people and sensor noise.")
 @_screen.verbose_option
 def evaluate(
     suite: str, count: int, method: str, sensor: str, start: str, rate: float, seed: int
 ) -> None:  # fmt: skip
     """Track simulated sequences of known motion and grade each 0 (lost), 1 (acceptable) or 2 (good).
 
-    2: the joints are off by at most 60 mm on average, none by more than 150 mm in over 5 % of the frames. 0: one is
-    off by more than 250 mm at the end, or in most of the frames: lost and not recovered.
+    Grade 2: the mean joint error is at most 60 mm, and no joint is off by more than 150 mm in over 5 % of the frames.
+    Grade 0: a joint is off by more than 250 mm at the end, or in most of the frames.
     """
     from kinefit.evaluation.sequences import sequences
     from kinefit.evaluation.voodoo import METHODS, conclusions, found_start

@@ -30,21 +30,21 @@ _NAMES = ("kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh")
 _RESTS = ("body", "t")
 _OF_BVH = ("bvh", *_NAMES[:-1])
 _OF_HANIM = ("hanim", *(name for name in _NAMES if name != "hanim"))
-_OPENSIM = "OpenSim's files are in metres, y up, under the names of the body's coordinates"
+_OPENSIM = "OpenSim files are in metres, y up, with the names of the body's coordinates"
 
 FREEDOM = {
     "csv": Freedom(("m", "cm", "mm"), _UPS, _NAMES),
     "parquet": Freedom(("m", "cm", "mm"), _UPS, _NAMES),
     "bvh": Freedom(("cm", "m", "mm"), _Y_UPS, _OF_BVH, _RESTS),
     "glb": Freedom((), (), _NAMES, _RESTS, "GLB is in metres and y up by its specification"),
-    "usd": Freedom(("m", "cm", "mm"), ("y", "z"), _NAMES, _RESTS, "USD knows y and z up"),
+    "usd": Freedom(("m", "cm", "mm"), ("y", "z"), _NAMES, _RESTS, "USD supports only y and z up"),
     "c3d": Freedom(("mm", "cm", "m"), _UPS, _NAMES),
-    "trc": Freedom(("m", "cm", "mm"), _Y_UPS, (), (), "TRC holds landmarks, which bear the names of H-Anim"),
+    "trc": Freedom(("m", "cm", "mm"), _Y_UPS, (), (), "TRC has landmarks, with their H-Anim names"),
     "x3d": Freedom((), (), _OF_HANIM, _RESTS, "X3D is in metres and y up by its standard"),
-    "nwb": Freedom((), _UPS, _NAMES, (), "NWB is in metres here"),
+    "nwb": Freedom((), _UPS, _NAMES, (), "kinefit writes NWB in metres"),
     "mcap": Freedom((), _Z_UPS, _NAMES, (), "ROS is in metres"),
-    "rrd": Freedom((), _UPS, _NAMES, (), "RRD is in metres here"),
-    "jsonl": Freedom((), _UPS, (), (), "JSON lines are in metres, under the names of the body's segments"),
+    "rrd": Freedom((), _UPS, _NAMES, (), "kinefit writes RRD in metres"),
+    "jsonl": Freedom((), _UPS, (), (), "JSON lines are in metres, with the names of the body's segments"),
     "mot": Freedom(why=_OPENSIM),
     "osim": Freedom(why=_OPENSIM),
 }
@@ -61,10 +61,11 @@ Examples:
   kinefit export motion.npz --to usd --up z --out walk.usda
   kinefit export motion.npz --to trc --out walk.trc --unit mm
   kinefit export motion.npz --to parquet --out tables
-  kinefit export motion.npz --retarget character.glb                  the motion on another character, mesh and all
+  kinefit export motion.npz --retarget character.glb                  the motion on another character's mesh
 
 \b
-Choices, the default first (csv, parquet, c3d, nwb, rrd, jsonl keep the vertical axis; --names mixamo rests as t):
+Values of each format, default first (csv, parquet, c3d, nwb, rrd, jsonl keep the vertical axis; --names mixamo has
+rest pose t):
 """ + "".join(
     f"  {format:<8} "
     + "; ".join(f"--{key} {' '.join(getattr(free, key))}" for key in KEYS if getattr(free, key))
@@ -88,39 +89,39 @@ def _format(ctx: click.Context, parameter: click.Parameter, value: str | None) -
 @click.argument("motion", type=click.Path(path_type=Path))
 @click.option(
     "--to", "format", callback=_format, metavar=f"[{'|'.join(FREEDOM)}]",
-    help="Format; csv and parquet are a folder of tables. Needed, unless --retarget.",
+    help="Format to write; csv and parquet give a folder of tables. Required without --retarget.",
 )
 @click.option(
     "--retarget", "character", type=click.Path(path_type=Path), metavar="CHARACTER",
-    help="Put the motion onto the skeleton and mesh of a GLB, VRM, glTF or BVH file.",
+    help="Write the motion on the skeleton and mesh of a GLB, VRM, glTF or BVH file.",
 )
 @click.option(
     "--names-table", "table", type=click.Path(path_type=Path), metavar="TOML",
-    help="With --retarget: lines such as thigh_l = \"JointName\", where the character's names tell it not.",
+    help="With --retarget: lines such as thigh_l = \"JointName\", for joints that are not recognised by name.",
 )
-@click.option("-o", "--out", type=click.Path(path_type=Path), help="File or folder.  [default: beside MOTION]")
+@click.option("-o", "--out", type=click.Path(path_type=Path), help="File or folder.  [default: next to MOTION]")
 @click.option("--unit", metavar="UNIT", help="Unit of length: m, cm or mm.")
 @click.option("--up", metavar="AXIS", help="Vertical axis: x, y, z, -x, -y or -z.")
 @click.option("--names", metavar="NAMES", help="Names of joints: kinefit, mixamo, cmu, opensim, hanim or bvh.")
 @click.option("--rest", metavar="POSE", help="Rest pose: body (arms hanging, facing x) or t (a T facing z).")
-@click.option("--cylinders", is_flag=True, help="GLB and USD: the body's cylinders in place of a skin.")
+@click.option("--cylinders", is_flag=True, help="GLB and USD: write the body's cylinders instead of a skin.")
 @_screen.verbose_option
 def export(
     motion: Path, format: str | None, character: Path | None, table: Path | None, out: Path | None, cylinders: bool,
     **choices: str | None,
 ) -> None:
-    """Write a motion file, as `kinefit track` leaves it, in another format, or on another character."""
+    """Write a motion file of `kinefit track` in another format, or on another character."""
     if character is not None:
         given = {"to": format, **choices, "cylinders": cylinders or None}
         others = [key for key, value in given.items() if value is not None]
         return _retarget(motion, character, table, out, others)
     if table is not None:
-        raise click.UsageError("--names-table names the joints of a --retarget CHARACTER.")
+        raise click.UsageError("--names-table needs --retarget CHARACTER, whose joints it names.")
     if format is None:
         problem = f"Missing option '--to' (or --retarget CHARACTER). Give --to [{'|'.join(FREEDOM)}]."
         raise click.UsageError(problem)
     if cylinders and format not in ("glb", "usd"):
-        raise click.UsageError(f"--cylinders has no place in {format}: only glb and usd hold a mesh of the body.")
+        raise click.UsageError(f"--cylinders does not apply to {format}: only glb and usd contain a mesh of the body.")
     options = {
         key: _choice(format, key, _meant(key, value, getattr(FREEDOM[format], key)))
         for key, value in choices.items() if value is not None
@@ -148,7 +149,7 @@ def _meant(key: str, value: str, valid: Sequence[str]) -> str:
 def _retarget(motion: Path, character: Path, table: Path | None, out: Path | None, others: list[str]) -> None:
     """Write a motion on a character, in its format."""
     if others:
-        raise click.UsageError(f"--{others[0]} has no place beside --retarget: all is as in the character's file.")
+        raise click.UsageError(f"--{others[0]} does not apply with --retarget: the character's file determines it.")
     from kinefit.exporters import write_character
     from kinefit.exporters.skeletons.finger_bones import in_words
     from kinefit.readers.motion import find_motion, read_motion
@@ -162,7 +163,7 @@ def _retarget(motion: Path, character: Path, table: Path | None, out: Path | Non
     found = write_character(recorded, character, out, names=read_names(table) if table else None)
     _screen.say(f"{out}: {len(recorded)} frames on {len(found.segments)} joints of {character.name}")
     if found.lacking:
-        _screen.note(f"{character.name} has no bones for fingers that the motion moves. {in_words(found.lacking)}.")
+        _screen.note(f"{character.name} has no bones for moving fingers of the motion. {in_words(found.lacking)}.")
 
 
 def _choice(format: str, key: str, value: str) -> str:
@@ -172,6 +173,6 @@ def _choice(format: str, key: str, value: str) -> str:
         return value
     why = f"{FREEDOM[format].why}. " if FREEDOM[format].why and not (valid and key == "unit") else ""
     if valid:
-        raise click.UsageError(f"{why}--{key} of {format} is one of: {', '.join(valid)}; not {value}.")
+        raise click.UsageError(f"{why}--{key} {value} is not possible for {format}. Give one of: {', '.join(valid)}.")
     others = [name for name, free in FREEDOM.items() if getattr(free, key)]
-    raise click.UsageError(f"{why}--{key} is of {', '.join(others)}; not of {format}.")
+    raise click.UsageError(f"{why}--{key} does not apply to {format}, only to {', '.join(others)}.")

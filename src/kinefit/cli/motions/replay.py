@@ -11,23 +11,23 @@ from kinefit.cli import _screen
 _EXAMPLES = """\b
 Examples:
   kinefit replay motion.npz -o ride.mp4 --speed 6               a video on a slope of 30 degrees
-  kinefit replay motion.npz -o ride.npz --speed 6 --gain 1.5    a motion; look at it with kinefit view ride.npz
+  kinefit replay motion.npz -o ride.npz --speed 6 --gain 1.5    a motion; show it with kinefit view ride.npz
 """
 
 
-@click.command(short_help="Show a motion on a slope, carried along, from a new camera.", epilog=_EXAMPLES)
+@click.command(short_help="Move a motion down a slope; render it from a new camera.", epilog=_EXAMPLES)
 @click.argument("source", metavar="MOTION", type=click.Path(path_type=Path))
 @click.option("-o", "--out", required=True, type=click.Path(path_type=Path), help="Video (.mp4) or motion (.npz).")
-@click.option("--slope", type=float, default=30.0, show_default=True, help="[deg] of the floor.")
-@click.option("--heading", type=float, default=0.0, show_default=True, help="[deg] of the fall line.")
-@click.option("--speed", type=float, default=4.0, show_default=True, help="[m/s] down the slope at first.")
-@click.option("--gain", type=float, default=0.0, show_default=True, help="[m/s²] by which it grows.")
-@click.option("--azimuth", type=float, default=100.0, show_default=True, help="[deg] of the camera from the fall line.")
+@click.option("--slope", type=float, default=30.0, show_default=True, help="[deg] Slope of the floor.")
+@click.option("--heading", type=float, default=0.0, show_default=True, help="[deg] Direction of the fall line.")
+@click.option("--speed", type=float, default=4.0, show_default=True, help="[m/s] Initial speed down the slope.")
+@click.option("--gain", type=float, default=0.0, show_default=True, help="[m/s²] Acceleration down the slope.")
+@click.option("--azimuth", type=float, default=100.0, show_default=True, help="[deg] Camera from the fall line.")
 @_screen.verbose_option
 def replay(
     source: Path, out: Path, slope: float, heading: float, speed: float, gain: float, azimuth: float
 ) -> None:
-    """Put a motion on a slope, add a translation that changes with time, and write it as a video or a motion."""
+    """Place a motion on a slope, move it downhill, and write it as a video or a motion."""
     from kinefit.cli._results import check_file
     from kinefit.exporters.motion_file import write_motion
     from kinefit.readers.motion import read_motion

@@ -16,20 +16,20 @@ Examples:
 """
 
 
-@click.command(short_help="Put a recorded motion (BVH, ASF/AMC) onto the humanoid.", epilog=_EXAMPLES)
+@click.command(short_help="Retarget a recorded motion (BVH, ASF/AMC) to the humanoid.", epilog=_EXAMPLES)
 @click.argument("recording", type=click.Path(path_type=Path))
-@click.option("--asf", type=click.Path(path_type=Path), help="Skeleton of an .amc file; needed there.")
+@click.option("--asf", type=click.Path(path_type=Path), help="Skeleton (.asf) of an .amc file.")
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="Motion file.  [default: RECORDING with .npz]")
-@click.option("--rate", type=click.FloatRange(min=0, min_open=True), help="Frames a second.  [default: as recorded]")
+@click.option("--rate", type=click.FloatRange(min=0, min_open=True), help="Frames per second.  [default: as recorded]")
 @click.option(
     "--names-table", "table", type=click.Path(path_type=Path), metavar="TOML",
-    help="Lines such as thigh_l = \"JointName\", where the joints are named in no known way.",
+    help="Lines such as thigh_l = \"JointName\", for joints that are not recognised by name.",
 )
 @_screen.verbose_option
 def retarget(
     recording: Path, asf: Path | None, out: Path | None, rate: float | None, table: Path | None
 ) -> None:
-    """Put a recorded motion onto the humanoid, by the directions of its bones."""
+    """Retarget a recorded motion to the humanoid, by the directions of its bones."""
     from kinefit.cli._results import check_file
     from kinefit.exporters import write_motion
     from kinefit.readers.skeletons.amc import read_amc
@@ -39,9 +39,9 @@ def retarget(
 
     suffix = recording.suffix.lower()
     if suffix not in (".bvh", ".amc"):
-        raise click.BadParameter(f"'{recording.name}' ends neither in .bvh nor in .amc.", param_hint="RECORDING")
+        raise click.BadParameter(f"'{recording.name}' is not a .bvh or .amc file.", param_hint="RECORDING")
     if (asf is not None) != (suffix == ".amc"):
-        raise click.UsageError("An .amc file needs its skeleton, --asf FILE; a .bvh file takes none.")
+        raise click.UsageError("An .amc file needs its skeleton: give --asf FILE. With a .bvh file, leave out --asf.")
     out = out or recording.with_suffix(".npz")
     check_file(out)
     skeleton = read_amc(asf, recording) if asf else read_bvh(recording)

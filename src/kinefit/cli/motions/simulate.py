@@ -29,34 +29,34 @@ def _frames(ctx: click.Context, parameter: click.Parameter, value: str | None) -
     try:
         return int(first or 0), int(last) if last else None if colon else int(first) + 1
     except ValueError:
-        raise click.BadParameter("give FIRST:LAST, the last not included.") from None
+        raise click.BadParameter("give FIRST:LAST, without the frame LAST.") from None
 
 
-@click.command(short_help="Render what depth, stereo and colour cameras would have seen of a motion.", epilog=_EXAMPLES)
+@click.command(short_help="Simulate depth, stereo and colour cameras for a motion.", epilog=_EXAMPLES)
 @click.argument("motion", type=click.Path(path_type=Path))
-@click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Folder of the take.")
+@click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Folder for the take.")
 @click.option(
     "--sensor", "sensors", type=click.Choice(_SENSORS), multiple=True, default=("kinect",), show_default=True,
-    help="May be given more than once.",
+    help="Sensor to simulate; repeat for several.",
 )  # fmt: skip
-@click.option("--body", help="Catalogue name or body file.  [default: the motion's, or humanoid]")
-@click.option("--asf", type=click.Path(path_type=Path), help="Skeleton of an .amc file; needed there.")
-@click.option("--rate", type=click.FloatRange(min=0, min_open=True), help="Frames a second.  [default: at most 30]")
-@click.option("--frames", callback=_frames, help="FIRST:LAST at that rate, the last not included.  [default: all]")
-@click.option("--distance", type=click.FloatRange(0.1, 50), help="[m]  [default: as near as all of it is in view]")
-@click.option("--azimuth", type=float, default=0.0, show_default=True, help="[deg] 90: from the person's left.")
+@click.option("--body", help="Body of the catalogue, or a file.  [default: the motion's, or humanoid]")
+@click.option("--asf", type=click.Path(path_type=Path), help="Skeleton (.asf) of an .amc file.")
+@click.option("--rate", type=click.FloatRange(min=0, min_open=True), help="Frames per second.  [default: at most 30]")
+@click.option("--frames", callback=_frames, help="FIRST:LAST at this rate, without LAST.  [default: all]")
+@click.option("--distance", type=click.FloatRange(0.1, 50), help="[m] to the sensors.  [default: nearest full view]")
+@click.option("--azimuth", type=float, default=0.0, show_default=True, help="[deg] 90: at the person's left.")
 @click.option("--height", type=float, default=1.2, show_default=True, help="[m] of the sensors above the floor.")
-@click.option("--no-room", is_flag=True, help="No floor, walls and table.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of all errors.")
+@click.option("--no-room", is_flag=True, help="Leave out floor, walls and table.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all noise.")
 @_screen.verbose_option
 def simulate(
     motion: Path, out: Path, sensors: tuple[str, ...], body: str | None, asf: Path | None, rate: float | None,
     frames: tuple[int, int | None] | None, distance: float | None, azimuth: float, height: float, no_room: bool,
     seed: int,
 ) -> None:  # fmt: skip
-    """Render what sensors in front of a person would have seen of a MOTION (.npz of kinefit, .bvh or .amc).
+    """Simulate the sensors in front of a person who performs MOTION (.npz of kinefit, .bvh or .amc).
 
-    The folder then holds a take for kinefit track, and the truth beside it.
+    The folder gets a take for kinefit track, and the true motion in truth/.
     """
     import math
 
@@ -78,7 +78,7 @@ def simulate(
             seed=seed, step=step, beside=truth, body=Path(body).resolve() if body and body.endswith(".toml") else None,
         )  # fmt: skip
     _screen.say(f"{take}: {len(known)} frames at {known.rate:g} Hz of the body {known.body.name}")
-    _screen.say(f"{out / 'truth'}: motion.npz, joints.csv and more: what they should find")
+    _screen.say(f"{out / 'truth'}: the true motion (motion.npz, joints.csv and more)")
     _screen.say(f"Next:\n  {command('track', take)}")
 
 
@@ -92,9 +92,9 @@ def _known(path: Path, body: str | None, asf: Path | None, rate: float | None, s
 
     suffix = path.suffix.lower()
     if suffix not in (".npz", ".bvh", ".amc"):
-        raise click.BadParameter(f"'{path.name}' ends neither in .npz, .bvh nor .amc.", param_hint="MOTION")
+        raise click.BadParameter(f"'{path.name}' is not a .npz, .bvh or .amc file.", param_hint="MOTION")
     if (asf is not None) != (suffix == ".amc"):
-        raise click.UsageError("An .amc file needs its skeleton, --asf FILE; others take none.")
+        raise click.UsageError("An .amc file needs its skeleton: give --asf FILE. With other files, leave out --asf.")
     chosen = load_body(body) if body else None
     if suffix == ".npz":
         known = read_motion(path)

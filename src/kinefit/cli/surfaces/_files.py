@@ -45,13 +45,13 @@ def read_views(calibration: Path, unit: str, views: Sequence[str]) -> tuple[Rig,
     for view in views:
         name, sign, path = view.partition("=")
         if not sign or not path:
-            raise ObservationError(f"a view '{view}'", remedy="Write CAMERA=PATH, with the camera's name.")
+            raise ObservationError(f"view '{view}' is not CAMERA=PATH", remedy="Write it as left=left.png.")
         place = Path(path)
         names.append(name)
         if place.is_dir() or "*" in place.name:
             files = images_in(place, PHOTOGRAPHS)
             if not files:
-                raise FileError("no images here", file=place, remedy="Name a photograph, a folder of them, or a video.")
+                raise FileError("no images here", file=place, remedy="Give a photograph, a folder of them, a video.")
             photographs.append(tuple(files))
         elif place.suffix.lower() in PHOTOGRAPHS:
             photographs.append((place,))
@@ -59,8 +59,8 @@ def read_views(calibration: Path, unit: str, views: Sequence[str]) -> tuple[Rig,
             videos.append(place)
     if len(names) < 2 or (photographs and videos) or len({len(files) for files in photographs}) > 1:
         counts = ", ".join(str(len(files)) for files in photographs)
-        problem = f"{len(names)} views: {len(videos)} videos, photographs: {counts or 'none'}"
-        raise ObservationError(problem, remedy="Give two views or more, all videos or all with as many photographs.")
+        problem = f"these {len(names)} views do not go together: {len(videos)} videos, photographs: {counts or 'none'}"
+        raise ObservationError(problem, remedy="Give at least two views: all videos, or all with as many photographs.")
     if photographs:
         size = read_photograph(photographs[0][0]).shape[1::-1]
     else:
@@ -88,8 +88,8 @@ def read_photograph(path: Path) -> NDArray:
         return picture
     brightest = float(picture.max())
     if not 0.0 < brightest < np.inf or picture.min() < 0.0:
-        problem = f"grey values from {picture.min():g} to {brightest:g}"
-        raise FileError(problem, file=path, remedy="Give photographs whose values are finite, 0 for black.")
+        problem = f"grey values range from {picture.min():g} to {brightest:g}"
+        raise FileError(problem, file=path, remedy="Give photographs with finite values, 0 for black and not all 0.")
     return np.asarray(picture * np.float32(255.0 / brightest))
 
 
@@ -98,23 +98,23 @@ def read_seeds(path: Path, views: int) -> list[Seeds]:
 
     Raises FileError for a file without points, or with other columns.
     """
-    remedy = "Give u and v [px] of each point in every view: u1,v1,u2,v2."
+    remedy = "Give u and v [px] of each point in every view, as in u1,v1,u2,v2."
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file)
             rows = [(reader.line_num, row) for row in reader if row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FileError(f"cannot be read: {error}", file=path, remedy="Write numbers, separated by commas.") from None
+        raise FileError(f"cannot be read: {error}", file=path, remedy="Write numbers separated by commas.") from None
     if rows and not _is_number(rows[0][1][0]):
         rows = rows[1:]
     for line, row in rows:
         bad = next((cell for cell in row if cell.strip() and not _is_number(cell)), None)
         if bad is not None or len(row) != 2 * views:
-            problem = f"{len(row)} columns for {views} views" if bad is None else f"'{shortened(bad, 60)}' is no number"
+            problem = f"{len(row)} columns, not {2 * views}" if bad is None else f"'{shortened(bad, 60)}' is no number"
             raise FileError(problem, file=path, place=f"line {line}", remedy=remedy)
     table = np.array([[float(cell) if cell.strip() else np.nan for cell in row] for _, row in rows])
     if not len(table):
-        raise FileError("no points in it", file=path, remedy=remedy)
+        raise FileError("the file has no points", file=path, remedy=remedy)
     return [Seeds.of(table[:, :2], table[:, 2 * k : 2 * k + 2]) for k in range(1, views)]
 
 

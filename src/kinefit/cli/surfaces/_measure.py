@@ -63,8 +63,8 @@ class Wanted:
     def side_of_all(self) -> int:
         """Side of the windows [px], of all; ObservationError for one that is no odd number."""
         if not self.window.isdigit():
-            problem = f"a window of '{self.window}'"
-            raise ObservationError(problem, remedy="Give an odd number of pixels; or 'texture' for photographs.")
+            problem = f"--window '{self.window}' is not a number"
+            raise ObservationError(problem, remedy="Give an odd number of pixels, or 'texture' with photographs.")
         return int(self.window)
 
     def side(self, first: SplineImage, second: SplineImage, grid: Grid) -> int | NDArray:
@@ -97,7 +97,8 @@ def measure_photographs(rig: Rig, views: StateImages, wanted: Wanted, progress: 
     rig = with_field(rig, wanted.field)
     count = len(views.photographs[0])
     if wanted.still is not None and wanted.still >= count:
-        raise ObservationError(f"state {wanted.still} of {count}", remedy="The first is 0; --still names another one.")
+        problem = f"--still {wanted.still} does not exist; there are {count} states"
+        raise ObservationError(problem, remedy=f"Give a state from 1 to {count - 1}; state 0 is the reference.")
     states = _States(views.photographs, wanted.field, wanted.smooth)
     first = states[0]
     grid = Grid.of(first[0].size, wanted.step, mask=mask_of(wanted.mask, wanted.field))
@@ -120,8 +121,9 @@ def measure_one_camera(photographs: Sequence[Path], millimetres: float, wanted: 
     """
     named = [str(p) for p in photographs if p.suffix.lower() not in PHOTOGRAPHS or ("=" in p.name and not p.exists())]
     if named or wanted.seeds is not None or len(photographs) < 2:
-        problem = f"--flat with {', '.join(named) or ('--seeds' if wanted.seeds else 'one photograph')}"
-        raise ObservationError(problem, remedy="Name photographs of one camera, before and after, and nothing else.")
+        given = ", ".join(named) or ("--seeds" if wanted.seeds else "one photograph")
+        problem = f"--flat does not work with {given}"
+        raise ObservationError(problem, remedy="Give only photographs of one camera, before and after.")
     states = [spline_of(read_photograph(path), wanted.field, wanted.smooth) for path in photographs]
     grid = Grid.of(states[0].size, wanted.step, mask=mask_of(wanted.mask, wanted.field))
     window = wanted.side(states[0], states[1], grid)
@@ -179,7 +181,7 @@ def _write(
         moved = 1e3 * float(np.linalg.norm(T[:3, :3] @ middle + T[:3, 3] - middle))
         turned = np.rad2deg(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
         lines.append(
-            f"   moved by {moved:.3f} mm, turned by {turned:.3f} degrees; the rest {rms:.4f} mm RMS a coordinate"
+            f"   moved by {moved:.3f} mm, turned by {turned:.3f} degrees; residual {rms:.4f} mm RMS per coordinate"
         )
         if wanted.gauge is not None:
             strain = surface_strain(reference, surface, wanted.gauge / 1e3, window)
@@ -209,7 +211,7 @@ def _write(
 def _about(surface: MeasuredSurface, k: int) -> str:
     inside, seen = surface.grid.inside.sum(), surface.measured
     if not seen.any():
-        return f"state {k}: none of {inside} points found"
+        return f"state {k}: none of {inside} points matched"
     std = 1e3 * float(np.median(np.linalg.norm(surface.std[seen], axis=1)))
     return (
         f"state {k}: {seen.sum()} of {inside} points, {len(surface.triangles)} triangles; "
@@ -230,8 +232,8 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
     photographs = {"--gauge": wanted.gauge, "--still": wanted.still, "--incremental": wanted.incremental or None}
     given = [name for name, value in photographs.items() if value is not None]
     if given:
-        problem = f"{', '.join(given)} with videos"
-        raise ObservationError(problem, remedy="These are for photographs: states of one surface.")
+        problem = f"{', '.join(given)} cannot be used with videos"
+        raise ObservationError(problem, remedy="Leave them out, or give photographs: states of one surface.")
     rig = with_field(rig, wanted.field)
     motion = None if wanted.motion is None else read_motion(wanted.motion)
     with ExitStack() as opened:
@@ -239,8 +241,8 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
         if not all(is_even(video.times, videos[0].rate) for video in videos):
             rates = [video.unevenness or f"{video.rate:.6g} Hz" for video in videos]
             listed = ", ".join(f"{name} {rate}" for name, rate in zip(views.names, rates))
-            remedy = "A surface is matched between images taken at once: record with cameras in step."
-            raise ObservationError(f"videos of different or varying rate: {listed}", remedy=remedy)
+            remedy = "Record with synchronised cameras at one constant rate."
+            raise ObservationError(f"the videos' frame rates differ or vary: {listed}", remedy=remedy)
         if motion is not None:
             _check_motion(motion, wanted.motion, videos[0].rate)
         count = min(len(video) for video in videos)
@@ -275,18 +277,18 @@ def measure_videos(rig: Rig, views: StateImages, wanted: Wanted, progress: Progr
     lengths = kept.live.sum(axis=0)
     lengths = lengths[lengths > 0] if lengths.any() else np.zeros(1, int)
     count = int(kept.live.any(axis=0).sum())
-    about = f"{len(paths.times)} frames: {count} of {before} paths kept, {live.min()} to {live.max()} a frame"
-    lines.insert(0, f"{about}, {np.median(lengths):.0f} frames a path (median), speed {speed:.3f} m/s (99 %)")
+    about = f"{len(paths.times)} frames: {count} of {before} paths kept, {live.min()} to {live.max()} per frame"
+    lines.insert(0, f"{about}, {np.median(lengths):.0f} frames per path (median), speed {speed:.3f} m/s (99 %)")
     if cut:
-        lines.insert(1, "places cut off by the filters: " + ", ".join(f"{name} {count}" for name, count in cut.items()))
+        lines.insert(1, "points rejected by filters: " + ", ".join(f"{name} {count}" for name, count in cut.items()))
     return lines
 
 
 def _check_motion(motion: Motion, path: Path | None, rate: float) -> None:
     """Refuse a motion of another rate than the videos', or one that does not begin with them."""
     if abs(motion.rate - rate) > 1e-3 * rate or abs(float(motion.times[0])) > 0.5 / rate:
-        problem = f"a motion at {motion.rate:g} Hz from {motion.times[0]:.3f} s on, for videos at {rate:g} Hz"
-        remedy = "Give the motion of these videos: kinefit track of a take with rate and first frame as theirs."
+        problem = f"motion of {motion.rate:g} Hz from {motion.times[0]:.3f} s on does not fit videos of {rate:g} Hz"
+        remedy = "Give a motion with the videos' rate that starts at 0 s: set rate and frames in its take."
         raise FileError(problem, file=path, place="times", remedy=remedy)
 
 

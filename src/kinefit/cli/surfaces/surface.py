@@ -13,43 +13,43 @@ Examples:
   kinefit surface calib.toml left=left.png right=right.png            points, mesh, standard deviations
   kinefit surface calib.toml 201=states/201 202=states/202 --gauge 5  folders: states of one surface; strain over 5 mm
   kinefit surface calib.toml a=a.mp4 b=b.mp4 --window 21              videos: the surface is tracked
-  kinefit surface before.png after.png --flat 0.05 --gauge 5          one camera, a flat plate, 0.05 mm a pixel
+  kinefit surface before.png after.png --flat 0.05 --gauge 5          one camera, a flat plate, 0.05 mm per pixel
 """
 
 
 @click.command(short_help="Measure a surface without a body: points, mesh, strain.", epilog=_EXAMPLES)
 @click.argument("calibration", type=click.Path(path_type=Path))
 @click.argument("views", nargs=-1, required=True, metavar="CAMERA=PATH...")
-@click.option("-o", "--out", type=click.Path(path_type=Path), default=Path("surface"), help="Folder.")
-@click.option("--unit", default="auto", help="Of the calibration: m, cm, mm ..., or metres.  [default: as it states]")
-@click.option("--window", default="13", show_default=True, help="Side [px] of the windows, odd, or 'texture'.")
-@click.option("--step", type=click.IntRange(1), default=6, show_default=True, help="[px] from point to point.")
-@click.option("--mask", type=click.Path(path_type=Path), help="PNG over the first image, black where no point is.")
+@click.option("-o", "--out", type=click.Path(path_type=Path), default=Path("surface"), help="Output folder.")
+@click.option("--unit", default="auto", help="Calibration's unit: m, cm, mm, or metres.  [default: as it states]")
+@click.option("--window", default="13", show_default=True, help="Side of the matched windows [px], odd; or 'texture'.")
+@click.option("--step", type=click.IntRange(1), default=6, show_default=True, help="Grid spacing [px].")
+@click.option("--mask", type=click.Path(path_type=Path), help="PNG mask of the first image, black outside the surface.")
 @click.option(
     "--seeds", type=click.Path(path_type=Path),
-    help="CSV of points known in all cameras: u and v of each in the order of the views.  [default: they are found]",
+    help="CSV of known points: u and v in each camera, in the order of the views.  [default: found automatically]",
 )  # fmt: skip
-@click.option("--least", type=click.FloatRange(0, 1), help="Correlation of a match.  [default: 0.8]")
-@click.option("--gauge", type=click.FloatRange(min=0, min_open=True), help="Strain over this length [mm].")
-@click.option("--incremental", is_flag=True, help="Match and strain each state against the one before, not the first.")
-@click.option("--still", type=click.IntRange(1), help="State of nothing moved: strain to it is the noise floor.")
+@click.option("--least", type=click.FloatRange(0, 1), help="Smallest correlation of a match.  [default: 0.8]")
+@click.option("--gauge", type=click.FloatRange(min=0, min_open=True), help="Gauge length of the strain [mm].")
+@click.option("--incremental", is_flag=True, help="Refer each state to the previous state, not to the first.")
+@click.option("--still", type=click.IntRange(1), help="State without motion: its strain is the noise floor.")
 @click.option(
-    "--smooth", type=click.FloatRange(0, 5), default=0.0, help="[px] of a Gaussian, for texture sharper than pixels."
+    "--smooth", type=click.FloatRange(0, 5), default=0.0, help="Gaussian blur [px], for aliased texture."
 )
 @click.option(
     "--flat", type=click.FloatRange(min=0, min_open=True), metavar="MM",
-    help="Photographs of one camera that faces a flat surface; MM are the millimetres that a pixel shows.",
+    help="One camera that faces a flat surface; MM is the width of a pixel on it, in mm.",
 )  # fmt: skip
 @click.option(
     "--motion", type=click.Path(path_type=Path),
-    help="Of videos: the motion.npz, or its folder, of the body that they show; lost points are sought where it says.",
+    help="Videos: motion.npz, or its folder, of the body in view; it predicts where lost points reappear.",
 )  # fmt: skip
 @click.option(
     "--bounds", type=(float, float), metavar="M/S M/S²",
-    help="Of videos: speed and acceleration beyond which a path is cut off.",
+    help="Videos: largest speed and acceleration of a path; a path ends where it exceeds them.",
 )  # fmt: skip
-@click.option("--neighbours", is_flag=True, help="Of videos: also cut off points whose neighbours were cut off.")
-@click.option("--field", type=click.Choice(["odd", "even"]), help="Of interlaced images, these lines alone.")
+@click.option("--neighbours", is_flag=True, help="Videos: also reject points whose neighbours were rejected.")
+@click.option("--field", type=click.Choice(["odd", "even"]), help="Interlaced images: use only these lines.")
 @_screen.verbose_option
 def surface(
     calibration: Path, views: tuple[str, ...], out: Path, unit: str, window: str, step: int, mask: Path | None,
@@ -57,13 +57,13 @@ def surface(
     smooth: float, flat: float | None, motion: Path | None, bounds: tuple[float, float] | None,
     neighbours: bool, field: str | None,
 ) -> None:  # fmt: skip
-    """Measure a surface that two cameras or more see: points with standard deviations, a mesh, displacement, strain.
+    """Measure a surface with two or more cameras: points with standard deviations, mesh, displacement, strain.
 
-    CALIBRATION is any that `kinefit` reads; each CAMERA=PATH names one of its cameras and its photograph, its folder of
-    photographs (states, in the order of the names) or its video. The first camera's first image holds the grid of
-    points.
+    CALIBRATION is any calibration file that kinefit reads. Each CAMERA=PATH gives one of its cameras with its
+    photograph, its folder of photographs (states, in the order of their names) or its video. The grid of points lies on
+    the first image of the first camera.
 
-    With --flat no calibration is needed: all arguments are photographs, before and after.
+    With --flat there is no calibration: all arguments are photographs, before and after.
     """
     from kinefit.cli._results import check_folder
     from kinefit.cli.surfaces._files import read_views
@@ -77,14 +77,14 @@ def surface(
     videos_alone = {"--motion": motion, "--bounds": bounds, "--neighbours": neighbours or None}
     of_videos = [name for name, value in videos_alone.items() if value is not None]
     if of_videos and flat is not None:
-        raise ObservationError(f"{of_videos[0]} with --flat", remedy="It is for videos, which are followed in time.")
+        raise ObservationError(f"{of_videos[0]} needs videos; --flat has photographs", remedy="Leave out one of them.")
     if flat is not None:
         lines = measure_one_camera([calibration, *map(Path, views)], flat, wanted)
     else:
         rig, paths = read_views(calibration, unit, views)
         if of_videos and not paths.videos:
-            problem = f"{of_videos[0]} with photographs"
-            raise ObservationError(problem, remedy="It is for videos, which are followed in time.")
+            problem = f"{of_videos[0]} needs videos; the views are photographs"
+            raise ObservationError(problem, remedy="Leave it out, or give videos.")
         with _screen.bars() as progress:
             lines = (measure_videos if paths.videos else measure_photographs)(rig, paths, wanted, progress)
     for line in lines:

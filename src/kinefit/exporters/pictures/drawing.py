@@ -16,7 +16,7 @@ from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
 from kinefit.rendering import Canvas
-from kinefit.rendering.colours import LOST, side_colour
+from kinefit.rendering.colours import LOST_COLOUR, side_colour
 from kinefit.rendering.looks import segment_looks, side_colours, triangle_segments, uncertain_segments
 from kinefit.rendering.tubes import TubeMesh, body_mesh
 
@@ -69,7 +69,7 @@ def draw_bones(image: NDArray, motion: Motion, frame: int, camera: Camera, image
         width = max(1, int(thick[b]) // 3) if lost else int(thick[b])
         dash = _DASH_WIDTHS * (width + 2 * edge) if lost else 0.0
         draw_line(image, uv[b], DARK, width + 2 * edge, dash)
-        draw_line(image, uv[b], LOST if lost else colours[b], width, dash)
+        draw_line(image, uv[b], LOST_COLOUR if lost else colours[b], width, dash)
     for b in np.flatnonzero(~motion.lost[frame, list(owners)]):
         _dot(image, uv[b, 0], 0.36 * thick[b], WHITE, -1)
 
@@ -129,7 +129,7 @@ def draw_body(image: NDArray, motion: Motion, frame: int, camera: Camera, image_
             uv = image_frame.from_calibration(rim)
             dash = _DASH_WIDTHS * 3 * edge if lost[s] else 0.0
             draw_line(image, uv, DARK, 3 * edge, dash)
-            draw_line(image, uv, LOST if lost[s] else side_colour(segments[s]), edge, dash)
+            draw_line(image, uv, LOST_COLOUR if lost[s] else side_colour(segments[s]), edge, dash)
 
 
 def segment_contours(segments: NDArray, segment: int) -> list[NDArray]:

@@ -11,11 +11,11 @@ from kinefit.exporters.curves import Curve, curves
 from kinefit.exporters.report.cycles import PERCENT, Cycles, normalised
 from kinefit.exporters.report.names import DIGITS, FINGER_JOINTS, NAMES
 from kinefit.exporters.report.norms import Norms
-from kinefit.exporters.report.page import CENTRE, LEFT, RIGHT, Html, plot
+from kinefit.exporters.report.page import CENTRE_COLOUR, LEFT_COLOUR, RIGHT_COLOUR, Html, plot
 from kinefit.motion import Motion
 
 MAX_CURVE_POINTS = 1000  # points of a curve; the page is about as many pixels wide
-_COLOURS = {"left": LEFT, "right": RIGHT, "": CENTRE}
+_COLOURS = {"left": LEFT_COLOUR, "right": RIGHT_COLOUR, "": CENTRE_COLOUR}
 _ROW, _GREY = 190, "#8a949e"  # [px] height of one plot
 
 # In the humanoid's order of interest; a joint that is not here keeps its own name and comes last.

@@ -15,7 +15,7 @@ from kinefit.exporters.report.page import Html, to_json
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion, rotation_between_up
-from kinefit.rendering.colours import LOST, side_colour, to_hex
+from kinefit.rendering.colours import LOST_COLOUR, side_colour, to_hex
 from kinefit.rendering.looks import LOST_OPACITY, UNCERTAIN_OPACITY, triangle_segments, uncertain_segments
 from kinefit.rendering.tubes import body_mesh, is_last
 
@@ -71,7 +71,7 @@ def _player(body: Body, Ts: NDArray, **more: Any) -> Html:
         "middle": 0.5 * (low + high), "low": low, "high": high, "floor": floor, "rest": body.tree.rest,
         "ends": capsules.points.points, "owners": owners, "radii": capsules.radii, "skin": _skin(body),
         "colours": [to_hex(side_colour(name)) for name in names],
-        "sides": [name.endswith("_r") - name.endswith("_l") for name in names], "lost_colour": to_hex(LOST),
+        "sides": [name.endswith("_r") - name.endswith("_l") for name in names], "lost_colour": to_hex(LOST_COLOUR),
         "opacities": [LOST_OPACITY, UNCERTAIN_OPACITY], "cameras": [], "start": 0.0, "lost": "", "uncertain": "",
         **more,
     }  # fmt: skip

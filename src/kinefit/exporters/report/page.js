@@ -8,8 +8,9 @@
 
   // plotly.js is unpacked when the first plot comes into sight.
   let library;
+  const source = document.getElementById("plotly-gzip");  // none where it could not be fetched
   const plotly = () => library ??= (async () => {
-    const packed = Uint8Array.from(atob(document.getElementById("plotly-gzip").textContent), c => c.charCodeAt(0));
+    const packed = Uint8Array.from(atob(source.textContent), c => c.charCodeAt(0));
     const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
     const script = document.createElement("script");
     script.textContent = await new Response(stream).text();
@@ -49,9 +50,12 @@
   const shown = place => place.offsetParent !== null;
   const watch = new IntersectionObserver(entries => entries.forEach(e => { if (e.isIntersecting) draw(e.target); }),
     { rootMargin: "400px" });
-  document.querySelectorAll(".plot").forEach(place => { place.style.height = `${place.dataset.height}px`; watch.observe(place); });
+  document.querySelectorAll(".plot").forEach(place => {
+    if (!source) { place.dataset.drawn = "none"; place.textContent = `Not drawn: ${place.ariaLabel}`; return; }
+    place.style.height = `${place.dataset.height}px`; watch.observe(place);
+  });
   // The library is unpacked when the page has come to rest, so that printing finds it ready.
-  if (document.querySelector(".plot")) addEventListener("load", () => setTimeout(plotly, 500));
+  if (source) addEventListener("load", () => setTimeout(plotly, 500));
   addEventListener("beforeprint", () => document.querySelectorAll(".plot").forEach(draw));
 
   function seek(time) { document.dispatchEvent(new CustomEvent("seek", { detail: time })); }

@@ -1,8 +1,9 @@
-"""One self-contained HTML page: every picture, plot and script lies in the file, nothing is ever fetched.
+"""One self-contained HTML page: every picture, plot and script lies in the file, which loads nothing.
 
 A page is made of parts of type `Html`; plain text is escaped wherever it is given. A rule in the head of the page (its
 content security policy) forbids the browser to load anything from elsewhere. Plots are drawn by plotly.js, which is put
-in once, compressed, and only where there is a plot.
+in once, compressed, and only where there is a plot. `kinefit.assets` fetches it before the first page with a plot; a
+page that is written where it cannot be fetched says so and has no plots.
 
     text = page("Balancing", [
         section("Quality", paragraph("All frames were tracked."), plot([{"x": times, "y": quality}])),
@@ -29,15 +30,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import ExportError
+from kinefit.errors import AssetError, ExportError
 from kinefit.rendering import colours
 from kinefit.serving.policy import inline_policy
 
 # Left and right as in overlays.
-LEFT, RIGHT, CENTRE = (colours.to_hex(c) for c in (colours.LEFT, colours.RIGHT, colours.CENTRE))
-SERIES = (LEFT, RIGHT, CENTRE, "#cc79a7", "#7a5195", "#56b4e9", "#b8860b", "#4d4d4d")
+LEFT_COLOUR, RIGHT_COLOUR = colours.to_hex(colours.LEFT_COLOUR), colours.to_hex(colours.RIGHT_COLOUR)
+CENTRE_COLOUR = colours.to_hex(colours.CENTRE_COLOUR)
+SERIES = (LEFT_COLOUR, RIGHT_COLOUR, CENTRE_COLOUR, "#cc79a7", "#7a5195", "#56b4e9", "#b8860b", "#4d4d4d")
 SEVERITIES = {"good": "✓", "note": "i", "warning": "!", "bad": "✕"}
 
+_PLOTS_REMEDY = "Run kinefit warmup once where the package index can be reached, then write this page again."
 _SHADES = 20  # steps of the ground of a table's cell, from white to the right side's orange; text stays dark on all
 
 
@@ -74,10 +77,12 @@ def page(title: str, sections: Iterable[Section | str], *, subtitle: str = "", c
     scripts = [_resource(name) for name in ("page.js", *(["player.js"] if 'class="player"' in body else []))]
     style, library, allowed = _resource("page.css") + _shades(), "", list(scripts)
     if 'class="plot"' in body:
-        from plotly.offline import get_plotlyjs
-
-        library = f'<script type="text/plain" id="plotly-gzip">{_plotly()}</script>'
-        allowed.append(get_plotlyjs())
+        script, packed = _plotly()
+        if packed:
+            library = f'<script type="text/plain" id="plotly-gzip">{packed}</script>'
+            allowed.append(script)
+        else:
+            body = callout("note", "The plots of this page are missing", script, _PLOTS_REMEDY) + body
     # plotly.js adds its rules to style elements that are empty when they are made
     policy = inline_policy(allowed, [style, ""], "img-src data: blob:; font-src data:")
     return "\n".join(
@@ -254,13 +259,14 @@ def gallery(pictures: Iterable[Html], *, size: str = "medium") -> Html:
 
 
 def plot(
-    traces: Any, layout: Mapping[str, Any] | None = None, *, height: int = 320, label: str = "", seeks: bool = False
-) -> Html:
+    traces: Iterable[Mapping[str, Any]], layout: Mapping[str, Any] | None = None, *,
+    height: int = 320, label: str = "", seeks: bool = False,
+) -> Html:  # fmt: skip
     """A plot by plotly.js.
 
     Parameters
     ----------
-    traces : list of dicts, or a plotly Figure
+    traces : list of dicts
         As plotly.js takes them; arrays may hold NaN, which become gaps.
     layout : dict, optional
         What differs from the page's own layout.
@@ -270,10 +276,6 @@ def plot(
     seeks : bool
         Whether x is the time [s], so that a click moves the page's 3D figure there.
     """
-    if hasattr(traces, "to_plotly_json"):
-        given = traces.to_plotly_json()
-        traces = given["data"]
-        layout = {k: v for k, v in given["layout"].items() if k != "template"} | dict(layout or {})
     data = to_json({"data": list(traces), "layout": {**dict(layout or {}), "height": height}})
     marks = " data-seeks" if seeks else ""
     return Html(
@@ -317,14 +319,18 @@ def _shades() -> str:
     """Rules of `shaded` cells: a page's policy allows no style of a single element."""
     rules = []
     for k in range(_SHADES + 1):
-        red, green, blue = (round(255 + (end - 255) * 0.75 * k / _SHADES) for end in colours.RIGHT)
+        red, green, blue = (round(255 + (end - 255) * 0.75 * k / _SHADES) for end in colours.RIGHT_COLOUR)
         rules.append(f".shade-{k} {{ background: rgb({red},{green},{blue}); }}\n")
     return "".join(rules)
 
 
 @lru_cache(maxsize=1)
-def _plotly() -> str:
-    """plotly.js compressed, 2 MB where it has 5; the page unpacks it."""
-    from plotly.offline import get_plotlyjs
+def _plotly() -> tuple[str, str]:
+    """plotly.js, and compressed, 2 MB where it has 5; the page unpacks it. Why it cannot be had, and ""."""
+    from kinefit.assets import PLOTLY_PACKAGE, fetch
 
-    return base64.b64encode(gzip.compress(get_plotlyjs().encode("utf-8"), 9, mtime=0)).decode("ascii")
+    try:
+        script = (fetch(PLOTLY_PACKAGE) / "plotly.min.js").read_bytes()
+    except AssetError as error:
+        return str(error), ""
+    return script.decode("utf-8"), base64.b64encode(gzip.compress(script, 9, mtime=0)).decode("ascii")

@@ -69,6 +69,8 @@ def write_report(
 ) -> Path:
     """Write one self-contained HTML page about a motion.
 
+    The first page fetches plotly.js, which draws the plots; where it cannot be fetched, the page says so and has none.
+
     Parameters
     ----------
     motion : Motion

@@ -230,9 +230,8 @@ def _distance(a: _DetectionTrack, b: _DetectionTrack, points: slice) -> float:
 
 def detect_people(
     images: Iterable[NDArray[np.uint8]], models: Models, *, camera: str, rate: float, people: int = 3,
-    masks: bool = True, source: str = "",
-    with_hands: _Adder | None = None, with_faces: _Adder | None = None,
-) -> Detections:
+    masks: bool = True, with_hands: _Adder | None = None, with_faces: _Adder | None = None,
+) -> Detections:  # fmt: skip
     """Detect and track people in a video: keypoints and masks.
 
     Parameters
@@ -245,8 +244,6 @@ def detect_people(
         Largest number of people at a time.
     masks : bool
         Whether masks are computed.
-    source : str
-        Name of the video.
     with_hands, with_faces : callable, optional
         Adds hands, or faces, to the people in an image: a `HandFollower`, a `FaceFinder`.
 
@@ -281,7 +278,7 @@ def detect_people(
     hands, hand_confidence = _stacked(frames, column, "hands", (2, 21)) if with_hands else (None, None)
     face, face_confidence = _stacked(frames, column, "face", (478,)) if with_faces else (None, None)
     return Detections(
-        camera, rate, size, points, confidence, np.concatenate(runs), np.concatenate([[0], np.cumsum(counts)]), source,
+        camera, rate, size, points, confidence, np.concatenate(runs), np.concatenate([[0], np.cumsum(counts)]), "",
         lifted, hands, hand_confidence, None, face, face_confidence,
     )
 

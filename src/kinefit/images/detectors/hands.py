@@ -20,7 +20,7 @@ from kinefit.images.detectors.models import interpreter
 from kinefit.images.detectors.roi import Roi, is_inside
 
 PALMS, HANDS = "palm_detection_full.tflite", "hand_landmark_full.tflite"
-ALONE = -1
+HANDS_ONLY_COLUMN = -1
 """Column of hands of a person whose body is not in view."""
 
 _PALM_CELLS = ((8, 2), (16, 6))  # stride [px] of the feature maps, anchors in a cell
@@ -122,7 +122,8 @@ class HandFollower:
     def __call__(self, image: NDArray[np.uint8], people: Sequence[PersonDetection]) -> list[PersonDetection]:
         """Add hands to the people in an image (H, W, 3).
 
-        If no person has hands, one person more in column `ALONE` holds the hands that the palm detector finds, if any.
+        If no person has hands, one person more in column `HANDS_ONLY_COLUMN` holds the hands that the palm detector
+        finds, if any.
         """
         now: dict[tuple[int, int], HandLandmarks] = {}
         for person in people:
@@ -155,13 +156,13 @@ class HandFollower:
     def _alone(self, image: NDArray[np.uint8]) -> dict[tuple[int, int], HandLandmarks]:
         """Track or detect at most one left and one right hand, by their palms."""
         now: dict[tuple[int, int], HandLandmarks] = {}
-        for before in [hand for (column, _), hand in self._before.items() if column == ALONE]:
+        for before in [hand for (column, _), hand in self._before.items() if column == HANDS_ONLY_COLUMN]:
             if found := self._look(image, before.roi):
-                now.setdefault((ALONE, int(found.left < 0.5)), found)
+                now.setdefault((HANDS_ONLY_COLUMN, int(found.left < 0.5)), found)
         for roi in self.models.find_palms(image) if not now else ():
             found = self._look(image, roi, twice=True)
             if found and not any(_is_same(found, hand) for hand in now.values()):
-                now.setdefault((ALONE, int(found.left < 0.5)), found)
+                now.setdefault((HANDS_ONLY_COLUMN, int(found.left < 0.5)), found)
         return now
 
     def _look(self, image: NDArray[np.uint8], roi: Roi, *, twice: bool = False) -> HandLandmarks | None:
@@ -195,4 +196,4 @@ def hands_of(
 def _unseen_person() -> PersonDetection:
     """A person whose body is not in view."""
     unseen = np.full((33, 2), np.nan), np.zeros(33), np.zeros(0, np.uint32), np.full((33, 3), np.nan)
-    return PersonDetection(ALONE, *unseen)
+    return PersonDetection(HANDS_ONLY_COLUMN, *unseen)

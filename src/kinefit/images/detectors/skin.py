@@ -19,7 +19,7 @@ from kinefit.images.detectors.detection import Follower
 from kinefit.images.detectors.models import Models
 from kinefit.observations import KeypointFrame
 
-FACE, LEFT, RIGHT = 0, 1, 2
+FACE, LEFT_HAND, RIGHT_HAND = 0, 1, 2
 LANDMARKS = ("nose_tip", "l_metacarpal_phalanx_3", "r_metacarpal_phalanx_3")  # at the centres of the patches
 WRISTS = ("nose_tip", "l_wrist", "r_wrist")  # for bodies without fingers; the centre of a hand lies 8 cm further
 
@@ -187,7 +187,7 @@ class SkinTracker:
 
     def _hand_near(self, patch: _Patch) -> bool:
         """Whether a hand is predicted near a patch adjacent to the face; else the patch is forehead or neck."""
-        hands = [b for b in self.blobs[LEFT:] if b is not None]
+        hands = [b for b in self.blobs[LEFT_HAND:] if b is not None]
         return any(np.linalg.norm(b.centre - patch.centre) < _FACE_RADIUS * self._height for b in hands)
 
     def _candidates(self, mask: NDArray) -> list[_Patch]:
@@ -220,7 +220,8 @@ class SkinTracker:
     def _update_hands(self, found: list[_Patch]) -> None:
         """Assign each hand a patch or none: the pair with the highest score (see `_score`)."""
         motion = max([0.1, *(p.movement for p in found)])
-        found = sorted(found, key=lambda p: -max(self._score(k, p, motion) for k in (LEFT, RIGHT)))[:_MAX_CANDIDATES]
+        sides_of_hands = LEFT_HAND, RIGHT_HAND
+        found = sorted(found, key=lambda p: -max(self._score(k, p, motion) for k in sides_of_hands))[:_MAX_CANDIDATES]
         options: list[_Patch | None] = [None, *found]
         chosen, best = (options[0], options[0]), 2.0 * _NO_HAND_SCORE
         for left in options:
@@ -228,10 +229,10 @@ class SkinTracker:
                 if left and right and left.label == right.label:
                     continue  # both ends of one arm
                 sides = 0.3 if left and right and left.centre[0] > right.centre[0] else 0.0
-                score = self._score(LEFT, left, motion) + self._score(RIGHT, right, motion) + sides
+                score = self._score(LEFT_HAND, left, motion) + self._score(RIGHT_HAND, right, motion) + sides
                 if score > best:
                     chosen, best = (left, right), score
-        for k, patch in zip((LEFT, RIGHT), chosen):
+        for k, patch in zip((LEFT_HAND, RIGHT_HAND), chosen):
             if patch is not None:
                 self._update(k, patch)
 
@@ -246,7 +247,7 @@ class SkinTracker:
         assert face is not None
         motion_score = 2.0 * patch.movement / motion
         if hand is None:
-            right_side = (patch.centre[0] < face.centre[0]) == (k == RIGHT)
+            right_side = (patch.centre[0] < face.centre[0]) == (k == RIGHT_HAND)
             return motion_score + (0.1 if right_side else 0.0)
         near = 0.5 * self._height * (1.0 + 2.0 * (hand.unseen - self._step) / _MAX_TIME_LOST)
         return motion_score + float(np.exp(-0.5 * np.sum((patch.centre - hand.centre) ** 2) / near**2))

@@ -26,7 +26,7 @@ class JsonLines:
             self._file: BinaryIO = sys.stdout.buffer if str(path) == "-" else open(self.path, "wb")
         except OSError as error:
             problem = f"cannot be written ({error.strerror})"
-            raise ExportError(problem, file=self.path, remedy="Name another file.") from error
+            raise ExportError(problem, file=self.path, remedy="Give another file with --json.") from error
 
     def hello(self, body: Body, packet: bytes) -> None:
         """Write the packet of a new body as one line."""
@@ -47,4 +47,4 @@ class JsonLines:
             self._file.flush()
         except OSError as error:
             problem = f"cannot be written ({error.strerror})"
-            raise ExportError(problem, file=self.path, remedy="Free some space, or name another file.") from error
+            raise ExportError(problem, file=self.path, remedy="Free some space, or give another --json.") from error

@@ -34,7 +34,7 @@
       figure.move(p.segments, new Set(p.lost), new Set(p.uncertain));
       tell(p, `following, ${p.time.toFixed(2)} s`);
     },
-    waiting(p) { tell(p, p.paused ? "paused: what the sensors see is not followed" : "nobody is found"); },
+    waiting(p) { tell(p, p.paused ? "paused: what the sensors see is not followed" : "person not found"); },
     refused(p) { status.textContent = p.why; },
     done() {},
   };
@@ -65,7 +65,7 @@
     socket.onopen = () => able(true);
     socket.onmessage = event => { const p = JSON.parse(event.data); (act[p.type] || (() => {}))(p); };
     socket.onclose = () => {
-      able(false); status.textContent = "the session is over; a next one with the same token is shown here"; setTimeout(open, 1000);
+      able(false); status.textContent = "the session has ended; the next session with the same token appears here"; setTimeout(open, 1000);
     };
   }
   open();

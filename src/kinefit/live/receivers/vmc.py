@@ -86,8 +86,8 @@ class Vmc:
         try:
             family, _, _, _, self._to = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         except (OSError, UnicodeError) as error:
-            remedy = 'Give it as "192.168.1.5:39539".'
-            raise ExportError(f"the host '{host}:{port}' is not known", place="VMC", remedy=remedy) from error
+            remedy = "Give it as 192.168.1.5:39539."
+            raise ExportError(f"the host '{host}:{port}' cannot be found", place="VMC", remedy=remedy) from error
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._turn = se3.transform(rotation_between_up(up, "y"), np.zeros(3))
@@ -101,7 +101,7 @@ class Vmc:
         self._rest = rest_pose(body, "t", "kinefit", "VMC")
         segments, parents = body.tree.segments, body.tree.parents
         if "pelvis" not in segments:
-            raise BodyError(f"body '{body.name}' has no pelvis", place="VMC", remedy="Follow a person: humanoid.")
+            raise BodyError(f"body '{body.name}' has no pelvis", place="VMC", remedy="Use a humanoid body.")
         bones, ancestors = [s for s, name in enumerate(segments) if name in BONES], []
         for s in bones:
             above = int(parents[s])

@@ -142,10 +142,10 @@ class WebSockets:
         while True:
             wish = await connection.recv(decode=False)
             if not connection.has_token:
-                why = "A wish needs the token: connect to the address that the command printed, with ws for http."
+                why = "Requests need the token: connect to the address that kinefit printed, with ws instead of http."
                 answer({"type": "refused", "why": why})
             elif self._ask is None:
-                answer({"type": "refused", "why": "This session takes no wishes."})
+                answer({"type": "refused", "why": "This session accepts no requests."})
             else:
                 self._ask(wish, answer)
 

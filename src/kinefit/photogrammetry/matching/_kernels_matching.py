@@ -27,7 +27,7 @@ SIZE = 8  # unknowns
 U, V, A, OFFSET, GAIN, CORRELATION, VAR_U, COV, VAR_V = 0, 1, 2, 6, 7, 8, 9, 10, 11
 NOISE, ITERATIONS, STATUS = 12, 13, 14
 ROW = 15
-FOUND, FLAT, OUTSIDE, DIVERGED, NOT_TRIED = 0, 1, 2, 3, 4
+FOUND, FLAT, OUTSIDE_IMAGE, DIVERGED, NOT_VISITED = 0, 1, 2, 3, 4
 
 
 @jit
@@ -191,7 +191,7 @@ def match_point(first, second, at_u, at_v, start, half, steps, tolerance, share,
     out[ITERATIONS] = 0.0
     mean = template(first, at_u, at_v, half, f, fx, fy, rows)
     if not abs(mean) < math.inf:
-        out[STATUS] = OUTSIDE
+        out[STATUS] = OUTSIDE_IMAGE
         return
     normal_matrix(f, fx, fy, half, mean, m)
     f_f = m[5, 5]
@@ -203,7 +203,7 @@ def match_point(first, second, at_u, at_v, start, half, steps, tolerance, share,
     status = DIVERGED
     for step in range(steps):
         if not fits(second, u, v, a11, a12, a21, a22, half):
-            status = OUTSIDE
+            status = OUTSIDE_IMAGE
             break
         shift, hh = right_side(second, f, fx, fy, half, mean, u, v, a11, a12, a21, a22, b)
         variance = hh - b[4] * b[4] / n

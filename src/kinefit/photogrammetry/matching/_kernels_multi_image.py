@@ -20,7 +20,7 @@ from kinefit.photogrammetry.matching._kernels_matching import (
     FLAT,
     FOUND,
     GAIN,
-    OUTSIDE,
+    OUTSIDE_IMAGE,
     ROW,
     SIZE,
     STATUS,
@@ -89,7 +89,7 @@ def _match_ray(
             each[i, c] = math.nan
     mean = template(first, at[0], at[1], half, f, fx, fy, rows)
     if not (abs(mean) < math.inf and abs(start[0]) < math.inf):
-        out[STATE] = OUTSIDE
+        out[STATE] = OUTSIDE_IMAGE
         return
     normal_matrix(f, fx, fy, half, mean, m)
     f_f = m[5, 5]
@@ -149,7 +149,7 @@ def _match_ray(
             correlation += each[i, CORRELATION]
             taken += 1
         if taken == 0 or not below > 0.0:
-            status = OUTSIDE
+            status = OUTSIDE_IMAGE
             break
         change = above / below
         distance += change
@@ -184,7 +184,7 @@ def _match_ray(
         return
     total = 0.0
     for i in range(count):
-        each[i, STATUS] = FOUND if used[i] else OUTSIDE
+        each[i, STATUS] = FOUND if used[i] else OUTSIDE_IMAGE
         if used[i]:
             covariance(m, at[0], at[1], half, each[i, GAIN], squares[i], share, own, each[i])
             if each[i, STATUS] == FOUND:

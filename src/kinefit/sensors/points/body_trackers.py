@@ -58,11 +58,12 @@ class BodyTrackerSensor(Sensor):
         mounts: Mapping[str, ArrayLike] | None = None, mount_sigma: float = 0.0,
     ) -> None:  # fmt: skip
         if not (0 < sigma < np.inf and 0 < rotation_sigma < np.inf and 0 <= mount_sigma < np.inf and points):
-            problem = f"sigma {sigma} m, {rotation_sigma} rad, mounts {mount_sigma} rad, {len(points)} trackers"
-            raise ObservationError(problem, remedy="Give positive numbers, and where each tracker is.")
+            problem = f"sigma {sigma} m, rotation_sigma {rotation_sigma} rad, mount_sigma {mount_sigma} rad, "
+            problem += f"{len(points)} points: not all are positive"
+            raise ObservationError(problem, remedy="Give positive numbers, and points with the place of each tracker.")
         for tracker, mount in (mounts or {}).items():
             if tracker not in points:
-                raise ObservationError(choices("tracker", tracker, list(points)), remedy="Name it in `points`, too.")
+                raise ObservationError(choices("tracker", tracker, list(points)), remedy="Add it to points.")
             check_shape(np.asarray(mount, float), (3,), f"the mount of tracker '{tracker}'", finite=True)
         self.name, self.points, self.sigma, self.lever = name, dict(points), float(sigma), sigma / rotation_sigma
         self.mounts = {k: np.asarray(v, float) for k, v in (mounts or {}).items()}
@@ -77,7 +78,7 @@ class BodyTrackerSensor(Sensor):
         BodyError
             A point that the body does not have.
         """
-        of_kind(frame, BodyTrackerFrame, f"a frame of the sensor '{self.name}'", "Give what it saw in such a record.")
+        of_kind(frame, BodyTrackerFrame, f"a frame of the sensor '{self.name}'", "Give its data in such a record.")
         here = [k for k, n in enumerate(frame.names) if n in self.points and np.isfinite(frame.x_world[k]).all()]
         names = tuple(frame.names[k] for k in here)
         self.places(scene.body, names)
@@ -97,7 +98,7 @@ class BodyTrackerSensor(Sensor):
                 segments, x = [*segments, body.tree.segment(at)], [*x, np.zeros(3)]
             else:
                 problem = choices("landmark or segment", at, [*body.landmarks.names, *body.tree.segments])
-                raise BodyError(f"tracker '{name}': {problem}", remedy="Name a point that the body has.")
+                raise BodyError(f"tracker '{name}': {problem}", remedy="Give a landmark or segment of the body.")
         return PointSet(tuple(names), np.array(segments, int), np.reshape(x, (-1, 3)))
 
     def mounted(self, names: Sequence[str], scene: Scene) -> NDArray:

@@ -202,8 +202,8 @@ class KeypointMatched(Matched):
         layout = self.measurement.layout
         points, channels = layout.points_of(scene.body), layout.channels
         if len(scene.rig) < len(channels.rig):
-            problem = f"keypoints of {len(channels.rig)} cameras in a scene of {len(scene.rig)}"
-            raise ObservationError(problem, remedy="Give the scene the rig that the keypoints' sensor has.")
+            problem = f"keypoints have {len(channels.rig)} cameras, the scene {len(scene.rig)}"
+            raise ObservationError(problem, remedy="Give the scene the rig of the keypoints' sensor.")
         rows = scene.rows_of(
             _kernels.pixel_rows, 2, points, scene.rig.packed, channels.camera, self.uv, self.weight
         )

@@ -102,8 +102,8 @@ class RegionSensor(Sensor):
             A body without surfaces.
         """
         if frame.size != self.camera.size:
-            problem = f"images of {frame.sensor} are {frame.size} px, its camera has {self.camera.size}"
-            raise ObservationError(problem, remedy="Give images in the size of those that were calibrated.")
+            problem = f"images of {frame.sensor} have {frame.size} px, its camera {self.camera.size}"
+            raise ObservationError(problem, remedy="Give images of the calibrated size.")
         m = RegionMeasurement(self, frame, scene)
         if not self._stated:
             self._stated = True

@@ -102,8 +102,8 @@ class SilhouetteMeasurement(Measurement):
 
     def __init__(self, of: SilhouetteSensor, frame: SilhouetteFrame, scene: Scene) -> None:
         if frame.size != of.camera.size:
-            problem = f"masks of {frame.sensor} are {frame.size} px, its camera has {of.camera.size}"
-            raise ObservationError(problem, remedy="Give the masks in the size of the images that were calibrated.")
+            problem = f"masks of {frame.sensor} have {frame.size} px, its camera {of.camera.size}"
+            raise ObservationError(problem, remedy="Give masks of the calibrated size.")
         self.sensor, self.time, self.of, self.sigma = of.name, frame.time, of, of.sigma
         mask = frame.mask
         if of.scale < 1.0:

@@ -105,7 +105,7 @@ class DepthImageMeasurement(Measurement):
     def __init__(self, of: DepthImageSensor, frame: DepthFrame, scene: Scene) -> None:
         camera, s, surface = of.camera, of.settings, scene.surface
         if frame.size != camera.size:
-            problem = f"depth images of {frame.sensor} are {frame.size} px, its camera has {camera.size}"
+            problem = f"depth images of {frame.sensor} have {frame.size} px, its camera {camera.size}"
             raise ObservationError(problem, remedy="Give the camera of these images, or camera.scaled(size).")
         self.sensor, self.time, self.of, self.sigma, self._step = of.name, frame.time, of, of.sigma, 1
         vertices, corners = surface.posed(scene.state), np.empty((2, 3))

@@ -50,7 +50,7 @@ class SurfacePointSensor(Sensor):
 
     def __init__(self, name: str, *, slide: float = 0.01, most: int = 400) -> None:
         if not (0 < slide < np.inf) or most < 1:
-            raise ObservationError(f"a slide of {slide} m, {most} points", remedy="Give positive numbers.")
+            raise ObservationError(f"slide is {slide} m, most is {most}", remedy="Give positive numbers.")
         self.name, self.slide, self.most = name, float(slide), int(most)
         self.anchors: Mapping[int, Anchor] = {}
         self.turns: Mapping[int, NDArray] = {}  # of segments until their first anchor; see `Matched`
@@ -59,7 +59,7 @@ class SurfacePointSensor(Sensor):
 
     def prepare(self, frame: SurfacePointFrame, scene: Scene) -> SurfacePointMeasurement:
         """The measurement of one frame: anchored points first, then new ones, at most `most`."""
-        of_kind(frame, SurfacePointFrame, f"a frame of the sensor '{self.name}'", "Give what it saw in such a record.")
+        of_kind(frame, SurfacePointFrame, f"a frame of the sensor '{self.name}'", "Give its data in such a record.")
         known = np.array([int(i) in self.anchors for i in frame.ids], bool)
         order = np.concatenate([np.flatnonzero(known), np.flatnonzero(~known)])
         if len(order) > self.most:

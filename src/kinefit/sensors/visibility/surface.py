@@ -43,7 +43,7 @@ class TrackedSurface:
 
     def __init__(self, body: Body, count: int) -> None:
         if not body.surfaces:
-            remedy = "Depth needs some; see the catalogue's bodies."
+            remedy = "Depth needs surfaces: add them as in bodies of the catalogue, or use one of those."
             raise BodyError(f"body '{body.name}' has no surfaces", remedy=remedy)
         self.body, self.count, self.morphing = body, count, Morphing(body)
         self.mesh = self.morphing.mesh if isinstance(self.morphing.mesh, BodyMesh) else body_mesh(body)

@@ -16,7 +16,7 @@ from kinefit.motion import UP_AXES
 from kinefit.rendering import scaled
 from kinefit.simulation.placing import beside
 from kinefit.simulation.rendering.room import PARTS
-from kinefit.simulation.rendering.scenes import RenderedView, SimulatedScene
+from kinefit.simulation.rendering.scenes import RenderedView, SimulatedScene, centred_camera
 
 SKIN = (130, 160, 210)  # BGR, as all colours here
 _COLOURS = {
@@ -67,14 +67,12 @@ class ColourSensor:
 
     def __post_init__(self) -> None:
         if self.samples < 1 or not 0.0 <= self.noise < np.inf:
-            problem = f"a camera {self.name} of {self.samples} samples and noise {self.noise}"
-            raise ObservationError(problem, remedy="Give one sample or more, and noise of zero or more.")
+            problem = f"camera {self.name} has samples = {self.samples} and noise = {self.noise}"
+            raise ObservationError(problem, remedy="Give at least one sample, and noise of 0 or more.")
 
     def camera(self, T_camera_world: NDArray | None = None, *, name: str | None = None) -> Camera:
         """The sensor as a camera of a rig, with the pose T_camera_world (4, 4) [m]."""
-        (w, h), f = self.size, self.focal
-        K = np.array([[f, 0, 0.5 * (w - 1)], [0, f, 0.5 * (h - 1)], [0, 0, 1.0]])
-        return Camera(name or self.name, self.size, K, (), "radtan", T_camera_world)  # type: ignore[arg-type]
+        return centred_camera(name or self.name, self.size, self.focal, T_camera_world)
 
 
 @dataclass(frozen=True)

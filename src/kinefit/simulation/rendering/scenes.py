@@ -118,3 +118,18 @@ class SimulatedScene:
             vertices = np.concatenate([vertices, self.room.vertices])
         raster = Canvas(camera.size).draw_for(camera, vertices, self.faces, cull=True, labels=self.labels)
         return RenderedView(raster, camera, vertices, self.faces, frames)
+
+
+def centred_camera(
+    name: str, size: tuple[int, int], focal: float, T_camera_world: NDArray | None = None
+) -> Camera:
+    """A camera without distortion whose principal point is the centre of its image.
+
+    Parameters
+    ----------
+    size : (width, height) [px]
+    focal : float [px]
+    T_camera_world : (4, 4) [m], default: the identity
+    """
+    K = np.array([[focal, 0.0, 0.5 * (size[0] - 1)], [0.0, focal, 0.5 * (size[1] - 1)], [0.0, 0.0, 1.0]])
+    return Camera(name, size, K, (), "radtan", T_camera_world)  # type: ignore[arg-type]

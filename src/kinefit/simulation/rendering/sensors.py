@@ -13,7 +13,7 @@ from kinefit.geometry.camera import Camera
 from kinefit.motion import Motion
 from kinefit.observations.depth import DepthVideo
 from kinefit.rendering import scaled
-from kinefit.simulation.rendering.scenes import RenderedView, SimulatedScene
+from kinefit.simulation.rendering.scenes import RenderedView, SimulatedScene, centred_camera
 
 _MIN_EDGE_STEP = 0.1  # [m] within 3 x 3 pixels: an edge, for a sensor that matches patterns
 _MIN_NOISE_COSINE = 0.2  # of incidence, below which a sensor's noise no longer grows
@@ -72,8 +72,8 @@ class DepthSensor:
     def __post_init__(self) -> None:
         if not 0.0 < self.near < self.far or self.samples < 1 or min(*self.noise, self.focal, *self.size) < 0:
             raise ObservationError(
-                f"a sensor {self.name} of {self.near} to {self.far} m, {self.samples} samples, noise {self.noise}",
-                remedy="Give 0 < near < far, one sample or more, and nothing negative.",
+                f"sensor {self.name}: near {self.near} m, far {self.far} m, {self.samples} samples, noise {self.noise}",
+                remedy="Give 0 < near < far, at least one sample, and no negative values.",
             )
 
     def sigma(self, z: NDArray | float) -> NDArray | float:
@@ -83,9 +83,7 @@ class DepthSensor:
 
     def camera(self, T_camera_world: NDArray | None = None, *, name: str | None = None) -> Camera:
         """The sensor as a camera of a rig, with the pose T_camera_world (4, 4) [m]."""
-        (w, h), f = self.size, self.focal
-        K = np.array([[f, 0, 0.5 * (w - 1)], [0, f, 0.5 * (h - 1)], [0, 0, 1.0]])
-        return Camera(name or self.name, self.size, K, (), "radtan", T_camera_world)  # type: ignore[arg-type]
+        return centred_camera(name or self.name, self.size, self.focal, T_camera_world)
 
     def without_errors(self) -> DepthSensor:
         """The same sensor without errors, apart from its range."""

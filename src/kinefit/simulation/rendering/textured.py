@@ -42,8 +42,8 @@ def textured_picture(
         `grain` is not between 0 and 1 m; `noise` is negative or not finite.
     """
     if not (0 < grain < 1 and 0 <= noise < np.inf):
-        problem = f"a grain of {grain} m, noise of {noise}"
-        raise ObservationError(problem, remedy="Give metres, and noise of zero or more.")
+        problem = f"grain is {grain} m, noise is {noise}"
+        raise ObservationError(problem, remedy="Give a grain between 0 and 1 m, and noise of 0 or more.")
     view = scene.view(frame, scaled(camera, _SAMPLES))
     visible, segment = view.raster.seen, view.raster.segment
     fine = np.full(visible.shape, _BACKGROUND_GREY, np.float32)

@@ -56,7 +56,7 @@ class FixedLag:
 
     def __init__(self, tracker: TrackerLike, lag: float, *, noise: KnownNoise | None = None) -> None:
         if not (isinstance(getattr(tracker, "body", None), Body) and is_number(lag)):
-            problem = f"a lag of type {type(lag).__name__} behind a {type(tracker).__name__}"
+            problem = f"a {type(tracker).__name__} and a {type(lag).__name__} are not a tracker and a lag"
             raise ObservationError(problem, remedy="Give a Tracker and seconds: FixedLag(tracker, 0.1).")
         rate, settings = tracker.rate, tracker.settings
         self._lag = lag_frames(lag, rate)
@@ -103,7 +103,7 @@ class FixedLag:
         """
         if result is None or (self._frames and result is self._frames[-1].result):
             return []
-        of_kind(result, FrameResult, "the result", "Give what Tracker.update returns.")
+        of_kind(result, FrameResult, "the result", "Give a result of Tracker.update.")
         new = self._costs.frame(result, measurements)
         if not self._frames:
             self._append(new)
@@ -250,5 +250,5 @@ def lag_frames(lag: float, rate: float) -> int:
         The lag is less than a frame.
     """
     if not (np.isfinite(lag) and round(lag * rate) >= 1):
-        raise ObservationError(f"a lag of {lag:g} s", remedy=f"Give a frame at least, {1.0 / rate:.3f} s.")
+        raise ObservationError(f"lag is {lag:g} s", remedy=f"Give at least one frame, {1.0 / rate:.3f} s.")
     return round(lag * rate)

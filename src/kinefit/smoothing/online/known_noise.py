@@ -53,8 +53,8 @@ class KnownNoise:
         names = ("root_shift",) * 3 + ("root_turn",) * 3 + body.tree.coordinates
         missing = [name for name in names if name not in found]
         if missing:
-            problem = f"a motion that tells no process noise of {missing[0]}"
-            raise ObservationError(problem, remedy="Give one of this body that was smoothed as a whole.")
+            problem = f"the motion has no process noise of {missing[0]}"
+            raise ObservationError(problem, remedy="Give a motion of this body, smoothed over the whole take.")
         acceleration = np.maximum(np.array([found[name] for name in names]), 1e-3)
         return cls(acceleration, smoothing.get("pixel_sigma", {}), smoothing.get("sigma_factor", {}))
 
@@ -63,7 +63,7 @@ class KnownNoise:
         names = ("root_shift", "root_turn", *body.tree.coordinates)
         values = [self.acceleration[0], *self.acceleration[5:]]
         return {
-            "acceleration": {name: round(float(v), 2) for name, v in zip(names, values)},
+            "acceleration": {name: float(f"{v:.4g}") for name, v in zip(names, values)},
             "pixel_sigma": {source: dict(of) for source, of in self.pixel_sigma.items()},
             "sigma_factor": dict(self.scale),
         }  # fmt: skip

@@ -24,11 +24,11 @@ from kinefit.solvers.bundle.border_frames import (
     Weighing,
     differences,
     gram,
-    limits,
     settle,
     solved,
 )
 from kinefit.solvers.equations import lock
+from kinefit.solvers.least_squares import bounds_of
 
 _INITIAL_DAMPING = 1e-3  # as a share of the poses' mean diagonal
 _PARAMETER_DAMPING_RATIO = 0.01  # to the poses' damping: parameters have a prior, few angles have one
@@ -122,7 +122,7 @@ def solve(
         A sensor's rows differ in number between two worlds; rows on segments that the body lacks.
     """
     task = _Task(problem, prior, np.asarray(steps, float), weighing or Weighing())
-    theta, bounds, (most, settling) = np.array(theta, float), limits(problem.body(theta)), iterations
+    theta, bounds, (most, settling) = np.array(theta, float), bounds_of(problem.body(theta), True), iterations
     states = [s.retract(np.zeros(6 + len(s.angles)), bounds) for s in states]
     frames, states = settle(problem, theta, states, task.weighing, settling)
     cost, blocks, reusable = task.cost(theta, frames), None, None

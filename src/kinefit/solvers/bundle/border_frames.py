@@ -17,6 +17,7 @@ from kinefit.rows import AnyRows, Rows
 from kinefit.solvers import _kernels_border, _kernels_linear
 from kinefit.solvers.bundle.whitened import PoseScrews, columns, residuals, softening
 from kinefit.solvers.equations import dense_pattern, lock, normal_equations
+from kinefit.solvers.least_squares import bounds_of
 from kinefit.solvers.pixels import fit_pixels
 
 POSTURE_SHARE = 0.01
@@ -172,7 +173,7 @@ def settle(
 ) -> tuple[list[FrameEquations], list[BodyState]]:  # fmt: skip
     """Fit every frame's pose alone, for fixed parameters (p,): weakly constrained angles need steps of their own."""
     body, frames, out = problem.body(theta), [], []
-    bounds, packed = limits(body), getattr(problem, "packed", None)
+    bounds, packed = bounds_of(body, True), getattr(problem, "packed", None)
     posture = weighing.most * weighing.posture
     if any(share != 1.0 for share in weighing.shares.values()):
         packed = None
@@ -201,11 +202,6 @@ def settle(
         frames.append(frame)
         out.append(state)
     return frames, out
-
-
-def limits(body: Body) -> tuple[NDArray, NDArray]:
-    """(D,) lower and upper limits of every coordinate."""
-    return body.tree.lower, body.tree.upper
 
 
 def differences(problem: BorderedProblem, theta: NDArray, steps: NDArray, states: Sequence[BodyState]) -> list[NDArray]:

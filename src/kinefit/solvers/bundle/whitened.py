@@ -12,6 +12,7 @@ from kinefit.errors import ObservationError
 from kinefit.losses import Loss
 from kinefit.rows import AnyRows, DofRows, PairRows, ParameterRows, Rows
 from kinefit.solvers import _kernels_border
+from kinefit.solvers.equations import check_indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,17 +74,17 @@ def columns(rows: AnyRows, pose: PoseScrews) -> NDArray:
     """
     n, count = pose.body.tree.n_dofs, len(pose.body.tree.segments)
     if isinstance(rows, Rows):
-        _within("segment", rows.segment, count, pose.body)
+        check_indices("segment", count, pose.body, rows.segment)
         return np.sqrt(rows.weight)[:, None] * pose.along(rows.segment, rows.data)
     if isinstance(rows, PairRows):
-        _within("segment", rows.segments, count, pose.body)
+        check_indices("segment", count, pose.body, rows.segments)
         a, b = (
             pose.along(np.ascontiguousarray(s), np.concatenate([x.T, rows.direction.T]))
             for s, x in zip(rows.segments.T, (rows.point_a, rows.point_b))
         )
         return np.sqrt(rows.weight)[:, None] * (a - b)
     if isinstance(rows, ParameterRows):
-        _within("degree of freedom", rows.index, n, pose.body)
+        check_indices("degree of freedom", n, pose.body, rows.index)
         chosen = np.eye(n)[rows.index]
         if rows.weight.ndim == 2:
             return np.asarray(np.linalg.cholesky(rows.weight).T @ chosen)
@@ -92,9 +93,3 @@ def columns(rows: AnyRows, pose: PoseScrews) -> NDArray:
         problem = f"rows on {rows.jacobian.shape[1]} degrees of freedom, but body '{pose.body.name}' has {n}"
         raise ObservationError(problem, remedy="Make the rows with the body that is fitted.")
     return np.sqrt(rows.weight)[:, None] * rows.jacobian
-
-
-def _within(what: str, index: NDArray, count: int, body: Body) -> None:
-    if index.size and not 0 <= index.min() <= index.max() < count:
-        problem = f"rows name {what} {int(index.max())}, but body '{body.name}' has {count}"
-        raise ObservationError(problem, remedy="Make the rows with the body that is fitted.")

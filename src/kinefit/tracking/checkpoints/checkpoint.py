@@ -62,8 +62,8 @@ class Checkpoint:
             The checkpoint was not entered.
         """
         if self._frames is None:
-            remedy = "Write `with Checkpoint(...) as checkpoint:` about what uses it."
-            raise ExportError("a checkpoint that was not entered", file=self.folder, remedy=remedy)
+            remedy = "Use it inside `with Checkpoint(...) as checkpoint:`."
+            raise ExportError("the checkpoint is not open", file=self.folder, remedy=remedy)
         return self._frames
 
     @property
@@ -91,7 +91,7 @@ class Checkpoint:
         except OSError as error:
             self.close()
             problem = f"cannot be written ({error.strerror})"
-            raise ExportError(problem, file=self.folder, remedy="Name another place by --out.") from error
+            raise ExportError(problem, file=self.folder, remedy="Give another folder with --out.") from error
         except ExportError:
             self.close()
             raise
@@ -108,26 +108,26 @@ class Checkpoint:
     def _refuse_others(self, lock: IO[bytes]) -> None:
         info = self.folder.stat()
         if hasattr(os, "geteuid") and (info.st_uid != os.geteuid() or info.st_mode & 0o022):
-            raise ExportError("others can write to this folder", file=self.folder, remedy="Remove it.")
+            raise ExportError("other users can write to this folder", file=self.folder, remedy="Remove it.")
         if fcntl is not None:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
-                remedy = "Wait until it ends, or name another folder by --out."
-                raise ExportError("another run is working there", file=self.folder, remedy=remedy) from error
+                remedy = "Wait until it ends, or give another folder with --out."
+                raise ExportError("another run uses this folder", file=self.folder, remedy=remedy) from error
 
     def said(self) -> list[str]:
         """Sentences for the user: what is gone on with, what is dropped and computed again, what is left alone."""
         out, problem, file = [], self.frames.problem, self.folder / _FRAMES
         if self.resumed:
-            left = f"what an earlier run left in {self.folder}, at frame {self._found}"
-            out.append(f"going on with {left}; --restart begins anew")
+            left = f"the run in {self.folder} at frame {self._found}"
+            out.append(f"continuing {left}; --restart tracks all frames again")
         if problem:
-            again = f"frames from {self._found} on are" if self.resumed else "every frame is"
-            out.append(f"{file} {problem}: {again} computed again")
+            again = f"frames from {self._found} on are" if self.resumed else "all frames are"
+            out.append(f"{file} {problem}: {again} tracked again")
         others = sorted(p.name for p in self.folder.iterdir() if p.name not in (_FRAMES, _ROWS, _LOCK))
         if others:
-            out.append(f"{self.folder} holds {', '.join(others)}, not of this kinefit: left as it is")
+            out.append(f"{self.folder} has files that kinefit did not write and does not change: {', '.join(others)}")
         return out
 
     def close(self) -> None:
@@ -148,7 +148,7 @@ class Checkpoint:
             return
         with open(self.rows, "rb") as file:
             if not BEGIN.startswith(file.read(len(BEGIN))):
-                raise ExportError("a file of this name is in the way", file=self.rows, remedy="Move it elsewhere.")
+                raise ExportError("a file of this name is in the way", file=self.rows, remedy="Move or rename it.")
         self.rows.unlink()
 
     def remove(self) -> None:

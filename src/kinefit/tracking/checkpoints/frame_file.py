@@ -69,8 +69,8 @@ class FrameFile(Store):
             self._file.truncate()
             self._file.write(head)
             if re.fullmatch(FORMAT + rb"[0-9a-f]{64}\n", found):
-                return "is of another take, changed files, other options or another kinefit"
-            return "is damaged, or in another format" if found else ""
+                return "belongs to another take, changed files, other options or another version of kinefit"
+            return "is damaged or has another format" if found else ""
         records, whole, last = self._records, self._records.start, b""
         at, count, steps, places = 0, 0, list[int](), [array("q") for _ in KINDS]
         for place, tag, number, data in records.scan():
@@ -126,7 +126,7 @@ class FrameFile(Store):
         self._file.close()
 
     def _full(self, error: OSError) -> ExportError:
-        remedy = "Free some space, or name another place by --out."
+        remedy = "Free some space, or give another folder with --out."
         return ExportError(f"cannot be written ({error.strerror})", file=self._path, remedy=remedy)
 
     def _refer(self, thing: Any) -> str:
@@ -138,8 +138,8 @@ class FrameFile(Store):
                 return name
         if isinstance(thing, Layout):
             return _LAYOUT + json.dumps(thing.streams)
-        problem = f"a checkpoint of frames with a {type(thing).__name__} of one's own, which nobody can keep"
-        raise ObservationError(problem, remedy="Leave the checkpoint out.")
+        problem = f"a checkpoint cannot store a custom {type(thing).__name__}"
+        raise ObservationError(problem, remedy="Leave out checkpoint.")
 
     def _resolve(self, reference: int | str) -> Any:
         if (name := str(reference)).startswith(_LAYOUT):

@@ -40,5 +40,5 @@ def append_rows(file: Path, body: Body, results: Iterable[tuple[int, FrameResult
                 values = [r.time, r.quality, *r.state.T_world_root[:3, 3], *(factors * r.state.angles)]
                 out.write(",".join([str(step), *(f"{value:.5f}" for value in values)]) + "\n")
     except OSError as error:
-        remedy = "Free some space, or name another place by --out."
+        remedy = "Free some space, or give another folder with --out."
         raise ExportError(f"cannot be written ({error.strerror})", file=file, remedy=remedy) from error

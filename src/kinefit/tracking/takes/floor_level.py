@@ -56,6 +56,6 @@ def floor_sentences(provenance: Mapping[str, Any]) -> list[str]:
         return []
     entries = provenance[FLOOR]
     return [
-        f"the floor was found where feet rest: height zero, known to {1e3 * entries['height_std_m']:.0f} mm, level to "
-        f"{entries['tilt_std_deg']:.1f} degrees (one standard deviation); soles are held where they rest"
+        "the floor was estimated from resting feet and is at height zero; standard deviations "
+        f"{1e3 * entries['height_std_m']:.0f} mm and {entries['tilt_std_deg']:.1f} degrees. Resting soles stay still"
     ]

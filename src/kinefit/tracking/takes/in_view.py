@@ -14,7 +14,7 @@ from kinefit.errors import KinefitError, TrackingError
 from kinefit.images.depth import to_points
 from kinefit.images.depth_noise import denoised, without_speckles
 from kinefit.images.depth_scene import DepthBlob, find_floor, foreground, people
-from kinefit.initialization.from_depth import start_from_points
+from kinefit.initialization.from_depth import StartSearch, start_from_points
 from kinefit.motion import ARRAYS, Motion
 from kinefit.multiview.followed import PersonKeypoints, choose, follow
 from kinefit.multiview.people import PersonTrack
@@ -146,7 +146,8 @@ def people_in_depth(seen: Observations, recording: Recording, body: Body) -> InV
     for blob in found[step][:_MAX_BLOBS]:
         alone = np.where(blob.mask, frame.depth, 0.0)
         try:
-            start = start_from_points(body, None, camera, alone, up=recording.up_axis, count=1, attempts=1)[0]
+            search = StartSearch(count=1, attempts=1)
+            start = start_from_points(body, None, camera, alone, up=recording.up_axis, search=search)[0]
         except TrackingError:
             continue
         if start.score > (_LIKE if _moves(blob, step, found) else _SURELY):

@@ -69,21 +69,21 @@ def track_take(
     if (take.silhouettes or take.regions or take.surface_points) and not alone:
         kind, table = ("silhouettes", "silhouette") if take.silhouettes else ("colours", "region")
         if take.surface_points:
-            kind, table = "points of a surface", "surface_points"
+            kind, table = "surface points", "surface_points"
         raise TakeError(
-            f"{kind} alone do not show where the body is to begin with", file=take.path, place=f"[[{table}]]",
+            f"{kind} alone do not determine the first pose", file=take.path, place=f"[[{table}]]",
             remedy='Add [start], or [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
         )  # fmt: skip
     if not alone:
         raise TakeError(
-            "the take has no [[keypoints]], nor any other sensor", file=take.path,
-            remedy=f"It needs keypoints of two or more cameras; {command('detect', take.path)} finds them in videos.",
+            "the take has no [[keypoints]] and no other sensor", file=take.path,
+            remedy=f"Add keypoints of two or more cameras; {command('detect', take.path)} detects them in videos.",
         )  # fmt: skip
     named = body if take.start is None or take.body == _DEFAULT_BODY else load_body(take.body)
     if named.tree.segments != body.tree.segments:
         raise TakeError(
-            f"the body is {take.body}, and the motion that the take starts from has another, {body.name}",
-            file=take.path, place="[take] start", remedy="Leave `body` out, or start from a motion of this body.",
+            f"body is {take.body}, but the motion of start has the body {body.name}",
+            file=take.path, place="[take] start", remedy="Leave out body, or start from a motion of this body.",
         )  # fmt: skip
     recording, body = recording_of(take, seen, body, view.people if view else None)
     settings = settings_of(take, settings)
@@ -128,7 +128,7 @@ def load_keypoints(take: Take, *, exteriors: bool = True) -> Observations:
         raise TakeError(
             "the take has no [[keypoints]]",
             file=take.path,
-            remedy=f"It needs keypoints of two or more cameras; {command('detect', take.path)} finds them in videos.",
+            remedy=f"Add keypoints of two or more cameras; {command('detect', take.path)} detects them in videos.",
         )
     return observations
 
@@ -140,8 +140,8 @@ def trial_of(take: Take, *, frames: int = 50) -> Subject | None:
     trial = read_take(take.subject)
     if trial.body != take.body:
         raise TakeError(
-            f"the subject's trial has the body {trial.body}, the take {take.body}", file=take.path,
-            place="[take] subject", remedy="Use the same body in both.",
+            f"the take of subject has the body {trial.body}, this take {take.body}", file=take.path,
+            place="[take] subject", remedy="Write the same body into both takes.",
         )
     seen, body = load_keypoints(trial), load_body(take.body)
     assert seen.rig is not None

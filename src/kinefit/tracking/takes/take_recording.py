@@ -87,8 +87,8 @@ def recording_of(
         **{m.sensor: lambda i, m=m: m.at(float(times[i])) for m in marked},
     }.items():
         if all(at(i) is None for i in range(len(times))):
-            problem = f"{sensor} shares no time with the take's steps, {times[0]:.2f} to {times[-1]:.2f} s"
-            raise ObservationError(problem, remedy="Set its time_offset, or the take's frames.")
+            problem = f"{sensor} has no data in the take's time, {times[0]:.2f} to {times[-1]:.2f} s"
+            raise ObservationError(problem, remedy="Set its time_offset, or frames in [take].")
     recording = Recording(
         times, rate, rig, steps=steps, sigma=_sigma(take, seen, stereo), markers=tuple(marked),
         depth=_first_depth(depth, seen), on_body=tuple(v.sensor for v in depth if v.on_body),
@@ -194,8 +194,8 @@ def posed_start(take: Take, body: Body, frames: tuple[int, int]) -> tuple[int, B
         return TakeError(problem, file=take.path, place="[start]", remedy=remedy)
 
     if not frames[0] <= step < frames[1]:
-        problem = f"step = {step}, and the take has the steps [{frames[0]}, {frames[1]}]"
-        raise wrong(problem, "Name one of these, or leave it out: the first.")
+        problem = f"step = {step} is outside the take's steps {frames[0]} to {frames[1] - 1}"
+        raise wrong(problem, "Write one of these steps, or leave out step for the first.")
     y, x = np.array(pose.upward or UP_AXES[take.up], float), np.array(pose.forward, float)
     if pose.upward is None:  # upright: forward as far as it is level
         x = x - (x @ y) * y
@@ -213,8 +213,8 @@ def posed_start(take: Take, body: Body, frames: tuple[int, int]) -> tuple[int, B
         unit = 1.0 if tree.prismatic[k] else np.pi / 180.0
         angles[k] = value * unit
         if not tree.lower[k] - 1e-9 <= angles[k] <= tree.upper[k] + 1e-9:
-            problem = f"{name} = {value:g}, which the body lets go from {tree.lower[k] / unit:g} to"
-            raise wrong(f"{problem} {tree.upper[k] / unit:g}", "Give an angle that it can have.")
+            problem = f"{name} = {value:g} is outside its limits {tree.lower[k] / unit:g} to {tree.upper[k] / unit:g}"
+            raise wrong(problem, f"Write {name} within these limits.")
     return step - frames[0], BodyState(T, angles)
 
 
@@ -223,8 +223,8 @@ def _motion_start(take: Take, body: Body) -> tuple[int, BodyState]:
     motion = read_motion(take.start)
     if len(motion.body.tree.coordinates) != len(body.tree.coordinates):
         raise BodyError(
-            f"the motion that the take starts from has the body {motion.body.name}", file=take.path,
-            place="[take] start", remedy="Start from a motion of the take's own body.",
+            f"the motion of start has the body {motion.body.name}, not {body.name}", file=take.path,
+            place="[take] start", remedy="Start from a motion of the take's body.",
         )  # fmt: skip
     root = motion.Ts_world_root[0]
     if not is_level(take) and FLOOR in motion.provenance:
