@@ -47,7 +47,8 @@ def test_every_place_uses_the_same_colours():
     expected = [sides.get(name[-2:], colours.CENTRE_COLOUR) for name in body.tree.segments]
     assert [tuple(c) for c in looks.side_colours(body)] == expected
     assert {tuple(c) for c in body_mesh(body).colours} == set(expected)
-    assert (LEFT_COLOUR, RIGHT_COLOUR, CENTRE_COLOUR) == tuple(map(colours.to_hex, (colours.LEFT_COLOUR, colours.RIGHT_COLOUR, colours.CENTRE_COLOUR)))
+    sides = LEFT_COLOUR, RIGHT_COLOUR, CENTRE_COLOUR
+    assert sides == tuple(map(colours.to_hex, (colours.LEFT_COLOUR, colours.RIGHT_COLOUR, colours.CENTRE_COLOUR)))
     page = str(live_figure(body))
     lost = colours.to_hex(colours.LOST_COLOUR)
     assert all(colour in page for colour in (LEFT_COLOUR, RIGHT_COLOUR, CENTRE_COLOUR, lost))
