@@ -137,7 +137,7 @@ def test_two_windows_show_one_job_and_closing_them_stops_nothing(session, open_p
         second.get_by_role("button", name="Compute the motion").click()  # the same job
         for page in (first, second):
             page.get_by_role("button", name="Pause").wait_for()
-        assert first.get_by_role("button", name="Pause").count() == second.get_by_role("button", name="Pause").count() == 1
+        assert [page.get_by_role("button", name="Pause").count() for page in (first, second)] == [1, 1]
         first.context.close()
         second.context.close()
         motion = session / "wave" / "take-kinefit" / "report.html"

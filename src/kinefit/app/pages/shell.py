@@ -18,7 +18,9 @@ from kinefit.rendering import colours
 
 Value = TypeVar("Value")
 
-COLOURS = {"fault": colours.RIGHT_COLOUR, "doubt": (176, 132, 0), "note": colours.LEFT_COLOUR, "good": colours.CENTRE_COLOUR}
+COLOURS = {
+    "fault": colours.RIGHT_COLOUR, "doubt": (176, 132, 0), "note": colours.LEFT_COLOUR, "good": colours.CENTRE_COLOUR,
+}  # fmt: skip
 """RGB of the severities of findings: safe for the colour-blind, and dark enough for text."""
 
 

@@ -221,6 +221,8 @@ class _TakePage:
 
     def _step_name(self, what: str) -> str:
         kind, _, name = what.partition(" ")
+        if any(camera.name == what for camera in self._take.cameras):
+            kind, name = "detecting", what
         return self._t.get(f"step.{what}") or (self._t.get(f"step.{kind}") or what).format(name=name)
 
     def _results(self) -> None:
