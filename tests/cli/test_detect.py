@@ -439,7 +439,7 @@ def test_outlines_are_made_where_a_take_follows_them_and_missing_ones_are_told(t
     with_detections(read_take(take))
     assert read_detections(detections_file(take, "cam01")).mask(5, 0) is None
     take.write_text(wanted + '\n[[silhouette]]\ncamera = "cam01"\nformat = "detect"\n')
-    with pytest.raises(TakeError, match="has no outlines.*kinefit detect"):
+    with pytest.raises(TakeError, match="has no silhouettes.*kinefit detect"):
         load_observations(read_take(take))
     with_detections(read_take(take))
     assert read_detections(detections_file(take, "cam01")).mask(5, 0).any()

@@ -156,7 +156,7 @@ def test_clicked_joints_give_body_and_start(folder, tmp_path):
     assert answer.exit_code == 2 and "r_knee: camera cam02 is off by" in answer.stderr
     (tmp_path / "clicks.json").write_text('{"points": {"cam02": {"r_knee": [1]}}}')
     answer = run("init", folder, "--points", tmp_path / "clicks.json", "--force")
-    assert answer.exit_code == 2 and "[1] is no pixel" in answer.stderr
+    assert answer.exit_code == 2 and "[1] is not a pixel position" in answer.stderr
 
 
 def test_clicks_are_measurements_of_their_frames(folder, tmp_path):

@@ -114,8 +114,8 @@ DAMAGE = {
     "no points": (lambda p: change(p, points=None), "do not fit.*points"),
     "points": (lambda p: change(p, points=np.zeros((3, 2, 32, 2))), "do not fit"),
     "starts": (lambda p: change(p, mask_starts=[0, 3, 2, 5, 5, 6, 8]), "do not fit"),
-    "infinite": (lambda p: change(p, points=np.full((3, 2, 33, 2), np.inf)), "cannot be"),
-    "rate": (lambda p: change(p, rate=0.0), "cannot be"),
+    "infinite": (lambda p: change(p, points=np.full((3, 2, 33, 2), np.inf)), "impossible"),
+    "rate": (lambda p: change(p, rate=0.0), "impossible"),
     "folder": (lambda p: (p.unlink(), p.mkdir()), "no such file"),
 }  # fmt: skip
 

@@ -38,7 +38,7 @@ TABLE = {  # folder/part of the name: markers, frames, rate, up, first frame
 DAMAGED = {
     "badParameterOffset.c3d": (FileError, "ANALOG:UNITS"),
     "bad_parameter_section.c3d": (FileError, "after parameter 'LABELS'"),
-    "parameterOverflow.c3d": (ObservationError, "none of the 106 markers is seen"),
+    "parameterOverflow.c3d": (ObservationError, "none of the 106 markers is visible"),
 }
 
 
@@ -264,5 +264,5 @@ def test_missing_and_foreign_files(tmp_path):
 
 
 def test_a_parameter_of_no_numbers_in_dimensions_beyond_bounds_is_refused():
-    with pytest.raises(FileError, match="dimensions that cannot be"):
+    with pytest.raises(FileError, match="impossible dimensions"):
         _values(bytes([2, 10, 0, *[255] * 9]), "intel", "POINT:X", Path("a.c3d"))

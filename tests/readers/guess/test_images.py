@@ -53,7 +53,7 @@ def test_images_are_a_video(folder, pattern, video, picture):
 
 def test_photographs_of_no_camera_are_named(folder):
     write_images(folder / "a{}.png", COLOUR)
-    with pytest.raises(TakeError, match="name of its camera: cam01, cam02"):
+    with pytest.raises(TakeError, match="after its camera: cam01, cam02"):
         guess_take(folder)
 
 
