@@ -261,7 +261,7 @@ def test_joints_are_clicked_in_the_browser(folder, monkeypatch):
     assert seen["picture"] == (960, 544, 3) and "unsafe" not in seen["policy"]
     assert len(seen["files"]) == 2 and b"<style" not in seen["page"] and b"<script>" not in seen["page"]
     assert [a["taken"] for a in seen["answers"]] == [False, False, True]
-    assert "These are no clicks" in seen["answers"][0]["answer"]
+    assert "These clicks cannot be used" in seen["answers"][0]["answer"]
     assert "Camera cam03 is off in" in seen["answers"][1]["answer"]
     assert read_take(folder / "take.toml").pose is not None
     assert json.loads((folder / "clicks.json").read_text())["points"]["cam01"]
