@@ -52,7 +52,7 @@ def test_the_same_as_json_and_in_the_videos_picture(tmp_path):
     lines = LINES.replace(".csv", ".json") + 'frame = "video"\n'
     (video,) = load(tmp_path, lines, camera='size = [128, 96]\nimage = "scaled"').lines
     np.testing.assert_allclose(video.frame(0).ends[0], [[4.75, 9.75], [14.75, 19.75]])
-    with pytest.raises(TakeError, match="not stated in which the lines are"):
+    with pytest.raises(TakeError, match="not stated which the lines use"):
         load(tmp_path, LINES, camera='size = [128, 96]\nimage = "scaled"')
 
 

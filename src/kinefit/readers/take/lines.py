@@ -124,7 +124,7 @@ def _lines(
 ) -> LineVideo:
     same = np.allclose(image.T_image_calibration, np.eye(3), atol=1e-9)
     if entry.frame is None and not same:
-        problem = "the video's image is not the calibration's, and it is not stated in which the lines are"
+        problem = "the video's image is not the calibration's, and it is not stated which the lines use"
         raise TakeError(problem, remedy='Write frame = "calibration" or frame = "video".')
     rate = entry.rate or rate
     if rate is None:

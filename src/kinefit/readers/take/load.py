@@ -264,7 +264,7 @@ def _read_keypoints(
     same = np.allclose(image.T_image_calibration, np.eye(3), atol=1e-9)
     if source.frame is None and not same and source.format != "detect":
         raise TakeError(
-            "the video's image is not the calibration's, and it is not stated in which the keypoints are",
+            "the video's image is not the calibration's, and it is not stated which the keypoints use",
             file=take.path, place=place, remedy='Write frame = "calibration" or frame = "video".',
         )
     offset = next(entry.time_offset for entry in take.cameras if entry.name == source.camera)

@@ -102,7 +102,7 @@ def _silhouettes(
         if rate is None:
             raise TakeError("the rate is not stated", remedy="Write rate = ... into [take].")
         if entry.frame is None and not same:
-            problem = "the video's image is not the calibration's, and it is not stated in which the masks are"
+            problem = "the video's image is not the calibration's, and it is not stated which the masks use"
             raise TakeError(problem, remedy='Write frame = "calibration" or frame = "video".')
         assert entry.file is not None
         return read_silhouettes(
