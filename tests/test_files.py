@@ -19,7 +19,7 @@ from kinefit.errors import BodyError, FileError
         ("size = True", "Write true"),
         ('name = walk', 'quotes: name = "walk"'),
         ('[camera]\nname = "a"\n[[camera]]\nname = "b"', r"the first one too: \[\[camera\]\]"),
-        ("rate = 30\nrate = 60", "there twice"),
+        ("rate = 30\nrate = 60", "appears twice"),
         ("rate = 29,97", "a point, not a comma"),
         ("a = " + "[" * 5000 + "]" * 5000, "nested too deep"),
         ("a = " + "9" * 5000, "number too long"),
@@ -86,7 +86,7 @@ def test_arrays_come_back_as_numpy_reads_them(tmp_path):
         (header("{'descr': '<f8', 'fortran_order': False, 'shape': (-1,)}"), "but there are"),
         (header("{'descr': '<U0', 'fortran_order': False, 'shape': (9999999999,)}"), "but there are"),
         (header("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}"), "not of numbers or texts"),
-        (header("{'descr': '<U1', 'fortran_order': False, 'shape': (1,)}") + b"\xff" * 4, "characters that do not exist"),
+        (header("{'descr': '<U1', 'fortran_order': False, 'shape': (1,)}") + b"\xff" * 4, "that do not exist"),
         (header("(" * 5000), "damaged"), (b"no array", "damaged"), (b"", "damaged"),
     ],
 )  # fmt: skip

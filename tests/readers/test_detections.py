@@ -77,9 +77,9 @@ def test_faces_are_written_and_read(found, tmp_path):
     longer = read.within(1, 6)
     assert np.allclose(longer.face[1:4], face, equal_nan=True, atol=1e-5)
     assert not longer.face_confidence[[0, 4, 5]].any()
-    with pytest.raises(ObservationError, match="not looked for"):
+    with pytest.raises(ObservationError, match="not detected"):
         found.keypoints(face=True)
-    with pytest.raises(ObservationError, match="no face is seen"):
+    with pytest.raises(ObservationError, match="no face is found"):
         replace(read, face_confidence=np.zeros_like(confidence)).keypoints(face=True)
     with pytest.raises(ObservationError, match="face"):
         replace(found, face=face)

@@ -53,13 +53,13 @@ def test_a_take_without_calibration_is_tracked(folder):
 
 def test_what_was_found_is_used_again_until_something_changes(folder, monkeypatch):
     def never(*args, **options):
-        raise AssertionError("made again")
+        raise AssertionError("found anew")
 
     monkeypatch.setattr(of_take, "calibrate_people", never)
     take = find_cameras(folder / "take.toml", tell=lambda text: None)
     assert take.calibration.file.name == "take-cameras.toml" and take.calibration.position_sigma > 0
     (folder / "take.toml").write_text(take_text("height = 1.6"))
-    with pytest.raises(AssertionError, match="made again"):
+    with pytest.raises(AssertionError, match="found anew"):
         find_cameras(folder / "take.toml", tell=lambda text: None)
 
 

@@ -225,7 +225,7 @@ WRONG = {
     "unknown option": (take_text(a='image = "cropped"'), r"\[\[camera\]\] 1, image: Invalid value 'cropped'.*'scaled'"),
     "unknown up": (take_text(head='up = "up"'), r"\[take\] up: Invalid value 'up'.*'-z'"),
     "wrong type": (take_text(head='rate = "fast"'), r"\[take\] rate: a number is expected, not a text"),
-    "file of wrong type": (take_text(a="video = 3"), r"\[\[camera\]\] 1, video: a file or folder must be a text in quotes"),
+    "file of wrong type": (take_text(a="video = 3"), r"\[\[camera\]\] 1, video: a file or folder must be a text"),
     "missing key": (take_text(more='[[keypoints]]\nfile = "a"'), r"\[\[keypoints\]\] 3: there is no `camera`"),
     "one camera as table": ('[camera]\nname = "a"', r"'camera' is not a table \[\[camera\]\]"),
     "camera list of texts": ('camera = ["a"]', r"\[\[camera\]\] 1: not a table"),

@@ -113,7 +113,8 @@ class Topics:
                 return topic
             kind = self.kinds.get(topic)
             problem = f"no topic {topic}" if kind is None else f"{topic} ({kind}) has no {what}"
-            raise ObservationError(f"{problem}; topics with {what}: {listed or 'none'}", file=self.path, remedy="Correct topic.")
+            problem += f"; topics with {what}: {listed or 'none'}"
+            raise ObservationError(problem, file=self.path, remedy="Correct topic.")
         named = [t for t in fitting if name in t.split("/")] or list(fitting)
         if len(named) == 1:
             return named[0]
