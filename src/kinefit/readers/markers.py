@@ -160,7 +160,7 @@ def _read_trc(path: Path, unit: str | None) -> Markers:
         rate, stated = float(header["datarate"]), int(float(header["numframes"]))
         count = int(float(header["nummarkers"]))
     except (KeyError, ValueError, OverflowError) as error:
-        problem = f"DataRate, NumFrames or NumMarkers is missing or no number ({error})"
+        problem = f"DataRate, NumFrames or NumMarkers is missing or not a number ({error})"
         raise FileError(problem, file=path, place="line 3", remedy=_TRC_REMEDY) from error
     if not 0 < rate < np.inf:
         raise FileError(f"rate {rate:g} Hz", file=path, place="line 3", remedy="Correct DataRate.")

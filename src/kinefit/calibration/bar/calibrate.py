@@ -254,7 +254,7 @@ def _check_second(bundle: BarBundle, length: float, sigma: float, known: tuple[s
     relative_std = np.hypot(_TAPE_SIGMA, sigma / length)
     if abs(np.log(found / metres)) > _MAX_DISTANCE_SIGMAS * relative_std:
         raise CalibrationError(
-            f"with a bar of {length:g} m they stand {found:.3f} m apart, not {metres:g} m",
+            f"with a bar of {length:g} m they are {found:.3f} m apart, not {metres:g} m",
             place=f"cameras {a} and {b}",
             remedy=f"Measure both again, from centre to centre; a bar of {length * metres / found:.4g} m would agree.",
         )

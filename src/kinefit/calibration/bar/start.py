@@ -105,7 +105,7 @@ def first_pairs(cameras: Sequence[Camera], uv: NDArray, known: bool, length: flo
         worst = max(reasons, key=reasons.__getitem__, default="no two cameras see it from different sides")
         flatness = "plane" in worst
         raise CalibrationError(
-            f"the targets do not determine how the cameras stand: {worst}",
+            f"the targets do not determine the cameras' poses: {worst}",
             remedy="Wave the bar near and far, high and low, in all directions." if flatness
             else "Check that the videos are in step and the targets the brightest spots. Move the cameras apart.",
         )  # fmt: skip

@@ -279,7 +279,7 @@ def _check_values(
     if not least < median < _MAX_MEDIAN_DEPTH:
         likely = [unit for unit in _COUNT_UNITS if _PERSON_DISTANCES[0] < median / factor * unit < _PERSON_DISTANCES[1]]
         entry = f"unit = {likely[0]:g}" if likely else "the sensor's own unit = ..."
-        what = " (millimetres taken for metres?)" if factor == 1.0 and median > 100 else ""
+        what = " (probably millimetres)" if factor == 1.0 and median > 100 else ""
         raise ObservationError(
             f"the median depth is {median:.4g} m{what}: the unit of {factor:g} m a count is wrong", file=path,
             remedy=f"Write {entry} (metres a count).",

@@ -123,7 +123,7 @@ def _read_hierarchy(text: str, path: str | PathLike[str]) -> list[_BvhJoint]:
                     raise fault(f"{kind} {' '.join(words)} is not allowed here", line)
                 parent = open_joints[-1]["index"] if open_joints else -1
                 if parent is None:
-                    raise fault("a joint stands before its parent's OFFSET", line)
+                    raise fault("a joint comes before its parent's OFFSET", line)
                 taken = {joint.name for joint in joints}
                 name = _end_name(joints[parent].name, taken) if kind == "END" else " ".join(words)
                 if not name or name in taken:

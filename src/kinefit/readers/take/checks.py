@@ -81,10 +81,10 @@ def _values(take: Take) -> None:
         raise TakeError(problem, file=take.path, place=place, remedy=remedy)
 
     if take.rate is not None and not 0 < take.rate < 1e6:
-        refuse(f"rate {take.rate:g} Hz", "[take] rate", "Give frames per second, or leave it out.")
+        refuse(f"rate {take.rate:g} Hz", "[take] rate", "Give frames per second, or remove it.")
     if take.height is not None and not 0.3 < take.height < 3:
         metres = f": height = {take.height / 100:g}" if 30.0 < take.height < 300.0 else ""
-        refuse(f"height {take.height:g} m", "[take] height", f"Give the stature in metres{metres}, or leave it out.")
+        refuse(f"height {take.height:g} m", "[take] height", f"Give the stature in metres{metres}, or remove it.")
     if take.person is not None:
         try:
             PersonChoice.of(take.person)
@@ -95,7 +95,7 @@ def _values(take: Take) -> None:
             take.depth or take.stereo or take.markers or take.silhouettes or take.skin
         ):
             what = "[[keypoints]] if a start is given" if has_start else "[[keypoints]] or [[depth]]"
-            refuse(f"'person' has no use without {what}", "[take] person", "Leave it out.")
+            refuse(f"'person' has no use without {what}", "[take] person", "Remove it.")
     for key in ("height", "subject", "size"):
         if take.start is not None and getattr(take, key) is not None:
             refuse(f"'{key}' has no use with start, which gives the body", f"[take] {key}", "Remove one of the two.")
@@ -115,7 +115,7 @@ def _values(take: Take) -> None:
         sets = _SETS.get(source.format, MEDIAPIPE_SETS)
         if source.set is not None and source.set not in sets:
             kind = "keypoint set" if source.format == "openpose" else f"keypoint set of {source.format}"
-            refuse(choices(kind, source.set, sets), place, f'Use set = "{sets[0]}", or leave it out.')
+            refuse(choices(kind, source.set, sets), place, f'Use set = "{sets[0]}", or remove it.')
         if source.file is None and source.stream is None and source.format not in ("detect", "skin"):
             refuse(f"no file of {source.format} keypoints", place, 'Write file = "...", or format = "detect".')
         if source.face is not None and not all(v > 0 for v in source.face[2:]):
@@ -183,7 +183,7 @@ def _calibration(take: Take, entry: CalibrationEntry, refuse: Callable[[str, str
         refuse(stated, place, "Give metres below 1 and degrees below 30: a camera that far off needs calibration.")
     others = (take.silhouettes, take.markers, take.depth, take.stereo, take.lines, take.skin, take.trackers)
     if not take.keypoints and any(others):
-        refuse("position_sigma and rotation_sigma are for cameras with keypoints", place, "Leave both out.")
+        refuse("position_sigma and rotation_sigma are for cameras with keypoints", place, "Remove both.")
 
 
 def _pose(take: Take, pose: StartEntry, refuse: Callable[[str, str, str], None]) -> None:
@@ -241,7 +241,7 @@ def _uses(take: Take) -> None:
                     raise TakeError(
                         f"'{key}' has no use with format = \"{entry.format}\"", file=take.path,  # type: ignore[attr-defined]
                         place=f"{table} of camera {entry.camera}",  # type: ignore[attr-defined]
-                        remedy=f"Leave it out; it is for {', '.join(formats)}.",
+                        remedy=f"Remove it; it is for {', '.join(formats)}.",
                     )  # fmt: skip
 
 
@@ -298,7 +298,7 @@ def _names(take: Take) -> None:
             )  # fmt: skip
     for kind, several in (("silhouettes", take.silhouettes), ("regions", take.regions)):
         for camera in repeated(s.camera for s in several):  # type: ignore[attr-defined]
-            raise TakeError(f"two {kind}", file=take.path, place=f"camera {camera}", remedy="Leave one out.")
+            raise TakeError(f"two {kind}", file=take.path, place=f"camera {camera}", remedy="Remove one.")
     inputs: list[tuple[object, ...]] = [
         (f"keypoints of camera {k.camera}", k.file, k.format, k.frames, k.set == FACE_SET)
         for k in (*take.keypoints, *take.skin)

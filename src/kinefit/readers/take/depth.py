@@ -80,7 +80,7 @@ def load_depth(take: Take, rig: Rig | None, rates: Mapping[str, float]) -> Depth
 def _clouds(entry: DepthEntry, rig: Rig | None, rate: float | None) -> CloudVideo:
     odd = [key for key in ("size", "intrinsics", "background") if getattr(entry, key) is not None]
     if odd:
-        raise TakeError(f"'{odd[0]}' has no use with clouds of points", remedy="Leave it out.")
+        raise TakeError(f"'{odd[0]}' has no use with clouds of points", remedy="Remove it.")
     assert entry.file is not None
     camera = entry.camera or entry.name
     clouds = read_clouds(
@@ -103,7 +103,7 @@ def _video(entry: DepthEntry, rate: float | None) -> DepthVideo:
     )  # fmt: skip
     if entry.size is not None and tuple(video.size) != tuple(entry.size):
         problem = f"size = {list(entry.size)}, but the images have {video.size[0]}x{video.size[1]} px"
-        raise TakeError(problem, remedy="Leave size out: it is for raw files.")
+        raise TakeError(problem, remedy="Remove size: it is for raw files.")
     background = read_depth(entry.background, **given) if entry.background is not None else None
     return replace(video, background=background, on_body=entry.on_body)
 

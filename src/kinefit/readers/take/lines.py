@@ -44,7 +44,7 @@ def read_lines(path: Path, names: Iterable[str]) -> tuple[NDArray, NDArray]:
             raise FileError(f"not a row with a line ({error})", file=path, place=place, remedy=_REMEDY) from error
         if name not in names:
             raise ObservationError(
-                choices("line", name, names), file=path, place=place, remedy="Add it to `landmarks`, or leave it out."
+                choices("line", name, names), file=path, place=place, remedy="Add it to `landmarks`, or remove it."
             )
         if not np.isfinite(ends).all() or frame < 0 or (frame, name) in rows:
             problem = f"frame {frame}, line '{name}' appears twice, or its numbers are not finite"

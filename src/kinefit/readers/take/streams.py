@@ -51,7 +51,7 @@ def odd_streams(take: Take) -> Iterator[tuple[str, str, str]]:
         if entry.stream is not None:
             for key in ("time_unit", "segment"):
                 if getattr(entry, key) is not None:
-                    yield f"'{key}' has no use with a stream", place, "Leave it out."
+                    yield f"'{key}' has no use with a stream", place, "Remove it."
             if entry.intrinsics is not None and entry.size is None:
                 yield "a stream with intrinsics, and no size", place, "Write size = [width, height] of its images."
     streams = streams_of(take)
@@ -67,6 +67,6 @@ def odd_streams(take: Take) -> Iterator[tuple[str, str, str]]:
     seen = {entry.camera for entry in take.keypoints}
     blind = [entry.name for entry in take.cameras if entry.stream is None and entry.name not in seen]
     if recorded:
-        yield f"a recording cannot be combined with streams ({streams[0]})", recorded[0], "Leave it out."
+        yield f"a recording cannot be combined with streams ({streams[0]})", recorded[0], "Remove it."
     elif blind and any(entry.stream is not None for entry in take.cameras):
-        yield "it has no stream, others have", f"camera {blind[0]}", "Give each camera a stream, or leave it out."
+        yield "it has no stream, others have", f"camera {blind[0]}", "Give each camera a stream, or remove it."
