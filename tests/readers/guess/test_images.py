@@ -63,4 +63,4 @@ def test_photographs_some_of_which_are_missing_are_no_video(folder):
     write_images(folder / "mask{}.png", MASK)
     with pytest.raises(TakeError, match="cam01, cam02") as told:
         guess_take(folder)
-    assert "nothing here" not in str(told.value)  # the one that is whole is looked at
+    assert "no videos, keypoints" not in str(told.value)  # the one that is whole is looked at
