@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from drawing import results
 from kinefit import read_motion
 from kinefit.bodies.surfaces import body_mesh
-from kinefit.exporters import write_motion
+from kinefit.calibration.people.of_take import find_cameras
+from kinefit.exporters import draw_overlay, write_motion
+from kinefit.exporters.pictures.drawing import draw_body
 from kinefit.exporters.report.cycles import PERCENT, find_cycles, normalised
 from kinefit.readers.skeletons.bvh import read_bvh
 from kinefit.readers.take.file import read_take
@@ -29,28 +31,41 @@ _TO_CALIBRATION = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
 
 
 def people() -> None:
-    """Two people who were tracked with their faces hidden: one of them, in all views."""
-    place = results.two_people()
-    out = results.folder("people")
-    if not (out / "person-2" / "montage.png").is_file():
-        results.command("track", place, "--hide-faces", "--no-report", "-q", "--out", out)
-    results.save("people.jpg", results.reduced(cv2.imread(str(out / "person-2" / "montage.png")), width=1000))
+    """Two people who were tracked together, each with the fitted skeleton, in all views."""
+    place, out = results.two_people(), results.folder("people")
+    if not (out / "person-2" / "motion.npz").is_file():
+        results.command("track", place, "--no-overlays", "--no-report", "-q", "--out", out)
+    motions = [read_motion(out / person / "motion.npz") for person in ("person-1", "person-2")]
+    take = read_take(place / "take.toml")
+    seen, shown = load_observations(take), []
+    assert seen.rig is not None
+    with TakePictures(take, seen) as pictures:
+        for camera in seen.rig:
+            image, frame = pictures(camera.name, 50)  # type: ignore[misc]
+            image = np.array(image)
+            for motion in motions:
+                draw_body(image, motion, 50, camera, frame)
+            shown.append(results.reduced(image, width=248))
+    height = min(image.shape[0] for image in shown)
+    results.save("people.jpg", np.hstack([image[:height] for image in shown])[..., ::-1])
 
 
 def one_camera() -> None:
     """The same two people before one of the cameras, which nobody calibrated: each with the fitted skeleton."""
     place = results.folder("one_camera")
-    video = results.two_people() / "cam01.mp4"
-    out = place / "results"
+    take, out = place / "take.toml", place / "results"
     if not (out / "person-2" / "motion.npz").is_file():
-        shutil.copy(video, place / "phone.mp4")
+        shutil.copy(results.two_people() / "cam01.mp4", place / "phone.mp4")
         results.command("init", place, "--force")
-        take = place / "take.toml"
-        results.command("track", take, "--hide-faces", "--no-report", "-q", "--out", out)
-    shown = []
-    for person in ("person-1", "person-2"):
-        with Video(next((out / person / "overlays").glob("*.mp4"))) as overlay:
-            shown.append(results.reduced(overlay.read(len(overlay) // 2), height=668))
+        results.command("track", take, "--no-overlays", "--no-report", "-q", "--out", out)
+    camera, shown = load_observations(find_cameras(read_take(take))).rig.cameras[0], []  # type: ignore[union-attr]
+    with Video(place / "phone.mp4") as video:
+        for person in ("person-1", "person-2"):
+            motion = read_motion(out / person / "motion.npz")
+            T_level_world = np.array(motion.provenance["floor"]["T_level_world"])  # the floor was found, and levelled
+            levelled = camera.with_pose(camera.T_camera_world @ np.linalg.inv(T_level_world))
+            image = draw_overlay(video.read(50), motion, 50, levelled)
+            shown.append(results.reduced(image, height=668))
     results.save("one_camera.jpg", np.hstack(shown)[..., ::-1])
 
 
