@@ -125,13 +125,14 @@ def body_skin() -> None:
              (("hip_flexion", 80.0), ("knee_angle", 95.0), ("ankle_angle", 20.0), ("arm_flex", 70.0))}  # fmt: skip
     spread = {f"arm_add_{side}": -80.0 for side in "lr"} | {f"hip_adduction_{side}": -20.0 for side in "lr"}
     image = _metaballs("humanoid_metaballs", [spread, squat, {}], (420, 460), 1400.0, (2.6, 0.5, 2.2))
-    results.save("body_skin.png", image)
+    results.save("body_skin.png", image, palette=False)
 
 
 def metaball_skin() -> None:
     """The arm of metaballs under one skin, straight and bent."""
     poses = [{}, {"elbow_flex_r": 60.0}, {"elbow_flex_r": 110.0}]
-    results.save("metaball_skin.png", _metaballs("arm_metaballs", poses, (300, 420), 1250.0, (0.3, 0.0, 1.5)))
+    image = _metaballs("arm_metaballs", poses, (300, 420), 1250.0, (0.3, 0.0, 1.5))
+    results.save("metaball_skin.png", image, palette=False)
 
 
 def replay() -> None:

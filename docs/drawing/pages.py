@@ -83,7 +83,7 @@ def view() -> None:
         _choose(browser, "look through", "cam04")
         time.sleep(15.0)
         right = browser.image()[:, 310:664]  # the camera's image is upright, in the middle of the window
-    results.save("view.png", np.hstack([left, right]))
+    results.save("view.png", np.hstack([left, right]), palette=False)
 
 
 def _choose(browser: Browser, label: str, option: str) -> None:

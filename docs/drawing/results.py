@@ -69,11 +69,11 @@ def reduced(image: NDArray, *, width: int | None = None, height: int | None = No
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-def save(name: str, image: NDArray) -> None:
-    """Write a BGR image: JPEG of quality 85, or PNG with a palette of 256 colours."""
+def save(name: str, image: NDArray, *, palette: bool = True) -> None:
+    """Write a BGR image: JPEG of quality 85, or PNG, with a palette of 256 colours if it has no shades."""
     rgb = Image.fromarray(np.ascontiguousarray(image[..., ::-1]))
     if name.endswith(".png"):
-        rgb.quantize(256, dither=Image.Dither.NONE).save(IMAGES / name, optimize=True)
+        (rgb.quantize(256, dither=Image.Dither.NONE) if palette else rgb).save(IMAGES / name, optimize=True)
     else:
         rgb.save(IMAGES / name, quality=85, optimize=True)
     print(f"{IMAGES / name}: {image.shape[1]} by {image.shape[0]} px, {(IMAGES / name).stat().st_size // 1000} kB")
