@@ -1,7 +1,8 @@
 """Images of the pages: `python docs/draw.py NAME ...` draws those that `DRAWN` names, `python docs/draw.py` lists all.
 
 Those that benchmarks draw are in `BENCHMARKS`, each with its command. Real recordings are read below $KINEFIT_DATA;
-`kinefit demo` fetches its own. Pages in the browser need Chromium.
+`kinefit demo` fetches its own. Pages in the browser need Chromium. Results that several images show are kept in the
+folder kinefit-drawn of the system's temporary files: delete it after a change of what they show.
 """
 
 from __future__ import annotations
