@@ -11,8 +11,10 @@ extensions = [
     "myst_parser", "sphinx_click", "sphinx_design", "sphinx.ext.autodoc", "sphinx.ext.autosummary",
     "sphinx.ext.napoleon", "sphinx.ext.mathjax",
 ]
-exclude_patterns = ["_build", "_templates", "draw.py"]
+exclude_patterns = ["_build", "_templates"]
 templates_path = ["_templates"]
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_theme = "furo"
 html_title = f"kinefit {release}"
 
@@ -44,8 +46,8 @@ def branch_of_the_page(app, pagename, templatename, context, doctree):
 
 
 def plain_help(app, ctx, lines):
-    """The same for what commands say of themselves."""
-    lines[:] = [line.replace("*", r"\*") for line in lines]
+    """The same for what commands say of themselves; a default that is a path stands as it is typed."""
+    lines[:] = [re.sub(r"(?:Posix|Windows)Path\('([^']*)'\)", r"\1", line).replace("*", r"\*") for line in lines]
 
 
 def examples(app, ctx, lines):

@@ -72,12 +72,12 @@ def test_what_is_right_goes_through(args, more):
 
 
 @pytest.mark.parametrize(("args", "more", "said"), [
-    ((None, [1]), {}, "some: path is a NoneType. It takes str or Path"), ((3, [1]), {}, "path is a int"),
-    (("a", "b"), {}, "values is a str. It takes an array of numbers"), (("a", [[1], [2, 3]]), {}, "values is a list"),
-    (("a", 1, "abc"), {}, "names is a str. It takes Sequence of str"),
-    (("a", 1, [1]), {}, "names is a list that does"),
-    (("a", 1, (), 1.5), {}, "count is a float. It takes int"),
-    (("a", 1), {"table": {"a": "b"}}, "table is a dict that"),
+    ((None, [1]), {}, "some: path is a NoneType. Give str or Path"), ((3, [1]), {}, "path is a int"),
+    (("a", "b"), {}, "values is a str. Give an array of numbers"), (("a", [[1], [2, 3]]), {}, "values is a list"),
+    (("a", 1, "abc"), {}, "names is a str. Give Sequence of str"),
+    (("a", 1, [1]), {}, "names is a list of the wrong"),
+    (("a", 1, (), 1.5), {}, "count is a float. Give int"),
+    (("a", 1), {"table": {"a": "b"}}, "table is a dict of the wrong"),
     (("a", 1), {"tell": 3}, "tell is a int"),
 ])  # fmt: skip
 def test_what_is_wrong_is_told(args, more, said):

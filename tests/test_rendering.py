@@ -214,8 +214,8 @@ def test_cutting_triangles_keeps_the_surface_whole():
     ("change", "word"),
     [
         ({"vertices_camera": [[0, 0, 1], [1, 0, 1], [0, np.nan, 1]]}, "finite"),
-        ({"faces": [[0, 1, 3]]}, "not there"),
-        ({"faces": [[0, 1, -1]]}, "not there"),
+        ({"faces": [[0, 1, 3]]}, "out of range"),
+        ({"faces": [[0, 1, -1]]}, "out of range"),
         ({"faces": [0, 1, 2]}, "faces"),
         ({"vertices_camera": [[0, 0], [1, 0], [0, 1]]}, "vertices"),
         ({"size": (0, 4)}, "image"),

@@ -41,8 +41,8 @@ def checked(function: F) -> F:
             if name in tests and not tests[name](value):
                 problem = f"{function.__name__}: {name} is a {type(value).__name__}"
                 if isinstance(value, Sequence | Mapping) and not isinstance(value, str):
-                    problem += " that does not hold what it should, or none is wanted"
-                raise ObservationError(problem, remedy=f"It takes {_told(_hints(function)[name])}.")
+                    problem += " of the wrong content or type"
+                raise ObservationError(problem, remedy=f"Give {_told(_hints(function)[name])}.")
         return function(*args, **more)
 
     return typing.cast(F, call)

@@ -69,7 +69,7 @@ def read_table(
                     rows.append([float(row[k]) for k in at] + cells)
                     texts += [row[names.index(text)].strip()] if text else []
                 except (ValueError, IndexError):
-                    raise FileError("a number that is none", file=path, place=f"line {line}", remedy=remedy) from None
+                    raise FileError("a cell is not a number", file=path, place=f"line {line}", remedy=remedy) from None
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise FileError(f"cannot be read: {error}", file=path, remedy=remedy) from None
     return texts, np.array(rows).reshape(-1, len(columns) + len(optional))
@@ -93,7 +93,7 @@ def read_bytes(path: Path) -> bytes:
     """All of a file; FileError where it cannot be read, or has no end (a device)."""
     try:
         if path.exists() and not path.is_file():
-            raise FileError("is no file", file=path, remedy="Check the path.")
+            raise FileError("is not a file", file=path, remedy="Check the path.")
         return path.read_bytes()
     except (OSError, ValueError) as problem:
         reason = getattr(problem, "strerror", None) or str(problem)
@@ -140,11 +140,11 @@ def _remedy(text: str, problem: str) -> str:
         return f"Write {'true' if value in ('True', 'yes', 'Yes') else 'false'}."
     if "overwrite" in problem:
         if header := re.match(r"\s*\[\[?([^\[\]]{1,60})\]", line):
-            return f"Tables that are there several times have two brackets, the first one too: [[{header[1].strip()}]]."
-        return "It is there twice: keep one."
+            return f"A table that appears several times has two brackets, the first one too: [[{header[1].strip()}]]."
+        return "It appears twice: keep one."
     if "twice" in problem and (header := re.match(r"\s*\[\s*([^\[\]]{1,60}?)\s*\]", line)):
         name = header[1]
-        return f"Of a table that may be there several times write [[{name}]], the first one too; of any other keep one."
+        return f"If the table may appear several times, write [[{name}]], the first one too. Otherwise keep one."
     if re.fullmatch(r"[^\W\d][^\"'\[\]{}]{0,119}", value):
         return f"Put a text in quotes: {line.partition('=')[0].strip()[:60]} = \"{value}\"."
     return "Put texts in quotes and numbers not, and give numbers a point, not a comma: 1.5."
@@ -181,7 +181,7 @@ def read_npz(
     except _Refused as problem:
         raise error(str(problem), file=path, remedy=remedy) from problem
     except Exception as problem:  # zipfile, zlib and numpy have a dozen kinds of errors for what is damaged
-        raise error(f"no numpy archive, or damaged ({_reason(problem)})", file=path, remedy=remedy) from problem
+        raise error(f"not a numpy archive, or damaged ({_reason(problem)})", file=path, remedy=remedy) from problem
 
 
 def read_npy(file: str | os.PathLike[str], *, remedy: str) -> NDArray:
@@ -223,7 +223,7 @@ def _members(archive: zipfile.ZipFile, names: set[str], room: int) -> dict[str, 
             continue
         room -= info.file_size
         if room < 0:
-            raise _Refused(f"array {name!r} of {info.file_size / 1e6:.0f} MB, which the file is far too small for")
+            raise _Refused(f"array {name!r} of {info.file_size / 1e6:.0f} MB, but the file is much smaller")
         with archive.open(info) as stream:
             found[name] = _array(stream, info.file_size, name)
     return found
@@ -248,7 +248,7 @@ def _array(stream: IO[bytes], size: int, name: str) -> NDArray:
     if dtype.kind == "U" and dtype.itemsize:
         codes = array.view(f"{dtype.byteorder}u4")
         if (codes > 0x10FFFF).any() or ((codes >= 0xD800) & (codes < 0xE000)).any():
-            raise _Refused(f"array {name!r} has characters that there are not")
+            raise _Refused(f"array {name!r} has characters that do not exist")
     return array.reshape(shape, order="F" if fortran else "C").copy()
 
 

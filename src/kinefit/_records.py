@@ -78,8 +78,8 @@ class Codec:
         try:
             return self._thing(msgspec.msgpack.decode(data), resolve)
         except _ERRORS as error:
-            problem = f"a record that kinefit did not write ({error})"
-            raise FileError(problem, file=name, remedy="Run again: it is then computed anew.") from error
+            problem = f"this record is not from kinefit ({error})"
+            raise FileError(problem, file=name, remedy="Run again: kinefit then computes it again.") from error
 
     def _tree(self, thing: Any, refer: Refer | None) -> Any:
         kind = type(thing)

@@ -162,7 +162,7 @@ class Motion:
                 try:
                     array = np.array(array, dtype=float)  # nobody else's
                 except (TypeError, ValueError) as error:
-                    problem = f"{name} of a motion is a {type(array).__name__} that is no array of numbers"
+                    problem = f"{name} of a motion is a {type(array).__name__} that is not an array of numbers"
                     remedy = "Give arrays of as many frames as there are times."
                     raise ObservationError(problem, remedy=remedy) from error
                 array.flags.writeable = False
@@ -171,7 +171,7 @@ class Motion:
             raise ObservationError(choices("vertical axis", self.up, UP_AXES))
         if not np.all(np.isfinite(self.Ts_world_root)) or not np.all(np.isfinite(self.angles)):
             raise ObservationError(
-                "a motion holds poses that are not finite", remedy="Leave out frames without a pose."
+                "a motion holds poses that are not finite", remedy="Remove frames without a pose."
             )
 
     def __len__(self) -> int:

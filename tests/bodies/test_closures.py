@@ -115,7 +115,7 @@ def test_a_part_that_goes_takes_its_closures_along():
         ('to = "rod_end"', 'to = "rod_end"\nkind = "line"', "axis None.*lines and planes"),
         ('to = "rod_end"', 'to = "rod_end"\nkind = "line"\naxis = [0, 0, 0]', "no direction"),
         ('to = "rod_end"', 'to = "rod_end"\nturn = [0, 0, 9]', "only rigid closures"),
-        ('to = "rod_end"', 'to = "rod_end"\nmode = "hard"\nsigma = 0.1', "hard closure with a standard deviation"),
+        ('to = "rod_end"', 'to = "rod_end"\nmode = "hard"\nsigma = 0.1', "cannot have a standard deviation"),
         ('to = "rod_end"', 'to = "rod_end"\nsigma = 0.0', "positive"),
         ('point = "l_tip"', 'point = "rod_end"', "of one segment"),
         ('name = "rod end"', 'name = "rod end"\nstrength = 3', "not a body file.*strength"),
@@ -141,7 +141,7 @@ def test_wrong_closures_are_told(old, new, told):
         ({"moves": '["rod end"]'}, "shifts closure"),
         ({"value": "nan"}, "not finite"),
         ({"value": "-inf"}, "not finite"),
-        ({"along": "along = [1e308, 0, 0]", "value": "9.0"}, "no dimensions"),
+        ({"along": "along = [1e308, 0, 0]", "value": "9.0"}, "not a dimension"),
     ],
 )
 def test_wrong_dimensions_are_told(changes, told):

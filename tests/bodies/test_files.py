@@ -128,7 +128,7 @@ BAD = {
     "cycle": (changed('parent = "base"', 'parent = "slide"'), ("arm, slide, tool", "cycle", "end at the root"), None),
     "itself as parent": (changed('parent = "slide"', 'parent = "tool"'), ("tool", "cycle"), None),
     "two roots": (changed('parent = "slide"\n', ""), ("exactly one segment without a parent", "base, tool", "Give the others"), None),
-    "no root": (changed('name = "base"\n', 'name = "base"\nparent = "tool"\n'), ("without a parent", "none"), None),
+    "not the root": (changed('name = "base"\n', 'name = "base"\nparent = "tool"\n'), ("without a parent", "none"), None),
     "zero axis": (changed("[0.0, 2.0, 0.0]", "[0.0, 0.0, 0.0]"), ("turn", "no direction", "not all zero"), "joint shoulder"),
     "axis not finite": (changed("[0.0, 2.0, 0.0]", "[0.0, inf, 0.0]"), ("turn", "no direction"), "joint shoulder"),
     "axis not a number": (changed("[0.0, 2.0, 0.0]", "[0.0, nan, 0.0]"), ("turn", "no direction"), "joint shoulder"),

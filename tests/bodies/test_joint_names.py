@@ -66,7 +66,7 @@ def test_a_table_goes_before_the_names_and_is_checked():
     assert joint_map([*names, "spare"], {"head": "spare"})["head"] == len(names)
     with pytest.raises(BodyError, match="no joint 'nose'"):
         joint_map(names, {"head": "nose"})
-    with pytest.raises(BodyError, match="named for two segments"):
+    with pytest.raises(BodyError, match="assigned to two segments"):
         joint_map(names, {"head": "Hips"})
     with pytest.raises(BodyError, match=r"no joint for foot_r \('RightFoot' in Mixamo\)"):
         joint_map([name for name in names if name != "RightFoot"])

@@ -119,14 +119,14 @@ def refused():
     hinge = {"coordinates": ("swing",), "axes": ((0.0, 0.0, 1.0),)}
     return {
         "'pelvis' is the root": lambda: without_part(body, "pelvis"),
-        "hang on it": lambda: without_part(body, "thorax"),
+        "it has the children": lambda: without_part(body, "thorax"),
         "no segment 'tail'": lambda: without_part(body, "tail"),
         "no segment 'paw'": lambda: with_part(body, "crate", parent="paw", surfaces=crate),
-        "segment 'crate' is there": lambda: with_part(more, "crate", parent="hand_l", surfaces=crate),
-        "coordinate 'swing' is there": lambda: with_part(
+        "segment 'crate' exists": lambda: with_part(more, "crate", parent="hand_l", surfaces=crate),
+        "coordinate 'swing' exists": lambda: with_part(
             more, "bag", parent="hand_l", surfaces=crate, joint=PartJoint(**hinge)
         ),
-        "landmark 'corner_a' is there": lambda: with_part(
+        "landmark 'corner_a' exists": lambda: with_part(
             more, "bag", parent="hand_l", surfaces=crate, landmarks={"corner_a": (0, 0, 0)}
         ),
         "axes of its joint": lambda: with_part(
@@ -135,7 +135,7 @@ def refused():
         "lower of its joint": lambda: with_part(
             body, "bag", parent="hand_l", surfaces=crate, joint=PartJoint(**hinge, lower=(0.0, 1.0))
         ),
-        "axis without direction": lambda: with_part(
+        "an axis of its joint has no direction": lambda: with_part(
             body, "bag", parent="hand_l", surfaces=crate,
             joint=PartJoint(coordinates=("a",), axes=((0.0, 0.0, 0.0),)),
         ),

@@ -376,10 +376,10 @@ def test_faces_are_looked_for_where_they_are_asked_for_and_kept(take, networks, 
     assert read_detections(file).face.shape[2:] == (478, 2)
     assert run(take).exit_code == 0 and run(take, "--face").exit_code == 0 and networks.pictures == pictures
     take.write_text(take.read_text() + '[[keypoints]]\ncamera = "cam01"\nformat = "detect"\nset = "MEDIAPIPE_478"\n')
-    with pytest.raises(ObservationError, match="no face is seen"):
+    with pytest.raises(ObservationError, match="no face is found"):
         load_observations(with_detections(read_take(take)))
     assert run(take, "--no-face").exit_code == 0 and read_detections(file).face is None
-    with pytest.raises(ObservationError, match="not looked for"):
+    with pytest.raises(ObservationError, match="faces were not detected"):
         load_observations(read_take(take))
 
 
@@ -439,7 +439,7 @@ def test_outlines_are_made_where_a_take_follows_them_and_missing_ones_are_told(t
     with_detections(read_take(take))
     assert read_detections(detections_file(take, "cam01")).mask(5, 0) is None
     take.write_text(wanted + '\n[[silhouette]]\ncamera = "cam01"\nformat = "detect"\n')
-    with pytest.raises(TakeError, match="has no outlines.*kinefit detect"):
+    with pytest.raises(TakeError, match="has no silhouettes.*kinefit detect"):
         load_observations(read_take(take))
     with_detections(read_take(take))
     assert read_detections(detections_file(take, "cam01")).mask(5, 0).any()

@@ -156,7 +156,7 @@ def test_clicked_joints_give_body_and_start(folder, tmp_path):
     assert answer.exit_code == 2 and "r_knee: camera cam02 is off by" in answer.stderr
     (tmp_path / "clicks.json").write_text('{"points": {"cam02": {"r_knee": [1]}}}')
     answer = run("init", folder, "--points", tmp_path / "clicks.json", "--force")
-    assert answer.exit_code == 2 and "[1] is no pixel" in answer.stderr
+    assert answer.exit_code == 2 and "[1] is not a pixel position" in answer.stderr
 
 
 def test_clicks_are_measurements_of_their_frames(folder, tmp_path):
@@ -261,7 +261,7 @@ def test_joints_are_clicked_in_the_browser(folder, monkeypatch):
     assert seen["picture"] == (960, 544, 3) and "unsafe" not in seen["policy"]
     assert len(seen["files"]) == 2 and b"<style" not in seen["page"] and b"<script>" not in seen["page"]
     assert [a["taken"] for a in seen["answers"]] == [False, False, True]
-    assert "These are no clicks" in seen["answers"][0]["answer"]
+    assert "These clicks cannot be used" in seen["answers"][0]["answer"]
     assert "Camera cam03 is off in" in seen["answers"][1]["answer"]
     assert read_take(folder / "take.toml").pose is not None
     assert json.loads((folder / "clicks.json").read_text())["points"]["cam01"]

@@ -131,7 +131,7 @@ def test_one_camera_is_told_from_the_start(take, tmp_path):
         take.with_name(f"mediapipe_{camera}.npy").unlink()
     take.unlink()
     told = run("init", take.parent)
-    assert told.exit_code == 0 and "cam01 alone: the built-in detector tells how far limbs are" in told.stdout
+    assert told.exit_code == 0 and "cam01 alone: the built-in detector estimates depth" in told.stdout
     video = take.read_text()
     keypoints = '[[keypoints]]\ncamera = "cam01"\nfile = "mediapipe_cam01.npy"\nformat = "mediapipe"\n'
     take.write_text(f"{video}\n{keypoints}")
@@ -226,10 +226,10 @@ def test_formats_may_stand_apart():
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [("up = ", 'unit = "mm"\nup = ', "'unit' belongs to [calibration], [[markers]], [[depth]]"),
-     ("rate = 30.0", "rate = 35.0", "Leave rate out of [take]: the videos state theirs"),
+     ("rate = 30.0", "rate = 35.0", "Remove rate from [take]: the videos state theirs"),
      ("[[camera]]", "[camera]", "write [[camera]], the first one too"),
      ('format = "mediapipe"', 'format = "openpose"', '.npy files are of format = "mediapipe"'),
-     ("mediapipe_cam02.npy", "mediapipe_cam01.npy", "mediapipe_cam01.npy is of camera cam02, too"),
+     ("mediapipe_cam02.npy", "mediapipe_cam01.npy", "mediapipe_cam01.npy is also the file of camera cam02"),
      ("cam02.mp4", "cam01.mp4", "cam01.mp4 is of camera cam02, too"), ("", TWICE, "the same file twice")],
 )  # fmt: skip
 def test_slips_of_a_take_are_told(take, old, new, told):
@@ -244,7 +244,7 @@ def test_check_of_one_camera_says_that_one_is_too_few(take):
     start, *tables = re.split(r"(?m)^(?=\[\[)", text)
     take.write_text(start + "".join(table for table in tables if "cam01" in table))
     told = run("check", take)
-    assert "Keypoints of one camera do not tell how far a person is; two cameras do" in told.stdout
+    assert "Keypoints of one camera do not give a person's distance; two cameras do" in told.stdout
 
 
 def test_a_take_of_any_table_is_found_in_its_folder(take):

@@ -47,4 +47,4 @@ def test_a_motion_without_measurements_is_not_called_sure(capsys):
     motion = good_motion(offsets=())
     assert np.all(motion.quality == 0.9) and not doubtful_moments(motion)
     print_summary(motion)
-    assert "doubtful moments: none known, as the motion comes without measurements" in capsys.readouterr().out
+    assert "doubtful moments: none known, because the motion has no measurements" in capsys.readouterr().out

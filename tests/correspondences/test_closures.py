@@ -135,5 +135,5 @@ def test_what_the_paper_has_no_equation_for_is_named():
     with pytest.raises(BodyError, match="closure 'foot' is a line"):
         closure_targets(line, line.usual_state())
     rider = load_body("cyclist")
-    with pytest.raises(BodyError, match="'cyclist' has gear that is to be estimated"):
+    with pytest.raises(BodyError, match="'cyclist' has gear to estimate"):
         closure_targets(rider, rider.usual_state())

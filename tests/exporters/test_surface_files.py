@@ -103,7 +103,7 @@ def test_a_picture_has_a_scale_and_refuses_nothing(surfaces, tmp_path):
     write_field_picture(first, image, values, tmp_path / "field.png", title="x", unit="m")
     picture = cv2.imread(str(tmp_path / "field.png"))
     assert picture.shape == (60, 80 + 180, 3)
-    with pytest.raises(ExportError, match="nothing measured"):
+    with pytest.raises(ExportError, match="no measurement to show"):
         write_field_picture(first, image, np.full(48, np.nan), tmp_path / "none.png", title="x", unit="m")
     write_point_picture(first.uv[:, 0], image, tmp_path / "points.png")
     assert cv2.imread(str(tmp_path / "points.png")).shape == (60, 80, 3)

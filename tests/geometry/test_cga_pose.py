@@ -212,9 +212,9 @@ def test_derivatives_by_differences(kind):
 
 def test_what_cannot_be_settled_or_understood_is_told():
     X, L, P = point(x_d), line_of(LINES), plane_of(PLANES)
-    with pytest.raises(ObservationError, match=r"settle [0-5] of 6 unknowns"):
+    with pytest.raises(ObservationError, match=r"determine [0-5] of 6 unknowns"):
         estimate_pose([Constraint(X[:2], L[:2])])
-    with pytest.raises(ObservationError, match="settle 0 of 6"):
+    with pytest.raises(ObservationError, match="determine 0 of 6"):
         estimate_pose([])
     with pytest.raises(ObservationError, match="no constraint for elements of grades"):
         estimate_pose([Constraint(P, L)])

@@ -67,7 +67,7 @@ def test_two_cameras_do_not_tell_which_of_them_is_off():
     uv[0, 0, 1] += 150.0
     with pytest.raises(TrackingError, match=rf"{NAMES[0]}: rays pass each other by \d+ cm \({RIG.names[0]} \d+ px"):
         clicked_points(RIG, NAMES, uv)
-    with pytest.raises(TrackingError, match="0 points are known"):
+    with pytest.raises(TrackingError, match="0 points can be triangulated"):
         clicked_points(RIG, NAMES, np.full_like(uv, np.nan))
 
 

@@ -68,7 +68,7 @@ def test_units_ranges_and_damage_of_depth_images(tmp_path):
     (tmp_path / "c.png").write_bytes((tmp_path / "a.png").read_bytes()[:60])
     assert stream.read(tmp_path / "c.png", 0.0) is None
     cv2.imwrite(str(tmp_path / "d.png"), image(3))
-    with pytest.raises(ObservationError, match="which is no depth"):
+    with pytest.raises(ObservationError, match="not a depth image"):
         stream.read(tmp_path / "d.png", 0.0)
     cv2.imwrite(str(tmp_path / "e.png"), counts[:20])
     with pytest.raises(ObservationError, match="images have 64x20 px instead of 64x48"):
@@ -194,9 +194,9 @@ KEYPOINTS = '[[keypoints]]\ncamera = "a"\nstream = "new"\n'
 @pytest.mark.parametrize(("text", "told"), [
     (DEPTH, "neither a file nor a stream"), (STREAM, "a stream with intrinsics, and no size"),
     (STREAM + 'file = "old.npz"\nsize = [10, 10]\n', "a stream and a file"),
-    (STREAM + 'size = [10, 10]\n[[markers]]\nfile = "a.trc"\n', "what was recorded stands beside streams"),
+    (STREAM + 'size = [10, 10]\n[[markers]]\nfile = "a.trc"\n', "a recording cannot be combined with streams"),
     (CAMERA + KEYPOINTS + 'format = "mediapipe"\n', "'stream' has no use"),
-    (CAMERA + 'stream = "0"\n' + KEYPOINTS, "its camera has a stream, too"),
+    (CAMERA + 'stream = "0"\n' + KEYPOINTS, "its camera also has a stream"),
 ])  # fmt: skip
 def test_streams_beside_what_excludes_them(tmp_path, text, told):
     (tmp_path / "take.toml").write_text(text)
@@ -206,7 +206,7 @@ def test_streams_beside_what_excludes_them(tmp_path, text, told):
 
 def test_a_stream_is_no_recording(tmp_path):
     (tmp_path / "take.toml").write_text(STREAM + 'size = [10, 10]\n')
-    with pytest.raises(TakeError, match="nothing is recorded.*kinefit live"):
+    with pytest.raises(TakeError, match="a stream is no recording.*kinefit live"):
         load_observations(read_take(tmp_path / "take.toml"))
     with pytest.raises(FileError, match="no such folder"):
         live_session(read_take(tmp_path / "take.toml"))

@@ -109,7 +109,7 @@ def test_bad_input_is_told(known):
     assert list(split_people(two)) == ["A", "B"]
     assert split_people(two)["B"].names == markers.names
     for unseen in (markers.positions[:0], np.full_like(markers.positions, np.nan)):
-        with pytest.raises(ObservationError, match="none of the markers is seen"):
+        with pytest.raises(ObservationError, match="none of the markers is visible"):
             fit_marker_subject(BODY, Markers(markers.names, 60.0, unseen))
     few = np.array(markers.positions)
     few[:, 5:] = np.nan

@@ -163,11 +163,11 @@ def test_repeated_names_are_found_by_a_comparison_for_each():
 
 @pytest.mark.parametrize(
     ("text", "told"),
-    [("[" * 100_000, "is no JSON"), ('{"points": {"a": {"b": [1, %s]}}}' % ("9" * 400), "no pixel"),
-     ('{"points": {"a": {"b": [NaN, 1]}}}', "no pixel"),
-     ('{"step": %s, "points": {}}' % ("9" * 400), "no number of a frame"),
-     ("[]", "holds no points"), ('[{"points": {}}, {"points": {}}]', "step 0 is there twice"),
-     ("\xff", "is no JSON")],
+    [("[" * 100_000, "is not JSON"), ('{"points": {"a": {"b": [1, %s]}}}' % ("9" * 400), "not a pixel"),
+     ('{"points": {"a": {"b": [NaN, 1]}}}', "not a pixel"),
+     ('{"step": %s, "points": {}}' % ("9" * 400), "not a frame number"),
+     ("[]", "holds no points"), ('[{"points": {}}, {"points": {}}]', "step 0 appears twice"),
+     ("\xff", "is not JSON")],
 )  # fmt: skip
 def test_clicks_that_are_none_are_told(tmp_path, text, told):
     (tmp_path / "a.json").write_text(text, encoding="latin-1")
@@ -179,7 +179,7 @@ def test_clicks_that_are_none_are_told(tmp_path, text, told):
 def test_a_device_without_an_end_is_not_read():
     if not Path("/dev/zero").exists():
         pytest.skip("no such device")
-    with pytest.raises(FileError, match="is no file"):
+    with pytest.raises(FileError, match="is not a file"):
         read_bytes(Path("/dev/zero"))
 
 

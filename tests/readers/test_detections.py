@@ -77,9 +77,9 @@ def test_faces_are_written_and_read(found, tmp_path):
     longer = read.within(1, 6)
     assert np.allclose(longer.face[1:4], face, equal_nan=True, atol=1e-5)
     assert not longer.face_confidence[[0, 4, 5]].any()
-    with pytest.raises(ObservationError, match="not looked for"):
+    with pytest.raises(ObservationError, match="not detected"):
         found.keypoints(face=True)
-    with pytest.raises(ObservationError, match="no face is seen"):
+    with pytest.raises(ObservationError, match="no face is found"):
         replace(read, face_confidence=np.zeros_like(confidence)).keypoints(face=True)
     with pytest.raises(ObservationError, match="face"):
         replace(found, face=face)
@@ -114,8 +114,8 @@ DAMAGE = {
     "no points": (lambda p: change(p, points=None), "do not fit.*points"),
     "points": (lambda p: change(p, points=np.zeros((3, 2, 32, 2))), "do not fit"),
     "starts": (lambda p: change(p, mask_starts=[0, 3, 2, 5, 5, 6, 8]), "do not fit"),
-    "infinite": (lambda p: change(p, points=np.full((3, 2, 33, 2), np.inf)), "cannot be"),
-    "rate": (lambda p: change(p, rate=0.0), "cannot be"),
+    "infinite": (lambda p: change(p, points=np.full((3, 2, 33, 2), np.inf)), "impossible"),
+    "rate": (lambda p: change(p, rate=0.0), "impossible"),
     "folder": (lambda p: (p.unlink(), p.mkdir()), "no such file"),
 }  # fmt: skip
 

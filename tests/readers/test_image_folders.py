@@ -37,7 +37,7 @@ def test_a_pattern_names_the_images_of_one_camera(tmp_path):
         (tmp_path / f"img{i}.png").rename(tmp_path / f"left_{i}.png")
     draw(tmp_path, range(6))
     assert len(Video(tmp_path / "left_*.png", rate=10.0)) == 4
-    with pytest.raises(ObservationError, match=r"two images of one number.*pattern"):
+    with pytest.raises(ObservationError, match=r"two images with one number.*pattern"):
         Video(tmp_path, rate=10.0)
 
 

@@ -129,7 +129,7 @@ def test_missing_and_doubled_frames(tmp_path):
         read(folder)
     other = write(tmp_path / "two", {0: [person()]})
     write(other, {0: [person()]}, name="other_{:03d}.json")
-    with pytest.raises(ObservationError, match="frame 0 is there twice"):
+    with pytest.raises(ObservationError, match="frame 0 appears twice"):
         read(other)
     (tmp_path / "named").mkdir()
     (tmp_path / "named" / "all.json").write_text("{}")
@@ -138,7 +138,7 @@ def test_missing_and_doubled_frames(tmp_path):
 
 
 def test_nobody_and_nothing(tmp_path):
-    with pytest.raises(ObservationError, match="nobody is seen in any of the 3 frames of camera cam"):
+    with pytest.raises(ObservationError, match="no person is detected in any of the 3 frames of camera cam"):
         read(write(tmp_path / "json", {0: [], 1: [], 2: []}))
     with pytest.raises(FileError, match="no such folder"):
         read(tmp_path / "none")
@@ -192,7 +192,7 @@ def test_mediapipe_bad_arrays(tmp_path):
     gap[3, 7, 0] = np.nan
     with pytest.raises(ObservationError, match="frame 3.*left_ear"):
         of(gap)
-    with pytest.raises(ObservationError, match="nobody"):
+    with pytest.raises(ObservationError, match="no person"):
         of(0 * good)
     with pytest.raises(ObservationError, match=r"shape \(5, 32, 3\)"):
         of(good[:, :32])

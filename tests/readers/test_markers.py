@@ -38,7 +38,7 @@ TABLE = {  # folder/part of the name: markers, frames, rate, up, first frame
 DAMAGED = {
     "badParameterOffset.c3d": (FileError, "ANALOG:UNITS"),
     "bad_parameter_section.c3d": (FileError, "after parameter 'LABELS'"),
-    "parameterOverflow.c3d": (ObservationError, "none of the 106 markers is seen"),
+    "parameterOverflow.c3d": (ObservationError, "none of the 106 markers is visible"),
 }
 
 
@@ -211,12 +211,12 @@ BAD_TRC = {
     "not a number.*x7": trc([*ROWS[:2], "3\t0.02\tx7\t0\t0\t7\t8\t9"]),
     "line 8.*7 cells where 2 markers need 8": trc([ROWS[0], "2\t0.01\t1\t2\t3\t4\t5"]),
     "line 8.*9 cells": trc([ROWS[0], "2\t0.01\t1\t2\t3\t4\t5\t6\t7"]),
-    "missing or no number": trc(ROWS, rate="fast"),
+    "missing or not a number": trc(ROWS, rate="fast"),
     "DataRate 100 Hz, but the 4 rows": trc([*ROWS[:3], "4\t9.0\t1\t2\t3"]),
     "none of the 2 markers": trc(["1\t0.00\t0\t0\t0\t0\t0\t0", "2\t0.01\t\t\t\t\t\t"]),
     "nothing in this file": trc([]),
     "rate 0": trc(ROWS, rate="0"),
-    "missing or no number .*infinity": trc(ROWS).replace("\t4\t2\t", "\t4\tinf\t"),
+    "missing or not a number .*infinity": trc(ROWS).replace("\t4\t2\t", "\t4\tinf\t"),
     "1000000000000 markers in 4 frames": trc(ROWS).replace("\t4\t2\t", "\t4\t1e12\t"),
     "not a TRC file": "PathFileType\t4\n",
 }
@@ -264,5 +264,5 @@ def test_missing_and_foreign_files(tmp_path):
 
 
 def test_a_parameter_of_no_numbers_in_dimensions_beyond_bounds_is_refused():
-    with pytest.raises(FileError, match="dimensions that cannot be"):
+    with pytest.raises(FileError, match="impossible dimensions"):
         _values(bytes([2, 10, 0, *[255] * 9]), "intel", "POINT:X", Path("a.c3d"))

@@ -98,7 +98,7 @@ def test_other_files_are_told(tmp_path):
     pickled = tmp_path / "c.npz"
     np.savez(pickled, format=np.array([{"a": 1}], dtype=object))
     for path, problem in (
-        (text, "no motion file"), (other, "no motion file"), (pickled, "not of numbers"),
+        (text, "not a motion file"), (other, "not a motion file"), (pickled, "not of numbers"),
         (tmp_path / "d.npz", "no such"),
     ):  # fmt: skip
         with pytest.raises(FileError, match=problem) as caught:

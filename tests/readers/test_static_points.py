@@ -24,8 +24,8 @@ def test_points_are_read(tmp_path):
         (GOOD.replace("cam3", "cam9"), "[beam] cam9", "no camera 'cam9'; there are: cam1"),
         ("[beam]\ncam1 = [1, 2]\n", "[beam]", "two or more cameras"),
         ("beam = 3\n", "[beam]", "two or more cameras"),
-        (GOOD.replace("430.1", "nan"), "[beam] cam3", "no pixel"),
-        (GOOD.replace("512.5, 1204", "512.5"), "[beam] cam1", "no pixel"),
+        (GOOD.replace("430.1", "nan"), "[beam] cam3", "not a pixel"),
+        (GOOD.replace("512.5, 1204", "512.5"), "[beam] cam1", "not a pixel"),
         ("", None, "no points"),
     ],
 )

@@ -207,7 +207,7 @@ def test_streams_of_different_length_or_rate(tmp_path):
 
 
 def test_common_frames_without_overlap():
-    with pytest.raises(ObservationError, match="no time that all streams saw"):
+    with pytest.raises(ObservationError, match="no time that all streams share"):
         common_frames({"a": np.arange(10) / 30, "b": np.arange(10) / 30 + 5.0}, 30.0)
 
 

@@ -122,7 +122,7 @@ def test_what_cannot_be_fitted(seen):
         metaball_bodies(BODY, [x + 9.0 for x in points], start)
     with pytest.raises(ObservationError, match="1 poses"):
         metaball_bodies(BODY, points, start[:1])
-    with pytest.raises(ObservationError, match="joint fit takes no"):
+    with pytest.raises(ObservationError, match="joint fit does not accept"):
         metaball_bodies(BODY, points, start, method="joint", helps=HELPS)
     with pytest.raises(ObservationError, match="of 1 frames for 2"):
         metaball_bodies(BODY, points, start, sigma=[0.001])

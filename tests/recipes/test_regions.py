@@ -135,7 +135,7 @@ def test_a_parzen_density_is_a_sum_of_windows_and_a_mixture_of_one_colour_a_gaus
 
 
 def test_what_cannot_be_is_refused():
-    with pytest.raises(ObservationError, match="nothing of the body"):
+    with pytest.raises(ObservationError, match="no part of the body"):
         T = np.eye(4)
         T[:3, 3] = 50.0
         pose_from_regions(BODY, BodyState(T, state(BODY, 0).angles), RIG, images(0))

@@ -170,6 +170,15 @@ def test_the_synthetic_take_can_be_read(tmp_path):
         assert (len(video), video.rate, video.size) == (60, 30.0, (544, 960))
 
 
+def test_a_synthetic_take_of_another_motion_has_wide_images_where_it_goes_far(tmp_path):
+    walk = cut(squat_and_wave(), 0, 3)
+    Ts = np.array(walk.Ts_world_root)
+    Ts[:, 0, 3] += (0.0, 2.0, 4.0)
+    for name, motion, size in (("on the spot", walk, (544, 960)), ("far", replace(walk, Ts_world_root=Ts), (960, 544))):
+        observations = load_observations(read_take(write_synthetic_take(tmp_path / name, motion)))
+        assert observations.rig["cam01"].size == size and len(observations.keypoints[0].points) == 3
+
+
 def test_a_folder_that_cannot_be_written_is_told(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ExportError, match="cannot be written"):

@@ -44,7 +44,7 @@ def test_what_a_limb_cannot_be_fitted_to():
     rng = np.random.default_rng(0)
     with pytest.raises(ObservationError, match="5 points"):
         fit_balls(LIMB, rng.normal(size=(5, 3)), 0.001)
-    with pytest.raises(BodyError, match="collapses|do not melt"):
+    with pytest.raises(BodyError, match="collapses|do not join"):
         fit_balls(LIMB, 0.002 * rng.normal(size=(4000, 3)) + LIMB.centres[1], 1e-4)
 
 

@@ -74,7 +74,7 @@ def test_places_and_orientations_of_a_table(taken):
         (HEADER + "0,a,1,2,3,,,,\n1,a,1,nan,3,,,,\n", FileError, "line 3"),
         (HEADER + "0,a,1,2,3,1,0,0,\n1,a,1,2,3,,,,\n", FileError, "line 2.*quaternion|quaternion"),
         (HEADER + "0,a,1,2,3,1,0,0,0\n1,a,1,2,3,0,0,0,0\n", FileError, "quaternion"),
-        (HEADER + "0,a,1,2,3,,,,\n0,a,1,2,3,,,,\n", FileError, "a at 0 s is there twice"),
+        (HEADER + "0,a,1,2,3,,,,\n0,a,1,2,3,,,,\n", FileError, "a at 0 s has two rows"),
         (HEADER + "0,a,1,2,3,,,,\n", ObservationError, "1 times"),
         (HEADER + "0,b,1,2,3,,,,\n1,b,1,2,3,,,,\n", ObservationError, "no tracker 'a'"),
     ],

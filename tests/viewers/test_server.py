@@ -104,7 +104,7 @@ def test_a_viser_that_cannot_be_guarded_is_not_served(monkeypatch):
     stopped = []
     other = types.SimpleNamespace(stop=lambda: stopped.append(True))
     monkeypatch.setattr(viser, "ViserServer", lambda **_: other)
-    with pytest.raises(ExportError, match="serves in another way"):
+    with pytest.raises(ExportError, match="is not supported"):
         open_server(0)
     assert stopped
 

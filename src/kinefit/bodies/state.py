@@ -30,10 +30,10 @@ class BodyState:
             try:
                 array = np.array(getattr(self, name), dtype=float, order="C")
             except (TypeError, ValueError) as error:
-                problem = f"a state whose {name} is a {type(getattr(self, name)).__name__} that is no array of numbers"
-                raise BodyError(problem, remedy="Give a (4, 4) pose and one number for each coordinate.") from error
+                problem = f"a state whose {name} is a {type(getattr(self, name)).__name__}, not an array of numbers"
+                raise BodyError(problem, remedy="Give a (4, 4) pose and a number for each coordinate.") from error
             if not math.isfinite(array.sum()):
-                raise BodyError(f"a state with {name} that are not finite", remedy="Leave out what is not known.")
+                raise BodyError(f"{name} of a state are not finite", remedy="Remove unknown values.")
             array.flags.writeable = False
             object.__setattr__(self, name, array)
 
@@ -53,7 +53,7 @@ class BodyState:
             bounds = -free, free
         delta = np.ascontiguousarray(delta, dtype=float)
         if delta.shape != (6 + len(angles),):
-            problem = f"a step of shape {delta.shape} of a state with {len(angles)} angles"
+            problem = f"a step of shape {delta.shape} for a state with {len(angles)} angles"
             raise BodyError(problem, remedy=f"Give {6 + len(angles)} numbers.")
         _kernels.retract(self.T_world_root, self.angles, delta, bounds[0], bounds[1], root, angles)
         return BodyState(root, angles)

@@ -89,7 +89,7 @@ class KinematicTree:
         middle = [d.start + 1 for d in self.ball_joints]
         for d in np.flatnonzero((self.couplings != 0.0).any(axis=0)):
             if d in middle or not np.isfinite(self.spread[d]):
-                why = "the middle axis of a ball joint" if d in middle else "without a spread of its own"
+                why = "the middle axis of a ball joint" if d in middle else "without its own spread"
                 problem = f"a coupling of {self.coordinates[d]}, {why}"
                 raise BodyError(problem, remedy="Couple other coordinates, with a finite spread.")
 
@@ -108,7 +108,7 @@ class KinematicTree:
         for what, (bad, names, remedy) in wrong.items():
             if bad.any():
                 place = f"{what} of {names[np.argmax(bad)]}"
-                raise BodyError("a number that is not finite, or beyond what it can be", place=place, remedy=remedy)
+                raise BodyError("a number is not finite or out of range", place=place, remedy=remedy)
 
     @property
     def n_dofs(self) -> int:
@@ -285,7 +285,7 @@ class KinematicTree:
     def _check_angles(self, count: int) -> None:
         if count != len(self.coordinates):  # a kernel would read beyond the end
             problem = f"a state with {count} angles for a body with {len(self.coordinates)}"
-            raise BodyError(problem, remedy="Is the state that of another body?")
+            raise BodyError(problem, remedy="Give a state of this body.")
 
     def segment_jacobian(self, screws: NDArray, segment: int) -> NDArray:
         """Jacobian J_s (6, 6 + D): twist (v, ω) of a segment about the root's origin, from screws (D, 6)."""

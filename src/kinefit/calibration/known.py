@@ -22,11 +22,11 @@ def known_camera(interiors: Rig, name: str, size: tuple[int, int]) -> Camera:
     """
     if name not in interiors:
         problem = choices("intrinsics of camera", name, interiors.names)
-        raise CalibrationError(problem, remedy="Name the videos as the cameras.")
+        raise CalibrationError(problem, remedy="Name the videos like the cameras.")
     camera = interiors[name].with_pose(np.eye(4))
     if camera.size != size:
         raise CalibrationError(
             f"its image has {size[0]}x{size[1]} px, its intrinsics are of {camera.size[0]}x{camera.size[1]}",
-            place=f"camera {name}", remedy="Calibrate the intrinsics anew, or record as it was calibrated.",
+            place=f"camera {name}", remedy="Calibrate the intrinsics again, or record at the calibrated size.",
         )  # fmt: skip
     return camera

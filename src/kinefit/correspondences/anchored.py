@@ -89,7 +89,7 @@ def target_rows(
         Arrays of other sizes, a standard deviation that is not positive.
     """
     if not sigma > 0:
-        raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive one.")
+        raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive number of pixels.")
     count = len(segment)
     data, x, pixel = np.empty((8, count)), _checked(points, count), _checked(target, count, 2)
     kernels.target_rows(frames, segment, x, camera.packed, pixel, slack, 1.0 / sigma**2, data)

@@ -78,7 +78,7 @@ def joint_bands(
     for s in range(1, len(tree.segments)):
         turns = tree.axes[tree.dof_start[s] : tree.dof_start[s + 1]]
         if tree.prismatic[tree.dof_start[s] : tree.dof_start[s + 1]].any():
-            raise BodyError("bands hold no sliding joint", place=body.joints[s], remedy="Cut bodies whose joints turn.")
+            raise BodyError("bands cannot have a sliding joint", place=body.joints[s], remedy="Give rotating joints.")
         if len(turns) == 0 or body.joints[s] in elliptic:
             bands = elliptic_bands(np.zeros(3), _section(body, s), along_ellipse)
         elif len(turns) == 1:

@@ -169,12 +169,12 @@ def closure_targets(body: Body, state: BodyState) -> tuple[PointSet, NDArray]:
         A closure to a line or a plane, which the paper does not have; gear that is to be estimated.
     """
     if has_unknown_gear(body):
-        problem = f"body '{body.name}' has gear that is to be estimated, which equations (18) and (19) cannot do"
-        raise BodyError(problem, remedy="Give `known_gear(body)`, with its dimensions and places as they are.")
+        problem = f"body '{body.name}' has gear to estimate, which equations (18) and (19) cannot do"
+        raise BodyError(problem, remedy="Give `known_gear(body)`, with fixed dimensions and positions.")
     points, x_world = [body.landmarks.select(())], [np.zeros((0, 3))]
     for c in body.closures:
         if c.kind not in ("point", "rigid"):
-            problem = f"closure '{c.name}' is a {c.kind}, which is no pair of points as in equations (18) and (19)"
+            problem = f"closure '{c.name}' is a {c.kind}, not a pair of points as in equations (18) and (19)"
             raise BodyError(problem, remedy='Write kind = "point" or "rigid", or take `closure_rows`.')
         shifts = _RIGID_PAIRS if c.kind == "rigid" else _RIGID_PAIRS[:1]
         turned = shifts @ se3.exp_so3(np.array(c.turn)).T

@@ -29,7 +29,7 @@ def coincidence_rows(
     """
     if len(points_a) != len(points_b):
         problem = f"{len(points_a)} points should meet {len(points_b)}"
-        raise ObservationError(problem, remedy="Give as many points of one side as of the other.")
+        raise ObservationError(problem, remedy="Give equal numbers of points.")
     a, b = body.positions(state, points_a), body.positions(state, points_b)
     n = np.tile(np.eye(3), (len(a), 1))
     w = np.repeat(targets.weights(sigma, np.ones(len(a), bool), "coincidences"), 3)

@@ -31,7 +31,7 @@ def weights(sigma: ArrayLike, present: NDArray, what: str) -> NDArray:
         return out
     stated = sigma[present] if sigma.shape else sigma
     if not (stated > 0).all():
-        remedy = "Leave out what was not measured, or give it a large one."
+        remedy = "Remove what was not measured, or give it a large one."
         raise ObservationError(f"the standard deviation of {what} must be positive", remedy=remedy)
     out[present] = 1.0 / stated**2
     return out
@@ -84,7 +84,7 @@ def unit(directions: NDArray, present: NDArray, what: str) -> None:
         One is not.
     """
     if np.any(np.abs(np.linalg.norm(directions[present], axis=1) - 1.0) > 1e-6):
-        raise ObservationError(f"{what} are no unit vectors", remedy="Divide them by their lengths.")
+        raise ObservationError(f"{what} are not unit vectors", remedy="Divide them by their lengths.")
 
 
 def cameras(rig: Rig, camera: ArrayLike, count: int) -> NDArray:

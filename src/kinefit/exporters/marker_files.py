@@ -95,8 +95,8 @@ def _rows(like: C3d, markers: Markers, path: Path) -> NDArray | None:
     start = markers.first_frame - like.first_frame
     if not 0 <= start <= len(like.points) - len(markers):
         raise ExportError(
-            f"frames {markers.first_frame} to {markers.first_frame + len(markers) - 1} are not all in the file that "
-            f"this one should be like ({like.first_frame} to {like.first_frame + len(like.points) - 1})", file=path,
+            f"frames {markers.first_frame} to {markers.first_frame + len(markers) - 1} are not all in the file "
+            f"given as `like` ({like.first_frame} to {like.first_frame + len(like.points) - 1})", file=path,
             remedy="Name the file that the markers came from.",
         )  # fmt: skip
     return like.analog[start : start + len(markers)].astype(np.float32) if like.analog.shape[1] else None

@@ -68,7 +68,7 @@ def write_mcap(motion: Motion, path: str | PathLike[str], *, up: str = "z", name
         raise ExportError("MCAP needs the package mcap-ros2-support", file=path, remedy=remedy) from error
     if not len(motion) or motion.times[0] < 0:
         problem = "a motion without frames" if not len(motion) else "a motion that begins before 0 s"
-        raise ExportError(f"{problem} has no stamps in ROS", file=path, remedy="Cut it to frames of time 0 and later.")
+        raise ExportError(f"{problem} has no ROS time stamps", file=path, remedy="Cut it to frames from time 0 on.")
     bones, world = bone_names(motion.body, names, path), turned(motion, up, path)
     with writing(path) as temporary, temporary.open("wb") as file, Writer(file) as out:
         state = out.register_msgdef("sensor_msgs/msg/JointState", _STATE)

@@ -99,7 +99,7 @@ def write_field_picture(
     """
     shown = surface.measured & np.isfinite(values)
     if not shown.any():
-        raise ExportError("nothing measured to paint", file=path, remedy="Look at the correlations in the CSV file.")
+        raise ExportError("no measurement to show", file=path, remedy="Look at the correlations in the CSV file.")
     scale = min(1.0, _MAX_IMAGE_SIDE_PX / max(image.shape))
     low, high = np.percentile(image, (0.5, 99.5))
     grey = np.clip((image - low) * (255.0 / max(high - low, 1e-9)), 0, 255).astype(np.uint8)

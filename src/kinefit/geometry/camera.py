@@ -94,7 +94,7 @@ class Camera:
         if K[0, 0] <= 0 or K[1, 1] <= 0:
             raise self._error(f"focal lengths {K[0, 0]:g}, {K[1, 1]:g} px", "Both must be positive.")
         if K[1, 0] != 0 or np.any(K[2] != (0, 0, 1)):
-            raise self._error("matrix is not [[fx, s, cx], [0, fy, cy], [0, 0, 1]]", "Is it transposed?")
+            raise self._error("matrix is not [[fx, s, cx], [0, fy, cy], [0, 0, 1]]", "It may be transposed.")
         if k.size not in _COEFFICIENT_COUNTS[self.model]:
             raise self._error(
                 f"{k.size} distortion coefficients for the model {self.model}",
@@ -284,7 +284,7 @@ class Rig:
 
     def __post_init__(self) -> None:
         if not isinstance(self.cameras, Sequence) or not all(isinstance(c, Camera) for c in self.cameras):
-            problem = f"a rig of a {type(self.cameras).__name__} that holds other things than cameras"
+            problem = f"a rig of a {type(self.cameras).__name__} with entries that are not cameras"
             raise CalibrationError(problem, remedy="Give a tuple of Camera; read_calibration reads some from a file.")
         object.__setattr__(self, "cameras", tuple(self.cameras))
         twice = [name for name in set(self.names) if self.names.count(name) > 1]

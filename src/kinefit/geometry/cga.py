@@ -60,7 +60,7 @@ def _length(values: NDArray, what: str) -> NDArray:
     """Lengths (N,) of coefficients (K, N); raises ObservationError for a zero length."""
     length = np.linalg.norm(values, axis=0)
     if not np.all((length > 1e-12) & (length < math.inf)):
-        raise ObservationError(what, remedy="Give points that are apart.")
+        raise ObservationError(what, remedy="Give points at different positions.")
     return length
 
 
@@ -271,7 +271,7 @@ def between(Psi: Multivector, other: Multivector) -> Multivector:
     M = 1.0 - (other * Psi / theta2).select(_MOTOR)
     if np.any(M.scalar < 1e-12):
         raise ObservationError(
-            "opposite lines, which infinitely many turns carry into each other", remedy="Give a joint on the way."
+            "opposite lines, which infinitely many rotations map to each other", remedy="Give a joint between them."
         )
     return unit(M)
 

@@ -124,7 +124,7 @@ def estimate_pose(
         step, _, rank, _ = np.linalg.lstsq(jacobian, -residual, rcond=1e-10)
         if rank < 6 + count:
             raise ObservationError(
-                f"the constraints settle {rank} of {6 + count} unknowns", remedy="Give more points, or other rays."
+                f"the constraints determine {rank} of {6 + count} unknowns", remedy="Give more points, or other rays."
             )
         M, theta = unit(exp(twist(step[:6])) * M), theta + step[6:]
         steps, size = steps + 1, float(np.linalg.norm(step))
@@ -157,7 +157,7 @@ def _unit(A: Multivector) -> Multivector:
     """Points of weight 1, lines and planes of length 1."""
     size = A.along(e0) if A.grades == (1,) else np.sqrt(np.abs((A * ~A).scalar))
     if not np.all((np.abs(size) > 1e-12) & (np.abs(size) < np.inf)):
-        raise ObservationError("elements without a direction or not finite", remedy="Build them of points apart.")
+        raise ObservationError("elements without a direction or not finite", remedy="Give points that differ.")
     return A / size
 
 

@@ -18,9 +18,9 @@ _MIN_STEP = 0.01  # [m] below which a step of depth is noise, whatever the slope
 def _image(depth: NDArray, camera: Camera | None = None) -> NDArray:
     depth = np.ascontiguousarray(depth, np.float32)
     if depth.ndim != 2 or not depth.size or (camera is not None and depth.shape != camera.size[::-1]):
-        wanted = f"{camera.size[::-1]}, as camera {camera.name}" if camera else "(height, width)"
+        wanted = f"{camera.size[::-1]}, as camera {camera.name} has" if camera else "(height, width)"
         raise ObservationError(
-            f"a depth image of shape {depth.shape}", remedy=f"Give {wanted}; `camera.scaled(size)` is one of its size."
+            f"a depth image of shape {depth.shape}", remedy=f"Give {wanted}, or use `camera.scaled(size)`."
         )
     return depth
 

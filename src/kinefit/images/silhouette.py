@@ -45,7 +45,7 @@ def colour_mask(image: ArrayLike, low: ArrayLike, high: ArrayLike) -> NDArray:
     """
     pixels, (low, high) = rgb_image(image), (shaped(v, (3,), "a threshold") for v in (low, high))
     if not np.all(low <= high):
-        raise ObservationError(f"thresholds {low} to {high} leave no colour", remedy="Give the lower ones first.")
+        raise ObservationError(f"thresholds {low} to {high} leave no colour", remedy="Give the lower limits first.")
     return np.asarray(cv2.morphologyEx(cv2.inRange(pixels, low, high), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)))
 
 

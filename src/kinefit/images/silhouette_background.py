@@ -54,7 +54,7 @@ class BackgroundPlate:
         """
         stack = [rgb_image(image) for image in images]
         if not stack:
-            raise ObservationError("no pictures to learn the background from", remedy="Give ten or more.")
+            raise ObservationError("no images to learn the background from", remedy="Give ten or more.")
         return cls(np.median(stack, axis=0).astype(np.uint8), **options)
 
     @property
@@ -72,8 +72,8 @@ class BackgroundPlate:
         """
         smoothed = _smooth(rgb_image(image))
         if smoothed.shape != self.plate.shape:
-            problem = f"a picture of {smoothed.shape[1::-1]} px, the background has {self.size}"
-            raise ObservationError(problem, remedy="Take both with the same camera and settings.")
+            problem = f"an image of {smoothed.shape[1::-1]} px, but the background has {self.size}"
+            raise ObservationError(problem, remedy="Record both with the same camera and settings.")
         alpha = np.einsum("ijk,ijk->ij", smoothed, self.plate) / self._square
         difference = smoothed - alpha[..., None] * self.plate
         alpha /= max(float(np.median(alpha[::4, ::4])), 1e-3)  # the camera's own exposure

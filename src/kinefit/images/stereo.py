@@ -51,8 +51,8 @@ class StereoRectifier:
         across = right.centre_world - left.centre_world
         self.baseline = float(np.linalg.norm(across))
         if self.baseline < 1e-4:
-            problem = f"both stand at one place ({1e3 * self.baseline:.2g} mm apart)"
-            raise CalibrationError(problem, place=place, remedy="Is the calibration in metres, of these two?")
+            problem = f"both are at the same position ({1e3 * self.baseline:.2g} mm apart)"
+            raise CalibrationError(problem, place=place, remedy="Check that the calibration is theirs and in metres.")
         self.left, self.right, self.near, self.far = left, right, near, far
         R = _rotation(left, right, across / self.baseline)
         focal = float(np.mean([left.matrix[0, 0], left.matrix[1, 1], right.matrix[0, 0], right.matrix[1, 1]]))
@@ -86,8 +86,8 @@ class StereoRectifier:
                 continue
             shared = max(shared, float(np.mean(seen[0][:, inside] & seen[1][:, u[inside]])) * float(inside.mean()))
         if shared < _MIN_SHARED_VIEW:
-            problem = f"only {100 * shared:.0f} % of the first one's view is seen by the other"
-            remedy = "Choose two that look at the same thing, or another range."
+            problem = f"the second camera sees only {100 * shared:.0f} % of the first one's view"
+            remedy = "Choose two that see the same object, or another range."
             raise CalibrationError(problem, place=place, remedy=remedy)
 
     def rectify(self, left: NDArray, right: NDArray) -> tuple[NDArray, NDArray]:
@@ -158,7 +158,7 @@ def _rotation(left: Camera, right: Camera, x: NDArray) -> NDArray:
     if length < 0.1 or left.T_camera_world[2, :3] @ right.T_camera_world[2, :3] <= 0.0:
         place = f"cameras {left.name} and {right.name}"
         remedy = "Choose two that look the same way, side by side."
-        raise CalibrationError("they look away from each other, or along their baseline", place=place, remedy=remedy)
+        raise CalibrationError("they look in different directions, or along their baseline", place=place, remedy=remedy)
     z = z / length
     return np.stack([x, np.cross(z, x), z])
 
@@ -173,7 +173,7 @@ def _view(camera: Camera, R: NDArray) -> tuple[NDArray, NDArray]:
     ray = ray[ray[:, 2] > 1e-3]
     if not len(ray):
         remedy = "Choose two that look the same way, side by side."
-        raise CalibrationError("it looks away from the other", place=f"camera {camera.name}", remedy=remedy)
+        raise CalibrationError("it looks in another direction", place=f"camera {camera.name}", remedy=remedy)
     tangents = np.clip(ray[:, :2] / ray[:, 2:], -_MAX_TANGENT, _MAX_TANGENT)
     return tangents.min(axis=0), tangents.max(axis=0)
 

@@ -54,7 +54,7 @@ def clicked_points(rig: Rig, names: Sequence[str], uv: NDArray) -> tuple[NDArray
     x = triangulate(rig, uv)
     if np.isfinite(x).all(axis=1).sum() < _MIN_POINTS:
         remedy = f"Click {_MIN_POINTS} or more points, each in two images or more."
-        raise TrackingError(f"{np.isfinite(x).all(axis=1).sum()} points are known in space", remedy=remedy)
+        raise TrackingError(f"{np.isfinite(x).all(axis=1).sum()} points can be triangulated", remedy=remedy)
     miss, px = _click_errors(rig, x, uv)
     inconsistent = np.flatnonzero(np.nanmax(np.where(np.isfinite(miss), miss, 0.0), axis=1) > 0.5 * _MAX_GAP)
     problems, blamed = [], list[tuple[int, float]]()
@@ -105,8 +105,8 @@ def _remedy(rig: Rig, blamed: Sequence[tuple[int, float]], count: int) -> str:
         off = [px for c, px in blamed if c == camera]
         if len(off) > 0.5 * count:
             return (
-                f"Camera {rig.names[camera]} is off in {len(off)} of {count} points, by {np.median(off):.0f} px in "
-                "the middle: its image is of another time, or its calibration is wrong."
+                f"Camera {rig.names[camera]} is off in {len(off)} of {count} points, by {np.median(off):.0f} px "
+                "(median): its image is of another time, or its calibration is wrong."
             )  # fmt: skip
     return "Click these again, the same joint and side in every image."
 

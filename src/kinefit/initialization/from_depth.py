@@ -194,7 +194,7 @@ def sized_start(
 def _unit(up: ArrayLike) -> NDArray:
     vector = np.asarray(up, float)
     if vector.shape != (3,) or not np.isfinite(vector).all() or np.linalg.norm(vector) < 1e-9:
-        raise ObservationError(f"up is no direction: {vector}", remedy="Give three numbers, such as (0, 1, 0).")
+        raise ObservationError(f"up is not a direction: {vector}", remedy="Give three numbers, such as (0, 1, 0).")
     return vector / np.linalg.norm(vector)
 
 
@@ -212,7 +212,7 @@ def _views(
     """Yield views of the candidate people; then of parts of them, for a person next to a table."""
     direction = _unit(up)
     if not body.surfaces:
-        raise BodyError(f"body '{body.name}' has no surfaces", remedy="Depth needs some; see the catalogue's bodies.")
+        raise BodyError(f"body '{body.name}' has no surfaces", remedy="Use a body of the catalogue, or add surfaces.")
     if depth is not None:
         depth = np.asarray(depth, float)
         if depth.shape != (camera.size[1], camera.size[0]):
@@ -229,7 +229,7 @@ def _views(
             is_empty = False
         if is_empty:
             raise TrackingError(
-                "nothing in the depth image is of a person's size", remedy=_scale_remedy(depth[depth > 0], body)
+                "nothing in the depth image has the size of a person", remedy=_scale_remedy(depth[depth > 0], body)
             )
         return
     cloud = np.asarray(points, float).reshape(-1, 3)
@@ -241,7 +241,7 @@ def _views(
     if np.ptp(cloud, axis=0).max() > 3.0 * max(body.stature, 1.0):
         raise ObservationError(
             f"the points reach over {np.ptp(cloud, axis=0).max():.3g} m, the body is {body.stature:.2f} m tall",
-            remedy="Give the person's points only, in metres (are these millimetres?).",
+            remedy="Give the person's points only, in metres (these may be millimetres).",
         )
     if depth is None:
         yield [view_of(coarse, coarse > 0, small)]
@@ -284,7 +284,7 @@ def _scale_remedy(values: NDArray, body: Body) -> str:
         return "The image holds no measurement: check the range gate and the unit."
     middle = float(np.median(values))
     if middle > 100.0:
-        return f"Its median is {middle:.4g}: millimetres taken for metres? Set the unit."
+        return f"Its median is {middle:.4g}: probably millimetres. Set the unit."
     if middle < 0.05:
-        return f"Its median is {middle:.2g} m: is the unit right?"
+        return f"Its median is {middle:.2g} m: check the unit."
     return "Check the camera's focal length, the unit and the range gate."

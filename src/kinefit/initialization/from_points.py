@@ -52,7 +52,7 @@ def first_scales(
             ratios.setdefault(group, []).append((float(np.nanmedian(distances)) / length, weight))
     if not ratios:
         raise TrackingError(
-            "no bone of the body can be measured: too few keypoints are seen by two cameras at once",
+            "no bone of the body can be measured: two cameras see too few keypoints at once",
             remedy="Check the calibration (its unit and its camera names) and that the cameras are in step.",
         )
     means = {g: float(np.average([r for r, _ in v], weights=[w for _, w in v])) for g, v in ratios.items()}
@@ -69,7 +69,7 @@ def first_scales(
     if not 0.2 < size < 5.0:
         raise TrackingError(
             f"the person would be {float(f'{size:.2g}'):g} times the body's size: the calibration's unit is wrong",
-            remedy=f"Set unit = {_unit_for(size)} under [calibration], or correct what stands there.",
+            remedy=f"Set unit = {_unit_for(size)} under [calibration], or correct it there.",
         )
     return np.array([np.clip(means.get(g, size), 0.6 * size, 1.6 * size) for g in range(len(body.scale_groups))])
 
@@ -124,7 +124,7 @@ def pose_from_points(
     body = replace(body, tree=replace(body.tree, root_free=True))
     known = np.isfinite(x_world).all(axis=1)
     if known.sum() < fewest:
-        problem = f"fewer than {_NUMBER_WORDS.get(fewest, fewest)} points are known in space"
+        problem = f"fewer than {_NUMBER_WORDS.get(fewest, fewest)} points can be triangulated"
         raise TrackingError(problem, remedy="Start where more cameras see the body.")
 
     if covariance is not None:

@@ -72,7 +72,7 @@ def coarse_to_fine(
         There are no silhouettes or no levels.
     """
     if not frames or not levels:
-        raise ObservationError("no silhouettes to fit, or no levels", remedy="Give those of one camera or more.")
+        raise ObservationError("no silhouettes to fit, or no levels", remedy="Give silhouettes of one camera or more.")
     settings = settings or TrackSettings()
     level_settings = [
         replace(

@@ -256,8 +256,8 @@ def _toml(
         return "[" + ", ".join(f"{v + 0.0:.3f}" for v in values) + "]"
 
     lines = [
-        "# A first marker set, written by `kinefit markers set`. Look through it: is every marker on its segment?",
-        "# [m] on a body of average size: x forward, y up, z to the right; places, joints from the middle of the hips.",
+        "# A first marker set, written by `kinefit markers set`. Check that every marker is on its segment.",
+        "# [m] on a body of average size: x forward, y up, z to the right; positions, joints from the mid-hip.",
         f"name = {json.dumps(name)}", "",
     ]  # fmt: skip
     if places:

@@ -39,7 +39,7 @@ def columns(markers: Markers, names: Sequence[str]) -> NDArray:
     duplicates = sorted(n for n, candidates in where.items() if len(candidates) > 1)
     if duplicates:
         raise ObservationError(
-            f"{len(duplicates)} labels are there for more than one subject: {', '.join(duplicates[:6])}",
+            f"{len(duplicates)} labels appear for more than one subject: {', '.join(duplicates[:6])}",
             file=markers.source or None, remedy="Fit one subject at a time: see `split_people`.",
         )
     out = np.full((len(markers), len(names), 3), np.nan)
@@ -79,7 +79,7 @@ def _start(body: Body, points: PointSet, x: NDArray, sigma: NDArray) -> tuple[in
     if not count.max(initial=0) >= _MIN_START_MARKERS:
         raise TrackingError(
             f"no frame shows enough markers to start from: {int(count.max(initial=0))} at most",
-            remedy=f"{_MIN_START_MARKERS} markers in one frame are the least.",
+            remedy=f"Give at least one frame with {_MIN_START_MARKERS} markers.",
         )
     most = np.flatnonzero(count == count.max())
     spread = np.maximum(sigma, _MIN_START_SIGMA)

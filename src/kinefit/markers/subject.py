@@ -123,7 +123,7 @@ def fit_marker_subject(
     positions = [columns(t, placed.points.names)[:: _stride(t)] for t in trials]
     x = np.concatenate(positions)
     if not np.isfinite(x).all(axis=2).any():
-        raise ObservationError("none of the markers is seen in any frame", remedy="Is this the right recording?")
+        raise ObservationError("none of the markers is visible in any frame", remedy="Check the choice of recording.")
     starts = np.cumsum([0, *map(len, positions)])
     visible = np.isfinite(x).all(axis=2)
     placed, x, visible = _visible_markers(placed, x, visible)

@@ -27,7 +27,7 @@ def numbers(values: Any, dtype: type | None = float, what: str = "an observation
     try:
         return np.array(values, dtype=dtype)
     except (TypeError, ValueError, OverflowError) as error:
-        problem = f"{what} holds a {type(values).__name__} that is no array of numbers"
+        problem = f"{what} holds a {type(values).__name__} that is not an array of numbers"
         raise ObservationError(problem, remedy="Give an array, or lists of numbers of one length.") from error
 
 

@@ -33,7 +33,7 @@ def checked_times(times: NDArray, sensor: str, source: str = "") -> NDArray:
         raise ObservationError(
             f"times of the frames of {sensor} do not increase ({both})" if len(times) else f"{sensor} has no frames",
             file=source or None, place=f"frame {frame}" if len(times) else None,
-            remedy="Sort the frames by time and leave out doubled ones; a clock that was set back needs two takes.",
+            remedy="Sort the frames by time and remove duplicates; a clock that was set back needs two takes.",
         )  # fmt: skip
     if max(-times[0], times[-1]) > _MAX_TIME:
         problem = f"times of the frames of {sensor} from {times[0]:.6g} to {times[-1]:.6g} s"
@@ -94,7 +94,7 @@ class _ImageRecording(_Recording):
         if image.shape[1::-1] != self.size:
             raise ObservationError(
                 f"the image has {image.shape[1::-1]} px, its camera {self.size}", file=self.source or None,
-                place=f"frame {i} of {self.sensor}", remedy="All images of one camera are of its image's size.",
+                place=f"frame {i} of {self.sensor}", remedy="All images of a camera must have its size.",
             )  # fmt: skip
         return float(self.times[i]), image
 
@@ -164,7 +164,7 @@ class DepthVideo(_Recording):
         if depth.shape != self.size[::-1]:
             raise ObservationError(
                 f"the image has shape {depth.shape}, not {self.size[::-1]}", file=self.source or None,
-                place=f"frame {i} of {self.sensor}", remedy="All frames of one sensor are of one size.",
+                place=f"frame {i} of {self.sensor}", remedy="All frames of a sensor must have one size.",
             )  # fmt: skip
         depth[~((depth >= self.near) & (depth <= self.far))] = 0.0
         return DepthFrame(self.sensor, float(self.times[i]), depth)

@@ -208,9 +208,9 @@ class Detections:
         """
         if not self.seen.any():
             raise ObservationError(
-                f"nobody is seen in any of the {len(self)} frames of camera {camera or self.camera}",
+                f"no person is detected in any of the {len(self)} frames of camera {camera or self.camera}",
                 file=self.source or None,
-                remedy="The detector wants a person of a tenth of the image's height or more; leave this camera out.",
+                remedy="The detector needs a person of a tenth of the image's height or more; or remove this camera.",
             )
         points, confidence, lifted, names = self.points, self.confidence, self.lifted, MEDIAPIPE_33
         if face:
@@ -232,8 +232,8 @@ class Detections:
         """Points and confidence of the faces; ObservationError where there are none."""
         if self.has_faces and self.face is not None and self.face_confidence is not None:
             return self.face, self.face_confidence
-        problem = "faces were not looked for" if self.face is None else f"no face is seen in any of {len(self)} frames"
-        remedy = "Run kinefit detect --face." if self.face is None else "Leave the camera's face out."
+        problem = "faces were not detected" if self.face is None else f"no face is found in any of {len(self)} frames"
+        remedy = "Run kinefit detect --face." if self.face is None else "Remove the camera's face."
         raise ObservationError(
             f"{problem} of camera {camera or self.camera}", file=self.source or None, remedy=remedy,
         )  # fmt: skip

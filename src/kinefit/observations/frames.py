@@ -49,7 +49,7 @@ class DepthFrame:
             depth[~((depth > 0.0) & (depth < np.inf))] = 0.0
         typical = typical_depth(depth)
         if typical > _MAX_DEPTH:
-            problem = f"millimetres taken for metres? A depth image of {self.sensor} shows things {typical:.0f} m away"
+            problem = f"a depth image of {self.sensor} has a typical depth of {typical:.0f} m: probably millimetres"
             raise ObservationError(problem, remedy="Give metres: 0.001 times an image in millimetres.")
         depth.flags.writeable = False
         object.__setattr__(self, "depth", depth)
@@ -256,7 +256,7 @@ class LineFrame:
                 raise ObservationError(problem, remedy="Give the two ends of an edge, or one point that lies on it.")
             if np.linalg.norm(a - b) < 1.0:
                 problem = f"the points of line '{name}' of {self.sensor} are less than a pixel apart"
-                raise ObservationError(problem, remedy="Give two points of it far from each other.")
+                raise ObservationError(problem, remedy="Give two points of it that are far apart.")
         object.__setattr__(self, "ends", ends)
 
 

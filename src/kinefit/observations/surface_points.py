@@ -81,8 +81,8 @@ class SurfacePointVideo(_Recording):
         object.__setattr__(self, "times", checked_times(self.times, self.sensor, self.source))
         lengths = {len(self.ids), len(self.x_world), len(self.std), int(self.first[-1]) if len(self.first) else -1}
         if len(lengths) > 1 or len(self.first) != len(self.times) + 1:
-            problem = f"columns of {sorted(lengths)} points, {len(self.first)} beginnings of {len(self.times)} frames"
-            remedy = "Give every point its place and deviation."
+            problem = f"columns of {sorted(lengths)} points, {len(self.first)} starts of {len(self.times)} frames"
+            remedy = "Give every point its position and standard deviation."
             raise ObservationError(problem, file=self.source or None, remedy=remedy)
 
     def frame(self, i: int) -> SurfacePointFrame:

@@ -29,7 +29,7 @@ def field_camera(camera: Camera, field: Field) -> Camera:
     """
     width, height = camera.size
     if height < 2:
-        raise CalibrationError("an image of one line", place=f"camera {camera.name}", remedy="It has no fields.")
+        raise CalibrationError("an image of one line", place=f"camera {camera.name}", remedy="Give two lines or more.")
     matrix, start = camera.matrix.copy(), _first(field)
     matrix[1, 1] *= 0.5
     matrix[1, 2] = 0.5 * (matrix[1, 2] - start)

@@ -64,8 +64,8 @@ def measure_flat(
         found = grow_over_time(first, image, current_grid, window=window, least=least)
         if not found.found.any():
             reject_untextured(first, "first image")
-            remedy = "Light it better, take a larger window, or images of states between."
-            raise ObservationError(f"nothing of the first image is found in image {k}", remedy=remedy)
+            remedy = "Use better light, a larger window, or images of states between."
+            raise ObservationError(f"no point of the first image is found in image {k}", remedy=remedy)
         reject_repeated_texture(first, image, found, f"image {k}")
         out.append(_surface(grid, found, pixel))
         if incremental:

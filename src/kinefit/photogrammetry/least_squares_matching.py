@@ -133,7 +133,7 @@ def half_sides(window: int | ArrayLike, count: int) -> NDArray[np.int64]:
         raise ObservationError(f"windows of shape {sides.shape}", remedy=f"Give a whole number of pixels, or {count}.")
     if sides.size and (np.any(sides % 2 == 0) or sides.min() < 5 or sides.max() > _MAX_WINDOW_PX):
         problem = f"a window of {sides.min()} to {sides.max()} px"
-        raise ObservationError(problem, remedy=f"Take an odd number from 5 to {_MAX_WINDOW_PX}.")
+        raise ObservationError(problem, remedy=f"Give an odd number from 5 to {_MAX_WINDOW_PX}.")
     return np.ascontiguousarray(np.broadcast_to(sides // 2, (count,)), dtype=np.int64)
 
 
@@ -195,7 +195,7 @@ def _coarse_starts(
     """Starts (N, 6) from coarser pyramid levels; windows not found there start from the nearest match."""
     if levels < 0 or min(*first.size, *second.size) >> levels < 32:
         problem = f"a pyramid of {levels} levels over images of {first.size} and {second.size} px"
-        raise ObservationError(problem, remedy="Take fewer: the highest must have 32 px a side.")
+        raise ObservationError(problem, remedy="Use fewer: the highest must have 32 px a side.")
     pairs = [(first.grey, second.grey)]
     for _ in range(levels):
         pairs.append((cv2.pyrDown(pairs[-1][0]), cv2.pyrDown(pairs[-1][1])))

@@ -62,7 +62,7 @@ class Grid:
                 raise ObservationError(problem, remedy="Draw it on the first image.")
             points[~inside[points[:, 1].astype(int), points[:, 0].astype(int)]] = np.nan
         if not np.isfinite(points).any():
-            raise ObservationError(f"no point on an image of {size} px", remedy="Take a smaller step or a larger mask.")
+            raise ObservationError(f"no point on an image of {size} px", remedy="Use a smaller step or a larger mask.")
         return cls(points, u.shape[1], float(step))
 
     @property

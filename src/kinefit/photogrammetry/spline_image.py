@@ -33,7 +33,7 @@ def grey(image: ArrayLike) -> NDArray[np.float32]:
     if out.ndim == 3:
         out = cv2.cvtColor(out, cv2.COLOR_RGB2GRAY)
     if not np.isfinite(out).all():
-        raise ObservationError("an image with a value that is not finite", remedy="Fill it, or leave the image out.")
+        raise ObservationError("an image with a value that is not finite", remedy="Fill it, or remove the image.")
     return out
 
 

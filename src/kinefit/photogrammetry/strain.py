@@ -79,7 +79,7 @@ def strain(
     reach = int(gauge / (2 * step) + 1e-6)
     if not (np.isfinite(step) and reach >= 1):
         problem = f"a gauge of {gauge:g} {unit} on a grid of step {step:g} {unit}"
-        raise ObservationError(problem, remedy="Take a gauge of two steps or more, or a finer grid.")
+        raise ObservationError(problem, remedy="Use a gauge of two steps or more, or a finer grid.")
     out = np.empty((len(x), kernels.COLUMNS))
     missing = ~(np.isfinite(x).all(axis=1) & np.isfinite(d).all(axis=1))
     x, d = np.where(missing[:, None], np.nan, x), np.where(missing[:, None], np.nan, d)

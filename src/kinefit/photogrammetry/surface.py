@@ -84,13 +84,13 @@ def check_images(rig: Rig, images: Sequence[SplineImage]) -> None:
         if camera.size != image.size:
             has, was = ("x".join(map(str, size)) for size in (image.size, camera.size))
             problem = f"its image has {has} px, its calibration {was}"
-            remedy = "Give images as they were calibrated, or calibrate the camera at this size."
+            remedy = "Give images of the calibrated size, or calibrate at this size."
             raise CalibrationError(problem, place=f"camera {camera.name}", remedy=remedy)
     centres = np.array([camera.centre_world for camera in rig])
     for camera, centre in zip(rig.cameras[1:], centres[1:]):
         if np.linalg.norm(centre - centres[0]) < _MIN_BASELINE:
-            problem = f"it stands where camera {rig.names[0]} does: distances cannot be measured"
-            remedy = "Put the cameras apart, or check the calibration and its unit."
+            problem = f"it is at the position of camera {rig.names[0]}: distances cannot be measured"
+            remedy = "Move the cameras apart, or check the calibration and its unit."
             raise CalibrationError(problem, place=f"camera {camera.name}", remedy=remedy)
 
 
@@ -154,13 +154,13 @@ def reject_untextured(first: SplineImage, place: str) -> None:
     contrast = float(np.std(first.grey))
     if contrast < 3.0 * first.noise:
         problem = f"no texture coarser than noise: grey values scatter by {contrast:.1f}, noise by {first.noise:.1f}"
-        raise ObservationError(problem, place=place, remedy="Put texture on the surface, or light it better.")
+        raise ObservationError(problem, place=place, remedy="Put texture on the surface, or improve the light.")
 
 
 def _raise_unmatched(first: SplineImage, camera: str) -> None:
     """Raise ObservationError with the reason why nothing was matched."""
     reject_untextured(first, "first camera")
-    problem = "nothing of the first image is found in it"
+    problem = "no point of the first image is found in it"
     remedy = "Give seeds by hand, a larger window, or a mask; repeated texture has no unique match."
     raise ObservationError(problem, place=f"camera {camera}", remedy=remedy)
 
@@ -183,8 +183,8 @@ def reject_repeated_texture(first: SplineImage, second: SplineImage, found: Matc
     )
     finite = np.isfinite(peaks.best)
     if finite.any() and np.mean(peaks.runner_up[finite] >= _MIN_REPEAT_RATIO * peaks.best[finite]) > 0.5:
-        problem = "texture that repeats: most points are found as well elsewhere, so where they are is not known"
-        raise ObservationError(problem, place=place, remedy="Give seeds by hand: they say where; or another texture.")
+        problem = "texture that repeats: most points also match elsewhere, so their positions are not known"
+        raise ObservationError(problem, place=place, remedy="Give seeds by hand, or use another texture.")
 
 
 def from_matches(rig: Rig, grid: Grid, own: Matches | None, others: Sequence[Matches]) -> MeasuredSurface:

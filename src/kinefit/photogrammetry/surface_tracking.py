@@ -130,7 +130,7 @@ class SurfaceTracker:
             points, velocity = self._track(images)
         if len(points) == 0:
             problem = f"no point of the surface is left in frame {len(self._frames)}"
-            raise TrackingError(problem, remedy="A larger reach or window, more light, or a shorter exposure may help.")
+            raise TrackingError(problem, remedy="Try a larger reach or window, more light, or a shorter exposure.")
         self._velocity = np.zeros_like(points.uv) if velocity is None else velocity
         if velocity is not None and self._vanished is not None:
             points = self._append(points, self._reidentify(images, points))

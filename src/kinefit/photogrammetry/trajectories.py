@@ -84,7 +84,7 @@ def within_bounds(paths: Trajectories, *, speed: float, acceleration: float) -> 
         A bound is not positive.
     """
     if not (speed > 0 and acceleration > 0):
-        raise ObservationError(f"bounds {speed} m/s, {acceleration} m/s²", remedy="Give positive ones.")
+        raise ObservationError(f"bounds {speed} m/s, {acceleration} m/s²", remedy="Give positive bounds.")
     fast = np.linalg.norm(paths.velocity, axis=2) > speed
     harsh = np.linalg.norm(paths.acceleration, axis=2) > acceleration
     return paths.live & ~fast & ~harsh

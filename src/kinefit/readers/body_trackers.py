@@ -49,14 +49,14 @@ def read_body_trackers(
     odd = ~np.isnan(values[:, 4:]).all(axis=1) & ~(turned & (np.abs(norm - 1.0) < _MAX_NORM_ERROR))
     for bad, problem in (
         (~np.isfinite(values[:, :4]).all(axis=1), "a number that is not finite"),
-        (odd, "qw, qx, qy, qz are no unit quaternion"),
+        (odd, "qw, qx, qy, qz are not a unit quaternion"),
     ):
         if bad.any():
             place = f"line {int(np.argmax(bad)) + 2}"
-            raise FileError(problem, file=path, place=place, remedy="Leave the row out, or its quaternion empty.")
+            raise FileError(problem, file=path, place=place, remedy="Remove the row, or leave its quaternion empty.")
     keys = [(t, name) for t, name in zip(values[:, 0].tolist(), labels)]
     if twice := repeated(f"{name} at {t:g} s" for t, name in keys):
-        raise FileError(f"{twice[0]} is there twice", file=path, remedy="Give each tracker one row at each time.")
+        raise FileError(f"{twice[0]} has two rows", file=path, remedy="Keep one.")
     times, frame = np.unique(values[:, 0], return_inverse=True)
     x, R = np.full((len(times), len(names), 3), np.nan), np.full((len(times), len(names), 3, 3), np.nan)
     for k, name in enumerate(names):

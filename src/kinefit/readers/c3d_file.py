@@ -60,7 +60,7 @@ def read_c3d(path: Path) -> C3d:
     section = (raw[0] - 1) * _BLOCK_BYTES
     processor = _PROCESSORS.get(raw[section + 3]) if section + 4 <= len(raw) else None
     if processor is None:
-        raise FileError("no parameter section where the header points to", file=path, place="header", remedy=_REMEDY)
+        raise FileError("it points to no parameter section", file=path, place="header", remedy=_REMEDY)
     parameters = _read_parameters(raw, section, processor, path)
     return _read_points(raw, processor, parameters, path)
 
@@ -92,13 +92,13 @@ def _read_parameters(raw: bytes, section: int, processor: str, path: Path) -> di
         if group == 0:
             break
         if pointer + 2 > end:
-            raise FileError("a parameter runs out of its section", file=path, place=f"after {last}", remedy=_REMEDY)
+            raise FileError("a parameter extends beyond its section", file=path, place=f"after {last}", remedy=_REMEDY)
         name = raw[at + 2 : pointer].decode("latin-1").strip().upper()
         offset = int.from_bytes(raw[pointer : pointer + 2], "big" if processor == "mips" else "little")
         following = pointer + offset
         if not name.isprintable() or (offset and (offset < 3 or following > end)):
             raise FileError(
-                f"the record of parameter {name!r} points {offset} bytes on, out of its section", file=path,
+                f"the record of parameter {name!r} points {offset} bytes ahead, outside its section", file=path,
                 place=f"after {last}", remedy=_REMEDY,
             )
         if group < 0:
@@ -122,12 +122,12 @@ def _values(record: bytes, processor: str, key: str, path: Path) -> Values:
     size = _SIZES.get(kind, 0) * int(np.prod(shape, dtype=object)) if rank else _SIZES.get(kind, 0)
     data = record[2 + rank : 2 + rank + size]
     if kind not in _SIZES or len(shape) < rank or len(data) < size:
-        raise FileError("longer than its record, or of no known type", file=path, place=key, remedy=_REMEDY)
+        raise FileError("is longer than its record, or its type is unknown", file=path, place=key, remedy=_REMEDY)
     if kind != -1:
         try:
             return _numbers(data, kind, processor).reshape(shape, order="F")
         except ValueError as error:  # no numbers, in impossible dimensions
-            raise FileError(f"dimensions that cannot be ({error})", file=path, place=key, remedy=_REMEDY) from error
+            raise FileError(f"impossible dimensions ({error})", file=path, place=key, remedy=_REMEDY) from error
     width = shape[0] if shape else 1
     cells = [data[i : i + width] for i in range(0, size, width)] if size else []
     return [_text(cell) for cell in cells]

@@ -60,14 +60,14 @@ def read_clicks(path: str | PathLike[str]) -> tuple[Clicks, ...]:
     try:
         content = json.loads(read_bytes(Path(path)))
     except (ValueError, RecursionError) as error:
-        raise FileError(f"is no JSON ({error})", file=path, remedy=_FORM) from error
+        raise FileError(f"is not JSON ({error})", file=path, remedy=_FORM) from error
     try:
         several = content if isinstance(content, list) and content else [content]
         steps = sorted(map(clicks_of, several), key=lambda of: of.step)
     except FileError as error:
         raise FileError(error.problem, file=path, place=error.place, remedy=error.remedy) from error
     if twice := repeated(str(of.step) for of in steps):
-        raise FileError(f"step {', '.join(twice)} is there twice", file=path, remedy="Put its points together.")
+        raise FileError(f"step {', '.join(twice)} appears twice", file=path, remedy="Put a step into one entry.")
     return tuple(steps)
 
 
@@ -77,7 +77,7 @@ def clicks_of(value: Any) -> Clicks:
         raise FileError("holds no points", remedy=_FORM)
     step = value.get("step", 0)
     if not isinstance(step, int) or isinstance(step, bool) or not 0 <= step < _MAX_NUMBER:
-        raise FileError(f"step {step!r} is no number of a frame", remedy=_FORM)
+        raise FileError(f"step {step!r} is not a frame number", remedy=_FORM)
     points: dict[str, dict[str, tuple[float, float]]] = {}
     for camera, of in value["points"].items():
         if not isinstance(of, dict):
@@ -86,6 +86,6 @@ def clicks_of(value: Any) -> Clicks:
         for name, place in of.items():
             pair = isinstance(place, list) and len(place) == 2 and all(type(v) in (int, float) for v in place)
             if not pair or not all(abs(v) < _MAX_NUMBER for v in place):
-                raise FileError(f"{place!r} is no pixel", place=f"camera {camera}, {name}", remedy=_FORM)
+                raise FileError(f"{place!r} is not a pixel position", place=f"camera {camera}, {name}", remedy=_FORM)
             points[camera][name] = (float(place[0]), float(place[1]))
     return Clicks(step, points)

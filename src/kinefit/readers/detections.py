@@ -58,7 +58,7 @@ def read_detections(path: str | PathLike[str]) -> Detections:
     file = Path(path)
     if not file.is_file():
         raise FileError("no such file of detections", file=file, remedy=f"Run: {_anew(file)}")
-    again = f"Make it anew: {_anew(file, '--force')}"
+    again = f"Detect again: {_anew(file, '--force')}"
     try:
         arrays = _load(file)
     except _DAMAGE as error:
@@ -72,9 +72,9 @@ def read_detections(path: str | PathLike[str]) -> Detections:
             *(arrays.get(name) for name in ("hands", "hand_confidence", "times", "face", "face_confidence")),
         )
     except (KinefitError, KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
-        raise FileError(f"contents that do not fit together ({error})", file=file, remedy=again) from error
+        raise FileError(f"its arrays do not fit together ({error})", file=file, remedy=again) from error
     if not found.rate > 0 or not np.isfinite(found.confidence).all() or np.isinf(found.points).any():
-        raise FileError("numbers that cannot be", file=file, remedy=again)
+        raise FileError("impossible values", file=file, remedy=again)
     return found
 
 
@@ -106,6 +106,6 @@ def _load(file: Path, *names: str) -> dict[str, NDArray]:
     if arrays["version"].shape or int(arrays["version"]) != VERSION:
         raise FileError(
             f"detections of version {arrays['version']}; this kinefit reads version {VERSION}", file=file,
-            remedy=f"Use the kinefit that wrote it, or a newer one; or make it anew: {_anew(file, '--force')}",
+            remedy=f"Use the kinefit that wrote it, or a newer one; or detect again: {_anew(file, '--force')}",
         )
     return arrays

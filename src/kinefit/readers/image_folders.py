@@ -64,7 +64,7 @@ class ImageFolder:
             if picture.shape[1::-1] != self.size:
                 sizes = [f"{width}x{height}" for width, height in (picture.shape[1::-1], self.size)]
                 problem = f"{sizes[0]} px, but the first image has {sizes[1]}"
-                raise FileError(problem, file=self._files[i], remedy="All images of a camera are of one size.")
+                raise FileError(problem, file=self._files[i], remedy="All images of a camera must have one size.")
             self._latest = i, picture
         return self._latest[1].copy()
 
@@ -82,12 +82,12 @@ def _check_numbers(files: list[Path]) -> None:
     if len(steps) and (steps <= 0).any():
         i = int(np.argmax(steps <= 0))
         raise ObservationError(
-            f"two images of one number, as {files[i].name} and {files[i + 1].name}", file=files[0].parent,
+            f"two images with one number: {files[i].name} and {files[i + 1].name}", file=files[0].parent,
             remedy="Name those of this camera by a pattern: video = \"folder/left_*.png\".",
         )  # fmt: skip
     if len(steps) and (steps > _MAX_NUMBER_STEP * np.sort(steps)[(len(steps) - 1) // 2]).any():
         i = int(np.argmax(steps))
         raise ObservationError(
             f"images are missing between {files[i].name} and {files[i + 1].name}", file=files[0].parent,
-            remedy="Copy them again; or leave out what comes after, and number the rest without a gap.",
+            remedy="Copy them again, or remove all later images, or number them without a gap.",
         )  # fmt: skip

@@ -30,7 +30,7 @@ def cut_frames(items: Any, frames: tuple[int, int] | None, file: Path) -> tuple[
     if not 0 <= frames[0] < frames[1] <= len(items):
         raise ObservationError(
             f"frames [{frames[0]}, {frames[1]}] of {len(items)}", file=file,
-            remedy=f"There are frames = [0, {len(items)}].",
+            remedy=f"Give frames within [0, {len(items)}].",
         )
     return items[frames[0] : frames[1]], frames[0]
 

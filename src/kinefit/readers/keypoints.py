@@ -87,8 +87,8 @@ def read_openpose(
     people = [_read_people(path, len(names), keypoint_set) for path in paths]
     if folder.is_dir() and not any(map(len, people)):
         raise ObservationError(
-            f"nobody is seen in any of the {len(paths)} frames of camera {camera}", file=folder,
-            remedy="Check that the detector ran on this camera's video; or leave this camera out.",
+            f"no person is detected in any of the {len(paths)} frames of camera {camera}", file=folder,
+            remedy="Check that the detector ran on this camera's video, or remove this camera.",
         )
     data = np.zeros((len(people), max(map(len, people)), len(names), 3))
     for row, persons in zip(data, people, strict=True):
@@ -138,14 +138,14 @@ def read_mediapipe(
         frame, point, _ = np.argwhere(~np.isfinite(data))[0]
         raise ObservationError(
             f"NaN or infinity at {names[point]}", file=path, place=f"frame {start + frame}",
-            remedy="A frame with nobody must be NaN (or zero) as a whole.",
+            remedy="A frame without a person must be all NaN (or zero).",
         )
     if keypoint_set == "MEDIAPIPE_478":
         data = face_mesh(data, path)
     if not data[..., 2].any():
         raise ObservationError(
-            f"nobody is seen in any of the {len(data)} frames of camera {camera}", file=path,
-            remedy="Check that the detector ran on this camera's video; or leave this camera out.",
+            f"no person is detected in any of the {len(data)} frames of camera {camera}", file=path,
+            remedy="Check that the detector ran on this camera's video, or remove this camera.",
         )
     return keypoint_record(data[:, None], camera, keypoint_set, rate, time_offset, start, path, image_frame)
 
@@ -275,7 +275,7 @@ def _numbered_files(folder: Path) -> list[Path]:
         number = int(match[1])
         if number in numbered:
             raise ObservationError(
-                f"frame {number} is there twice, also as {numbered[number].name}", file=path,
+                f"frame {number} appears twice, also as {numbered[number].name}", file=path,
                 remedy="Keep one camera in each folder.",
             )
         numbered[number] = path

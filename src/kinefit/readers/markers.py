@@ -87,7 +87,7 @@ def _unique(names: list[str]) -> tuple[str, ...]:
 
 
 def _unseen(markers: int, frames: int, path: Path) -> ObservationError:
-    problem = f"none of the {markers} markers is seen in any of the {frames} frames"
+    problem = f"none of the {markers} markers is visible in any of the {frames} frames"
     remedy = "Export it again with its trajectories, or choose another trial."
     return ObservationError(problem, file=path, remedy=remedy)
 
@@ -160,7 +160,7 @@ def _read_trc(path: Path, unit: str | None) -> Markers:
         rate, stated = float(header["datarate"]), int(float(header["numframes"]))
         count = int(float(header["nummarkers"]))
     except (KeyError, ValueError, OverflowError) as error:
-        problem = f"DataRate, NumFrames or NumMarkers is missing or no number ({error})"
+        problem = f"DataRate, NumFrames or NumMarkers is missing or not a number ({error})"
         raise FileError(problem, file=path, place="line 3", remedy=_TRC_REMEDY) from error
     if not 0 < rate < np.inf:
         raise FileError(f"rate {rate:g} Hz", file=path, place="line 3", remedy="Correct DataRate.")
@@ -174,7 +174,7 @@ def _read_trc(path: Path, unit: str | None) -> Markers:
     if len(frames) < stated - 1:  # some writers count one too many
         raise FileError(
             f"the file is truncated: {len(frames)} of {stated} frames can be read", file=path,
-            remedy="Copy or export it again; or, if it is whole, correct NumFrames in line 3.",
+            remedy="Copy or export it again; or, if it is complete, correct NumFrames in line 3.",
         )
     if not names or not len(frames):
         raise ObservationError(

@@ -65,7 +65,7 @@ def read_motion(path: str | PathLike[str]) -> Motion:
     arrays = _load(file)
     if "format" not in arrays or str(arrays["format"]) != FORMAT:
         remedy = "Give a file that `kinefit track` wrote."
-        raise FileError("this is no motion file of kinefit", file=file, remedy=remedy)
+        raise FileError("this is not a motion file of kinefit", file=file, remedy=remedy)
     try:
         if int(arrays["version"]) != VERSION:
             raise FileError(
@@ -92,12 +92,12 @@ def _load(file: Path) -> dict[str, NDArray]:
         ways = {".toml": ("track",), ".bvh": ("retarget",), ".amc": ("retarget",), ".c3d": ("markers", "fit"),
                 ".trc": ("markers", "fit")}  # fmt: skip
         way = ways.get(file.suffix.lower())
-        remedy = f"It becomes one: {command(*way, file)}" if way else "Give a file that `kinefit track` wrote."
-        raise FileError("this is no motion file of kinefit", file=file, remedy=remedy)
+        remedy = f"Convert it: {command(*way, file)}" if way else "Give a file that `kinefit track` wrote."
+        raise FileError("this is not a motion file of kinefit", file=file, remedy=remedy)
     try:
         return read_npz(file, remedy=_REMEDY)
     except FileError as error:
-        problem = f"this is no motion file of kinefit, or only a part of one: {error.problem}"
+        problem = f"this is not a motion file of kinefit, or only a part of one: {error.problem}"
         raise FileError(problem, file=file, remedy=_REMEDY) from error
 
 
@@ -134,7 +134,7 @@ def _residuals(arrays: Mapping[str, NDArray], sensor: str, F: int, S: int) -> Re
         _check(f"residuals/{sensor}/{key}", arrays[key], shape)
         arrays[key].flags.writeable = False
     if K and not (0 <= arrays["segments"].min() and arrays["segments"].max() < S):
-        raise ValueError(f"residuals/{sensor}/segments names a segment that is not there")
+        raise ValueError(f"residuals/{sensor}/segments names a segment that the body lacks")
     names = tuple(str(name) for name in arrays["names"])
     return Residuals(names=names, unit=str(arrays["unit"]), **{key: arrays[key] for key in shapes})
 

@@ -40,14 +40,14 @@ def read_static_points(
     out: dict[str, dict[str, tuple[float, float]]] = {}
     for name, views in raw.items():
         if not isinstance(views, dict) or len(views) < 2:
-            raise ObservationError("a point is seen by two or more cameras", file=file, place=f"[{name}]", remedy=form)
+            raise ObservationError("a point needs two or more cameras", file=file, place=f"[{name}]", remedy=form)
         out[name] = {}
         for camera, pixel in views.items():
             place = f"[{name}] {camera}"
             if camera not in cameras:
                 raise ObservationError(choices("camera", camera, cameras), file=file, place=place)
             if not _is_pixel(pixel):
-                raise ObservationError(f"{pixel} is no pixel", file=file, place=place, remedy=form)
+                raise ObservationError(f"{pixel} is not a pixel position", file=file, place=place, remedy=form)
             out[name][camera] = (float(pixel[0]), float(pixel[1]))
     if not out:
         raise ObservationError("there are no points", file=file, remedy=form)

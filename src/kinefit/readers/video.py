@@ -199,18 +199,18 @@ def common_frames(
         for n, (begin, end) in spans.items()
     )
     if start >= stop:
-        raise ObservationError(f"no time that all streams saw: {listed}", file=file, remedy="Check the time offsets.")
+        raise ObservationError(f"no time that all streams share: {listed}", file=file, remedy="Check the time offsets.")
     if frames is None:
         slack = np.ceil(2.0 * rate * max(uneven.values(), default=0.0) - 1e-6)
         if not overlap and np.ptp([end - begin for begin, end in spans.values()]) > slack:
             raise ObservationError(
                 f"streams of different length: {listed}", file=file,
-                remedy=f"If they start together, take what all saw: frames = [{start}, {stop}].",
+                remedy=f"If they start together, use the frames that all share: frames = [{start}, {stop}].",
             )
         return start, stop
     if not start <= frames[0] < frames[1] <= stop:
         raise ObservationError(
             f"frames [{frames[0]}, {frames[1]}] are not in every stream: {listed}", file=file,
-            remedy=f"All saw frames = [{start}, {stop}].",
+            remedy=f"All share frames = [{start}, {stop}].",
         )
     return frames

@@ -151,7 +151,7 @@ def _open(path: Path) -> Any:
 def _reason(error: Exception) -> str:
     """FFmpeg's message, without its error number and the path."""
     if isinstance(error, MemoryError):  # also for impossible counts in a file
-        return "it claims more than there is memory for"
+        return "it claims more data than fits into memory"
     return str(getattr(error, "strerror", None) or error)
 
 

@@ -120,4 +120,4 @@ def check_influence(
     """
     first = [field_rows(body, s, x, o) for s, x, o in zip(states, points, of)]
     if not any(np.abs(rows.direction).max(initial=0.0) > 1e-9 for rows in first):
-        raise ObservationError("no point lies near the body", remedy="Begin nearer; check the unit and the world.")
+        raise ObservationError("no point lies near the body", remedy="Start nearer; check the unit and the world.")

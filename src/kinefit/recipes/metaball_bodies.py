@@ -99,7 +99,7 @@ def metaball_bodies(
     if method == "joint":
         if not isinstance(sigma, int | float) or locked is not None or others is not None or helps != AS_PRINTED:
             remedy = "Give one sigma alone, or use subject.fit.fit_subject."
-            raise ObservationError("the joint fit takes no locked, others or helps", remedy=remedy)
+            raise ObservationError("the joint fit does not accept locked, others or helps", remedy=remedy)
         return _joint(body, points, states, sigma, weights)
     fixed = None if locked is None else np.asarray(locked, bool)
     closest = [nearest(body, s, x, max_distance=helps.max_distance) for s, x in zip(states, points)]

@@ -104,7 +104,7 @@ def pose_from_regions(
             parts.append(outline_rows(body, state, rim, vertices, camera, moved, by="rays"))
         rows, energy = Rows.concat(*parts), float(np.mean(energies))
         if not len(rows):
-            raise ObservationError("nothing of the body is in view", remedy="Start nearer to where it is.")
+            raise ObservationError("no part of the body is in view", remedy="Start nearer to it.")
         damping, sigma = 1e-6 * float(np.sum(rows.weight)), float(np.mean(rows.weight)) ** -0.5 / closure_factor
         rows = Rows.concat(rows, point_rows(body, state, *closure_targets(body, state), sigma=sigma))
         step = gauss_newton(body, state, rows, damping=damping)

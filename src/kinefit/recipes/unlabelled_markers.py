@@ -68,6 +68,6 @@ def start_from_markers(subject: MarkerSubject, model: MarkerModel, points: Array
     state, error = pose_from_points(subject.body, subject.points, x, sigma=0.01)
     if not error < MAX_START_ERROR:
         raise TrackingError(
-            f"no pose fits the markers: they are {1e3 * error:.0f} mm off", remedy="Are model and body of one subject?"
+            f"no pose fits the markers: they are {1e3 * error:.0f} mm off", remedy="Use model and body of one subject."
         )
     return state

@@ -48,7 +48,7 @@ class Raster:
     def segment(self) -> NDArray:
         """Label (H, W) int16 of the visible triangle, -1 for the background; raises ObservationError without labels."""
         if self.labels is None:
-            raise ObservationError("the triangles drawn have no labels", remedy="Use render_body, or give labels.")
+            raise ObservationError("the rendered triangles have no labels", remedy="Use render_body, or give labels.")
         return np.append(self.labels, -1).astype(np.int16)[self.face]
 
     @property
@@ -116,10 +116,10 @@ class Canvas:
             array.flags.writeable = False
         status = kernels.rasterise(*inputs, *lens, bool(cull), self._room, self._depth, self._face)
         if status == kernels.NOT_FINITE:
-            problem = "vertices to be drawn are not finite"
-            raise ObservationError(problem, remedy="Leave out states that are not finite.")
+            problem = "vertices to render are not finite"
+            raise ObservationError(problem, remedy="Remove states that are not finite.")
         if status == kernels.NO_VERTEX:
-            raise ObservationError("faces of vertices that are not there", remedy="Count vertices from 0.")
+            raise ObservationError("faces with vertex numbers out of range", remedy="Count vertices from 0.")
         return Raster(self._depth, self._face, labels)
 
 

@@ -23,13 +23,15 @@ _IMAGE_SIZE = (544, 960)  # [px]
 _KEYPOINT_SIGMA = 2.0  # [px] in the take file
 
 
-def write_synthetic_take(folder: str | os.PathLike[str], seed: int = 0) -> Path:
-    """Write a take of a drawn figure that squats and waves: four videos with keypoints, calibration and take.toml.
+def write_synthetic_take(folder: str | os.PathLike[str], motion: Motion | None = None, *, seed: int = 0) -> Path:
+    """Write a take of a drawn figure: four videos with keypoints, calibration and take.toml.
 
     Parameters
     ----------
     folder : path
         Made where it does not exist; files of the same names in it are replaced.
+    motion : Motion, optional
+        Of the figure, at the videos' rate; default: `squat_and_wave`. Images are wide for a motion that goes far.
     seed : int
         Of the keypoints' errors: 1.5 px noise, 5 % outliers, 5 % undetected.
 
@@ -43,8 +45,10 @@ def write_synthetic_take(folder: str | os.PathLike[str], seed: int = 0) -> Path:
     ExportError
         The folder cannot be written. It then contains no take file.
     """
-    folder, motion = Path(folder), squat_and_wave()
-    rig = studio_rig(motion, size=_IMAGE_SIZE)
+    folder, motion = Path(folder), motion or squat_and_wave()
+    low, high = (limit(motion.positions(), axis=(0, 1)) for limit in (np.min, np.max))
+    goes_far = np.argmax(high - low) != "xyz".index(motion.up[-1])
+    rig = studio_rig(motion, size=_IMAGE_SIZE[::-1] if goes_far else _IMAGE_SIZE)
     detections = simulate_keypoints(motion, rig, "MEDIAPIPE_33", noise_px=1.5, outliers=0.05, missing=0.05, seed=seed)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -85,7 +89,7 @@ def _landmarks(keypoints: Keypoints) -> np.ndarray:
 
 def _take(motion: Motion, rig: Rig) -> str:
     parts = [
-        "# A simulated figure that squats and waves, in four cameras. No recording of a person.\n",
+        "# A simulated figure in four cameras. No recording of a person.\n",
         f'[take]\nname = "{motion.name}"\nrate = {motion.rate}\nup = "{motion.up}"\nbody = "{motion.body.name}"\n',
         '[calibration]\nfile = "calibration.toml"\n',
     ]

@@ -182,7 +182,7 @@ def _columns(markers: Markers, labels: Sequence[str], least: int) -> NDArray:
             raise ObservationError(problem, file=markers.source or None, remedy="Give labels of the take.")
     if len(set(labels)) < max(least, len(labels)):
         raise ObservationError(
-            f"{len(set(labels))} markers of a segment: {', '.join(labels)}", remedy=f"Give {least} at least, each once."
+            f"{len(set(labels))} markers of a segment: {', '.join(labels)}", remedy=f"Give at least {least}, each once."
         )
     where = [markers.names.index(n) if n in markers.names else names.index(str(n)) for n in found]
     return np.asarray(markers.positions)[:, where]
@@ -232,12 +232,12 @@ def _inliers(off: NDArray, before: NDArray) -> NDArray:
 
 def _few(frames: int) -> ObservationError:
     return ObservationError(
-        f"{frames} frames show enough markers of both segments", remedy=f"{_MIN_FRAMES} frames are the least."
+        f"{frames} frames show enough markers of both segments", remedy=f"Give at least {_MIN_FRAMES} such frames."
     )
 
 
 def _held(turns: NDArray, about: str, which: int) -> ObservationError:
     return ObservationError(
-        f"the joint turns {about} by {np.degrees(turns[which]):.1f} deg (standard deviation), too little to tell it",
+        f"the joint turns {about} by {np.degrees(turns[which]):.1f} deg (standard deviation), too little to find it",
         remedy="Record it moving through its range: a hip swung forwards, outwards and round, a knee bent.",
     )

@@ -41,7 +41,7 @@ def absolute_orientation(
     for array, shape in ((source, (n, 3)), (target, (n, 3)), (weight, (n,)), (limb, (n,))):
         check_shape(array, shape, "pairs")
     if not np.isfinite([source.sum(), target.sum(), weight.sum()]).all() or (n and weight.min() < 0.0):
-        raise ObservationError("pairs are not finite, or have a negative weight", remedy="Leave out what is unknown.")
+        raise ObservationError("pairs are not finite, or have a negative weight", remedy="Remove unknown pairs.")
     total = np.bincount(limb, weight, count)
     share = 1.0 / np.where(total > 0.0, total, 1.0)
     mean_source, mean_target = (

@@ -185,8 +185,8 @@ def check_closed(body: Body) -> None:
             fixed = lock(body, None)
             hard = closed.chosen(closed.hard)
             if hard.jacobian.size and not null_space(hard.jacobian, hard.value, fixed).free.shape[1]:
-                problem = f"the closures of body '{body.name}' leave nothing to move: it is over-constrained"
-                raise BodyError(problem, remedy="`kinefit body check` tells which of them say the same.")
+                problem = f"the closures of body '{body.name}' leave no motion: it is over-constrained"
+                raise BodyError(problem, remedy="`kinefit body check` shows which of them are redundant.")
             return
         if worst < least[0]:
             least = worst, state
@@ -248,7 +248,7 @@ def _redundant(body: Body, A: NDArray) -> tuple[str, ...]:
         adds = rank - _rank(A[owner != k])
         if adds < c.rows:
             candidates = [name for name, u in zip(c.row_names, np.abs(U[owner == k]).max(axis=1)) if u > 0.1]
-            text = f"closure '{c.name}' has {c.rows} equations, of which {adds} say what no other does"
+            text = f"closure '{c.name}' has {c.rows} equations, of which {adds} are independent of the others"
             out.append(text + (f" (in question: {', '.join(candidates)})" if candidates else ""))
     return tuple(out)
 

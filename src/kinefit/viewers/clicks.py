@@ -89,6 +89,6 @@ class ClickPage:
         try:
             return self.take(msgspec.to_builtins(msgspec.json.decode(text, type=_ClicksMessage))), True
         except msgspec.DecodeError as error:
-            return f"These are no clicks: {error}.", False
+            return f"These clicks cannot be used: {error}.", False
         except KinefitError as error:
             return str(error), False

@@ -120,7 +120,7 @@ class View:
         if len(state.angles) != len(self.body.tree.coordinates):
             raise BodyError(
                 f"a state of {len(state.angles)} angles for a body of {len(self.body.tree.coordinates)}",
-                remedy="Give a state of the body that the view was made for.",
+                remedy="Give a state of the view's body.",
             )
         Ts = self.body.tree.segment_poses(state.T_world_root[None], state.angles[None])[0]
         with self.server.atomic():

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _TICK, _TELL = 1 / 60, 0.1  # [s] between looks at the page, and between read-outs while playing
 _STEPS = {"-10": -10, "-1": -1, "+1": 1, "+10": 10}
-_HELP = "drag: turn, right drag: shift, wheel: nearer; P plays, B and N step"
+_HELP = "drag: turn, right drag: shift, wheel: zoom; P plays, B and N step"
 
 
 @dataclass
@@ -201,7 +201,7 @@ def summary(motion: Motion, frame: int) -> str:
         norms = residuals.norms[frame]
         seen = np.isfinite(norms)
         scale, unit = (1.0, "px") if residuals.unit == "px" else (1000.0, "mm")
-        middle = f"{scale * np.median(norms[seen]):.1f} {unit}" if seen.any() else "nothing seen"
+        middle = f"{scale * np.median(norms[seen]):.1f} {unit}" if seen.any() else "no data"
         out = int((seen & (residuals.weights[frame] < scene.OUTLIER_WEIGHT)).sum())
         extra = f", {out} rejected" if out else ""
         extra += ", left/right swap corrected" if residuals.swapped[frame] else ""

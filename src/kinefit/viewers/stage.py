@@ -62,7 +62,7 @@ def open_server(port: int, access: Access | None = None, *, label: str = "kinefi
         server = viser.ViserServer(host=access.host, port=port, label=label, verbose=False)
         if not used:
             server.stop()
-            raise ExportError(f"viser {viser.__version__} serves in another way", remedy="Install viser 1.1.")
+            raise ExportError(f"viser {viser.__version__} is not supported", remedy="Install viser 1.1.")
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
     return server
 
@@ -110,8 +110,8 @@ def free_port(host: str, port: int) -> int:
         except OSError as error:
             if error.errno not in (errno.EADDRINUSE, errno.EACCES):
                 problem = f"nothing can be served as '{host}' ({error.strerror or error})"
-                raise ExportError(problem, remedy="Take 127.0.0.1, or 0.0.0.0 for all networks.") from error
-    raise ExportError("no port is free", place=f"ports from {port} on", remedy="Name another one by --port.")
+                raise ExportError(problem, remedy="Use 127.0.0.1, or 0.0.0.0 for all networks.") from error
+    raise ExportError("no port is free", place=f"ports from {port} on", remedy="Choose another one with --port.")
 
 
 @contextlib.contextmanager

@@ -198,7 +198,7 @@ def test_a_bulge_that_moves_with_a_bone(scene, blended):
         ahead, back = (model.pose(state.retract(sign * step)).vertices for sign in (1.0, -1.0))
         expected.append((ahead - back) / (2 * h))
     np.testing.assert_allclose(found, np.moveaxis(expected, 0, -1), atol=1e-7)
-    with pytest.raises(BodyError, match="moves with no segment"):
+    with pytest.raises(BodyError, match="moves needs a segment"):
         LocalMorph(centre, radii, shift, bulge.steering, moves=True)
 
 

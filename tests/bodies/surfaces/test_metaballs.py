@@ -165,11 +165,11 @@ def test_files_keep_balls(tmp_path):
 @pytest.mark.parametrize(
     ("centres", "radii", "weights", "said"),
     [
-        ([[0, 0, 0], [0, -1, 0]], [[0.1] * 3] * 2, None, "do not melt"),
+        ([[0, 0, 0], [0, -1, 0]], [[0.1] * 3] * 2, None, "do not join"),
         ([[0, 0, 0]], [[0.1, -0.1, 0.1]], None, "ball 1 has radii"),
         ([[0, 0, 0]], [[0.1] * 3], [0.0], "weight 0"),
-        ([[0, 0, 0]], [[0.1] * 3], [0.4], "do not melt"),
-        ([[0, 0, 0], [0, 0, 0]], [[0.1] * 3] * 2, None, "in one place"),
+        ([[0, 0, 0]], [[0.1] * 3], [0.4], "do not join"),
+        ([[0, 0, 0], [0, 0, 0]], [[0.1] * 3] * 2, None, "at the same position"),
         ([[0, 0, 0], [0, -0.2, 0], [0, -0.1, 0]], [[0.1] * 3] * 3, None, "order"),
         ([[0, 0, 0]], [[0.1] * 2], None, "centres"),
     ],
@@ -191,7 +191,7 @@ def test_body_files(tmp_path):
     with pytest.raises(BodyError, match="one shape"):
         load_body(str(path))
     path.write_text(text + balls.replace("1.2", "0.3"))
-    with pytest.raises(BodyError, match="do not melt"):
+    with pytest.raises(BodyError, match="do not join"):
         load_body(str(path))
 
 

@@ -32,15 +32,15 @@ def flipped(v, f):
     ("change", "says"),
     [
         (not_finite, "vertex 3 .* not finite"),
-        (lambda v, f: (v, f + 1), "not there"),
-        (lambda v, f: (v, f - 1), "not there"),
+        (lambda v, f: (v, f + 1), "out of range"),
+        (lambda v, f: (v, f - 1), "out of range"),
         (lambda v, f: (v, f[:0]), "no faces"),
         (lambda v, f: (v[:, :2], f), "shape"),
         (lambda v, f: (v, f + 0.5), "float64 numbers"),
         (flipped, "opposite ways, at 3 edges"),
         (lambda v, f: (v, f[:, ::-1]), "inside out"),
         (lambda v, f: (v, f[2:]), r"hole of 0\.224 m near \[-0\.15.* \(4 open edges"),
-        (lambda v, f: (1e-9 * v, f), "without area"),
+        (lambda v, f: (1e-9 * v, f), "have no area"),
     ],
 )
 def test_what_no_surface_can_be_made_of_is_refused(change, says):
@@ -85,7 +85,7 @@ def test_all_forms_of_faces(tmp_path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("v 0 0\n", "line 1.*not a line"), ("v 0 0 zero\n", "line 1"), ("v 0 0 0\nf 1 1 2\n", "line 2.*do not stand"),
+        ("v 0 0\n", "line 1.*not a line"), ("v 0 0 zero\n", "line 1"), ("v 0 0 0\nf 1 1 2\n", "line 2.*are not yet"),
         ("v 0 0 0\nf 1 1\n", "line 2"), ("v 0 0 0\nf 0 1 1\n", "line 2"), ("v 0 0 0\nf a b c\n", "line 2"),
         ("", "no faces"),
     ],
@@ -141,8 +141,8 @@ def test_a_body_file_names_its_meshes_beside_it(tmp_path):
     ("surface", "says"),
     [
         ('mesh = "none.obj"', "none.obj, surface of segment hand_r: cannot read the mesh"),
-        ('mesh = "hand.obj", end = [0.0, 1.0, 0.0], radii = [0.1, 0.1]', "needs one shape"),
-        ("end = [0.0, 1.0, 0.0]", "needs one shape"),
+        ('mesh = "hand.obj", end = [0.0, 1.0, 0.0], radii = [0.1, 0.1]', "needs exactly one shape"),
+        ("end = [0.0, 1.0, 0.0]", "needs exactly one shape"),
     ],
 )
 def test_a_surface_in_a_body_file_that_cannot_be(tmp_path, surface, says):

@@ -97,7 +97,7 @@ def test_without_couplings_the_prior_is_what_usual_and_spread_say():
         ("first = 0.5", "first = nan", "weights"),
         ("first = 0.5", "slide = 0.5", "slides"),
         ("first = 0.5", "s2 = 0.5", "the middle axis of a ball joint"),
-        ("first = 0.5", "s3 = 0.5", "without a spread"),
+        ("first = 0.5", "s3 = 0.5", "without its own spread"),
     ],
 )
 def test_couplings_that_cannot_be_are_refused(old, new, said):

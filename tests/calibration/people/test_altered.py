@@ -58,7 +58,7 @@ def test_a_video_of_two_frames_is_named(tmp_path):
     checked(tmp_path, cut)
     with pytest.raises(ObservationError, match="saw 2 frames") as told:
         load_observations(read_take(tmp_path / "take.toml"), exteriors=False)
-    assert told.value.place == f"keypoints {room().names[1]}" and "Leave that video out" in told.value.remedy
+    assert told.value.place == f"keypoints {room().names[1]}" and "Remove that video" in told.value.remedy
 
 
 def test_right_videos_pass(tmp_path):

@@ -100,7 +100,7 @@ def test_the_same_person_is_found_among_two():
 def test_one_video_twice_is_refused():
     one = seen()
     twice = (one[0], replace(one[0], camera="cam02"), *one[2:])
-    with pytest.raises(CalibrationError, match="cam02.*one video twice|same pictures"):
+    with pytest.raises(CalibrationError, match="cam02.*one video twice|same images"):
         first_cameras(guessed(), twice, within=0.0)
 
 
@@ -116,14 +116,14 @@ def test_a_camera_of_another_day_is_named():
 def test_a_motion_that_tells_no_lens_is_refused():
     still = CameraChange(5.0, 5.0, np.zeros(2), 0.1, 0.1, 0.2, 0.0, 0.02, 0.1, 0.3, 0.0, 20.0)
     changes = dict.fromkeys(room().names, still)
-    with pytest.raises(CalibrationError, match="does not tell the lenses.*cam01 to 30 %.*walks"):
+    with pytest.raises(CalibrationError, match="does not determine the lenses.*cam01 to 30 %.*walks"):
         check_result(room(), changes, 0.2, times=10.0)
 
 
 def test_somebody_who_stands_still_tells_nothing_of_clocks():
     still = [replace(r, **{w: np.repeat(getattr(r, w)[:1], 30, axis=0) for w in ("points", "confidence", "lifted")})
              for r in seen()]
-    with pytest.raises(CalibrationError, match="move like none.*somebody who moves"):
+    with pytest.raises(CalibrationError, match="move like no people.*person who moves"):
         first_cameras(guessed(), still, within=1.0)
 
 

@@ -81,7 +81,7 @@ BAD = {
     "broken video": (without_video, "cam02.mp4", "re-encode"),
     "nobody": (
         lambda t: landmarks(t, "cam02", np.zeros_like),
-        "nobody is seen", "detector",
+        "no person is detected", "detector",
     ),
 }  # fmt: skip
 

@@ -241,7 +241,7 @@ def test_json_without_anybody_is_told(openpose_take):
     people(openpose_take, "cam02", lambda frame, there: [])
     told = run("track", openpose_take)
     assert told.exit_code == 2
-    assert "nobody is seen in any of the 12 frames of camera cam02" in told.stderr
+    assert "no person is detected in any of the 12 frames of camera cam02" in told.stderr
     assert not openpose_take.with_name("take-kinefit").exists()
 
 

@@ -56,7 +56,7 @@ def test_a_hand_that_is_lost_finger_by_finger_is_one_moment(motion):
     lost = {"index_middle_l": 40, "middle_middle_l": 50, "ring_distal_l": 57}
     (moment,) = doubtful_moments(unsure(motion, **lost))
     assert (moment.start, moment.stop) == (40, F) and set(lost) <= set(moment.segments)
-    assert moment.what == ("The place of fingers of the left hand is uncertain: up to ±35 cm (2 σ).",)
+    assert moment.what == ("The position of fingers of the left hand is uncertain: up to ±35 cm (2 σ).",)
     assert len(doubtful_moments(unsure(motion, index_distal_l=40, index_distal_r=57))) == 2
 
 

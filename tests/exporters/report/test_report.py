@@ -99,7 +99,7 @@ def test_a_segment_that_hardly_anything_observes_is_told_with_the_cameras_that_s
         motion = changed_residuals(motion, camera, slice(20, 30), hidden, values=np.nan, weights=0.0)
     (moment,) = doubtful_moments(motion)
     assert (moment.start, moment.stop) == (20, 30) and set(moment.segments) == {"hand_r", "forearm_r"}
-    assert moment.what[0].startswith("The place of right forearm and right hand is uncertain: up to ±")
+    assert moment.what[0].startswith("The position of right forearm and right hand is uncertain: up to ±")
     assert moment.causes == ("Only cam2 saw it.", "No measurement supports right hand.")
 
 
@@ -117,9 +117,9 @@ def test_a_limb_that_most_views_show_elsewhere_for_a_while_is_told():
     motion = changed_residuals(motion, "cam1", slice(42, 44), None, swapped=True)
     (moment,) = doubtful_moments(motion)
     assert abs(moment.start - 41) <= 1 and abs(moment.stop - 59) <= 1 and moment.segments == ("hand_r",)
-    assert moment.what == ("Most views show right hand more than 8 cm beside the body.",)
+    assert moment.what == ("Most views show right hand more than 8 cm away from the body.",)
     assert moment.causes == (
-        "67 % of its keypoints were left out as outliers, most of them in cam0.",
+        "67 % of its keypoints were rejected as outliers, most of them in cam0.",
         "The detector swapped left and right in cam1 (corrected).",
     )
     one = changed_residuals(good_motion(), "cam2", slice(40, 60), hand, values=300.0, weights=0.0)
@@ -132,7 +132,7 @@ def test_a_stretch_without_anybody_comes_first():
     motion = changed(replace(good_motion(), quality=quality), "joint_std", slice(50, 52), 0, 0.1)
     moments = doubtful_moments(motion)
     assert [(m.start, m.stop) for m in moments] == [(10, 30), (50, 52)]
-    assert "Nothing of the person was seen" in moments[0].what[0]
+    assert "The person was not observed" in moments[0].what[0]
 
 
 def test_a_wide_error_bar_is_a_moment_or_told_of_the_whole_take():
@@ -141,7 +141,7 @@ def test_a_wide_error_bar_is_a_moment_or_told_of_the_whole_take():
     wide = changed(motion, "joint_std", slice(5, 9), toes, 0.1)
     (moment,) = doubtful_moments(wide)
     assert set(moment.segments) == {"toes_r", "foot_r"} and (moment.start, moment.stop) == (5, 9)
-    assert moment.what == ("The place of right foot and right toes is uncertain: up to ±35 cm (2 σ).",)
+    assert moment.what == ("The position of right foot and right toes is uncertain: up to ±35 cm (2 σ).",)
     assert throughout_sentence(motion) == throughout_sentence(wide) == ""
     always = changed(motion, "joint_std", slice(None), toes, 0.1)
     assert doubtful_moments(always) == ()
@@ -153,7 +153,7 @@ def test_a_wide_error_bar_is_a_moment_or_told_of_the_whole_take():
     unbounded = changed(motion, "joint_std", slice(5, 9), toes, np.inf)
     assert not doubtful_moments(unbounded)  # the joint itself is as known as the one before it
     unbounded = changed(unbounded, "dof_std", slice(5, 9), 6 + motion.body.tree.coordinate("knee_angle_r"), np.inf)
-    assert "nothing bounds it" in doubtful_moments(unbounded)[0].what[0]
+    assert "unbounded in at least one direction" in doubtful_moments(unbounded)[0].what[0]
 
 
 def test_what_happens_at_once_is_one_moment_and_near_ones_are_joined():
@@ -180,10 +180,10 @@ def test_angles_that_share_a_bend_by_the_prior_are_named_and_why(tmp_path):
     unsure = replace(motion, dof_std=std)
     assert {name: round(v, 6) for name, v in shared_by_prior(unsure).items()} == dict.fromkeys(shared, 8.0)
     page = write_report(unsure, tmp_path / "report.html", date="2026-01-01").read_text(encoding="utf-8")
-    assert "Shared by the prior posture" in page and "right hip flexion (±16°)" in page
+    assert "Shares from the reference pose" in page and "right hip flexion (±16°)" in page
     std[:, 6 + tree.coordinate("hip_flexion_l")] = np.radians(1.0)  # markers on the pelvis tell how the hips turn
     assert shared_by_prior(replace(motion, dof_std=std)) == {}
-    assert "Shared by the prior" not in write_report(motion, tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "Shares from the reference" not in write_report(motion, tmp_path / "r.html").read_text(encoding="utf-8")
 
 
 def test_stretches_and_lists():
@@ -294,7 +294,7 @@ def test_the_same_motion_gives_the_same_bytes(tmp_path):
 def test_doubt_comes_before_results_and_names_its_severity(tmp_path):
     bad = replace(good_motion(), quality=np.zeros(F), segment_quality=np.zeros((F, 20)))
     text = page_of(bad, tmp_path, findings=[("warning", "Found by the check", "cam0 is late")])
-    assert '<div class="callout bad">' in text and "In 100 % of the frames nobody was seen." in text
+    assert '<div class="callout bad">' in text and "In 100 % of the frames no person was observed." in text
     assert text.index("In 100 %") < text.index("Found by the check") < text.index('id="angles"')
     assert '<a href="#doubtful-moments">where and why</a>' in text
     assert '<div class="callout good">' in page_of(good_motion(), tmp_path)
@@ -326,8 +326,8 @@ def a_still_arm(motion):
     ("change", "told"),
     [
         (lambda m: cut(m, 0, 1), "1 frames at 60 Hz"), (lambda m: cut(m, 0, 2), "2 frames"),
-        (lambda m: replace(m, residuals={}), "comes without measurements"), (everything_inf, "Not observed: root tx"),
-        (nothing_seen, "nothing seen"), (a_still_arm, "comes without measurements"),
+        (lambda m: replace(m, residuals={}), "has no measurements"), (everything_inf, "Not observed: root tx"),
+        (nothing_seen, "no data"), (a_still_arm, "has no measurements"),
     ],
 )  # fmt: skip
 def test_poor_motions_have_a_page_that_says_so(tmp_path, change, told):
@@ -386,7 +386,7 @@ def test_pictures_stand_beside_their_moment(tmp_path):
     text = page_of(motion, tmp_path, pictures=pictures)
     doubtful = text[text.index('id="doubtful-moments"') : text.index('id="fit-to-the-measurements"')]
     assert f"cam2, frame {worst}" in doubtful and doubtful.count("<img") == 1
-    shown = text[text.index('<section id="pictures"') : text.index('<section id="methods"')]
+    shown = text[text.index('<section id="images"') : text.index('<section id="methods"')]
     assert shown.count("<img") == 3
 
 

@@ -199,7 +199,7 @@ def test_lacking_joints_are_named_and_a_table_helps(motion, tmp_path):
     lines["toes_l"] = "LeftToeBase"
     lines = {s[:-1] + s[-1].translate(other) if s[-2] == "_" else s: n for s, n in lines.items()}
     table.write_text("\n".join(f'{segment} = "joint of {name}"' for segment, name in lines.items()))
-    assert "left and right are exchanged" in run(tmp_path, options).stderr
+    assert "left and right are swapped" in run(tmp_path, options).stderr
     table.write_text('fin = "x"')
     assert "no segment 'fin'" in run(tmp_path, options).stderr
 

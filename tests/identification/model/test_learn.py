@@ -147,7 +147,7 @@ def test_what_does_not_fit_is_said():
     with pytest.raises(ObservationError, match="twice"):
         model_from_frame(SET.places, (*SET.labels[:-1], SET.labels[0]), SET)
     take = moving(5)
-    with pytest.raises(ObservationError, match="ever seen"):
+    with pytest.raises(ObservationError, match="are visible"):
         learn_model(replace(take, positions=np.full_like(take.positions, np.nan)))
     with pytest.raises(ObservationError, match="knows"):
         learn_model(take, template="CMU_41")

@@ -106,7 +106,7 @@ def test_who_is_seen_for_a_moment_only_is_nobody(draw, models):
 def test_nobody_is_no_column_and_a_plain_error_when_keypoints_are_asked_for(draw, models):
     found = detect([draw()] * 4, models)
     assert found.points.shape == (4, 0, 33, 2) and found.seen.shape == (4, 0) and len(found) == 4
-    with pytest.raises(ObservationError, match="nobody is seen in any of the 4 frames of camera left"):
+    with pytest.raises(ObservationError, match="no person is detected in any of the 4 frames of camera left"):
         found.keypoints("left")
 
 

@@ -82,10 +82,10 @@ def test_yaml_that_opencv_cannot_read():
 
 @pytest.mark.parametrize(
     ("text", "told"),
-    [("a: 1\n  b: 2", "line 2: an indentation"), ("a: 1\na: 2", "line 2: the key 'a' twice"),
-     ("a: |\n  x", "line 1: no value"), ("a: &b 1", "no value"), ("a: *b", "no value"), ('a: "x', "no value"),
-     ("a: [1, {b: 2]", "no comma or '}'"), ("a: [1", "no comma or ']'"), ("a:\n  b: 1\n c", "line 3: an indentation"),
-     ("x: {1}", "no key with a colon")],
+    [("a: 1\n  b: 2", "line 2: unexpected indentation"), ("a: 1\na: 2", "line 2: the key 'a' appears twice"),
+     ("a: |\n  x", "line 1: a value"), ("a: &b 1", "a value"), ("a: *b", "a value"), ('a: "x', "a value"),
+     ("a: [1, {b: 2]", "a comma or '}' is missing"), ("a: [1", "a comma or"), ("a:\n  b: 1\n c", "line 3: unexpected"),
+     ("x: {1}", "a key with a colon is missing")],
 )  # fmt: skip
 def test_broken_yaml_is_told_with_its_line(tmp_path, text, told):
     (tmp_path / "a.yml").write_text(f"%YAML:1.0\n{text}\n")
@@ -96,7 +96,7 @@ def test_broken_yaml_is_told_with_its_line(tmp_path, text, told):
 
 @pytest.mark.parametrize(
     ("text", "told"),
-    [("<a>1</a><a>2</a>", "<a> twice"), ("<a>" * 100, "deeper than any calibration"), ("<a>", "mismatched tag")],
+    [("<a>1</a><a>2</a>", "<a> twice"), ("<a>" * 100, "nested too deeply"), ("<a>", "mismatched tag")],
 )
 def test_broken_xml_is_told(tmp_path, text, told):
     (tmp_path / "a.xml").write_text(f"<opencv_storage>{text}</opencv_storage>")
@@ -165,7 +165,7 @@ def test_a_file_larger_than_any_calibration_is_not_read(tmp_path, monkeypatch):
     with path.open("wb") as file:
         file.truncate(read.MAX_CALIBRATION_BYTES + 1)
     monkeypatch.setattr(type(path), "read_text", lambda *_, **__: pytest.fail("it is read"))
-    with pytest.raises(FileError, match="more than any calibration"):
+    with pytest.raises(FileError, match="too large for a calibration"):
         read_calibration(path)
 
 

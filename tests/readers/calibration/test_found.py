@@ -34,5 +34,5 @@ def test_one_that_was_changed_is_told(found, tmp_path):
     file = tmp_path / "cameras.toml"
     write_found(found, file)
     file.write_text(file.read_text().replace("position_sigma", "place_sigma"))
-    with pytest.raises(FileError, match="position_sigma.*found anew"):
+    with pytest.raises(FileError, match="position_sigma.*made again"):
         read_found(file)

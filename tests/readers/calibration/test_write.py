@@ -300,7 +300,7 @@ def like(tmp_path):
 def test_never_over_the_old_one(like, tmp_path):
     text = like.read_text()
     for path in (like, tmp_path / "." / "a.toml"):
-        with pytest.raises(ExportError, match="to be kept"):
+        with pytest.raises(ExportError, match="the original calibration"):
             write_calibration_like(rig_of(turn=0.1), like, path, overwrite=True)
     write_calibration_like(rig_of(turn=0.1), like, tmp_path / "b.toml")
     with pytest.raises(ExportError, match=r"b\.toml.*already"):
@@ -340,7 +340,7 @@ def test_missing_file_and_folder(like, tmp_path):
 def test_too_long_a_lens_for_a_stored_matrix(tmp_path):
     file_storage(tmp_path / "cam01.yml", rig_of()["cam01"])
     rig = rig_of(distortion=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)).select(("cam01",))
-    with pytest.raises(CalibrationError, match=r"cam01\.yml.*do not go into it.*Pose2Sim TOML"):
+    with pytest.raises(CalibrationError, match=r"cam01\.yml.*cannot hold the rig's numbers.*Pose2Sim TOML"):
         write_calibration_like(rig, tmp_path / "cam01.yml", tmp_path / "b.yml")
 
 

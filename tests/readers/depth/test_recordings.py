@@ -162,7 +162,7 @@ def test_a_colour_video_or_rubbish_is_no_depth(tmp_path):
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
         container.mux(stream.encode(av.VideoFrame(64, 48, "yuv420p")))
         container.mux(stream.encode())
-    with pytest.raises(ObservationError, match="mpeg4 yuv420p, which is no depth"):
+    with pytest.raises(ObservationError, match="mpeg4 yuv420p, not depth"):
         read_depth(tmp_path / "a.mp4")
     (tmp_path / "b.mkv").write_bytes(b"nothing" * 100)
     with pytest.raises(FileError, match="not a readable video"):
@@ -231,9 +231,9 @@ def test_times_from_names_and_their_gaps(tmp_path):
     np.testing.assert_allclose(video.times, [2.0, 2.033, 2.067, 2.167, 2.2])
     assert video.rate == pytest.approx(30, rel=0.02)
     assert video.gaps.tolist() == [3]
-    with pytest.raises(ObservationError, match=r"say 29\.85 Hz, not 15 Hz"):
+    with pytest.raises(ObservationError, match=r"give 29\.85 Hz, not 15 Hz"):
         read_depth(tmp_path / "a", time_unit=0.001, rate=15)
-    with pytest.raises(ObservationError, match="nothing tells its rate"):
+    with pytest.raises(ObservationError, match="its rate is not stated"):
         read_depth(tmp_path / "a", usual_rate=None)
 
 
@@ -248,21 +248,21 @@ def test_times_that_do_not_increase_name_the_frame(tmp_path, times, frame):
     ("make", "words"),
     [
         (lambda p: read_depth(p / "nothing"), "no such file or folder"),
-        (lambda p: read_depth(p), "no files in it"),
-        (lambda p: read_depth(png(p / "a"), unit=1.0), r"millimetres taken for metres.*unit = 0.001"),
+        (lambda p: read_depth(p), "it holds no files"),
+        (lambda p: read_depth(png(p / "a"), unit=1.0), r"probably millimetres.*unit = 0.001"),
         (lambda p: read_depth(npz(p / "a.npz", depth=METRES), unit=0.001), r"0.001 m a count is wrong.*unit = 1 "),
         (lambda p: read_depth(png(p / "a"), unit=-1), "a unit of -1 m"),
         (lambda p: read_depth(png(p / "a"), range=(5, 9)), r"nothing lies within.*depths go from 0\.8\d* to 2\.9"),
         (lambda p: read_depth(png(p / "a"), range=(3, 2)), "range 3 to 2 m"),
-        (lambda p: read_depth(png(p / "a", counts=0 * COUNTS)), "nothing was measured"),
-        (lambda p: read_depth(png(p / "a", counts=COUNTS // 256 * 0 + 65535)), "nothing was measured"),
-        (lambda p: read_depth(npz(p / "a.npz", depth=METRES * np.nan)), "nothing was measured"),
+        (lambda p: read_depth(png(p / "a", counts=0 * COUNTS)), "no frame has a depth value"),
+        (lambda p: read_depth(png(p / "a", counts=COUNTS // 256 * 0 + 65535)), "no frame has a depth value"),
+        (lambda p: read_depth(npz(p / "a.npz", depth=METRES * np.nan)), "no frame has a depth value"),
         (lambda p: read_depth(png(p / "a", counts=COUNTS.astype(np.uint8))), "8 bits in 1 channel"),
-        (lambda p: read_depth(raw(p / "a")), "size of the image is not given"),
+        (lambda p: read_depth(raw(p / "a")), "without a stated image size"),
         (lambda p: read_depth(raw(p / "a"), size=(64, 50)), "6144 bytes, but 64x50 px of 16 bits are 6400"),
         (lambda p: read_depth(npz(p / "a.npz", depth=np.zeros(4))), r"`depth` has shape \(4,\)"),
         (lambda p: read_depth(npz(p / "a.npz", times=np.arange(4))), r"\(4,\) times for 5 frames"),
-        (lambda p: read_depth(npz(p / "a.npz", unit=np.ones(2))), "`unit` is no number"),
+        (lambda p: read_depth(npz(p / "a.npz", unit=np.ones(2))), "`unit` is not a number"),
         (lambda p: read_depth(npz(p / "a.npz"), rate=0.0 - 3), "rate -3 Hz"),
         (lambda p: read_depth(npz(p / "a.npz"), time_offset=np.nan), "offset nan s"),
         (lambda p: read_depth(png(p / "a", ["a.png", "b.png", "c.tif"])), "several kinds: .png, .tif"),
@@ -322,9 +322,9 @@ def test_clouds_without_order(tmp_path):
     for i in range(3):
         cloud(tmp_path / f"{i}.pcd", 1000 * (x + (i, 0, 0)), 50)
     assert is_unordered(tmp_path) and not is_unordered(organised(tmp_path / "o"))
-    with pytest.raises(ObservationError, match="without the order of an image"):
+    with pytest.raises(ObservationError, match="without the rows of an image"):
         read_depth(tmp_path)
-    with pytest.raises(ObservationError, match="millimetres taken for metres"):
+    with pytest.raises(ObservationError, match="probably millimetres"):
         read_clouds(tmp_path)
     T = np.eye(4)
     T[:3, 3] = (0, 0, 7)

@@ -125,7 +125,7 @@ def test_a_camera_of_another_size_is_told_by_it(folder, rig):
         write_video(folder / name, size=size, frames=2)
     take, _, guess = taken(folder)
     assert [entry.video.name for entry in take.cameras] == ["s.mp4", "r.mp4", "q.mp4", "p.mp4"]
-    assert notes(guess, "camera").count("by the size of its picture") == 4
+    assert notes(guess, "camera").count("by its image size") == 4
 
 
 def test_two_recordings_of_one_session_are_kept_apart(folder, rig):
@@ -136,7 +136,7 @@ def test_two_recordings_of_one_session_are_kept_apart(folder, rig):
     take, _, guess = taken(folder)
     assert {entry.video.name for entry in take.cameras} == {f"jump_{name}.mp4" for name in rig.names}
     told = notes(guess, "video")
-    assert "jump_*: taken" in told and "walk_*: another recording" in told and "static_*: a static trial" in told
+    assert "jump_*: used" in told and "walk_*: another recording" in told and "static_*: a static trial" in told
     assert "# subject = " in guess.text
 
 
@@ -146,7 +146,7 @@ def test_files_of_no_camera_are_left_out(folder, rig):
     take, _, guess = taken(folder)
     assert [entry.name for entry in take.cameras] == ["cam01", "cam03"]
     assert "overview.mp4 fits no camera" in notes(guess, "video")
-    assert "cam02, cam04 of the calibration: nothing here fits" in notes(guess, "cameras")
+    assert "cam02, cam04 of the calibration: no file here fits" in notes(guess, "cameras")
 
 
 def test_videos_without_keypoints_go_to_the_detector(folder, rig):
@@ -218,7 +218,7 @@ def test_a_person_on_the_ceiling_is_no_certain_up(folder, motion, rig):
     write_mediapipe(folder, motion, own, [f"{name}.npy" for name in own.names])
     told = notes(guess_take(folder), "up")
     assert told.startswith("guess")
-    assert 'up = "z": the person stands so; but the cameras stand upright would give -z' in told
+    assert 'up = "z": the person stands upright; but the cameras stand upright would give -z' in told
 
 
 @pytest.mark.parametrize("keypoint_set", ["BODY_25", "BODY_25B", "COCO_17", "HALPE_26"])
@@ -349,7 +349,7 @@ def test_sizes_that_a_calibration_lacks_are_those_of_the_videos(folder, motion, 
     write_mediapipe(folder, motion, rig, [f"{name}.npy" for name in rig.names])
     _, seen, guess = taken(folder)
     assert {camera.size for camera in seen.rig} == {SIZE[::-1] if turned else SIZE}
-    assert f"likely calibration: no size of the images of {', '.join(rig.names)}" in notes(guess)
+    assert f"likely calibration: no image size of {', '.join(rig.names)}" in notes(guess)
     text = (folder / "take.toml").read_text()
     turn = re.sub(r"^(video = .*)$", r"\1\nrotation = 90", text, flags=re.M)
     (folder / "take.toml").write_text(turn)
@@ -423,7 +423,7 @@ def test_keypoints_of_another_recording_are_left_out(folder, motion, rig):
     write_videos(folder, [f"{name}.mp4" for name in rig.names], frames=60)
     write_mediapipe(folder, motion, rig, [f"{name}.npy" for name in rig.names])
     take, _, guess = taken(folder)
-    assert take.keypoints == () and "30 frames, the videos have 60: of another recording" in notes(guess)
+    assert take.keypoints == () and "30 frames, the videos have 60: another recording" in notes(guess)
 
 
 def test_keypoints_go_with_the_recording_that_shares_their_words(folder, motion, rig):
@@ -454,7 +454,7 @@ def test_videos_that_a_detector_drew_on_are_not_taken(folder, rig):
     write_videos(folder, [f"videos/more/{name}.mp4" for name in rig.names], frames=9)
     take, _, guess = taken(folder)
     assert {entry.video.parent for entry in take.cameras} == {folder / "videos"}
-    assert "pose/*_pose: another recording, or what a detector drew" in notes(guess, "video")
+    assert "pose/*_pose: another recording, or a detector's overlay" in notes(guess, "video")
 
 
 def test_what_kinefit_left_is_no_recording(folder, rig):
@@ -468,7 +468,7 @@ def test_what_kinefit_left_is_no_recording(folder, rig):
 
 def test_an_empty_folder_and_none(folder):
     (folder / "readme.txt").write_text("nothing")
-    with pytest.raises(TakeError, match="nothing here that a take is made of, among 1 files"):
+    with pytest.raises(TakeError, match="no videos, keypoints, markers or recordings among 1 files"):
         guess_take(folder)
     with pytest.raises(TakeError, match="no such folder"):
         guess_take(folder / "none")
@@ -477,7 +477,7 @@ def test_an_empty_folder_and_none(folder):
 def test_names_that_fit_nothing(folder, rig):
     write_calibration(rig, folder / "calibration.toml")
     write_videos(folder, ["kitchen.mp4", "garden.mp4"], frames=2)
-    with pytest.raises(TakeError, match="bear the name of its camera: cam01, cam02, cam03, cam04"):
+    with pytest.raises(TakeError, match="after its camera: cam01, cam02, cam03, cam04"):
         guess_take(folder)
 
 
@@ -490,7 +490,7 @@ def test_markers_alone(folder):
     (folder / "bad.c3d").write_bytes(b"\x02\x50")
     take, _, guess = taken(folder)
     assert [entry.file.name for entry in take.markers] == ["walk.trc"] and (take.up, take.rate) == ("y", 100.0)
-    assert "bad.c3d left out" in notes(guess) and '# file = "static.trc"' in guess.text
+    assert "bad.c3d not used" in notes(guess) and '# file = "static.trc"' in guess.text
     (folder / "walk.trc").unlink()
     (folder / "static.trc").unlink()
     with pytest.raises(TakeError, match="no marker file can be read"):
@@ -585,7 +585,7 @@ def test_a_calibration_of_one_camera_is_left_out_and_a_damaged_one_refused(folde
     write_calibration(Rig((rig["cam01"],)), folder / "cam01.toml")
     (folder / "docker-compose.yml").write_text("a: [1,")  # of something else
     guess = guess_take(folder)
-    assert any("cam01.toml is of one camera alone" in note.text for note in guess.notes)
+    assert any("cam01.toml has one camera only" in note.text for note in guess.notes)
     (folder / "cam01.toml").write_text('[cam01]\nmatrix = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n[cam02]\nmatrix = "x"\n')
     with pytest.raises(CalibrationError, match=r"cam01.toml.*no calibration can be used"):
         guess_take(folder)

@@ -53,7 +53,7 @@ def test_images_are_a_video(folder, pattern, video, picture):
 
 def test_photographs_of_no_camera_are_named(folder):
     write_images(folder / "a{}.png", COLOUR)
-    with pytest.raises(TakeError, match="name of its camera: cam01, cam02"):
+    with pytest.raises(TakeError, match="after its camera: cam01, cam02"):
         guess_take(folder)
 
 
@@ -63,4 +63,4 @@ def test_photographs_some_of_which_are_missing_are_no_video(folder):
     write_images(folder / "mask{}.png", MASK)
     with pytest.raises(TakeError, match="cam01, cam02") as told:
         guess_take(folder)
-    assert "nothing here" not in str(told.value)  # the one that is whole is looked at
+    assert "no videos, keypoints" not in str(told.value)  # the one that is whole is looked at

@@ -89,7 +89,7 @@ def test_the_largest_of_several_is_taken_and_others_are_told(tmp_path):
     colour(bag, "/other/image_raw").write(tmp_path / "large")
     guess, take = guessed(tmp_path)
     assert take.depth[0].file.is_relative_to(tmp_path / "large")
-    assert any("small.mcap" in note.text and "left out" in note.text for note in guess.notes)
+    assert any("small.mcap" in note.text and "not used" in note.text for note in guess.notes)
 
 
 def test_recordings_that_are_not_read_say_so(tmp_path):
@@ -111,5 +111,5 @@ def test_beside_markers_a_recording_is_only_told_of(tmp_path):
     write_trc(cut(squat_and_wave(), 0, 5), tmp_path / "walk.trc")
     depth(Bag(), "/depth/image_raw").write(tmp_path / "bag")
     guess = guess_take(tmp_path)
-    assert any(note.about == "recording" and "left out" in note.text for note in guess.notes)
+    assert any(note.about == "recording" and "not used" in note.text for note in guess.notes)
     assert "[[depth]]" not in guess.text

@@ -99,7 +99,7 @@ def test_a_topic_is_named_in_the_path(record):
     file = record({"/left/depth": ("16UC1", COUNTS), "/right/depth": ("16UC1", COUNTS[::-1])})
     for place in (file / "right" / "depth", file.parent / "right" / "depth"):  # of the file, or of its folder
         np.testing.assert_allclose(read_depth(place).frame(0).depth, COUNTS[3] * 0.001, rtol=1e-6)
-    with pytest.raises(ObservationError, match=r"no topic /front/depth; .* there are /left/depth, /right/depth"):
+    with pytest.raises(ObservationError, match=r"no topic /front/depth; .*: /left/depth, /right/depth"):
         read_depth(file / "front" / "depth")
 
 

@@ -58,7 +58,7 @@ def test_what_is_no_video_is_told(tmp_path):
     file = bag.images("/late", "mono8", GREY, start=late).images("/odd", "yuv422", RGB[..., :2]).write(tmp_path / "bag")
     for topic, error, told in (
         ("", ObservationError, "3 topics have images in colour or grey: /a, /b, /late"),
-        ("c", ObservationError, r"no topic /c; .* there are /a, /b, /late"),
+        ("c", ObservationError, r"no topic /c; .*: /a, /b, /late"),
         ("d", ObservationError, "/d has images of 16UC1, no image"), ("odd", ObservationError, "images of yuv422"),
         ("late", ObservationError, r"no image on the topic /late from 0.00 to 3.00 s"),
     ):  # fmt: skip

@@ -134,7 +134,7 @@ def test_bad_skeletons(read, old, new, message):
         ("arm 90 0", "leg 90 0", "line 9: no bone 'leg'; there are: root, arm, hand.*skeleton"),
         ("arm 90 0", "arm 90 0\narm 90 0", "frame 2 lacks or repeats arm"),
         ("\n2\n", "\n3\n", "line 7: frame 3 follows frame 1"),
-        ("1\n", "", "'root' stands before the first frame"),
+        ("1\n", "", "'root' comes before the first frame"),
         (AMC[AMC.index("1\n") :], "", "holds no frames"),
     ],
 )

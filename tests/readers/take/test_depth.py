@@ -69,7 +69,7 @@ def test_frames_that_are_missing_are_told(folder):
     ("depth", "head", "more", "words"),
     [
         ("", "rate = 30", "", "nothing states its intrinsics"),
-        (ALONE, "", "", "nothing tells its rate"),
+        (ALONE, "", "", "its rate is not stated"),
         (ALONE + "unit = 1", "rate = 30", "", "depth tof: the median depth is 101"),
         (ALONE + "range = [2, 3]", "rate = 30", "", "depth tof: nothing lies within the range of 2 to 3 m"),
         (ALONE + "range = [3, 2]", "rate = 30", "", r"depth tof: range = \[3.0, 2.0\]"),
@@ -83,10 +83,10 @@ def test_frames_that_are_missing_are_told(folder):
         (ALONE + "distortion = [0.1]", "rate = 30", "", "1 distortion coefficients"),
         ('camera = "tof"', "rate = 30", "", r"no \[calibration\]"),
         (ALONE + "far = 3", "rate = 30", "", "no key 'far'; there are: name"),
-        (ALONE, "rate = 30", '[calibration]\nfile = "rig.toml"', "intrinsics alone do not say where"),
+        (ALONE, "rate = 30", '[calibration]\nfile = "rig.toml"', "intrinsics alone do not give"),
         ('camera = "nix"', "rate = 30", '[calibration]\nfile = "rig.toml"', "no calibration of camera 'nix'"),
         ('camera = "rgb"', "rate = 30", '[calibration]\nfile = "rig.toml"', r"64x48 px, its calibration is of \(640"),
-        (ALONE, "rate = 30", '[[depth]]\nname = "tof"\nfile = "depth"', "two of this name"),
+        (ALONE, "rate = 30", '[[depth]]\nname = "tof"\nfile = "depth"', "two have this name"),
         (ALONE, "rate = 30\nframes = [40, 50]", "", r"images are from 0 to 0.633 s"),
         (ALONE + 'background = "nix"', "rate = 30", "", "no such file or folder"),
         (None, "rate = 30", '[[depth]]\nname = "a"\nfile = "depth/*.tif"', "no such file or folder"),
@@ -169,5 +169,5 @@ def test_clouds_on_one_segment(folder):
     assert seen.recordings == seen.clouds
     with pytest.raises(TakeError, match="'background' has no use with clouds"):
         load(folder, None, "rate = 10", more + 'background = "empty"\n')
-    with pytest.raises(TakeError, match="'segment' is of clouds of points"):
+    with pytest.raises(TakeError, match="'segment' is for clouds of points"):
         load(folder, ALONE + 'rate = 15\nsegment = "forearm_l"\n')

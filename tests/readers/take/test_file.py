@@ -178,7 +178,7 @@ def test_keypoints_take_the_times_of_the_video_beside_them(small, write_frames):
 
 
 def test_nothing_tells_the_rate(small):
-    with pytest.raises(TakeError, match="nothing states the rate"):
+    with pytest.raises(TakeError, match="the rate is not stated"):
         load(small, take_text(head=""))
 
 
@@ -225,12 +225,12 @@ WRONG = {
     "unknown option": (take_text(a='image = "cropped"'), r"\[\[camera\]\] 1, image: Invalid value 'cropped'.*'scaled'"),
     "unknown up": (take_text(head='up = "up"'), r"\[take\] up: Invalid value 'up'.*'-z'"),
     "wrong type": (take_text(head='rate = "fast"'), r"\[take\] rate: a number is expected, not a text"),
-    "file of wrong type": (take_text(a="video = 3"), r"\[\[camera\]\] 1, video: a file or folder is a text"),
+    "file of wrong type": (take_text(a="video = 3"), r"\[\[camera\]\] 1, video: a file or folder must be a text"),
     "missing key": (take_text(more='[[keypoints]]\nfile = "a"'), r"\[\[keypoints\]\] 3: there is no `camera`"),
     "one camera as table": ('[camera]\nname = "a"', r"'camera' is not a table \[\[camera\]\]"),
     "camera list of texts": ('camera = ["a"]', r"\[\[camera\]\] 1: not a table"),
     "unknown camera": (take_text(more='[[keypoints]]\ncamera = "c"\nfile = "a"'), "no camera 'c'; there are: a, b"),
-    "camera twice": (take_text(more='[[camera]]\nname = "a"'), "camera a: there are two"),
+    "camera twice": (take_text(more='[[camera]]\nname = "a"'), "camera a: two have this name"),
     "empty": ("", "an empty take"),
     "empty with head": ('[take]\nname = "x"', "an empty take"),
     "one camera of no known place beside a sensor of the world": (
@@ -288,7 +288,7 @@ def test_no_take_and_no_toml(tmp_path):
 
 
 def test_cameras_that_saw_nothing(small):
-    with pytest.raises(TakeError, match="nothing that they saw"):
+    with pytest.raises(TakeError, match="no video and no keypoints"):
         load(small, take_text().partition("[[keypoints]]")[0])
 
 

@@ -52,7 +52,7 @@ def test_the_same_as_json_and_in_the_videos_picture(tmp_path):
     lines = LINES.replace(".csv", ".json") + 'frame = "video"\n'
     (video,) = load(tmp_path, lines, camera='size = [128, 96]\nimage = "scaled"').lines
     np.testing.assert_allclose(video.frame(0).ends[0], [[4.75, 9.75], [14.75, 19.75]])
-    with pytest.raises(TakeError, match="not stated in which the lines are"):
+    with pytest.raises(TakeError, match="not stated which the lines use"):
         load(tmp_path, LINES, camera='size = [128, 96]\nimage = "scaled"')
 
 
@@ -91,11 +91,11 @@ def test_wrong_tables(tmp_path, table, kind, message, place):
 
 def test_no_list_of_objects_no_file_and_another_time(tmp_path):
     (tmp_path / "l.json").write_text("{}")
-    with pytest.raises(FileError, match="no list of objects"):
+    with pytest.raises(FileError, match="not a list of objects"):
         read_lines(tmp_path / "l.json", ("a",))
     with pytest.raises(FileError, match="cannot read"):
         read_lines(tmp_path / "none.csv", ("a",))
     with pytest.raises(KinefitError, match="its images are from 0 to 0.1 s"):
         load(tmp_path, head="rate = 30\nframes = [10, 20]")
-    with pytest.raises(TakeError, match="nothing states the rate"):
+    with pytest.raises(TakeError, match="the rate is not stated"):
         load(tmp_path, head="")

@@ -96,7 +96,7 @@ def test_steps_without_a_frame_have_the_same_names(folder):
 
 
 def test_what_cannot_be_is_told(folder):
-    with pytest.raises(TakeError, match="nothing states where the face is"):
+    with pytest.raises(TakeError, match="the place of the face is not stated"):
         load(folder, SKIN_ENTRY)
     with pytest.raises(KinefitError, match="no face at"):
         load(folder, SKIN_ENTRY + "face = [500, 40, 36, 50]\n").skin[0].frame(0)

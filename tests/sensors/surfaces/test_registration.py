@@ -104,5 +104,5 @@ def test_one_that_is_upside_down_is_named_and_is_not_written(walk, tmp_path):
     take, _, fit = fitted(walk, tmp_path, over, frames=4)
     (found,) = sensor_findings([fit], take)
     assert (found.severity, found.cameras) == ("fault", ("depth",))
-    assert found.text.startswith("depth hangs upside down, or is so stated") and "the person turned by 1" in found.text
+    assert found.text.startswith("depth hangs upside down, or its pose") and "the person turned by 1" in found.text
     assert Refined(None, misfits([fit])).moved == ()

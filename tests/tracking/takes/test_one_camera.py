@@ -83,7 +83,7 @@ def test_a_person_is_followed_in_space_by_one_camera(folder):
     sigma = motion.provenance["smoothing"]["pixel_sigma"]["phone"]
     assert set(sigma.values()) == {8.0}  # as stated, though nothing is left over but a jitter of 3 px
     assert {"phone", "lifted phone"} <= set(motion.residuals)
-    assert any("field of view of 64°, the usual one" in note for note in seen.notes)
+    assert any("field of view of 64°, the default" in note for note in seen.notes)
 
 
 def test_the_world_stands_on_the_floor(folder):
@@ -144,7 +144,7 @@ def test_a_camera_without_calibration_is_level_and_of_a_usual_lens(folder):
 
 BAD = {
     "too wide": (CAMERA + "field_of_view = 200.0\n" + DETECTED, TakeError, "field_of_view 200"),
-    "other keypoints": (CAMERA + DETECTED.replace('"detect"', '"openpose"'), TakeError, "do not tell how far"),
+    "other keypoints": (CAMERA + DETECTED.replace('"detect"', '"openpose"'), TakeError, "do not give a person"),
     "not lifted": (CAMERA + DETECTED, TrackingError, "kinefit detect --force"),
 }  # fmt: skip
 

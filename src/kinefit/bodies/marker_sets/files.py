@@ -134,7 +134,7 @@ def parsed(text: str, source: str) -> SetRecord:
         numbers: list[Any] = [entry.spread, *entry.offset, *(entry.at or ())]
         if (entry.landmark is None) == (entry.segment is None or entry.at is None):
             raise FileError(
-                "a marker sits on a landmark, or on a segment `at` a place", file=source, place=label,
+                "a marker needs a landmark, or a segment and a position `at`", file=source, place=label,
                 remedy='Such as { landmark = "r_asis" } or { segment = "thigh_r", at = [0.0, -0.2, 0.08] }.',
             )  # fmt: skip
         if not np.isfinite(numbers).all() or not entry.spread > 0:

@@ -64,7 +64,7 @@ def placement(body: Body, marker_set: str | PathLike[str] | MarkerPlacement) -> 
     record, source = find_record(marker_set, (*body.marker_sets, *placed_set_names()))
     if not record.markers:
         raise FileError(
-            "does not tell where its markers sit on a body", file=source, place="markers",
+            "has no positions of its markers on a body", file=source, place="markers",
             remedy=f"Add [markers] to a file of your own, or use one of: {', '.join(placed_set_names())}.",
         )  # fmt: skip
     return placed(body, record)
@@ -101,7 +101,7 @@ def find_placement(
         given = marker_set.name if isinstance(marker_set, MarkerPlacement) else marker_set
         sets = f"set '{given}'" if given else "any marker set"
         raise ObservationError(
-            f"only {count} of the labels are known to {sets}: {_listed(labels)}",
+            f"{sets} knows only {count} of the labels: {_listed(labels)}",
             remedy=f"Sets: {', '.join(str(n) for n in [*body.marker_sets, *placed_set_names()])}; or a file (--set): "
             "`kinefit markers set` writes a first one.",
         )
@@ -124,7 +124,7 @@ def known_set(body: Body, labels: Iterable[str], marker_set: str | None = None) 
     best = max(shared, key=lambda name: shared[name])
     if not shared[best]:
         raise ObservationError(
-            f"none of the labels is known to body '{body.name}': {_listed(tuple(sorted(labels)))}",
+            f"body '{body.name}' knows none of the labels: {_listed(tuple(sorted(labels)))}",
             remedy=f"Marker sets of the body: {', '.join(body.marker_sets) or 'none'}; or name its landmarks.",
         )
     return best

@@ -163,8 +163,8 @@ def _built(record: SetRecord, source: str) -> MarkerSet:
             at.setdefault(left, [x, y, -z])
     if unknown := sorted(set(record.places) - set(labels)):
         raise FileError(
-            f"places of labels that no segment has: {', '.join(unknown)}", file=source, place="places",
-            remedy="Add each to a segment's markers, or leave it out.",
+            f"`places` has labels that no segment has: {', '.join(unknown)}", file=source, place="places",
+            remedy="Add each to a segment's markers, or remove it.",
         )
     places = np.array([at.get(label, [np.nan] * 3) for label in labels])
     computed = [n for label in record.computed for n in (label, mirror(label)) if n]
@@ -174,7 +174,7 @@ def _built(record: SetRecord, source: str) -> MarkerSet:
 def _fault(s: MarkerSegmentRecord, name: str, parent: str | None, own: list[str], names: list[str]) -> tuple[str, str]:
     """What is wrong with a segment, and what to do; empty if nothing is."""
     if name in names:
-        return "a segment is there twice", "Give each its own name."
+        return "a segment appears twice", "Give each its own name."
     if (parent is None) != (not names):
         return "the first segment is the root; every other has a parent", "Put the root first, children after parents."
     if parent is not None and parent not in names:
@@ -185,5 +185,5 @@ def _fault(s: MarkerSegmentRecord, name: str, parent: str | None, own: list[str]
         return f"`loose` names {', '.join(unknown)}, which it does not have", "Give labels of its markers."
     numbers = [s.give, s.range, *s.loose.values(), *(s.joint or ())]
     if not np.isfinite(numbers).all() or min(s.give, s.range, *s.loose.values()) <= 0:
-        return "joint, give or range is not finite, or not positive", "Give metres, and degrees for the range."
+        return "joint, give or range is not finite, or not positive", "Give positive metres, and degrees for the range."
     return "", ""

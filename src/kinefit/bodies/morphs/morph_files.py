@@ -118,7 +118,7 @@ def _morph(record: MorphRecord, tree: KinematicTree, source: str) -> Operator:
     if record.kind == "local":
         assert record.centre and record.radii and record.shift
         if not all(radius > 0.0 for radius in record.radii):
-            raise BodyError(f"radii {list(record.radii)} of a bulge", remedy="Give positive ones; inf leaves one out.")
+            raise BodyError(f"radii {list(record.radii)} of a bulge", remedy="Give positive ones; inf is no limit.")
         placed = np.array(record.centre), np.array(record.radii), np.array(record.shift)
         return LocalMorph(*placed, steering, record.segment, tuple(record.on or ()), bool(record.moves))
     if record.kind == "surface":
@@ -151,7 +151,7 @@ def _joint_motion(record: MorphRecord, segment: str, tree: KinematicTree, steeri
     """One screw motion from a shift [m] and a rotation [deg] about the joint."""
     s = tree.segment(segment)
     if s == 0:
-        raise BodyError("the root has no joint that could move", remedy="Name a segment beyond a joint.")
+        raise BodyError("the root has no joint that could move", remedy="Name a segment that has a joint.")
     R = se3.exp_so3(np.radians(record.turn or (0.0, 0.0, 0.0)))
     xi = se3.log(se3.transform(R, np.array(record.shift or (0.0, 0.0, 0.0))))
     return JointMotion(segment, se3.adjoint(se3.transform(np.eye(3), tree.rest[s])) @ xi, steering)
@@ -172,7 +172,7 @@ def _entry(morph: Operator, tree: KinematicTree) -> str:
     s = morph.steering
     degrees = 1.0 if tree.prismatic[tree.coordinate(s.coordinate)] else 180.0 / math.pi
     if callable(s.weight):
-        raise BodyError("a weighting by a function has no place in a file", remedy="Give a table of t and ω.")
+        raise BodyError("a file cannot hold a weighting by a function", remedy="Give a table of t and ω.")
     weight = f'"{s.weight}"' if isinstance(s.weight, str) else _numbers(s.weight)
     lines = [f'angle = "{s.coordinate}"', f"start = {_number(s.start * degrees)}", f"end = {_number(s.end * degrees)}"]
     lines += [f"weight = {weight}"] + ["beyond = true"] * s.beyond
@@ -190,8 +190,8 @@ def _entry(morph: Operator, tree: KinematicTree) -> str:
     elif isinstance(morph, SegmentMorph):
         kind, own = "surface", [f'segment = "{morph.segment}"', f"surface = {_surfaces(morph)}"]
     else:
-        remedy = "Write the nodes to an OBJ file, and name it as `target`."
-        raise BodyError("a morph to nodes given one by one has no place in a body file", remedy=remedy)
+        remedy = "Write the nodes to an OBJ file, and name that as `target`."
+        raise BodyError("a body file cannot hold a morph to single nodes", remedy=remedy)
     return "\n".join(["[[morph]]", f'kind = "{kind}"', *own, *lines, ""])
 
 
@@ -200,7 +200,7 @@ def _surfaces(morph: SegmentMorph) -> str:
     for c in morph.surfaces:
         if not isinstance(c, TaperedCylinder):
             remedy = "Name its OBJ file in the body file."
-            raise BodyError("a morph to a mesh has no place in a body file", remedy=remedy)
+            raise BodyError("a body file cannot hold a morph to a mesh", remedy=remedy)
         side = f", side = {_numbers(c.side)}" if c.side is not None else ""
         radii = _numbers(np.array(c.radii))
         out.append(f"{{ start = {_numbers(c.start)}, end = {_numbers(c.end)}, radii = {radii}{side} }}")

@@ -91,7 +91,7 @@ class Morphing:
                 raise BodyError(choices(f"angle of body '{body.name}' named", name, tree.coordinates))
         motions = [(o, tree.segment(o.segment)) for o in self.operators if isinstance(o, JointMotion)]
         if any(s == 0 for _, s in motions):
-            raise BodyError("the root has no joint that could move", remedy="Name a segment beyond a joint.")
+            raise BodyError("the root has no joint that could move", remedy="Name a segment that has a joint.")
         self._motions: dict[int, list[JointMotion]] = {}
         for o, s in motions:
             self._motions.setdefault(s, []).append(o)
@@ -158,8 +158,8 @@ class Morphing:
         place, remedy = f"morph of {morph.segment}", "Give one for each of the segment's surfaces, of the same kind."
         meshes = [triangles(s, _AROUND, _ALONG) for s in body.surfaces]
         if sum(len(v) for v, _ in meshes) != len(self.mesh.vertices) or self.mesh is body.skin:
-            problem = "a segment's surface blends to another, but what is drawn is a skin or a mesh of other points"
-            raise BodyError(problem, place=place, remedy="Take a global morph of all its nodes.")
+            problem = "a segment's surface blends to another, but the body's skin or mesh has other points"
+            raise BodyError(problem, place=place, remedy="Use a global morph of all its nodes.")
         targets = list(morph.surfaces)
         if len(targets) != sum(s.segment == here for s in body.surfaces):
             raise BodyError(f"{len(targets)} surfaces as the target of others", place=place, remedy=remedy)
@@ -325,7 +325,7 @@ class MorphedPose:
             problem = f"points between nodes {chosen.shape} with shares {part.shape} and directions {n.shape}"
             raise BodyError(problem, remedy="Give (N, C), (N, C) and (N, 3).")
         if chosen.size and not 0 <= chosen.min() <= chosen.max() < len(skin.nodes):
-            raise BodyError(f"nodes that a surface of {len(skin.nodes)} does not have", remedy="Count from 0.")
+            raise BodyError(f"node numbers beyond the {len(skin.nodes)} of the surface", remedy="Count from 0.")
         nodes = skin.nodes if self.shift is None else skin.nodes + self.shift[:, None]
         drive_dof = np.array([d for d, _, _ in self.drives], np.int64)
         drive_segment = np.array([s for _, s, _ in self.drives], np.int64)

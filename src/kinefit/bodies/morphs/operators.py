@@ -99,7 +99,7 @@ class GlobalMorph:
         """
         if np.allclose(factors, 1.0):
             return self
-        problem = "a body that blends to nodes given one by one is to be stretched"
+        problem = "a body with a morph to single nodes cannot be stretched"
         raise BodyError(problem, remedy="Fit without lengths, or declare `surface` of a segment as the target.")
 
 
@@ -156,7 +156,7 @@ class LocalMorph:
 
     def __post_init__(self) -> None:
         if self.moves and self.segment is None:
-            raise BodyError("a bulge that moves with no segment", remedy="Name the segment that carries it.")
+            raise BodyError("a bulge that moves needs a segment", remedy="Name the segment that carries it.")
 
     def placed(self, tree: KinematicTree) -> LocalMorph:
         """The morph with its centre in the root frame at rest."""

@@ -82,7 +82,7 @@ def morphs_from_arrays(arrays: Mapping[str, NDArray], surfaces: FromArrays) -> t
         try:
             out.append(_morph(own, surfaces))
         except (KeyError, ValueError, TypeError) as error:
-            raise BodyError(f"arrays of morph {len(out)} are not what they should be ({error})") from error
+            raise BodyError(f"arrays of morph {len(out)} are wrong ({error})") from error
     return tuple(out)
 
 
@@ -127,5 +127,5 @@ def skin_from_arrays(arrays: Mapping[str, NDArray], n_segments: int) -> SkinnedM
         raise BodyError(f"no array 'skin/{missing[0]}'")
     skin = SkinnedMesh(*(arrays[f"skin/{name}"] for name in _SKIN))
     if skin.owners.size and skin.owners.max() >= n_segments:
-        raise BodyError("array 'skin/owners' names something that is not there")
+        raise BodyError("array 'skin/owners' names a segment that the body lacks")
     return skin

@@ -88,7 +88,7 @@ class Steering:
             problem = f"a morph steered by {self.coordinate} from {self.start} to {self.end}"
             raise BodyError(problem, remedy="Give two different angles.")
         if self.beyond and not (isinstance(self.weight, str) and self.weight == "linear"):
-            raise BodyError("a weighting that goes on beyond its ends must be linear", remedy="Leave out `beyond`.")
+            raise BodyError("a weighting that continues beyond its ends must be linear", remedy="Remove `beyond`.")
         self._function  # noqa: B018  raises its errors at construction
 
     @cached_property

@@ -105,7 +105,7 @@ class SurfaceAnchors:
             best[own], out.surface[own], out.face[own], out.at[own] = away[nearer], k, face, at
         if count and out.surface.min() < 0:
             name = body.tree.segments[int(self.segment[np.argmin(out.surface)])]
-            raise BodyError(f"segment '{name}' has no surface to be anchored on", remedy="Give it a surface.")
+            raise BodyError(f"segment '{name}' has no surface for anchors", remedy="Give it a surface.")
         for k in np.unique(out.surface):
             own = out.surface == k
             _, J = _mapped(body.surfaces[k], out.face[own], out.at[own])
@@ -202,4 +202,4 @@ def _check_correspondence(body: Body, other: Body) -> None:
     )  # fmt: skip
     if not alike:
         problem = f"surfaces of body '{other.name}' do not correspond to those of '{body.name}'"
-        raise BodyError(problem, remedy="Take a body of the same make: other lengths and widths, the same surfaces.")
+        raise BodyError(problem, remedy="Use a body with the same surfaces, of other lengths and widths.")

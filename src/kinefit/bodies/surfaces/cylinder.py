@@ -53,7 +53,7 @@ class TaperedCylinder:
             raise BodyError(problem, remedy="Give positive radii in metres, and finite ends.")
         length = float(np.linalg.norm(end - start))
         if length < 1e-9:
-            raise BodyError("a cylinder has no length", remedy="Let its end differ from its start.")
+            raise BodyError("a cylinder has no length", remedy="Give an end that differs from its start.")
         for name, value in (("start", start), ("end", end), ("side", _side(self.side, (end - start) / length))):
             object.__setattr__(self, name, tuple(value.tolist()))
         object.__setattr__(self, "segment", int(self.segment))
@@ -104,13 +104,13 @@ def _side(side: Vector | None, axis: NDArray) -> NDArray:
         side = (0.0, 1.0, 0.0) if abs(axis[0]) > 0.8 else (1.0, 0.0, 0.0)
     out = np.array(side, float)
     if out.shape != (3,) or not np.isfinite(out).all():
-        raise BodyError(f"the side of a cylinder is no direction: {side}", remedy="Give three finite numbers.")
+        raise BodyError(f"the side of a cylinder has no direction: {side}", remedy="Give three finite numbers.")
     if abs(out @ out - 1.0) < 1e-12 and abs(out @ axis) < 1e-12:
         return out
     out = out - (out @ axis) * axis
     norm = float(np.linalg.norm(out))
     if norm < 1e-6 * max(float(np.linalg.norm(side)), 1e-12):
-        raise BodyError("the side of a cylinder lies along its axis", remedy="Give one at right angles to it.")
+        raise BodyError("the side of a cylinder lies along its axis", remedy="Give a direction at right angles to it.")
     return out / norm
 
 

@@ -80,7 +80,7 @@ def surfaces_of(
         if is_cylinder + (record.mesh is not None) + is_series + is_contour + bool(record.balls) != 1:
             remedy = "Give `end` and `radii` of a cylinder, or `mesh`, the path of an OBJ file, "
             remedy += "or `fourier` and `grid`, or `contour`, or `balls`."
-            raise BodyError("a surface needs one shape", file=source, place=place, remedy=remedy)
+            raise BodyError("a surface needs exactly one shape", file=source, place=place, remedy=remedy)
         if record.mesh is not None:
             path = Path(source).parent / record.mesh
             out.append(mesh_surface(path, segment, unit=record.unit, mirror=record.mirror, place=place))

@@ -44,7 +44,7 @@ def _checked(samples: ArrayLike, axes: int) -> NDArray:
         remedy = f"Give {'(M, 3)' if axes == 1 else '(M1, M2, 3)'} with at least three along each parameter."
         raise BodyError(f"points of shape {points.shape} for a Fourier series", remedy=remedy)
     if not np.isfinite(points).all():
-        raise BodyError("points of a Fourier series that are not finite", remedy="Leave them out and sample anew.")
+        raise BodyError("points of a Fourier series that are not finite", remedy="Remove them and sample again.")
     return points
 
 
@@ -253,7 +253,7 @@ def by_length(points: ArrayLike, count: int) -> NDArray:
     ring = np.concatenate([x, x[:1]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ring, axis=0), axis=1))])
     if along[-1] == 0.0:
-        raise BodyError("a contour of one point", remedy="Give points that are apart.")
+        raise BodyError("a contour of one point", remedy="Give points at different positions.")
     at = np.arange(count) * (along[-1] / count)
     return np.stack([np.interp(at, along, ring[:, k]) for k in range(3)], 1)
 

@@ -48,12 +48,12 @@ class MeshSurface:
             raise BodyError(problem, remedy="Give (V, 3) and (T, 3).")
         if not np.isfinite(vertices).all():
             line = int(np.flatnonzero(~np.isfinite(vertices).all(1))[0])
-            raise BodyError(f"vertex {line} of a mesh is not finite", remedy="Leave out it and its faces.")
+            raise BodyError(f"vertex {line} of a mesh is not finite", remedy="Remove it and its faces.")
         if faces.size and faces.dtype.kind not in "iu":
             raise BodyError(f"a mesh has faces of {faces.dtype} numbers", remedy="Give the indices of vertices.")
         faces = faces.astype(np.int64)
         if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
-            problem = f"a mesh of {len(vertices)} vertices has faces of vertices that are not there, or no faces"
+            problem = f"a mesh of {len(vertices)} vertices has faces with vertex numbers out of range, or no faces"
             raise BodyError(problem, remedy="Count vertices from 0.")
         vertices.flags.writeable = faces.flags.writeable = False
         object.__setattr__(self, "segment", int(self.segment))
@@ -137,7 +137,7 @@ def check_triangles(vertices: NDArray, faces: NDArray) -> None:
 
 def _check(vertices: NDArray, faces: NDArray, open_edges: NDArray) -> None:
     if not len(faces):
-        raise BodyError("all faces of a mesh are without area", remedy="Is it in metres?")
+        raise BodyError("all faces of a mesh have no area", remedy="Check that it is in metres.")
     edges, count, balance = _edges(faces)
     flipped = edges[(count % 2 == 0) & (balance != 0)]
     if len(flipped):
@@ -157,7 +157,7 @@ def _check(vertices: NDArray, faces: NDArray, open_edges: NDArray) -> None:
         volume = float(np.einsum("ti,ti->", a, np.cross(b, c))) / 6.0
         if volume <= 0.0:
             problem = f"a mesh's part of {len(part)} faces is inside out or flat (volume {volume:.3g} m³)"
-            raise BodyError(problem, remedy="List the corners of its faces the other way round; leave out inner walls.")
+            raise BodyError(problem, remedy="Reverse the order of corners of its faces; remove inner walls.")
 
 
 @cache

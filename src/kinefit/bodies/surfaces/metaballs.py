@@ -170,7 +170,7 @@ def _mesh(centres: NDArray, radii: NDArray, weights: NDArray, axes: NDArray) -> 
     hollow = _field(middles, *balls) < LEVEL
     if hollow.any():
         at = np.round(middles[np.argmax(hollow)], 3).tolist()
-        problem = f"metaballs do not melt into one: their field is below 1/2 near {at} m"
+        problem = f"metaballs do not join: their field is below 1/2 near {at} m"
         raise BodyError(problem, remedy="Give larger radii along the limb, or another ball between them.")
     side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
     side /= np.linalg.norm(side)
@@ -190,7 +190,7 @@ def _spine(centres: NDArray, radii: NDArray, axes: NDArray) -> tuple[NDArray, ND
     along = centres[-1] - centres[0]
     size = float(np.linalg.norm(along))
     if size < 1e-6:
-        raise BodyError("the first and the last metaball are in one place", remedy="Give them along the limb.")
+        raise BodyError("the first and the last metaball are at the same position", remedy="Give them along the limb.")
     along = along / size
     height = centres @ along
     if (np.diff(height) <= 0).any():

@@ -52,7 +52,7 @@ def read_obj(path: str | PathLike[str]) -> tuple[NDArray, NDArray]:
             raise BodyError(problem, file=path, place=f"line {number}", remedy=remedy) from error
         corners = [c - 1 if c > 0 else len(vertices) + c for c in corners]
         if len(corners) < 3 or min(corners) < 0 or max(corners) >= len(vertices):
-            problem = f"a face of {len(corners)} vertices, or of some that do not stand above it: '{line[:60]}'"
+            problem = f"a face of {len(corners)} vertices, or with vertices that are not yet defined: '{line[:60]}'"
             remedy = "A face lists three vertices or more, counted from 1."
             raise BodyError(problem, file=path, place=f"line {number}", remedy=remedy)
         faces += [(corners[0], corners[k], corners[k + 1]) for k in range(1, len(corners) - 1)]

@@ -65,7 +65,7 @@ def triangles(surface: TaperedCylinder | MeshSurface, around: int = 20, along: i
     if isinstance(surface, MeshSurface):
         return surface.vertices, surface.faces
     if around < 3 or along < 1:
-        raise BodyError(f"no cylinder has {around} corners and {along} rings", remedy="Take at least 3 and 1.")
+        raise BodyError(f"a cylinder cannot have {around} corners and {along} rings", remedy="Give at least 3 and 1.")
     a, b, axis = surface.axes
     turn = 2.0 * math.pi / around
     angle, t = turn * np.arange(around), np.linspace(0.0, 1.0, along + 1)[:, None]

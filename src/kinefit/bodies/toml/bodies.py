@@ -134,13 +134,13 @@ def _record(text: str, source: str, above: tuple[str, ...] = ()) -> FileRecord:
     most = max(len(record.segment), len(record.coupling), len(record.closure), len(record.dimension))
     if most > _MAX_SEGMENTS:
         problem = f"{most} segments, couplings, closures or dimensions, more than {_MAX_SEGMENTS}"
-        raise BodyError(problem, file=source, remedy="Leave out what does not move by itself.")
+        raise BodyError(problem, file=source, remedy="Merge segments that do not move on their own.")
     base = record.body.base
     if base is None:
         return record
     if base in above:
-        problem = f"bases that go round in a circle: {', '.join((*above, base))}"
-        raise BodyError(problem, file=source, place="body.base", remedy="Leave one out.")
+        problem = f"`base` entries form a cycle: {', '.join((*above, base))}"
+        raise BodyError(problem, file=source, place="body.base", remedy="Remove one.")
     try:
         below, file = _text(base if not base.endswith(".toml") else Path(source).parent / base)
     except BodyError as error:
@@ -241,7 +241,7 @@ def _tree(segments: list[SegmentRecord], index: dict[str, int], source: str) -> 
             )
         if i == 0 and any(j.at):
             raise BodyError(
-                "the root's joint is the origin of the body", file=source, place=place, remedy="Leave out `at`."
+                "the root's joint is the origin of the body", file=source, place=place, remedy="Remove `at`."
             )
         _finite(j.at, source, place)
         if j.type == "free" and i == 0:
@@ -263,7 +263,7 @@ def _tree(segments: list[SegmentRecord], index: dict[str, int], source: str) -> 
             norm = np.linalg.norm(axis)
             if not 1e-9 < norm < np.inf:
                 raise BodyError(
-                    f"axis {axes[k]!r} of {coordinates[k]} is no direction",
+                    f"axis {axes[k]!r} of {coordinates[k]} has no direction",
                     file=source,
                     place=place,
                     remedy='Use "x", "-y", ... or three numbers that are not all zero.',

@@ -83,7 +83,7 @@ def closed(
     """
     if body.morphs:
         problem = "closures of a body whose joints or surfaces morph"
-        raise BodyError(problem, file=source, place="closure", remedy="Leave out the morphs, or the closures.")
+        raise BodyError(problem, file=source, place="closure", remedy="Remove the morphs, or the closures.")
     for what, names in (("closure", [c.name for c in closures]), ("dimension", [d.name for d in dimensions])):
         if twice := sorted(repeated(names)):
             raise BodyError(f"{what} named twice: {', '.join(twice)}", file=source, remedy="Rename one of them.")
@@ -117,9 +117,9 @@ def _closure(body: Body, r: ClosureRecord, source: str) -> Closure:
     if (r.kind in _KINDS_WITH_AXIS) != (r.axis is not None):
         raise wrong(f"a {r.kind} closure with axis {r.axis}", "Give an axis to lines and planes, and to no other.")
     if r.turn is not None and r.kind != "rigid":
-        raise wrong(f"a {r.kind} closure with a turn", "Leave it out: only rigid closures hold turns.")
+        raise wrong(f"a {r.kind} closure with a turn", "Remove it: only rigid closures constrain rotation.")
     if r.mode == "hard" and (r.sigma is not None or r.turn_sigma is not None):
-        raise wrong("a hard closure with a standard deviation", 'Leave it out, or set mode = "soft".')
+        raise wrong("a hard closure cannot have a standard deviation", 'Remove it, or set mode = "soft".')
     sigma = Closure.sigma if r.sigma is None else r.sigma
     sigmas = (sigma, 2.0 if r.turn_sigma is None else r.turn_sigma, r.std, r.turn_std)
     if not all(0.0 < s < np.inf for s in sigmas):
@@ -164,14 +164,14 @@ def _dimension(body: Body, r: DimensionRecord, source: str) -> tuple[Dimension, 
         raise wrong(f"value = {r.value!r}", 'Give a number, or "estimate".')
     estimated = isinstance(r.value, str)
     if estimated and (r.std is None or not 0.0 < r.std < np.inf):
-        raise wrong(f"a value to estimate with std = {r.std}", "Give `std`, what it may differ from `mean` by.")
+        raise wrong(f"a value to estimate with std = {r.std}", "Give `std`, its standard deviation about `mean`.")
     closures = {c.name: c for c in body.closures}
     if not r.moves:
         raise wrong("it moves nothing", "Name landmarks, segments or closures in `moves`.")
     for name in r.moves:
         kinds = [name in closures, name in body.landmarks.names, name in body.tree.segments]
         if sum(kinds) != 1:
-            problem = f"'{name}' is " + ("a name of several things" if sum(kinds) else "nothing of the body")
+            problem = f"'{name}' is " + ("a name with several meanings" if sum(kinds) else "nothing of the body")
             raise wrong(problem, "Name landmarks, segments or closures of this body.")
         if r.about is not None and not (kinds[0] and closures[name].kind == "rigid"):
             raise wrong(f"an angle that moves '{name}'", "Angles turn rigid closures, and nothing else.")
@@ -180,7 +180,7 @@ def _dimension(body: Body, r: DimensionRecord, source: str) -> tuple[Dimension, 
     stated = [r.mean, None if isinstance(r.value, str) else r.value]
     numbers = [r.drawn, *(r.along or r.about or ()), *(number for number in stated if number is not None)]
     if not (np.abs(numbers) < _MAX_DIMENSION).all():
-        raise wrong("numbers that are not finite, or no dimensions of anything", "Give metres and degrees.")
+        raise wrong("numbers are not finite, or not a dimension", "Give metres and degrees.")
     axis = (0.0, 0.0, 0.0)
     if r.about is not None:
         unit_axis = _unit(r.about)

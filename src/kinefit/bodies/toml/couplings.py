@@ -42,7 +42,7 @@ def coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord], source: st
             line[tree.coordinate(name)] = weight
         if not (np.isfinite(line).all() and line.any() and 0.0 < c.spread < np.inf):
             problem = f"spread {c.spread}, weights {list(c.of.values())}"
-            raise BodyError(problem, file=source, place=place, remedy="Give a positive spread, and weights besides 0.")
+            raise BodyError(problem, file=source, place=place, remedy="Give a positive spread, weights other than 0.")
         if tree.prismatic[line != 0.0].any():
             raise BodyError("it couples a coordinate that slides", file=source, place=place, remedy="Couple angles.")
         line /= np.radians(c.spread)

@@ -134,7 +134,7 @@ def check_cameras(names: Collection[str]) -> None:
     """Raise CalibrationError for fewer than two cameras."""
     if len(names) < 2:
         problem = f"{len(names)} camera: a bar calibrates two or more together"
-        raise CalibrationError(problem, remedy="Give what two cameras or more saw at the same times.")
+        raise CalibrationError(problem, remedy="Give recordings of two or more cameras at the same times.")
 
 
 def _camera(name: str, views: BarViews, interiors: Rig | None) -> Camera:
@@ -170,7 +170,7 @@ def _adjusted(
             raise CalibrationError(
                 f"it shares {count} places with the cameras before it ({', '.join(rig.names)}), of which "
                 f"{100 * share:.0f} % agree", place=f"camera {cameras[c].name}",
-                remedy=f"Is it in step? Wave the bar where it and another camera see it, {MIN_PLACES} times or more.",
+                remedy=f"Check that it is in step. Wave the bar in {MIN_PLACES} places that two cameras see.",
             )  # fmt: skip
         members, rig = [*members, c], Rig((*rig, camera))
         rig, _, _ = _grown(rig, uv[:, members], length, known)
@@ -212,7 +212,7 @@ def _check_count(used: int, total: int) -> None:
     if used < MIN_PLACES:
         raise CalibrationError(
             f"the cameras agree on {used} of {total} places of the bar",
-            remedy="Are the videos in step, and the two targets the brightest spots that move? Wave it in 50 places.",
+            remedy="Check that the videos are in step and the targets the brightest moving spots. Use 50 places.",
         )  # fmt: skip
 
 
@@ -220,7 +220,7 @@ def _check(bundle: BarBundle, length: float, known: bool, seen: Mapping[str, Bar
     if bundle.scatter > _MAX_SCATTER * length:
         raise CalibrationError(
             f"the distance of the two targets scatters by {100 * bundle.scatter / length:.1f} % from place to place",
-            remedy="Are the videos in step, and the two brightest spots always those of one stiff bar?",
+            remedy="Check that the videos are in step and the two brightest spots always on one stiff bar.",
         )
     P = POSE + len(INTERIOR) * (not known)
     std = np.sqrt(np.diag(bundle.covariance)).reshape(-1, P)
@@ -229,19 +229,19 @@ def _check(bundle: BarBundle, length: float, known: bool, seen: Mapping[str, Bar
         if used < MIN_PLACES:
             raise CalibrationError(
                 f"only {used} of its {len(seen[camera.name].ends)} images of the bar agree with the other cameras",
-                place=f"camera {camera.name}", remedy="Is it in step? Wave the bar where it and another camera see it.",
+                place=f"camera {camera.name}", remedy="Check that it is in step. Wave the bar in view of two cameras.",
             )  # fmt: skip
         if not known and not std[c, POSE] < _MAX_RELATIVE_STD * camera.matrix[0, 0]:
             raise CalibrationError(
                 f"the focal length is not determined: {camera.matrix[0, 0]:.0f} px may be off by "
                 f"{100 * std[c, POSE] / camera.matrix[0, 0]:.0f} %", place=f"camera {camera.name}",
-                remedy="Wave the bar near and far, in all directions, set the cameras apart, or give --interiors.",
+                remedy="Wave the bar near and far, in all directions, move the cameras apart, or give --interiors.",
             )  # fmt: skip
     farthest = max(float(np.linalg.norm(camera.centre_world)) for camera in bundle.rig)
     position_std = float(np.sqrt((std[:, :3] ** 2).sum(axis=1)).max())
     if position_std > _MAX_RELATIVE_STD * farthest:
         raise CalibrationError(
-            f"where the cameras stand is known to {position_std:.2f} m only, of {farthest:.2f} m between them",
+            f"the cameras' positions have a standard deviation of {position_std:.2f} m, at {farthest:.2f} m apart",
             remedy="Wave the bar near and far and in all directions, and set the cameras 20 degrees apart or more.",
         )
 
@@ -254,7 +254,7 @@ def _check_second(bundle: BarBundle, length: float, sigma: float, known: tuple[s
     relative_std = np.hypot(_TAPE_SIGMA, sigma / length)
     if abs(np.log(found / metres)) > _MAX_DISTANCE_SIGMAS * relative_std:
         raise CalibrationError(
-            f"with a bar of {length:g} m they stand {found:.3f} m apart, not {metres:g} m",
+            f"with a bar of {length:g} m they are {found:.3f} m apart, not {metres:g} m",
             place=f"cameras {a} and {b}",
             remedy=f"Measure both again, from centre to centre; a bar of {length * metres / found:.4g} m would agree.",
         )

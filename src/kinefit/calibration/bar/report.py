@@ -111,5 +111,5 @@ def advice_of(rig: Rig, reports: Mapping[str, BarCameraReport]) -> list[str]:
             out.append(f"{camera.name}: focal length known to {part:.1f} % only; wave the bar nearer and farther.")
         if report.assumed:
             names = ", ".join(report.assumed)
-            out.append(f"{camera.name}: {names} rest on what lenses usually have; cover its image better.")
+            out.append(f"{camera.name}: {names} come mostly from the prior; cover its image better.")
     return out

@@ -97,17 +97,17 @@ def first_pairs(cameras: Sequence[Camera], uv: NDArray, known: bool, length: flo
             continue
         b = np.where(order[:, None, None], b[:, ::-1], b)
         if _is_flat(a[inside], b[inside], limit):
-            reasons[f"all places that {name} share lie in one plane, or they stand all but in one place"] = 1.0
+            reasons[f"all places that {name} share lie in one plane, or both cameras are nearly in one place"] = 1.0
             continue
         for metric, gain in _metric((cameras[i], cameras[j]), F, a[inside], b[inside], known, length):
             pairs.append(Pair(i, j, metric, share, gain * share))
     if not pairs:
-        worst = max(reasons, key=reasons.__getitem__, default="no two cameras see it from sides that differ")
+        worst = max(reasons, key=reasons.__getitem__, default="no two cameras see it from different sides")
         flatness = "plane" in worst
         raise CalibrationError(
-            f"the targets do not determine how the cameras stand: {worst}",
+            f"the targets do not determine the cameras' poses: {worst}",
             remedy="Wave the bar near and far, high and low, in all directions." if flatness
-            else "Are the videos in step, and the two targets the brightest spots? Set the cameras farther apart.",
+            else "Check that the videos are in step and the targets the brightest spots. Move the cameras apart.",
         )  # fmt: skip
     return sorted(pairs, key=lambda pair: -pair.worth)
 

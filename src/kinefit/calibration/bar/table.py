@@ -48,8 +48,8 @@ def read_centroids(
                 try:
                     frame, uv = int(row["frame"]), [float(row["u"]), float(row["v"])]
                 except (TypeError, ValueError):
-                    raise FileError("a frame, u or v that is no number", file=path, place=f"line {line}",
-                                    remedy="Correct it, or leave the row out.") from None  # fmt: skip
+                    raise FileError("a frame, u or v is not a number", file=path, place=f"line {line}",
+                                    remedy="Correct it, or remove the row.") from None  # fmt: skip
                 if np.isfinite(uv).all():
                     spots.setdefault(str(row["camera"]).strip(), {}).setdefault(frame, []).append(uv)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -73,5 +73,5 @@ def read_centroids(
             )
         out[name] = BarViews((int(size[0]), int(size[1])), ends, len(frames))
     if not out:
-        raise FileError("no targets in it", file=path, remedy="Write a row for each target: camera,frame,u,v.")
+        raise FileError("it holds no targets", file=path, remedy="Write a row for each target: camera,frame,u,v.")
     return out

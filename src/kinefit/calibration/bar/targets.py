@@ -139,6 +139,6 @@ def _background(camera: NumberedImages | Frames) -> NDArray | None:
 def _raise_unseen(name: str, counts: list[int]) -> None:
     most = max(set(counts), key=counts.count) if counts else 0
     raise CalibrationError(
-        f"two bright targets are seen in none of {len(counts)} images; most have {most}", place=f"camera {name}",
-        remedy="Darken the room or the exposure until the two targets are by far the brightest things that move.",
+        f"none of {len(counts)} images shows two bright targets; most show {most}", place=f"camera {name}",
+        remedy="Darken the room or the exposure until the two targets are much brighter than all else that moves.",
     )

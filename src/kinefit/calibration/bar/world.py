@@ -45,7 +45,7 @@ def on_floor(rig: Rig, x_world: NDArray, frames: NDArray, floor: Sequence[int]) 
     size, axes = np.linalg.svd(points - middle)[1:]
     if len(floor) < 2 or size[1] < _MIN_FLOOR_ASPECT * size[0]:
         raise CalibrationError(
-            "the bar on the floor lies along one line, which leaves open what is up", place="floor",
+            "the bar on the floor lies along one line, which does not determine the vertical", place="floor",
             remedy="Lay it there in two directions, and give a frame of each.",
         )  # fmt: skip
     above = np.mean([camera.centre_world for camera in rig], axis=0) - middle

@@ -136,7 +136,7 @@ def _interiors_only(
     board: Board, seen: Mapping[str, CameraViews], cameras: dict[str, Camera], single: dict[str, Interiors]
 ) -> BoardCalibration:
     if not single:
-        raise CalibrationError("intrinsics are given and extrinsics not wanted", remedy="Leave out one of the two.")
+        raise CalibrationError("intrinsics are given, but extrinsics are not wanted", remedy="Remove one of the two.")
     reports = {
         name: BoardCameraReport(
             own.rms_px, own.rms_px, len(seen[name].views), len(own.frames), own.coverage, own.focal_std, np.inf
@@ -146,7 +146,7 @@ def _interiors_only(
     rms = float(np.sqrt(np.mean([own.rms_px**2 for own in single.values()])))
     rig = Rig(tuple(cameras.values()))
     advice = tuple(_advice(rig, reports, {}, 1))
-    return BoardCalibration(rig, board, reports, rms, rms, {}, (0.0, 0.0), "Interiors alone: no poses.", advice)
+    return BoardCalibration(rig, board, reports, rms, rms, {}, (0.0, 0.0), "Intrinsics alone: no poses.", advice)
 
 
 def _in_world(bundle: BoardBundle, placed: Placed, floor: int | None, board: Board) -> tuple[Rig, str]:

@@ -163,9 +163,9 @@ def _raise_unconnected(names: list[str], placed: set[str], shared: Mapping[tuple
     if common:
         (a, b), n = max(common.items(), key=lambda item: item[1])
         raise CalibrationError(
-            f"{a} and {b} see the board in {n} common frames, which do not agree on where they stand",
+            f"{a} and {b} see the board in {n} common frames, but these contradict each other about the poses",
             place=f"cameras {group} against {', '.join(rest)}",
-            remedy="Are their frames taken at the same times, and the images not mirrored? Give synchronised videos.",
+            remedy="Give synchronised videos that are not mirrored.",
         )
     raise CalibrationError(
         f"no frame in which one of {group} and one of {', '.join(rest)} see the board",

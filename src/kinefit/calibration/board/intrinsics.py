@@ -56,7 +56,7 @@ def calibrate_interiors(name: str, seen: CameraViews, board: Board) -> Interiors
     views = _spread([view for view in seen.views if len(view.ids) >= 8 or len(board.corners) < 8], seen.size)
     if len(views) < MIN_VIEWS:
         raise CalibrationError(
-            f"the board is seen in {len(views)} images that show enough of it",
+            f"only {len(views)} images show enough of the board",
             place=place,
             remedy=f"Record {MIN_VIEWS} or better 20 views, turned by 20 to 45 degrees, over the whole image.",
         )

@@ -52,7 +52,7 @@ class NumberedImages:
             raise CalibrationError(
                 f"has {size[0]}x{size[1]} px, the images before it {self.size[0]}x{self.size[1]}",
                 file=self.files[frame],
-                remedy="Calibrate images of one size; sort the others out.",
+                remedy="Calibrate images of one size; remove the others.",
             )
         return image
 
@@ -120,7 +120,7 @@ def camera_sources(paths: Iterable[str | PathLike[str]]) -> dict[str, Path | dic
                     add(name, dict(enumerate(listed)), path)
         if not (videos or images or any(folders.values())):
             raise FileError(
-                "no video and no image in it", file=path,
+                "it holds no video and no image", file=path,
                 remedy=f"Known are {', '.join(_VIDEO_ENDINGS + _IMAGE_ENDINGS)}.",
             )  # fmt: skip
     return found
@@ -227,7 +227,7 @@ def _check_lengths(lengths: Mapping[str, int]) -> None:
     if lengths and max(lengths.values()) - min(lengths.values()) > _MAX_LENGTH_DIFFERENCE:
         listed = ", ".join(f"{name} {count}" for name, count in lengths.items())
         raise CalibrationError(
-            f"the videos have different numbers of frames ({listed}), so frames of one number are not of one time",
+            f"the videos have different numbers of frames ({listed}), so frames with one number differ in time",
             remedy="Cut them so that they begin and end together.",
         )
 
@@ -242,17 +242,17 @@ def _raise_unseen(board: Board, unseen: list[str], opened: Mapping[str, Numbered
     place = f"camera{'s' * (len(unseen) > 1)} {', '.join(unseen)}"
     if others:
         raise CalibrationError(
-            f"the board {board} is never seen there, though other cameras see it",
+            f"the board {board} is not found there, but other cameras see it",
             place=place,
-            remedy="Show the board to every camera, near enough that its squares are 20 px or more; or leave it out.",
+            remedy="Show the board to every camera, so near that its squares are 20 px or more; or remove the camera.",
         )
     images = [image for name in unseen for image in sample(opened[name], _SUGGESTION_IMAGES)]
     fits = fitting_boards(board, images[: 2 * _SUGGESTION_IMAGES])
     tried = "other dictionaries, the legacy pattern and the board turned" if board.kind == "charuco" else "other sizes"
-    found = f"there is one that reads as --board {fits[0]}" if fits else f"nor with {tried}"
+    found = f"one fits --board {fits[0]}" if fits else f"nor with {tried}"
     size = "squares" if board.kind == "charuco" else "inner corners, which are one less than squares"
     raise CalibrationError(
-        f"no board {board} is seen; {found}",
+        f"no board {board} is found; {found}",
         place=place,
         remedy=f"Check columns and rows (of {size}) and that the images are sharp and the board whole.",
     )
@@ -265,7 +265,7 @@ def _check_whole(board: Board, seen: Mapping[str, CameraViews], opened: Mapping[
         size, larger = sorted(board.size), sorted(other.size)
         if size != larger and all(a <= b for a, b in zip(size, larger)):
             raise CalibrationError(
-                f"{board} is only a part of the board that is seen, {other}",
+                f"{board} is only a part of the board in view, {other}",
                 place=f"cameras {', '.join(opened)}",
                 remedy=f"Give --board {other}, if its squares have that size.",
             )

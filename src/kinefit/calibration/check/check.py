@@ -90,14 +90,14 @@ def _others(person: PersonKeypoints, asked: bool) -> list[Finding]:
     """A note on other people in view."""
     if len(person.people) < 2:
         return []
-    why = "" if asked else ", who moves most and so shows most of the cameras' errors"
+    why = "" if asked else ", who moves most and so shows the cameras' errors best"
     text = f"{len(person.people)} people are in view; the check is by person {person.number}{why}."
-    return [Finding("note", "people", text, remedy="Another: write person = 2 to [take], or whichever it is.")]
+    return [Finding("note", "people", text, remedy="For another person, write person = 2 (or its number) into [take].")]
 
 
 def _of_depth_alone(take: Take, seen: Observations) -> list[Finding]:
     """Findings of a take with depth cameras alone: an upside-down image of the person."""
-    text = "Depth alone: where its cameras stand is not checked."
+    text = "Depth alone: the poses of its cameras are not checked."
     found = [Finding("note", "load", text, remedy="Add videos of two cameras, whose keypoints show the person.")]
     try:
         recording, body = recording_of(take, seen, load_body(take.body))
@@ -114,14 +114,14 @@ def _with_sensors(check: Check, progress: Progress | None) -> Check:
         return check
     fits: tuple[SensorAlignment, ...] = ()
     if check.faults:
-        text = "Whether other sensors fit the videos was not looked at: first the faults must be fixed."
+        text = "The fit of other sensors to the videos is not checked: correct the faults first."
         found = [Finding("note", "sensor", text)]
     else:
         try:
             fits = fit_sensors(take, seen, progress=progress)
             found = sensor_findings(fits, take)
         except KinefitError as error:
-            text = f"Whether other sensors fit the videos cannot be determined: {error.problem}."
+            text = f"The fit of other sensors to the videos cannot be determined: {error.problem}."
             found = [Finding("note", "sensor", text, remedy=error.remedy or "")]
     return replace(check, findings=ranked([*check.findings, *found]), sensors=fits)
 
@@ -186,7 +186,7 @@ def _known_cameras(take: Take, rig: Rig, findings: list[Finding]) -> Take:
     """The take without cameras that the calibration lacks; adds a finding for each."""
     unknown = [entry.name for entry in take.cameras if entry.name not in rig]
     for name in unknown:
-        text = f"{name} is not in the calibration, which has {', '.join(rig.names)}; it is left out."
+        text = f"{name} is not in the calibration, which has {', '.join(rig.names)}; it is not used."
         remedy = "Correct its name in the take, or calibrate it too."
         findings.append(Finding("fault", "load", text, (name,), remedy=remedy))
     return _only(take, [entry.name for entry in take.cameras if entry.name in rig]) if unknown else take
@@ -208,9 +208,9 @@ def _framed_keypoints(take: Take, rig: Rig, findings: list[Finding]) -> Take:
         differs = entry.image != "as calibrated" or entry.rotation != 0
         if source.frame is None and differs and source.format != "detect":
             text = (
-                f"It is not stated in which image the keypoints of {source.camera} are: the video's, the calibration's?"
+                f"The take does not state if keypoints of {source.camera} are in the image of video or calibration."
             )
-            remedy = 'Write frame = "video" (as taken here) or frame = "calibration" into its [[keypoints]].'
+            remedy = 'Write frame = "video" (assumed here) or frame = "calibration" into its [[keypoints]].'
             findings.append(Finding("doubt", "frame", text, (source.camera,), remedy=remedy))
             source = msgspec.structs.replace(source, frame="video")
         out.append(source)

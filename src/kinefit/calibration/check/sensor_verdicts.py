@@ -29,16 +29,16 @@ def sensor_findings(fits: Sequence[SensorAlignment], take: Take) -> list[Finding
     out, wrong, file = [], misfits(fits), take.path.name
     for fit in fits:
         shift = f"{np.degrees(fit.turn):.2f} ± {np.degrees(fit.bars[1]):.2f}° and {amount(fit)}"
-        evidence = f"{fit.deviations:.0f} standard deviations; ± holds 95 % of errors, the surface's own among them."
+        evidence = f"{fit.deviations:.0f} standard deviations; ± holds 95 % of errors, including the surface's own."
         if fit.kind == "depth" and fit.turn > _MIN_INVERTED_TURN:
             turn = f"{np.degrees(fit.turn):.0f} degrees"
-            text = f"{fit.sensor} hangs upside down, or is so stated: what it sees fits the person turned by {turn}."
-            remedy = "Correct its pose in the calibration, or turn its images by 180 degrees; `track` leaves it out."
+            text = f"{fit.sensor} hangs upside down, or its pose is wrong: it fits the person turned by {turn}."
+            remedy = "Correct its pose in the calibration, or turn its images by 180 degrees; `track` excludes it."
             out.append(Finding("fault", "sensor", text, (fit.sensor,), remedy=remedy))
         elif fit in wrong and fit.doubts:
             may = "does not fit the videos" if fit.falls else "may not fit the videos"
             text = f"{fit.sensor} {may}: it seems off by {shift} at the person."
-            unsure = f"Where it belongs is not sure, because {'; '.join(fit.doubts)}."
+            unsure = f"Its correct pose is uncertain, because {'; '.join(fit.doubts)}."
             remedy = "Calibrate it together with the videos, or record a person who walks and turns nearer to it."
             out.append(Finding("fault" if fit.falls else "doubt", "sensor", text, (fit.sensor,), unsure, remedy))
         elif fit in wrong and fit.kind == "depth":

@@ -306,6 +306,6 @@ class _PlacementProblem:
         """(n,) [m/s, rad/s] of the body, from the adjacent frames; raises ObservationError for a single frame."""
         a, b = max(frame - 1, 0), min(frame + 1, len(self.motion) - 1)
         if a == b:
-            raise ObservationError("a motion of one frame", remedy="Record the person for some seconds.")
+            raise ObservationError("the motion has only one frame", remedy="Record the person for some seconds.")
         seconds = float(self.motion.times[b] - self.motion.times[a])
         return self.motion.state(a).difference(self.motion.state(b)) / seconds

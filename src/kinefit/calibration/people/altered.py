@@ -56,7 +56,7 @@ def refuse_videos(take: Take) -> None:
     for i, own in enumerate(direct):
         if all(_frames_in_common(own, other) < _MIN_COMMON for j, other in enumerate(direct) if j != i):
             problem = f"{cameras[i].name} sees people only while no other camera does"
-            remedy = "Put in videos of the same moment that were started within two seconds, or leave this one out."
+            remedy = "Use videos of the same moment that were started within two seconds, or remove this one."
             raise CalibrationError(problem, file=take.path, place=f"camera {cameras[i].name}", remedy=remedy)
     votes: dict[tuple[int, int], int] = {}  # camera, 0 for mirrored or the times that it plays slower
     for i, j in combinations(range(len(lenses)), 2):
@@ -76,11 +76,11 @@ def refuse_videos(take: Take) -> None:
     which_camera, slower = max(votes, key=lambda one: votes[one])
     name = cameras[which_camera].name
     if slower:
-        problem = f"plays in slow motion: people move in it as in the others {slower} times as slowly"
-        remedy = "Export it at the speed at which it was filmed, with all its frames, or leave it out."
+        problem = f"plays in slow motion: people move {slower} times as slowly as in the other videos"
+        remedy = "Export it at the speed at which it was filmed, with all its frames, or remove it."
     else:
-        problem = "is mirrored: people move in it as in the others with left and right exchanged"
-        remedy = "Mirror it back, or leave it out. Some telephones mirror what the front camera records."
+        problem = "is mirrored: people move as in the other videos with left and right swapped"
+        remedy = "Mirror it back, or remove it. Some telephones mirror videos of the front camera."
     which = f"{cameras[0].name} or {cameras[1].name}" if len(lenses) == 2 and not slower else name
     raise CalibrationError(
         f"the video of {which} {problem}", file=take.path, place=f"camera {name}", remedy=remedy

@@ -200,7 +200,7 @@ def _whole_scale(body: Body, points: PointSet, x: NDArray, height: float | None)
             ratios.append(float(np.nanmedian(distance)) / length)
     if not ratios:
         raise CalibrationError(
-            "no bone of the person can be measured", remedy="Record a person who is seen whole in two cameras at once."
+            "no bone of the person can be measured", remedy="Record a person in full view of two cameras at once."
         )
     whole = height / body.stature if height and body.stature else 1.0
     return whole / float(np.median(ratios))
@@ -218,7 +218,7 @@ def _on_the_floor(
     """The rig with floor, origin and scale by the rule, and the rule."""
     body = seen.motion.body
     factor = sum(generic.segment_lengths().values()) / sum(body.segment_lengths().values())
-    rule = "the scale is that of a person of mean proportions (a few per cent unsure: give a height or a length)"
+    rule = "the scale is that of a person of mean proportions (a few per cent uncertain: give a height or a length)"
     if known_length is not None:
         a, b, metres = known_length
         factor, rule = metres / length_of(seen, a, b), f"{a} to {b} is {metres:g} m long"
@@ -229,4 +229,4 @@ def _on_the_floor(
         resized(rig, factor), x, factor * _above_soles(body, body.landmarks),
         balance=factor * centre_of_mass(seen.motion), up=up,
     )  # fmt: skip
-    return rig, f"The floor is at height zero, {up} is up, the origin lies below the person's mean place; {rule}."
+    return rig, f"The floor is at height zero, {up} is up, the origin lies below the person's mean position; {rule}."

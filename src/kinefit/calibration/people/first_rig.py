@@ -42,7 +42,7 @@ def first_rig(rig: Rig, uv: NDArray, sigma: float) -> Rig:
     }
     if not pairs:
         raise CalibrationError(
-            "no two cameras see enough of the same person from sides that differ",
+            "no two cameras see enough of the same person from different sides",
             remedy="Place the cameras 20 degrees apart or more, and record someone who moves about in view of all.",
         )
     first = max(pairs, key=lambda pair: pairs[pair][1])
@@ -54,8 +54,8 @@ def first_rig(rig: Rig, uv: NDArray, sigma: float) -> Rig:
         if trials[best][1] < _MIN_COMMON_KEYPOINTS:
             names = ", ".join(rig.names[c] for c in trials)
             raise CalibrationError(
-                f"what {names} saw agrees with no other camera", place=f"camera {rig.names[best]}",
-                remedy="Check its intrinsics, that it is of the same recording and in step, and sees the person.",
+                f"the keypoints of {names} agree with no other camera", place=f"camera {rig.names[best]}",
+                remedy="Check that its intrinsics are right, and that it is in step and sees the same person.",
             )
         poses[best] = trials[best][0]
     return Rig(tuple(camera.with_pose(poses[c]) for c, camera in enumerate(rig)))

@@ -122,12 +122,12 @@ def _find(take: Take, made_from: str, progress: Step | None) -> FoundCameras:
     )
     changes = found.cameras.values()
     first, *lines = found.summary_lines()
-    notes = [f"Nothing tells where the cameras stand: found from the people in view. {first}", "; ".join(lines)]
+    notes = [f"No calibration states the cameras' poses: found from the people in view. {first}", "; ".join(lines)]
     if heard:
         clocks = ", ".join(f"{name} {1e3 * offset:+.0f} ms" for name, offset in heard.items())
         notes.append(f"Clocks by sound, before the people's movements refined them: {clocks}.")
     if take.height is None:
-        notes.append("No height is stated: all lengths are as unsure as the person's size, about 5 %. Write height.")
+        notes.append("No height is stated: lengths are uncertain by about 5 %, like the person's size. Write height.")
     return FoundCameras(
         found.rig, tuple(heard.get(name, 0.0) + found.time_offsets[name] for name in found.rig.names),
         float(median(c.shift_std for c in changes)) / np.sqrt(3.0),

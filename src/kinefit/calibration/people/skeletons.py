@@ -193,8 +193,8 @@ def _refuse_doubles(seen: Sequence[Sequence[LiftedSkeleton]]) -> None:
         away = np.linalg.norm(a.points[:frames, 0] - b.points[:frames, 0], axis=-1)
         if np.isfinite(away).sum() > _MIN_COMMON_FRAMES and np.nanmedian(away) < _MAX_DOUBLE_PX:
             raise CalibrationError(
-                f"{a.camera} and {b.camera} show the same pictures", place=f"camera {b.camera}",
-                remedy="It is one video twice: leave one out.",
+                f"{a.camera} and {b.camera} show the same images", place=f"camera {b.camera}",
+                remedy="It is one video twice: remove one.",
             )
 
 
@@ -261,9 +261,9 @@ def _tree(cameras: Sequence[Camera], pairs: dict[_Pair, SkeletonMatch]) -> list[
 
 def _strangers(camera: Camera) -> CalibrationError:
     return CalibrationError(
-        f"the people before {camera.name} move like none before the other cameras", place=f"camera {camera.name}",
-        remedy="Record somebody who moves. Check that it is of the same recording, shows the same person at the same "
-        "time, and was started within two seconds of the others; or leave it out.",
+        f"the people in {camera.name} move like no people in the other cameras", place=f"camera {camera.name}",
+        remedy="Record a person who moves. Check that it is of the same recording, shows the same person at the same "
+        "time, and was started within two seconds of the others; or remove it.",
     )
 
 
@@ -326,8 +326,8 @@ def _laid(a: LiftedSkeleton, b: LiftedSkeleton, lag: int) -> NDArray:
     R = None if frames is None else _turned(a, b, frames)
     if frames is None or R is None:
         raise CalibrationError(
-            f"{a.record.camera} and {b.record.camera} hardly saw the person at the same time",
-            place=f"camera {b.record.camera}", remedy="Trim the videos to what all cameras recorded.",
+            f"{a.record.camera} and {b.record.camera} rarely see the person at the same time",
+            place=f"camera {b.record.camera}", remedy="Trim the videos to the time that all cameras recorded.",
         )  # fmt: skip
     moved = b.hips[frames[1]] - a.hips[frames[0]] @ R.T
     moved = moved[np.isfinite(moved).all(axis=1)]

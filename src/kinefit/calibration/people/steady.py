@@ -43,7 +43,7 @@ def steadiest(record: Keypoints) -> NDArray:
                 last = centre[f, chosen[f]]
     if not (chosen >= 0).any():
         raise CalibrationError(
-            "nobody is seen in any frame", file=record.source or None, place=f"camera {record.camera}",
-            remedy="Leave this camera out, or find the keypoints anew.",
+            "no frame has a person", file=record.source or None, place=f"camera {record.camera}",
+            remedy="Remove this camera, or detect again.",
         )
     return chosen

@@ -178,8 +178,8 @@ def _sight(rig: Rig, trial: PersonTrial, offsets: NDArray) -> PersonSighting:
         return sight(rig, trial, dict(zip(rig.names, offsets.tolist(), strict=True)))
     except TrackingError as error:
         raise CalibrationError(
-            f"the cameras agree on nobody ({error.problem})",
-            remedy="Check that the calibration is of this recording and that no two cameras are exchanged; "
+            f"the cameras agree on no person ({error.problem})",
+            remedy="Check that the calibration is of this recording and that no two cameras are swapped; "
             "`kinefit calibrate people` needs no poses of the cameras at all.",
         ) from error
 
@@ -205,7 +205,7 @@ def _in_old_frame(
     rig: Rig, old: Rig, seen: PersonSighting, static: StaticPoints, height: float | None, known_length: Length | None
 ) -> tuple[Rig, str]:
     """The rig in the old frame with the known scale, and the rule as text."""
-    rule = "The world is the old calibration's: all cameras together stay as near as they can to where they were"
+    rule = "The world is the old calibration's: all cameras together stay as near as possible to their old poses"
     if known_length is not None:
         a, b, metres = known_length
         names, pixels = static_pixels(rig, static, _STATIC_SIGMA_PX)
@@ -219,8 +219,8 @@ def _in_old_frame(
         length, metres = seen.motion.body.stature, height
         text = f", and the person is {height:g} m tall"
     else:
-        return aligned(rig, old)[0], f"{rule}, in place, turn and scale."
-    return aligned(resized(rig, metres / length), old, scale=False)[0], f"{rule} in place and turn{text}."
+        return aligned(rig, old)[0], f"{rule}, in position, rotation and scale."
+    return aligned(resized(rig, metres / length), old, scale=False)[0], f"{rule} in position and rotation{text}."
 
 
 def length_of(seen: PersonSighting, a: str, b: str) -> float:
@@ -292,17 +292,17 @@ def check_result(rig: Rig, changes: Mapping[str, CameraChange], distance: float,
     if wrong:
         listed = ", ".join(f"{name} ({changes[name].residual_after:.0f} px)" for name in wrong)
         raise CalibrationError(
-            f"refined, the body still does not lie where these cameras see it: {listed}",
-            remedy="Look whether two cameras are exchanged, the calibration is of another session or the cameras are "
+            f"after refinement the body still does not fit these cameras: {listed}",
+            remedy="Check whether two cameras are swapped, the calibration is of another session or the cameras are "
             "out of step; `kinefit calibrate people` starts from no poses at all.",
         )
     loose = [name for name, c in changes.items() if not c.focal_std <= _MAX_FOCAL_STD]
     if loose:
         shares = ", ".join(f"{name} to {100 * changes[name].focal_std:.0f} %" for name in loose)
         raise CalibrationError(
-            f"the motion does not tell the lenses: focal lengths would be known in {shares}",
+            f"the motion does not determine the lenses: focal lengths would be known in {shares}",
             place=f"camera {loose[0]}",
-            remedy="Record someone who walks towards the cameras and away, raises the arms and is seen whole; or state "
+            remedy="Record someone in full view who walks towards the cameras and away, and raises the arms; or state "
             "field_of_view, or calibrate the lenses with a board.",
         )  # fmt: skip
     unknown = [name for name, c in changes.items() if not c.uncertainty <= times * _MAX_UNCERTAINTY_PX]

@@ -96,7 +96,7 @@ class Refinement:
                 line += f", clock {1e3 * c.time:+.1f} ± {1e3 * c.time_std:.1f} ms"
             out.append(f"{line}; static points known to {c.uncertainty:.1f} px")
         if not self.confident:
-            out.append("Not sure: more movement through the whole volume would place the cameras better.")
+            out.append("Uncertain: more movement through the whole volume would place the cameras better.")
         return out
 
 

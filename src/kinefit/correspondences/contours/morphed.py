@@ -92,7 +92,7 @@ def morphed_outline_rows(
         A sigma that is not positive.
     """
     if not sigma > 0:
-        raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive one.")
+        raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive number of pixels.")
     n, away, size = toward_tangents(rim.on(pose.vertices), camera, image)
     share = np.stack([1.0 - rim.share, rim.share], axis=1)
     return morphed_rows(pose, rim.vertices, n, away, share=share, sigma=sigma / size)

@@ -78,7 +78,7 @@ def outline_rows(
     if by not in ("pixels", "rays"):
         raise ObservationError(f"rows by '{by}'", remedy='Write by="pixels" or by="rays".')
     if not sigma > 0:
-        raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive one.")
+        raise ObservationError(f"a standard deviation of {sigma} px", remedy="Give a positive number of pixels.")
     count = len(rim)
     data, segment, group = _kernels.buffers(2 * count)
     if by == "pixels":

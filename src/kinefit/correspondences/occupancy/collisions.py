@@ -64,7 +64,7 @@ def collision_rows(
         A sigma that is not positive.
     """
     if not sigma > 0:
-        raise ObservationError(f"the standard deviation of collisions is {sigma} m", remedy="Give a positive one.")
+        raise ObservationError(f"the standard deviation of collisions is {sigma} m", remedy="Give positive metres.")
     p = _of_all(body) if pairs is None else pairs
     a, b, n, distance = _gaps(body, state, p.segment, p.starts, p.ends, p.pairs)
     missing = p.apart + margin - distance
@@ -99,7 +99,7 @@ def collision_pairs(body: Body, between: Sequence[tuple[str, str]] | None = None
         wanted = {frozenset((body.tree.segment(i), body.tree.segment(j))) for i, j in between}
         bare = sorted(body.tree.segments[s] for s in frozenset().union(*wanted) - set(segment.tolist()))
         if bare:
-            raise BodyError(f"no surface of {', '.join(bare)}", remedy="Give it one, or leave it out of the pairs.")
+            raise BodyError(f"no surface of {', '.join(bare)}", remedy="Give it one, or remove it from the pairs.")
         pairs = zip(first.tolist(), second.tolist())
         keep = np.array([frozenset(p) in wanted for p in pairs], bool) & (first != second)
     index = np.ascontiguousarray(index[keep], np.int64)

@@ -80,7 +80,7 @@ def depth_image_rows(
     """
     check_depth_image(depth, camera)
     if not sigma > 0:
-        raise ObservationError(f"the standard deviation of a depth image is {sigma} m", remedy="Give a positive one.")
+        raise ObservationError(f"the standard deviation of a depth image is {sigma} m", remedy="Give positive metres.")
     data, segment, group = _kernels.buffers(len(samples))
     end = _kernels_depth_image.depth_image_rows(
         frames, samples.segment, samples.point, samples.normal, camera.packed, depth, camera.ray_table, shown,

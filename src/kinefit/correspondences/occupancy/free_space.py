@@ -73,7 +73,7 @@ class FreeSpace:
             raise ObservationError(problem, remedy="Give (height, width) in metres.")
         if not farthest > 0.0:
             remedy = "Give it in metres along the optical axis."
-            raise ObservationError(f"the farthest place of the body is {farthest} m", remedy=remedy)
+            raise ObservationError(f"the farthest point of the body is {farthest} m", remedy=remedy)
         cell = max(depth.shape[1] // max(columns, 1), 1)
         nearest, missing = np.full((2, -(-depth.shape[0] // cell), -(-depth.shape[1] // cell)), -1, np.int32)
         kernels.nearest_cells(depth, farthest, cell, np.empty((0, 0), np.float32), tolerance, nearest)
@@ -130,7 +130,7 @@ def free_space_rows(
     check_depth_image(space.depth, camera)
     sigma = 10.0 * space.cell if sigma is None else sigma
     if not sigma > 0:
-        raise ObservationError(f"the standard deviation of free space is {sigma} px", remedy="Give a positive one.")
+        raise ObservationError(f"the standard deviation of free space is {sigma} px", remedy="Give positive pixels.")
     data, segment, group = _kernels.buffers(len(samples))
     chosen = np.empty(len(samples), np.int64) if chosen is None else chosen
     end = kernels.free_space_rows(

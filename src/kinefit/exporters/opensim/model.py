@@ -91,7 +91,7 @@ def _joint(
             if abs(np.linalg.det(axes)) < 1e-3:
                 raise ExportError(
                     "OpenSim needs axes that do not lie in one plane",
-                    file=path, place=f"joint {name}", remedy="Turn one of the axes, or leave one out.",
+                    file=path, place=f"joint {name}", remedy="Turn one of the axes, or remove one.",
                 )  # fmt: skip
             for k in range(3):
                 _transform_axis(transform, f"{kind}{k + 1}", axes[k], moves[k][0] if k < len(moves) else None)

@@ -25,5 +25,5 @@ def fault_sections(faults: Iterable[Finding]) -> list[p.Section]:
     boxes = [finding_callout(found) for found in faults]
     if not boxes:
         return []
-    text = "The results below follow from inputs with these faults. Mend them and track again."
+    text = "The results below follow from inputs with these faults. Correct them and track again."
     return [p.section("Faults of the inputs", p.paragraph(text), *boxes)]

@@ -98,7 +98,7 @@ def point_table(motion: Motion) -> Html:
             cells.append(shaded(text + (f" ({100 * share:.0f} %)" if share >= 0.05 else ""), value / largest[r.unit]))
         rows.append(cells)
     heads = [f"{s} [{UNITS[r.unit][1]}]" for s, r in sensors.items()]
-    caption = "Median residual of every point; in brackets the share left out as outliers, where it is 5 % or more."
+    caption = "Median residual of every point; in brackets the share rejected as outliers, if it is 5 % or more."
     return table(["point", *heads], rows, caption=caption)
 
 
@@ -165,7 +165,7 @@ def _point_left_out(r: Residuals) -> NDArray:
 
 
 def _told(value: float, unit: str) -> str:
-    return f"{value:.1f} {unit}" if np.isfinite(value) else "nothing seen"
+    return f"{value:.1f} {unit}" if np.isfinite(value) else "no data"
 
 
 def _shade(m: Moment, motion: Motion) -> dict:

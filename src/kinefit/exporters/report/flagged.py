@@ -23,9 +23,10 @@ _WARNING, _BAD = "#e0a100", "#d0441c"
 def flagged(motion: Motion, moments: Sequence[Moment], pictures: Pictures, width: int) -> list[p.Html]:
     """Parts of the section on doubtful moments; pictures at most `width` px wide."""
     if not motion.residuals and not moments:
-        return [p.callout("note", "This motion comes without measurements, so nothing shows where it is doubtful.")]
+        return [p.callout("note", "This motion has no measurements, so doubtful moments are not known.")]
     if not moments:
-        return [p.callout("good", "None: no end of a segment is probably farther off than 8 cm in some frames only.")]
+        text = "None: no end of a segment is probably more than 8 cm off, except where it is so in most frames."
+        return [p.callout("good", text)]
     out = [time_line(motion, moments)]
     for m in moments[:MOMENTS]:
         shots = [
@@ -33,7 +34,7 @@ def flagged(motion: Motion, moments: Sequence[Moment], pictures: Pictures, width
             for camera, frames in pictures.items() if m.worst in frames
         ]  # fmt: skip
         severity = "bad" if motion.quality[m.worst] <= 0 else "warning"
-        seen = [p.folded("Pictures", p.gallery(shots, size="small"))] if shots else []
+        seen = [p.folded("Images", p.gallery(shots, size="small"))] if shots else []
         out.append(p.callout(severity, _when(motion, m), " ".join(m.what + m.causes), *seen))
     if len(moments) > MOMENTS:
         rest = moments[MOMENTS : MOMENTS + _MAX_TABLE_MOMENTS]

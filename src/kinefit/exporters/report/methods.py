@@ -28,9 +28,9 @@ def methods(motion: Motion, date: str, doubtful: int) -> list[p.Html]:
     return [
         p.paragraph("To paste into a paper:", small=True), p.quote(text),
         p.paragraph(
-            "Error bars are standard deviations. In them are the jitter and lasting errors of the keypoints, what "
-            "the cameras' images have shifted as a whole, and how sure the body's lengths are; not the scale of the "
-            "calibration, nor errors that all cameras share.", small=True),
+            "Error bars are standard deviations. They include jitter and systematic errors of the keypoints, "
+            "shifts of whole images, and the uncertainty of the body's lengths. They exclude the scale of the "
+            "calibration and errors that all cameras share.", small=True),
         p.folded("All settings, as JSON", p.code(json.dumps(summary(motion, date), indent=2, ensure_ascii=False))),
     ]  # fmt: skip
 
@@ -63,7 +63,7 @@ def methods_sentences(motion: Motion, doubtful: int) -> list[str]:
             left = sum(f.count * f.left_out for f in fits) / max(count, 1)
             out.append(
                 f"The median residual is {median:.1f} {UNITS[unit][1]} over {count} measured points, of which "
-                f"{100 * left:.1f} % were left out as outliers."
+                f"{100 * left:.1f} % were rejected as outliers."
             )
     flagged = {0: "No moment was", 1: "One moment was"}.get(doubtful, f"{doubtful} moments were")
     return [*out, f"{flagged} flagged as doubtful."]
@@ -114,11 +114,11 @@ def _cameras(provenance: Mapping[str, Any], names: list[str]) -> str:
     accuracies = sorted({float(e["accuracy"]) for e in keypoints if isinstance(e.get("accuracy"), int | float)})
     text = f"2D keypoints {f'({listed([k for k in kinds if k])}) ' if any(kinds) else ''}of {listed(names, 12)}"
     stated = f" with a stated standard deviation of {listed([f'{a:g}' for a in accuracies])} px" if accuracies else ""
-    return f"{text} entered{stated}."
+    return f"{text} were used{stated}."
 
 
 def _markers(names: list[str]) -> str:
-    return f"Markers of {listed(names)} entered." if names else ""
+    return f"Markers of {listed(names)} were used." if names else ""
 
 
 def _calibration(provenance: Mapping[str, Any]) -> str:

@@ -72,7 +72,7 @@ def doubtful_moments(motion: Motion) -> tuple[Moment, ...]:
 def doubt_sentence(motion: Motion, moments: Sequence[Moment]) -> str:
     """How many doubtful moments there are: "none", "1 (3 % of the frames)"."""
     if not moments:
-        return "none" if motion.residuals else "none known, as the motion comes without measurements"
+        return "none" if motion.residuals else "none known, because the motion has no measurements"
     frames = np.zeros(len(motion), bool)
     for m in moments:
         frames[m.start : m.stop] = True
@@ -227,12 +227,12 @@ def _sentences(body: Body, group: Sequence[_Doubt]) -> Iterable[str]:
         names = listed(spoken_segments(body, [g.segment for g in same]))
         most = max(g.amount for g in same)
         if kind == "nobody":
-            yield "Nothing of the person was seen; the body stays where it was."
+            yield "The person was not observed; the body keeps its last pose."
         elif kind == "against":
-            yield f"Most views show {names} more than 8 cm beside the body."
+            yield f"Most views show {names} more than 8 cm away from the body."
         else:
-            far = f"up to ±{most:.0f} cm (2 σ)" if np.isfinite(most) else "in some direction nothing bounds it"
-            yield f"The place of {names} is uncertain: {far}."
+            far = f"up to ±{most:.0f} cm (2 σ)" if np.isfinite(most) else "unbounded in at least one direction"
+            yield f"The position of {names} is uncertain: {far}."
 
 
 def causes(motion: Motion, moment: Moment) -> tuple[str, ...]:
@@ -252,9 +252,10 @@ def causes(motion: Motion, moment: Moment) -> tuple[str, ...]:
     if seen_points and sum(left_out.values()) >= _MIN_OUTLIER_SHARE * seen_points:
         most = max(left_out, key=lambda name: left_out[name])
         share = 100 * sum(left_out.values()) / seen_points
-        out.append(f"{share:.0f} % of its keypoints were left out as outliers, most of them in {most}.")
+        out.append(f"{share:.0f} % of its keypoints were rejected as outliers, most of them in {most}.")
     quality = motion.segment_quality[frames]
-    for text, of in (("No measurement supports {}", quality <= 0), ("More speaks against {} than for it", quality > 0)):
+    more = "More evidence contradicts than supports {}"
+    for text, of in (("No measurement supports {}", quality <= 0), (more, quality > 0)):
         gone = 2 * (of & motion.lost[frames]).sum(axis=0) > len(quality)
         if names := [n for n in moment.segments if gone[motion.body.tree.segments.index(n)]]:
             out.append(text.format(listed(spoken_segments(motion.body, names))) + ".")

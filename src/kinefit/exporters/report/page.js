@@ -43,7 +43,7 @@
         displayModeBar: coarse || narrow() ? false : "hover" });
       if ("seeks" in place.dataset) place.on("plotly_click", e => seek(+e.points[0].x));
     } catch (problem) {
-      place.textContent = `This plot cannot be drawn here (${problem}); a newer browser will.`;
+      place.textContent = `This browser cannot draw the plot (${problem}). Open the page in a newer browser.`;
       console.error(problem);
     }
   }

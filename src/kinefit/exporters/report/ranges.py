@@ -96,7 +96,7 @@ def ranges_table(motion: Motion) -> p.Html:
     parts = []
     if paired:
         columns = [f"{side} {what}" for side in ("left", "right") for what in _HEAD]
-        parts.append(p.table(["[°], [°/s]", *columns, "left less right, range"], paired))
+        parts.append(p.table(["[°], [°/s]", *columns, "range, left minus right"], paired))
     if single:
         parts.append(p.table(["[°], [°/s]", *_HEAD], single))
     return p.joined(*parts)

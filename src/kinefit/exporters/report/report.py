@@ -110,9 +110,9 @@ def write_report(
         *fault_sections(of_provenance(motion.provenance)),
         _summary(motion, moments, list(findings), date),
         p.section("Moving figure", figure(motion, rig), p.paragraph(
-            "Drag to turn, click and use the wheel (or two fingers) to zoom. Blue is left, orange right; what is "
-            "grey and dashed was not seen, what is translucent is uncertain. Cylinders shows the surfaces of the fit. "
-            "Times anywhere on this page, and clicks into plots over time, move the figure there.", small=True)),
+            "Drag to turn. Click, then use the wheel (or two fingers) to zoom. Blue is left, orange right. Parts "
+            "that are grey and dashed are lost; translucent parts are uncertain. Cylinders shows the surfaces of the "
+            "fit. Click a time on this page, or a plot over time, to move the figure to that time.", small=True)),
         p.section("Angles", *_angles(motion)),
         p.section("Cycles", *_cycles(motion, cycles, norms or {})),
         p.section("Doubtful moments", *flagged(motion, moments, shown, width)),
@@ -120,7 +120,7 @@ def write_report(
     ]  # fmt: skip
     if shown:
         about = "First, middle and last frame, and the one of lowest quality"
-        sections.append(p.section("Pictures", p.folded(about, *_pictures(motion, shown, width))))
+        sections.append(p.section("Images", p.folded(about, *_pictures(motion, shown, width))))
     sections.append(p.section("Methods", *methods(motion, date, len(moments))))
     if files:
         rows = [(p.file_link(name), about) for name, about in files.items()]
@@ -136,7 +136,7 @@ def trust_sentence(motion: Motion, moments: Sequence[Moment]) -> str:
         names = [name for name, r in motion.residuals.items() if r.unit == unit and np.isfinite(r.norms).any()]
         if names:
             parts.append(f"fits {listed(names, 6)} to a median of {overall_median(motion, unit):.1f} {shown_unit}")
-    start = " and ".join(parts) or "comes without measurements to compare it with"
+    start = " and ".join(parts) or "has no measurements to compare it with"
     if not moments:
         return f"The motion {start}; no doubtful moment."
     return f"The motion {start}; doubtful moments: {doubt_sentence(motion, moments)}."
@@ -158,7 +158,7 @@ def _summary(
     if moments:
         notes.append(p.paragraph("See ", p.link("doubtful-moments", "where and why"), "."))
     if nobody:
-        notes.append(f"In {100 * nobody:.0f} % of the frames nobody was seen.")
+        notes.append(f"In {100 * nobody:.0f} % of the frames no person was observed.")
     if throughout := throughout_sentence(motion):
         notes.append(f"Uncertain in most frames, at the far end (2 σ): {throughout}.")
     parts = [p.callout(severity, trust_sentence(motion, moments), *notes)]
@@ -173,17 +173,17 @@ def _summary(
         parts.append(p.callout("warning", f"Constant shift in {shifts}.", text))
     blind = never_observed(motion)
     if blind:
-        text = "No measurement observes them: what is shown follows from the prior posture and is no result."
+        text = "No measurement observes them. Their values come from the prior and are no results."
         most = len(blind) > 0.5 * len(motion.body.dof_names)
         title = f"Not observed: {listed([spoken(name) for name in blind], 8)}."
         parts.append(p.callout("bad" if most else "note", title, text))
     shared = shared_by_prior(motion)
     if shared:
         each = [f"{spoken(name)} (±{2 * std:.0f}°)" for name, std in shared.items()]
-        title = f"Shared by the prior posture: {listed(each, 8)}."
+        title = f"Shares from the reference pose: {listed(each, 8)}."
         text = (
             "Their sum is measured, their shares are not: points at joint centres do not determine the rotation of the "
-            "segment between them. The default posture sets the shares; ± (two standard deviations) is how far people "
+            "segment between them. The reference pose sets the shares; ± (two standard deviations) is how far people "
             "differ from it. Changes within a take are more certain than the values. Markers on the front and the back "
             "of the pelvis would determine the shares."
         )
@@ -204,15 +204,15 @@ def _summary(
     if body.stature:
         facts["Stature of the body"] = f"{body.stature:.2f} m"
     about = (
-        "± is two standard deviations; that of a range takes its two ends to err on their own, so it is an upper bound "
-        "where an error lasts. * : observed in a part of the frames only."
+        "± is two standard deviations. Of a range it assumes independent errors at its ends: an upper bound if errors "
+        "are systematic. *: observed in only some of the frames."
     )
     more = (
-        "An angle with a standard deviation above 45° counts as not observed. ± of the greatest speed is what "
-        "smoothing leaves of a change from frame to frame in lively moments."
+        "An angle with a standard deviation above 45° counts as not observed. ± of the fastest speed is from the "
+        "covariance of adjacent frames after smoothing; nine tenths of the frames have less."
     )
     hint = [] if session else [p.paragraph(
-        "Who was recorded, when and at which movement was not stated: [session] in the take does.", small=True
+        "The subject, the date and the movement are not stated. Write them into [session] of the take.", small=True
     )]  # fmt: skip
     return p.section(
         "Summary", p.facts(facts), *hint, *parts, p.heading("How far every joint moved"),
@@ -225,7 +225,7 @@ def _angles(motion: Motion) -> list[p.Html]:
     return [
         p.paragraph(
             "Names and signs are those of OpenSim's Rajagopal model. The band is ±2 standard deviations of the "
-            "measurement; a grey broken line without a band was not observed in that time."
+            "measurement; a grey dashed line without a band was not observed in that time."
         ),
         p.chooser("Joint", joint_plots(motion)),
     ]
@@ -242,21 +242,21 @@ def _check_norms(motion: Motion, norms: Norms | None, path: str | PathLike[str])
 def _cycles(motion: Motion, cycles: Cycles | None, norms: Norms) -> list[p.Html]:
     if cycles is None:
         text = (
-            "Two or more cycles that last about as long and look alike were not found: neither strides nor another "
-            "movement that repeats itself."
+            "No two cycles of similar duration and shape were found: neither strides nor another repeated "
+            "movement."
         )
         return [p.callout("note", "This take has no repeated cycle.", text)]
     counts = listed([f"{len(s.spans)} {'' if s.name == 'both' else s.name + ' '}cycles" for s in cycles.sides])
     if cycles.kind == "gait":
         text = (
-            f"Gait: {counts}, from heel strike to heel strike (0–100 %), found from how far the heels are ahead of the "
-            "pelvis (Zeni et al. 2008); the broken upright line is where the toes leave the floor. "
+            f"Gait: {counts}, from heel strike to heel strike (0–100 %), by the distance of the heels ahead of the "
+            "pelvis (Zeni et al. 2008). The dashed vertical line is toe-off. "
         )
     else:
-        text = f"A movement that repeats itself: {counts}, from one extreme posture to the next alike. "
+        text = f"A repeated movement: {counts}, from one extreme posture to the next of the same kind. "
     text += (
-        "The thick line is the mean, thin ones are single cycles; the band is ±1 standard deviation between cycles, "
-        "where there are three or more of them. The cycles' coefficient of multiple correlation is "
+        "The thick line is the mean, thin ones are single cycles. The band is ±1 standard deviation between cycles, "
+        "if there are three or more. The cycles' coefficient of multiple correlation is "
         f"{cycles.likeness:.2f}."
     )
     numbers = gait_numbers(motion, cycles)
@@ -277,14 +277,14 @@ def _mean(mean: float, spread: float) -> str:
 
 
 def _fit(motion: Motion, moments: Sequence[Moment]) -> list[p.Html]:
-    text = "Quality is the share of the body that its measurements support; below the dotted line, less than half."
+    text = "Quality is the share of the body that its measurements support: less than half below the dotted line."
     parts = [p.paragraph(text), quality_plot(motion, moments)]
     if not motion.residuals:
-        return [*parts, p.callout("note", "This motion comes without measurements, so there are no residuals.")]
+        return [*parts, p.callout("note", "This motion has no measurements, so there are no residuals.")]
     fits, names = sensor_fits(motion), {name for r in motion.residuals.values() for name in r.names}
     about = (
         "Residuals are measured minus fitted. A shift is the median residual along an axis: far from zero, it points "
-        "to the calibration. Points left out were too far off to be believed."
+        "to the calibration. Rejected points are outliers."
     )
     return [*parts, p.heading("Sensors"), p.paragraph(about), sensor_table(motion, fits), p.heading("Points"),
             p.folded("Every point in every sensor", point_table(motion), opened=len(names) <= 40)]  # fmt: skip
@@ -292,7 +292,7 @@ def _fit(motion: Motion, moments: Sequence[Moment]) -> list[p.Html]:
 
 def _pictures(motion: Motion, pictures: Pictures, width: int) -> list[p.Html]:
     names = {frame: what for frame, what in report_frames(motion).items() if what != "doubtful"}
-    out = [p.paragraph("The fitted skeleton on the video; rings are keypoints, red crosses those left out.")]
+    out = [p.paragraph("The fitted skeleton on the video; rings are keypoints, red crosses rejected ones.")]
     for camera, frames in pictures.items():
         shots = [
             p.picture(frames[f], caption=f"{what}: frame {f}, {motion.times[f]:.2f} s", width=width)

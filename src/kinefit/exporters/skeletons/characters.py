@@ -127,7 +127,7 @@ def _bvh(motion: Motion, found: Retargeted) -> Iterator[str]:
     joints = [node for node, name in enumerate(character.names) if not name.endswith("_end")]
     if len(channels) != len(joints):
         remedy = "Export the character again, one CHANNELS line for each joint."
-        raise ExportError("its joints and CHANNELS differ in number", file=character.path, remedy=remedy)
+        raise ExportError("it has different numbers of joints and CHANNELS lines", file=character.path, remedy=remedy)
     columns: list[NDArray] = []
     for node, names in zip(joints, channels):
         parent = int(character.parents[node])

@@ -128,8 +128,8 @@ def _nodes(character: Character, names: Mapping[str, str] | None) -> dict[str, i
     forward = _standing(character, nodes)[:, 0]
     toes = [(x[nodes[f"toes_{s}"]] - x[nodes[f"foot_{s}"]]) @ forward for s in "lr" if f"toes_{s}" in nodes]
     if toes and max(toes) < 0:
-        remedy = "Exchange them in the table of names."
-        raise ExportError("the toes point backwards: left and right are exchanged", file=path, remedy=remedy)
+        remedy = "Swap them in the table of names."
+        raise ExportError("the toes point backwards: left and right are swapped", file=path, remedy=remedy)
     return nodes
 
 
@@ -296,7 +296,7 @@ def _common(character: Character, nodes: list[int]) -> int:
         paths.append(path)
     shared = [node for node in paths[0] if all(node in path for path in paths[1:])]
     if not shared:
-        raise FileError("its joints hang on different roots", file=character.path, remedy="Join them under one node.")
+        raise FileError("its joints have different roots", file=character.path, remedy="Join them under one node.")
     return shared[0]
 
 

@@ -343,7 +343,7 @@ def _swap_finding(
     size = float(np.nanmedian(gaps)) if np.isfinite(gaps).any() else float("nan")
     what = f"{names[0]} and {names[1]} are swapped"
     if visible_shares.min() < 0.5:
-        what = f"what is called {names[int(np.argmax(visible_shares))]} is {names[int(np.argmin(visible_shares))]}"
+        what = f"the label {names[int(np.argmax(visible_shares))]} is on {names[int(np.argmin(visible_shares))]}"
     always = last - first + 1 == total
     when = "throughout" if always else f"in frames {first} to {last}"
     text = f"{what} {when}" + (f" ({100 * size:.0f} cm apart)" if np.isfinite(size) else "")

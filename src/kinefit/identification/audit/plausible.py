@@ -135,8 +135,8 @@ def _swaps_by_place(model: MarkerModel, s: int, places: Sequence[NDArray]) -> It
     rms_after, a, b = min(trials, default=(np.inf, 0, 0))
     if rms_after < MAX_RATIO_AFTER_SWAP * rms and _fits_other_segments(model, places, s, (members[a], members[b])):
         pair = (model.labels[members[a]], model.labels[members[b]])
-        text = f"{pair[0]} and {pair[1]} are swapped throughout: {model.names[s]} is {100 * rms:.0f} cm off its places"
-        yield pair, rms, f"{text}, with them exchanged {100 * rms_after:.0f} cm"
+        text = f"{pair[0]} and {pair[1]} are swapped throughout: {model.names[s]} is {100 * rms:.0f} cm off its markers"
+        yield pair, rms, f"{text}, after a swap {100 * rms_after:.0f} cm"
 
 
 def moved_labels(model: MarkerModel, places: Sequence[NDArray]) -> list[tuple[str, float, str]]:
@@ -162,8 +162,8 @@ def moved_labels(model: MarkerModel, places: Sequence[NDArray]) -> list[tuple[st
             residuals = np.linalg.norm(actual[others] - (scale * x @ R.T + t), axis=1)
             label = model.labels[members[k]]
             if distance > max(2 * MIN_PLACEMENT_RMS, 2 * residuals.max(), out.get(label, (0.0, ""))[0]):
-                text = f"{label} sits {100 * distance:.0f} cm elsewhere on {model.names[s]} and moves with it"
-                out[label] = (distance, f"{text}: placed otherwise, not misnamed")
+                text = f"{label} is {100 * distance:.0f} cm off its position on {model.names[s]} and moves with it"
+                out[label] = (distance, f"{text}: placed differently, not mislabelled")
     return [(label, size, text) for label, (size, text) in sorted(out.items(), key=lambda item: -item[1][0])]
 
 

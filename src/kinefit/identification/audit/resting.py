@@ -43,8 +43,8 @@ def resting_markers(markers: Markers) -> list[tuple[str, tuple[int, int], float,
         least = reach[:, near].min(axis=1)  # NaN where one is not visible: no finding
         for a, b in runs_of((reach[:, k] < MAX_RESTING_DISTANCE) & (least > MIN_NEIGHBOUR_DISTANCE)):
             span, moved = (int(starts[a]), int(starts[b - 1]) + length - 1), float(np.median(least[a:b]))
-            text = f"{label} rests in frames {span[0]} to {span[1]} while its neighbours move by {100 * moved:.0f} cm"
-            out.append((label, span, moved, f"{text}: it is on none of their segments"))
+            text = f"{label} stays still in frames {span[0]} to {span[1]} but its neighbours move {100 * moved:.0f} cm"
+            out.append((label, span, moved, f"{text}: it is not on their segments"))
     return out
 
 

@@ -84,7 +84,7 @@ def save_model(model: MarkerModel, path: str | PathLike[str]) -> None:
         temporary.write_bytes(msgspec.json.format(msgspec.json.encode(record), indent=1) + b"\n")
         os.replace(temporary, target)
     except OSError as error:
-        remedy = "Give a folder that exists and that you may change, with space left."
+        remedy = "Choose an existing folder with write permission and free space."
         raise ExportError(f"cannot be written ({error.strerror or error})", file=target, remedy=remedy) from error
     finally:
         with suppress(OSError):
@@ -163,7 +163,7 @@ def _symmetric(upper: tuple[float, ...]) -> NDArray:
     out[_UPPER] = upper
     out = out + np.triu(out, 1).T
     if not np.isfinite(out).all() or np.linalg.eigvalsh(out)[0] <= 0:
-        raise ValueError("`give` of a joint is no covariance")
+        raise ValueError("`give` of a joint is not a covariance")
     return out
 
 

@@ -82,7 +82,7 @@ def _unknown(model: MarkerModel) -> list[TrainingFinding]:
     sizes = sorted(zip((len(s) for s in model.segments), model.names), reverse=True)
     text = f"no set of the catalogue knows the labels; {len(sizes)} segments are from motion alone, the largest with "
     text += f"{sizes[0][0]} markers ({sizes[0][1]})"
-    remedy = "Write a set: `kinefit markers set TAKE -o set.toml`, put it right, and learn with --set set.toml"
+    remedy = "Write a set: `kinefit markers set TAKE -o set.toml`, correct it, and learn with --set set.toml"
     return [TrainingFinding("unknown", model.name, text, remedy)]
 
 
@@ -112,7 +112,7 @@ def _merged(model: MarkerModel) -> list[TrainingFinding]:
         length = float(model.mean[np.ix_(members, members)].max())
         if length > 0.75:  # [m] trunk, shoulder to hip, of a very tall man (ANSUR II, 99th percentile and more)
             text = f"its {len(members)} markers lie up to {length:.2f} m apart: probably several segments in one"
-            out.append(TrainingFinding("merged", name, text, "Put the marker set right, or record all joints moving"))
+            out.append(TrainingFinding("merged", name, text, "Correct the marker set, or record all joints moving"))
     return out
 
 
@@ -121,8 +121,8 @@ def _rare(markers: Markers, model: MarkerModel) -> list[TrainingFinding]:
     out = []
     for label in model.gaps:
         share = np.isfinite(markers.positions[:, index[label], 0]).mean() if label in index else 0.0
-        text = f"seen in {100 * share:.0f} % of the frames" + ("" if label in model.labels else "; not in the model")
-        out.append(TrainingFinding("seldom", label, text, "Record it, or leave the label out"))
+        text = f"visible in {100 * share:.0f} % of the frames" + ("" if label in model.labels else "; not in the model")
+        out.append(TrainingFinding("seldom", label, text, "Record it, or remove the label"))
     return out
 
 
@@ -136,7 +136,7 @@ def _few(model: MarkerModel) -> list[TrainingFinding]:
         flat = np.linalg.svd(points - points.mean(0), compute_uv=False)
         if len(points) < 3 or flat[1] < 0.02:  # [m] off one line
             text = f"{len(members)} markers" + (", nearly on one line with its joint" if len(points) > 2 else "")
-            out.append(TrainingFinding("few", name, text, "Add a marker off the line, or expect doubtful names there"))
+            out.append(TrainingFinding("few", name, text, "Add a marker off the line, or expect uncertain names there"))
     return out
 
 
@@ -152,6 +152,6 @@ def _alike(model: MarkerModel) -> list[TrainingFinding]:
             d = model.mean[np.ix_(first, first)][i, j] - model.mean[np.ix_(second, second)][i, j]
             if np.abs(d).max() < MAX_SHAPE_DIFFERENCE:
                 text = f"same shape as {model.names[b]} within {1e3 * np.abs(d).max():.0f} mm"
-                remedy = "Move one marker by 3 cm, or wear one more on a side"
+                remedy = "Move one marker by 3 cm, or add one on one side"
                 out.append(TrainingFinding("alike", model.names[a], text, remedy))
     return out

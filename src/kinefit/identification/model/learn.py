@@ -64,7 +64,7 @@ def learn_model(markers: Markers, *, name: str = "subject", template: MarkerSet 
     if not extent < MAX_EXTENT:
         raise ObservationError(
             f"the labels spread over {extent:.4g} m", file=markers.source or None,
-            remedy="One subject at a time, in the right unit (--unit mm ...).",
+            remedy="Learn one subject at a time, in the right unit (--unit mm ...).",
         )
     tables = distance_statistics(positions)
     if isinstance(marker_set, MarkerSet):
@@ -95,10 +95,10 @@ def usable_markers(markers: Markers, marker_set: MarkerSet | None) -> tuple[NDAr
     excluded = [n for i, n in enumerate(markers.names) if i not in keep and not n.startswith("*")]
     excluded = [n for n in excluded if not (marker_set and marker_set.is_computed(n))]
     if len(keep) < 3:
-        problem, remedy = f"{len(keep)} labelled markers are ever seen", "A model needs three and more."
+        problem, remedy = f"only {len(keep)} labelled markers are visible", "A model needs three or more."
         if all(label.startswith("*") for label in markers.names):
             problem = f"{len(markers.names)} trajectories without names"
-            remedy = "Identify first: `kinefit markers identify TAKE SUBJECT.json`; a subject is learnt from names."
+            remedy = "Identify first: `kinefit markers identify TAKE SUBJECT.json`; learning needs labels."
         raise ObservationError(problem, file=markers.source or None, remedy=remedy)
     rows = np.flatnonzero(visible[:, keep].sum(1) >= 3)
     step = max(1, -(-len(rows) // MAX_FRAMES))
@@ -281,5 +281,5 @@ def mean_shape(positions: NDArray, segments: tuple[tuple[int, ...], ...], mean: 
             weights[index] += 1
     placed = weights > 0
     if not placed.all():
-        raise ObservationError("no frame shows all segments", remedy="Give a take in which every marker is seen.")
+        raise ObservationError("no frame shows all segments", remedy="Give a take in which every marker is visible.")
     return sums / weights[:, None]

@@ -88,7 +88,7 @@ class MarkerModel:
         if np.shape(self.reference) != (count, 3) or not np.isfinite(self.reference).all():
             raise ObservationError(
                 f"reference positions of shape {np.shape(self.reference)}, or not finite, for {count} labels",
-                remedy="Give a frame in which every marker is seen.",
+                remedy="Give a frame in which every marker is visible.",
             )
         for table in ("mean", "deviation", "low", "high"):
             if np.shape(getattr(self, table)) != (count, count):

@@ -154,7 +154,7 @@ def identify_take(
     if share < MIN_LABEL_SHARE:
         raise ObservationError(
             f"the take does not fit the model of {model.name}: {_mismatch(work, share)}", file=markers.source or None,
-            remedy="Is it the same subject, with the same markers, and the right unit?" + _marker_set_advice(model),
+            remedy="Check that subject, markers and unit are the same." + _marker_set_advice(model),
         )
     work.update_beliefs()
     work.identify_frames(sorted(set(anchors) - set(first)))
@@ -185,8 +185,8 @@ def _marker_set_advice(model: MarkerModel) -> str:
     if find_marker_set(model.labels) is not None:
         return ""
     return (
-        " No set of the catalogue knows its labels, so that its segments may be none: write a set (`kinefit markers "
-        "set TAKE -o set.toml`), put it right, and learn with --set set.toml."
+        " No set of the catalogue knows its labels, so its segments may be wrong: write a set (`kinefit markers "
+        "set TAKE -o set.toml`), correct it, and learn with --set set.toml."
     )
 
 
@@ -234,7 +234,7 @@ def list_doubts(
             misfit = float(np.nanmax(np.append(off[frames, m], 0.0)))
             kind = "off" if misfit > OUTLIER_SIGMAS else "unsure"
             text = f"{label} in frames {first} to {last}: " + (
-                f"off its segment by {misfit:.0f} deviations" if kind == "off" else f"probability {least:.2f}"
+                f"off its segment by {misfit:.0f} standard deviations" if kind == "off" else f"probability {least:.2f}"
             )
             out.append(Doubt(first, last, label, kind, least, text))
     return sorted(out, key=lambda d: (d.confidence, d.first))

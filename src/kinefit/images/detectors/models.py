@@ -18,7 +18,7 @@ from kinefit.images.detectors.person_detector import DetectedPerson, PersonDetec
 from kinefit.images.detectors.pose_model import MASK, PersonLandmarks, PoseModel, mean_with_mirrored
 
 DETECTOR, LANDMARKS = "pose_detection.tflite", "pose_landmark_full.tflite"
-_REMEDY = "Delete its folder; it is then fetched again."
+_REMEDY = "Delete its folder; kinefit then fetches it again."
 _LAYOUT = (
     "Name a landmark network of BlazePose: input (1, 256, 256, 3); outputs (1, 195), (1, 1), (1, 64, 64, 39), (1, 117) "
     "and, for outlines, (1, 256, 256, 1)."
@@ -148,7 +148,7 @@ def _reduced(path: Path, without: tuple[int, ...]) -> bytes:
 
     content = path.read_bytes()
     if not schema.Model.ModelBufferHasIdentifier(content, 0):
-        raise ValueError("it is no file of TensorFlow Lite")
+        raise ValueError("it is not a file of TensorFlow Lite")
     model = schema.ModelT.InitFromObj(schema.Model.GetRootAs(content, 0))
     graph = model.subgraphs[0]
     graph.outputs = [k for k in graph.outputs if tuple(graph.tensors[k].shape) != without]

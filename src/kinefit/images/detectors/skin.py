@@ -95,10 +95,10 @@ class SkinTracker:
         h, w = image.shape[:2]
         is_inside = left < w and top < h and left + width > 0 and top + height > 0
         if not (min(width, height) >= 8 and width <= 2 * w and height <= 2 * h and is_inside):
-            remedy = "Give (left, top, width, height) in pixels: 8 px or more, no larger than the picture."
-            raise ObservationError(f"no face at {tuple(face)} in a picture of {w}x{h} px", remedy=remedy)
+            remedy = "Give (left, top, width, height) in pixels: 8 px or more, no larger than the image."
+            raise ObservationError(f"no face at {tuple(face)} in an image of {w}x{h} px", remedy=remedy)
         if not rate > 0:
-            raise ObservationError(f"a rate of {rate} Hz", remedy="Give pictures per second.")
+            raise ObservationError(f"a rate of {rate} Hz", remedy="Give images per second.")
         self._shape, self._step = image.shape, 1.0 / rate
         self._scale = min(1.0, _MAX_SIDE_PX / max(h, w))
         self._height = height * self._scale  # of the face, in the scaled image
@@ -141,7 +141,7 @@ class SkinTracker:
         """
         self._check(image)
         if image.shape != self._shape:
-            problem = f"a picture of shape {image.shape} after one of {self._shape}"
+            problem = f"an image of shape {image.shape} after one of {self._shape}"
             raise ObservationError(problem, remedy="Start a new tracker for another camera.")
         bins = self._chroma(image)
         p = (self._skin * _PRIOR / (self._skin * _PRIOR + self._rest * (1.0 - _PRIOR)))[bins].astype(np.float32)

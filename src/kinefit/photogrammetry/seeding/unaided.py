@@ -76,7 +76,7 @@ def grow_over_time(
     """
     points = grid.points[grid.inside]
     if not len(points):
-        raise ObservationError("the surface is lost", remedy="Take more images between, or leave this one out.")
+        raise ObservationError("the surface is lost", remedy="Use more images between, or remove this one.")
     spots = points[np.random.default_rng(0).permutation(len(points))[:_MAX_SEARCHED_POINTS]]
     peaks = search_box(first, second, spots, reach=_SEARCH_REACH_PX, window=LINE_WINDOW)
     good = (peaks.best >= _MIN_BOX_CORRELATION) & (peaks.runner_up < _MAX_RUNNER_UP_RATIO * peaks.best)

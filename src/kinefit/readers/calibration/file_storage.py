@@ -102,7 +102,7 @@ class _Yaml:
     def document(self) -> Any:
         value = self._block(-1)
         if self._at < len(self._text):
-            self._fail("an indentation, or a text, that does not belong here")
+            self._fail("unexpected indentation or text")
         return value
 
     def _block(self, parent: int) -> Any:
@@ -168,7 +168,7 @@ class _Yaml:
                 self._at += 1
                 self._skip()
             elif not self._text.startswith(close, self._at):
-                self._fail(f"no comma or '{close}'")
+                self._fail(f"a comma or '{close}' is missing")
         self._at += 1
         return table if keyed else items
 
@@ -182,10 +182,10 @@ class _Yaml:
 
     def _key(self, pattern: re.Pattern[str], table: dict[str, Any]) -> str:
         if (found := pattern.match(self._text, self._at)) is None:
-            self._fail("no key with a colon")
+            self._fail("a key with a colon is missing")
         name = _unquoted(found[1].strip())
         if name in table:
-            self._fail(f"the key '{name}' twice")
+            self._fail(f"the key '{name}' appears twice")
         self._at = found.end()
         return name
 
@@ -203,7 +203,7 @@ class _Yaml:
     def _take_text(self, pattern: re.Pattern[str]) -> str:
         found = pattern.match(self._text, self._at)
         if found is None or found[0].startswith(("&", "*", "|", ">", "`", "@", '"', "'", "- ")):
-            self._fail("no value that OpenCV writes")
+            self._fail("a value that OpenCV does not write")
         self._at = found.end()
         return found[0]
 
@@ -234,4 +234,4 @@ def _unquoted(text: str) -> str:
 
 def _check_depth(depth: int) -> None:
     if depth > _MAX_DEPTH:
-        raise ValueError("tables within tables, deeper than any calibration")
+        raise ValueError("tables are nested too deeply for a calibration")

@@ -66,7 +66,7 @@ def read_found(path: str | PathLike[str]) -> FoundCameras | None:
             str(metadata[_KEY]),
         )  # fmt: skip
     except (KeyError, TypeError, ValueError) as error:
-        raise FileError(f"its [metadata] lacks {error}", file=path, remedy="Delete it: it is found anew.") from error
+        raise FileError(f"its [metadata] lacks {error}", file=path, remedy="Delete it: it is made again.") from error
 
 
 def found_notes(entry: CalibrationEntry | None) -> tuple[str, ...]:

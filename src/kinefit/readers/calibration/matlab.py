@@ -33,9 +33,9 @@ def read_mat(path: Path) -> Table:
         found = loadmat(path, simplify_cells=True)
     except NotImplementedError:
         remedy = "Save it again: save('calibration.mat', '-struct', 's', '-v7')."
-        raise FileError("a file of MATLAB's version 7.3", file=path, remedy=remedy) from None
+        raise FileError("a MATLAB file of version 7.3, which kinefit does not read", file=path, remedy=remedy) from None
     except Exception as error:  # a damaged file can raise anything
-        raise FileError(f"no file of MATLAB that can be read: {error}", file=path, remedy="Save it again.") from None
+        raise FileError(f"not a readable MATLAB file: {error}", file=path, remedy="Save it again.") from None
     variables = {key: _plain(value, path) for key, value in found.items() if not key.startswith("__")}
     pair = next((v for v in variables.values() if isinstance(v, dict) and "CameraParameters1" in v), variables)
     return matlab_tree(pair, path, of_mat=True)
@@ -50,7 +50,7 @@ def _plain(value: Any, path: Path) -> Any:
     if isinstance(value, list | np.ndarray) and type(value).__name__ != "MatlabOpaque":
         return [_plain(inner, path) for inner in value]
     if not isinstance(value, str | int | float | np.generic):
-        raise CalibrationError("MATLAB's objects, which no other program reads", file=path, remedy=f"{_AS_STRUCT}.")
+        raise CalibrationError("MATLAB objects, which only MATLAB reads", file=path, remedy=f"{_AS_STRUCT}.")
     return value.item() if isinstance(value, np.generic) else value
 
 

@@ -111,7 +111,7 @@ def qualisys_text(rig: Rig, text: str, metres_per_unit: float, path: Path) -> st
 def _replace(element: Element, camera: Camera, metres_per_unit: float, path: Path) -> None:
     if camera.model != "radtan" or camera.distortion[5:].any():
         raise CalibrationError(
-            "a lens model that Qualisys files lack", file=path, place=f"camera {camera.name}",
+            "Qualisys files cannot hold this lens model", file=path, place=f"camera {camera.name}",
             remedy="Calibrate it with k1, k2, p1, p2, k3 alone, or write another format.",
         )
     fov, K = element.find("fov_video"), camera.matrix

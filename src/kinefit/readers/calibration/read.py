@@ -236,7 +236,7 @@ def _rig_of(
 ) -> Rig:
     if len(tables) > _MAX_CAMERAS:
         problem = f"{len(tables)} cameras, more than {_MAX_CAMERAS}"
-        raise CalibrationError(problem, file=path, remedy="Leave out those that recorded nothing.")
+        raise CalibrationError(problem, file=path, remedy="Remove the cameras that recorded nothing.")
     cameras = [
         camera_from_table(name, table, file, image_size=image_size, pose_needed=exteriors and len(tables) > 1)
         for name, table, file in tables
@@ -264,7 +264,7 @@ def _tree(path: Path) -> dict:
 def _read_text(path: Path) -> str:
     try:
         if (size := path.stat().st_size) > MAX_CALIBRATION_BYTES:
-            problem = f"{size / 1e6:.0f} MB, more than any calibration"
+            problem = f"{size / 1e6:.0f} MB, too large for a calibration"
             raise FileError(problem, file=path, remedy=f"Is it another file? kinefit reads {FORMATS}.")
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError):

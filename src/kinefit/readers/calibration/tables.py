@@ -229,7 +229,7 @@ def camera_from_table(
     if size is None:
         raise CalibrationError(
             "the size of its image is missing", file=path, place=place,
-            remedy="Write size = [width, height] beside its matrix, or its video or size into the take's [[camera]] "
+            remedy="Write size = [width, height] next to its matrix, or its video or size into the take's [[camera]] "
             "(from Python: image_size=(width, height)).",
         )  # fmt: skip
     model = "fisheye" if _is_fisheye(table) else "radtan"

@@ -52,7 +52,7 @@ def _camera(element: Element, path: Path) -> Camera:
     (focal,), centre = values("FOCAL_LENGTH", (1,)), values("PRINCIPAL_POINT", (2,))
     sides = [values(key, (1,), "1")[0] for key in ("PIXEL_ASPECT_RATIO", "PIXEL_ASPECT_RATIO_CORRECTION")]
     if max(abs(side - 1) for side in sides) > _MAX_ASPECT_ERROR or values("SKEW", (1,), "0")[0] != 0:
-        problem = "pixels that are no squares: PIXEL_ASPECT_RATIO or SKEW"
+        problem = "pixels are not square: PIXEL_ASPECT_RATIO or SKEW"
         raise CalibrationError(problem, file=path, place=place, remedy="Resample the video to square pixels.")
     K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
     quaternion = values("ORIENTATION", (4,))
@@ -76,7 +76,7 @@ def _radial(frame: Element, centre: NDArray, path: Path, place: str) -> NDArray:
         k = numbers(words, (5,), path, f"{place}, VICON_RADIAL2")
         known = model in ("", "Vicon3Parameter", "ViconRadial2")
         if k[2:].any() and (not known or np.abs(k[:2] - centre).max() > _MAX_CENTRE_OFFSET_PX):
-            problem = "a distortion about another point than the principal one" if known else f"a lens '{model}'"
+            problem = "the centre of distortion is not the principal point" if known else f"a lens '{model}'"
             remedy = "Undistort the video in Vicon's program, or calibrate with a board."
             raise CalibrationError(problem, file=path, place=f"{place}, VICON_RADIAL2", remedy=remedy)
         k = k[2:]

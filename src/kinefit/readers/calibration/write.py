@@ -75,8 +75,8 @@ def write_calibration_like(
     like, path = Path(like), Path(path)
     like = like.parent if like.name in ("cameras.txt", "images.txt") else like
     if inside(like) is not None:
-        remedy = "Write what `read_calibration` gives of it by `write_calibration`, and name that TOML in the take."
-        raise CalibrationError("a recording of ROS 2 is no calibration to be written again", file=like, remedy=remedy)
+        remedy = "Use `read_calibration` and `write_calibration` to make a TOML of it, and name that in the take."
+        raise CalibrationError("kinefit cannot write cameras into a recording of ROS 2", file=like, remedy=remedy)
     old = read_calibration(like, unit=unit, image_size=image_size, exteriors=False)
     for name in rig.names:
         if name not in old:
@@ -101,9 +101,9 @@ def write_calibration_like(
 
 def _check_target(like: Path, path: Path, overwrite: bool) -> None:
     if path.exists() and path.samefile(like):
-        raise ExportError("this is the calibration to be kept", file=path, remedy="Give another name.")
+        raise ExportError("this is the original calibration, which must stay", file=path, remedy="Give another name.")
     if path.exists() and (not overwrite or path.is_dir() != like.is_dir()):
-        raise ExportError("there is something of this name already", file=path, remedy="Give another name.")
+        raise ExportError("this name is already taken", file=path, remedy="Give another name.")
 
 
 def _move(root: Path, path: Path, texts: dict[str, str]) -> None:
@@ -121,7 +121,7 @@ def _compare(rig: Rig, written: Path, like: Path, **reading: Any) -> None:
         back = read_calibration(written, exteriors=False, **reading)
     except KinefitError as error:
         raise CalibrationError(
-            f"the rig's numbers do not go into it ({error.problem})", file=like, place=error.place, remedy=_REMEDY
+            f"the file cannot hold the rig's numbers ({error.problem})", file=like, place=error.place, remedy=_REMEDY
         ) from None
     for camera in rig:
         found = back[camera.name] if camera.name in back else None

@@ -17,7 +17,7 @@ from kinefit.readers.depth._kernels_clouds import lzf
 
 ENDINGS = (".pcd", ".ply")
 _REMEDY = "Export it again, as PCD or PLY with x, y and z."
-_CUT = "It is cut: copy it again."
+_CUT = "The file is truncated: copy it again."
 _PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 _PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",

@@ -103,8 +103,8 @@ def _depth_of(picture: NDArray, file: Path) -> NDArray:
     if picture.ndim != 2 or picture.dtype not in (np.uint16, np.float32, np.float64):
         channels = 1 if picture.ndim == 2 else picture.shape[2]
         raise ObservationError(
-            f"a picture of {picture.itemsize * 8} bits in {channels} channel(s), which is no depth", file=file,
-            remedy="Depth is one channel of 16 bits, or of float. Is this the colour, or a picture for the eye? "
+            f"an image of {picture.itemsize * 8} bits in {channels} channel(s), not a depth image", file=file,
+            remedy="A depth image has one channel of 16 bits or of float. This may be a colour image. "
             "Name only the depth files: depth_*.png.",
         )  # fmt: skip
     return picture
@@ -133,7 +133,7 @@ def raw_source(files: list[Path], size: tuple[int, int] | None) -> DepthSource:
     length = files[0].stat().st_size
     if size is None:
         raise ObservationError(
-            f"raw files of {length} bytes, and the size of the image is not given", file=files[0],
+            f"raw files of {length} bytes without a stated image size", file=files[0],
             remedy="Give size = [width, height]; 614400 bytes are 640x480 in 16 bits.",
         )  # fmt: skip
     width, height = size
@@ -143,7 +143,7 @@ def raw_source(files: list[Path], size: tuple[int, int] | None) -> DepthSource:
         if have == 0 or have % frame or (len(files) > 1 and have != frame):
             raise ObservationError(
                 f"{have} bytes, but {width}x{height} px of 16 bits are {frame}", file=file,
-                remedy="Correct the size, and leave out files of another kind: name them by a pattern (depth-*).",
+                remedy="Correct the size, or name only the depth files by a pattern (depth-*).",
             )  # fmt: skip
     per_file = length // frame
 
@@ -151,7 +151,7 @@ def raw_source(files: list[Path], size: tuple[int, int] | None) -> DepthSource:
         file, place = (files[i], 0) if len(files) > 1 else (files[0], i)
         data = np.fromfile(file, "<u2", width * height, offset=place * frame)
         if len(data) < width * height:
-            raise FileError("is shorter than before", file=file, place=f"frame {i}", remedy="Copy it again.")
+            raise FileError("became shorter while it was read", file=file, place=f"frame {i}", remedy="Copy it again.")
         return counts_of(data.reshape(height, width))
 
     count = len(files) if len(files) > 1 else per_file
@@ -185,7 +185,7 @@ def array_source(path: Path) -> DepthSource:
         if key in content:
             value = content[key]
             if value.size != 1 or value.dtype.kind not in "uif":
-                raise ObservationError(f"`{key}` is no number", file=path, remedy="Give one number.")
+                raise ObservationError(f"`{key}` is not a number", file=path, remedy="Give one number.")
             number[key] = float(value.ravel()[0])
     unit = number.get("unit", 1.0 if depth.dtype.kind == "f" else 0.001)
     return DepthSource(

@@ -168,7 +168,7 @@ def _source(path: Path, name: str, size: tuple[int, int] | None) -> DepthSource:
     if pieces := _of_ending(files, clouds.ENDINGS):
         return _organised(pieces, name)
     if size is None and (colour := _of_ending(files, (".jpg", ".jpeg", ".bmp", ".gif"))):
-        problem = f"{colour[0].suffix} files hold colours, no depth"
+        problem = f"{colour[0].suffix} files hold colour, not depth"
         raise FileError(problem, file=path, remedy=f"kinefit reads {FORMATS}.")
     return raw_source(files, size)
 
@@ -185,14 +185,14 @@ def _of_ending(files: list[Path], endings: tuple[str, ...]) -> list[Path]:
 
 
 def _nothing(path: Path, what: str) -> FileError:
-    return FileError(f"no {what} in it", file=path, remedy=f"kinefit reads {FORMATS}.")
+    return FileError(f"it holds no {what}", file=path, remedy=f"kinefit reads {FORMATS}.")
 
 
 def _organised(files: list[Path], name: str) -> DepthSource:
     first = clouds.read_cloud(files[0])
     if first.shape is None:
         raise ObservationError(
-            "a cloud without the order of an image", file=files[0],
+            "a cloud without the rows of an image", file=files[0],
             remedy="Read it with kinefit.read_clouds; a take does so by itself.",
         )  # fmt: skip
     return DepthSource(
@@ -204,7 +204,7 @@ def _organised(files: list[Path], name: str) -> DepthSource:
 def _depth(file: Path) -> NDArray:
     cloud = clouds.read_cloud(file)
     if cloud.shape is None:
-        raise ObservationError("a cloud without the order of an image", file=file, remedy="Leave this file out.")
+        raise ObservationError("a cloud without the rows of an image", file=file, remedy="Remove this file.")
     return clouds.depth_of(cloud)
 
 
@@ -217,7 +217,7 @@ def _times(
     if time_unit is not None:
         numbers = [re.findall(r"\d+", name) for name in source.names]
         if not numbers or not all(numbers):
-            raise ObservationError("names without a number", file=path, remedy="Leave time_unit out, and give rate.")
+            raise ObservationError("the file names have no number", file=path, remedy="Remove time_unit, give rate.")
         counts = [int(found[-1]) for found in numbers]
         times = np.array([count - counts[0] for count in counts], float) * time_unit
     if not (np.isfinite(time_offset) and (time_unit is None or (np.isfinite(time_unit) and time_unit > 0))):
@@ -227,14 +227,14 @@ def _times(
     if times is None:
         rate = rate or source.rate or (default_rate if source.count > 1 else _DEFAULT_RATE)
         if rate is None:
-            raise ObservationError("nothing tells its rate", file=path, remedy="Give rate = ... in frames per second.")
+            raise ObservationError("its rate is not stated", file=path, remedy="Give rate = ... in frames per second.")
         return np.arange(source.count) / rate + time_offset, rate
     steps = np.diff(times)
     measured = 1.0 / float(np.median(steps[steps > 0])) if (steps > 0).any() else None
     if rate is not None and measured is not None and not 0.9 < rate / measured < 1.1:
         raise ObservationError(
-            f"the times of its frames say {measured:.4g} Hz, not {rate:g} Hz", file=path,
-            remedy="Leave the rate out, or correct the unit of the times.",
+            f"the times of its frames give {measured:.4g} Hz, not {rate:g} Hz", file=path,
+            remedy="Remove the rate, or correct the unit of the times.",
         )  # fmt: skip
     if source.rate and measured and abs(source.rate / measured - 1.0) < 0.1:
         measured = source.rate  # times are rounded to milliseconds
@@ -272,14 +272,14 @@ def _check_values(
 ) -> None:
     if not len(depth):
         raise ObservationError(
-            "nothing was measured in any of its frames", file=path,
-            remedy="Was the sensor covered, or are these the infrared pictures?",
+            "no frame has a depth value", file=path,
+            remedy="Check that the sensor was not covered and that these are not infrared images.",
         )  # fmt: skip
     median = float(np.median(depth))
     if not least < median < _MAX_MEDIAN_DEPTH:
         likely = [unit for unit in _COUNT_UNITS if _PERSON_DISTANCES[0] < median / factor * unit < _PERSON_DISTANCES[1]]
         entry = f"unit = {likely[0]:g}" if likely else "the sensor's own unit = ..."
-        what = " (millimetres taken for metres?)" if factor == 1.0 and median > 100 else ""
+        what = " (probably millimetres)" if factor == 1.0 and median > 100 else ""
         raise ObservationError(
             f"the median depth is {median:.4g} m{what}: the unit of {factor:g} m a count is wrong", file=path,
             remedy=f"Write {entry} (metres a count).",

@@ -93,8 +93,8 @@ def track_source(path: Path, name: str) -> DepthSource:
             pixels = None if codec.format is None else codec.format.name  # old PyAV has no `pix_fmt` then
             if not raw and pixels not in _GREY:
                 raise ObservationError(
-                    f"its video is {codec.name} {pixels}, which is no depth", file=path,
-                    remedy="Depth is 16-bit grey (FFV1 gray16le) or the depth track of an Azure Kinect recording.",
+                    f"its video is {codec.name} {pixels}, not depth", file=path,
+                    remedy="Give 16-bit grey (FFV1 gray16le) or the depth track of an Azure Kinect recording.",
                 )  # fmt: skip
             rate = float(stream.average_rate or 0) or None
             camera = _azure_camera(container, name, size, path)
@@ -102,7 +102,7 @@ def track_source(path: Path, name: str) -> DepthSource:
     except (av.FFmpegError, OSError, ValueError) as error:
         raise FileError(f"not a readable video ({error})", file=path, remedy="Copy it again.") from error
     if not times:
-        raise FileError("its depth track has no frames", file=path, remedy="Was the recording stopped at once?")
+        raise FileError("its depth track has no frames", file=path, remedy="Record for longer.")
     seconds = np.array(times) * base
     return DepthSource(
         len(times), _StreamTrack(path, index, raw, times), size, 0.001, camera is not None, seconds - seconds[0],
@@ -187,7 +187,7 @@ class _Bag:
         for frame in self.frames():
             if self._next == i + 1:
                 return np.asanyarray(frame.get_data()).astype(np.float32)
-        raise FileError("the recording ends before it", file=self._path, place=f"frame {i}", remedy="Copy it again.")
+        raise FileError("the recording ends before", file=self._path, place=f"frame {i}", remedy="Copy it again.")
 
 
 def bag_source(path: Path, name: str) -> DepthSource:

@@ -72,10 +72,10 @@ def describe_cameras(
             keypoint_entries(draft, source, record, frame, images, active=record is first)
     if len(names) == 1:
         lifted = names[0] in opened and not first
-        consequence = "the built-in detector tells how far limbs are" if lifted else ONE_CAMERA
+        consequence = "the built-in detector estimates depth" if lifted else ONE_CAMERA
         draft.note("cameras", "likely" if lifted else "open", f"{names[0]} alone: {consequence}")
     if missing := [name for name in rig.names if name not in names]:
-        draft.note("cameras", "sure", f"{', '.join(missing)} of the calibration: nothing here fits, left out")
+        draft.note("cameras", "sure", f"{', '.join(missing)} of the calibration: no file here fits, not used")
     if opened and not first:
         draft.note("keypoints", "sure", "none here: kinefit track runs the built-in detector on the videos")
 
@@ -100,8 +100,8 @@ def describe_uncalibrated(draft: Draft, videos: Sequence[Path]) -> None:
             opened[path.stem] = stack.enter_context(Video(path, rate=UNSTATED))
         draft.head["rate"] = draft.note_value("rate", _rate(draft, opened, []), "rate")
         counts = {name: f"{len(video)} frames" for name, video in opened.items()}
-    more = "a tenth more, a tenth nearer" if len(opened) == 1 else "it is found with where the cameras stand"
-    why = f"degrees across the longer side; {DEFAULT_FIELD_OF_VIEW:g} is usual for telephones; {more}"
+    more = "10 % wider places people 10 % nearer" if len(opened) == 1 else "kinefit track estimates it with the poses"
+    why = f"degrees across the longer side; {DEFAULT_FIELD_OF_VIEW:g} is typical of telephones; {more}"
     for path in videos:
         video = Value(path, "likely", counts[path.stem]) if len(videos) > 1 else Value(path)
         wide = Value(DEFAULT_FIELD_OF_VIEW, "guess", why)
@@ -110,19 +110,19 @@ def describe_uncalibrated(draft: Draft, videos: Sequence[Path]) -> None:
             wide = Value(round(field_of_view(stated), 1), "likely", whence)
         draft.cameras[path.stem] = {"video": video, "field_of_view": wide}
     if len(videos) == 1:
-        alone = f"{draft.name(videos[0])} alone: a network tells how far limbs are; state height"
+        alone = f"{draft.name(videos[0])} alone: a network estimates depth; state height"
         draft.note("camera", "likely", alone)
         return
     draft.head["up"] = Value("z", "sure", "found with the floor, from the people in view")
     draft.note("cameras", "likely", f"{len(videos)} videos of one moment: {', '.join(map(draft.name, videos))}")
-    found = "none here: kinefit track finds lenses, places and clocks from the people in view"
+    found = "none here: kinefit track finds lenses, poses and clocks from the people in view"
     draft.note("calibration", "guess", found)
 
 
 def _nothing_fits(draft: Draft, calibration: CalibrationFile, *, found: bool) -> TakeError:
     """Make the error of a folder whose files do not fit its calibration."""
     names = ", ".join(calibration.rig.names)
-    remedy = f"Let each file, or its folder, bear the name of its camera: {names}."
+    remedy = f"Name each file, or its folder, after its camera: {names}."
     if found:  # keypoints are there, but none can be read
         remedy = "; ".join(note.text for note in draft.notes if note.about.startswith("keypoints"))
     problem = "neither videos nor keypoints can be used with the cameras of the calibration"
@@ -163,7 +163,7 @@ def _cut(draft: Draft, clocks: Mapping[str, NDArray], rate: float) -> None:
     except ObservationError:
         lengths = sorted({steps_of(times, rate)[1] for times in clocks.values()})
         listed = ", ".join(map(str, lengths))
-        frames = Value((0, lengths[0]), "guess", f"streams of {listed} frames, taken as if they began together")
+        frames = Value((0, lengths[0]), "guess", f"streams of {listed} frames, assumed to start together")
         draft.head["frames"] = draft.note_value("frames", frames, "frames")
 
 
@@ -199,7 +199,7 @@ def _choose_recording(draft: Draft, paths: Sequence[Path], rig: Rig) -> Trial | 
                 sizes[path] = video.size
     found, left = trials(paths, draft.folder, rig.names, sizes, wanted)
     for path in left:
-        draft.note("video", "open", f"{draft.name(path)} fits no camera of the calibration: left out")
+        draft.note("video", "open", f"{draft.name(path)} fits no camera of the calibration: not used")
 
     def rank(trial: Trial) -> tuple[bool, bool, int, int, int]:
         size = sum(path.stat().st_size for path in trial.files.values() if path.exists())
@@ -208,15 +208,15 @@ def _choose_recording(draft: Draft, paths: Sequence[Path], rig: Rig) -> Trial | 
 
     found = sorted(found, key=rank)
     if len(found) > 1:
-        draft.note("video", "guess", f"{found[0].place}: taken, the first or largest of {len(found)} recordings")
+        draft.note("video", "guess", f"{found[0].place}: used, the first or largest of {len(found)} recordings")
     for trial in found[1:]:
         still = bool(STATIC.search(trial.place))
-        drawn = "another recording, or what a detector drew" if DRAWN_ON.search(trial.place) else "another recording"
+        drawn = "another recording, or a detector's overlay" if DRAWN_ON.search(trial.place) else "another recording"
         what = "a static trial" if still else drawn
         draft.note("video", "likely" if still else "guess", f"{trial.place}: {what}; kinefit init on its own folder")
         if still:
             draft.comments.append(
-                f"subject = \"...\"  # open: take of the static trial {trial.place}, to take bone lengths from"
+                f"subject = \"...\"  # open: take of the static trial {trial.place}, for its bone lengths"
             )
     return found[0] if found else None
 
@@ -263,7 +263,7 @@ def _rate(draft: Draft, opened: Mapping[str, Video], records: Sequence[Mapping[s
         return Value(rate, "likely", f"the highest of the videos ({listed} Hz); points are interpolated between frames")
     if tables:
         return Value(round(min(tables), 3), "likely", "median of the table's own times")
-    return Value(None, "open", "nothing here states the frames per second: write it")
+    return Value(None, "open", "no file states the frame rate: write it")
 
 
 def _world(
@@ -272,14 +272,14 @@ def _world(
     """Enter unit and vertical axis of the calibration's world."""
     person: NDArray | None = None
     spread = calibration.spread
-    size = Value(None, "open", f"the cameras would stand {2 * spread:.3g} m apart, no keypoints show a person's size")
+    size = Value(None, "open", f"the cameras would be {2 * spread:.3g} m apart, and no keypoints show a person's size")
     if _MIN_SPREAD < spread < _MAX_SPREAD:
-        size = Value("m", "likely", f"the cameras stand about {2 * spread:.2g} m apart")
+        size = Value("m", "likely", f"the cameras are about {2 * spread:.2g} m apart")
     if len(records) > 1:
         x, _ = guess_views.meet(calibration.rig, records, images)
         points = next(iter(records.values())).names
         size, person = guess_views.guess_unit(x, points), guess_views.up_of_person(x, points)
-    unit = Value(calibration.unit, "guess", "so the cameras stand some metres apart")
+    unit = Value(calibration.unit, "guess", "with it the cameras are some metres apart")
     if unit.value == "auto" and size.value not in (None, "m"):
         unit = size
     if unit.value != "auto" and draft.calibration:

@@ -16,7 +16,7 @@ CONFIDENCE_LEVELS = ("sure", "likely", "guess", "open")
 _COMMENT_COLUMN = 40
 _HEAD = """\
 # A first take file, made by kinefit init from what lies in the folder.
-# A comment begins with how sure its line is: sure, likely, guess, or open (for you to decide). Then:
+# A comment begins with the confidence of its line: sure, likely, guess, or open (you decide). Then:
 #   kinefit check THIS_FILE      checks whether cameras, keypoints and calibration agree
 #   kinefit track THIS_FILE      fits the body
 """

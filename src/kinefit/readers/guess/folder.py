@@ -21,7 +21,7 @@ from kinefit.readers.ros.contents import Shown, shown
 from kinefit.readers.ros.rig import mcap_rig
 
 _CALIBRATE = (
-    "Calibrate with a board (kinefit calibrate board) or, where the cameras' interiors are known, from the person "
+    "Calibrate with a board (kinefit calibrate board) or, if the cameras' intrinsics are known, from the person "
     "(kinefit calibrate people); then run kinefit init again."
 )
 
@@ -72,7 +72,7 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
         draft.note("keypoints", "open", remark)
     if not (videos or keypoints or markers or recordings):
         raise TakeError(
-            f"nothing here that a take is made of, among {len(files)} files", file=folder,
+            f"no videos, keypoints, markers or recordings among {len(files)} files", file=folder,
             remedy="Name a folder with videos (.mp4, .avi ...) or keypoints and a calibration, or with .c3d, .trc or "
             ".mcap (ROS 2).",
         )
@@ -84,7 +84,7 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
         describe_recordings(draft, recordings, alone=not (videos or keypoints or markers))
     _describe_markers(draft, markers)
     for path in [file for file in files if file.name == "trajectories.csv"] if draft.cameras else []:
-        file = Value(path, "likely", "a surface that kinefit surface followed; it needs a [start] or another sensor")
+        file = Value(path, "likely", "a surface that kinefit surface tracked; it needs a [start] or another sensor")
         draft.surface_points.append((not draft.surface_points, {"file": draft.note_value("surface", file, "file")}))
     draft.comments.append(OPEN_HEIGHT)
     return Guess(draft.text(), tuple(draft.notes))
@@ -99,7 +99,7 @@ def _choose_calibration(
     if not found:
         found = guess_files.find_calibrations(_above(draft.folder), videos, draft.folder)[0]
     if not found and markers:
-        draft.note("calibration", "open", f"none, so that videos and keypoints are left out. {_CALIBRATE}")
+        draft.note("calibration", "open", f"none, so videos and keypoints are not used. {_CALIBRATE}")
         return None
     if not found and faults:
         fault = faults[0]
@@ -110,10 +110,10 @@ def _choose_calibration(
     if not found:
         if videos and len(seen) == len(videos):
             if singles:
-                draft.note("calibration", "open", f"{draft.name(singles[0])} is of one camera alone: left out")
+                draft.note("calibration", "open", f"{draft.name(singles[0])} has one camera only: not used")
             describe_uncalibrated(draft, _of_one_moment(draft, videos))
             return None
-        alone = f" ({draft.name(singles[0])} is of one camera alone)" if singles else ""
+        alone = f" ({draft.name(singles[0])} has one camera only)" if singles else ""
         raise CalibrationError(f"no calibration of the cameras{alone}", file=draft.folder, remedy=_CALIBRATE)
 
     def fitting(c: CalibrationFile) -> int:
@@ -129,13 +129,13 @@ def _choose_calibration(
         reason = (
             "more files fit its cameras" if fitting(best) > fitting(others[0])
             else "its name says that it was refined" if best.is_refined > others[0].is_refined
-            else "it lies nearer"
+            else "it is nearer to the folder"
         )  # fmt: skip
-        why += f"; taken before {', '.join(map(draft.name, draft.others))}, since {reason}"
+        why += f"; chosen over {', '.join(map(draft.name, draft.others))}: {reason}"
     file = Value(best.path, "likely" if others else "sure", why)
     draft.note("calibration", file.sure, f"{draft.name(best.path)}: {why}")
     if best.sized:
-        draft.note("calibration", "likely", f"no size of the images of {', '.join(best.sized)}: their videos' is taken")
+        draft.note("calibration", "likely", f"no image size of {', '.join(best.sized)}: that of the video is used")
     draft.calibration = best, {"file": file}
     return best
 
@@ -166,7 +166,7 @@ def _describe_markers(draft: Draft, files: Sequence[Path]) -> None:
             records[path] = read_markers(path)
         except KinefitError as error:
             faults.append(error)
-            draft.note("markers", "open", f"{draft.name(path)} left out: {error.problem}")
+            draft.note("markers", "open", f"{draft.name(path)} not used: {error.problem}")
     if faults and not records and not draft.cameras:
         raise TakeError(
             f"no marker file can be read: {faults[0].problem}", file=faults[0].file, remedy=faults[0].remedy
@@ -180,14 +180,14 @@ def _describe_markers(draft: Draft, files: Sequence[Path]) -> None:
         record = records[used]
         extent = np.nanmedian(np.nanmax(record.positions, 1) - np.nanmin(record.positions, 1), axis=0)
         up = Value("xyz"[int(np.nanargmax(extent))], "likely", f"markers spread {np.nanmax(extent):.2f} m along it")
-        up = Value(record.up, "sure", "the file says so") if record.up else up
+        up = Value(record.up, "sure", "stated by the file") if record.up else up
         draft.head = {"rate": Value(record.rate, "sure", "of the markers"), "up": draft.note_value("up", up, "up")}
-        draft.note("markers", "sure" if len(records) == 1 else "guess", f"{draft.name(used)}: taken")
+        draft.note("markers", "sure" if len(records) == 1 else "guess", f"{draft.name(used)}: used")
         draft.note("markers", "sure", "kinefit.fit_markers fits a body to them; kinefit track needs cameras")
     left = len(records) - (used is not None)
     if left:
         reason = "results of other programs, or" if draft.cameras else ""
-        draft.note("markers", "guess", f"{left} files stand as comments: {reason} other recordings".replace("  ", " "))
+        draft.note("markers", "guess", f"{left} files are comments: {reason} other recordings".replace("  ", " "))
 
 
 _ALIGNED = "aligned"  # in the name of a topic with the same depth, warped to another camera
@@ -205,12 +205,12 @@ def describe_recordings(draft: Draft, paths: Sequence[Path], *, alone: bool) -> 
     """
     path, *others = paths
     if not alone:
-        text = "left out beside the other files; alone in a folder, kinefit init enters its topics"
+        text = "not used with the other files; alone in a folder, kinefit init enters its topics"
         for recording in paths:
             draft.note("recording", "open", f"{draft.name(recording)}: {text}")
         return
     for other in others:
-        draft.note("recording", "open", f"{draft.name(other)}: left out, {draft.name(path)} is larger")
+        draft.note("recording", "open", f"{draft.name(other)}: not used, {draft.name(path)} is larger")
     topics = shown(path)
     if not topics:
         remedy = "Record depth (16UC1, 32FC1) or colour images of the cameras."
@@ -240,7 +240,7 @@ def _calibration(draft: Draft, path: Path) -> Rig | None:
 def _up(rig: Rig | None) -> Value:
     if rig is not None and len(rig) > 1:
         return Value("z", "likely", "worlds of ROS are z up (REP 103)")
-    return Value("-y", "guess", "the world is the camera's own, taken as held level: y points down")
+    return Value("-y", "guess", "the world is the camera's frame, assumed level: y points down")
 
 
 def _depth(draft: Draft, path: Path, topics: Sequence[Shown], rig: Rig | None) -> None:
@@ -254,7 +254,7 @@ def _depth(draft: Draft, path: Path, topics: Sequence[Shown], rig: Rig | None) -
             entry["intrinsics"] = Value(None, "open", "[fx, fy, cx, cy] in pixels: the topic has no camera_info")
         draft.depth.append((t in used, entry))
         why = "" if t in used else (
-            ": a comment, the same once more" if t not in plain else ": a comment, its pose is unknown"
+            ": a comment, the same images again" if t not in plain else ": a comment, its pose is unknown"
         )  # fmt: skip
         draft.note(f"depth {t.name}", "sure" if t in used else "guess", f"{t.topic}, {count}{why}")
 
@@ -262,14 +262,14 @@ def _depth(draft: Draft, path: Path, topics: Sequence[Shown], rig: Rig | None) -
 def _colour(draft: Draft, path: Path, topics: Sequence[Shown], rig: Rig | None, *, beside_depth: bool) -> None:
     for t in topics:
         if rig is None or t.camera not in rig.names:
-            draft.note("camera", "open", f"{t.topic}: left out, its lens and pose are unknown")
+            draft.note("camera", "open", f"{t.topic}: not used, its lens and pose are unknown")
             continue
         draft.cameras[t.name] = {
             "video": Value(path), "topic": Value(t.topic, "sure", f"{t.frames} images, {t.rate:g} Hz"),
         }  # fmt: skip
         draft.note(f"camera {t.name}", "sure", t.topic)
         if beside_depth:
-            entry: Entry = {"camera": Value(t.name), "format": Value("detect", "open", "keypoints beside the depth")}
+            entry: Entry = {"camera": Value(t.name), "format": Value("detect", "open", "keypoints besides depth")}
             draft.keypoints.append((False, entry))
     if draft.cameras and not beside_depth:
         draft.note("keypoints", "sure", "none here: kinefit track runs the built-in detector on the videos")

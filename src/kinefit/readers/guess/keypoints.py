@@ -31,7 +31,7 @@ def keypoint_sources(
         of = {k.path: k for k in found if k.format == format and k.points}
         for k in found:
             if k.format == format and not k.points:
-                draft.note("keypoints", "open", f"{draft.name(k.path)}: nobody is seen in any frame, left out")
+                draft.note("keypoints", "open", f"{draft.name(k.path)}: no person in any frame, not used")
         if format == "caliscope":  # one table of all cameras
             numbered = [name for name in rig.names if camera_number(name) is not None]
             groups = [Trial(dict.fromkeys(numbered, path), "number", draft.name(path)) for path in of]
@@ -47,7 +47,7 @@ def keypoint_sources(
 
         for trial in sorted(groups, key=rank)[:1]:
             if frames and abs(counts[trial.place] - frames) > _MAX_LENGTH_ERROR * frames:
-                reason = f"{counts[trial.place]} frames, the videos have {frames}: of another recording, left out"
+                reason = f"{counts[trial.place]} frames, the videos have {frames}: another recording, not used"
                 draft.note("keypoints", "likely", f"{trial.place}: {reason}")
             else:
                 out.append({name: of[path] for name, path in trial.files.items()})
@@ -63,7 +63,7 @@ def read_sources(draft: Draft, sources: Sequence[Source]) -> list[dict[str, Keyp
             try:
                 read[name] = _read(file, name)
             except KinefitError as error:
-                draft.note(f"keypoints {name}", "open", f"{draft.name(file.path)} left out: {error.problem}")
+                draft.note(f"keypoints {name}", "open", f"{draft.name(file.path)} not used: {error.problem}")
         out.append(read)
     return out
 
@@ -102,7 +102,7 @@ def keypoint_entries(
         return
     format = next(iter(source.values())).format
     what = f"{format}, {', '.join(sorted({r.keypoint_set for r in records.values()}))}, {len(records)} cameras"
-    text = f"{what}: taken" if active else f"{what}: left as comments, as one detector is enough to begin with"
+    text = f"{what}: used" if active else f"{what}: as comments, because one detector is enough to begin with"
     draft.note("keypoints", "sure" if active else "guess", text)
     if active and any(_hands_seen(record) for record in records.values()):
         body = Value("humanoid_hands", "likely", "the humanoid with fingers, as the keypoints have hands")

@@ -16,8 +16,8 @@ HOW = {
     "name": ("sure", "by its name"),
     "number": ("likely", "by the number in its name"),
     "shifted": ("guess", "by the number in its name, which counts from another start"),
-    "size": ("likely", "by the size of its picture"),
-    "order": ("guess", "by order only: its name has no camera"),
+    "size": ("likely", "by its image size"),
+    "order": ("guess", "by order only: its name contains no camera"),
 }
 """{way of matching: (confidence level, its text in a message)}, in order of decreasing confidence."""
 

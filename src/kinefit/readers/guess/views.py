@@ -58,11 +58,11 @@ def guess_turn(rig: Rig, records: Mapping[str, Keypoints], sizes: Mapping[str, S
         misses[degrees] = float(np.median(residual[np.isfinite(residual)])) / found if found else np.inf
     if misses and min(misses.values()) < _MAX_RESIDUAL_RATIO * max(misses.values()):
         best = min(misses, key=lambda degrees: misses[degrees])
-        return Value(best, "likely", f"so that the keypoints of the cameras meet, not if turned by {360 - best}")
+        return Value(best, "likely", f"the keypoints of the cameras then agree; turned by {360 - best} they do not")
     for degrees in (90, 270):
         axis, angle = nearest_axis(up_of_cameras(rig, dict.fromkeys(turned, degrees)))
         if not axis.startswith("-") and angle < 30:
-            return Value(degrees, "guess", f"so that people stand upright, {axis} being up; else {360 - degrees}")
+            return Value(degrees, "guess", f"people then stand upright, with {axis} up; otherwise {360 - degrees}")
     return Value(90, "guess", "clockwise or counterclockwise: try 90, then 270")
 
 
@@ -91,7 +91,7 @@ def picture(calibrated: Size, video: Video, turn: Value) -> dict[str, Value]:
         return out | {"image": Value("letterboxed", "sure", f"{sizes}, and it has black bars of {max(bars)} px")}
     if max(expected) < 2:
         return out | {"image": Value("letterboxed", "likely", f"{sizes}: nearly the same shape")}
-    return out | {"image": Value("scaled", "guess", f"{sizes}, and it has no black bars; it may have been cut instead")}
+    return out | {"image": Value("scaled", "guess", f"{sizes}, without black bars; it may be cropped instead")}
 
 
 def image_frame(calibrated: Size, size: Size, degrees: int, image: str) -> ImageFrame:
@@ -178,24 +178,24 @@ def keypoint_frame(
         }
         for frame, other in (("calibration", "video"), ("video", "calibration")):
             if outside[other] > _MIN_OUTSIDE_SHARE > outside[frame]:
-                share = f"{100 * outside[other]:.1f} % of the points of {name} lie outside the {other}'s picture"
+                share = f"{100 * outside[other]:.1f} % of the points of {name} lie outside the {other}'s image"
                 return Value(frame, "sure" if outside[other] > 10 * _MIN_OUTSIDE_SHARE else "likely", share)
     medians = {}
     for frame in ("video", "calibration"):
         residual = meet(rig, records, images if frame == "video" else {})[1]
         medians[frame] = float(np.median(residual[np.isfinite(residual)])) if np.isfinite(residual).any() else np.nan
     if not np.isfinite(list(medians.values())).all():
-        return Value("video", "guess", "detectors run on the video; too little is seen to check it")
+        return Value("video", "guess", "detectors run on the video; too few detections to check this")
     best, other = sorted(medians, key=lambda name: medians[name])
-    why = f"the cameras agree to {medians[best]:.1f} px, to {medians[other]:.1f} px if in the {other}'s"
+    why = f"the cameras agree to {medians[best]:.1f} px; in the {other}'s image, to {medians[other]:.1f} px"
     if medians[best] < _MAX_RESIDUAL_RATIO * medians[other]:
         return Value(best, "likely", why)
     for frame in medians:
         residual = meet(rig, records, images if frame == "video" else {}, offset_rounds=_OFFSET_ROUNDS)[1]
         medians[frame] = float(np.median(residual[np.isfinite(residual)]))
     best, other = sorted(medians, key=lambda name: medians[name])
-    why = f"{medians[best]:.2f} px, {medians[other]:.2f} px if in the {other}'s"
-    return Value(best, "guess", f"by little: without each camera's constant offset the cameras agree to {why}")
+    why = f"{medians[best]:.2f} px; in the {other}'s image, to {medians[other]:.2f} px"
+    return Value(best, "guess", f"a small difference: without each camera's bias the cameras agree to {why}")
 
 
 def meet(
@@ -246,8 +246,8 @@ def guess_unit(x: NDArray, names: Sequence[str]) -> Value:
     unit = min(_UNITS, key=lambda u: abs(np.log(ratio / _UNITS[u])))
     if abs(np.log(ratio / _UNITS[unit])) < np.log(_MAX_SIZE_RATIO):
         height = 1.75 * ratio / _UNITS[unit]
-        return Value(unit, "likely", f"a person so long in the limbs would be {height:.2f} m tall")
-    return Value(None, "open", f"in metres the person would be {1.75 * ratio:.3g} m tall: no usual unit")
+        return Value(unit, "likely", f"by the length of the limbs the person is {height:.2f} m tall")
+    return Value(None, "open", f"in metres the person would be {1.75 * ratio:.3g} m tall: no known unit fits")
 
 
 def up_of_person(x: NDArray, names: Sequence[str]) -> NDArray | None:
@@ -291,7 +291,7 @@ def guess_up(rig: Rig, person: NDArray | None, turns: Mapping[str, int], *, qual
     votes = {"the cameras stand upright": cameras}
     if person is not None:
         axis, lean = nearest_axis(person)
-        votes, tilt = {"the person stands so": axis} | votes, min(tilt, lean)
+        votes, tilt = {"the person stands upright": axis} | votes, min(tilt, lean)
     if qualisys:
         votes = {"Qualisys' worlds are z up": "z"} | votes
     why, axis = next(iter(votes.items()))

@@ -111,10 +111,10 @@ class Topics:
         if topic is not None:
             if topic in fitting:
                 return topic
-            there = f"there {'is' if len(fitting) == 1 else 'are'} {listed}" if fitting else "no topic of it has any"
             kind = self.kinds.get(topic)
             problem = f"no topic {topic}" if kind is None else f"{topic} ({kind}) has no {what}"
-            raise ObservationError(f"{problem}; of {what} {there}", file=self.path, remedy="Correct topic.")
+            problem += f"; topics with {what}: {listed or 'none'}"
+            raise ObservationError(problem, file=self.path, remedy="Correct topic.")
         named = [t for t in fitting if name in t.split("/")] or list(fitting)
         if len(named) == 1:
             return named[0]
@@ -123,7 +123,7 @@ class Topics:
             problem = f"no topic of it has {what}; its topics are {have}"
             raise ObservationError(problem, file=self.path, remedy="Record the camera's images.")
         problem = f"{len(named)} topics have {what}: {', '.join(sorted(named))}"
-        raise ObservationError(problem, file=self.path, remedy="Write topic = ... beside the file.")
+        raise ObservationError(problem, file=self.path, remedy="Write topic = ... in the table that names the file.")
 
     def begin(self) -> int:
         """[ns] time of the first image of any topic, by its header; 0 if headers have no time."""
@@ -160,7 +160,7 @@ def median_rate(times: NDArray, topic: str, path: Path) -> float:
     """
     steps = np.diff(times)
     if not len(steps):
-        raise ObservationError(f"one image alone on the topic {topic}", file=path, remedy="Record it for longer.")
+        raise ObservationError(f"only one image on the topic {topic}", file=path, remedy="Record it for longer.")
     step = float(np.median(steps))
     if step < _MIN_STEP_S:
         problem = f"a median step of {step:g} s between the images on the topic {topic}"

@@ -49,7 +49,7 @@ class McapVideo:
             begin, end = (0.0, *times)[gaps[0]], times[gaps[0]]
             raise ObservationError(
                 f"no image on the topic {self.topic} from {begin:.2f} to {end:.2f} s", file=path,
-                remedy="Cut the recording to the time that all its cameras saw: `mcap filter`.",
+                remedy="Cut the recording to the time that all its cameras share: `mcap filter`.",
             )  # fmt: skip
         self.path, self.size = path, (int(first.shape[1]), int(first.shape[0]))
         self.rate = round(rate, 6)
@@ -80,7 +80,7 @@ class McapVideo:
             image = colours(self._messages(number), self.path)
             if image.shape[1::-1] != self.size:
                 problem = f"{image.shape[1]}x{image.shape[0]} px, but the first image has {self.size[0]}x{self.size[1]}"
-                remedy = "All images of a camera are of one size."
+                remedy = "All images of a camera must have one size."
                 raise ObservationError(problem, file=self.path, place=f"{self.topic}, frame {i}", remedy=remedy)
             self._last = number, image
         return self._last[1].copy()

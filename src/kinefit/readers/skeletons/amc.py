@@ -113,7 +113,7 @@ def _read_values(path: str | PathLike[str], skeleton: AsfSkeleton) -> tuple[dict
                 raise fault(f"frame {words[0]} follows frame {first + frames - 1}", n, "Give every frame, in order.")
             frames += 1
         elif not frames:
-            raise fault(f"'{words[0]}' stands before the first frame number", n, "Give an AMC file.")
+            raise fault(f"'{words[0]}' comes before the first frame number", n, "Give an AMC file.")
         elif words[0] not in counts:
             raise fault(choices("bone", words[0], counts), n, f"Give this motion's skeleton, not {skeleton.source}.")
         elif len(words) - 1 != counts[words[0]]:

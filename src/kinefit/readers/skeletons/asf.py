@@ -169,12 +169,12 @@ def _bone(entries: dict, line: int, unit: float, angle: float, path: str | PathL
                 f"bone '{name}' has {len(numbers)} limits for {len(dofs)} degrees of freedom",
                 file=path,
                 place=f"line {limit_line}",
-                remedy="Give a pair for each.",
+                remedy="Give a pair of limits for each.",
             )
         scale = np.array([angle if dof[0] == "r" else unit for dof in dofs])
         if not all(map(_LIMIT.fullmatch, numbers)):
             problem = f"bone '{name}' has limits that are no numbers"
-            raise FileError(problem, file=path, place=f"line {limit_line}", remedy="Give two for each.")
+            raise FileError(problem, file=path, place=f"line {limit_line}", remedy="Give two limits for each.")
         limits = np.array([float(x) for x in numbers]).reshape(-1, 2) * scale[:, None]  # may be infinite
     vector = direction / np.linalg.norm(direction) * length * unit
     return Bone(name, -1, vector, axes, dofs, limits)
@@ -193,7 +193,7 @@ def _axes(angles: NDArray, order: str, path: str | PathLike[str], line: int) -> 
     order = order.lower()
     if sorted(order) != ["x", "y", "z"]:
         raise FileError(
-            f"the order of axes '{order}' is unknown", file=path, place=f"line {line}", remedy="Give such as XYZ."
+            f"the order of axes '{order}' is unknown", file=path, place=f"line {line}", remedy="Give one, as XYZ."
         )
     return euler_rotations(angles[::-1], order[::-1])
 

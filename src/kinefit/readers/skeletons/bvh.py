@@ -120,14 +120,14 @@ def _read_hierarchy(text: str, path: str | PathLike[str]) -> list[_BvhJoint]:
                 while (next_word := take(1)[0]) != "{":
                     words.append(next_word)
                 if (kind == "ROOT") != (not open_joints) or (kind == "ROOT" and joints):
-                    raise fault(f"{kind} {' '.join(words)} stands where none may stand", line)
+                    raise fault(f"{kind} {' '.join(words)} is not allowed here", line)
                 parent = open_joints[-1]["index"] if open_joints else -1
                 if parent is None:
-                    raise fault("a joint stands before its parent's OFFSET", line)
+                    raise fault("a joint comes before its parent's OFFSET", line)
                 taken = {joint.name for joint in joints}
                 name = _end_name(joints[parent].name, taken) if kind == "END" else " ".join(words)
                 if not name or name in taken:
-                    raise fault(f"the joint name '{name}' is missing or taken", line)
+                    raise fault(f"the joint name '{name}' is missing or already used", line)
                 open_joints.append({"name": name, "parent": parent, "end": kind == "END", "index": None})
             case "OFFSET" if open_joints and open_joints[-1]["index"] is None:
                 offset = tuple(parse_numbers(take(3), file=path, line=line))
@@ -147,7 +147,7 @@ def _read_hierarchy(text: str, path: str | PathLike[str]) -> list[_BvhJoint]:
             case "}" if open_joints and open_joints[-1]["index"] is not None:
                 open_joints.pop()
             case _:
-                raise fault(f"'{word}' stands where it may not stand", line)
+                raise fault(f"unexpected '{word}'", line)
     if open_joints or not joints:
         raise fault("the hierarchy ends in the middle", tokens[-1][1])
     return joints
@@ -198,7 +198,7 @@ def _read_motion(text: str, channels: int, line: int, path: str | PathLike[str])
         values.append(numbers)
     if len(values) != frames:
         raise FileError(
-            f"{len(values)} frames where {frames} are announced",
+            f"{len(values)} frames, but the file announces {frames}",
             file=path,
             place=f"line {rows[-1][0] if rows else lines[1][0]}",
             remedy=f"Export it again, or set 'Frames: {len(values)}' on line {lines[0][0]}.",
@@ -282,7 +282,7 @@ def _human_unit(names: Sequence[str], parents: Sequence[int], offsets: NDArray, 
     unit = min(UNITS, key=lambda u: abs(height * u - _TYPICAL_STATURE))
     if not _MIN_STATURE <= height * unit <= _MAX_STATURE:
         raise FileError(
-            f"the skeleton is {height:.4g} units tall: in no usual unit is that a person",
+            f"the skeleton is {height:.4g} units tall: no known unit makes that a person",
             file=path,
             remedy="Give the unit in metres (unit=0.01 for centimetres).",
         )

@@ -164,7 +164,7 @@ def _of_gltf(gltf: Gltf, parents: NDArray, order: NDArray, path: Path) -> Charac
             raise FileError("is scaled unevenly", file=path, place=f"node '{names[node]}'", remedy=remedy)
     points, owners = _vertices(gltf, Ms, path)
     if not (np.isfinite(Ms).all() and np.isfinite(points).all()):
-        raise ValueError("a place that is not finite")
+        raise ValueError("a position that is not finite")
     rotations = Ms[:, :3, :3] / np.maximum(scales, 1e-12)[:, None, None]
     return Character(
         path, names, parents, order, Ms[:, :3, 3], rotations, scales, np.eye(3), joints, _vrm_joints(gltf.json), points,

@@ -46,7 +46,7 @@ def assumed_camera(entry: CameraEntry, size: tuple[int, int] | None, take: Take)
     """
     if size is None:
         raise TakeError(
-            "nothing tells the size of the image", file=take.path, place=f"camera {entry.name}",
+            "the size of the image is not stated", file=take.path, place=f"camera {entry.name}",
             remedy="Give the camera its video, or size = [width, height].",
         )  # fmt: skip
     width, height = size
@@ -65,13 +65,13 @@ def what_is_assumed(take: Take) -> list[str]:
         return []
     entry = take.cameras[0]
     lens = f"a field of view of {entry.field_of_view or DEFAULT_FIELD_OF_VIEW:g}°"
-    lens += "" if entry.field_of_view else ", the usual one"
+    lens += "" if entry.field_of_view else ", the default"
     out = [
-        f"camera {entry.name} is alone and not calibrated: it is taken to look level, with {lens}; where it is a tenth "
-        "wider, the person is a tenth nearer. Error bars do not hold this."
+        f"camera {entry.name} is alone and not calibrated: it is assumed level, with {lens}; a field of view 10 % "
+        "wider places the person 10 % nearer. Error bars do not include this."
     ]
     if take.height is None:
-        out.append("no height is stated: lengths and distances are as unsure as the person's size, about a tenth")
+        out.append("no height is stated: lengths and distances are uncertain by about 10 %, as the person's size is")
     return out
 
 
@@ -121,7 +121,7 @@ def image_frame(entry: CameraEntry, rig: Rig | None, video_size: tuple[int, int]
     if video_size and entry.size and entry.size != video_size:
         raise TakeError(
             f"size = {list(entry.size)}, but the video has {video_size[0]}x{video_size[1]}", file=take.path,
-            place=f"camera {entry.name}", remedy="Leave size out where there is a video.",
+            place=f"camera {entry.name}", remedy="Remove size: the video has its own.",
         )
     calibrated = rig[entry.name].size
     turned = calibrated if entry.rotation % 180 == 0 else calibrated[::-1]

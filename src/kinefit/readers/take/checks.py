@@ -36,7 +36,7 @@ _ONLY: dict[str, dict[str, tuple[str, ...]]] = {
 }  # fmt: skip
 """Formats for which a key means something: with any other it is refused."""
 
-ONE_CAMERA = "keypoints of one camera do not tell how far a person is; two cameras do, or one beside depth or markers"
+ONE_CAMERA = "keypoints of one camera do not give a person's distance; two cameras do, or one with depth or markers"
 _SETS = {"openpose": tuple(KEYPOINT_SETS), "skin": SKIN_SETS, "detect": (*MEDIAPIPE_SETS, FACE_SET)}
 
 
@@ -54,7 +54,7 @@ def check_enough(take: Take) -> None:
     if len(seeing) == 1 and not (lifted or take.other_sensors or take.start or take.pose):
         raise TakeError(
             ONE_CAMERA, file=take.path, place=f"camera {next(iter(seeing))}",
-            remedy="Leave its [[keypoints]] out and give it its video: the built-in detector tells depth, too; or add "
+            remedy="Remove its [[keypoints]] and give it its video: the built-in detector estimates depth; or add "
             "[[camera]] of a second one, calibrated with the first, or [[depth]].",
         )  # fmt: skip
 
@@ -82,10 +82,10 @@ def _values(take: Take) -> None:
         raise TakeError(problem, file=take.path, place=place, remedy=remedy)
 
     if take.rate is not None and not 0 < take.rate < 1e6:
-        refuse(f"rate {take.rate:g} Hz", "[take] rate", "Give frames per second, or leave it out.")
+        refuse(f"rate {take.rate:g} Hz", "[take] rate", "Give frames per second, or remove it.")
     if take.height is not None and not 0.3 < take.height < 3:
         metres = f": height = {take.height / 100:g}" if 30.0 < take.height < 300.0 else ""
-        refuse(f"height {take.height:g} m", "[take] height", f"Give the stature in metres{metres}, or leave it out.")
+        refuse(f"height {take.height:g} m", "[take] height", f"Give the stature in metres{metres}, or remove it.")
     if take.person is not None:
         try:
             PersonChoice.of(take.person)
@@ -95,13 +95,13 @@ def _values(take: Take) -> None:
         if not (take.keypoints or (take.depth and not has_start)) and (
             take.depth or take.stereo or take.markers or take.silhouettes or take.skin
         ):
-            what = "[[keypoints]], beside a start" if has_start else "[[keypoints]] or [[depth]]"
-            refuse(f"'person' has no use without {what}", "[take] person", "Leave it out.")
+            what = "[[keypoints]] if a start is given" if has_start else "[[keypoints]] or [[depth]]"
+            refuse(f"'person' has no use without {what}", "[take] person", "Remove it.")
     for key in ("height", "subject", "size"):
         if take.start is not None and getattr(take, key) is not None:
-            refuse(f"'{key}' has no use with start, which tells the body", f"[take] {key}", "Leave one of both out.")
+            refuse(f"'{key}' has no use with start, which gives the body", f"[take] {key}", "Remove one of the two.")
         if take.size is False and key != "size" and getattr(take, key) is not None:
-            refuse(f"'{key}' has no use with size = false", f"[take] {key}", "Leave one of both out.")
+            refuse(f"'{key}' has no use with size = false", f"[take] {key}", "Remove one of the two.")
     if take.calibration is not None:
         _calibration(take, take.calibration, refuse)
     if take.pose is not None:
@@ -116,7 +116,7 @@ def _values(take: Take) -> None:
         sets = _SETS.get(source.format, MEDIAPIPE_SETS)
         if source.set is not None and source.set not in sets:
             kind = "keypoint set" if source.format == "openpose" else f"keypoint set of {source.format}"
-            refuse(choices(kind, source.set, sets), place, f'Use set = "{sets[0]}", or leave it out.')
+            refuse(choices(kind, source.set, sets), place, f'Use set = "{sets[0]}", or remove it.')
         if source.file is None and source.stream is None and source.format not in ("detect", "skin"):
             refuse(f"no file of {source.format} keypoints", place, 'Write file = "...", or format = "detect".')
         if source.face is not None and not all(v > 0 for v in source.face[2:]):
@@ -182,19 +182,19 @@ def _calibration(take: Take, entry: CalibrationEntry, refuse: Callable[[str, str
         refuse(stated, place, "Give metres below 1 and degrees below 30: a camera that far off needs calibration.")
     others = (take.silhouettes, take.markers, take.depth, take.stereo, take.lines, take.skin, take.trackers)
     if not take.keypoints and any(others):
-        refuse("position_sigma and rotation_sigma are for cameras with keypoints", place, "Leave both out.")
+        refuse("position_sigma and rotation_sigma are for cameras with keypoints", place, "Remove both.")
 
 
 def _pose(take: Take, pose: StartEntry, refuse: Callable[[str, str, str], None]) -> None:
     """Refuse a start that is none."""
     if take.start is not None:
-        refuse("[start] has no use with start = ... in [take]", "[start]", "Leave one of both out.")
+        refuse("[start] has no use with start = ... in [take]", "[start]", "Remove one of the two.")
     up = np.array(pose.upward or UP_AXES[take.up], float)
     if pose.at is None or pose.forward is None:
         return refuse("no `at` and `forward`", "[start]", "Give both; clicks alone need none, and no other key.")
     numbers = np.concatenate([pose.at, pose.forward, up, list(pose.angles.values())])
     if not np.isfinite(numbers).all() or np.abs(numbers).max() > 1e6:
-        refuse("numbers that are no place, direction or angle", "[start]", "Give metres, directions and degrees.")
+        refuse("numbers are not a position, direction or angle", "[start]", "Give metres, directions and degrees.")
     lengths = float(np.linalg.norm(pose.forward)) * float(np.linalg.norm(up))
     if not float(np.linalg.norm(np.cross(pose.forward, up))) > 1e-6 * max(lengths, 1e-12):
         refuse(
@@ -240,7 +240,7 @@ def _uses(take: Take) -> None:
                     raise TakeError(
                         f"'{key}' has no use with format = \"{entry.format}\"", file=take.path,  # type: ignore[attr-defined]
                         place=f"{table} of camera {entry.camera}",  # type: ignore[attr-defined]
-                        remedy=f"Leave it out; it is for {', '.join(formats)}.",
+                        remedy=f"Remove it; it is for {', '.join(formats)}.",
                     )  # fmt: skip
 
 
@@ -255,7 +255,7 @@ def _names(take: Take) -> None:
     for name in sensors:
         if sensors.count(name) > 1:
             kind = "camera" if name in names else "depth" if any(d.name == name for d in take.depth) else "stereo"
-            raise TakeError("there are two of this name", file=take.path, place=f"{kind} {name}", remedy="Rename one.")
+            raise TakeError("two have this name", file=take.path, place=f"{kind} {name}", remedy="Rename one.")
     named = [("keypoints", k.camera) for k in (*take.keypoints, *take.skin)]
     named += [("silhouette", s.camera) for s in take.silhouettes] + [("region", r.camera) for r in take.regions]
     named += [("lines", e.camera) for e in take.lines]
@@ -267,13 +267,13 @@ def _names(take: Take) -> None:
             )
     beside = (places, take.depth, take.stereo)  # of a world in which its place is not known
     if take.cameras and take.calibration is None and any(beside):
-        remedy = 'Add [calibration] with file = "...". Cameras that see people, and nothing beside, need none.'
+        remedy = 'Add [calibration] with file = "...". Only a take of nothing but videos of people needs none.'
         raise TakeError("cameras without calibration", file=take.path, remedy=remedy)
     for entry in take.cameras:
         angle, place = entry.field_of_view, f"camera {entry.name}"
         if angle is not None and take.calibration is not None:
-            problem = "field_of_view beside a calibration"
-            raise TakeError(problem, file=take.path, place=place, remedy="Leave it out: the calibration tells it.")
+            problem = "field_of_view has no use with a calibration"
+            raise TakeError(problem, file=take.path, place=place, remedy="Remove it: the calibration states it.")
         if angle is not None and not 5.0 <= angle <= 150.0:
             problem = f"field_of_view {angle:g}"
             raise TakeError(problem, file=take.path, place=place, remedy="Give degrees from 5 to 150.")
@@ -297,7 +297,7 @@ def _names(take: Take) -> None:
             )  # fmt: skip
     for kind, several in (("silhouettes", take.silhouettes), ("regions", take.regions)):
         for camera in repeated(s.camera for s in several):  # type: ignore[attr-defined]
-            raise TakeError(f"two {kind}", file=take.path, place=f"camera {camera}", remedy="Leave one out.")
+            raise TakeError(f"two {kind}", file=take.path, place=f"camera {camera}", remedy="Remove one.")
     inputs: list[tuple[object, ...]] = [
         (f"keypoints of camera {k.camera}", k.file, k.format, k.frames, k.set == FACE_SET)
         for k in (*take.keypoints, *take.skin)
@@ -307,7 +307,7 @@ def _names(take: Take) -> None:
     inputs += [(f"trackers {p.file.name}", p.file, sorted(p.points)) for p in take.trackers]
     for one in inputs:
         if inputs.count(one) > 1:
-            remedy = "Leave one out: what is there twice would count twice."
+            remedy = "Remove one: a file named twice would count twice."
             raise TakeError("the same file twice", file=take.path, place=str(one[0]), remedy=remedy)
     of_one = [(f"camera {c.name}", c.name, c.video) for c in take.cameras if c.video is not None]
     of_one += [(f"keypoints of camera {k.camera}", k.camera, k.file) for k in take.keypoints
@@ -315,12 +315,12 @@ def _names(take: Take) -> None:
     for place, camera, file in of_one:
         others = [other for _, other, same in of_one if same == file and other != camera]
         if others:
-            problem = f"{file.name} is of camera {others[0]}, too"
+            problem = f"{file.name} is also the file of camera {others[0]}"
             raise TakeError(problem, file=take.path, place=place, remedy="Give each camera its own file.")
     alone = [entry.name for entry in take.depth if entry.intrinsics is not None]
     if alone and (take.calibration is not None or len(take.depth) > 1):
         raise TakeError(
-            "intrinsics alone do not say where a sensor stands beside others", file=take.path,
+            "intrinsics alone do not give a sensor's pose relative to the others", file=take.path,
             place=f"depth {alone[0]}", remedy="Put its intrinsics and its pose into the calibration, and not here.",
         )  # fmt: skip
 

@@ -80,7 +80,7 @@ def load_depth(take: Take, rig: Rig | None, rates: Mapping[str, float]) -> Depth
 def _clouds(entry: DepthEntry, rig: Rig | None, rate: float | None) -> CloudVideo:
     odd = [key for key in ("size", "intrinsics", "background") if getattr(entry, key) is not None]
     if odd:
-        raise TakeError(f"'{odd[0]}' has no use with clouds of points", remedy="Leave it out.")
+        raise TakeError(f"'{odd[0]}' has no use with clouds of points", remedy="Remove it.")
     assert entry.file is not None
     camera = entry.camera or entry.name
     clouds = read_clouds(
@@ -93,7 +93,7 @@ def _clouds(entry: DepthEntry, rig: Rig | None, rate: float | None) -> CloudVide
 
 def _video(entry: DepthEntry, rate: float | None) -> DepthVideo:
     if entry.segment is not None:
-        problem = "'segment' is of clouds of points, these are images"
+        problem = "'segment' is for clouds of points, but these are images"
         raise TakeError(problem, remedy="Give one PCD or PLY file a frame, of the points on this segment alone.")
     assert entry.file is not None
     given: dict[str, Any] = {"sensor": entry.name, "unit": entry.unit, "size": entry.size}
@@ -102,8 +102,8 @@ def _video(entry: DepthEntry, rate: float | None) -> DepthVideo:
         time_offset=entry.time_offset, **given,
     )  # fmt: skip
     if entry.size is not None and tuple(video.size) != tuple(entry.size):
-        problem = f"size = {list(entry.size)}, and the images have {video.size[0]}x{video.size[1]} px"
-        raise TakeError(problem, remedy="Leave size out: it is for raw files.")
+        problem = f"size = {list(entry.size)}, but the images have {video.size[0]}x{video.size[1]} px"
+        raise TakeError(problem, remedy="Remove size: it is for raw files.")
     background = read_depth(entry.background, **given) if entry.background is not None else None
     return replace(video, background=background, on_body=entry.on_body)
 

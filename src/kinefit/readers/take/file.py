@@ -213,7 +213,7 @@ def _path_in(folder: Path) -> Callable[[type, Any], Path]:
 
     def make(_: type, value: Any) -> Path:
         if not isinstance(value, str) or not value:
-            raise ValueError("a file or folder is a text")
+            raise ValueError("a file or folder must be a text in quotes")
         if len(value.encode()) > _MAX_PATH_BYTES or any(len(part.encode()) > 255 for part in Path(value).parts):
             raise ValueError(f"{shortened(value, 60)!r} is no path: it is too long")
         if any(ord(character) < 32 for character in value):

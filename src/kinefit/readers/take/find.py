@@ -37,7 +37,7 @@ def find_take(path: str | PathLike[str], *, wanted: Sequence[str] = ("track",)) 
     if kind in VIDEOS:
         there = next(iter(takes_in(path.parent)), None)
         first = f"Run {command('init', path.parent)}, which writes the take file of all videos and their calibration."
-        what = first if there is None else f"The take file beside it: {command(*wanted, there)}."
+        what = first if there is None else f"Use the take file next to it: {command(*wanted, there)}."
         remedy = f"{what} For keypoints of this video alone: {command('detect', path)}"
         raise FileError("a video, not a take file", file=path, remedy=remedy)
     if kind in MARKERS:

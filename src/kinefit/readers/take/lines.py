@@ -41,13 +41,13 @@ def read_lines(path: Path, names: Iterable[str]) -> tuple[NDArray, NDArray]:
             frame, name = int(row["frame"]), str(row["line"]).strip()
             ends = [float(row[key]) for key in _COLUMNS[2:]]
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise FileError(f"no line of a table of lines ({error})", file=path, place=place, remedy=_REMEDY) from error
+            raise FileError(f"not a row with a line ({error})", file=path, place=place, remedy=_REMEDY) from error
         if name not in names:
             raise ObservationError(
-                choices("line", name, names), file=path, place=place, remedy="Add it to `landmarks`, or leave it out."
+                choices("line", name, names), file=path, place=place, remedy="Add it to `landmarks`, or remove it."
             )
         if not np.isfinite(ends).all() or frame < 0 or (frame, name) in rows:
-            problem = f"frame {frame}, line '{name}' is there twice, or its numbers are not finite"
+            problem = f"frame {frame}, line '{name}' appears twice, or its numbers are not finite"
             raise FileError(problem, file=path, place=place, remedy="Give each line once a frame; frames begin with 0.")
         rows[frame, name] = ends
     if not rows:
@@ -66,7 +66,7 @@ def _rows(path: Path) -> Iterable[tuple[str, Mapping[str, Any]]]:
         if path.suffix.lower() == ".json":
             content = json.loads(text)
             if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
-                raise FileError("no list of objects", file=path, remedy=_REMEDY)
+                raise FileError("not a list of objects", file=path, remedy=_REMEDY)
             return [(f"entry {i}", row) for i, row in enumerate(content)]
         return [(f"line {i}", row) for i, row in enumerate(csv.DictReader(text.splitlines()), 2)]
     except (OSError, ValueError, RecursionError, csv.Error) as error:
@@ -113,9 +113,9 @@ def load_clicks(take: Take, images: Mapping[str, ImageFrame], rate: float | None
     for camera in dict.fromkeys(camera for of in steps for camera in of.points):
         if camera not in images:
             problem = choices("camera", camera, images)
-            raise TakeError(problem, file=take.clicks, place="[start] clicks", remedy="Leave out its clicks.")
+            raise TakeError(problem, file=take.clicks, place="[start] clicks", remedy="Remove its clicks.")
         if rate is None:
-            raise TakeError("nothing states the rate", file=take.path, remedy="Write rate = ... into [take].")
+            raise TakeError("the rate is not stated", file=take.path, remedy="Write rate = ... into [take].")
         mine = [of for of in steps if of.points.get(camera)]
         names = tuple(dict.fromkeys(name for of in mine for name in of.points[camera]))
         uv = np.array([[of.points[camera].get(name, (np.nan, np.nan)) for name in names] for of in mine])
@@ -134,11 +134,11 @@ def _lines(
 ) -> LineVideo:
     same = np.allclose(image.T_image_calibration, np.eye(3), atol=1e-9)
     if entry.frame is None and not same:
-        problem = "the video's image is not the calibration's, and it is not stated in which the lines are"
+        problem = "the video's image is not the calibration's, and it is not stated which the lines use"
         raise TakeError(problem, remedy='Write frame = "calibration" or frame = "video".')
     rate = entry.rate or rate
     if rate is None:
-        raise TakeError("nothing states the rate", remedy="Write rate = ... into [take].")
+        raise TakeError("the rate is not stated", remedy="Write rate = ... into [take].")
     names = tuple(entry.landmarks)
     frames, ends = read_lines(entry.file, names)
     if entry.frame == "video" and not same:

@@ -167,7 +167,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     listed = ", ".join(f"{stream} {rate:.6g} Hz" for stream, rate in rates.items())
     if take.rate and rates and take.rate > 1.001 * max(rates.values()):
         problem = f"a rate above that of every video: take {take.rate:.6g} Hz, {listed}"
-        raise ObservationError(problem, file=take.path, remedy="Leave rate out of [take]: the videos state theirs.")
+        raise ObservationError(problem, file=take.path, remedy="Remove rate from [take]: the videos state theirs.")
     rate = take.rate or max(rates.values(), default=0.0)
     if not all(is_even(times, rate) for times in clocks.values()):
         notes.append(f"take {rate:.6g} Hz, {listed}: points are interpolated between frames")
@@ -202,7 +202,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     recordings: tuple[_Timed, ...] = (*sensors.depth, *sensors.clouds, *surfaces, *trackers)
     if not (streams or lines or clicks or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
-        raise TakeError("cameras, but nothing that they saw", file=take.path, remedy=remedy)
+        raise TakeError("the cameras have no video and no keypoints", file=take.path, remedy=remedy)
     own = [*(recording.rate for recording in (*recordings, *lines, *clicks)), *(m.rate for m in markers)]
     rate = fastest or own[0]
     if streams:
@@ -214,7 +214,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
             problem += f"{len(streams[shortest])}"
             raise ObservationError(
                 problem, file=take.path, place=shortest,
-                remedy="Leave that video out, or use a longer one: two seconds or more tell where cameras stand.",
+                remedy="Remove that video, or use a longer one: finding the cameras takes two seconds or more.",
             )  # fmt: skip
         common, whole = (frames[1] - frames[0]) / rate, max(float(np.ptp(t)) for t in streams.values()) + 1.0 / rate
         if overlap and not take.frames and whole > 1.1 * common:
@@ -270,7 +270,7 @@ def _read_keypoints(
     same = np.allclose(image.T_image_calibration, np.eye(3), atol=1e-9)
     if source.frame is None and not same and source.format != "detect":
         raise TakeError(
-            "the video's image is not the calibration's, and it is not stated in which the keypoints are",
+            "the video's image is not the calibration's, and it is not stated which the keypoints use",
             file=take.path, place=place, remedy='Write frame = "calibration" or frame = "video".',
         )
     offset = next(entry.time_offset for entry in take.cameras if entry.name == source.camera)
@@ -283,7 +283,7 @@ def _read_keypoints(
         return seen, frame_times(len(found), found.rate, clock if found.times is None else found.times)
     rate = source.rate or rates.get(f"video {source.camera}") or take.rate
     if rate is None:
-        raise TakeError("nothing states the rate", file=take.path, place=place, remedy="Write rate = ... into [take].")
+        raise TakeError("the rate is not stated", file=take.path, place=place, remedy="Write rate = ... into [take].")
     assert source.file is not None
     options: dict[str, Any] = {"keypoint_set": source.set} if source.format == "openpose" and source.set else {}
     record = read_keypoints(
@@ -296,7 +296,7 @@ def _read_keypoints(
         own = rates[f"video {source.camera}"]
         raise ObservationError(
             f"the keypoints have {source.rate:.6g} Hz, and the video of as many frames {own:.6g} Hz", file=take.path,
-            place=place, remedy="Leave rate out of [[keypoints]]: they take the times of the video's frames.",
+            place=place, remedy="Remove rate from [[keypoints]]: they take the times of the video's frames.",
         )
     hands_unwanted = source.set == "MEDIAPIPE_33" and record.keypoint_set == "MEDIAPIPE_75"
     return record.first_points(source.set, MEDIAPIPE_33) if source.set and hands_unwanted else record, times

@@ -59,7 +59,7 @@ def read_silhouettes(
         mask = _mask(files[i])
         if mask.shape[::-1] != wanted:
             problem = f"the mask has {mask.shape[1]}x{mask.shape[0]} px, not {wanted[0]}x{wanted[1]}"
-            raise ObservationError(problem, file=files[i], remedy="All masks of a camera are of its image's size.")
+            raise ObservationError(problem, file=files[i], remedy="Give masks of the size of the camera's image.")
         return in_calibration(mask, size, image_frame)
 
     times = time_offset + frame_times(len(files), rate, clock)
@@ -100,9 +100,9 @@ def _silhouettes(
     rate = entry.rate or rates.get(f"video {entry.camera}") or take.rate
     if entry.format == "masks":
         if rate is None:
-            raise TakeError("nothing states the rate", remedy="Write rate = ... into [take].")
+            raise TakeError("the rate is not stated", remedy="Write rate = ... into [take].")
         if entry.frame is None and not same:
-            problem = "the video's image is not the calibration's, and it is not stated in which the masks are"
+            problem = "the video's image is not the calibration's, and it is not stated which the masks use"
             raise TakeError(problem, remedy='Write frame = "calibration" or frame = "video".')
         assert entry.file is not None
         return read_silhouettes(
@@ -120,8 +120,8 @@ def _silhouettes(
     file = entry.file or detections_file(take.path, entry.camera)
     found = read_detections(file)
     if found.seen.any() and not len(found.mask_runs):
-        remedy = "Run `kinefit detect` on this take, which keeps outlines."
-        raise TakeError("the detector's file has no outlines", file=file, remedy=remedy)
+        remedy = "Run `kinefit detect` on this take: it stores silhouettes."
+        raise TakeError("the detector's file has no silhouettes", file=file, remedy=remedy)
     times = offset + frame_times(len(found), found.rate, clock if found.times is None else found.times)
     return SilhouetteVideo(
         entry.camera, found.rate, times, size, lambda i: in_calibration(_everybody(found, i), size, frame), found.source

@@ -71,13 +71,13 @@ def _detected_face(
     file = detections_file(take.path, entry.camera)
     if not file.exists():
         raise TakeError(
-            "nothing states where the face is",
+            "the place of the face is not stated",
             remedy="Write face = [left, top, width, height] of the first image used, or run `kinefit detect`.",
         )
     found = read_detections(file)
     frames = [i for i in range(begin, min(end, len(found))) if found.seen[i].any()]
     if not frames:
-        raise TakeError("the detector saw nobody", remedy="Write face = [left, top, width, height] of the first one.")
+        raise TakeError("no person is detected", remedy="Write face = [left, top, width, height] of the first one.")
     people = np.where(found.seen[frames[0]], found.confidence[frames[0]].mean(axis=1), -1.0)
     return frames[0], face_box(found.points[frames[0], int(np.argmax(people))])
 

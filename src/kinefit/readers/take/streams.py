@@ -28,21 +28,21 @@ def refuse_streams(take: Take) -> None:
     """
     streams = streams_of(take)
     if streams:
-        remedy = f"Follow it by {command('live', take.path)}, or name its recording in place of the stream."
-        raise TakeError("a stream, nothing is recorded", file=take.path, place=streams[0], remedy=remedy)
+        remedy = f"Track it live ({command('live', take.path)}), or name its recording in place of the stream."
+        raise TakeError("a stream is no recording", file=take.path, place=streams[0], remedy=remedy)
 
 
 def odd_streams(take: Take) -> Iterator[tuple[str, str, str]]:
     """Streams that stand beside what excludes them: problem, place, remedy."""
     for camera in take.cameras:
         if camera.stream is not None and camera.video is not None:
-            yield "a stream and a video", f"camera {camera.name}", "Leave one of both out."
+            yield "a stream and a video", f"camera {camera.name}", "Remove one of the two."
     for source in take.keypoints:
         place = f"keypoints of camera {source.camera}"
         if source.stream is not None and source.file is not None:
-            yield "a stream and a file", place, "Leave one of both out."
+            yield "a stream and a file", place, "Remove one of the two."
         if source.stream is not None and any(c.name == source.camera and c.stream is not None for c in take.cameras):
-            yield "its camera has a stream, too", place, "Leave out one: the detector looks through a camera's stream."
+            yield "its camera also has a stream", place, "Remove one: the detector runs on the camera's stream."
     for entry in take.depth:
         place = f"depth {entry.name}"
         if (entry.stream is None) == (entry.file is None):
@@ -51,7 +51,7 @@ def odd_streams(take: Take) -> Iterator[tuple[str, str, str]]:
         if entry.stream is not None:
             for key in ("time_unit", "segment"):
                 if getattr(entry, key) is not None:
-                    yield f"'{key}' has no use with a stream", place, "Leave it out."
+                    yield f"'{key}' has no use with a stream", place, "Remove it."
             if entry.intrinsics is not None and entry.size is None:
                 yield "a stream with intrinsics, and no size", place, "Write size = [width, height] of its images."
     streams = streams_of(take)
@@ -67,6 +67,6 @@ def odd_streams(take: Take) -> Iterator[tuple[str, str, str]]:
     seen = {entry.camera for entry in take.keypoints}
     blind = [entry.name for entry in take.cameras if entry.stream is None and entry.name not in seen]
     if recorded:
-        yield f"what was recorded stands beside streams ({streams[0]})", recorded[0], "Leave it out."
+        yield f"a recording cannot be combined with streams ({streams[0]})", recorded[0], "Remove it."
     elif blind and any(entry.stream is not None for entry in take.cameras):
-        yield "it has no stream, others have", f"camera {blind[0]}", "Give each camera a stream, or leave it out."
+        yield "it has no stream, others have", f"camera {blind[0]}", "Give each camera a stream, or remove it."

@@ -30,7 +30,7 @@ def read_surface_points(path: Path, sensor: str = "surface_points", *, time_offs
     bad = ~(np.isfinite(values).all(axis=1) & (values[:, 5:] > 0).all(axis=1) & (np.abs(values[:, 1]) < 2**53))
     if bad.any():
         problem = "a number that is not finite, or a standard deviation that is not positive"
-        raise FileError(problem, file=path, place=f"line {int(np.argmax(bad)) + 2}", remedy="Leave the row out.")
+        raise FileError(problem, file=path, place=f"line {int(np.argmax(bad)) + 2}", remedy="Remove the row.")
     times, frame = np.unique(values[:, 0], return_inverse=True)
     rate = rate_of(times, path, _REMEDY)
     order = np.argsort(frame, kind="stable")

@@ -327,10 +327,10 @@ def _stacked(parts: Sequence[Part]) -> NDArray:
 
 def _same(parts: Sequence[Part], moved: Sequence[Part]) -> None:
     """Check that rows of one match correspond one to one in both worlds."""
-    remedy = "Give all rows of a match always; weight 0 for one that is not felt."
+    remedy = "Always give all rows of a match, with weight 0 for inactive ones."
     for (sensor, a), (other, b) in zip(parts, moved):
         if sensor != other or len(a) != len(b) or type(a) is not type(b):
-            problem = f"sensor '{sensor}' gives {len(a)} rows of a match, and {len(b)} of the same with another body"
+            problem = f"sensor '{sensor}' gives {len(a)} rows of a match, but {len(b)} with another body"
             raise ObservationError(problem, remedy=remedy)
     if len(parts) != len(moved):
         sensor = max(parts, moved, key=len)[-1][0]

@@ -128,7 +128,7 @@ def smooth(
     now = _system(body, roots, angles, equations, prior, depth, entering)
     mean = float(now.C[:, np.arange(tree.n_dofs), depth].mean() + now.band[0, :, :, 0].mean())
     if not np.isfinite(now.cost) or not np.isfinite(mean):
-        raise ObservationError("a take that cannot be smoothed", remedy="Are all weights and pixels finite?")
+        raise ObservationError("this take cannot be smoothed", remedy="Check that all weights and pixels are finite.")
     damping, growth, nothing = 1e-9 * mean, 2.0, 1e-16 * now.cost + 1e-300
     W, below, delta = _workspace(len(roots), tree.n_dofs)
     start = start_of(entering, tree.n_dofs, W.shape[1])

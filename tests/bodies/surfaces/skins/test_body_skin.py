@@ -145,5 +145,5 @@ def test_a_limb_within_the_other_is_refused():
     short = tuple(
         s if BODY.tree.segments[s.segment] != "pelvis" else s.changed(6.0 * s.radii) for s in BODY.surfaces
     )
-    with pytest.raises(BodyError, match=r"segment '\w+' (lies within the one|where it branches off)"):
+    with pytest.raises(BodyError, match=r"segment '\w+' (lies inside the limb|at its branch)"):
         body_skins(replace(BODY, surfaces=short))

@@ -83,9 +83,9 @@ def nearest_lines(
     """
     count = x.shape[1]
     if not abs(float(x.sum())) < np.inf:
-        raise ObservationError("points are not finite", remedy="Leave out what was not measured.")
+        raise ObservationError("points are not finite", remedy="Remove points without a measurement.")
     if not 0.0 < max_distance < np.inf:
-        raise ObservationError(f"the largest distance is {max_distance} m", remedy="Give a positive one.")
+        raise ObservationError(f"the largest distance is {max_distance} m", remedy="Give a positive distance.")
     wanted = np.full(count, -1) if only is None else np.asarray(only)
     if wanted.shape not in ((), (count,)) or wanted.dtype.kind not in "iu":
         raise ObservationError(f"segments have shape {wanted.shape}", remedy=f"Give ({count},) integers, or one.")

@@ -207,8 +207,8 @@ def _shortened(body: Body, limb: Tube, host: Tube, end: int) -> Tube:
         rings = rings[1 + int(covered.max()) :] if end == 0 else rings[: int(covered.min())]
     if len(rings) < 2:
         name = body.tree.segments[limb.limbs[0].limb.segment]
-        problem = f"limb of segment '{name}' lies within the one that it branches off"
-        raise BodyError(problem, remedy="Make it longer, or the other thinner.")
+        problem = f"limb of segment '{name}' lies inside the limb that it branches from"
+        raise BodyError(problem, remedy="Make it longer, or that limb thinner.")
     return replace(limb, rings=rings).cut
 
 
@@ -239,7 +239,7 @@ def _hole(
             best, out = cost, (block, loop[turns[shift]])
     if out is None:
         name = body.tree.segments[limbs[0].limb.segment]
-        raise BodyError(f"no room for the limb of segment '{name}' where it branches off", remedy="Move limbs apart.")
+        raise BodyError(f"no room for the limb of segment '{name}' at its branch", remedy="Move limbs apart.")
     return out
 
 

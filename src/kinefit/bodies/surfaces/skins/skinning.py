@@ -57,7 +57,7 @@ class SkinnedMesh:
             raise BodyError(f"a skin of {len(nodes)} nodes has faces {faces.shape} of others", remedy="Count from 0.")
         if not np.isfinite(nodes).all():
             bad = int(np.flatnonzero(~np.isfinite(nodes).all((1, 2)))[0])
-            raise BodyError(f"node {bad} of a skin is not finite", remedy="Leave out it and its faces.")
+            raise BodyError(f"node {bad} of a skin is not finite", remedy="Remove it and its faces.")
         total = weights.sum(1)
         wrong = np.flatnonzero(~((np.abs(total - 1.0) < _MAX_WEIGHT_ERROR) & (weights >= 0.0).all(1)))
         if len(wrong):

@@ -1,0 +1,52 @@
+"""Every image of the pages has a command that draws it, and a page that shows it."""
+
+import ast
+import importlib
+import sys
+
+import pytest
+from tests.conftest import ROOT
+from tests.docs.blocks import PAGES
+
+IMAGES = ROOT / "docs" / "images"
+
+
+@pytest.fixture(scope="module")
+def draw():
+    sys.path.insert(0, str(ROOT / "docs"))
+    try:
+        yield importlib.import_module("draw")
+    finally:
+        sys.path[:] = [path for path in sys.path if path != str(ROOT / "docs")]
+
+
+def functions(path):
+    return {node.name for node in ast.parse(path.read_text("utf-8")).body if isinstance(node, ast.FunctionDef)}
+
+
+def test_every_image_is_listed_once_and_every_listed_one_exists(draw):
+    listed = [*draw.DRAWN, *draw.BENCHMARKS, *draw.BY_HAND]
+    assert sorted(listed) == sorted(path.name for path in IMAGES.iterdir())
+
+
+def test_every_command_exists(draw):
+    for image, module in draw.DRAWN.items():
+        assert image.partition(".")[0] in functions(ROOT / "docs" / "drawing" / f"{module}.py"), image
+    for image, command in draw.BENCHMARKS.items():
+        module, *parts = command.partition("benchmarks.")[2].split()
+        names = [part for part in parts if (ROOT / "benchmarks" / f"{part}.py").is_file()] or [module]
+        text = (ROOT / "benchmarks" / f"{names[0]}.py").read_text("utf-8")
+        assert "__main__" in (ROOT / "benchmarks" / f"{module}.py").read_text("utf-8"), command
+        stem, _, ending = image.partition(".")
+        assert image in text or (f".{ending}" in text and stem.partition("_")[0] in text) or image in command, image
+
+
+def test_every_image_is_shown():
+    text = "".join(page.read_text("utf-8") for page in PAGES.values())
+    assert not [path.name for path in IMAGES.iterdir() if f"images/{path.name}" not in text]
+
+
+def test_tutorials_begin_with_an_image():
+    for page, path in PAGES.items():
+        if page.startswith("tutorials/") and page != "tutorials/index":
+            assert "](../images/" in path.read_text("utf-8").partition("\n```")[0], page
