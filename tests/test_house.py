@@ -35,6 +35,7 @@ LEVELS = [
     {"simulation", "recipes"},
     {"evaluation"},
     {"batch", "live"},
+    {"app"},
     {"cli", "__main__"},
 ]
 BESIDE = {
@@ -45,8 +46,8 @@ BESIDE = {
 LEVEL = {part: level for level, parts in enumerate(LEVELS) for part in parts}
 OUTPUTS = {"exporters", "viewers"}  # see everything up to rows
 SEEN_ONLY_BY = {
-    "exporters": {"recipes", "batch", "live", "cli", "preparing"},
-    "viewers": {"recipes", "batch", "cli"},
+    "exporters": {"recipes", "batch", "live", "app", "cli", "preparing"},
+    "viewers": {"recipes", "batch", "app", "cli"},
     "assets": {"cli", "preparing"},
 }
 MOST_FILES = 15  # of a folder, without its __init__.py

@@ -25,6 +25,7 @@ from kinefit.serving.access import Access
 from kinefit.serving.policy import inline_policy
 from kinefit.serving.server import Connection, Page, PageServer
 
+_APP = "http://localhost:* http://127.0.0.1:*"  # `kinefit app` shows the page in its own
 _MAX_WAITING_ANSWERS = 100  # a client that leaves more unread is disconnected
 Ask = Callable[[bytes, Answer], None]
 
@@ -168,7 +169,7 @@ _WAITING = '<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" cont
 def live_page(title: str, body: Body | None, up: str) -> Page:
     """Self-contained HTML page; without a body it reloads until there is one."""
     if body is None:
-        return Page(_WAITING.encode())
+        return Page(_WAITING.encode(), framed_by=_APP)
     figure, capsules = live_figure(body)
     report = resources.files("kinefit.exporters.report")
     own = resources.files("kinefit.live.receivers")
@@ -185,4 +186,4 @@ def live_page(title: str, body: Body | None, up: str) -> Page:
         f'<script type="application/json" id="capsules">{to_json(places)}</script>'
         f"{''.join(f'<script>{script}</script>' for script in scripts)}</body></html>"
     )
-    return Page(html.encode(), policy=inline_policy(scripts, [style], "connect-src 'self'"))
+    return Page(html.encode(), policy=inline_policy(scripts, [style], "connect-src 'self'"), framed_by=_APP)
