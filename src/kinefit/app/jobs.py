@@ -59,6 +59,7 @@ class Job:
     notes : sentences of the command
     error : {"problem", "at", "try"} of a command that failed
     result : what the command prints with --json; None before its end
+    printed : what the command printed on its standard output; "" before its end
     environment : further variables of the process, such as a token, which a command line would show to others
     """
 
@@ -69,6 +70,7 @@ class Job:
     notes: list[str] = field(default_factory=list)
     error: dict[str, str] | None = None
     result: dict[str, Any] | None = None
+    printed: str = ""
     environment: dict[str, str] = field(default_factory=dict)
     _process: asyncio.subprocess.Process | None = None
 
@@ -98,6 +100,7 @@ class Job:
         printed, _ = await asyncio.gather(process.stdout.read(), self._follow(process))
         code = await process.wait()
         with suppress(ValueError):
+            self.printed = printed.decode("utf-8", "replace")
             self.result = json.loads(printed)
         self.state = DONE if code == 0 else PAUSED if code == _INTERRUPTED else FAILED
         if self.state == FAILED and self.error is None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from kinefit.app.folders import takes_below
 from kinefit.app.jobs import Job, JobQueue
 from kinefit.errors import KinefitError
+from kinefit.readers.take.cameras import is_uncalibrated
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.streams import streams_of
 from kinefit.serving import TOKEN_VARIABLE
@@ -19,11 +20,16 @@ _HOST, _CONNECT_TIMEOUT_S = "127.0.0.1", 0.2
 
 
 def followable(root: Path) -> dict[Path, bool]:
-    """{take file: whether its sensors have streams} of all takes below a folder; the others are replayed."""
+    """{take file: whether its sensors have streams} of the takes below a folder whose cameras' places are known.
+
+    Those without streams are replayed.
+    """
     found = {}
     for take in takes_below(root):
         try:
-            found[take.file] = bool(streams_of(read_take(take.file)))
+            read = read_take(take.file)
+            if not is_uncalibrated(read):
+                found[take.file] = bool(streams_of(read))
         except KinefitError:
             continue
     return dict(sorted(found.items(), key=lambda item: not item[1]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from kinefit.exporters.take_text import quoted, with_keys
 from kinefit.live.cameras import SessionClock
 from kinefit.live.inbox import Arrived, Inbox
 from kinefit.live.take import camera_source, stream_size
+from kinefit.preparing.detecting import hushed
 from kinefit.readers.guess.folder import guess_take
 from kinefit.readers.take.cameras import read_rig
 from kinefit.readers.take.file import read_take
@@ -63,10 +64,11 @@ def find_webcams(numbers: Iterable[int] = NUMBERS) -> list[Webcam]:
             found[number] = Webcam(number, np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8))
 
     threads = [threading.Thread(target=look, args=(number,), daemon=True) for number in numbers]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(_OPEN_TIMEOUT_S / len(threads))
+    with hushed():  # OpenCV warns of each number without a camera
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(_OPEN_TIMEOUT_S / len(threads))
     return [found[number] for number in sorted(found)]
 
 
@@ -158,11 +160,13 @@ class Recorder(Inbox):
             images.put(None)
         for thread in self._writing:
             thread.join()
-        if error := self._problem or self._error:
-            raise error
+        if self._error is not None:
+            raise self._error
         if not self.count:
             problem, remedy = "a camera sent no image", "Check that no other program uses it."
             raise ObservationError(problem, file=self.folder, remedy=remedy)
+        if self._problem is not None:
+            raise self._problem
         write_text(self.folder / "take.toml", self._text())
         return self.folder
 
@@ -177,9 +181,13 @@ class Recorder(Inbox):
         return self._times[name][0] - min(times[0] for times in self._times.values() if times)
 
     def _write(self, name: str, size: tuple[int, int]) -> None:
-        width, height = (side - side % 2 for side in size)
-        images = (image[:height, :width] for image in iter(self._images[name].get, None))
+        width, height = (side - side % 2 for side in size)  # the encoder wants even sides
+
+        def images() -> Iterator[NDArray[np.uint8]]:
+            while (image := self._images[name].get()) is not None:
+                yield image[:height, :width]
+
         try:
-            write_pictures(images, self.folder / f"{name}.mp4", _RATE, (width, height), times=self._times[name])
+            write_pictures(images(), self.folder / f"{name}.mp4", _RATE, (width, height), times=self._times[name])
         except (KinefitError, OSError) as error:
             self._problem = error

@@ -38,12 +38,11 @@ async def compare_page(desk: Desk, before: Path, after: Path) -> None:
             return
         finally:
             waiting.delete()
-        with ui.row().classes("w-full items-stretch"):
-            with ui.column().classes("flex-1 min-w-[320px]"), card(t("compare.scene")):
-                scene = ui.element("iframe").props(f'src="{both.scene.address}" title="{t("compare.scene")}"')
-                scene.classes("w-full h-[26rem] border")
-            with ui.column().classes("flex-1 min-w-[320px]"), card(t("compare.angle")):
-                _angles(t, both, names)
+        with card(t("compare.scene")):
+            scene = ui.element("iframe").props(f'src="{both.scene.address}" title="{t("compare.scene")}"')
+            scene.classes("w-full h-[32rem] border")
+        with card(t("compare.angle")):
+            _angles(t, both, names)
         with card(t("compare.ranges")):
             _ranges(t, both)
 
@@ -74,13 +73,13 @@ def _angles(t: Texts, both: Comparison, names: tuple[str, str]) -> None:
 
 def _ranges(t: Texts, both: Comparison) -> None:
     ui.label(t("compare.ranges_text")).classes("text-sm")
-    keys = ("angle", "range_before", "range_after", "change", "clear")
+    keys = ("angle", "range_before", "range_after", "change")
     columns = [
         {"name": key, "label": t(f"compare.{key}"), "field": key, "align": "left" if key == "angle" else "right"}
         for key in keys
     ]
-    rows = [
-        dict(zip(keys, (of.angle, of.before, of.after, of.change, t("compare.is_clear") * of.is_clear), strict=True))
-        for of in both.ranges
-    ]
-    ui.table(columns=columns, rows=rows, row_key="angle").classes("w-full").props("dense").mark("ranges")
+    rows = []
+    for of in both.ranges:
+        values = (text.replace(" ", "\u00a0") for text in (of.before, of.after, "● " * of.is_clear + of.change))
+        rows.append(dict(zip(keys, (of.angle, *values), strict=True)))
+    ui.table(columns=columns, rows=rows, row_key="angle").classes("w-full").props("dense wrap-cells").mark("ranges")

@@ -52,7 +52,8 @@ class _LivePage:
     async def _look(self) -> None:
         """Show the session anew if its state changed, and how much is recorded."""
         job = self._job
-        state = (job, job.state, job.is_open and await in_thread(is_up, job)) if job else ()
+        was_up = self._shown[:1] == (job,) and self._shown[-1]
+        state = (job, job.state, was_up or await in_thread(is_up, job)) if job else ()
         if state != self._shown:
             self._shown = state
             self._session.refresh()
@@ -89,8 +90,8 @@ class _LivePage:
             show_error(t, job.error)
             return
         ui.label(t("live.ended"))
-        for note in job.notes:
-            ui.label(note).classes("text-sm text-grey-8")
+        for line in job.printed.splitlines()[1:]:  # behind the address of the page
+            ui.label(line).classes("text-sm text-grey-8 break-all")
         if take := recorded_take(job):
             ui.link(t("live.recorded"), link("/take", path=take)).mark("recorded")
 

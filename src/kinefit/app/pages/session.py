@@ -14,7 +14,7 @@ from kinefit.app.pages.shell import in_thread, link, shell, short, texts
 from kinefit.app.texts import Texts
 
 _REFRESH_S = 2.0  # between two looks at the folders
-_TEXTS, _NUMBERS = ("take", "subject", "date", "movement", "state"), ("seconds", "agreement")
+_TEXTS, _NUMBERS = ("take", "state", "subject", "date", "movement"), ("seconds", "agreement")
 _LINK = '<q-td :props="props"><a :href="props.row.page" class="text-primary">{{ props.value }}</a></q-td>'
 """Of the recording's cell: the way to its page."""
 
@@ -31,7 +31,7 @@ async def session_page(desk: Desk) -> None:
              "align": "left" if key in _TEXTS else "right"} for key in (*_TEXTS, *_NUMBERS)
         ]  # fmt: skip
         table = ui.table(columns=columns, rows=[], row_key="key", selection="multiple")
-        table.classes("w-full").props(f'no-data-label="{t("session.reading")}"').mark("takes")
+        table.classes("w-full").props(f'dense no-data-label="{t("session.reading")}"').mark("takes")
         table.add_slot("body-cell-take", _LINK)
         with ui.row():
             compute = ui.button(t("session.compute"), icon="play_arrow", on_click=lambda: _compute(desk, t, table))
