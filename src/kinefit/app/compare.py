@@ -90,7 +90,9 @@ def _changes(
         for side in before[stem]:
             a, b = before[stem][side], after.get(stem, {}).get(side)
             change = (b.span[0] - a.span[0], float(np.hypot(a.span[1], b.span[1]))) if a and b else None
-            shown = [with_error(*pair) if pair else "" for pair in (a and a.span, b and b.span, change)]
+            spans = a and a.span, b and b.span, change
+            first, second, third = (with_error(*span) if span else "" for span in spans)
             is_clear = change is not None and abs(change[0]) > change[1]
-            found.append(RangeChange(f"{spoken(stem)}{f', {side}' * bool(side)}", *shown, is_clear))
+            name = f"{spoken(stem)}, {side}" if side else spoken(stem)
+            found.append(RangeChange(name, first, second, third, is_clear))
     return tuple(found)

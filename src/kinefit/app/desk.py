@@ -67,8 +67,10 @@ class Desk:
 
     async def close(self) -> None:
         """Pause all jobs, end the recording and close all results."""
-        for opened in (*self._reviews.values(), *self._comparisons.values()):
-            opened.close()
+        for review in self._reviews.values():
+            review.close()
+        for comparison in self._comparisons.values():
+            comparison.close()
         if self.recorder is not None:
             self.recorder.stop()
         await self.jobs.close()

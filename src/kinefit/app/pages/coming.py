@@ -27,6 +27,8 @@ def coming_images(take: Take, job: Job) -> Callable[[], None]:
         progress, now = job.steps.get(STEP), time.monotonic()
         if job.state != RUNNING or not videos or progress is None or now - last[0] < _INTERVAL_S:
             return
+        if progress.share >= 1.0 and len(images) == len(videos):
+            return
         camera = videos[int(last[1]) % len(videos)]
         last[:] = now, last[1] + 1
         source = link("/image/raw", path=camera.video, share=f"{progress.share:.4f}", **_span(take, camera))

@@ -45,7 +45,7 @@ def people_cards(desk: Desk, t: Texts, take: Path, who: ui.select) -> None:
             for picture in pictures:
                 number, said = picture.number, t("people.choose", number=picture.number)
                 with ui.column().classes("gap-1 items-center"):
-                    source = link("/image/person", path=take, number=number, faces=int(not desk.hide_faces))
+                    source = link("/image/person", path=take, number=number)
                     image = ui.image(source).classes("w-28 h-40 cursor-pointer").props(f'fit=contain alt="{said}"')
                     image.on("click", lambda n=number: choose(n))
                     _button(said, number == chosen, lambda n=number: choose(n))

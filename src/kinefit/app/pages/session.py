@@ -31,7 +31,7 @@ async def session_page(desk: Desk) -> None:
              "align": "left" if key in _TEXTS else "right"} for key in (*_TEXTS, *_NUMBERS)
         ]  # fmt: skip
         table = ui.table(columns=columns, rows=[], row_key="key", selection="multiple")
-        table.classes("w-full").props(f'dense no-data-label="{t("session.reading")}"').mark("takes")
+        table.classes("w-full").props(f'dense hide-selected-banner no-data-label="{t("session.reading")}"').mark("takes")
         table.add_slot("body-cell-take", _LINK)
         with ui.row():
             compute = ui.button(t("session.compute"), icon="play_arrow", on_click=lambda: _compute(desk, t, table))
