@@ -12,7 +12,7 @@ from tests.viewers.recordings import write_take
 
 from kinefit.app import webcams
 from kinefit.app.jobs import DONE, PAUSED, JobQueue
-from kinefit.app.live import followable, is_up, page_of, recorded_take, start_live
+from kinefit.app.live import followable, found_cameras, is_up, page_of, recorded_take, start_live
 from kinefit.app.webcams import Recorder, find_webcams, write_live_take
 from kinefit.errors import FileError, ObservationError
 from kinefit.readers.take.file import read_take
@@ -33,6 +33,8 @@ def test_takes_with_streams_come_first_and_uncalibrated_ones_not_at_all(tmp_path
     (tmp_path / "b" / "take.toml").write_text(STUDIO + camera(tmp_path / "b", "one"))
     (tmp_path / "c").mkdir()
     (tmp_path / "c" / "take.toml").write_text(STUDIO + '[[camera]]\nname = "x"\n[[camera]]\nname = "y"\n')
+    (tmp_path / "c" / "take-cameras.toml").touch()
+    assert found_cameras(tmp_path) == [tmp_path / "c" / "take-cameras.toml"]
     assert list(followable(tmp_path).items()) == [
         (tmp_path / "b" / "take.toml", True), (tmp_path / "a" / "take.toml", False)
     ]  # fmt: skip

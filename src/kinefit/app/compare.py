@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kinefit.app.scene import Scene
+from kinefit.app.scene import ScenePage
 from kinefit.batch.viewed import gather
 from kinefit.exporters.curves import curves
 from kinefit.exporters.report.names import spoken
@@ -44,7 +44,7 @@ class Comparison:
     ranges : tuple of RangeChange
     angles : {name: (before, after), two Curve} that both motions have
     times : of both, (F,) [s] from the first frame on
-    scene : Scene with both
+    scene : ScenePage with both
 
     Raises
     ------
@@ -61,7 +61,7 @@ class Comparison:
         known = {curve.name: curve for curve in curves(first) if curve.unit == "deg"}
         self.angles = {curve.name: (known[curve.name], curve) for curve in curves(second) if curve.name in known}
         self.times = first.times - first.times[0], second.times - second.times[0]
-        self.scene = Scene(content)
+        self.scene = ScenePage(content)
 
     @property
     def is_current(self) -> bool:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from kinefit.app.folders import takes_below
 from kinefit.app.jobs import Job, JobQueue
+from kinefit.calibration.people.of_take import cameras_file
 from kinefit.errors import KinefitError
 from kinefit.readers.take.cameras import is_uncalibrated
 from kinefit.readers.take.file import read_take
@@ -33,6 +34,11 @@ def followable(root: Path) -> dict[Path, bool]:
         except KinefitError:
             continue
     return dict(sorted(found.items(), key=lambda item: not item[1]))
+
+
+def found_cameras(root: Path) -> list[Path]:
+    """Files of cameras that were found from the people in the takes below a folder."""
+    return [file for take in takes_below(root) if (file := cameras_file(take.file)).is_file()]
 
 
 def start_live(jobs: JobQueue, take: Path) -> Job:

@@ -14,7 +14,7 @@ from kinefit.readers.take.file import read_take
 
 
 @dataclass(frozen=True)
-class Recorded:
+class SessionRow:
     """One person of one take; a take without results has one, too.
 
     Parameters
@@ -36,7 +36,7 @@ class Recorded:
     agreement: float | None = None
 
 
-def recordings(root: Path) -> list[Recorded]:
+def recordings(root: Path) -> list[SessionRow]:
     """Everybody in all takes below a folder, by path."""
     found = []
     for take in takes_below(root):
@@ -47,9 +47,9 @@ def recordings(root: Path) -> list[Recorded]:
         people = take.people
         for k, folder in enumerate(people, start=1):
             number = k if len(people) > 1 else 0
-            found.append(Recorded(take, number, folder, session, problem, *measures(folder / "motion.npz")))
+            found.append(SessionRow(take, number, folder, session, problem, *measures(folder / "motion.npz")))
         if not people:
-            found.append(Recorded(take, 0, None, session, problem))
+            found.append(SessionRow(take, 0, None, session, problem))
     return found
 
 

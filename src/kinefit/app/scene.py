@@ -9,8 +9,10 @@ from kinefit.viewers.player import Player
 from kinefit.viewers.show import ViewerContent
 from kinefit.viewers.stage import open_server, quiet
 
+_END_TIMEOUT_S = 5.0  # of the frame that is shown
 
-class Scene:
+
+class ScenePage:
     """A player of motions that runs until it is closed.
 
     Parameters
@@ -34,10 +36,12 @@ class Scene:
         self.address = access.url(self._server.get_port())
         self.player = Player(self._server, content)
         self._ended = threading.Event()
-        threading.Thread(target=self.player.run, args=(self._ended.is_set,), daemon=True).start()
+        self._running = threading.Thread(target=self.player.run, args=(self._ended.is_set,), daemon=True)
+        self._running.start()
 
     def close(self) -> None:
         """End the player and its server."""
         self._ended.set()
+        self._running.join(_END_TIMEOUT_S)
         with quiet():
             self._server.stop()

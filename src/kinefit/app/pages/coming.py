@@ -21,7 +21,7 @@ _MAX_CAMERAS = 4  # of which images are shown
 def coming_images(take: Take, job: Job) -> Callable[[], None]:
     """A row of images, empty until frames are computed; what is returned brings them up to date."""
     videos = [camera for camera in take.cameras if camera.video is not None and camera.video.is_file()][:_MAX_CAMERAS]
-    row, images, last = ui.row().classes("w-full").mark("coming"), dict[str, ui.image](), [0.0, 0]
+    row, images, last = ui.row().classes("w-full"), dict[str, ui.image](), [0.0, 0]
 
     def update() -> None:
         progress, now = job.steps.get(STEP), time.monotonic()

@@ -66,7 +66,7 @@ def _angles(t: Texts, both: Comparison, names: tuple[str, str]) -> None:
 
     angles = list(both.angles)
     first = next((name for name in angles if name.startswith("knee_angle")), angles[0])
-    choice = ui.select(angles, value=first, label=t("compare.angle"), on_change=draw).classes("w-48").mark("angle")
+    choice = ui.select(angles, value=first, label=t("compare.angle"), on_change=draw).classes("w-48")
     chart = ui.echart({}).classes("w-full h-[22rem]")
     draw()
 
@@ -82,4 +82,4 @@ def _ranges(t: Texts, both: Comparison) -> None:
     for of in both.ranges:
         values = (text.replace(" ", "\u00a0") for text in (of.before, of.after, "● " * of.is_clear + of.change))
         rows.append(dict(zip(keys, (of.angle, *values), strict=True)))
-    ui.table(columns=columns, rows=rows, row_key="angle").classes("w-full").props("dense wrap-cells").mark("ranges")
+    ui.table(columns=columns, rows=rows, row_key="angle").classes("w-full").props("dense wrap-cells")

@@ -11,7 +11,7 @@ from nicegui import ui
 from kinefit.app.desk import Desk
 from kinefit.app.images import jpeg, unrecognisable
 from kinefit.app.jobs import FAILED, Job
-from kinefit.app.live import followable, is_up, page_of, recorded_take, start_live
+from kinefit.app.live import followable, found_cameras, is_up, page_of, recorded_take, start_live
 from kinefit.app.pages.shell import card, in_thread, link, shell, short, show_error, texts
 from kinefit.app.texts import Texts
 from kinefit.app.webcams import Recorder, Webcam, find_webcams, write_live_take
@@ -38,6 +38,7 @@ class _LivePage:
     def __init__(self, desk: Desk, t: Texts, takes: dict[Path, bool]) -> None:
         self._desk, self._t, self._takes = desk, t, takes
         self._webcams: list[Webcam] | None = None
+        self._calibrations: list[Path] = []
         self._shown: tuple[object, ...] = ()
         with ui.card().classes("w-full"):
             self._session()
@@ -70,7 +71,7 @@ class _LivePage:
                 ui.element("iframe").props(f'src="{page}" title="{t("live.page")}"').classes("w-full h-[36rem] border")
             else:
                 ui.label(t("live.starting"))
-            ui.button(t("live.stop"), icon="stop", on_click=job.pause).mark("stop")
+            ui.button(t("live.stop"), icon="stop", on_click=job.pause)
             return
         if job is not None:
             self._ended(job)
@@ -82,7 +83,7 @@ class _LivePage:
             for file, streams in self._takes.items()
         }
         choice = ui.select(names, value=next(iter(names)), label=t("live.take")).classes("w-full max-w-xl")
-        ui.button(t("live.start"), icon="videocam", on_click=lambda: self._start(Path(choice.value))).mark("start")
+        ui.button(t("live.start"), icon="videocam", on_click=lambda: self._start(Path(choice.value)))
 
     def _ended(self, job: Job) -> None:
         t = self._t
@@ -93,7 +94,7 @@ class _LivePage:
         for line in job.printed.splitlines()[1:]:  # behind the address of the page
             ui.label(line).classes("text-sm text-grey-8 break-all")
         if take := recorded_take(job):
-            ui.link(t("live.recorded"), link("/take", path=take)).mark("recorded")
+            ui.link(t("live.recorded"), link("/take", path=take))
 
     def _start(self, take: Path) -> None:
         start_live(self._desk.jobs, take)
@@ -104,9 +105,9 @@ class _LivePage:
         t = self._t
         if self._desk.recorder is not None:
             self._recorded = ui.label(self._said())
-            ui.button(t("live.end"), icon="stop", on_click=self._end).mark("end")
+            ui.button(t("live.end"), icon="stop", on_click=self._end)
             return
-        ui.button(t("live.find"), icon="search", on_click=self._find).props("outline").mark("find")
+        ui.button(t("live.find"), icon="search", on_click=self._find).props("outline")
         if self._webcams is None:
             return
         if not self._webcams:
@@ -120,8 +121,8 @@ class _LivePage:
                     ui.image(_data(jpeg(image, _PREVIEW_PX))).classes("w-60").props(f'alt="{webcam.name}"')
                     boxes[webcam.number] = ui.checkbox(webcam.name, value=True)
         ui.label(t("live.one_alone"))
-        found = sorted(self._desk.root.rglob("*-cameras.toml"))
-        places = {"": t("live.no_calibration")} | {str(file): short(file, self._desk.root) for file in found}
+        places = {"": t("live.no_calibration")}
+        places |= {str(file): short(file, self._desk.root) for file in self._calibrations}
         where = ui.select(places, value="", label=t("live.calibration")).classes("w-full max-w-xl")
 
         def chosen() -> dict[int, tuple[int, int]]:
@@ -129,13 +130,14 @@ class _LivePage:
             return {number: size for number, size in sizes.items() if boxes[number].value}
 
         with ui.row():
-            ui.button(t("live.use"), icon="videocam", on_click=lambda: self._use(chosen(), where.value)).mark("use")
+            ui.button(t("live.use"), icon="videocam", on_click=lambda: self._use(chosen(), where.value))
             walk = ui.button(t("live.walk"), icon="directions_walk", on_click=lambda: self._record(chosen()))
-            walk.props("outline").mark("walk")
+            walk.props("outline")
 
     async def _find(self) -> None:
         ui.notify(self._t("live.finding"))
         self._webcams = await in_thread(find_webcams)
+        self._calibrations = await in_thread(found_cameras, self._desk.root)
         self._cameras.refresh()
 
     def _use(self, sizes: dict[int, tuple[int, int]], calibration: str) -> None:

@@ -41,7 +41,7 @@ def people_cards(desk: Desk, t: Texts, take: Path, who: ui.select) -> None:
         if not pictures:
             return
         ui.label(t("people.text"))
-        with ui.row().classes("items-end").mark("people"):
+        with ui.row().classes("items-end"):
             for picture in pictures:
                 number, said = picture.number, t("people.choose", number=picture.number)
                 with ui.column().classes("gap-1 items-center"):

@@ -9,7 +9,7 @@ from nicegui import ui
 
 from kinefit.app.desk import Desk
 from kinefit.app.jobs import DONE, RUNNING
-from kinefit.app.overview import Recorded, recordings
+from kinefit.app.overview import SessionRow, recordings
 from kinefit.app.pages.shell import in_thread, link, shell, short, texts
 from kinefit.app.texts import Texts
 
@@ -31,13 +31,12 @@ async def session_page(desk: Desk) -> None:
              "align": "left" if key in _TEXTS else "right"} for key in (*_TEXTS, *_NUMBERS)
         ]  # fmt: skip
         table = ui.table(columns=columns, rows=[], row_key="key", selection="multiple")
-        table.classes("w-full").props(f'dense hide-selected-banner no-data-label="{t("session.reading")}"').mark("takes")
+        table.classes("w-full").props(f'dense hide-selected-banner no-data-label="{t("session.reading")}"')
         table.add_slot("body-cell-take", _LINK)
         with ui.row():
-            compute = ui.button(t("session.compute"), icon="play_arrow", on_click=lambda: _compute(desk, t, table))
+            ui.button(t("session.compute"), icon="play_arrow", on_click=lambda: _compute(desk, t, table))
             compare = ui.button(t("session.compare"), icon="compare", on_click=lambda: _compare(t, table))
-            compute.mark("compute")
-            compare.props("outline").mark("compare")
+            compare.props("outline")
         ui.label(t("session.agreement_text")).classes("text-sm")
 
         async def look() -> None:
@@ -49,7 +48,7 @@ async def session_page(desk: Desk) -> None:
         ui.timer(_REFRESH_S, look)
 
 
-def _row(desk: Desk, t: Texts, found: Recorded) -> dict[str, Any]:
+def _row(desk: Desk, t: Texts, found: SessionRow) -> dict[str, Any]:
     """A row of the table: texts, and numbers, by which it is sorted."""
     file = found.take.file
     name = short(file.parent if file.name == "take.toml" else file, desk.root)
@@ -64,7 +63,7 @@ def _row(desk: Desk, t: Texts, found: Recorded) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _state(desk: Desk, t: Texts, found: Recorded) -> str:
+def _state(desk: Desk, t: Texts, found: SessionRow) -> str:
     """That of the last job of the take unless it is done, else that of its files."""
     job = next((job for job in reversed(desk.jobs.jobs) if job.take == found.take.file and job.state != DONE), None)
     if job is None:
