@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 from kinefit.app.compare import Comparison
@@ -9,6 +10,7 @@ from kinefit.app.jobs import Job, JobQueue
 from kinefit.app.people import PeoplePictures
 from kinefit.app.review import Review
 from kinefit.app.webcams import Recorder
+from kinefit.errors import KinefitError
 
 
 class Desk:
@@ -72,5 +74,6 @@ class Desk:
         for comparison in self._comparisons.values():
             comparison.close()
         if self.recorder is not None:
-            self.recorder.stop()
+            with suppress(KinefitError):  # a camera without images
+                self.recorder.stop()
         await self.jobs.close()
