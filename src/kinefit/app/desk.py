@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
+from kinefit.app.compare import Comparison
 from kinefit.app.jobs import Job, JobQueue
+from kinefit.app.people import PeoplePictures
 from kinefit.app.review import Review
+from kinefit.app.webcams import Recorder
+from kinefit.errors import KinefitError
 
 
 class Desk:
@@ -21,6 +26,8 @@ class Desk:
     hide_faces : bool or None
         The user's choice at the start; None until it is made, and nothing of a video is shown before.
     jobs : JobQueue
+    people : PeoplePictures of all takes
+    recorder : of cameras of this computer, while it records
     """
 
     def __init__(self, root: Path, prefix: str) -> None:
@@ -28,6 +35,9 @@ class Desk:
         self.hide_faces: bool | None = None
         self.jobs = JobQueue()
         self._reviews: dict[Path, Review] = {}
+        self._comparisons: dict[tuple[Path, Path], Comparison] = {}
+        self.people = PeoplePictures()
+        self.recorder: Recorder | None = None
 
     def start(self, take: Path, *command: str) -> Job:
         """Ask for a command on a take, with the choice of faces."""
@@ -48,8 +58,22 @@ class Desk:
         """The result in a folder, if it is open."""
         return self._reviews.get(folder)
 
+    def comparison(self, before: Path, after: Path) -> Comparison:
+        """Two results side by side; read anew if a motion was written since. Slow: call it in a thread."""
+        known = self._comparisons.get((before, after))
+        if known is None or not known.is_current:
+            if known is not None:
+                known.close()
+            self._comparisons[before, after] = known = Comparison(before, after)
+        return known
+
     async def close(self) -> None:
-        """Pause all jobs and close all results."""
+        """Pause all jobs, end the recording and close all results."""
         for review in self._reviews.values():
             review.close()
+        for comparison in self._comparisons.values():
+            comparison.close()
+        if self.recorder is not None:
+            with suppress(KinefitError):  # a camera without images
+                self.recorder.stop()
         await self.jobs.close()

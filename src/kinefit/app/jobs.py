@@ -7,7 +7,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -59,6 +59,8 @@ class Job:
     notes : sentences of the command
     error : {"problem", "at", "try"} of a command that failed
     result : what the command prints with --json; None before its end
+    printed : what the command printed on its standard output; "" before its end
+    environment : further variables of the process, such as a token, which a command line would show to others
     """
 
     take: Path
@@ -68,6 +70,8 @@ class Job:
     notes: list[str] = field(default_factory=list)
     error: dict[str, str] | None = None
     result: dict[str, Any] | None = None
+    printed: str = ""
+    environment: dict[str, str] = field(default_factory=dict)
     _process: asyncio.subprocess.Process | None = None
 
     @property
@@ -89,13 +93,14 @@ class Job:
         pipe = asyncio.subprocess.PIPE
         process = await asyncio.create_subprocess_exec(
             *words, stdin=pipe, stdout=pipe, stderr=pipe, limit=_MAX_LINE_BYTES,
-            env={**os.environ, "PYTHONIOENCODING": "utf-8"},
+            env={**os.environ, **self.environment, "PYTHONIOENCODING": "utf-8"},
         )  # fmt: skip
         self._process = process
         assert process.stdout is not None
         printed, _ = await asyncio.gather(process.stdout.read(), self._follow(process))
         code = await process.wait()
         with suppress(ValueError):
+            self.printed = printed.decode("utf-8", "replace")
             self.result = json.loads(printed)
         self.state = DONE if code == 0 else PAUSED if code == _INTERRUPTED else FAILED
         if self.state == FAILED and self.error is None:
@@ -133,11 +138,19 @@ class Job:
 
 
 class JobQueue:
-    """Jobs in the order in which they were asked for; one runs at a time, since each uses all cores."""
+    """Jobs in the order in which they were asked for; one runs at a time, since each uses all cores.
+
+    Attributes
+    ----------
+    jobs : of the queue
+    beside : live sessions, which run beside it until they are told to end
+    """
 
     def __init__(self) -> None:
         self.jobs: list[Job] = []
+        self.beside: list[Job] = []
         self._task: asyncio.Task[None] | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
 
     def add(self, take: Path, command: Sequence[str]) -> Job:
         """Append a command for a take; the take's open job of the same kind, if there is one, stands for it."""
@@ -151,6 +164,15 @@ class JobQueue:
             self._task = asyncio.create_task(self._work())
         return job
 
+    def start_beside(self, take: Path, command: Sequence[str], environment: Mapping[str, str]) -> Job:
+        """Run a command at once, whatever the queue does."""
+        job = Job(take, tuple(command), environment=dict(environment))
+        self.beside = [*(old for old in self.beside if old.is_open), job]
+        task = asyncio.create_task(_run(job))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return job
+
     def of(self, take: Path, kind: str) -> Job | None:
         """The last job of a kind for a take."""
         return next((job for job in reversed(self.jobs) if job.take == take and job.kind == kind), None)
@@ -161,16 +183,19 @@ class JobQueue:
 
     async def _work(self) -> None:
         while job := next((job for job in self.jobs if job.state == WAITING), None):
-            try:
-                await job.run()
-            except OSError as error:  # no memory for a process
-                job.state, job.error = FAILED, {"problem": str(error), "at": " ".join(job.command), "try": ""}
+            await _run(job)
 
     async def close(self) -> None:
         """Pause all jobs and wait until what is done is written."""
-        for job in self.jobs:
+        for job in (*self.jobs, *self.beside):
             if job.is_open:
                 job.pause()
-        if self._task is not None:
-            with suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._task, _PAUSE_TIMEOUT_S)
+        if tasks := [*self._tasks, *([self._task] if self._task else [])]:
+            await asyncio.wait(tasks, timeout=_PAUSE_TIMEOUT_S)
+
+
+async def _run(job: Job) -> None:
+    try:
+        await job.run()
+    except OSError as error:  # no memory for a process
+        job.state, job.error = FAILED, {"problem": str(error), "at": " ".join(job.command), "try": ""}

@@ -148,8 +148,8 @@ def opened_streams(take: Take, body: Body, threads: int, tell: Tell) -> Opened:
     rig, clock, rate = read_rig(take), SessionClock(), take.rate or _DEFAULT_RATE
     cameras = [entry for entry in take.cameras if entry.stream is not None]
     if cameras:
-        sizes = {entry.name: _size(entry, rig, take) for entry in cameras}
-        images = [_camera(entry, sizes[entry.name], take, clock) for entry in cameras]
+        sizes = {entry.name: stream_size(entry, rig, take) for entry in cameras}
+        images = [camera_source(entry, sizes[entry.name], take, clock) for entry in cameras]
         seen = with_detector(take, body, images, sizes, rate, threads, tell)
     else:
         empty = Recording(np.zeros(1), rate, Rig(()), up=take.up, name=take.name)
@@ -220,8 +220,8 @@ def with_detector(
     return Opened(recording, body, tuple(sources), detector)
 
 
-def _size(entry: CameraEntry, rig: Rig | None, take: Take) -> tuple[int, int]:
-    """(width, height) [px] of a camera's image."""
+def stream_size(entry: CameraEntry, rig: Rig | None, take: Take) -> tuple[int, int]:
+    """(width, height) [px] of a camera's image; TakeError where neither entry nor calibration states it."""
     size = entry.size or (rig[entry.name].size if rig is not None else None)
     if size is None:
         remedy = "Write size = [width, height] into its [[camera]], or add [calibration]."
@@ -230,8 +230,8 @@ def _size(entry: CameraEntry, rig: Rig | None, take: Take) -> tuple[int, int]:
     return size
 
 
-def _camera(entry: CameraEntry, size: tuple[int, int], take: Take, clock: SessionClock) -> Source:
-    """Source of the images of one camera: a folder or a stream."""
+def camera_source(entry: CameraEntry, size: tuple[int, int], take: Take, clock: SessionClock) -> Source:
+    """Source of the images (size [px]) of one camera: a folder or a stream; FileError if it cannot be opened."""
     assert entry.stream is not None
     folder = take.path.parent / entry.stream
     if folder.is_dir():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +110,41 @@ def first_image(path: Path) -> NDArray[np.uint8]:
     finally:
         container.close()
     return _upright(frame, _quarter_turns(frame))
+
+
+def image_at(
+    path: Path, share: float, *, start: float = 0.0, stop: float | None = None, timeout: float = 0.1
+) -> NDArray[np.uint8]:
+    """An image (H, W, 3) about a share of the way through a video file, RGB and upright.
+
+    No frame is counted, and what lies between two key frames is decoded for `timeout` [s] at most: it may be an earlier
+    image.
+
+    Parameters
+    ----------
+    share : 0 to 1, of the time from `start` to `stop` [s]; default: all of the video
+
+    Raises
+    ------
+    FileError
+        Not readable, or no image in it.
+    """
+    with _open(path) as container:
+        stop = (container.duration or 0) / av.time_base if stop is None else stop
+        aim = max(start + min(max(share, 0.0), 1.0) * (stop - start), 0.0)
+        until, found = time.monotonic() + timeout, None
+        container.streams.video[0].codec_context.skip_frame = "NONREF"  # what no other image needs
+        try:
+            container.seek(round(aim * av.time_base) + (container.start_time or 0), backward=True)
+            for found in container.decode(video=0):
+                begin = (container.start_time or 0) / av.time_base
+                if found.time is None or found.time - begin >= aim or time.monotonic() > until:
+                    break
+        except (av.FFmpegError, ValueError) as error:
+            raise FileError(f"no image can be decoded ({error})", file=path, remedy=_REMEDY) from error
+        if found is None:
+            raise FileError("no image can be decoded", file=path, remedy=_REMEDY)
+        return _upright(found, _quarter_turns(found))
 
 
 def open_container(path: Path) -> Any:

@@ -55,6 +55,7 @@ class Page(NamedTuple):
     content: bytes
     kind: str = "text/html; charset=utf-8"
     policy: str = "default-src 'none'"
+    framed_by: str = "'none'"  # pages that may show it as a part of theirs, as the policy `frame-ancestors` has them
 
 
 class Allowance:
@@ -247,7 +248,7 @@ class PageServer:
             return connection.respond(HTTPStatus.NOT_FOUND, "There is no such page.\n")
         headers = Headers([
             ("Content-Type", page.kind), ("Content-Length", str(len(page.content))),
-            ("Content-Security-Policy", f"{page.policy}; frame-ancestors 'none'"),
+            ("Content-Security-Policy", f"{page.policy}; frame-ancestors {page.framed_by}"),
         ])  # fmt: skip
         return Response(HTTPStatus.OK.value, HTTPStatus.OK.phrase, headers, page.content)
 

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 from fastapi import Response
 from fastapi.responses import FileResponse
 from nicegui import app, ui
+from numpy.typing import NDArray
 
 from kinefit.app.desk import Desk
 from kinefit.app.images import jpeg, unrecognisable
+from kinefit.app.pages.compare import compare_page
 from kinefit.app.pages.home import home_page
+from kinefit.app.pages.live import live_page
 from kinefit.app.pages.result import result_page
+from kinefit.app.pages.session import session_page
 from kinefit.app.pages.take import take_page
 from kinefit.errors import KinefitError
-from kinefit.readers.video_files import first_image
+from kinefit.readers.video_files import first_image, image_at
 
 _THUMBNAIL_PX = 384
 _PAGES = (".html",)  # files that are shown as pages: reports and check pages
@@ -37,15 +43,42 @@ def add_pages(desk: Desk) -> None:
     async def result(path: str, folder: str) -> None:
         await result_page(desk, Path(path), Path(folder))
 
-    @app.get("/image/first")
-    def first(path: str) -> Response:
+    @ui.page("/session")
+    async def session() -> None:
+        await session_page(desk)
+
+    @ui.page("/compare")
+    async def compare(a: str, b: str) -> None:
+        await compare_page(desk, Path(a), Path(b))
+
+    @ui.page("/live")
+    async def live() -> None:
+        await live_page(desk)
+
+    def of_video(read: Callable[[], NDArray[np.uint8]]) -> Response:
+        """What `read` gives, unrecognisable where faces are hidden."""
         if desk.hide_faces is None:
             return Response(status_code=403)
         try:
-            image = first_image(Path(path))
+            image = read()
         except KinefitError as error:
             return Response(str(error), status_code=404)
         return _image(jpeg(unrecognisable(image) if desk.hide_faces else image, _THUMBNAIL_PX))
+
+    @app.get("/image/first")
+    def first(path: str) -> Response:
+        return of_video(lambda: first_image(Path(path)))
+
+    @app.get("/image/raw")
+    def raw(path: str, share: float, start: float = 0.0, stop: float | None = None) -> Response:
+        return of_video(lambda: image_at(Path(path), share, start=start, stop=stop))
+
+    @app.get("/image/person")
+    def person(path: str, number: int) -> Response:
+        if desk.hide_faces is None:
+            return Response(status_code=403)
+        image = desk.people.known(Path(path), number, hide_faces=desk.hide_faces)
+        return Response(status_code=404) if image is None else _image(jpeg(image, _THUMBNAIL_PX))
 
     @app.get("/image/frame")
     def frame(folder: str, camera: str, frame: int, longest: int = 640) -> Response:

@@ -11,6 +11,8 @@ from nicegui import ui
 from kinefit.app.desk import Desk
 from kinefit.app.folders import NEW, TakeFolder, video_files
 from kinefit.app.jobs import DONE, FAILED, PAUSED, RUNNING, WAITING, Job
+from kinefit.app.pages.coming import coming_images
+from kinefit.app.pages.people import people_cards
 from kinefit.app.pages.shell import COLOURS, card, in_thread, link, shell, short, show_error, texts
 from kinefit.app.texts import Texts
 from kinefit.batch import corrections
@@ -116,6 +118,7 @@ class _TakePage:
             self._who = ui.select(who, label=t("take.who"), value="").classes("w-64")
             qualities = {"best": t("take.best"), "balanced": t("take.balanced")}
             self._quality = ui.select(qualities, label=t("take.quality"), value="best").classes("w-40")
+        people_cards(self._desk, t, self._folder.file, self._who)
 
     def _set_height(self, height: float | None) -> None:
         if height and height != self._take.height:
@@ -201,7 +204,7 @@ class _TakePage:
                 left.text = "" if seconds is None or progress.share >= 1.0 else _time_left(t, seconds)
 
         update()
-        self._updates.append(update)
+        self._updates += [update, coming_images(self._take, job)]
         for note in job.notes[-_MAX_NOTES:]:
             ui.label(note).classes("text-sm text-grey-8")
         if job.state == FAILED and job.error is not None:

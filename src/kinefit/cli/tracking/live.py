@@ -103,13 +103,13 @@ def live(
             if served.access.warning:
                 _screen.note(f"warning: {served.access.warning}")
             _screen.say(f"page and poses at {served.url}", stderr=quiet)
-    except BaseException:
+        warm_depth() if entry.depth or entry.stereo else warm_keypoints()
+    except BaseException:  # Ctrl-C while it warms up, too
         for receiver in receivers:
             receiver.close()
         session.close()
         raise
     session.receivers = tuple(receivers)
-    warm_depth() if entry.depth or entry.stereo else warm_keypoints()
     with _ctrl_c(session):
         session.run(seconds)
     _tell(session, kept, quiet)

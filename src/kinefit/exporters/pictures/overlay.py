@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from fractions import Fraction
 from os import PathLike
 from typing import Any
@@ -82,7 +82,7 @@ def write_overlay(
 
 def write_pictures(
     pictures: Iterator[NDArray[np.uint8]], path: str | PathLike[str], rate: float, size: tuple[int, int],
-    progress: Callable[[int], None] | None = None, *, times: NDArray | None = None,
+    progress: Callable[[int], None] | None = None, *, times: NDArray | Sequence[float] | None = None,
 ) -> None:  # fmt: skip
     """Write a video of pictures (H, W, 3) uint8 RGB at a rate [Hz], each drawn while the one before it is encoded.
 
@@ -90,7 +90,7 @@ def write_pictures(
     ----------
     size : (width, height) [px] of all, even
     progress : called with the number of pictures done
-    times : (N,) [s], optional, when each is shown; default: at the rate
+    times : (N,) [s], optional, when each is shown, each known as its picture comes; default: at the rate
 
     Raises
     ------
