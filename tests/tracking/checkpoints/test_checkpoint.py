@@ -160,7 +160,7 @@ def test_a_state_that_somebody_made_up_ends_once(state, whole, tmp_path):
     folder = tmp_path / "c"
     with Checkpoint(folder, "key") as checkpoint:
         checkpoint.frames.keep(4, state)
-    with pytest.raises(FileError, match="not from kinefit"):
+    with pytest.raises(FileError, match="not one of this tracker"):
         followed(folder, False, smooth=False)
     assert_same(followed(folder, False, smooth=False)[0], whole)
 
