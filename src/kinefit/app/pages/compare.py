@@ -53,7 +53,7 @@ def _angles(t: Texts, both: Comparison, names: tuple[str, str]) -> None:
     def draw() -> None:
         series = [
             {"type": "line", "name": names[k], "showSymbol": False, "data": both.points(choice.value, k, _MAX_POINTS),
-             "itemStyle": {"color": colours.to_hex((colours.LEFT, colours.RIGHT)[k])},
+             "itemStyle": {"color": colours.to_hex((colours.LEFT_COLOUR, colours.RIGHT_COLOUR)[k])},
              "lineStyle": {"type": ("solid", "dashed")[k]}} for k in (0, 1)
         ]  # fmt: skip
         chart.options.update({
