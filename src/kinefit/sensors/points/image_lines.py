@@ -106,11 +106,6 @@ class ImageLineMatched(Matched):
     loss: Loss
 
     @property
-    def sensor(self) -> str:  # type: ignore[override]
-        """Name of the sensor."""
-        return self.measurement.sensor
-
-    @property
     def channels(self) -> Sequence[str]:
         """All lines of the sensor."""
         return self.measurement.titles
