@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import renamed
 from kinefit.bodies import BodyState
-from kinefit.errors import ObservationError, choices
+from kinefit.errors import ObservationError, check_choice, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import UP_AXES, Motion
 from kinefit.multiview.association import choose_people, person_records
@@ -97,8 +97,7 @@ class Recording:
         if not len(self.times) or not 0.0 < self.rate < np.inf:
             problem = f"a recording of {len(self.times)} steps at {self.rate} Hz"
             raise ObservationError(problem, remedy="Give sensors that share some time, and a positive rate.")
-        if self.up not in UP_AXES:
-            raise ObservationError(choices("vertical axis", self.up, UP_AXES))
+        check_choice("vertical axis", self.up, UP_AXES, ObservationError)
         if self.start is not None and not 0 <= self.start[0] < len(self.times):
             problem = f"a start at step {self.start[0]} of {len(self.times)}"
             raise ObservationError(problem, remedy="Start at a step of the recording.")
