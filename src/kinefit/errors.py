@@ -6,7 +6,7 @@ import difflib
 import os
 import shlex
 import subprocess
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
@@ -135,7 +135,7 @@ def choices(kind: str, name: str, valid: object) -> str:
     return f"no {kind} '{name}'; there are: {listed}"
 
 
-def check_choice(kind: str, name: str, valid: Container[str], error: type[KinefitError], **more: Any) -> None:
+def check_choice(kind: str, name: str, valid: Iterable[str], error: type[KinefitError], **more: Any) -> None:
     """Raise an error that lists the valid names where a name is none of them; `more`: its file, place and remedy."""
     if name not in valid:
         raise error(choices(kind, name, valid), **more)
