@@ -78,7 +78,7 @@ def run() -> None:
             seconds, memory = tracked(take, out)
             figure(f"long_memory_{frames}", memory, "MB", "<= 700")
             print(f"  {seconds:.0f} s, {sum(p.stat().st_size for p in out.rglob('*')) / 1e6:.0f} MB of results")
-        figure("long_resume_equal", _resumed(folder, amount(3_000, 200)), "of 1", "== 1")
+        figure("long_resume_equal", _resumed(folder, amount(3_000, 320)), "of 1", "== 1")
         motion = read_motion(folder / f"{LENGTHS[0]}-out" / "motion.npz")
         hour, page = _repeated(motion, amount(HOUR, HOUR // 60)), folder / "report.html"
         began = time.process_time()
