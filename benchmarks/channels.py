@@ -19,7 +19,7 @@ from kinefit.observations import MarkerFrame
 from kinefit.sensors.base import Measurement, RowsOf, Sensor
 from kinefit.simulation.movements import movement
 
-RATE, FRAMES, MARKERS = 30.0, 60, 90
+RATE, FRAMES, MARKERS = 30.0, amount(60, 20), 90
 SET = "dense"
 POST = np.array([0.5, 2.2, -0.5])  # [m]
 RANGE_SIGMA = 0.05  # [m]
@@ -132,7 +132,7 @@ def ranged(draw: int) -> tuple[float, float, float]:
 
 def run() -> None:
     """Print what is found, over all draws."""
-    draws = range(amount(100, 2))
+    draws = range(amount(100, 1))
     for kind, goal in (("constant", "10 mm constant"), ("gaps", "10 mm constant, 20 % random gaps")):
         z, found = np.array([markers(k, kind) for k in draws]).T
         for what, value in (("lowest", found.min()), ("highest", found.max())):

@@ -28,7 +28,7 @@ def run() -> None:
                 figure(f"real_{name}_{what}", None, unit, goal, "no recording")
             continue
         distances, shares = [], []
-        for depth, camera, start, body in fitted(images[0][: amount(None, 1)], images[1]):
+        for depth, camera, start, body in fitted(*images):
             distance, share = explained(body, start.state, camera, depth)
             distances.append(distance)
             shares.append(share)
@@ -46,7 +46,7 @@ def _sr305() -> tuple[list[NDArray], Any] | None:
     if folder is None:
         return None
     files = [f for s in ("231615", "230536") for f in sorted(folder.glob(f"*-{s}/*.png"), key=lambda f: int(f.stem))]
-    images = [0.000125 * cv2.imread(str(f), cv2.IMREAD_UNCHANGED).astype(float) for f in files]
+    images = [0.000125 * cv2.imread(str(f), cv2.IMREAD_UNCHANGED).astype(float) for f in files[: amount(None, 1)]]
     return images, _camera(476.007, 313.683, 242.755)
 
 
@@ -58,7 +58,7 @@ def _skeltrack() -> tuple[list[NDArray], Any] | None:
     if folder is None:
         return None
     camera, images = _camera(577.0, 320.0, 240.0), []
-    for file in sorted(folder.glob("depth-data-*")):
+    for file in sorted(folder.glob("depth-data-*"))[: amount(None, 1)]:
         depth = 0.001 * np.fromfile(file, "<u2").reshape(480, 640)
         blobs = people(depth, camera)
         if len(blobs) > 1:

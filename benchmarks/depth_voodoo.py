@@ -26,7 +26,7 @@ from kinefit.recipes.voodoo import Settings
 from kinefit.simulation.rendering.sensors import KINECT, TOF
 
 KINECT_COUNT = amount(20, 1)  # each movement and each person twice: images of 640 x 480 take long to simulate
-RATE = amount(10.0, 5.0)  # [Hz]
+RATE = amount(10.0, 4.0)  # [Hz]
 TUNED, HELD_OUT = 2, 1  # seeds of people and errors
 FLOOR = (0.0, 1.0, 0.0, 0.0)
 _WAS = Settings(overlap="exclusive", maximum=100)

@@ -50,7 +50,8 @@ def run() -> None:
 
 
 def _detect(videos: dict[str, Path], folder: Path) -> dict[str, Detections]:
-    jobs = [detecting.DetectionJob(name, video, folder / f"{name}.npz") for name, video in videos.items()]
+    span = amount(None, (0.0, 0.4))  # [s]
+    jobs = [detecting.DetectionJob(n, video, folder / f"{n}.npz", seconds=span) for n, video in videos.items()]
     detecting.detect(jobs, detecting.DetectionSettings(masks=True, quality="balanced"), force=True, tell=print)
     return {job.camera: read_detections(job.file) for job in jobs}
 

@@ -88,10 +88,10 @@ def _open_landmarks(trial: Path) -> tuple[list[bool], float]:
     The landmarks were made by MediaPipe's own program. And the seconds of processor for a second of video.
     """
     shares, began, seconds = list[bool](), time.process_time(), 0.0
-    for camera in amount(("cam01", "cam02", "cam03", "cam04"), ("cam01", "cam03")):
-        video, span = trial / "videos" / f"{camera}.mp4", amount(None, (0.0, 0.7))
+    for camera in amount(("cam01", "cam02", "cam03", "cam04"), ("cam03",)):
+        video, span = trial / "videos" / f"{camera}.mp4", amount(None, (0.0, 0.3))
         heads = find_faces(DetectionJob(camera, video, Path(), seconds=span))
-        truth = np.load(trial / f"mediapipe_landmarks_{camera}.npy")[: amount(None, 42), [0, 2, 5]]
+        truth = np.load(trial / f"mediapipe_landmarks_{camera}.npy")[: amount(None, 18), [0, 2, 5]]
         seconds += len(truth) / 60
         for frame, points in enumerate(truth):
             circles = heads.at(frame)

@@ -79,7 +79,7 @@ class Watch:
         pass
 
     def pose(self, posed, packet):
-        if posed.number >= self.after and posed.number % amount(1000, 250) == 0:
+        if posed.number >= self.after and posed.number % amount(1000, 200) == 0:
             self.memory.append(resident_mb())
         if posed.number % self.period == 0 and posed.result is not None:
             self.rounds.append(posed.Ts_world_segment[:, :3, 3])
@@ -140,10 +140,10 @@ def run() -> None:
         figure("live_keypoints_p99", float(np.quantile(ms, 0.99)), "ms", "<= 5")
         figure("live_uncounted", _uncounted(session), "frames", "== 0")
     videos()
-    frames = amount(108_000, 900)
+    frames = amount(108_000, 450)
     with tempfile.TemporaryDirectory() as folder:
         period = 198
-        watch = Watch(period, amount(10_000, 250))
+        watch = Watch(period, amount(10_000, 200))
         began = time.perf_counter()
         session = followed(folder, frames, 0.0, [watch])
         print(f"{session.processed} frames in {time.perf_counter() - began:.0f} s")

@@ -73,7 +73,7 @@ def run() -> None:
             if quick() and frames > LENGTHS[0]:
                 figure(f"long_memory_{frames}", None, "MB", "<= 700", LEFT_OUT)
                 continue
-            take = write_long_take(folder / str(frames), amount(frames, 150))
+            take = write_long_take(folder / str(frames), amount(frames, 60))
             out = folder / f"{frames}-out"
             seconds, memory = tracked(take, out)
             figure(f"long_memory_{frames}", memory, "MB", "<= 700")

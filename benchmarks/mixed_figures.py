@@ -224,11 +224,12 @@ def _mean(values: Sequence[float] | NDArray) -> float:
 
 
 def runs_of(groups: Sequence[str], quick: bool) -> list[Run]:
-    """Runs that some groups of figures need; quickly, what the sensors add, and all conditions of two fast mixes."""
+    """Runs that some groups of figures need; quickly, all sensors beside two, and all conditions of two fast mixes."""
     mixes = [mix for mix in MIXES if not quick or mix in QUICK]
     out: list[Run] = [(mix, "smoothed") for mix in ALONE if "alone" in groups]
     if "sensors" in groups:
-        out += [(mix, "smoothed") for mix in dict.fromkeys(name for pair in PAIRS for name in pair)]
+        pairs = PAIRS[-1:] if quick else PAIRS
+        out += [(mix, "smoothed") for mix in dict.fromkeys(name for pair in pairs for name in pair)]
     if "smoothing" in groups:
         out += [(mix, "lag") for mix in mixes]
     if {"smoothing", "intervals", "doubt"} & {*groups}:

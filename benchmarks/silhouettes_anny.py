@@ -31,7 +31,7 @@ from kinefit.subject.surfaces import AnnyShape
 from kinefit.tracking.takes.take import track_take
 from kinefit.tracking.tracker import Tracker
 
-STEPS, POSES = amount(100, 10), amount(6, 2)
+STEPS, POSES = amount(100, 10), amount(6, 1)
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "anny.jpg"
 DRAWN = amount(PICTURE, None)
 

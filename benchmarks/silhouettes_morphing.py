@@ -31,7 +31,7 @@ FRAMES, SIZE, FOCAL = 200, (640, 480), 560.0
 JOINTS = tuple(f"{name}_{side}" for side in "rl" for name in ("arm_flex", "arm_add", "elbow_flex"))
 BOUNDS = (12.0, 8.0, 5.0, 4.0, 3.0, 3.0)  # [px] within which outlines are paired, iteration by iteration
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "morphing_arm.svg"
-SEEN, DRAWN = amount(FRAMES, 10), amount(PICTURE, None)
+SEEN, DRAWN = amount(FRAMES, 5), amount(PICTURE, None)
 
 
 def cameras() -> list[Camera]:

@@ -22,7 +22,7 @@ from kinefit.readers.calibration.read import write_calibration
 from kinefit.rendering import Canvas
 from kinefit.tracking.takes.take import track_take
 
-SEEN = amount(FRAMES, 8)
+SEEN = amount(FRAMES, 4)
 
 
 def write_masks(folder: Path, states: list[BodyState]) -> None:

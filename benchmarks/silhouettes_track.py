@@ -22,7 +22,7 @@ from kinefit.rendering import render_body, scaled
 from kinefit.tracking.takes.take import track_take
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
-FRAMES = amount(100, 12)
+FRAMES = amount(100, 6)
 SCALE = 0.25  # at which the body and masks are compared
 
 

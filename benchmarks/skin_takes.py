@@ -74,7 +74,7 @@ def held_out(folder: Path, where: Path) -> dict[str, float]:
 
 def _text(folder: Path, used: Sequence[int], network: Sequence[int], colour: Sequence[int]) -> str:
     """A take of some cameras, some with the network's keypoints, some with face and hands by colour."""
-    text = f'[take]\nrate = 6.0\nframes = [0, {amount(60, 12)}]\n'
+    text = f'[take]\nrate = 6.0\nframes = [0, {amount(60, 6)}]\n'
     text += f'[calibration]\nfile = "{folder}/config.toml"\nunit = "m"\n'
     text += "".join(f'[[camera]]\nname = "cam_{c}"\nvideo = "{folder}/port_{c}.mp4"\n' for c in used)
     for format, cameras in (("detect", network), ("skin", colour)):

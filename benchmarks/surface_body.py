@@ -35,7 +35,7 @@ def run() -> None:
     worst: dict[str, list[float]] = {}
     for seed in (12, 13)[: amount(2, 1)]:
         with tempfile.TemporaryDirectory() as place:
-            for name, rms in errors(Path(place), seed, frames=amount(40, 6), size=amount(640, 320)).items():
+            for name, rms in errors(Path(place), seed, frames=amount(40, 4), size=amount(640, 320)).items():
                 worst.setdefault(name, []).append(rms)
     for name, values in worst.items():
         unit = "stated standard deviations, RMS" if name.endswith("deviations") else "deg RMS"

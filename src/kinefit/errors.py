@@ -6,9 +6,11 @@ import difflib
 import os
 import shlex
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 
 class KinefitError(Exception):
@@ -44,6 +46,37 @@ class KinefitError(Exception):
         where = ", ".join(part for part in (file_text, self.place) if part)
         text = f"{where}: {self.problem}" if where else self.problem
         super().__init__(f"{text.rstrip('.')}. {self.remedy}" if remedy else text)
+
+
+@contextmanager
+def located(file: str | PathLike[str] | None = None, place: str | None = None) -> Iterator[None]:
+    """Context in which every error names this file, unless it names one, and this place before its own.
+
+    Raises
+    ------
+    KinefitError
+        What is raised inside, of the same class.
+    """
+    try:
+        yield
+    except KinefitError as error:
+        where = ", ".join(part for part in (place, error.place) if part)
+        raise type(error)(error.problem, file=error.file or file, place=where or None, remedy=error.remedy) from error
+
+
+@contextmanager
+def extra(name: str, problem: str, error: type[KinefitError], **more: Any) -> Iterator[None]:
+    """Context that imports packages of an extra of kinefit: where they are missing, an error says how to install it.
+
+    Parameters
+    ----------
+    name : of the extra
+    problem, more : what needs which package, and the error's file or place
+    """
+    try:
+        yield
+    except ImportError as missing:
+        raise error(problem, remedy=f"Install it: pip install 'kinefit[{name}]'.", **more) from missing
 
 
 _MAX_LIST_CHARACTERS = 240  # characters of a list of names
@@ -100,6 +133,12 @@ def choices(kind: str, name: str, valid: object) -> str:
         near = difflib.get_close_matches(str(name), names, 5, 0.3) or names[:5]
         listed = f"{', '.join(near)} and {len(names) - len(near)} more"
     return f"no {kind} '{name}'; there are: {listed}"
+
+
+def check_choice(kind: str, name: str, valid: Iterable[str], error: type[KinefitError], **more: Any) -> None:
+    """Raise an error that lists the valid names where a name is none of them; `more`: its file, place and remedy."""
+    if name not in valid:
+        raise error(choices(kind, name, valid), **more)
 
 
 def spelled(text: str, valid: Iterable[str]) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.state import BodyState
-from kinefit.errors import ExportError, ObservationError, choices
+from kinefit.errors import ExportError, ObservationError, check_choice
 from kinefit.geometry import se3
 from kinefit.motion_columns import angle_columns, joint_columns
 
@@ -41,8 +41,7 @@ def rotation_between_up(source: str, target: str) -> NDArray:
     Raises ObservationError for an axis of no such name.
     """
     for axis in (source, target):
-        if axis not in UP_AXES:
-            raise ObservationError(choices("vertical axis", axis, UP_AXES))
+        check_choice("vertical axis", axis, UP_AXES, ObservationError)
     a, b = np.array(UP_AXES[source]), np.array(UP_AXES[target])
     if a @ b < -0.5:  # opposite: half a turn about an axis at right angles to both
         return se3.exp_so3(np.pi * np.roll(np.abs(a), 1)).round(12) + 0.0
@@ -167,8 +166,7 @@ class Motion:
                     raise ObservationError(problem, remedy=remedy) from error
                 array.flags.writeable = False
             object.__setattr__(self, name, array)
-        if self.up not in UP_AXES:
-            raise ObservationError(choices("vertical axis", self.up, UP_AXES))
+        check_choice("vertical axis", self.up, UP_AXES, ObservationError)
         if not np.all(np.isfinite(self.Ts_world_root)) or not np.all(np.isfinite(self.angles)):
             raise ObservationError(
                 "a motion holds poses that are not finite", remedy="Remove frames without a pose."

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from kinefit.batch.processes import Failure
-from kinefit.errors import ExportError
+from kinefit.errors import ExportError, extra
 from kinefit.tracking.checkpoints.checkpoint import code_digest
 
 T = TypeVar("T")
@@ -35,11 +35,8 @@ def run_there(
     ExportError
         The extra "cluster" is not installed, no scheduler answers, or a worker has another version of kinefit.
     """
-    try:
+    with extra("cluster", "a cluster needs the package distributed", ExportError, place="--cluster"):
         from distributed import Client
-    except ImportError as error:
-        remedy = "Install it: pip install 'kinefit[cluster]'."
-        raise ExportError("--cluster needs the package distributed", place="--cluster", remedy=remedy) from error
     try:
         client = Client(address, timeout=_CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, ValueError) as error:  # TimeoutError is an OSError

@@ -11,16 +11,6 @@ from kinefit.bodies.toml.bodies import catalogue, parse_body
 from kinefit.bodies.tree import KinematicTree
 
 __all__ = [
-    "Body",
-    "BodyState",
-    "KinematicTree",
-    "MeshSurface",
-    "Morphing",
-    "PointSet",
-    "TaperedCylinder",
-    "catalogue",
-    "load_body",
-    "parse_body",
-    "placement",
-    "save_body",
+    "Body", "BodyState", "KinematicTree", "MeshSurface", "Morphing", "PointSet", "TaperedCylinder", "catalogue",
+    "load_body", "parse_body", "placement", "save_body",
 ]

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from kinefit._jit import jit
+from kinefit.geometry._kernels_frames import moved, turned
 
 
 @jit
@@ -31,9 +32,7 @@ def forward(parents, dof_start, prismatic, axes, rest, root, angles, frames, scr
         f = frames[s]
         for d in range(dof_start[s], dof_start[s + 1]):
             ax, ay, az = axes[d, 0], axes[d, 1], axes[d, 2]
-            wx = f[0] * ax + f[1] * ay + f[2] * az
-            wy = f[3] * ax + f[4] * ay + f[5] * az
-            wz = f[6] * ax + f[7] * ay + f[8] * az
+            wx, wy, wz = turned(f, ax, ay, az)
             q = angles[d]
             if prismatic[d]:
                 screws[d, 0], screws[d, 1], screws[d, 2] = wx, wy, wz
@@ -43,9 +42,7 @@ def forward(parents, dof_start, prismatic, axes, rest, root, angles, frames, scr
                 f[11] += q * wz
                 continue
             px, py, pz = rest[s, 0], rest[s, 1], rest[s, 2]
-            ox = f[0] * px + f[1] * py + f[2] * pz + f[9]
-            oy = f[3] * px + f[4] * py + f[5] * pz + f[10]
-            oz = f[6] * px + f[7] * py + f[8] * pz + f[11]
+            ox, oy, oz = moved(f, px, py, pz)
             dx, dy, dz = ox - cx, oy - cy, oz - cz
             screws[d, 0] = dy * wz - dz * wy
             screws[d, 1] = dz * wx - dx * wz
@@ -54,17 +51,14 @@ def forward(parents, dof_start, prismatic, axes, rest, root, angles, frames, scr
             sine = np.sin(q)
             half = np.sin(0.5 * q)
             versine = 2.0 * half * half
-            for i in range(
-                0, 9, 3
-            ):  # rows of R exp(q â), with a at rest: rounding errors of w would grow along a chain
+            for i in range(0, 9, 3):  # rows of R exp(q â), a at rest: rounding errors of w would grow along a chain
                 r0, r1, r2 = f[i], f[i + 1], f[i + 2]
                 dot = r0 * ax + r1 * ay + r2 * az
                 f[i] = r0 + sine * (r1 * az - r2 * ay) + versine * (ax * dot - r0)
                 f[i + 1] = r1 + sine * (r2 * ax - r0 * az) + versine * (ay * dot - r1)
                 f[i + 2] = r2 + sine * (r0 * ay - r1 * ax) + versine * (az * dot - r2)
-            f[9] = ox - (f[0] * px + f[1] * py + f[2] * pz)
-            f[10] = oy - (f[3] * px + f[4] * py + f[5] * pz)
-            f[11] = oz - (f[6] * px + f[7] * py + f[8] * pz)
+            px, py, pz = turned(f, px, py, pz)
+            f[9], f[10], f[11] = ox - px, oy - py, oz - pz
 
 
 @jit

@@ -17,7 +17,7 @@ from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces import SkinnedMesh, Surface, TaperedCylinder
 from kinefit.bodies.surfaces.tables import SurfaceTables, tables
 from kinefit.bodies.tree import ROOT_DOFS, KinematicTree
-from kinefit.errors import BodyError, choices
+from kinefit.errors import BodyError, check_choice
 from kinefit.geometry import se3
 
 _MIN_LIMB_LENGTH = 0.05  # [m] of segments with a detector's full error; on shorter ones, such as fingers, it is smaller
@@ -67,8 +67,7 @@ class PointSet:
         BodyError
             No such point.
         """
-        if name not in self.names:
-            raise BodyError(choices("point", name, self.names))
+        check_choice("point", name, self.names, BodyError)
         return self.names.index(name)
 
     def select(self, names: tuple[str, ...]) -> PointSet:
@@ -163,8 +162,7 @@ class Body:
         BodyError
             No such set.
         """
-        if name not in self.keypoint_sets:
-            raise BodyError(choices(f"keypoint set of body '{self.name}' named", name, self.keypoint_sets))
+        check_choice(f"keypoint set of body '{self.name}' named", name, self.keypoint_sets, BodyError)
         return self.keypoint_sets[name]
 
     def markers(self, name: str) -> PointSet:
@@ -175,8 +173,7 @@ class Body:
         BodyError
             No such set.
         """
-        if name not in self.marker_sets:
-            raise BodyError(choices(f"marker set of body '{self.name}' named", name, self.marker_sets))
+        check_choice(f"marker set of body '{self.name}' named", name, self.marker_sets, BodyError)
         return self.marker_sets[name]
 
     def alias(self, convention: str, segment: str) -> str:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import BodyError, choices
+from kinefit.errors import BodyError, check_choice
 from kinefit.geometry import se3
 
 if TYPE_CHECKING:
@@ -128,8 +128,7 @@ def with_dimensions(body: Body, values: Mapping[str, float]) -> Body:
     """
     known = {d.name: d for d in body.dimensions}
     for name in values:
-        if name not in known:
-            raise BodyError(choices(f"dimension of body '{body.name}' named", name, known), remedy="Use one of these.")
+        check_choice(f"dimension of body '{body.name}' named", name, known, BodyError, remedy="Use one of these.")
         if not np.isfinite(values[name]):
             raise BodyError(f"dimension '{name}' of {values[name]}", remedy="Give metres, or radians.")
     offsets, points = np.array(body.tree.offsets), np.array(body.landmarks.points)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import _kernels
-from kinefit.errors import BodyError, choices
+from kinefit.errors import BodyError, check_choice
 
 ROOT_DOFS = ("root_tx", "root_ty", "root_tz", "root_rx", "root_ry", "root_rz")
 
@@ -237,8 +237,7 @@ class KinematicTree:
         BodyError
             No such segment.
         """
-        if name not in self.segments:
-            raise BodyError(choices("segment", name, self.segments))
+        check_choice("segment", name, self.segments, BodyError)
         return self.segments.index(name)
 
     def coordinate(self, name: str) -> int:
@@ -249,8 +248,7 @@ class KinematicTree:
         BodyError
             No such coordinate.
         """
-        if name not in self.coordinates:
-            raise BodyError(choices("coordinate", name, self.coordinates))
+        check_choice("coordinate", name, self.coordinates, BodyError)
         return self.coordinates.index(name)
 
     def with_offsets(self, offsets: NDArray) -> KinematicTree:

@@ -12,18 +12,13 @@ import numpy as np
 
 from kinefit._jit import jit
 from kinefit.geometry._kernels_camera import project_jacobian
+from kinefit.geometry._kernels_frames import moved
 
 
 @jit
 def place(frames, owner, rest, k):
     """Position (x, y, z) [m] of point k in the world."""
-    f = frames[owner[k]]
-    x, y, z = rest[k, 0], rest[k, 1], rest[k, 2]
-    return (
-        f[0] * x + f[1] * y + f[2] * z + f[9],
-        f[3] * x + f[4] * y + f[5] * z + f[10],
-        f[6] * x + f[7] * y + f[8] * z + f[11],
-    )
+    return moved(frames[owner[k]], rest[k, 0], rest[k, 1], rest[k, 2])
 
 
 @jit

@@ -6,6 +6,7 @@ import math
 
 from kinefit._jit import jit
 from kinefit.geometry._kernels_camera import project_jacobian
+from kinefit.geometry._kernels_frames import moved, turned
 
 
 @jit
@@ -59,12 +60,8 @@ def anchored_rows(frames, owner, rest, normal, target, weight, at_surface, data)
     """
     for k in range(owner.size):
         f = frames[owner[k]]
-        a, b, c = normal[k, 0], normal[k, 1], normal[k, 2]
-        nx, ny, nz = f[0] * a + f[1] * b + f[2] * c, f[3] * a + f[4] * b + f[5] * c, f[6] * a + f[7] * b + f[8] * c
-        a, b, c = rest[k, 0], rest[k, 1], rest[k, 2]
-        x = f[0] * a + f[1] * b + f[2] * c + f[9]
-        y = f[3] * a + f[4] * b + f[5] * c + f[10]
-        z = f[6] * a + f[7] * b + f[8] * c + f[11]
+        nx, ny, nz = turned(f, normal[k, 0], normal[k, 1], normal[k, 2])
+        x, y, z = moved(f, rest[k, 0], rest[k, 1], rest[k, 2])
         qx, qy, qz = target[k, 0], target[k, 1], target[k, 2]
         r = nx * (qx - x) + ny * (qy - y) + nz * (qz - z)
         back = r if at_surface else 0.0
@@ -82,10 +79,7 @@ def target_rows(frames, owner, rest, camera, target, slack, weight, data):
     """
     for k in range(owner.size):
         f = frames[owner[k]]
-        a, b, c = rest[k, 0], rest[k, 1], rest[k, 2]
-        x = f[0] * a + f[1] * b + f[2] * c + f[9]
-        y = f[3] * a + f[4] * b + f[5] * c + f[10]
-        z = f[6] * a + f[7] * b + f[8] * c + f[11]
+        x, y, z = moved(f, rest[k, 0], rest[k, 1], rest[k, 2])
         data[0, k], data[1, k], data[2, k] = x, y, z
         data[3, k], data[4, k], data[5, k], data[6, k], data[7, k] = 0.0, 0.0, 1.0, 0.0, 0.0
         ok, u, v, ux, uy, uz, vx, vy, vz = project_jacobian(camera, x, y, z)

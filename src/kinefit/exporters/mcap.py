@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import ExportError
+from kinefit.errors import ExportError, extra
 from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import bone_names, turned
 from kinefit.geometry import se3
@@ -61,11 +61,8 @@ def write_mcap(motion: Motion, path: str | PathLike[str], *, up: str = "z", name
         The extra "ros" is not installed, no frame, a time before 0, unknown axis or names, or the file cannot be
         written.
     """
-    try:
+    with extra("ros", "MCAP needs the package mcap-ros2-support", ExportError, file=path):
         from mcap_ros2.writer import Writer
-    except ImportError as error:
-        remedy = "Install it: pip install 'kinefit[ros]'."
-        raise ExportError("MCAP needs the package mcap-ros2-support", file=path, remedy=remedy) from error
     if not len(motion) or motion.times[0] < 0:
         problem = "a motion without frames" if not len(motion) else "a motion that begins before 0 s"
         raise ExportError(f"{problem} has no ROS time stamps", file=path, remedy="Cut it to frames from time 0 on.")

@@ -13,7 +13,7 @@ from uuid import NAMESPACE_URL, uuid5
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import ExportError
+from kinefit.errors import ExportError, extra
 from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import bone_names, convention, plain_names, turned
 from kinefit.motion import Motion
@@ -45,14 +45,11 @@ def write_nwb(motion: Motion, path: str | PathLike[str], *, up: str | None = Non
     ExportError
         The extra "nwb" is not installed, no frame, unknown axis or names, or the file cannot be written.
     """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            import ndx_pose
-            import pynwb
-    except ImportError as error:
-        remedy = "Install them: pip install 'kinefit[nwb]'."
-        raise ExportError("NWB needs the packages pynwb and ndx-pose", file=path, remedy=remedy) from error
+    needed = "NWB needs the packages pynwb and ndx-pose"
+    with extra("nwb", needed, ExportError, file=path), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import ndx_pose
+        import pynwb
     if not len(motion):
         raise ExportError("a motion without frames has nothing to write", file=path, remedy="Track the take first.")
     bones = list(motion.body.joints) if convention(names) == "kinefit" else bone_names(motion.body, names, path)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from kinefit.errors import ExportError
+from kinefit.errors import ExportError, extra
 from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import bone_names, turned
 from kinefit.motion import Motion
@@ -35,11 +35,8 @@ def write_rrd(motion: Motion, path: str | PathLike[str], *, up: str | None = Non
     ExportError
         The extra "rerun" is not installed, no frame, unknown axis or names, or the file cannot be written.
     """
-    try:
+    with extra("rerun", "RRD needs the package rerun-sdk", ExportError, file=path):
         import rerun as rr
-    except ImportError as error:
-        remedy = "Install it: pip install 'kinefit[rerun]'."
-        raise ExportError("RRD needs the package rerun-sdk", file=path, remedy=remedy) from error
     if not len(motion):
         raise ExportError("a motion without frames has nothing to show", file=path, remedy="Track the take first.")
     world, labels = turned(motion, up or motion.up, path), bone_names(motion.body, names, path)

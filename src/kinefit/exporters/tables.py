@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit.errors import ExportError
+from kinefit.errors import ExportError, extra
 from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import UNITS, bone_names, length_factor, turned
 from kinefit.motion import Motion
@@ -69,13 +69,9 @@ def write_parquet(
     ExportError
         The extra "parquet" is not installed; and as `write_csv`.
     """
-    try:
+    with extra("parquet", "Parquet needs the package pyarrow", ExportError, file=folder):
         import pyarrow
         import pyarrow.parquet
-    except ImportError as error:
-        raise ExportError(
-            "Parquet needs the package pyarrow", file=folder, remedy="Install it: pip install 'kinefit[parquet]'."
-        ) from error
     about = {"name": motion.name, "rate [Hz]": repr(float(motion.rate)), "up": up or motion.up}
 
     def to_parquet(pieces: Iterator[Table], file: Path) -> None:

@@ -15,7 +15,7 @@ from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit._image_headers import MAX_IMAGE_PIXELS
-from kinefit.errors import CalibrationError, choices
+from kinefit.errors import CalibrationError, check_choice, choices
 from kinefit.geometry import _kernels_camera as kernels
 from kinefit.geometry.se3 import inverse
 
@@ -319,8 +319,7 @@ class Rig:
 
     def index(self, name: str) -> int:
         """Index of a camera in the rig; raises CalibrationError for an unknown name."""
-        if name not in self.names:
-            raise CalibrationError(choices("camera", name, self.names), remedy="Use one of these names.")
+        check_choice("camera", name, self.names, CalibrationError, remedy="Use one of these names.")
         return self.names.index(name)
 
     def select(self, names: tuple[str, ...]) -> Rig:

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from kinefit.bodies import Body, catalogue, load_body
-from kinefit.errors import BodyError, KinefitError, ObservationError, choices
+from kinefit.errors import BodyError, KinefitError, ObservationError, check_choice, choices
 from kinefit.exporters.pose_lines import hello
 from kinefit.frame.results import FrameResult
 from kinefit.live.detecting import LiveDetector
@@ -277,8 +277,7 @@ class LiveSession:
         elif wish.person is not None:
             self._choose(wish.person)
         elif wish.body is not None:
-            if wish.body not in catalogue():  # no file of this computer
-                raise BodyError(choices("body of the catalogue", wish.body, catalogue()))
+            check_choice("body of the catalogue", wish.body, catalogue(), BodyError)
             before = self._replaced[0] if self._replaced else self.tracker.body
             self.change_body(load_body(wish.body))
             self._replaced = before, wish, answer

@@ -10,7 +10,7 @@ import numpy as np
 
 from kinefit._threads import cores
 from kinefit.bodies import Body, load_body
-from kinefit.errors import CalibrationError, TakeError
+from kinefit.errors import CalibrationError, TakeError, located
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
 from kinefit.identification.take.named import with_names
 from kinefit.images.depth_scene import background_model
@@ -242,11 +242,8 @@ def camera_source(entry: CameraEntry, size: tuple[int, int], take: Take, clock: 
 def _depth_camera(entry: DepthEntry, rig: Rig | None, take: Take) -> Camera:
     """The sensor's stated camera; errors name the take and the sensor."""
     remedy = "Write intrinsics = [fx, fy, cx, cy] and size = [width, height] [px], or add [calibration]."
-    try:
+    with located(take.path, f"depth {entry.name}"):
         camera = stated_camera(entry, entry.size, rig)
         if camera is None:
             raise CalibrationError("its intrinsics are unknown", remedy=remedy)
-    except (CalibrationError, TakeError) as error:
-        place = f"depth {entry.name}"
-        raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error
     return camera

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import read_bytes, repeated
-from kinefit.errors import FileError
+from kinefit.errors import FileError, located
 
 _MAX_NUMBER = 1e9  # of a frame or a pixel; no recording has as many
 _FORM = 'Write {"step": 0, "points": {"CAMERA": {"r_knee": [812.0, 401.5], ...}, ...}}, or a list of these.'
@@ -61,11 +61,9 @@ def read_clicks(path: str | PathLike[str]) -> tuple[Clicks, ...]:
         content = json.loads(read_bytes(Path(path)))
     except (ValueError, RecursionError) as error:
         raise FileError(f"is not JSON ({error})", file=path, remedy=_FORM) from error
-    try:
+    with located(path):
         several = content if isinstance(content, list) and content else [content]
         steps = sorted(map(clicks_of, several), key=lambda of: of.step)
-    except FileError as error:
-        raise FileError(error.problem, file=path, place=error.place, remedy=error.remedy) from error
     if twice := repeated(str(of.step) for of in steps):
         raise FileError(f"step {', '.join(twice)} appears twice", file=path, remedy="Put a step into one entry.")
     return tuple(steps)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from kinefit.errors import ObservationError, choices
+from kinefit.errors import ObservationError, check_choice
 from kinefit.observations import MEDIAPIPE_33, MEDIAPIPE_75, MEDIAPIPE_478
 
 _FACE_ARMS_LEGS = (
@@ -58,6 +58,5 @@ SETS_WITH_HANDS = (OPENPOSE_HANDS, "COCO_WHOLEBODY_133", "MEDIAPIPE_75")
 
 def keypoint_names(keypoint_set: str) -> tuple[str, ...]:
     """Names of a keypoint set in the detector's order; raises ObservationError for an unknown set."""
-    if keypoint_set not in KEYPOINT_SETS:
-        raise ObservationError(choices("keypoint set", keypoint_set, KEYPOINT_SETS))
+    check_choice("keypoint set", keypoint_set, KEYPOINT_SETS, ObservationError)
     return KEYPOINT_SETS[keypoint_set]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import no_column, read_npy
-from kinefit.errors import FileError, ObservationError, choices
+from kinefit.errors import FileError, ObservationError, check_choice, choices
 from kinefit.observations import Keypoints
 from kinefit.readers.keypoint_arrays import FACE_POINTS, cut_frames, face_mesh, keypoint_record
 from kinefit.readers.keypoint_sets import HAND_POINTS, KEYPOINT_SETS, MEDIAPIPE_SETS, OPENPOSE_HANDS, keypoint_names
@@ -241,8 +241,7 @@ def read_keypoints(path: str | PathLike[str], *, format: str | None = None, **op
     formats = {"openpose": read_openpose, "mediapipe": read_mediapipe, "caliscope": _caliscope_camera}
     if format is None:
         format = "openpose" if Path(path).is_dir() else "mediapipe"
-    if format not in formats:
-        raise ObservationError(choices("keypoint format", format, formats), file=path)
+    check_choice("keypoint format", format, formats, ObservationError, file=path)
     reader: Any = formats[format]
     return reader(path, **options)
 

@@ -14,7 +14,7 @@ from os import PathLike
 from pathlib import Path
 
 from kinefit._files import parse_toml
-from kinefit.errors import FileError, ObservationError, choices
+from kinefit.errors import FileError, ObservationError, check_choice
 
 
 def read_static_points(
@@ -44,8 +44,7 @@ def read_static_points(
         out[name] = {}
         for camera, pixel in views.items():
             place = f"[{name}] {camera}"
-            if camera not in cameras:
-                raise ObservationError(choices("camera", camera, cameras), file=file, place=place)
+            check_choice("camera", camera, cameras, ObservationError, file=file, place=place)
             if not _is_pixel(pixel):
                 raise ObservationError(f"{pixel} is not a pixel position", file=file, place=place, remedy=form)
             out[name][camera] = (float(pixel[0]), float(pixel[1]))

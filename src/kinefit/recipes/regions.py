@@ -27,7 +27,7 @@ from kinefit.correspondences import point_rows
 from kinefit.correspondences.closures import closure_targets
 from kinefit.correspondences.contours.outlines import outline_rows
 from kinefit.correspondences.contours.rims import RimFinder
-from kinefit.errors import ObservationError, choices
+from kinefit.errors import ObservationError, check_choice
 from kinefit.geometry.camera import Rig
 from kinefit.recipes._colour_densities import COLOURS, DENSITIES, colour_cells
 from kinefit.rows import Rows
@@ -83,8 +83,7 @@ def pose_from_regions(
     """
     mesh = body_mesh(body) if mesh is None else mesh
     finder = RimFinder(mesh) if finder is None else finder
-    if densities not in DENSITIES:
-        raise ObservationError(choices("form of densities", densities, tuple(DENSITIES)))
+    check_choice("form of densities", densities, DENSITIES, ObservationError)
     cells = {rig[name]: colour_cells(image, rig[name]) for name, image in images.items()}
     changes: list[NDArray] = []
     energy, converged = np.nan, False

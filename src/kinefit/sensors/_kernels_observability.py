@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from kinefit._jit import jit
+from kinefit.geometry._kernels_frames import moved
 
 
 @jit
@@ -13,10 +14,8 @@ def longest_levers(frames, screws, segments, rest, seen, root, last_dof, dof_par
     out[:] = 0.0
     for k in range(segments.size):
         if seen[k]:
-            f, p = frames[segments[k]], rest[k]
-            x = f[0] * p[0] + f[1] * p[1] + f[2] * p[2] + f[9] - root[0, 3]
-            y = f[3] * p[0] + f[4] * p[1] + f[5] * p[2] + f[10] - root[1, 3]
-            z = f[6] * p[0] + f[7] * p[1] + f[8] * p[2] + f[11] - root[2, 3]
+            x, y, z = moved(frames[segments[k]], rest[k, 0], rest[k, 1], rest[k, 2])
+            x, y, z = x - root[0, 3], y - root[1, 3], z - root[2, 3]
             d = last_dof[segments[k]]
             while d >= 6:
                 t = screws[d - 6]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit._mapped import release, room
 from kinefit.bodies import Body, BodyState, PointSet
-from kinefit.errors import ObservationError, choices
+from kinefit.errors import ObservationError, check_choice
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Keypoints
 from kinefit.observations.recordings import mirror_name
@@ -101,8 +101,7 @@ def known_names(body: Body, rig: Rig, keypoints: Sequence[Keypoints]) -> dict[st
     """{keypoint set: points of the body in some record}; raises as `make_channels`."""
     names: dict[str, list[str]] = {}
     for record in keypoints:
-        if record.camera not in rig:
-            raise ObservationError(choices("camera", record.camera, rig.names), file=record.source or None)
+        check_choice("camera", record.camera, rig.names, ObservationError, file=record.source or None)
         known = known_points(body, record.keypoint_set).names
         used = names.setdefault(record.keypoint_set, [])
         used += [n for n in dict.fromkeys(record.names) if n in known and n not in used]

@@ -78,11 +78,6 @@ class DisplacedMatched(Matched):
     matched: Matched
 
     @property
-    def sensor(self) -> str:  # type: ignore[override]
-        """Name of the sensor."""
-        return self.measurement.sensor
-
-    @property
     def of_points(self) -> bool:  # type: ignore[override]
         """As of the sensor."""
         return self.matched.of_points

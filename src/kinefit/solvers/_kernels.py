@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from kinefit._jit import jit
+from kinefit.geometry._kernels_frames import moved
 from kinefit.losses._kernels import weigh
 
 
@@ -190,10 +191,8 @@ def joint_moves(frames, screws, rest, root, dof_parent, last_dof, moves):
     """moves (S, 3, n): derivative of every joint centre by every degree of freedom."""
     moves[:] = 0.0
     for s in range(rest.shape[0]):
-        f = frames[s]
-        x = f[0] * rest[s, 0] + f[1] * rest[s, 1] + f[2] * rest[s, 2] + f[9] - root[0, 3]
-        y = f[3] * rest[s, 0] + f[4] * rest[s, 1] + f[5] * rest[s, 2] + f[10] - root[1, 3]
-        z = f[6] * rest[s, 0] + f[7] * rest[s, 1] + f[8] * rest[s, 2] + f[11] - root[2, 3]
+        x, y, z = moved(frames[s], rest[s, 0], rest[s, 1], rest[s, 2])
+        x, y, z = x - root[0, 3], y - root[1, 3], z - root[2, 3]
         m = moves[s]
         m[0, 0] = m[1, 1] = m[2, 2] = 1.0
         m[0, 4], m[0, 5], m[1, 5] = z, -y, x

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.correspondences.closures import closed_at
-from kinefit.errors import BodyError, choices
+from kinefit.errors import BodyError, check_choice
 from kinefit.rows import AnyRows
 from kinefit.solvers import _kernels_linear
 from kinefit.solvers.equations import lock, normal_equations
@@ -269,8 +269,7 @@ def closure_forces(
         gear = body.gear_scale[body.segment_scale]
         active = [name for name, s in zip(tree.coordinates, tree.owners) if not gear[s]]
     for name in active:
-        if name not in tree.coordinates:
-            raise BodyError(choices(f"angle of body '{body.name}'", name, tree.coordinates))
+        check_choice(f"angle of body '{body.name}'", name, tree.coordinates, BodyError)
     held = np.zeros(tree.n_dofs, bool)
     held[[6 + tree.coordinate(name) for name in active]] = True
     held[:6] = not tree.root_free

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, PointSet
-from kinefit.errors import BodyError, ObservationError, choices
+from kinefit.errors import BodyError, ObservationError, check_choice
 from kinefit.geometry.camera import Rig
 from kinefit.solvers.bundle.shape import PROPORTIONS, mirror_points
 
@@ -206,8 +206,7 @@ class PointOffsets:
 
     def __post_init__(self) -> None:
         sets = {**self.body.keypoint_sets, **self.body.marker_sets}
-        if self.name not in sets:
-            raise BodyError(choices(f"point set of body '{self.body.name}' named", self.name, sets))
+        check_choice(f"point set of body '{self.body.name}' named", self.name, sets, BodyError)
         std = np.asarray(self.std, float)
         if std.shape not in ((), (len(self.points),)) or not np.all(std > 0):
             problem = f"std of shape {std.shape} does not fit the {len(self.points)} points of '{self.name}'"

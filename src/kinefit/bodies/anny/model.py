@@ -25,7 +25,7 @@ from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh, strongest
 from kinefit.bodies.toml.bodies import read_toml_body
 from kinefit.bodies.tree import KinematicTree
-from kinefit.errors import BodyError, choices
+from kinefit.errors import BodyError, check_choice
 from kinefit.geometry import se3
 
 NAMES = tuple(FACTORS)
@@ -93,8 +93,7 @@ class AnnyModel:
         """Shape parameters (6,) from values by name, 0 to 1; default 0.5. Raises a BodyError for an unknown name."""
         out = MEAN_SHAPE.copy()
         for name, value in values.items():
-            if name not in NAMES:
-                raise BodyError(choices("shape parameter", name, NAMES), remedy="Use one of these.")
+            check_choice("shape parameter", name, NAMES, BodyError, remedy="Use one of these.")
             out[NAMES.index(name)] = value
         return out
 

@@ -14,20 +14,7 @@ from kinefit.bodies.marker_sets.sets import (
 )
 
 __all__ = [
-    "GIVE",
-    "MIN_COMMON_LABELS",
-    "RANGE",
-    "MarkerPlacement",
-    "MarkerSet",
-    "SetSegment",
-    "bare",
-    "find_marker_set",
-    "find_placement",
-    "known_set",
-    "load_marker_set",
-    "marker_set_names",
-    "matched",
-    "placed_set_names",
-    "placement",
-    "subject_of",
+    "GIVE", "MIN_COMMON_LABELS", "RANGE", "MarkerPlacement", "MarkerSet", "SetSegment", "bare", "find_marker_set",
+    "find_placement", "known_set", "load_marker_set", "marker_set_names", "matched", "placed_set_names",
+    "placement", "subject_of",
 ]

@@ -15,7 +15,7 @@ from kinefit.bodies.surfaces.cylinder import TaperedCylinder
 from kinefit.bodies.surfaces.files import SurfaceRecord, surfaces_of
 from kinefit.bodies.surfaces.obj import UNITS, read_obj
 from kinefit.bodies.tree import KinematicTree
-from kinefit.errors import BodyError, choices
+from kinefit.errors import BodyError, check_choice, located
 from kinefit.geometry import se3
 
 Vector = tuple[float, float, float]
@@ -91,21 +91,16 @@ def morphs_of(records: Sequence[MorphRecord], tree: KinematicTree, source: str) 
     """
     out = []
     for record in records:
-        try:
+        with located(source, record.place):
             out.append(_morph(record, tree, source))
-        except BodyError as error:
-            file, place = error.file or source, ", ".join(t for t in (record.place, error.place) if t)
-            raise BodyError(error.problem, file=file, place=place, remedy=error.remedy) from error
     return tuple(out)
 
 
 def _morph(record: MorphRecord, tree: KinematicTree, source: str) -> Operator:
     _check_keys(record)
-    if record.angle not in tree.coordinates:
-        raise BodyError(choices("angle", record.angle, tree.coordinates), remedy="Use one of these.")
+    check_choice("angle", record.angle, tree.coordinates, BodyError, remedy="Use one of these.")
     for name in [*([] if record.segment is None else [record.segment]), *(record.on or [])]:
-        if name not in tree.segments:
-            raise BodyError(choices("segment", name, tree.segments), remedy="Use one of these, or add it.")
+        check_choice("segment", name, tree.segments, BodyError, remedy="Use one of these, or add it.")
     for what, value in (("shift", record.shift), ("turn", record.turn), ("centre", record.centre)):
         if value is not None and not np.isfinite(value).all():
             raise BodyError(f"`{what}` is not finite: {list(value)}", remedy="Give three numbers.")
@@ -126,15 +121,13 @@ def _morph(record: MorphRecord, tree: KinematicTree, source: str) -> Operator:
         surfaces = surfaces_of(record.surface, tree.segment(record.segment), source, "surface")
         return SegmentMorph(record.segment, tuple(surfaces), steering)
     unit = record.unit or "m"
-    if unit not in UNITS:
-        raise BodyError(choices("unit", unit, UNITS), remedy="Use one of these.")
+    check_choice("unit", unit, UNITS, BodyError, remedy="Use one of these.")
     vertices, _ = read_obj(Path(source).parent / str(record.target))
     return GlobalMorph(UNITS[unit] * vertices, steering)
 
 
 def _check_keys(record: MorphRecord) -> None:
-    if record.kind not in KINDS:
-        raise BodyError(choices("kind of morph", record.kind, KINDS), remedy="Use one of these.")
+    check_choice("kind of morph", record.kind, KINDS, BodyError, remedy="Use one of these.")
     needed, allowed = KINDS[record.kind]
     given = {name for name in record.__struct_fields__ if getattr(record, name) is not None} - _COMMON
     if missing := needed - given:

@@ -34,13 +34,7 @@ from kinefit.errors import BodyError, choices
 from kinefit.geometry import se3
 
 __all__ = [
-    "GlobalMorph",
-    "JointMotion",
-    "LocalMorph",
-    "MorphedPose",
-    "Morphing",
-    "Operator",
-    "SegmentMorph",
+    "GlobalMorph", "JointMotion", "LocalMorph", "MorphedPose", "Morphing", "Operator", "SegmentMorph",
     "radial_basis",
 ]
 

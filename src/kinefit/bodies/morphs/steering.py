@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kinefit.errors import BodyError, choices
+from kinefit.errors import BodyError, check_choice
 
 _MIN_ROOT_T = 1e-3  # below, √t is replaced by a straight line: its slope at 0 is unbounded
 _DIFFERENCE_STEP = 1e-5  # of t, for numerical slopes
@@ -42,8 +42,7 @@ def weight_function(weight: str | ArrayLike | Callable[[float], float]) -> Weigh
         An unknown name; a table or function that does not go from ω(0) = 1 to ω(1) = 0.
     """
     if isinstance(weight, str):
-        if weight not in WEIGHTS:
-            raise BodyError(choices("weighting", weight, WEIGHTS), remedy="Or give a table of t and ω.")
+        check_choice("weighting", weight, WEIGHTS, BodyError, remedy="Or give a table of t and ω.")
         return WEIGHTS[weight]
     if callable(weight):
         value = weight

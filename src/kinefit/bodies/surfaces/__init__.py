@@ -13,22 +13,7 @@ from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh, sample, segme
 Surface = TaperedCylinder | MeshSurface
 
 __all__ = [
-    "BodyMesh",
-    "Box",
-    "FourierCurve",
-    "FourierSurface",
-    "MeshSurface",
-    "Metaballs",
-    "Nearest",
-    "SkinnedMesh",
-    "Surface",
-    "SurfaceAnchors",
-    "SurfaceTables",
-    "TaperedCylinder",
-    "body_mesh",
-    "bounding_box",
-    "nearest",
-    "sample",
-    "segment_middles",
-    "triangles",
+    "BodyMesh", "Box", "FourierCurve", "FourierSurface", "MeshSurface", "Metaballs", "Nearest", "SkinnedMesh",
+    "Surface", "SurfaceAnchors", "SurfaceTables", "TaperedCylinder", "body_mesh", "bounding_box", "nearest",
+    "sample", "segment_middles", "triangles",
 ]

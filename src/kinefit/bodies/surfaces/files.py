@@ -14,7 +14,7 @@ from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface, by_len
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.surfaces.metaballs import Metaballs
 from kinefit.bodies.surfaces.obj import mesh_surface, surface_of_file
-from kinefit.errors import BodyError
+from kinefit.errors import BodyError, located
 from kinefit.geometry.se3 import exp_so3
 
 _CURVE_POINTS = 256  # along a contour: one every 4 mm for a sheet of A4
@@ -93,10 +93,8 @@ def surfaces_of(
             continue
         assert record.end is not None and record.radii is not None
         first, last = (r if isinstance(r, tuple) else (r, r) for r in record.radii)
-        try:
+        with located(source, place):
             out.append(TaperedCylinder(segment, record.start, record.end, (first, last), record.side))
-        except BodyError as error:
-            raise BodyError(error.problem, file=source, place=place, remedy=error.remedy) from error
     return out
 
 
@@ -124,10 +122,8 @@ def _series(record: SurfaceRecord, segment: int, source: str, place: str) -> Mes
 def _metaballs(record: SurfaceRecord, segment: int, source: str, place: str) -> Metaballs:
     balls = record.balls
     axes = exp_so3(np.radians([b.turn for b in balls])).swapaxes(1, 2)
-    try:
+    with located(source, place):
         out = Metaballs.of(segment, [b.at for b in balls], [b.radii for b in balls], [b.weight for b in balls], axes)
-    except BodyError as error:
-        raise BodyError(error.problem, file=source, place=place, remedy=error.remedy) from error
     return out.mirrored() if record.mirror else out
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.surfaces.mesh import MeshSurface
-from kinefit.errors import BodyError, choices
+from kinefit.errors import BodyError, check_choice, located
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 MAX_LENGTH = 10.0  # [m] of a segment's mesh; a longer one is in another unit
@@ -97,9 +97,8 @@ def surface_of_file(
     BodyError
         As `mesh_surface`.
     """
-    if unit not in UNITS:
-        raise BodyError(choices("unit", unit, UNITS), file=path, place=place, remedy="Give one of these.")
-    try:
+    check_choice("unit", unit, UNITS, BodyError, file=path, place=place, remedy="Give one of these.")
+    with located(path, place):
         shape, nodes = read()
         series = None
         if isinstance(shape, np.ndarray):
@@ -112,7 +111,4 @@ def surface_of_file(
             remedy = 'State the unit of its file, such as unit = "mm".'
             raise BodyError(f"the mesh is {length:.4g} m long", remedy=remedy)
         surface = MeshSurface(segment, vertices, faces, series=series, nodes=series and nodes)
-    except BodyError as error:
-        where = ", ".join(text for text in (place, error.place) if text)
-        raise BodyError(error.problem, file=path, place=where or None, remedy=error.remedy) from error
     return surface.mirrored() if mirror else surface

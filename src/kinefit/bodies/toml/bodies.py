@@ -29,7 +29,7 @@ from kinefit.bodies.toml.records import (
     stature_of,
 )
 from kinefit.bodies.tree import KinematicTree
-from kinefit.errors import BodyError, choices
+from kinefit.errors import BodyError, check_choice, choices
 
 JOINT_TYPES = {"fixed": 0, "revolute": 1, "prismatic": 1, "universal": 2, "ball": 3, "free": 6}
 _AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
@@ -77,8 +77,7 @@ def catalogue_text(name: str) -> str:
     BodyError
         Unknown name.
     """
-    if name not in catalogue():
-        raise BodyError(choices("body in the catalogue named", name, catalogue()), remedy="Name one of these.")
+    check_choice("body in the catalogue named", name, catalogue(), BodyError, remedy="Name one of these.")
     return _text(name)[0]
 
 
@@ -235,10 +234,7 @@ def _tree(segments: list[SegmentRecord], index: dict[str, int], source: str) -> 
     rows: list[tuple[int, Any, bool, float, float, float, float]] = []
     for i, s in enumerate(segments):
         j, place = s.joint, f"joint {s.joint.name}"
-        if j.type not in JOINT_TYPES:
-            raise BodyError(
-                choices("joint type", j.type, JOINT_TYPES), file=source, place=place, remedy="Use one of these."
-            )
+        check_choice("joint type", j.type, JOINT_TYPES, BodyError, file=source, place=place, remedy="Use one of these.")
         if i == 0 and any(j.at):
             raise BodyError(
                 "the root's joint is the origin of the body", file=source, place=place, remedy="Remove `at`."
@@ -310,8 +306,7 @@ def _points(
     points: dict[str, tuple[str, Vector]], index: dict[str, int], source: str, what: str = "landmark "
 ) -> PointSet:
     for name, (segment, at) in points.items():
-        if segment not in index:
-            raise BodyError(choices("segment", segment, index), file=source, place=what + name, remedy=_CHOOSE)
+        check_choice("segment", segment, index, BodyError, file=source, place=what + name, remedy=_CHOOSE)
         _finite(at, source, what + name)
     return PointSet(
         tuple(points), np.array([index[s] for s, _ in points.values()]), np.array([a for _, a in points.values()])

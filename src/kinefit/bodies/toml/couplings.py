@@ -10,7 +10,7 @@ import numpy as np
 
 from kinefit.bodies.toml.records import CouplingRecord
 from kinefit.bodies.tree import KinematicTree
-from kinefit.errors import BodyError, choices
+from kinefit.errors import BodyError, check_choice, choices, located
 
 
 def with_coupling_images(records: Sequence[CouplingRecord], left: Callable[[str], str]) -> list[CouplingRecord]:
@@ -35,10 +35,9 @@ def coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord], source: st
     for line, c in zip(lines, couplings):
         place = f"coupling {c.name}"
         for name, weight in c.of.items():
-            if name not in tree.coordinates:
-                raise BodyError(
-                    choices("coordinate", name, tree.coordinates), file=source, place=place, remedy="Use one of these."
-                )
+            check_choice(
+                "coordinate", name, tree.coordinates, BodyError, file=source, place=place, remedy="Use one of these."
+            )
             line[tree.coordinate(name)] = weight
         if not (np.isfinite(line).all() and line.any() and 0.0 < c.spread < np.inf):
             problem = f"spread {c.spread}, weights {list(c.of.values())}"
@@ -46,10 +45,8 @@ def coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord], source: st
         if tree.prismatic[line != 0.0].any():
             raise BodyError("it couples a coordinate that slides", file=source, place=place, remedy="Couple angles.")
         line /= np.radians(c.spread)
-    try:
+    with located(source, "coupling"):
         return replace(tree, couplings=lines)
-    except BodyError as error:
-        raise BodyError(error.problem, file=source, place="coupling", remedy=error.remedy) from error
 
 
 def with_posture(tree: KinematicTree, usual: Mapping[str, float], source: str) -> KinematicTree:

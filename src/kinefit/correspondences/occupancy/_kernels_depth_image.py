@@ -6,6 +6,7 @@ import math
 
 from kinefit._jit import jit
 from kinefit.geometry._kernels_camera import HEIGHT, ROT, TRANS, WIDTH, project_jacobian
+from kinefit.geometry._kernels_frames import moved, turned
 
 
 @jit
@@ -30,12 +31,8 @@ def depth_image_rows(
     i = start
     for k in range(owner.size):
         f = frames[owner[k]]
-        a, b, c = normal[0, k], normal[1, k], normal[2, k]
-        nx, ny, nz = f[0] * a + f[1] * b + f[2] * c, f[3] * a + f[4] * b + f[5] * c, f[6] * a + f[7] * b + f[8] * c
-        a, b, c = rest[0, k], rest[1, k], rest[2, k]
-        x = f[0] * a + f[1] * b + f[2] * c + f[9]
-        y = f[3] * a + f[4] * b + f[5] * c + f[10]
-        z = f[6] * a + f[7] * b + f[8] * c + f[11]
+        nx, ny, nz = turned(f, normal[0, k], normal[1, k], normal[2, k])
+        x, y, z = moved(f, rest[0, k], rest[1, k], rest[2, k])
         sx, sy, sz = cx - x, cy - y, cz - z
         along = nx * sx + ny * sy + nz * sz
         if along <= facing * math.sqrt(sx * sx + sy * sy + sz * sz):

@@ -8,6 +8,7 @@ import numpy as np
 
 from kinefit._jit import jit
 from kinefit.geometry._kernels_camera import HEIGHT, ROT, TRANS, WIDTH, project_jacobian
+from kinefit.geometry._kernels_frames import moved, turned
 
 CONTOUR_TOLERANCE = 3  # [cells] between contours of the body and of the depth image
 
@@ -107,12 +108,8 @@ def free_space_rows(
     for k in range(owner.size):
         chosen[k] = -1
         f = frames[owner[k]]
-        a, b, c = rest[0, k], rest[1, k], rest[2, k]
-        x = f[0] * a + f[1] * b + f[2] * c + f[9]
-        y = f[3] * a + f[4] * b + f[5] * c + f[10]
-        z = f[6] * a + f[7] * b + f[8] * c + f[11]
-        a, b, c = normal[0, k], normal[1, k], normal[2, k]
-        nx, ny, nz = f[0] * a + f[1] * b + f[2] * c, f[3] * a + f[4] * b + f[5] * c, f[6] * a + f[7] * b + f[8] * c
+        x, y, z = moved(f, rest[0, k], rest[1, k], rest[2, k])
+        nx, ny, nz = turned(f, normal[0, k], normal[1, k], normal[2, k])
         if nx * (cx - x) + ny * (cy - y) + nz * (cz - z) <= 0.0:
             continue
         found = project_jacobian(camera, x, y, z)
@@ -187,16 +184,10 @@ def capsule_gaps(frames, owner, starts, ends, pairs, point_a, point_b, direction
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
         f, g, a, b = frames[owner[i]], frames[owner[j]], starts[i], starts[j]
-        p0 = f[0] * a[0] + f[1] * a[1] + f[2] * a[2] + f[9]
-        p1 = f[3] * a[0] + f[4] * a[1] + f[5] * a[2] + f[10]
-        p2 = f[6] * a[0] + f[7] * a[1] + f[8] * a[2] + f[11]
-        q0 = g[0] * b[0] + g[1] * b[1] + g[2] * b[2] + g[9]
-        q1 = g[3] * b[0] + g[4] * b[1] + g[5] * b[2] + g[10]
-        q2 = g[6] * b[0] + g[7] * b[1] + g[8] * b[2] + g[11]
-        x, y, z = ends[i, 0] - a[0], ends[i, 1] - a[1], ends[i, 2] - a[2]
-        d0, d1, d2 = f[0] * x + f[1] * y + f[2] * z, f[3] * x + f[4] * y + f[5] * z, f[6] * x + f[7] * y + f[8] * z
-        x, y, z = ends[j, 0] - b[0], ends[j, 1] - b[1], ends[j, 2] - b[2]
-        e0, e1, e2 = g[0] * x + g[1] * y + g[2] * z, g[3] * x + g[4] * y + g[5] * z, g[6] * x + g[7] * y + g[8] * z
+        p0, p1, p2 = moved(f, a[0], a[1], a[2])
+        q0, q1, q2 = moved(g, b[0], b[1], b[2])
+        d0, d1, d2 = turned(f, ends[i, 0] - a[0], ends[i, 1] - a[1], ends[i, 2] - a[2])
+        e0, e1, e2 = turned(g, ends[j, 0] - b[0], ends[j, 1] - b[1], ends[j, 2] - b[2])
         s, t = closest_on_segments(p0, p1, p2, d0, d1, d2, q0, q1, q2, e0, e1, e2)
         p0, p1, p2 = p0 + s * d0, p1 + s * d1, p2 + s * d2
         q0, q1, q2 = q0 + t * e0, q1 + t * e1, q2 + t * e2

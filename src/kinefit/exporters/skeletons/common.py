@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.errors import ExportError, choices, spelled
+from kinefit.errors import ExportError, check_choice, spelled
 from kinefit.motion import UP_AXES, Motion
 
 NAMES = ("kinefit", "bvh", "mixamo", "cmu", "opensim", "hanim")
@@ -67,8 +67,7 @@ def bone_names(body: Body, names: str, path: str | PathLike[str]) -> list[str]:
     A segment without a counterpart there keeps its own name; without any it raises ExportError, unless for "bvh".
     """
     names = convention(names)
-    if names not in NAMES:
-        raise ExportError(choices("convention of names", names, NAMES), file=path)
+    check_choice("convention of names", names, NAMES, ExportError, file=path)
     if names not in ("kinefit", "bvh") and not body.aliases.get(names):
         known = ", ".join(["kinefit", *(name for name in NAMES if body.aliases.get(name))])
         remedy = f"It has those of: {known}. Or write them into its body file: names = {{ {names} = ... }}."
@@ -83,8 +82,7 @@ def convention(names: str) -> str:
 
 def length_factor(unit: str, units: Mapping[str, float], path: str | PathLike[str]) -> float:
     """Units of length in a metre; ExportError where the format has no such unit."""
-    if unit not in units:
-        raise ExportError(choices("unit of length", unit, units), file=path)
+    check_choice("unit of length", unit, units, ExportError, file=path)
     return units[unit]
 
 
@@ -96,8 +94,7 @@ def turned(motion: Motion, up: str, path: str | PathLike[str], allowed: Iterable
 
 def check_up(up: str, path: str | PathLike[str], allowed: Iterable[str] = UP_AXES) -> None:
     """ExportError where a format has no such vertical axis."""
-    if up not in allowed:
-        raise ExportError(choices("vertical axis of this format", up, allowed), file=path)
+    check_choice("vertical axis of this format", up, allowed, ExportError, file=path)
 
 
 def plain_names(names: Iterable[str]) -> list[str]:

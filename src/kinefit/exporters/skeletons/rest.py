@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.errors import ExportError, choices
+from kinefit.errors import ExportError, check_choice
 from kinefit.exporters.skeletons.common import convention
 from kinefit.geometry import se3
 from kinefit.motion import Motion
@@ -91,8 +91,7 @@ def rest_pose(body: Body, rest: str | None, names: str, path: str | PathLike[str
         An unknown rest pose; `path` for the message.
     """
     rest = rest or ("t" if convention(names) == "mixamo" else "body")
-    if rest not in RESTS:
-        raise ExportError(choices("rest pose", rest, RESTS), file=path)
+    check_choice("rest pose", rest, RESTS, ExportError, file=path)
     count = len(body.tree.segments)
     turns = np.tile(np.eye(3), (count, 1, 1)) if rest == "body" else np.stack([_turn(body, s) for s in range(count)])
     return _rest(body, turns)

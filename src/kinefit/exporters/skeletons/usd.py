@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, MeshSurface
 from kinefit.bodies.surfaces import Surface
-from kinefit.errors import ExportError
+from kinefit.errors import ExportError, extra
 from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import UNITS, bone_names, length_factor, turned
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
@@ -53,11 +53,8 @@ def write_usd(
         The extra "usd" is not installed; no frame; another ending; unknown unit, axis, names or rest pose; or the file
         cannot be written.
     """
-    try:
+    with extra("usd", "USD needs the package usd-core", ExportError, file=path):
         from pxr import Tf, Usd
-    except ImportError as error:
-        remedy = "Install it: pip install 'kinefit[usd]'."
-        raise ExportError("USD needs the package usd-core", file=path, remedy=remedy) from error
     if Path(path).suffix not in ENDINGS:
         raise ExportError("not a name of a USD file", file=path, remedy=f"Let it end in one of {', '.join(ENDINGS)}.")
     if not len(motion):

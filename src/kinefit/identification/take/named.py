@@ -7,7 +7,7 @@ from os import PathLike
 
 import numpy as np
 
-from kinefit.errors import KinefitError
+from kinefit.errors import located
 from kinefit.identification.model.files import load_model
 from kinefit.identification.model.model import MarkerModel
 from kinefit.identification.take.naming import Step
@@ -62,9 +62,6 @@ def with_names(take: Take, seen: Observations, *, progress: Step | None = None) 
         return seen
     out = []
     for entry, markers in zip(take.markers, seen.markers):
-        try:
+        with located(take.path, f"markers {entry.file.name}"):
             out.append(named_markers(markers, entry.model, progress=progress) if entry.model else markers)
-        except KinefitError as error:
-            place = f"markers {entry.file.name}"
-            raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error
     return replace(seen, markers=tuple(out))

@@ -145,32 +145,25 @@ def _unmatched(grid: Grid, found: Matches | None) -> Grid:
 
 _MAX_SIFT_IMAGE_PX = 1200  # larger images are reduced: features are larger than grains
 _MAX_DESCRIPTOR_RATIO = 0.8  # of the best to the second-best descriptor distance (Lowe)
+_MAX_SIFT_SEEDS = 200
 _MAX_RAY_DISTANCE_PX = 2.0  # of a feature from the line of sight in the reduced image: three sigma
 
 
 def sift_seeds(
-    first: SplineImage,
-    second: SplineImage,
-    cameras: tuple[Camera, Camera] | None = None,
-    *,
-    mask: NDArray | None = None,
-    count: int = 200,
+    first: SplineImage, second: SplineImage, cameras: tuple[Camera, Camera] | None = None
 ) -> Seeds:
     """Match SIFT features of two images, best descriptor ratio first; rotation and scale give the deformation.
 
     Parameters
     ----------
     cameras : of the two images, if calibrated: features whose rays miss each other are rejected
-    mask : (H, W) bool, of the first image
-    count : largest number of seeds
 
     Returns
     -------
     Seeds
         Empty if the images have nothing in common or their texture repeats.
     """
-    features = [_sift_features(image, mask if k == 0 else None) for k, image in enumerate((first, second))]
-    (points1, turns1, found1), (points2, turns2, found2) = features
+    (points1, turns1, found1), (points2, turns2, found2) = map(_sift_features, (first, second))
     no_seeds = Seeds(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)))
     if found1 is None or found2 is None or min(len(found1), len(found2)) < 2:
         return no_seeds
@@ -190,21 +183,18 @@ def sift_seeds(
         uv = np.stack([one, two], axis=1)
         _, is_inlier, _ = triangulate_robust(Rig(cameras), uv, max_residual_px=_MAX_RAY_DISTANCE_PX * max(scale, 1.0))
         keep = np.flatnonzero(is_inlier.all(axis=1))
-    keep = keep[:count]
+    keep = keep[:_MAX_SIFT_SEEDS]
     return Seeds(one[keep], two[keep], deformation[keep])
 
 
-def _sift_features(image: SplineImage, mask: NDArray | None) -> tuple[NDArray, NDArray, NDArray | None]:
+def _sift_features(image: SplineImage) -> tuple[NDArray, NDArray, NDArray | None]:
     """Positions (K, 2) [px], rotation times scale (K, 2, 2), and descriptors of SIFT features."""
     scale = min(1.0, _MAX_SIFT_IMAGE_PX / max(image.size))
     pixels = cv2.resize(image.grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else image.grey
     low, high = np.percentile(pixels, (1, 99))
     pixels = np.clip((pixels - low) * (255.0 / max(high - low, 1.0)), 0, 255).astype(np.uint8)
-    area = None
-    if mask is not None:
-        area = cv2.resize(np.asarray(mask, np.uint8), pixels.shape[::-1], interpolation=cv2.INTER_NEAREST)
     sift = cv2.SIFT_create(3000)  # type: ignore[attr-defined]
-    keys, descriptors = sift.detectAndCompute(pixels, area)
+    keys, descriptors = sift.detectAndCompute(pixels, None)
     points = np.array([key.pt for key in keys]).reshape(-1, 2)
     angle, size = np.deg2rad([key.angle for key in keys]), np.array([key.size for key in keys])
     cos, sin = size * np.cos(angle), size * np.sin(angle)

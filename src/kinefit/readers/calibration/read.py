@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from kinefit._arguments import checked
-from kinefit.errors import CalibrationError, ExportError, FileError, choices
+from kinefit.errors import CalibrationError, ExportError, FileError, choices, located
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
 from kinefit.readers.calibration.colmap import colmap_cameras
@@ -341,9 +341,5 @@ def _rig(cameras: list[Camera], path: Path, unit: str | float) -> Rig:
     if not cameras:
         raise CalibrationError("no camera in it", file=path, remedy=f"kinefit reads {FORMATS}.")
     factor = _factor(unit, path)
-    try:
+    with located(path):
         return Rig(tuple(_in_metres(camera, factor, path) for camera in cameras))
-    except CalibrationError as error:
-        if error.file is not None:
-            raise
-        raise CalibrationError(error.problem, file=path, place=error.place, remedy=error.remedy) from None

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit._files import parse_toml
-from kinefit.errors import CalibrationError
+from kinefit.errors import CalibrationError, located
 from kinefit.geometry.camera import Camera
 from kinefit.geometry.se3 import exp_so3, inverse, transform
 from kinefit.readers.calibration.file_storage import storage_of_xml, storage_of_yaml
@@ -287,10 +287,8 @@ def build_camera(
     name: str, size: tuple[int, int], K: NDArray, k: NDArray, model: str, T: NDArray, path: Path
 ) -> Camera:
     """Make a camera of K (3, 3), k (N,) and T_camera_world (4, 4); raises CalibrationError with the file's path."""
-    try:
+    with located(path):
         return Camera(name, size, K, k, model, T)
-    except CalibrationError as error:
-        raise CalibrationError(error.problem, file=path, place=error.place, remedy=error.remedy) from None
 
 
 def numbers(value: Any, shape: tuple[int, ...] | None, path: Path, place: str) -> NDArray:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
-from kinefit.errors import CalibrationError, ExportError, KinefitError, choices
+from kinefit.errors import CalibrationError, ExportError, KinefitError, check_choice
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import inverse, log_so3
 from kinefit.readers.calibration.colmap import colmap_texts
@@ -79,8 +79,7 @@ def write_calibration_like(
         raise CalibrationError("kinefit cannot write cameras into a recording of ROS 2", file=like, remedy=remedy)
     old = read_calibration(like, unit=unit, image_size=image_size, exteriors=False)
     for name in rig.names:
-        if name not in old:
-            raise CalibrationError(choices("camera", name, old.names), file=like, remedy="Give the rig these names.")
+        check_choice("camera", name, old.names, CalibrationError, file=like, remedy="Give the rig these names.")
     _check_target(like, path, overwrite)
     texts, rig = _texts(rig, like, unit)
     try:

@@ -11,7 +11,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import CalibrationError, FileError, ObservationError
+from kinefit.errors import CalibrationError, FileError, ObservationError, extra
 from kinefit.geometry.camera import Camera
 from kinefit.readers.depth.images import DepthSource
 from kinefit.readers.video_files import open_container
@@ -200,13 +200,8 @@ def bag_source(path: Path, name: str) -> DepthSource:
     CalibrationError
         A lens model that OpenCV lacks.
     """
-    try:
+    with extra("realsense", "a RealSense recording needs Intel's library", FileError, file=path):
         import pyrealsense2 as rs
-    except ImportError:
-        raise FileError(
-            "a RealSense recording needs Intel's library, which is not installed", file=path,
-            remedy="pip install 'kinefit[realsense]'",
-        ) from None  # fmt: skip
     bag = _Bag(rs, path)
     try:
         profile = bag.start()

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import FileError, KinefitError, ObservationError
+from kinefit.errors import FileError, KinefitError, ObservationError, extra
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"
@@ -220,14 +220,9 @@ class Messages:
 @contextmanager
 def reading(path: Path) -> Iterator[Any]:
     """A reader as a context manager; raises FileError for all errors of its library."""
-    try:
+    with extra("ros", "an MCAP recording needs the package mcap-ros2-support", FileError, file=path):
         from mcap.reader import make_reader
         from mcap_ros2.decoder import DecoderFactory
-    except ImportError:
-        raise FileError(
-            "an MCAP recording needs the package mcap-ros2-support, which is not installed", file=path,
-            remedy="pip install 'kinefit[ros]'",
-        ) from None  # fmt: skip
     try:
         with _BoundedReader(io.FileIO(path)) as file:
             reader = make_reader(file, decoder_factories=[DecoderFactory()])

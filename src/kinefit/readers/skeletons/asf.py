@@ -10,7 +10,7 @@ from os import PathLike, fspath
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import FileError, choices
+from kinefit.errors import FileError, check_choice, choices
 from kinefit.readers.skeletons.common import euler_rotations, parse_numbers, read_text
 
 _INCH = 0.0254  # [m]
@@ -216,8 +216,7 @@ def _in_order(
         if parent.lower() in ("begin", "end") and not names:
             continue
         for name in (parent, *names):
-            if name not in loose:
-                raise FileError(choices("bone", name, loose), file=path, place=f"line {n}")
+            check_choice("bone", name, loose, FileError, file=path, place=f"line {n}")
         for name in names:
             if name in parent_of or name == "root":
                 raise FileError(

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from kinefit.errors import CalibrationError, KinefitError, TakeError
+from kinefit.errors import CalibrationError, TakeError, located
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.readers.depth.recordings import is_unordered, read_clouds, read_depth
@@ -65,15 +65,12 @@ def load_depth(take: Take, rig: Rig | None, rates: Mapping[str, float]) -> Depth
     for entry in take.depth:
         usual = take.rate or next(iter(rates.values()), None)
         assert entry.file is not None
-        try:
+        with located(take.path, f"depth {entry.name}"):
             if is_unordered(entry.file):
                 clouds.append(_clouds(entry, rig, usual))
                 continue
             depth.append(_video(entry, usual))
             cameras.append(_camera(entry, depth[-1], rig))
-        except KinefitError as error:
-            place = ", ".join(part for part in (f"depth {entry.name}", error.place) if part)
-            raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error
     return DepthSensors(tuple(depth), tuple(clouds), tuple(cameras))
 
 

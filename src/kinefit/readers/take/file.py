@@ -13,7 +13,7 @@ import msgspec
 
 from kinefit._arguments import checked
 from kinefit._files import BACKSLASHES, parse_toml
-from kinefit.errors import FileError, TakeError, choices, shortened
+from kinefit.errors import FileError, TakeError, check_choice, choices, shortened
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.checks import check_take
 from kinefit.readers.take.entries import (
@@ -40,20 +40,8 @@ from kinefit.readers.take.values import wrong_value
 from kinefit.readers.units import LENGTHS, TIMES, worth
 
 __all__ = [
-    "CalibrationEntry",
-    "CameraEntry",
-    "DepthEntry",
-    "KeypointsEntry",
-    "LinesEntry",
-    "MarkersEntry",
-    "RegionEntry",
-    "SessionEntry",
-    "SilhouetteEntry",
-    "StartEntry",
-    "StereoEntry",
-    "SurfacePointsEntry",
-    "Take",
-    "TrackerEntry",
+    "CalibrationEntry", "CameraEntry", "DepthEntry", "KeypointsEntry", "LinesEntry", "MarkersEntry", "RegionEntry",
+    "SessionEntry", "SilhouetteEntry", "StartEntry", "StereoEntry", "SurfacePointsEntry", "Take", "TrackerEntry",
     "read_take",
 ]
 
@@ -248,8 +236,7 @@ def _fields(entry: type[msgspec.Struct]) -> tuple[str, ...]:
 def _check_keys(raw: dict[str, Any], path: Path) -> None:
     """Name an unknown table or key, and what exists."""
     for table, content in raw.items():
-        if table not in TABLES:
-            raise TakeError(choices("sensor or table", table, TABLES), file=path, place=f"[{table}]")
+        check_choice("sensor or table", table, TABLES, TakeError, file=path, place=f"[{table}]")
         many = table not in _SINGLE_TABLES
         if many != isinstance(content, list):
             wanted = f"[[{table}]]" if many else f"[{table}]"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import FileError, KinefitError, ObservationError, TakeError, choices
+from kinefit.errors import FileError, ObservationError, TakeError, choices, located
 from kinefit.geometry.camera import ImageFrame
 from kinefit.observations import ClickVideo, LineVideo
 from kinefit.readers.clicks import read_clicks
@@ -87,11 +87,8 @@ def load_lines(
     """
     out = []
     for entry in take.lines:
-        try:
+        with located(take.path, f"lines of camera {entry.camera}"):
             out.append(_lines(entry, take, images[entry.camera], rate, clocks.get(entry.camera)))
-        except KinefitError as error:
-            place = ", ".join(part for part in (f"lines of camera {entry.camera}", error.place) if part)
-            raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error
     return tuple(out)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._pictures import read_picture
-from kinefit.errors import FileError, KinefitError, ObservationError, TakeError
+from kinefit.errors import FileError, ObservationError, TakeError, located
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.images.silhouette import colour_mask
 from kinefit.images.silhouette_background import BackgroundPlate
@@ -81,11 +81,8 @@ def load_silhouettes(
     """
     out = []
     for entry in take.silhouettes:
-        try:
+        with located(take.path, f"silhouette of camera {entry.camera}"):
             out.append(_silhouettes(entry, take, rig, images[entry.camera], rates, clocks.get(entry.camera)))
-        except KinefitError as error:
-            place = ", ".join(part for part in (f"silhouette of camera {entry.camera}", error.place) if part)
-            raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error
     return tuple(out)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import KinefitError, TakeError
+from kinefit.errors import TakeError, located
 from kinefit.geometry.camera import ImageFrame
 from kinefit.images.detectors.skin import LANDMARKS, WRISTS, SkinTracker, face_box
 from kinefit.observations import KeypointVideo
@@ -36,11 +36,8 @@ def load_skin(
     """
     out = []
     for entry in take.skin:
-        try:
+        with located(take.path, f"keypoints of camera {entry.camera}"):
             out.append(_skin(entry, take, images[entry.camera], videos[entry.camera], rate))
-        except KinefitError as error:
-            place = ", ".join(part for part in (f"keypoints of camera {entry.camera}", error.place) if part)
-            raise type(error)(error.problem, file=error.file or take.path, place=place, remedy=error.remedy) from error
     return tuple(out)
 
 

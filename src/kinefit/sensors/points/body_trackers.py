@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit._arguments import check_shape
 from kinefit.bodies import Body, PointSet
 from kinefit.correspondences import _kernels
-from kinefit.errors import BodyError, ObservationError, choices
+from kinefit.errors import BodyError, ObservationError, check_choice, choices
 from kinefit.geometry import se3
 from kinefit.losses import Loss
 from kinefit.observations import BodyTrackerFrame
@@ -62,8 +62,7 @@ class BodyTrackerSensor(Sensor):
             problem += f"{len(points)} points: not all are positive"
             raise ObservationError(problem, remedy="Give positive numbers, and points with the place of each tracker.")
         for tracker, mount in (mounts or {}).items():
-            if tracker not in points:
-                raise ObservationError(choices("tracker", tracker, list(points)), remedy="Add it to points.")
+            check_choice("tracker", tracker, points, ObservationError, remedy="Add it to points.")
             check_shape(np.asarray(mount, float), (3,), f"the mount of tracker '{tracker}'", finite=True)
         self.name, self.points, self.sigma, self.lever = name, dict(points), float(sigma), sigma / rotation_sigma
         self.mounts = {k: np.asarray(v, float) for k, v in (mounts or {}).items()}

@@ -106,11 +106,6 @@ class ImageLineMatched(Matched):
     loss: Loss
 
     @property
-    def sensor(self) -> str:  # type: ignore[override]
-        """Name of the sensor."""
-        return self.measurement.sensor
-
-    @property
     def sigma_known(self) -> bool:  # type: ignore[override]
         """Whether they are clicks, which have no robust loss: how far the fit is off says nothing about these."""
         return self.loss.kind == SQUARED.kind

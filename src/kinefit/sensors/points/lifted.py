@@ -141,11 +141,6 @@ class LiftedMatched(Matched):
     lasts = 0.9
 
     @property
-    def sensor(self) -> str:  # type: ignore[override]
-        """Name of the sensor."""
-        return self.measurement.sensor
-
-    @property
     def channels(self) -> Sequence[str]:
         """The landmarks."""
         return self.measurement.names

@@ -103,11 +103,6 @@ class MarkerMatched(Matched):
     lasts = 1.0  # a marker system's own noise is a tenth of what markers are off by: skin, and where they were put on
     independent = True
 
-    @property
-    def sensor(self) -> str:  # type: ignore[override]
-        """Name of the marker system."""
-        return self.measurement.sensor
-
     cameras = np.zeros(0, np.int64)
 
     @property

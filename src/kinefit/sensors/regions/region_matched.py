@@ -48,11 +48,6 @@ class RegionMatched(Matched):
     sure: NDArray
     of_points = False
 
-    @property
-    def sensor(self) -> str:  # type: ignore[override]
-        """Name of the sensor."""
-        return self.measurement.sensor
-
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """One row a line: the body's point should project onto the image's contour; one row a seam point."""
         seams = [] if self.seams is None else [self.seams.rows(scene, self.off, self.sure, self.loss)]

@@ -208,11 +208,6 @@ class SilhouetteMatched(Matched):
     loss: Loss
     of_points = False
 
-    @property
-    def sensor(self) -> str:  # type: ignore[override]
-        """Name of the silhouettes."""
-        return self.measurement.sensor
-
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """One row a pair: the body's point should project onto the tangent of the image's contour."""
         camera = scene.placed(self.measurement.camera)

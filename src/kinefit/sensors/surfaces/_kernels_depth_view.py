@@ -9,6 +9,7 @@ import numpy as np
 from kinefit._jit import jit
 from kinefit.bodies._kernels import forward
 from kinefit.correspondences.occupancy._kernels_space import capsule_gaps
+from kinefit.geometry._kernels_frames import moved
 from kinefit.rendering._kernels import rasterise
 
 
@@ -41,11 +42,7 @@ def agreement(
     for b in range(len(roots)):
         forward(parents, dof_start, prismatic, axes, rest, roots[b], angles[b], frames, screws)
         for v in range(len(vertices)):
-            f = frames[owner[v]]
-            p, q, r = vertices[v, 0], vertices[v, 1], vertices[v, 2]
-            x[v, 0] = f[0] * p + f[1] * q + f[2] * r + f[9]
-            x[v, 1] = f[3] * p + f[4] * q + f[5] * r + f[10]
-            x[v, 2] = f[6] * p + f[7] * q + f[8] * r + f[11]
+            x[v, 0], x[v, 1], x[v, 2] = moved(frames[owner[v]], vertices[v, 0], vertices[v, 1], vertices[v, 2])
         rasterise(x, T_view_world, faces, lens[0], lens[1], lens[2], lens[3], 0.05, True, room, depth, face)
         hands[:] = 0.0
         top, bottom, left, right = _box(room, h, w)

@@ -266,11 +266,6 @@ class DepthImageMatched(Matched):
     of_points = False
     shows_surface = True
 
-    @property
-    def sensor(self) -> str:  # type: ignore[override]
-        """Name of the depth camera."""
-        return self.measurement.sensor
-
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """One row a measured point, one a visible sample, one a sample in free space."""
         return [pairs.rows(scene) for pairs in (self.points, self.samples, self.free) if pairs is not None]

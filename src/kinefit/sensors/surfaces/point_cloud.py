@@ -140,11 +140,6 @@ class PointCloudMatched(Matched):
     of_points = False
     shows_surface = True
 
-    @property
-    def sensor(self) -> str:  # type: ignore[override]
-        """Name of the cloud's sensor."""
-        return self.measurement.sensor
-
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """One row a point."""
         return [self.pairs.rows(scene)]

@@ -21,7 +21,6 @@ In the 1988 anthropometric survey of U.S. Army personnel (C. Gordon et al., 1989
 lengths vary by 4 to 6 % and correlate with stature by 0.5 to 0.9, which leaves 2 to 4 %. A detector's points add some.
 """
 _UNKNOWN_SIZE_STD = 0.2  # of a person's size, as a share
-_KNOWN_SIZE_STD = 0.02  # of a person's size with known stature, as a share: shoes, posture
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +140,7 @@ class ShapeParameters:
 
 
 def shape_parameters(
-    body: Body, points: PointSet, scales: NDArray, scale_sigma: float, shift_sigma: float, *, whole: float | None = None
+    body: Body, points: PointSet, scales: NDArray, scale_sigma: float, shift_sigma: float
 ) -> ShapeParameters:
     """Parameters of a body's shape, with their prior: one scale for each group, landmark offsets [m] of points.
 
@@ -149,16 +148,15 @@ def shape_parameters(
 
     Parameters
     ----------
-    scales : (G,) first estimates of the scales
+    scales : (G,) first estimates of the scales; their median is the size as a share of the body's, known to 20 %
     scale_sigma : standard deviation of each scale about the size, as a share
     shift_sigma : [m] standard deviation of a landmark offset
-    whole : size as a share of the body's, known to 2 %; default: the median of `scales`, known to 20 %
     """
     lead, sign = mirror_points(points, body.tree.segments)
     leaders = np.unique(lead)
     shift = 3 * np.searchsorted(leaders, lead)
-    groups, size = len(scales), float(np.median(scales)) if whole is None else whole
-    common = (_UNKNOWN_SIZE_STD if whole is None else _KNOWN_SIZE_STD) * size
+    groups, size = len(scales), float(np.median(scales))
+    common = _UNKNOWN_SIZE_STD * size
     prior = np.diag(np.full(groups + 3 * len(leaders), shift_sigma**-2))
     middle = groups + shift[sign == 0.0] + 2
     prior[middle, middle] = _MIDLINE_STD**-2

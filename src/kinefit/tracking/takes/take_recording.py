@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.marker_sets import bare, find_placement, known_set, matched
-from kinefit.errors import BodyError, KinefitError, ObservationError, TakeError, choices
+from kinefit.errors import BodyError, KinefitError, ObservationError, TakeError, choices, located
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.images.depth_scene import background_model
@@ -164,15 +164,12 @@ def _own_sensors(take: Take, seen: Observations, body: Body) -> tuple[Sensor, ..
     ]
     for k, (entry, video) in enumerate(zip(take.trackers, seen.trackers)):
         turn, mounts = np.radians(entry.rotation_sigma), {name: np.radians(m) for name, m in entry.mounts.items()}
-        try:
+        with located(take.path, f"[[tracker]] {k + 1}"):
             sensor = BodyTrackerSensor(
                 video.sensor, entry.points, sigma=entry.sigma, rotation_sigma=float(turn), mounts=mounts,
                 mount_sigma=float(np.radians(entry.mount_sigma)),
             )  # fmt: skip
             sensor.places(body, video.names)
-        except KinefitError as error:
-            place = f"[[tracker]] {k + 1}"
-            raise type(error)(error.problem, file=take.path, place=place, remedy=error.remedy) from error
         out.append(sensor)
     return tuple(out)
 
@@ -236,11 +233,8 @@ def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[NamedMark
     """All marker recordings by the names of the body's sets; a set of the catalogue is put on the body where needed."""
     out = []
     for k, (entry, markers) in enumerate(zip(take.markers, seen.markers)):
-        try:
+        with located(entry.file, f"[[markers]] {k + 1}"):
             own, known, std = _set_of(body, markers.names, entry.set)
-        except KinefitError as error:
-            place = f"[[markers]] {k + 1}"
-            raise type(error)(error.problem, file=entry.file, place=place, remedy=error.remedy) from error
         if own and own not in body.marker_sets:
             body = replace(body, marker_sets={**body.marker_sets, own: known})
         names = tuple(n or bare(label) for label, n in zip(markers.names, matched(markers.names, known.names)))

@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from kinefit._jit import jit
+from kinefit.geometry._kernels_frames import moved, turned
 
 BLOCK = 1024  # points at a time, whose buffers fit into the cache
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)  # literals would promote to double precision
@@ -163,12 +164,9 @@ def _caps(p, q, z, d, np_, nq, nz, room, a0, b0, a1, b1, length):
 @jit
 def _gather(x, first, count, f, t, best, only, place, buffer):
     """Points of a block near the cylinder's box: indices place (n,), buffer p, q, h; n, origin and directions."""
-    ox = f[0] * t[1] + f[1] * t[2] + f[2] * t[3] + f[9]
-    oy = f[3] * t[1] + f[4] * t[2] + f[5] * t[3] + f[10]
-    oz = f[6] * t[1] + f[7] * t[2] + f[8] * t[3] + f[11]
-    ax, bx = f[0] * t[4] + f[1] * t[5] + f[2] * t[6], f[0] * t[7] + f[1] * t[8] + f[2] * t[9]
-    ay, by = f[3] * t[4] + f[4] * t[5] + f[5] * t[6], f[3] * t[7] + f[4] * t[8] + f[5] * t[9]
-    az, bz = f[6] * t[4] + f[7] * t[5] + f[8] * t[6], f[6] * t[7] + f[7] * t[8] + f[8] * t[9]
+    ox, oy, oz = moved(f, t[1], t[2], t[3])
+    ax, ay, az = turned(f, t[4], t[5], t[6])
+    bx, by, bz = turned(f, t[7], t[8], t[9])
     ux, uy, uz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
     length, a0, b0 = t[13], t[14], t[15]
     a1, b1 = a0 + t[16] * length, b0 + t[17] * length

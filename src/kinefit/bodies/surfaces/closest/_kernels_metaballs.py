@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from kinefit._jit import jit
+from kinefit.geometry._kernels_frames import turned
 
 _MAX_ITERATIONS = 30
 _MIN_STEP = 1e-9  # [m] at which the iteration ends
@@ -93,6 +94,4 @@ def nearest_on_metaballs(x, frames, limbs, balls, wanted, distance, normal, segm
             if not ok or not d < distance[k]:
                 continue
             distance[k], segment[k] = d, s
-            normal[0, k] = f[0] * a + f[1] * b + f[2] * c
-            normal[1, k] = f[3] * a + f[4] * b + f[5] * c
-            normal[2, k] = f[6] * a + f[7] * b + f[8] * c
+            normal[0, k], normal[1, k], normal[2, k] = turned(f, a, b, c)

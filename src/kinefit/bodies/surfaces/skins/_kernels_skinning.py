@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from kinefit._jit import jit
+from kinefit.geometry._kernels_frames import moved
 
 
 @jit
@@ -14,11 +15,8 @@ def posed(nodes, owners, weights, frames, out):
             w = weights[v, k]
             if w == 0.0:
                 continue
-            f = frames[owners[v, k]]
-            a, b, c = nodes[v, k, 0], nodes[v, k, 1], nodes[v, k, 2]
-            x += w * (f[0] * a + f[1] * b + f[2] * c + f[9])
-            y += w * (f[3] * a + f[4] * b + f[5] * c + f[10])
-            z += w * (f[6] * a + f[7] * b + f[8] * c + f[11])
+            a, b, c = moved(frames[owners[v, k]], nodes[v, k, 0], nodes[v, k, 1], nodes[v, k, 2])
+            x, y, z = x + w * a, y + w * b, z + w * c
         out[v, 0], out[v, 1], out[v, 2] = x, y, z
 
 
@@ -45,11 +43,8 @@ def moves(
                 if w == 0.0:
                     continue
                 s = owners[v, k]
-                f = frames[s]
-                a, b, c = nodes[v, k, 0], nodes[v, k, 1], nodes[v, k, 2]
-                x = f[0] * a + f[1] * b + f[2] * c + f[9] - centre[0]
-                y = f[3] * a + f[4] * b + f[5] * c + f[10] - centre[1]
-                z = f[6] * a + f[7] * b + f[8] * c + f[11] - centre[2]
+                x, y, z = moved(frames[s], nodes[v, k, 0], nodes[v, k, 1], nodes[v, k, 2])
+                x, y, z = x - centre[0], y - centre[1], z - centre[2]
                 a0, a1, a2 = w * n0, w * n1, w * n2
                 a3, a4, a5 = y * a2 - z * a1, z * a0 - x * a2, x * a1 - y * a0
                 row[0] += a0

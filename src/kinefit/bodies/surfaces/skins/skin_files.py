@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies.surfaces.obj import MAX_LENGTH, UNITS, read_obj
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
 from kinefit.bodies.tree import KinematicTree
-from kinefit.errors import BodyError, choices
+from kinefit.errors import BodyError, check_choice, choices
 
 _PLACE = "skin"
 
@@ -37,8 +37,7 @@ def skin_of(record: SkinRecord | None, tree: KinematicTree, source: str) -> Skin
     """
     if record is None:
         return None
-    if record.unit not in UNITS:
-        raise BodyError(choices("unit", record.unit, UNITS), file=source, place=_PLACE, remedy="Use one of these.")
+    check_choice("unit", record.unit, UNITS, BodyError, file=source, place=_PLACE, remedy="Use one of these.")
     if record.owners < 1:
         raise BodyError(f"{record.owners} owners a node", file=source, place=_PLACE, remedy="Give 1 or more.")
     mesh, table = Path(source).parent / record.mesh, Path(source).parent / record.weights
