@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from contextlib import suppress
 from pathlib import Path
 
@@ -36,6 +37,7 @@ class Desk:
         self.jobs = JobQueue()
         self._reviews: dict[Path, Review] = {}
         self._comparisons: dict[tuple[Path, Path], Comparison] = {}
+        self._opening = threading.Lock()  # of two windows that open the same result, the second waits
         self.people = PeoplePictures()
         self.recorder: Recorder | None = None
 
@@ -46,13 +48,13 @@ class Desk:
 
     def review(self, take: Path, folder: Path) -> Review:
         """An open result; read anew if its motion was written since. Slow: call it in a thread."""
-        known = self._reviews.get(folder)
-        if known is not None and known.is_current(bool(self.hide_faces)):
+        with self._opening:
+            known = self._reviews.get(folder)
+            if known is None or not known.is_current(bool(self.hide_faces)):
+                if known is not None:
+                    known.close()
+                self._reviews[folder] = known = Review(take, folder, hide_faces=bool(self.hide_faces))
             return known
-        if known is not None:
-            known.close()
-        self._reviews[folder] = Review(take, folder, hide_faces=bool(self.hide_faces))
-        return self._reviews[folder]
 
     def opened(self, folder: Path) -> Review | None:
         """The result in a folder, if it is open."""
@@ -60,12 +62,13 @@ class Desk:
 
     def comparison(self, before: Path, after: Path) -> Comparison:
         """Two results side by side; read anew if a motion was written since. Slow: call it in a thread."""
-        known = self._comparisons.get((before, after))
-        if known is None or not known.is_current:
-            if known is not None:
-                known.close()
-            self._comparisons[before, after] = known = Comparison(before, after)
-        return known
+        with self._opening:
+            known = self._comparisons.get((before, after))
+            if known is None or not known.is_current:
+                if known is not None:
+                    known.close()
+                self._comparisons[before, after] = known = Comparison(before, after)
+            return known
 
     async def close(self) -> None:
         """Pause all jobs, end the recording and close all results."""

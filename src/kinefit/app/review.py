@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.app.scene import ScenePage
 from kinefit.batch.viewed import content_of, has_same_cameras
 from kinefit.calibration.people.of_take import last_found
 from kinefit.errors import ObservationError
@@ -18,9 +19,6 @@ from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.readers.video import Video
-from kinefit.serving.access import Access
-from kinefit.viewers.player import Player
-from kinefit.viewers.stage import open_server, quiet
 
 _DOUBTFUL_QUALITY = 0.5  # of a frame: fewer than half of its measurements agree with the fit
 _MIN_DOUBTFUL_S = 0.1  # of moments that are marked; shorter ones within this time are one
@@ -39,8 +37,7 @@ class Review:
     ----------
     motion : Motion
     has_cameras : whether the calibration is still the motion's; if not, images are shown without the fit
-    player : Player of the 3D scene, whose clock is that of the page
-    address : of the 3D scene
+    scene : ScenePage, whose player has the clock of the page
 
     Raises
     ------
@@ -58,13 +55,7 @@ class Review:
         self.has_cameras = has_same_cameras(self.motion, self.take)
         self._videos: dict[str, Video] = {}
         self._reading = threading.Lock()
-        access = Access()
-        self._server = open_server(0, access, label=self.motion.name)
-        self.address = access.url(self._server.get_port())
-        self.player = Player(self._server, content_of([self.motion], self.take, self.seen, find=False))
-        self._server.gui.main_panel.minimize()
-        self._ended = threading.Event()
-        threading.Thread(target=self.player.run, args=(self._ended.is_set,), daemon=True).start()
+        self.scene = ScenePage(content_of([self.motion], self.take, self.seen, find=False), with_panel=False)
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -120,9 +111,7 @@ class Review:
         return [moment for moment in moments if moment[1] - moment[0] >= gap]
 
     def close(self) -> None:
-        """Close the viewer and all videos."""
-        self._ended.set()
-        with quiet():
-            self._server.stop()
+        """Close the 3D scene and all videos."""
+        self.scene.close()
         for video in self._videos.values():
             video.close()

@@ -18,6 +18,7 @@ class ScenePage:
     Parameters
     ----------
     content : ViewerContent
+    with_panel : whether the player's controls are open at first
 
     Attributes
     ----------
@@ -30,11 +31,13 @@ class ScenePage:
         No port is free.
     """
 
-    def __init__(self, content: ViewerContent) -> None:
+    def __init__(self, content: ViewerContent, *, with_panel: bool = True) -> None:
         access = Access()
         self._server = open_server(0, access, label=content.name)
         self.address = access.url(self._server.get_port())
         self.player = Player(self._server, content)
+        if not with_panel:
+            self._server.gui.main_panel.minimize()
         self._ended = threading.Event()
         self._running = threading.Thread(target=self.player.run, args=(self._ended.is_set,), daemon=True)
         self._running.start()

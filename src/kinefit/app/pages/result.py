@@ -57,7 +57,7 @@ class _ResultPage:
         if not review.has_cameras:
             ui.label(t("result.other_cameras")).props('role="alert"')
         with ui.row().classes("w-full items-stretch"):
-            figure = ui.element("iframe").props(f'src="{review.address}" title="3D"')
+            figure = ui.element("iframe").props(f'src="{review.scene.address}" title="3D"')
             figure.classes("flex-1 min-w-[320px] min-h-[28rem] border")
             with ui.row().classes("flex-1 min-w-[320px] content-start gap-1"):
                 for camera in review.cameras:
@@ -109,27 +109,27 @@ class _ResultPage:
 
     def _key(self, event: events.KeyEventArguments) -> None:
         if event.action.keydown and (event.key.arrow_left or event.key.arrow_right):
-            self._go(self._review.player.clock.frame + (1 if event.key.arrow_right else -1))
+            self._go(self._review.scene.player.clock.frame + (1 if event.key.arrow_right else -1))
         elif event.action.keydown and not event.action.repeat and event.key == " ":
             self._toggle()
 
     def _toggle(self) -> None:
-        clock = self._review.player.clock
+        clock = self._review.scene.player.clock
         clock.playing = not clock.playing
 
     def _go(self, frame: int) -> None:
-        clock = self._review.player.clock
+        clock = self._review.scene.player.clock
         clock.playing = False
         clock.go(int(frame))
         self._follow()
 
     def _next(self, moments: list[tuple[int, int]]) -> None:
-        now = self._review.player.clock.frame
+        now = self._review.scene.player.clock.frame
         self._go(next((a for a, _ in moments if a > now), moments[0][0]))
 
     def _follow(self) -> None:
         """Bring images and read-outs to the frame of the 3D figure."""
-        clock, motion, t = self._review.player.clock, self._review.motion, self._t
+        clock, motion, t = self._review.scene.player.clock, self._review.motion, self._t
         icon, said = ("pause", "result.stop") if clock.playing else ("play_arrow", "result.play")
         self._play.props(f"icon={icon}").text = t(said)
         if clock.frame == self._shown:
@@ -227,7 +227,7 @@ class _ResultPage:
         ui.navigate.to(link("/take", path=self._take))
 
     def _set_range(self, end: int) -> None:
-        self._range[end] = self._review.player.clock.frame
+        self._range[end] = self._review.scene.player.clock.frame
         first, last = self._range
         if first is not None and last is not None:
             self._range = [min(first, last), max(first, last)]
@@ -271,7 +271,7 @@ class _ResultPage:
         uv = (event.image_x * share, event.image_y * share)
         if not 0 <= uv[0] < width:
             return
-        frame = self._review.player.clock.frame
+        frame = self._review.scene.player.clock.frame
         self._edit(corrections.add_click, self._take, self._step_of(frame), camera, joint, uv)
         ui.notify(self._t("result.clicked", joint=joint, camera=camera, frame=frame), type="positive")
 

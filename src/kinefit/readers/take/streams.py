@@ -64,6 +64,7 @@ def odd_streams(take: Take) -> Iterator[tuple[str, str, str]]:
               "lines": take.lines, "surface_points": take.surface_points,
               "tracker": take.trackers}  # fmt: skip
     recorded += [f"[[{name}]]" for name, entries in tables.items() if entries]
+    recorded += ["[start] clicks"] * (take.clicks is not None)
     seen = {entry.camera for entry in take.keypoints}
     blind = [entry.name for entry in take.cameras if entry.stream is None and entry.name not in seen]
     if recorded:
