@@ -44,6 +44,8 @@ class Finding:
         How sure that is, and why; empty where the text is a plain fact.
     remedy : str
         What would fix it: the line to write, the command to run; empty where nothing need be done.
+    keys : tuple of (key, value)
+        What to write into the `[[camera]]` of the one camera that it is about: keys with their values as TOML has them.
     """
 
     severity: Severity
@@ -52,6 +54,7 @@ class Finding:
     cameras: tuple[str, ...] = ()
     confidence: str = ""
     remedy: str = ""
+    keys: tuple[tuple[str, str], ...] = ()
 
 
 def faults_of(findings: Iterable[Finding]) -> tuple[Finding, ...]:

@@ -13,6 +13,7 @@ from kinefit.batch.corrections import (
     corrections_of,
     exchange_sides,
     exclude_view,
+    set_camera_keys,
     set_height,
     trim,
     undo,
@@ -60,7 +61,7 @@ def test_an_edit_is_listed_and_undone(edit, take):
     before, files = corrections_of(take), files_in(take.parent)
     EDITS[edit](take)
     assert set(corrections_of(take)) - set(before) == {SENTENCES[edit]}
-    assert take.read_text().startswith("# of Tuesday\n# A drawn figure")
+    assert take.read_text().startswith("# of Tuesday\n# A simulated figure")
     assert undo(take) and files_in(take.parent) == files
     assert not undo(take) and files_in(take.parent) == files
 
@@ -271,3 +272,12 @@ def test_a_click_is_of_the_person_with_the_nearest_keypoint(take):
             (click,) = (f for f in recording.steps(12) if isinstance(f, ClickFrame))
             assert np.isfinite(click.ends).all() == np.isfinite(click.ends).any() == (person == owner)
     assert not recording.sees_more  # clicks part nobody
+
+
+def test_a_finding_is_written_into_its_camera(take):
+    before = read_take(take).cameras
+    set_camera_keys(take, "cam02", {"time_offset": "0.0109"})
+    assert [entry.time_offset for entry in read_take(take).cameras] == [0.0, 0.0109, 0.0, 0.0]
+    with pytest.raises(TakeError, match="cam9"):
+        set_camera_keys(take, "cam9", {"time_offset": "0.1"})
+    assert undo(take) and read_take(take).cameras == before

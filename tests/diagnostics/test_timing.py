@@ -61,6 +61,7 @@ def test_the_line_to_write_stands_in_the_finding(late, severity):
     found = [f for f in check.findings if f.kind == "time"]
     assert [(f.severity, f.cameras) for f in found] == [(severity, ("cam02",))]
     value = float(found[0].remedy.partition("time_offset = ")[2].split()[0])
+    assert found[0].keys == (("time_offset", f"{value:.4f}"),)
     assert value == pytest.approx(late / 30.0, abs=0.1 / 30.0)
     assert not [f for f in check.findings if f.kind != "time" and f.severity in ("fault", "doubt")]
 

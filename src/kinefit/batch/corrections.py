@@ -7,13 +7,13 @@ take file that would not be valid is not written.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 from kinefit.bodies import load_body
-from kinefit.errors import KinefitError, TakeError, choices
+from kinefit.errors import KinefitError, TakeError, check_choice, choices
 from kinefit.exporters.atomic import write_bytes, write_text, writing
 from kinefit.exporters.take_text import quoted, with_keys
 from kinefit.preparing.take import has_face, uses_detector
@@ -62,6 +62,14 @@ def choose_person(take: TakePath, number: int | None) -> None:
 def set_height(take: TakePath, height: float | None) -> None:
     """State the person's height [m]; None: it is not stated."""
     _set(take, "take", {"height": None if height is None else f"{float(height)!r}"})
+
+
+def set_camera_keys(take: TakePath, camera: str, keys: Mapping[str, str]) -> None:
+    """Set keys of a `[[camera]]`, with values as TOML has them, such as those of a `Finding`."""
+    read, text = _opened(take)
+    names = [entry.name for entry in read.cameras]
+    check_choice("camera", camera, names, TakeError, file=read.path)
+    _write(read.path, with_keys(text, "camera", names.index(camera), keys))
 
 
 def add_click(take: TakePath, step: int, camera: str, landmark: str, uv: Sequence[float]) -> None:

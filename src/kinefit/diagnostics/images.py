@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 
@@ -44,6 +44,7 @@ _MIN_TRIPLES = 3
 _NO_STATIC_PIXELS = np.zeros(0), np.zeros((0, 2))  # times and noise of a camera without static pixels
 _NOISE_GROWTH = 1.4e-3  # [1/m] noise by squared depth that a sensor may have beyond its sigma (Khoshelham 2012)
 _OUTLIER_SIGMAS = 6.0
+_NO_KEYS: Mapping[str, str] = {}
 _MAX_NOISE_RATIO = 1.5  # to the stated sigma
 _MAX_UNSTABLE_SHARE = 0.1  # of static pixels that are missing in one image; single Kinects: 0.01 to 0.04
 
@@ -76,8 +77,11 @@ def fit_image(
         return msgspec.structs.replace(entry, video=None, size=None), [finding_of(error, (entry.name,))]
     findings = []
 
-    def add(severity: Severity, kind: str, text: str, remedy: str = "", sure: str = "") -> None:
-        findings.append(Finding(severity, kind, f"{entry.name} {text}.", (entry.name,), sure, remedy))
+    def add(
+        severity: Severity, kind: str, text: str, remedy: str = "", sure: str = "", keys: Mapping[str, str] = _NO_KEYS
+    ) -> None:
+        found = Finding(severity, kind, f"{entry.name} {text}.", (entry.name,), sure, remedy, tuple(keys.items()))
+        findings.append(found)
 
     if entry.size and entry.size != size:
         problem = f"has a video of {size[0]}x{size[1]} px, but size = {list(entry.size)}"
@@ -97,23 +101,24 @@ def fit_image(
         add("note", "letterboxed", f"is letterboxed against the calibration, as the take says: {with_bars}")
     elif entry.image == "letterboxed":
         shows = bars < max(expected) - tolerance  # dark scenes only widen them
-        line = 'image = "scaled"'
-        remedy = f"Write {line} into [[camera]] {entry.name}." if shows else f"Try {line} in [[camera]] {entry.name}."
+        remedy = f'{"Write" if shows else "Try"} image = "scaled" in [[camera]] {entry.name}.'
         text = f"is letterboxed by the take ({with_bars}), but its black bars have {bars} px"
-        add("fault" if shows else "doubt", "picture", text, remedy)
+        add("fault" if shows else "doubt", "picture", text, remedy, keys={"image": '"scaled"'})
     elif entry.image == "scaled" and boxed and max(expected) >= _MIN_BAR_ERROR_PX:
         remedy = f'Write image = "letterboxed" into [[camera]] {entry.name}.'
-        add("fault", "letterboxed", f"is scaled by the take, but its video is letterboxed: {with_bars}", remedy)
+        problem = f"is scaled by the take, but its video is letterboxed: {with_bars}"
+        add("fault", "letterboxed", problem, remedy, keys={"image": '"letterboxed"'})
         return msgspec.structs.replace(entry, image="letterboxed"), findings
     elif entry.image == "scaled":
         add("note", "picture", f"is scaled against the calibration, as the take says: {sizes}")
     elif guessed:
         is_boxed = "image" in guessed and guessed["image"].value == "letterboxed"
-        lines = [f'{k} = "{v.value}"' if isinstance(v.value, str) else f"{k} = {v.value}" for k, v in guessed.items()]
+        keys = {k: f'"{v.value}"' if isinstance(v.value, str) else str(v.value) for k, v in guessed.items()}
         what = f"is letterboxed against the calibration: {with_bars}" if is_boxed else f"has another size: {sizes}"
         sure = "; ".join(f"{v.sure.capitalize()}: {v.why}" for v in guessed.values()) + "."
-        remedy = f"Write {' and '.join(lines)} into [[camera]] {entry.name}."
-        add("fault", "letterboxed" if is_boxed else "picture", f"{what}; the take does not say so", remedy, sure)
+        remedy = f"Write {' and '.join(f'{k} = {v}' for k, v in keys.items())} into [[camera]] {entry.name}."
+        kind = "letterboxed" if is_boxed else "picture"
+        add("fault", kind, f"{what}; the take does not say so", remedy, sure, keys)
         return msgspec.structs.replace(entry, **{key: v.value for key, v in guessed.items()}), findings
     return entry, findings
 

@@ -182,7 +182,7 @@ def time_findings(
             confidence += "; but temporal smoothing in a detector, or a rolling shutter, also delays by part of a frame"
         out.append(Finding(
             severity, "time", text, (name,), f"{confidence}.",
-            f"Write time_offset = {value:.4f} into [[camera]] {name}.",
+            f"Write time_offset = {value:.4f} into [[camera]] {name}.", (("time_offset", f"{value:.4f}"),),
         ))  # fmt: skip
     if not out:
         worst = float(np.max(np.abs(times.frames[known])))

@@ -124,6 +124,13 @@ class _TakePage:
         if height and height != self._take.height:
             self._edit(lambda: corrections.set_height(self._folder.file, height), self._t("take.height_saved"))
 
+    def _write(self, found: dict[str, Any]) -> None:
+        """Write the keys of a finding into its camera, and check again."""
+        (camera,), keys = found["cameras"], dict(found["keys"])
+        said = self._t("take.written", keys=", ".join(f"{k} = {v}" for k, v in keys.items()), camera=camera)
+        self._edit(lambda: corrections.set_camera_keys(self._folder.file, camera, keys), said)
+        self._check()
+
     def _edit(self, edit: Callable[[], object], said: str) -> None:
         try:
             edit()
@@ -260,6 +267,8 @@ class _TakePage:
                         with ui.row():
                             for remedy in _REMEDIES.get(found["kind"], ()) if found["severity"] != "note" else ():
                                 ui.button(t(f"take.{remedy}"), on_click=lambda r=remedy: self._check(*_REFINE[r]))
+                            if found["keys"]:
+                                ui.button(t("take.write"), on_click=lambda f=found: self._write(f)).props("outline")
             page = self._desk.prefix + link("/file", path=self._folder.check_page)
             frame = ui.element("iframe").props(f'src="{page}" title="{t("take.check_page")}"')
             frame.classes("w-full h-[36rem] border")
