@@ -85,7 +85,7 @@ def test_several_edits_are_undone_one_by_one(take):
     (lambda take: add_click(take, 12, "cam09", "r_knee", (1.0, 2.0)), TakeError, "cam09"),
     (lambda take: add_click(take, 12, "cam02", "r_kneee", (1.0, 2.0)), TakeError, "r_knee"),
     (lambda take: add_click(take, -1, "cam02", "r_knee", (1.0, 2.0)), FileError, "step -1"),
-    (lambda take: add_click(take, 12, "cam02", "r_knee", (np.nan, 2.0)), FileError, "no pixel"),
+    (lambda take: add_click(take, 12, "cam02", "r_knee", (np.nan, 2.0)), FileError, "not a pixel position"),
 ])  # fmt: skip
 def test_what_cannot_be_is_refused_and_nothing_is_written(edit, error, words, take):
     files = files_in(take.parent)

@@ -101,7 +101,8 @@ def fit_image(
         add("note", "letterboxed", f"is letterboxed against the calibration, as the take says: {with_bars}")
     elif entry.image == "letterboxed":
         shows = bars < max(expected) - tolerance  # dark scenes only widen them
-        remedy = f'{"Write" if shows else "Try"} image = "scaled" in [[camera]] {entry.name}.'
+        verb, where = ("Write", "into") if shows else ("Try", "in")
+        remedy = f'{verb} image = "scaled" {where} [[camera]] {entry.name}.'
         text = f"is letterboxed by the take ({with_bars}), but its black bars have {bars} px"
         add("fault" if shows else "doubt", "picture", text, remedy, keys={"image": '"scaled"'})
     elif entry.image == "scaled" and boxed and max(expected) >= _MIN_BAR_ERROR_PX:
