@@ -8,9 +8,8 @@ from nicegui import ui
 
 from kinefit.app.compare import Comparison
 from kinefit.app.desk import Desk
-from kinefit.app.pages.shell import card, in_thread, link, shell, short, show_error, texts
+from kinefit.app.pages.shell import card, link, loaded, shell, short, texts
 from kinefit.app.texts import Texts
-from kinefit.errors import KinefitError
 from kinefit.rendering import colours
 
 _MAX_POINTS = 2000  # of a curve
@@ -29,15 +28,9 @@ async def compare_page(desk: Desk, before: Path, after: Path) -> None:
                 ui.label(name).classes("break-all")
             to = link("/compare", a=after, b=before)
             ui.button(t("compare.swap"), icon="swap_horiz", on_click=lambda: ui.navigate.to(to)).props("flat")
-        waiting = ui.label(t("compare.loading"))
-        await ui.context.client.connected()
-        try:
-            both = await in_thread(desk.comparison, before, after)
-        except KinefitError as error:
-            show_error(t, error)
+        both = await loaded(t, t("compare.loading"), desk.comparison, before, after)
+        if both is None:
             return
-        finally:
-            waiting.delete()
         with card(t("compare.scene")):
             scene = ui.element("iframe").props(f'src="{both.scene.address}" title="{t("compare.scene")}"')
             scene.classes("w-full h-[32rem] border")

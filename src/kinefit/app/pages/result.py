@@ -11,7 +11,7 @@ import numpy as np
 from nicegui import events, ui
 
 from kinefit.app.desk import Desk
-from kinefit.app.pages.shell import COLOURS, card, in_thread, link, shell, show_error, texts
+from kinefit.app.pages.shell import COLOURS, card, in_thread, link, loaded, shell, show_error, texts
 from kinefit.app.review import Review
 from kinefit.app.texts import Texts
 from kinefit.batch import corrections
@@ -32,16 +32,9 @@ async def result_page(desk: Desk, take: Path, folder: Path) -> None:
         if desk.hide_faces is None:
             ui.navigate.to("/")
             return
-        waiting = ui.label(t("result.loading"))
-        await ui.context.client.connected()
-        try:
-            review = await in_thread(desk.review, take, folder)
-        except KinefitError as error:
-            show_error(t, error)
-            return
-        finally:
-            waiting.delete()
-        _ResultPage(desk, t, take, review)
+        review = await loaded(t, t("result.loading"), desk.review, take, folder)
+        if review is not None:
+            _ResultPage(desk, t, take, review)
 
 
 class _ResultPage:

@@ -92,6 +92,19 @@ async def in_thread(function: Callable[..., Value], *arguments: Any, **options: 
     return await asyncio.to_thread(function, *arguments, **options)
 
 
+async def loaded(t: Texts, said: str, function: Callable[..., Value], *arguments: Any) -> Value | None:
+    """What something slow returns, called in a thread while the page shows a text; None, and its error as a card."""
+    waiting = ui.label(said)
+    await ui.context.client.connected()
+    try:
+        return await in_thread(function, *arguments)
+    except KinefitError as error:
+        show_error(t, error)
+        return None
+    finally:
+        waiting.delete()
+
+
 def short(path: Path, root: Path) -> str:
     """A path relative to the session's folder where it lies in it."""
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)

@@ -13,7 +13,7 @@ from kinefit.app.folders import NEW, TakeFolder, video_files
 from kinefit.app.jobs import DONE, FAILED, PAUSED, RUNNING, WAITING, Job
 from kinefit.app.pages.coming import coming_images
 from kinefit.app.pages.people import people_cards
-from kinefit.app.pages.shell import COLOURS, card, in_thread, link, shell, short, show_error, texts
+from kinefit.app.pages.shell import COLOURS, card, link, loaded, shell, short, show_error, texts
 from kinefit.app.texts import Texts
 from kinefit.batch import corrections
 from kinefit.errors import KinefitError
@@ -43,16 +43,10 @@ async def take_page(desk: Desk, path: str) -> None:
             ui.navigate.to("/")
             return
         first_images(Path(path))
-        waiting = ui.label(t("take.reading"))
-        await ui.context.client.connected()
-        try:
-            file, take, notes = await in_thread(opened_take, Path(path))
-        except KinefitError as error:
-            show_error(t, error)
-            return
-        finally:
-            waiting.delete()
-        _TakePage(desk, t, TakeFolder(file), take, notes)
+        opened = await loaded(t, t("take.reading"), opened_take, Path(path))
+        if opened is not None:
+            file, take, notes = opened
+            _TakePage(desk, t, TakeFolder(file), take, notes)
 
 
 def first_images(path: Path) -> None:
