@@ -14,6 +14,7 @@ from pathlib import Path
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
 DRAWN = {
+    "app.png": "pages",
     "bar_coverage.png": "recordings",
     "body_skin.png": "bodies",
     "check.png": "pages",

@@ -1,4 +1,4 @@
-"""Images of pages in the browser: report, check, clicks, 3D viewer, live session."""
+"""Images of pages in the browser: report, check, clicks, 3D viewer, live session, the app."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from urllib.parse import urlencode
 
 import numpy as np
 
@@ -119,3 +120,37 @@ def init_click() -> None:
                 browser.click(left + x0 + (u + 0.5) * scale, top + y0 + (v + 0.5) * scale)
         time.sleep(1.0)
         results.save("init_click.png", browser.image())
+
+
+def app() -> None:
+    """The result page of `kinefit app` with the demo's result, at a moment on the beam."""
+    recording = results.folder("app") / "balancing"
+    if not recording.exists():
+        recording.symlink_to(results.demo() / "take")
+    words = ("app", recording.parent, "--port", 0, "--no-browser")
+    with served(*words) as address, Browser((1300, 1600)) as browser:
+        browser.open(address)
+        _press(browser, "Show faces")  # the recording hides them itself
+        _wait_for(browser, "Open a recording")
+        browser.open(f"{address}result?{urlencode({'path': recording / 'take.toml', 'folder': results.demo()})}")
+        _wait_for(browser, "Corrections")
+        time.sleep(10.0)
+        left, top = browser.run("(b => [b.x, b.y])(document.querySelector('iframe').getBoundingClientRect())")
+        browser.click(left + 265, top + 75)  # close the viewer's note on slow rendering
+        x, y, width = browser.run(
+            "(b => [b.x, b.y + b.height / 2, b.width])(document.querySelector('.q-slider').getBoundingClientRect())"
+        )
+        browser.click(x + 0.4 * width, y)
+        time.sleep(10.0)
+        results.save("app.png", browser.image())
+
+
+def _wait_for(browser: Browser, text: str) -> None:
+    browser.wait(f"document.body.innerText.includes({json.dumps(text)})")
+
+
+def _press(browser: Browser, said: str) -> None:
+    """Press the button that says so."""
+    found = f"[...document.querySelectorAll('button')].find(e => e.textContent.includes({json.dumps(said)}))"
+    browser.wait(found)
+    browser.run(f"{found}.click()")

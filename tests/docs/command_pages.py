@@ -21,6 +21,8 @@ from kinefit.readers.calibration.read import write_calibration
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave
 
 NOT_RUN = {
+    ("app", "pip install"): "changes the environment",
+    ("app", "kinefit app"): "serves pages until Ctrl-C; tests/app/test_pages.py goes this way in a browser",
     ("README", "python3 -m venv"): "makes an environment and installs into it; tests/test_wheel.py and .ci/run do that",
     ("batch", "dask scheduler"): "cluster of several machines; tests/batch/test_cluster.py starts one on this machine",
     ("batch", "dask worker"): "the same",
@@ -177,7 +179,7 @@ def surfaces(folder):
 
 
 PREPARED = {
-    "README": nothing, "batch": batch, "blender": blender, "calibration": calibration, "check": take,
+    "README": nothing, "app": nothing, "batch": batch, "blender": blender, "calibration": calibration, "check": take,
     "closed-chains": nothing, "comparison": comparison, "detect": nothing, "first-recording": first_recording,
     "index": nothing, "init": init, "install": nothing, "live": take, "one-camera": nothing,
     "recipes/depth-fusion": depth_fusion, "recipes/silhouettes": nothing,

@@ -149,7 +149,10 @@ class _ResultPage:
         spread = np.degrees(2 * motion.dof_std[::step, 6 + d])
         spread = np.where(np.isfinite(spread) & (spread < 90.0), spread, np.nan)
         line = {"type": "line", "showSymbol": False, "lineStyle": {"width": 2}, "itemStyle": {"color": "#0072b2"}}
-        band = {**line, "lineStyle": {"width": 0}, "stack": "band", "silent": True, "tooltip": {"show": False}}
+        band = {
+            **line, "lineStyle": {"width": 0}, "stack": "band", "stackStrategy": "all",  # also across zero
+            "silent": True, "tooltip": {"show": False},
+        }  # fmt: skip
         self._chart.options.update({
             "animation": False, "grid": {"left": 50, "right": 15, "top": 15, "bottom": 30},
             "tooltip": {"trigger": "axis"},
