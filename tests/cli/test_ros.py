@@ -76,7 +76,7 @@ def test_a_folder_with_a_recording_becomes_a_take_that_tracks(seen, tmp_path):
 
 
 @pytest.mark.parametrize(("lines", "error", "told"), [
-    ('file = "bag/bag.mcap"\ntopic = "/side/depth"', ObservationError, "no topic /side/depth; .* is /front/depth"),
+    ('file = "bag/bag.mcap"\ntopic = "/side/depth"', ObservationError, "no topic /side/depth; .*: /front/depth"),
     ('file = "bag/bag.mcap"\ntopic = "/front/color"', ObservationError, "/front/color has images of mono8, no depth"),
     ('file = "depth"\ntopic = "/front/depth"', TakeError, "'topic' has no use with depth"),
     ('file = "bag/other.mcap"\ntopic = "/front/depth"', FileError, "no such file"),

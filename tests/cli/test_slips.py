@@ -230,7 +230,7 @@ def test_formats_may_stand_apart():
      ("[[camera]]", "[camera]", "write [[camera]], the first one too"),
      ('format = "mediapipe"', 'format = "openpose"', '.npy files are of format = "mediapipe"'),
      ("mediapipe_cam02.npy", "mediapipe_cam01.npy", "mediapipe_cam01.npy is also the file of camera cam02"),
-     ("cam02.mp4", "cam01.mp4", "cam01.mp4 is of camera cam02, too"), ("", TWICE, "the same file twice")],
+     ("cam02.mp4", "cam01.mp4", "cam01.mp4 is also the file of camera cam02"), ("", TWICE, "the same file twice")],
 )  # fmt: skip
 def test_slips_of_a_take_are_told(take, old, new, told):
     text = take.read_text()

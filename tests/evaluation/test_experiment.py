@@ -76,7 +76,7 @@ def test_motions_that_cannot_be_compared_are_told():
         grade(TRUTH, short)
     arm = replace(load_body("arm"), landmarks=PointSet((), np.zeros(0, int), np.zeros((0, 3))))
     zeros = np.zeros((40, len(arm.tree.coordinates)))
-    with pytest.raises(ObservationError, match="in common"):
+    with pytest.raises(ObservationError, match="share no landmark"):
         grade(TRUTH, known_motion(arm, 10.0, np.tile(np.eye(4), (40, 1, 1)), zeros))
 
 

@@ -64,7 +64,7 @@ def test_packets_say_what_the_protocol_says(scene, collected):
 
 def test_what_cannot_be_done_is_refused_and_the_session_goes_on(scene, collected):
     session = LiveSession(scene.tracker(), [scene.replay()], [collected])
-    wishes = [*REFUSED, ({"sensor": "cam01", "sigma": float("nan")}, "a standard deviation of nan")]
+    wishes = [*REFUSED, ({"sensor": "cam01", "sigma": float("nan")}, "sigma of 'cam01' is nan")]
     answers = [[] for _ in wishes]
     for (wish, _), told in zip(wishes, answers):
         session.ask(wish, told.append)

@@ -91,7 +91,7 @@ def test_tables_that_are_none(tmp_path, text, error, said):
     [
         ("sigma = 0.003\n", "sigma = 3.0\n", "sigma 3.0 m"),
         ("rotation_sigma = 0.6", "rotation_sigma = 0.0", r"\[\[tracker\]\] 1.*0.0 rad"),
-        ("rotation_sigma = 0.6", "mount_sigma = -1.0", "mounts -0.01"),
+        ("rotation_sigma = 0.6", "mount_sigma = -1.0", "mount_sigma -0.01"),
         ("mounts = {", "mounts = { elbow = [0, 0, 1],", "no tracker 'elbow'"),
         ("points = {", 'points = { elbow = "r_elbow",', "no tracker 'elbow'"),
         ('"r_wrist"', '"r_wrst"', r"\[\[tracker\]\] 1.*r_wrst"),

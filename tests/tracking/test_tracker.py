@@ -374,7 +374,7 @@ def test_nothing_measured_is_nothing_known(kind, search):
 
 WRONG = [
     ("millimetres", ObservationError, lambda: [DepthFrame("depth", 0.0, 1000.0 * images()[0])]),
-    ("are \\(80, 60\\)", ObservationError, lambda: [DepthFrame("depth", 0.0, np.ones((60, 80)))]),
+    ("have \\(80, 60\\)", ObservationError, lambda: [DepthFrame("depth", 0.0, np.ones((60, 80)))]),
     ("depth2", CalibrationError, lambda: [DepthFrame("depth2", 0.0, np.ones((120, 160)))]),
     ("middle", CalibrationError, lambda: [replace(keypoint_frame(0, "left"), sensor="middle")]),
     ("COCO_18", BodyError, lambda: [replace(keypoint_frame(0, "left"), keypoint_set="COCO_18")]),
@@ -384,7 +384,7 @@ WRONG = [
     ("no frame", ObservationError, list),
     ("not finite", ObservationError, lambda: [replace(marker_frame(0, FEW), time=np.nan)]),
     ("not finite", ObservationError, lambda: [replace(marker_frame(0, FEW), time=np.inf), depth_frame(0)]),
-    ("ndarray among", ObservationError, lambda: [images()[0]]),
+    ("a ndarray is not a frame", ObservationError, lambda: [images()[0]]),
 ]
 
 
@@ -399,7 +399,7 @@ def test_wrong_frames_are_told_and_do_no_harm(says, kind, frames):
 
 @pytest.mark.parametrize("accuracy", [0.0, -0.01, np.nan, np.inf])
 def test_an_accuracy_that_is_none_is_told(accuracy):
-    with pytest.raises(ObservationError, match="standard deviations of depth"):
+    with pytest.raises(ObservationError, match="sigma is not positive: depth"):
         Tracker(BODY, a_rig(), sigma={"depth": accuracy}, up="y")
 
 

@@ -195,12 +195,12 @@ def test_nobody_is_a_typed_error(truth):
         Keypoints(k.camera, k.keypoint_set, k.names, k.rate, k.points * np.nan, 0 * k.confidence)
         for k in simulate_keypoints(truth, rig)
     ]
-    with pytest.raises(TrackingError, match="nobody"):
+    with pytest.raises(TrackingError, match="no person is seen"):
         Recording.of_keypoints(rig, empty)
 
 
 def test_one_camera_is_told(truth):
     rig = studio_rig(truth)
     keypoints = simulate_keypoints(truth, rig)
-    with pytest.raises(TrackingError, match="two cameras"):
+    with pytest.raises(TrackingError, match="only one camera, cam01"):
         track(Recording.of_keypoints(rig.select(rig.names[:1]), keypoints[:1]), load_body("humanoid"))

@@ -83,7 +83,7 @@ def test_a_camera_that_is_out_of_step_is_noted_with_the_line_to_write(take, tmp_
     told = run("track", take, "--no-overlays", "--no-report", "--formats", "motion", "--realtime", "--out", tmp_path)
     assert told.exit_code == 0, told.output
     printed = " ".join((told.stdout + told.stderr).split())
-    note = r"note: cam03 runs 1\.\d+ ± 0\.\d+ frames \(\d+ ms\) earlier .* Write time_offset = (\S+) into"
+    note = r"note: cam03 is 1\.\d+ ± 0\.\d+ frames \(\d+ ms\) earlier .* Write time_offset = (\S+) into"
     found = re.search(note, printed)
     assert found and abs(float(found[1])) < 0.01
 
@@ -182,7 +182,7 @@ BAD = {
     "rates": (lambda t: swap(t, "take.toml", "^rate = .*", "rate = 35.0"), "take.toml", "take 35 Hz, video cam01 30"),
     "lengths": (lambda t: landmarks(t, lambda a: a[:-7]), "take.toml", "keypoints cam02 53 frames"),
     "nan": (lambda t: landmarks(t, with_nan), "frame 3", "right_eye_inner"),
-    "nobody": (lambda t: landmarks(t, np.zeros_like), "mediapipe_cam02.npy", "nobody"),
+    "nobody": (lambda t: landmarks(t, np.zeros_like), "mediapipe_cam02.npy", "no person is detected"),
     "unknown sensor": (lambda t: swap(t, "take.toml", r"\Z", "\n[[lidar]]\nx = 1\n"), "[lidar]", "keypoints, markers"),
     "unknown camera": (lambda t: swap(t, "take.toml", '^camera = "cam04"', 'camera = "cam7"'), "take.toml", "'cam7'"),
     "empty": (lambda t: t.write_text(""), "take.toml", "names no sensor"),

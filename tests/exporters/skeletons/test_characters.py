@@ -256,8 +256,8 @@ def test_what_cannot_be_is_refused(motion, tmp_path):
         write_character(arm, tmp_path / "c.glb", tmp_path / "o.glb")
     write_motion(motion, tmp_path / "m.npz")
     for words, problem in (
-        (["--to", "glb", "--retarget", "c.glb"], "--to has no place beside --retarget"),
-        (["--retarget", "c.glb", "--rest", "t"], "--rest has no place"),
+        (["--to", "glb", "--retarget", "c.glb"], "--to does not apply with --retarget"),
+        (["--retarget", "c.glb", "--rest", "t"], "--rest does not apply with --retarget"),
         (["--to", "glb", "--names-table", "n.toml"], "needs --retarget CHARACTER"), ([], "Missing option '--to'"),
     ):  # fmt: skip
         told = run(tmp_path, ["export", "m.npz", *words])

@@ -90,7 +90,7 @@ def test_a_take_with_silhouettes_alone(tmp_path):
 
 def test_silhouettes_with_nothing_to_begin_with_are_refused(tmp_path):
     write_masks(tmp_path / "m")
-    with pytest.raises(TakeError, match="begin"):
+    with pytest.raises(TakeError, match="silhouettes alone do not determine the first pose"):
         track_take(take(tmp_path, '[[silhouette]]\ncamera = "cam1"\nfile = "m"\n'))
 
 

@@ -100,7 +100,7 @@ def test_what_cannot_be_is_told(folder):
         load(folder, SKIN_ENTRY)
     with pytest.raises(KinefitError, match="no face at"):
         load(folder, SKIN_ENTRY + "face = [500, 40, 36, 50]\n").skin[0].frame(0)
-    with pytest.raises(KinefitError, match="no larger than the picture"):
+    with pytest.raises(KinefitError, match="no larger than the image"):
         load(folder, SKIN_ENTRY + "face = [0, 0, 36, 1e308]\n")
     for keys, said in (
         ("face = [1, 2, 0, 4]\n", "face = "), (FACE + 'set = "BODY_25B"\n', "no keypoint set of skin 'BODY_25B'"),

@@ -122,7 +122,7 @@ def test_a_person_who_leaves_the_image_is_held_and_told_as_hidden(body):
 def test_a_mask_of_the_wrong_size_is_refused(body, rig):
     follow = tracker(body, rig)
     follow.start_at(posture(body, 0))
-    with pytest.raises(ObservationError, match="c0 are"):
+    with pytest.raises(ObservationError, match="masks of c0 have"):
         follow.update([SilhouetteFrame("c0", 0.0, np.zeros((10, 10), np.uint8))])
     for wrong in (np.zeros((3, 4, 3), np.uint8), np.zeros((3, 4)), np.zeros((0, 4), np.uint8)):
         with pytest.raises(ObservationError):

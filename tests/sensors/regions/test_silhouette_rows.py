@@ -123,7 +123,7 @@ def test_an_empty_mask_says_nothing_for_and_one_of_another_size_is_refused():
     empty = of.prepare(SilhouetteFrame("c0", 0.0, np.zeros((240, 320), np.uint8)), SCENE).match(SCENE, 0.1)
     assert len(empty.rows(SCENE)[0]) == 0 and empty.evidence(SCENE).agreeing.sum() == 0.0
     assert empty.evidence(SCENE).lost.sum() > 10 and (empty.leftovers(SCENE)[0].count == 0).all()
-    with pytest.raises(ObservationError, match="c0 are"):
+    with pytest.raises(ObservationError, match="masks of c0 have"):
         of.prepare(SilhouetteFrame("c0", 0.0, np.zeros((10, 10), np.uint8)), SCENE)
 
 

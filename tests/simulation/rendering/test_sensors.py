@@ -228,7 +228,7 @@ def test_a_sensor_stands_in_front_and_sees_all(motion):
     from_left = placed(motion, KINECT, azimuth=np.pi / 2)
     ls, rs = motion.positions(shoulders)[0] @ from_left.T_camera_world[2, :3]
     assert ls < rs
-    with pytest.raises(ObservationError, match="nowhere"):
+    with pytest.raises(ObservationError, match="no place of kinect"):
         placed(motion, replace(KINECT, far=1.2))
 
 
