@@ -210,6 +210,18 @@ def test_a_take_that_is_moved_while_it_is_open(session, open_page):
         page.get_by_text(re.compile("There is no take file any more")).wait_for()
 
 
+def test_pages_of_recordings_run_apart_and_other_files_are_not_given(tmp_path, open_page):
+    (tmp_path / "page.html").write_text("<p>a report</p>")
+    (tmp_path / "secret.txt").write_text("x")
+    with running_app(tmp_path) as (_, address):
+        page = open_page(address)
+        answers = {name: page.request.get(f"{address}/file?path={quote(str(tmp_path / name))}")
+                   for name in ("page.html", "secret.txt", "gone.html")}  # fmt: skip
+        assert [answer.status for answer in answers.values()] == [200, 404, 404]
+        policy = answers["page.html"].headers["content-security-policy"]
+        assert "sandbox" in policy and "allow-same-origin" not in policy
+
+
 def test_faces_stay_hidden_until_they_are_found(session, browser):
     with running_app(session) as (_, address):
         page = browser.new_context(locale="en-GB").new_page()

@@ -54,9 +54,15 @@ def exchange_sides(take: TakePath, camera: str, first: int, stop: int) -> None:
     _set_ranges(take, camera, "swapped", (first, stop))
 
 
-def choose_person(take: TakePath, number: int | None) -> None:
-    """Track this person alone, a number from 1 as `kinefit track` lists them; None: everybody."""
-    _set(take, "take", {"person": None if number is None else str(int(number))})
+def choose_person(take: TakePath, person: int | str | None) -> None:
+    """Track this person alone: a number from 1 as `kinefit track` lists them, or words such as "moving"; None: all."""
+    value = quoted(person) if isinstance(person, str) else None if person is None else str(int(person))
+    _set(take, "take", {"person": value})
+
+
+def can_undo(take: TakePath) -> bool:
+    """Whether there is an edit to take back."""
+    return any(_before(find_take(take).absolute()).glob("*.txt"))
 
 
 def set_height(take: TakePath, height: float | None) -> None:

@@ -108,7 +108,7 @@ def _drop_area(desk: Desk, t: Texts) -> None:
         ui.navigate.to(link("/take", path=folder))
 
     def refuse(_: Any) -> None:
-        ui.notify(t("home.drop_refused", name=""), type="negative", timeout=0)
+        ui.notify(t("home.drop_refused"), type="negative", timeout=0)
 
     ui.upload(
         label=t("home.drop_label"), multiple=True, auto_upload=True, max_file_size=_MAX_UPLOAD_BYTES,

@@ -154,7 +154,7 @@ class _ResultPage:
             "silent": True, "tooltip": {"show": False},
         }  # fmt: skip
         self._chart.options.update({
-            "animation": False, "grid": {"left": 50, "right": 15, "top": 15, "bottom": 30},
+            "animation": False, "grid": {"left": 50, "right": 15, "top": 30, "bottom": 30},
             "tooltip": {"trigger": "axis"},
             "xAxis": {"type": "category", "data": [round(float(s), 3) for s in motion.times[::step]], "name": "s"},
             "yAxis": {"type": "value", "scale": True, "name": self._t("result.angles_unit")},
@@ -214,9 +214,9 @@ class _ResultPage:
             ui.label(t("result.none")).classes("text-sm")
             return
         with ui.row():
-            ui.button(t("result.again"), icon="play_arrow", on_click=self._again)
             undo = ui.button(t("result.undo"), icon="undo", on_click=lambda: self._edit(corrections.undo, self._take))
-            undo.props("flat")
+            undo.props("flat").set_visibility(corrections.can_undo(self._take))
+            ui.button(t("result.again"), icon="play_arrow", on_click=self._again)
 
     def _again(self) -> None:
         self._desk.start(self._take, "track", str(self._take), "--json")

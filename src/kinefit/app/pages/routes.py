@@ -92,6 +92,8 @@ def add_pages(desk: Desk) -> None:
 
     @app.get("/file")
     def file(path: str) -> Response:
+        if desk.hide_faces is None:
+            return Response(status_code=403)
         if Path(path).suffix.lower() not in _PAGES or not Path(path).is_file():
             return Response(status_code=404)
         return FileResponse(path, headers=_SANDBOX)

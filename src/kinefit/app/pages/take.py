@@ -109,7 +109,9 @@ class _TakePage:
             height.classes("w-64").tooltip(t("take.height_text")).on("blur", lambda: self._set_height(height.value))
             who = {"": t("take.everybody"), "first": t("take.first"), "moving": t("take.moving")}
             who |= {"largest": t("take.largest")}
-            self._who = ui.select(who, label=t("take.who"), value="").classes("w-64")
+            chosen = self._take.person if self._take.person in who else ""
+            self._who = ui.select(who, label=t("take.who"), value=chosen).classes("w-64")
+            self._who.on_value_change(lambda: self._choose(self._who.value))
             qualities = {"best": t("take.best"), "balanced": t("take.balanced")}
             self._quality = ui.select(qualities, label=t("take.quality"), value="best").classes("w-40")
         people_cards(self._desk, t, self._folder.file, self._who)
@@ -117,6 +119,11 @@ class _TakePage:
     def _set_height(self, height: float | None) -> None:
         if height and height != self._take.height:
             self._edit(lambda: corrections.set_height(self._folder.file, height), self._t("take.height_saved"))
+
+    def _choose(self, who: str) -> None:
+        """Write who is meant into the take file; a number that was chosen by a picture stays."""
+        if who or isinstance(self._take.person, str):
+            self._edit(lambda: corrections.choose_person(self._folder.file, who or None), self._t("take.who_saved"))
 
     def _write(self, found: dict[str, Any]) -> None:
         """Write the keys of a finding into its camera, and check again."""
@@ -140,8 +147,7 @@ class _TakePage:
 
     def _track(self, *options: str) -> None:
         self._detect()
-        who = ("--person", self._who.value) if self._who.value else ()
-        self._desk.start(self._folder.file, "track", str(self._folder.file), "--json", *who, *options)
+        self._desk.start(self._folder.file, "track", str(self._folder.file), "--json", *options)
 
     def _check(self, *options: str) -> None:
         self._detect()
@@ -263,6 +269,11 @@ class _TakePage:
                                 ui.button(t(f"take.{remedy}"), on_click=lambda r=remedy: self._check(*_REFINE[r]))
                             if found["keys"]:
                                 ui.button(t("take.write"), on_click=lambda f=found: self._write(f)).props("outline")
+            if job.result["refined"]:
+                with ui.row().classes("items-center"):
+                    ui.label(t("take.refined", file=job.result["refined"])).classes("break-all")
+                    to = link("/take", path=job.result["refined"])
+                    ui.button(t("take.use_refined"), on_click=lambda: ui.navigate.to(to))
             page = self._desk.prefix + link("/file", path=self._folder.check_page)
             frame = ui.element("iframe").props(f'src="{page}" title="{t("take.check_page")}"')
             frame.classes("w-full h-[36rem] border")

@@ -90,8 +90,10 @@ def _refine(
     )  # fmt: skip
 
 
-def write_refined(found: Check, refined: Refined, path: Path) -> None:
+def write_refined(found: Check, refined: Refined, path: Path) -> Path | None:
     """Write the refined calibration beside the old one, and a copy of the take at `path` that uses it.
+
+    Returns the copy; None where nothing changes.
 
     Raises TakeError where the form of [calibration] cannot be changed.
     """
@@ -113,7 +115,7 @@ def write_refined(found: Check, refined: Refined, path: Path) -> None:
         _screen.say(line)
     if not len(rig) and not markers:
         _screen.say(f"Next:\n  {command('track', path)}")
-        return
+        return None
     changed: list[str] = []
     if len(rig):
         file = _relative(new, path.absolute().parent)
@@ -138,6 +140,7 @@ def write_refined(found: Check, refined: Refined, path: Path) -> None:
         raise TakeError("the refined file cannot be written into [calibration]", file=path, remedy=remedy) from error
     _screen.say(f"\nWritten: {beside}, a copy of {path.name} with {', '.join(changed)}.")
     _screen.say(f"Next:\n  {command('track', beside)}")
+    return beside
 
 
 def _relative(path: Path, folder: Path) -> str:

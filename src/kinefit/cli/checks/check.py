@@ -90,13 +90,14 @@ def check(
     _print(found)
     write_text(out, check_page(found, refinement=refined, up=entry.up))
     _screen.say(f"\nWritten: {out}")
+    used = write_refined(found, refined, take) if refined is not None else None
     if as_json:
-        found_here = as_records(ranked(found.findings))
-        _screen.print_json({"take": str(take), "faults": len(found.faults), "findings": found_here, "page": str(out)})
+        _screen.print_json({
+            "take": str(take), "faults": len(found.faults), "findings": as_records(ranked(found.findings)),
+            "page": str(out), "refined": str(used) if used else None,
+        })  # fmt: skip
     if failed is not None:
         raise failed
-    if refined is not None:
-        write_refined(found, refined, take)
     if strict and found.faults:
         click.get_current_context().exit(2)
 
