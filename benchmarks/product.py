@@ -7,7 +7,8 @@ from benchmarks.figures import run_parts
 PARTS = {
     "start": "how long a user waits: first and later starts, the whole track of the demo's recording",
     "install": "what a fresh installation takes on disk, with the viewer and without",
-    "window": "kinefit app in a browser: first image, answers while it computes, cost, kills, typed words",
+    "window": "kinefit app in a browser: first image, answers while it computes, cost, typed words",
+    "window_kills": "kinefit app killed while it computes a session of 20 takes",
     "report_pages": "pages of the demo's report in print",
     "long": "long takes: memory by length, going on after a kill, the page of an hour",
     "live": "live sessions of the balancing trial: latency, an hour's memory and drift",
