@@ -89,7 +89,7 @@ def running_app(folder: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
 
 def open_page(browser: Any, address: str) -> Any:
     """A window of the app in which faces are shown."""
-    page = browser.new_context(viewport={"width": 1300, "height": 900}, locale="en-GB").newopen_page()
+    page = browser.new_context(viewport={"width": 1300, "height": 900}, locale="en-GB").new_page()
     page.set_default_timeout(WAIT_MS)
     page.add_init_script(_COUNT_KEYS)
     page.goto(address)
@@ -108,7 +108,7 @@ def _dropped(browser: Any, videos: list[Path], *, answers: int = 60) -> tuple[fl
         first = time.perf_counter() - since
         page.get_by_role("button", name="Compute the motion").click()
         since, took = time.perf_counter(), []
-        other = browser.new_context(locale="en-GB").newopen_page() if answers else None
+        other = browser.new_context(locale="en-GB").new_page() if answers else None
         if other is not None:
             other.goto(address)
             other.get_by_text("One folder up").wait_for()
@@ -118,7 +118,7 @@ def _dropped(browser: Any, videos: list[Path], *, answers: int = 60) -> tuple[fl
             page.wait_for_timeout(500)
         spent = time.perf_counter() - since
         typed = page.evaluate("window.typed")
-        with page.context.expectopen_page() as opened:
+        with page.context.expect_page() as opened:
             page.get_by_role("link", name="Report").first.click()
         opened.value.get_by_text("Summary").first.wait_for(state="attached")
         page.context.close()
