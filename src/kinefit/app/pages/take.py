@@ -243,8 +243,7 @@ class _TakePage:
                 to = link("/result", path=self._folder.file, folder=folder)
                 ui.button(said, icon="accessibility_new", on_click=lambda to=to: ui.navigate.to(to))
                 if (folder / "report.html").is_file():
-                    report = self._desk.prefix + link("/file", path=folder / "report.html")
-                    ui.link(t("take.report"), report, new_tab=True)
+                    ui.link(t("take.report"), link("/file", path=folder / "report.html"), new_tab=True)
 
     @ui.refreshable_method
     def _findings(self) -> None:
@@ -274,8 +273,8 @@ class _TakePage:
                     ui.label(t("take.refined", file=job.result["refined"])).classes("break-all")
                     to = link("/take", path=job.result["refined"])
                     ui.button(t("take.use_refined"), on_click=lambda: ui.navigate.to(to))
-            page = self._desk.prefix + link("/file", path=self._folder.check_page)
-            frame = ui.element("iframe").props(f'src="{page}" title="{t("take.check_page")}"')
+            page = link("/file", path=self._folder.check_page)
+            frame = ui.element("iframe").props(f'src="{self._desk.prefix}{page}" title="{t("take.check_page")}"')
             frame.classes("w-full h-[36rem] border")
             ui.link(t("take.check_page"), page, new_tab=True)
 
