@@ -48,8 +48,11 @@ def test_a_take_without_videos_has_a_report_without_pictures(tracked, tmp_path):
     from dataclasses import replace
 
     motion, seen, take = tracked
-    write_track_report(motion, take, replace(seen, videos={}), tmp_path, silent, {})
-    assert "data:image" not in (tmp_path / "report.html").read_text("utf-8")
+    notes = "cam01 is off", "No height is stated."
+    write_track_report(motion, take, replace(seen, videos={}), tmp_path, silent, {}, notes=notes)
+    text = (tmp_path / "report.html").read_text("utf-8")
+    assert "data:image" not in text
+    assert "cam01 is off.<" in text and "No height is stated.<" in text  # one full stop each
 
 
 def test_the_provenance_names_files_with_their_content_and_no_place(tracked):

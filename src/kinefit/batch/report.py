@@ -43,7 +43,7 @@ def write_track_report(
     links = {path.relative_to(folder).as_posix(): DESCRIPTIONS.get(name, name) for name, path in files.items()}
     files["report"] = write_report(
         motion, folder / "report.html", rig=seen.rig, pictures=shown, files=links, norms=norms,
-        findings=[("warning", f"{note}.", "") for note in notes],
+        findings=[("warning", f"{note.rstrip('.')}.", "") for note in notes],
     )
     step("report", 1, 1)
 
