@@ -28,6 +28,15 @@ _GOALS = {
 _TOKEN = "a-token-of-the-benchmark"
 WAIT_MS = 900_000.0
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+_CLICK = """() => new Promise(done => {
+  const field = document.querySelector('input[aria-label=Folder]'), before = field.value, since = performance.now();
+  document.querySelector('.q-item').click();
+  const timer = setInterval(() => {
+    if (field.value !== before) { clearInterval(timer); done(performance.now() - since); }
+  }, 5);
+})"""
+"""A click on the first entry, one folder up, as a browser times it."""
+
 _COUNT_KEYS = "window.typed = 0; window.addEventListener('keydown', () => { window.typed += 1 }, true)"
 
 
@@ -47,7 +56,8 @@ def run() -> None:
     assert four is not None and walk is not None
     with chromium() as browser:
         videos = sorted((four / "videos").glob("*.mp4"))
-        first, answers, typed, spent = _dropped(browser, videos)
+        first, _, typed, spent = _dropped(browser, videos, answers=0)
+        answers = _dropped(browser, videos)[1]
         figure("window_first_image", first, *_GOALS["window_first_image"])
         middle, most = np.median(answers), max(answers)
         print(f"# {len(answers)} answers while it computes: median {middle:.0f} ms, at most {most:.0f} ms")
@@ -67,9 +77,8 @@ def _one_video(walk: Path) -> list[Path]:
 def chromium() -> Iterator[Any]:
     from playwright.sync_api import sync_playwright
 
-    drawn = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     with sync_playwright() as playwright:
-        yield playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *drawn])
+        yield playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
 
 
 @contextmanager
@@ -130,12 +139,9 @@ def _dropped(browser: Any, videos: list[Path], *, answers: int = 60) -> tuple[fl
 def _answer(page: Any) -> float:
     """Time [ms] from a click into the list of folders until the page shows the folder."""
     before = page.locator("input[aria-label=Folder]").input_value()
-    since = time.perf_counter()
-    page.get_by_text("One folder up").click()
-    page.wait_for_function("b => document.querySelector('input[aria-label=Folder]').value != b", arg=before, polling=10)
-    spent = 1000.0 * (time.perf_counter() - since)
+    spent = float(page.evaluate(_CLICK))
     page.get_by_text(Path(before).name, exact=True).first.click()
-    page.wait_for_timeout(200)
+    page.wait_for_timeout(1000)
     return spent
 
 

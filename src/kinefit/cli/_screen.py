@@ -33,6 +33,7 @@ REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES)
 """Errors of the system for which nobody is to blame but the disk."""
 
 _VERBOSE, _QUIET, _EVENTS = "kinefit.verbose", "kinefit.quiet", "kinefit.events"
+_EVENTS_NICE = 10  # lower priority than the program that waits, whose page must answer
 _EVENT_INTERVAL_S = 0.1  # between two events of the progress of one piece of work
 _STYLES = {"fault": "bold red", "doubt": "yellow", "note": "cyan", "good": "green"}
 
@@ -73,6 +74,8 @@ def events_option(command: Callable) -> Callable:
     def remember(ctx: click.Context, parameter: click.Parameter, value: bool) -> None:
         if value:
             ctx.find_root().meta[_EVENTS] = True
+            with contextlib.suppress(AttributeError, OSError):  # not on Windows
+                os.nice(_EVENTS_NICE)
             threading.Thread(target=_interrupt_at_end_of_input, daemon=True).start()
 
     return click.option("--events", is_flag=True, expose_value=False, callback=remember, help=text)(command)
