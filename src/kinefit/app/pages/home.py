@@ -67,20 +67,13 @@ class _FolderChoice:
             inside = []
         videos = video_files(self._at)
         with ui.scroll_area().classes("w-full h-48 border"), ui.list().props("dense").classes("w-full"):
-            if self._at.parent != self._at:
-                self._entry("arrow_upward", t("home.up"), self._at.parent)
+            if self._at.parent != self._at:  # two elements an entry: hundreds of folders are listed in a moment
+                ui.item(f"↑ {t('home.up')}", on_click=lambda: self._go(self._at.parent))
             for folder in inside:
-                self._entry("folder", folder.name, folder)
+                ui.item(folder.name, on_click=lambda folder=folder: self._go(folder))
         names = ", ".join(video.name for video in videos[:_MAX_NAMES]) + (" ..." if len(videos) > _MAX_NAMES else "")
         ui.label(t("home.videos_here", count=len(videos), names=names) if videos else t("home.no_videos"))
         ui.button(t("home.use"), icon="folder_open", on_click=self._open)
-
-    def _entry(self, icon: str, name: str, folder: Path) -> None:
-        with ui.item(on_click=lambda: self._go(folder)):
-            with ui.item_section().props("avatar"):
-                ui.icon(icon)
-            with ui.item_section():
-                ui.item_label(name)
 
     def _go(self, folder: Path) -> None:
         self._at = folder
