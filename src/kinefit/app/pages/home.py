@@ -96,7 +96,7 @@ def _drop_area(desk: Desk, t: Texts) -> None:
                 with writing(folder / name) as temporary:
                     await file.save(temporary)
             except (OSError, KinefitError) as error:
-                ui.notify(t("home.drop_failed", name=name, folder=folder, reason=error), type="negative", timeout=0)
+                ui.notify(t("home.drop_failed", name=name, reason=error), type="negative", timeout=0)
                 return
         ui.navigate.to(link("/take", path=folder))
 
