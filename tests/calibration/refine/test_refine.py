@@ -112,7 +112,7 @@ def test_focal_lengths_are_found_on_request():
 def test_exchanged_cameras_are_named():
     names = room().names
     swapped = Rig(tuple(replace(room().cameras[k], name=n) for k, n in zip((0, 2, 1, 3), names, strict=True)))
-    with pytest.raises(CalibrationError, match="exchanged"):
+    with pytest.raises(CalibrationError, match="two cameras are swapped"):
         refine(swapped, seen(), BODY, sigma=2.0)
 
 
