@@ -2,7 +2,7 @@
 
 import pytest
 
-from kinefit.app.folders import NEW, TRACKED, UNFINISHED, TakeFolder, subfolders, takes_below, video_files
+from kinefit.app.folders import COMPLETE, NEW, UNFINISHED, TakeFolder, subfolders, takes_below, video_files
 from kinefit.errors import FileError
 
 
@@ -19,7 +19,7 @@ def test_states_of_a_take(tmp_path):
     assert take.state == UNFINISHED
     (take.out / "unfinished").rmdir()
     (take.out / "motion.npz").write_bytes(b"")
-    assert take.state == TRACKED and take.people == (take.out,)
+    assert take.state == COMPLETE and take.people == (take.out,)
 
 
 def test_people_are_in_the_order_of_their_numbers(tmp_path):
@@ -28,7 +28,7 @@ def test_people_are_in_the_order_of_their_numbers(tmp_path):
         (take.out / f"person-{number}").mkdir(parents=True)
         (take.out / f"person-{number}" / "motion.npz").write_bytes(b"")
     assert [folder.name for folder in take.people] == ["person-1", "person-2", "person-10"]
-    assert take.state == TRACKED
+    assert take.state == COMPLETE
     (take.out / "person-2" / "unfinished").mkdir()
     assert take.state == UNFINISHED
 

@@ -10,7 +10,9 @@ from kinefit.errors import FileError, KinefitError
 from kinefit.readers.guess.files import VIDEOS
 from kinefit.readers.take.find import takes_in
 
-NEW, UNFINISHED, TRACKED = "new", "unfinished", "tracked"
+NEW = "new"
+UNFINISHED = "unfinished"
+COMPLETE = "tracked"
 """States of a take: not tracked yet, stopped before its end, tracked."""
 
 _MAX_DEPTH = 3  # of folders below the session's in which takes are looked for
@@ -47,10 +49,10 @@ class TakeFolder:
 
     @property
     def state(self) -> str:
-        """NEW, UNFINISHED or TRACKED."""
+        """NEW, UNFINISHED or COMPLETE."""
         if any(self.out.glob("**/unfinished")):
             return UNFINISHED
-        return TRACKED if self.people else NEW
+        return COMPLETE if self.people else NEW
 
 
 def subfolders(folder: Path) -> list[Path]:

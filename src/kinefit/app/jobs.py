@@ -143,7 +143,7 @@ class JobQueue:
     Attributes
     ----------
     jobs : of the queue
-    beside : live sessions, which run beside it until they are told to end
+    beside : live sessions, which run at the same time as the queue until they are ended
     """
 
     def __init__(self) -> None:
