@@ -51,7 +51,7 @@ def people() -> None:
 
 
 def one_camera() -> None:
-    """The same two people before one of the cameras, which nobody calibrated: each with the fitted skeleton."""
+    """The same two people before one of the cameras, which is not calibrated: each with the fitted skeleton."""
     place = results.folder("one_camera")
     take, out = place / "take.toml", place / "results"
     if not (out / "person-2" / "motion.npz").is_file():

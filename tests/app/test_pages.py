@@ -9,7 +9,9 @@ import pytest
 from tests.app.running import running_app
 
 from kinefit import read_motion
+from kinefit.readers.clicks import read_clicks
 from kinefit.readers.take.file import read_take
+from kinefit.readers.video import Video
 
 pytestmark = pytest.mark.slow
 pytest.importorskip("nicegui")
@@ -25,18 +27,18 @@ def session(tmp_path, copy_take):
 
 @pytest.fixture
 def open_page(browser):
-    """Function that opens an app in a window of its own, after the choice to show faces."""
+    """Function that opens an app in a window of its own, after the choice of faces; None leaves it open."""
     contexts = []
 
-    def open_at(address, path="/", **viewport):
+    def open_at(address, path="/", faces="Show faces", **viewport):
         context = browser.new_context(viewport={"width": 1300, "height": 900, **viewport}, locale="en-GB")
         contexts.append(context)
         page = context.new_page()
         page.set_default_timeout(LONG_MS)
         page.goto(f"{address}/")
         page.get_by_text(re.compile("Open a recording|May the faces")).first.wait_for()
-        if page.get_by_role("button", name="Show faces").count():
-            page.get_by_role("button", name="Show faces").click()
+        if faces and page.get_by_role("button", name=faces).count():
+            page.get_by_role("button", name=faces).click()
             page.get_by_text("Open a recording").wait_for()
         if path != "/":
             page.goto(address + path)
@@ -165,11 +167,9 @@ def test_nothing_is_wider_than_a_phone(session, open_page):
     assert max(widths) <= 390
 
 
-def test_by_keys_alone(session, browser):
+def test_by_keys_alone(session, open_page):
     with running_app(session) as (_, address):
-        page = browser.new_context(locale="en-GB").new_page()
-        page.set_default_timeout(LONG_MS)
-        page.goto(f"{address}/")
+        page = open_page(address, faces=None)
         page.get_by_role("button", name="Hide all faces").wait_for()
 
         def press(said):
@@ -187,7 +187,6 @@ def test_by_keys_alone(session, browser):
         page.get_by_text(re.compile("4 videos here")).wait_for()
         press("Open this folder")
         page.get_by_text("cam01.mp4").wait_for()
-        page.context.close()
 
 
 @pytest.mark.parametrize("what", ["empty", "broken", "gone"])
@@ -225,15 +224,33 @@ def test_pages_of_recordings_run_apart_and_other_files_are_not_given(tmp_path, o
         assert "sandbox" in policy and "allow-same-origin" not in policy
 
 
-def test_faces_stay_hidden_until_they_are_found(session, browser):
+def test_faces_stay_hidden_until_they_are_found(session, open_page):
     with running_app(session) as (_, address):
-        page = browser.new_context(locale="en-GB").new_page()
-        page.set_default_timeout(LONG_MS)
-        page.goto(f"{address}/")
-        page.get_by_role("button", name="Hide all faces").click()
-        page.get_by_text("Faces are hidden").wait_for()
-        page.goto(address + take_path(session))
-        page.get_by_text("cam01.mp4").wait_for()
+        page = open_page(address, take_path(session), faces="Hide all faces")
         page.get_by_role("button", name="Compute the motion").wait_for()
         assert page.get_by_text("Faces are hidden").count() == 1
-        page.context.close()
+
+
+def test_a_joint_is_placed_and_the_person_meant_stays(session, open_page):
+    file = session / "wave" / "take.toml"
+    with running_app(session) as (_, address):
+        page = open_page(address, take_path(session))
+        page.get_by_role("combobox", name="Who is meant").click()
+        page.get_by_text("the one who moves most").last.click()
+        page.get_by_text("The choice is in the take file.").wait_for()
+        page.get_by_role("button", name="Compute the motion").click()
+        page.get_by_role("button", name="Look at the result").click()
+        page.get_by_text("Corrections", exact=True).wait_for()
+        page.get_by_role("combobox", name="Joint").fill("r_knee")
+        page.get_by_role("option", name="r_knee").click()
+        image = page.get_by_role("img", name="cam02").or_(page.locator("[alt=cam02]")).first
+        image.scroll_into_view_if_needed()
+        box = image.bounding_box()
+        image.click(position={"x": box["width"] / 2, "y": box["height"] / 4})
+        page.get_by_text("r_knee is placed by hand in camera cam02 at step 0.").wait_for()
+    take = read_take(file)
+    (clicks,) = read_clicks(take.clicks)
+    assert take.person == "moving" and clicks.step == 0
+    with Video(take.cameras[1].video) as video:
+        expected = video.size[0] / 2, video.size[1] / 4
+    assert clicks.points["cam02"]["r_knee"] == pytest.approx(expected, abs=0.02 * max(expected))

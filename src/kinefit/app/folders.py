@@ -50,7 +50,7 @@ class TakeFolder:
     @property
     def state(self) -> str:
         """NEW, UNFINISHED or COMPLETE."""
-        if any(self.out.glob("**/unfinished")):
+        if (self.out / "unfinished").exists() or any(self.out.glob("person-*/unfinished")):
             return UNFINISHED
         return COMPLETE if self.people else NEW
 
@@ -73,8 +73,8 @@ def subfolders(folder: Path) -> list[Path]:
 
 
 def is_result(folder: Path) -> bool:
-    """Whether kinefit made a folder: results, detections, session of `kinefit live`."""
-    return folder.name.endswith(("-kinefit", "-detect"))
+    """Whether kinefit made a folder: results, detections, former take files, session of `kinefit live`."""
+    return folder.name.endswith(("-kinefit", "-detect", "-before"))
 
 
 def video_files(folder: Path) -> list[Path]:

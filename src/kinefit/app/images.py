@@ -6,6 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.preparing.faces import shown_video
+from kinefit.readers.take.file import Take
+from kinefit.readers.take.load import Observations
+from kinefit.readers.video import Video
+
 _JPEG_QUALITY = 85
 _HIDDEN_PX = 24  # longer side of an image in which no face can be recognised
 
@@ -30,3 +35,24 @@ def unrecognisable(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     size = image.shape[1], image.shape[0]
     return np.asarray(cv2.resize(scaled(image, _HIDDEN_PX), size, interpolation=cv2.INTER_CUBIC), np.uint8)
 
+
+
+class ShownVideos:
+    """The videos of a take as they may be shown, each opened when it is first asked for.
+
+    Where faces are hidden and were not looked for yet, images are blurred as a whole.
+    """
+
+    def __init__(self, take: Take, seen: Observations) -> None:
+        self._take, self._seen, self._open = take, seen, dict[str, Video]()
+
+    def __call__(self, camera: str) -> Video:
+        """The video of a camera."""
+        if camera not in self._open:
+            self._open[camera] = shown_video(self._take, self._seen, camera, find=False)
+        return self._open[camera]
+
+    def close(self) -> None:
+        """Close all of them."""
+        for video in self._open.values():
+            video.close()

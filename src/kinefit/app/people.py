@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.app.images import unrecognisable
+from kinefit.app.images import ShownVideos
 from kinefit.batch.results import silent
 from kinefit.calibration.people.of_take import cameras_file, find_cameras
 from kinefit.errors import KinefitError, TrackingError
 from kinefit.multiview.people import PersonTrack
 from kinefit.preparing.detecting import detection_key, jobs_of_take
-from kinefit.preparing.faces import ensure_faces, shown_video
 from kinefit.preparing.take import prepared
 from kinefit.readers.detections import detections_key
 from kinefit.readers.take.cameras import is_uncalibrated
@@ -78,7 +78,7 @@ def people_pictures(take_file: Path, *, hide_faces: bool) -> tuple[PersonPicture
     Parameters
     ----------
     take_file : Path
-    hide_faces : whether faces are hidden; all of an image is where faces were not looked for yet
+    hide_faces : whether faces are hidden; images in which they were not looked for yet are blurred as a whole
     """
     try:
         take = replace(read_take(take_file), person=None, hide_faces=False)
@@ -89,19 +89,11 @@ def people_pictures(take_file: Path, *, hide_faces: bool) -> tuple[PersonPicture
         if view is None or len(view.people) < 2 or not view.seen.keypoints:
             return ()
         numbers = [k for k, person in enumerate(view.people) if person.image_of is None]
-        shown, hide_all = replace(take, hide_faces=hide_faces), False
-        if hide_faces:
-            try:
-                ensure_faces(shown, _refuse)
-            except KinefitError:
-                shown, hide_all = take, True
-        with _Videos(shown, view.seen) as videos:
+        with closing(ShownVideos(replace(take, hide_faces=hide_faces), view.seen)) as videos:
             found = [(k + 1, _picture(view.people[k], take, view.seen, videos)) for k in numbers]
     except (KinefitError, OSError):
         return ()
-    return tuple(
-        PersonPicture(k, unrecognisable(image) if hide_all else image) for k, image in found if image is not None
-    )
+    return tuple(PersonPicture(k, image) for k, image in found if image is not None)
 
 
 def _refuse(*_: object) -> None:
@@ -114,25 +106,6 @@ def _is_detected(take: Take) -> bool:
     if take.keypoints and all(entry.file is not None for entry in take.keypoints):
         return True
     return all((detections_key(job.file) or "").startswith(f"{detection_key(job)} ") for job in jobs_of_take(take))
-
-
-class _Videos:
-    """The videos of a take as they may be shown, opened where one is asked for."""
-
-    def __init__(self, take: Take, seen: Observations) -> None:
-        self._take, self._seen, self._open = take, seen, dict[str, Video]()
-
-    def __call__(self, camera: str) -> Video:
-        if camera not in self._open:
-            self._open[camera] = shown_video(self._take, self._seen, camera)
-        return self._open[camera]
-
-    def __enter__(self) -> _Videos:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for video in self._open.values():
-            video.close()
 
 
 def _picture(

@@ -9,19 +9,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.app.images import ShownVideos
 from kinefit.app.scene import ScenePage
 from kinefit.batch.viewed import content_of, has_same_cameras
 from kinefit.calibration.people.of_take import last_found
 from kinefit.errors import ObservationError
 from kinefit.exporters.pictures.overlay import draw_overlay
-from kinefit.preparing.faces import shown_video
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.readers.video import Video
-
-_DOUBTFUL_QUALITY = 0.5  # of a frame: fewer than half of its measurements agree with the fit
-_MIN_DOUBTFUL_S = 0.1  # of moments that are marked; shorter ones within this time are one
 
 
 class Review:
@@ -53,7 +49,7 @@ class Review:
         self.take = last_found(replace(read_take(take), hide_faces=hide_faces))
         self.seen = load_observations(self.take)
         self.has_cameras = has_same_cameras(self.motion, self.take)
-        self._videos: dict[str, Video] = {}
+        self._videos = ShownVideos(self.take, self.seen)
         self._reading = threading.Lock()
         self.scene = ScenePage(content_of([self.motion], self.take, self.seen, find=False), with_panel=False)
 
@@ -64,7 +60,7 @@ class Review:
 
     def size(self, camera: str) -> tuple[int, int]:
         """(width, height) [px] of a camera's video."""
-        return self._video(camera).size
+        return self._videos(camera).size
 
     def is_current(self, hide_faces: bool) -> bool:
         """Whether the motion was not written since, and faces are shown as they were."""
@@ -83,7 +79,7 @@ class Review:
             raise ObservationError(f"no image of camera {camera} at frame {frame}", remedy="Open the result again.")
         offset = next(entry.time_offset for entry in self.take.cameras if entry.name == camera)
         with self._reading:
-            video = self._video(camera)
+            video = self._videos(camera)
             at = video.frame_at(float(self.motion.times[frame]) - offset)
             image = video.read(at) if at is not None else np.full((*video.size[::-1], 3), 60, np.uint8)
         if not self.has_cameras:
@@ -94,24 +90,7 @@ class Review:
             residuals=residuals,
         )  # fmt: skip
 
-    def _video(self, camera: str) -> Video:
-        if camera not in self._videos:
-            self._videos[camera] = shown_video(self.take, self.seen, camera, find=False)
-        return self._videos[camera]
-
-    def doubtful(self) -> list[tuple[int, int]]:
-        """Frames (first, one after the last) of moments in which most measurements contradict the fit."""
-        gap = max(1, round(_MIN_DOUBTFUL_S * self.motion.rate))
-        moments: list[tuple[int, int]] = []
-        for frame in np.flatnonzero(self.motion.quality < _DOUBTFUL_QUALITY):
-            if moments and frame - moments[-1][1] < gap:
-                moments[-1] = moments[-1][0], int(frame) + 1
-            else:
-                moments.append((int(frame), int(frame) + 1))
-        return [moment for moment in moments if moment[1] - moment[0] >= gap]
-
     def close(self) -> None:
         """Close the 3D scene and all videos."""
         self.scene.close()
-        for video in self._videos.values():
-            video.close()
+        self._videos.close()

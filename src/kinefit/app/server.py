@@ -1,4 +1,4 @@
-"""Serve the pages of `kinefit app` to the browser of this computer, and to nobody else."""
+"""Serve the pages of `kinefit app` to browsers of this computer alone."""
 
 from __future__ import annotations
 

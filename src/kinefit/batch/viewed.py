@@ -147,7 +147,7 @@ def _in_folder(folder: Path) -> tuple[Path, Path | None]:
 
 
 def _triangulated(take: Take, seen: Observations, tell: Tell) -> NDArray | None:
-    """(F, K, 3) [m] keypoints of the person where two cameras agree; None, and a note, where there is nobody."""
+    """(F, K, 3) [m] keypoints of the person where two cameras agree; None, and a note, without a person."""
     import numpy as np
 
     from kinefit.bodies import load_body

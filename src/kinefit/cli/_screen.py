@@ -5,7 +5,6 @@ from __future__ import annotations
 import _thread
 import contextlib
 import errno
-import json
 import os
 import sys
 import threading
@@ -89,6 +88,8 @@ def _interrupt_at_end_of_input() -> None:
 
 
 def _emit(event: str, **content: Any) -> None:
+    import json
+
     print(json.dumps({"event": event, **content}, ensure_ascii=False), file=sys.stderr, flush=True)
 
 
@@ -117,6 +118,8 @@ def console(*, stderr: bool = False, always: bool = False) -> Console:
 
 def print_json(result: Mapping[str, Any]) -> None:
     """Print the result of a command that was given --json."""
+    import json
+
     click.echo(json.dumps(result, indent=2, ensure_ascii=False))
 
 

@@ -44,12 +44,12 @@ def print_summary(motion: Motion, *, points: bool = False) -> None:
         say(f"  and {len(moments) - MOMENTS} more, less severe")
     if throughout := throughout_sentence(motion):
         say(f"uncertain in most frames, at the far end (2 σ): {throughout}")
-    nobody = np.flatnonzero(motion.quality <= 0)
-    if len(nobody):
-        say(f"person not found: frames {frame_ranges(nobody)}")
+    unobserved = np.flatnonzero(motion.quality <= 0)
+    if len(unobserved):
+        say(f"person not found: frames {frame_ranges(unobserved)}")
     bare = without_markers(motion)
     for label, gone in (("no markers", bare), ("lost", lost_segments(motion))):
-        never = [name for name, frames in gone.items() if len(frames) == len(motion) - len(nobody)]
+        never = [name for name, frames in gone.items() if len(frames) == len(motion) - len(unobserved)]
         if never:
             names = ", ".join(_hands_together(motion, {n: gone[n] for n in never}))
             say(f"{'lost in all frames' if label == 'lost' else 'no markers in any frame on'}: {names}")

@@ -32,7 +32,7 @@ class PosePacket:
     silent : sensors without new frames
     paused : whether the session ignores what its sensors see
     people : int, in view
-    person : int, number of the tracked one as `LivePerson.people` counts them, from 1; None while nobody is tracked
+    person : int, number of the tracked one as `LivePerson.people` counts them, from 1; None without a tracked person
     camera : in whose image the people are numbered; "" before the first detection
     choice : int, how many times a client has chosen another person
     """

@@ -81,7 +81,7 @@ def side_colours(body: Body) -> NDArray:
 
 
 def segment_looks(
-    quality: NDArray, usual: NDArray, *, by_quality: bool, uncertain: NDArray | None = None
+    quality: NDArray, base_colours: NDArray, *, by_quality: bool, uncertain: NDArray | None = None
 ) -> tuple[NDArray, NDArray]:
     """Colours (S, 3) uint8 and opacities (S,) of the segments by their quality (S,) in 0..1.
 
@@ -89,7 +89,7 @@ def segment_looks(
     little translucent.
     """
     lost = np.asarray(quality) < BELIEVED
-    colours = quality_ramp(1.0 - np.asarray(quality, float)) if by_quality else usual
+    colours = quality_ramp(1.0 - np.asarray(quality, float)) if by_quality else base_colours
     opacities = np.where(False if uncertain is None else uncertain, UNCERTAIN_OPACITY, 1.0)
     shades = np.where(lost[:, None], np.array(LOST_COLOUR, np.uint8), colours)
     return shades, np.where(lost, LOST_OPACITY, np.broadcast_to(opacities, lost.shape))

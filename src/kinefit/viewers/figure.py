@@ -40,7 +40,7 @@ class Figure:
     def __init__(self, scene: Any, name: str, body: Body, *, colour: content.RGB | None = None) -> None:
         self.body = body
         S = len(body.tree.segments)
-        self.usual = looks.side_colours(body) if colour is None else np.tile(np.array(colour, np.uint8), (S, 1))
+        self.base_colours = looks.side_colours(body) if colour is None else np.tile(np.array(colour, np.uint8), (S, 1))
         self._root = scene.add_frame(f"/world/{name}", show_axes=False)
         self._segments = [scene.add_frame(f"/world/{name}/{s}", show_axes=False) for s in body.tree.segments]
         self._parts: dict[str, list[Any]] = {part: [] for part in PARTS}
@@ -53,7 +53,7 @@ class Figure:
         balls = [_ball(radius) for radius in content.joint_radii(body)]
         (dashes, gaps), surfaces = content.bone_meshes(body), content.surface_meshes(body)
         for s, segment in enumerate(body.tree.segments):
-            at, shade = f"/world/{name}/{segment}", tuple(int(v) for v in self.usual[s])
+            at, shade = f"/world/{name}/{segment}", tuple(int(v) for v in self.base_colours[s])
             for part, mesh, more in (
                 ("bones", dashes[s], {}),
                 ("gaps", gaps[s], {}),
@@ -91,7 +91,7 @@ class Figure:
             node = scene.add_mesh_skinned(
                 f"/world/{name}/skin_{self.body.tree.segments[piece.segment]}", piece.mesh.vertices, piece.mesh.faces,
                 bone_wxyzs=unturned, bone_positions=rest[piece.followed], skin_weights=piece.weights,
-                color=tuple(int(v) for v in self.usual[piece.segment]),
+                color=tuple(int(v) for v in self.base_colours[piece.segment]),
             )  # fmt: skip
             self._parts["skin"].append(node)
             self._shaded[piece.segment].append((node, "skin", 1.0))
@@ -137,8 +137,8 @@ class Figure:
             bone.wxyz, bone.position = wxyz[s], x[s]
         uncertain = None if joint_std is None else looks.uncertain_segments(self.body, joint_std)
         colours, opacities = looks.segment_looks(
-            np.ones(len(x)) if quality is None else quality, self.usual, by_quality=by_quality and quality is not None,
-            uncertain=uncertain,
+            np.ones(len(x)) if quality is None else quality, self.base_colours, uncertain=uncertain,
+            by_quality=by_quality and quality is not None,
         )  # fmt: skip
         bones = self._bare or "bones" in self._on
         for s, (colour, opacity) in enumerate(zip(colours.tolist(), opacities.tolist(), strict=True)):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from kinefit.app.texts import Texts
 from kinefit.batch import corrections
 from kinefit.batch.results import DESCRIPTIONS, NAMES, write_format
 from kinefit.errors import KinefitError
+from kinefit.exporters.report.moments import Moment, doubtful_moments
 from kinefit.rendering.colours import to_hex
 
 _REFRESH_S = 0.1  # between two looks at the clock of the 3D figure
@@ -82,12 +84,13 @@ class _ResultPage:
     def _time_line(self) -> None:
         """The slider with the marks of doubtful moments, and the keys that move it."""
         t, motion = self._t, self._review.motion
-        moments = self._review.doubtful()
+        moments = doubtful_moments(motion)
         last = max(len(motion) - 1, 1)
         marks = "".join(
-            f'<span title="{t("result.doubtful")}" style="position:absolute;height:8px;left:{100 * a / last:.2f}%;'
-            f'width:max(3px,{100 * (b - a) / last:.2f}%);background:{to_hex(COLOURS["fault"])}"></span>'
-            for a, b in moments
+            f'<span title="{escape(" ".join(m.what))}" style="position:absolute;height:8px;'
+            f'left:{100 * m.start / last:.2f}%;width:max(3px,{100 * (m.stop - m.start) / last:.2f}%);'
+            f'background:{to_hex(COLOURS["fault"])}"></span>'
+            for m in moments
         )
         ui.html(f'<div style="position:relative;height:8px">{marks}</div>', sanitize=False).classes("w-full")
         self._slider = ui.slider(min=0, max=last, step=1, value=0).classes("w-full")
@@ -116,9 +119,9 @@ class _ResultPage:
         clock.go(int(frame))
         self._follow()
 
-    def _next(self, moments: list[tuple[int, int]]) -> None:
-        now = self._review.scene.player.clock.frame
-        self._go(next((a for a, _ in moments if a > now), moments[0][0]))
+    def _next(self, moments: Sequence[Moment]) -> None:
+        now, worst = self._review.scene.player.clock.frame, sorted(moment.worst for moment in moments)
+        self._go(next((frame for frame in worst if frame > now), worst[0]))
 
     def _follow(self) -> None:
         """Bring images and read-outs to the frame of the 3D figure."""

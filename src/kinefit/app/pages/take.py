@@ -9,7 +9,7 @@ from typing import Any
 from nicegui import ui
 
 from kinefit.app.desk import Desk
-from kinefit.app.folders import NEW, TakeFolder, video_files
+from kinefit.app.folders import NEW, UNFINISHED, TakeFolder, video_files
 from kinefit.app.jobs import DONE, FAILED, PAUSED, RUNNING, WAITING, Job
 from kinefit.app.pages.coming import coming_images
 from kinefit.app.pages.people import people_cards
@@ -117,12 +117,12 @@ class _TakePage:
         people_cards(self._desk, t, self._folder.file, self._who)
 
     def _set_height(self, height: float | None) -> None:
-        if height and height != self._take.height:
-            self._edit(lambda: corrections.set_height(self._folder.file, height), self._t("take.height_saved"))
+        if (height or None) != self._take.height:
+            self._edit(lambda: corrections.set_height(self._folder.file, height or None), self._t("take.height_saved"))
 
     def _choose(self, who: str) -> None:
-        """Write who is meant into the take file; a number that was chosen by a picture stays."""
-        if who or isinstance(self._take.person, str):
+        """Write who is meant into the take file; a number that was chosen by an image stays."""
+        if who or isinstance(read_take(self._folder.file).person, str):
             self._edit(lambda: corrections.choose_person(self._folder.file, who or None), self._t("take.who_saved"))
 
     def _write(self, found: dict[str, Any]) -> None:
@@ -182,7 +182,7 @@ class _TakePage:
                 with card(f"{t('take.progress_title')}: {t(f'state.{job.state}')}"):
                     self._job(job)
         open_jobs = any(job.is_open for job in jobs)
-        if not open_jobs and self._folder.state == "unfinished" and not any(job.state == PAUSED for job in jobs):
+        if not open_jobs and self._folder.state == UNFINISHED and not any(job.state == PAUSED for job in jobs):
             with card(t("state.unfinished")):
                 ui.label(t("take.paused_text"))
                 self._resume_buttons()

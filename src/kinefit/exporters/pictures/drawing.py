@@ -125,8 +125,8 @@ def draw_body(image: NDArray, motion: Motion, frame: int, camera: Camera, image_
     drawn = Canvas(camera.size).draw_for(camera, vertices, mesh.faces, cull=True, labels=mesh.face_segment).segment
     edge, lost = max(1, round(image.shape[0] / 480)), motion.lost[frame]
     for s in np.unique(drawn[drawn >= 0]):
-        for rim in segment_contours(drawn, s):
-            uv = image_frame.from_calibration(rim)
+        for contour in segment_contours(drawn, s):
+            uv = image_frame.from_calibration(contour)
             dash = _DASH_WIDTHS * 3 * edge if lost[s] else 0.0
             draw_line(image, uv, DARK, 3 * edge, dash)
             draw_line(image, uv, LOST_COLOUR if lost[s] else side_colour(segments[s]), edge, dash)
@@ -134,8 +134,8 @@ def draw_body(image: NDArray, motion: Motion, frame: int, camera: Camera, image_
 
 def segment_contours(segments: NDArray, segment: int) -> list[NDArray]:
     """Closed contours (N, 2) [px] of one segment in an image (H, W) of segments."""
-    rims, _ = cv2.findContours((segments == segment).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    return [np.vstack([rim[:, 0], rim[:1, 0]]).astype(float) for rim in rims]
+    contours, _ = cv2.findContours((segments == segment).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    return [np.vstack([contour[:, 0], contour[:1, 0]]).astype(float) for contour in contours]
 
 
 def drawn_points(motion: Motion, frame: int) -> NDArray:

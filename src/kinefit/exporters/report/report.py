@@ -149,16 +149,16 @@ def _subtitle(motion: Motion, date: str) -> str:
 def _summary(
     motion: Motion, moments: Sequence[Moment], findings: Sequence[tuple[str, str, str]], date: str
 ) -> p.Section:
-    nobody = float(np.mean(motion.quality <= 0))
+    unobserved = float(np.mean(motion.quality <= 0))
     poor = float(np.mean(motion.quality < POORLY_SUPPORTED))
-    wrong = nobody > 0.1 or poor > 0.5 or of_provenance(motion.provenance)
+    wrong = unobserved > 0.1 or poor > 0.5 or of_provenance(motion.provenance)
     severity = "bad" if wrong else "warning" if moments else "good"
     severity = severity if motion.residuals else "note"
     notes: list[str] = []
     if moments:
         notes.append(p.paragraph("See ", p.link("doubtful-moments", "where and why"), "."))
-    if nobody:
-        notes.append(f"In {100 * nobody:.0f} % of the frames no person was observed.")
+    if unobserved:
+        notes.append(f"In {100 * unobserved:.0f} % of the frames no person was observed.")
     if throughout := throughout_sentence(motion):
         notes.append(f"Uncertain in most frames, at the far end (2 σ): {throughout}.")
     parts = [p.callout(severity, trust_sentence(motion, moments), *notes)]
