@@ -11,6 +11,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from benchmarks.house import HOUSE_SIZE, house_size, source_size
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "kinefit"
@@ -50,6 +51,8 @@ SEEN_ONLY_BY = {
     "viewers": {"recipes", "batch", "app", "cli"},
     "assets": {"cli", "preparing", "exporters"},
 }
+RATCHET = tomllib.loads((ROOT / "tests" / "house_size.toml").read_text("utf-8"))
+SLACK = 0.005  # share by which a stored number may lie above the sources before it has to follow them down
 MOST_FILES = 15  # of a folder, without its __init__.py
 LONGEST = {"src/kinefit/recipes": 150, "src/kinefit": 350, "examples": 80}  # lines; the first that fits holds
 
@@ -206,6 +209,20 @@ def test_files_are_short():
             if (lines := len(path.read_text("utf-8").splitlines())) > longest:
                 wrong.append(f"{name}: {lines} lines, {longest} are allowed")
     assert not wrong, "\n".join(wrong)
+
+
+def test_sizes_are_counted_without_blanks_comments_and_docstrings():
+    words = '"""Module\n\nof two."""\n\nimport x  # why\n_A, _B = 3, 0.5\n'
+    text = words + 'def f(\n    a,\n):\n    """One."""\n    return a\n'
+    assert dict(source_size(text)) == {"code_lines": 6, "statements": 6, "tokens": 18, "literals": 1, "constants": 1}
+
+
+@pytest.mark.parametrize("unit", HOUSE_SIZE)
+def test_the_house_does_not_grow(unit):
+    size, stored = house_size()[unit], RATCHET[unit]
+    assert size <= stored, f"{size} {unit}, {stored} are allowed: delete what the change supersedes"
+    lower = f"{size} {unit}: write that number into tests/house_size.toml, so that the house stays as small"
+    assert size >= stored * (1 - SLACK), lower
 
 
 def public_without_docstring(body: list[ast.stmt], prefix: str = "") -> list[str]:
