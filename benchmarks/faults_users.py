@@ -29,7 +29,7 @@ def run() -> None:
     siblings = {name: answer for module in modules for name, answer in module.SIBLINGS.items()}
     siblings = dict(list(siblings.items())[: amount(None, 4)])
     with tempfile.TemporaryDirectory() as folder:
-        for number, name in enumerate(siblings):
+        for number in range(len(siblings)):
             (Path(folder) / str(number)).mkdir()
         folders = {name: Path(folder) / str(number) for number, name in enumerate(siblings)}
         right = _right(siblings, folders)
