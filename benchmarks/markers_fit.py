@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import LEFT_OUT, amount, data, figure, peers, quick
 from benchmarks.peers.environments import run_peer
 from kinefit import Markers, Motion, load_body, read_markers
-from kinefit.cli.markers._fit import wearing
+from kinefit.cli.markers._fit import worn_body
 from kinefit.exporters import write_markers, write_osim
 from kinefit.markers.fit import fit_markers
 from kinefit.markers.subject import MarkerSubject, fit_marker_subject
@@ -127,7 +127,7 @@ def opensim() -> None:
     seconds = fastest(lambda: fit_markers(subject.body, trials[1], subject.marker_set, sigma=subject.sigma))
     with tempfile.TemporaryDirectory() as name:
         own = Path(name)
-        write_osim(wearing(subject), own / "body.osim")
+        write_osim(worn_body(subject, trials[1].names), own / "body.osim")
         write_markers(replace(trials[1], up="y"), own / "markers.trc", unit="m")
         run = (folder / "run").resolve()
         take = {

@@ -13,6 +13,7 @@ from kinefit._arguments import checked
 from kinefit.bodies import Body, BodyState, PointSet, load_body
 from kinefit.correspondences import point_rows, prediction_rows, prior_rows
 from kinefit.errors import BodyError, ObservationError, choices
+from kinefit.findings import FINDINGS, as_records
 from kinefit.geometry import se3
 from kinefit.motion import Motion
 from kinefit.observations import SkeletonMotion
@@ -58,12 +59,13 @@ def retarget(
     Returns
     -------
     Motion
-        Y up, standard deviations zero, qualities one.
+        Y up, standard deviations zero, qualities one. Its provenance holds a finding if the trunk's zero is doubtful.
 
     Raises
     ------
     ObservationError
-        The skeleton is of no known family; the message lists the missing joints.
+        The skeleton is of no known family (the message lists the missing joints), or no pose of it is upright: see
+        `skeletons.bone_directions`.
     BodyError
         The body lacks segments or landmarks of the humanoid.
     """
@@ -91,7 +93,8 @@ def retarget(
     follow(range(anchor, -1, -1), state)
     follow(range(anchor + 1, len(bones)), state)
     name = skeleton.source.replace("\\", "/").rpartition("/")[2].partition(".")[0]
-    return known_motion(body, bones.rate, roots, angles, name=name or "motion")
+    motion = known_motion(body, bones.rate, roots, angles, name=name or "motion")
+    return replace(motion, provenance={FINDINGS: as_records([bones.doubt])}) if bones.doubt else motion
 
 
 def known_motion(

@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.joint_names import SIDES, Recorded, recorded_joints
 from kinefit.errors import ObservationError
+from kinefit.findings import Finding
+from kinefit.geometry import se3
 from kinefit.motion import rotation_between_up
 from kinefit.observations import SkeletonMotion
 
 _MIN_BONE_LENGTH = 0.005  # [m]: a shorter bone has no direction
+_LEGS = tuple((f"{bone}_{s}", f"{far}_{s}") for s in SIDES for bone, far in (("thigh", "shank"), ("shank", "foot")))
+_MAX_REST_DEG = 10.0  # of thighs and shanks in an upright rest pose, forward or backward of the vertical
+_MAX_TRUNK_DEG = 25.0  # likewise of the line from hips to neck, which leans backward by 14 degrees in CMU's skeletons
+_MAX_OFF_AXIS_DEG = 4.0  # nearer to one of the axes, a rest pose stands along that axis
+_MAX_STANCE_DEG = 8.0  # of thighs and shanks of a person who stands; while walking, 12 degrees or more
+_MAX_T_POSE_DEG = 1.0  # likewise of a pose set by a program, which no person holds
+_MAX_BONE_TURN_DEG = 20.0  # of a bone in its joint's frame, which a rotating joint keeps at 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +43,7 @@ class BoneDirections:
     upright : name -> (2,) forward and up, unit
         Directions of "pelvis", "abdomen", "thorax" and "head" of an upright person: skeletons differ in the places of
         the spine's joints.
+    doubt : Finding, optional, that these come from a frame in which the person only about stands upright.
     """
 
     rate: float
@@ -42,6 +52,7 @@ class BoneDirections:
     bones: Mapping[str, NDArray]
     across: Mapping[str, NDArray]
     upright: Mapping[str, NDArray]
+    doubt: Finding | None = None
 
     def __len__(self) -> int:
         return len(self.hip_centre)
@@ -55,11 +66,11 @@ class BoneDirections:
         def between(array: NDArray) -> NDArray:
             return (1 - share) * array[low] + share * array[high]
 
-        return BoneDirections(
-            rate, between(self.hip_centre), self.leg_length,
-            {name: _unit(between(v)) for name, v in self.bones.items()},
-            {name: _unit(between(v)) for name, v in self.across.items()}, self.upright,
-        )
+        return replace(
+            self, rate=rate, hip_centre=between(self.hip_centre),
+            bones={name: _unit(between(v)) for name, v in self.bones.items()},
+            across={name: _unit(between(v)) for name, v in self.across.items()},
+        )  # fmt: skip
 
 
 def steps(frames: int, rate: float, new_rate: float) -> NDArray:
@@ -78,6 +89,10 @@ def steps(frames: int, rate: float, new_rate: float) -> NDArray:
 def bone_directions(skeleton: SkeletonMotion, names: Mapping[str, str] | None = None) -> BoneDirections:
     """Directions of the bones of a recorded skeleton.
 
+    Joint positions give them. What positions leave open (the zero of the trunk's angles, the rotation of head and hands
+    about their own axes) comes from a pose in which the person stands upright: the rest pose, however it lies in its
+    world, or else the frame with the straightest legs. So neither the axes of the joints nor the rest pose matter.
+
     Parameters
     ----------
     skeleton : SkeletonMotion
@@ -87,15 +102,18 @@ def bone_directions(skeleton: SkeletonMotion, names: Mapping[str, str] | None = 
     Raises
     ------
     ObservationError
-        The skeleton is of no known family; a bone of the trunk, the arms or the legs has no length.
+        The skeleton is of no known family; a bone of the trunk, the arms or the legs has no length; neither the rest
+        pose nor a frame is upright; or the joints do not rotate with their bones.
     """
     found = recorded_joints(skeleton.names, names, source=skeleton.source)
     joints, R_up = found.joints, rotation_between_up(skeleton.up, "y")
-    positions = skeleton.positions @ R_up.T
-    rest, right, forward = _rest(skeleton, found, R_up)
+    positions, rotations = skeleton.positions @ R_up.T, R_up @ skeleton.Ts_world_joint[..., :3, :3]
+    known = found.upright is not None and {"eye_l", "thumb_l"} <= joints.keys()  # positions give all
+    pose = None if known else _upright_pose(skeleton, found, positions, rotations)
 
-    def turned(role: str, direction: NDArray) -> NDArray:  # direction in the rest pose -> (F, 3) with the joint
-        return (R_up @ skeleton.Ts_world_joint[:, joints[role], :3, :3] @ R_up.T) @ direction
+    def turned(role: str, axis: str) -> NDArray:  # direction in the upright pose -> (F, 3) with the joint
+        assert pose is not None
+        return rotations[:, joints[role]] @ (pose.rotations[joints[role]].T @ getattr(pose, axis))
 
     def end(role: str, of: str) -> NDArray:  # the first child of `of` if there is no joint of this name
         return positions[:, joints.get(role, _child(skeleton, joints[of]))]
@@ -112,7 +130,7 @@ def bone_directions(skeleton: SkeletonMotion, names: Mapping[str, str] | None = 
         bones["head"] = 0.5 * (joint["eye_l"] + joint["eye_r"]) - neck
         across["head"] = joint["eye_r"] - joint["eye_l"]
     else:
-        bones["head"], across["head"] = end("head_top", "head") - neck, turned("head", right)
+        bones["head"], across["head"] = end("head_top", "head") - neck, turned("head", "right")
     for s in SIDES:
         chain = {
             "thigh": "shank", "shank": "foot", "foot": "toes", "upperarm": "forearm", "forearm": "hand",
@@ -123,7 +141,7 @@ def bone_directions(skeleton: SkeletonMotion, names: Mapping[str, str] | None = 
         bones[f"hand_{s}"] = end(f"knuckle_{s}", f"hand_{s}") - joint[f"hand_{s}"]
         palm = f"palm_{s}" if f"palm_{s}" in joints else f"hand_{s}"
         thumb = joint.get(f"thumb_{s}")
-        across[f"hand_{s}"] = turned(palm, forward) if thumb is None else thumb - joint[palm]
+        across[f"hand_{s}"] = turned(palm, "forward") if thumb is None else thumb - joint[palm]
     legs = [np.linalg.norm(bones[f"{bone}_{side}"], axis=1).mean() for bone in ("thigh", "shank") for side in SIDES]
     for name, vector in bones.items():
         if not name.startswith(("hand", "toes")) and np.any(np.linalg.norm(vector, axis=1) < _MIN_BONE_LENGTH):
@@ -131,7 +149,7 @@ def bone_directions(skeleton: SkeletonMotion, names: Mapping[str, str] | None = 
     return BoneDirections(
         skeleton.rate, hip_centre, float(sum(legs) / 2),
         {name: _unit(v) for name, v in bones.items()}, {name: _unit(v) for name, v in across.items()},
-        _upright(skeleton, found, rest, forward),
+        _upright(skeleton, found, pose), pose.doubt if pose else None,
     )
 
 
@@ -141,21 +159,105 @@ def _child(skeleton: SkeletonMotion, joint: int) -> int:
     return int(children[0]) if len(children) else joint
 
 
-def _rest(skeleton: SkeletonMotion, found: Recorded, R_up: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Joints (J, 3) of the rest pose, y up, and the directions (3,) to the right and forward in it."""
-    rest = skeleton.rest @ R_up.T
-    across = _unit(rest[found.joints["thigh_r"]] - rest[found.joints["thigh_l"]])
-    return rest, across, _unit(np.cross([0.0, 1.0, 0.0], across))
+@dataclass(frozen=True, eq=False)
+class _UprightPose:
+    """Joints (J, 3) and their frames (J, 3, 3) of an upright person, y up, with directions (3,) right and forward."""
+
+    positions: NDArray
+    rotations: NDArray
+    right: NDArray
+    forward: NDArray
+    doubt: Finding | None = None
 
 
-def _upright(skeleton: SkeletonMotion, found: Recorded, rest: NDArray, forward: NDArray) -> dict[str, NDArray]:
+def _upright_pose(skeleton: SkeletonMotion, found: Recorded, positions: NDArray, rotations: NDArray) -> _UprightPose:
+    """The rest pose, rotated as a whole, if it is upright; else the frame whose legs are straightest.
+
+    Positions (F, J, 3) and rotations (F, J, 3, 3) are those of the frames, y up.
+    """
+    for bone, far in _LEGS:
+        bone_in_joint = _unit(_local(positions, rotations, found.joints[bone], found.joints[far]))
+        if np.percentile(_angles(bone_in_joint, np.median(bone_in_joint, axis=0)), 90) > _MAX_BONE_TURN_DEG:
+            raise ObservationError(
+                f"the joint '{skeleton.names[found.joints[bone]]}' does not rotate with its bone: the file has "
+                "positions alone, which leave the rotation of head and hands open", file=skeleton.source or None,
+                remedy="Export the motion again, with the rotations of all joints.",
+            )  # fmt: skip
+    R = _turn_upright(skeleton.rest, found)
+    rest = skeleton.rest @ R.T
+    if _leg_angle(rest[None], found)[0] < _MAX_REST_DEG:
+        return _pose(rest, np.broadcast_to(R, (len(rest), 3, 3)), found)
+    angles = _leg_angle(positions, found)
+    frame = int(np.argmin(angles))
+    if angles[frame] > _MAX_STANCE_DEG:
+        raise ObservationError(
+            "the rest pose is no upright person, and in no frame the person stands upright with straight legs "
+            f"(nearest: frame {frame + 1}, legs {angles[frame]:.0f}° off): the zero of the trunk's angles is unknown",
+            file=skeleton.source or None,
+            remedy="Export the motion again with an upright rest pose, or with a T-pose as its first frame.",
+        )
+    doubt = Finding(
+        "doubt", "rest", "The rest pose of the file is no upright person. The trunk's angles are zero in frame "
+        f"{frame + 1}, where the legs are within {angles[frame]:.0f}° of upright: they may be off by some degrees.",
+        remedy="Export the motion with an upright rest pose, or with a T-pose as its first frame.",
+    )  # fmt: skip
+    pose = _pose(positions[frame], rotations[frame], found)
+    return pose if angles[frame] < _MAX_T_POSE_DEG else replace(pose, doubt=doubt)
+
+
+def _pose(x: NDArray, rotations: NDArray, found: Recorded) -> _UprightPose:
+    right = _unit(x[found.joints["thigh_r"]] - x[found.joints["thigh_l"]])
+    return _UprightPose(x, rotations, right, _unit(np.cross([0.0, 1.0, 0.0], right)))
+
+
+def _turn_upright(rest: NDArray, found: Recorded) -> NDArray:
+    """(3, 3) smallest rotation of a rest pose (J, 3) that brings the line from ankles to hips upright (y)."""
+    hip_l, hip_r, foot_l, foot_r = (rest[found.joints[name]] for name in ("thigh_l", "thigh_r", "foot_l", "foot_r"))
+    across = _unit(hip_r - hip_l)
+    up = np.nan_to_num(_unit(hip_l + hip_r - foot_l - foot_r - ((hip_l + hip_r - foot_l - foot_r) @ across) * across))
+    axis = np.eye(3)[np.argmax(np.abs(up))] * np.sign(up[np.argmax(np.abs(up))])
+    return se3.shortest_turn(axis if _angles(up, axis) < _MAX_OFF_AXIS_DEG else up, np.array([[0.0, 1.0, 0.0]]))[0]
+
+
+def _leg_angle(x: NDArray, found: Recorded) -> NDArray:
+    """(F,) [deg] largest angle of hips, thighs and shanks from an upright stance, y up; inf where the trunk is bent.
+
+    Poses x are (F, J, 3). Thighs and shanks count by their angle from the vertical in the sagittal plane, as legs may
+    be apart.
+    """
+    joint = {role: x[:, index] for role, index in found.joints.items()}
+    right = _unit(joint["thigh_r"] - joint["thigh_l"])
+    forward = _unit(np.cross([0.0, 1.0, 0.0], right))
+
+    def sagittal(v: NDArray) -> NDArray:
+        ahead, above = _unit(np.stack([np.sum(v * forward, axis=1), v[:, 1]], axis=1)).T  # NaN of a lateral bone
+        return np.degrees(np.arctan2(ahead, above))
+
+    parts = [np.degrees(np.arcsin(right[:, 1])), *(sagittal(joint[bone] - joint[far]) for bone, far in _LEGS)]
+    trunk = sagittal(joint["neck"] - 0.5 * (joint["thigh_l"] + joint["thigh_r"]))
+    worst = np.abs(parts).max(axis=0)
+    return np.where(np.isfinite(worst) & (np.abs(trunk) < _MAX_TRUNK_DEG), worst, np.inf)
+
+
+def _local(positions: NDArray, rotations: NDArray, joint: int, far: int) -> NDArray:
+    """(F, 3) [m] position of a joint in the frame of another one."""
+    return np.einsum("fji,fj->fi", rotations[:, joint], positions[:, far] - positions[:, joint])
+
+
+def _angles(a: NDArray, b: NDArray) -> NDArray:
+    """[deg] angles between directions (..., 3)."""
+    return np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1)))
+
+
+def _upright(skeleton: SkeletonMotion, found: Recorded, pose: _UprightPose | None) -> dict[str, NDArray]:
     vectors = np.array(found.upright)
     if found.upright is None:
-        joints = found.joints
-        hips = rest[[joints["thigh_l"], joints["thigh_r"]]].mean(axis=0)
+        assert pose is not None
+        joints, x = found.joints, pose.positions
+        hips = x[[joints["thigh_l"], joints["thigh_r"]]].mean(axis=0)
         top = joints.get("head_top", _child(skeleton, joints["head"]))
-        bones = np.diff([hips, *rest[[joints["sacrum"], joints["spine"], joints["neck"], top]]], axis=0)
-        vectors = np.stack([bones @ forward, bones[:, 1]], axis=1)
+        bones = np.diff([hips, *x[[joints["sacrum"], joints["spine"], joints["neck"], top]]], axis=0)
+        vectors = np.stack([bones @ pose.forward, bones[:, 1]], axis=1)
     return dict(zip(("pelvis", "abdomen", "thorax", "head"), _unit(vectors)))
 
 

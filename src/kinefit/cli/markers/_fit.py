@@ -10,9 +10,11 @@ import numpy as np
 
 from kinefit.batch import results
 from kinefit.bodies import Body, PointSet, load_body
+from kinefit.bodies.marker_sets import matched
 from kinefit.cli import _results
 from kinefit.cli._screen import Step
 from kinefit.errors import ExportError
+from kinefit.exporters.skeletons.common import plain_names
 from kinefit.markers.subject import MarkerSubject
 from kinefit.motion import Motion, rotation_between_up
 
@@ -69,7 +71,7 @@ def fit_file(
     KinefitError
         A file cannot be read or written, too few labels are known, or no frame shows enough: see `fit_markers`.
     """
-    from kinefit.exporters import write_markers, write_osim
+    from kinefit.exporters import write_markers, write_osim, write_trc
     from kinefit.markers.fit import fit_markers
     from kinefit.markers.people import split_people
     from kinefit.markers.subject import fit_marker_subject
@@ -96,26 +98,40 @@ def fit_file(
         )
         files: dict[str, Path] = {}
         own = folder / person if len(people) > 1 else folder
-        plain = [name for name in formats if name not in ("markers", "osim")]
+        worn = worn_body(subject, markers.names)
+        plain = [name for name in formats if name not in ("markers", "osim", "trc")]
         results.write_results(motion, own, plain, step, files)
+        if "trc" in formats:
+            write_trc(motion, own / results.NAMES["trc"], worn.landmarks)  # the points of body.osim
+            files["trc"] = own / results.NAMES["trc"]
         if "osim" in formats:
-            write_osim(wearing(subject), own / results.NAMES["osim"])
+            write_osim(worn, own / results.NAMES["osim"])
             files["osim"] = own / results.NAMES["osim"]
         if "markers" in formats:
             R = rotation_between_up(motion.up, "y")
-            write_markers(replace(markers, positions=markers.positions @ R.T, up="y"), own / _MARKERS, unit="m")
+            names = tuple(plain_names(markers.names))  # as body.osim has them
+            seen = replace(markers, names=names, positions=markers.positions @ R.T, up="y")
+            write_markers(seen, own / _MARKERS, unit="m")
             files["markers"] = own / _MARKERS
         found[person] = motion, files
     return found
 
 
-def wearing(subject: MarkerSubject) -> Body:
-    """The subject's body with its markers among the landmarks, so that a model of it has them in its marker set."""
-    body, points = subject.body, subject.points
-    new = [k for k, name in enumerate(points.names) if name not in body.landmarks.names]
-    both = PointSet(
-        body.landmarks.names + tuple(points.names[k] for k in new),
-        np.concatenate([body.landmarks.segments, points.segments[new]]),
-        np.concatenate([body.landmarks.points, points.points[new]]),
-    )
-    return replace(body, landmarks=both)
+def worn_body(subject: MarkerSubject, labels: Iterable[str]) -> Body:
+    """The subject's body with its fitted markers among the landmarks, named as in the recording.
+
+    Parameters
+    ----------
+    subject : MarkerSubject
+    labels : of the recording. A landmark of the same name is left out, as OpenSim would take it for the marker.
+    """
+    labels, body, points = tuple(labels), subject.body, subject.points
+    found = {label: name for label, name in zip(labels, matched(labels, points.names)) if name is not None}
+    taken = set(plain_names(labels))
+    names = body.landmarks.names
+    kept = body.landmarks.select(tuple(n for n, plain in zip(names, plain_names(names)) if plain not in taken))
+    worn = points.select(tuple(found.values()))
+    segments, places = ([getattr(p, key) for p in (worn, kept)] for key in ("segments", "points"))
+    return replace(
+        body, landmarks=PointSet((*found, *kept.names), np.concatenate(segments), np.concatenate(places))
+    )  # fmt: skip

@@ -25,13 +25,17 @@ Examples:
     "--names-table", "table", type=click.Path(path_type=Path), metavar="TOML",
     help="Lines such as thigh_l = \"JointName\", for joints that are not recognised by name.",
 )
+@click.option("--unit", metavar="UNIT", help="Unit of length: m, cm, mm, in, or metres.  [default: found by the size]")
+@click.option("--up", metavar="AXIS", default="auto", help="Vertical axis: x, y, z, -x ...  [default: feet to head]")
 @_screen.verbose_option
 def retarget(
-    recording: Path, asf: Path | None, out: Path | None, rate: float | None, table: Path | None
-) -> None:
+    recording: Path, asf: Path | None, out: Path | None, rate: float | None, table: Path | None, unit: str | None,
+    up: str,
+) -> None:  # fmt: skip
     """Retarget a recorded motion to the humanoid, by the directions of its bones."""
     from kinefit.cli._results import check_file
     from kinefit.exporters import write_motion
+    from kinefit.findings import of_provenance
     from kinefit.readers.skeletons.amc import read_amc
     from kinefit.readers.skeletons.bvh import read_bvh
     from kinefit.readers.skeletons.characters import read_names
@@ -44,10 +48,14 @@ def retarget(
         raise click.UsageError("An .amc file needs its skeleton: give --asf FILE. With a .bvh file, leave out --asf.")
     out = out or recording.with_suffix(".npz")
     check_file(out)
-    skeleton = read_amc(asf, recording) if asf else read_bvh(recording)
+    skeleton = (
+        read_amc(asf, recording, unit=unit, up=up) if asf else read_bvh(recording, unit=unit or "auto", up=up)
+    )
     with _screen.bars() as step:
         step("retargeting", 0, 0)
         motion = retarget_motion(skeleton, rate=rate, names=read_names(table) if table else None)
         step("retargeting", len(motion), len(motion))
         write_motion(motion, out)
     _screen.say(f"{out}: {len(motion)} frames at {motion.rate:g} Hz of the body {motion.body.name}")
+    for found in of_provenance(motion.provenance):
+        _screen.tell_finding(found)

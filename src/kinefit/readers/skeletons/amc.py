@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit.errors import FileError, choices
+from kinefit.errors import FileError, check_choice, choices
+from kinefit.motion import UP_AXES
 from kinefit.observations import SkeletonMotion
 from kinefit.readers.skeletons.asf import AsfSkeleton, Bone, read_asf
-from kinefit.readers.skeletons.common import euler_rotations, joint_poses, parse_numbers, read_text
+from kinefit.readers.skeletons.common import euler_rotations, joint_poses, parse_numbers, read_text, up_axis
 
 
 @checked
@@ -20,7 +21,8 @@ def read_amc(
     amc_path: str | PathLike[str],
     *,
     rate: float = 120.0,
-    unit: float | None = None,
+    unit: float | str | None = None,
+    up: str = "auto",
 ) -> SkeletonMotion:
     """Read an AMC motion with its ASF skeleton.
 
@@ -30,21 +32,24 @@ def read_amc(
         The skeleton may be another subject's with the same bones and degrees of freedom.
     rate : float [Hz]
         Frames a second, which the format does not state; 120 in nearly all of the CMU library.
-    unit : float [m], optional
-        Metres per unit of length; None takes inches divided by the ASF's `length`, as the CMU library means it.
+    unit : float [m] or a unit such as "cm", optional
+        Unit of length; None takes inches divided by the ASF's `length`, as the CMU library means it.
+    up : an axis such as "y" or "-z", or "auto"
+        Vertical axis of the world. "auto" takes the axis along which, on average, the head is above the feet.
 
     Returns
     -------
     SkeletonMotion
         "root" and one joint a bone, under the bone's name, at the bone's START and turning with the bone; the end
         of every bone without children is the joint "<bone>_end". All frames are aligned with the world in the rest
-        pose. Y is up.
+        pose.
 
     Raises
     ------
     FileError
         If a file is missing, truncated or contradicts the other, or holds a value that is not finite.
     """
+    check_choice("vertical axis", up, (*UP_AXES, "auto"), FileError, file=amc_path)
     skeleton = read_asf(asf_path, unit=unit)
     if not 0 < rate < np.inf:
         raise FileError(f"the rate {rate} is not positive", file=amc_path, remedy="Give frames a second.")
@@ -61,13 +66,15 @@ def read_amc(
     for i, bone in enumerate(bones):
         if bone.dofs:
             _move(Ts_parent_joint[:, i], bone, values[bone.name], skeleton.unit, degrees)
+    names = tuple(bone.name for bone in bones) + tuple(f"{bones[i].name}_end" for i in leaves)
+    Ts_world_joint = joint_poses(parents, Ts_parent_joint)
     return SkeletonMotion(
-        names=tuple(bone.name for bone in bones) + tuple(f"{bones[i].name}_end" for i in leaves),
+        names=names,
         parents=np.array(parents),
         offsets=offsets,
         rate=float(rate),
-        Ts_world_joint=joint_poses(parents, Ts_parent_joint),
-        up="y",
+        Ts_world_joint=Ts_world_joint,
+        up=up_axis(names, Ts_world_joint[..., :3, 3]) if up == "auto" else up,
         source=fspath(amc_path),
     )
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import FileError, check_choice, choices
-from kinefit.readers.skeletons.common import euler_rotations, parse_numbers, read_text
+from kinefit.readers.skeletons.common import euler_rotations, given_unit, parse_numbers, read_text
 
 _INCH = 0.0254  # [m]
 _DOFS = ("rx", "ry", "rz", "tx", "ty", "tz")
@@ -62,14 +62,14 @@ class AsfSkeleton:
 _LIMIT = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|[-+]?inf(?:inity)?", re.IGNORECASE)
 
 
-def read_asf(path: str | PathLike[str], *, unit: float | None = None) -> AsfSkeleton:
+def read_asf(path: str | PathLike[str], *, unit: float | str | None = None) -> AsfSkeleton:
     """Read an ASF skeleton.
 
     Parameters
     ----------
     path : path
-    unit : float [m], optional
-        Metres per unit of length; None: inches divided by the file's `length`, the convention of the CMU library.
+    unit : float [m] or a unit such as "cm", optional
+        Unit of length; None: inches divided by the file's `length`, the convention of the CMU library.
 
     Raises
     ------
@@ -86,8 +86,7 @@ def read_asf(path: str | PathLike[str], *, unit: float | None = None) -> AsfSkel
         line, length = units.get("length", (0, "1.0"))
         (scale,) = parse_numbers([length], file=path, line=line)
         unit = _INCH / scale if scale > 0 else 0.0
-    if not 0 < unit < np.inf:
-        raise FileError("the unit of length is not positive", file=path, remedy="Give unit= in metres.")
+    unit = given_unit(unit, path)
 
     root = {words[0].lower(): (n, words[1:]) for n, words in sections["root"]}
     angle = np.pi / 180.0 if degrees else 1.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,9 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit.errors import FileError
+from kinefit.errors import FileError, check_choice
+from kinefit.motion import UP_AXES
 from kinefit.observations import SkeletonMotion
-from kinefit.readers.skeletons.common import euler_rotations, joint_poses, parse_numbers, read_text
+from kinefit.readers.skeletons.common import (
+    euler_rotations,
+    given_unit,
+    joint_poses,
+    landmarks,
+    parse_numbers,
+    read_text,
+    up_axis,
+)
 
 UNITS = (0.001, 0.01, 0.0254, 0.0254 / 0.45, 1.0)
 """Metres per unit that "auto" chooses from: mm, cm, inch, the unit of CMU's ASF files, m."""
@@ -39,15 +47,16 @@ def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str =
 
     Rotation channels multiply from left to right in the order of the file. Position channels replace the joint's
     OFFSET in some programs' files and are added to it in others'; the reader takes whichever is nearer to the
-    values (for the root: in height). The rest pose has all angles zero; a person may be unable to take it.
+    values (for the root: in height). The rest pose has all angles zero; a person may be unable to take it. Where
+    joints have position channels, its bones are the medians of those: some programs write OFFSETs of zero.
 
     Parameters
     ----------
     path : path
-    unit : float [m] or "auto"
-        Metres per unit of length of the file, which BVH does not state. "auto" chooses the one of `UNITS` with
+    unit : float [m], a unit such as "cm", or "auto"
+        Unit of length of the file, which BVH does not state. "auto" chooses the one of `UNITS` with
         the most plausible stature (within 1.0 to 2.2 m, nearest to 1.7 m). The motion's `source` states it.
-    up : "x", "y", "z" or "auto"
+    up : an axis such as "y" or "-z", or "auto"
         Vertical axis of the file's world. "auto" takes the axis along which, on average, the head is above the
         feet; the common "y" if no joint is named as head and feet.
 
@@ -63,8 +72,7 @@ def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str =
         Missing, truncated, not BVH, numbers that are not finite, or no unit with a plausible stature.
     """
     text = read_text(path, "BVH")
-    if up not in ("x", "y", "z", "auto"):
-        raise FileError(f"up {up!r} is not an axis", file=path, remedy='Give "x", "y", "z" or "auto".')
+    check_choice("vertical axis", up, (*UP_AXES, "auto"), FileError, file=path)
     hierarchy, *motion = re.split(r"^[ \t]*MOTION\b", text, maxsplit=1, flags=re.M | re.I)
     joints = _read_hierarchy(hierarchy, path)
     if not motion:
@@ -74,11 +82,13 @@ def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str =
 
     names = tuple(joint.name for joint in joints)
     parents = [joint.parent for joint in joints]
-    offsets = np.array([joint.offset for joint in joints])
-    scale = _human_unit(names, parents, offsets, path) if unit == "auto" else _given_unit(unit, path)
-    Ts_world_joint = joint_poses(parents, _local_poses(joints, values))
+    Ts_parent_joint = _local_poses(joints, values)
+    offsets = np.median(Ts_parent_joint[..., :3, 3], axis=0)
+    offsets[0] = joints[0].offset
+    scale = _human_unit(names, parents, offsets, path) if unit == "auto" else given_unit(unit, path)
+    Ts_world_joint = joint_poses(parents, Ts_parent_joint)
     if up == "auto":
-        up = _up_axis(names, Ts_world_joint[..., :3, 3])
+        up = up_axis(names, Ts_world_joint[..., :3, 3])
     Ts_world_joint[..., :3, 3] += _root_shift(joints[0], values, up)
     Ts_world_joint[..., :3, 3] *= scale
     return SkeletonMotion(
@@ -245,22 +255,12 @@ def _is_added(positions: NDArray, offset: NDArray) -> bool:
 
 def _root_shift(root: _BvhJoint, values: NDArray, up: str) -> NDArray:
     """(3,) the root's OFFSET if its position channels are added to it, else zero."""
-    shift = np.zeros(3)
+    shift, up = np.zeros(3), up[-1]
     height = [k for k, channel in enumerate(root.channels) if channel == f"{up}position"]
     if _is_added(values[:, height], np.array(root.offset)[["xyz".index(up)] * len(height)]):
         axes = ["xyz".index(channel[0]) for channel in root.channels if channel.endswith("position")]
         shift[axes] = np.array(root.offset)[axes]
     return shift
-
-
-def _given_unit(unit: float | str, path: str | PathLike[str]) -> float:
-    try:
-        value = float(unit)
-    except ValueError:
-        value = math.nan
-    if not (value > 0 and math.isfinite(value)):
-        raise FileError(f"unit {unit!r} is not a length", file=path, remedy='Give metres per unit, or "auto".')
-    return value
 
 
 def _human_unit(names: Sequence[str], parents: Sequence[int], offsets: NDArray, path: str | PathLike[str]) -> float:
@@ -269,7 +269,7 @@ def _human_unit(names: Sequence[str], parents: Sequence[int], offsets: NDArray, 
     The stature is the length of the bones from head to ankle, independent of the pose; the extent of the rest pose
     if no joint is named as head and feet.
     """
-    head, feet = _landmarks(names)
+    head, feet = landmarks(names)
     if head is not None and feet:
         chains = [set(_chain(head, parents)) ^ set(_chain(foot, parents)) for foot in feet]
         lengths = np.linalg.norm(offsets, axis=1)
@@ -284,16 +284,9 @@ def _human_unit(names: Sequence[str], parents: Sequence[int], offsets: NDArray, 
         raise FileError(
             f"the skeleton is {height:.4g} units tall: no known unit makes that a person",
             file=path,
-            remedy="Give the unit in metres (unit=0.01 for centimetres).",
+            remedy="Give the unit (--unit cm; in Python unit=0.01) if the person is as tall as that.",
         )
     return unit
-
-
-def _landmarks(names: Sequence[str]) -> tuple[int | None, list[int]]:
-    """Joint of the head (None if not found by name) and joints of the feet."""
-    heads = [i for i, name in enumerate(names) if "head" in name.lower()]
-    feet = [i for i, name in enumerate(names) if re.search("foot|ankle", name.lower()) and not name.endswith("_end")]
-    return (heads[0] if heads else None), feet
 
 
 def _chain(joint: int, parents: Sequence[int]) -> list[int]:
@@ -303,10 +296,3 @@ def _chain(joint: int, parents: Sequence[int]) -> list[int]:
         chain.append(joint)
         joint = parents[joint]
     return chain
-
-
-def _up_axis(names: Sequence[str], positions: NDArray) -> str:
-    head, feet = _landmarks(names)
-    if head is None or not feet:
-        return "y"
-    return "xyz"[int(np.argmax((positions[:, head] - positions[:, feet].mean(axis=1)).mean(axis=0)))]

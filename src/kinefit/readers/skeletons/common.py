@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
+from contextlib import suppress
 from os import PathLike
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import FileError
+from kinefit.motion import UP_AXES
+from kinefit.readers.units import LENGTHS, worth
 
 
 def read_text(path: str | PathLike[str], kind: str) -> str:
@@ -88,3 +92,32 @@ def joint_poses(parents: Sequence[int], Ts_parent_joint: NDArray) -> NDArray:
         if parent >= 0:
             Ts_world_joint[:, joint] = Ts_world_joint[:, parent] @ Ts_parent_joint[:, joint]
     return Ts_world_joint
+
+
+def landmarks(names: Sequence[str]) -> tuple[int | None, list[int]]:
+    """Joint of the head (None if not found by name) and joints of the feet."""
+    heads = [i for i, name in enumerate(names) if "head" in name.lower()]
+    feet = [i for i, name in enumerate(names) if re.search("foot|ankle", name.lower()) and not name.endswith("_end")]
+    return (heads[0] if heads else None), feet
+
+
+def up_axis(names: Sequence[str], positions: NDArray) -> str:
+    """The axis, such as "y" or "-z", along which the head is above the feet on average in positions (F, J, 3).
+
+    "y" if no joint is named as head and feet.
+    """
+    head, feet = landmarks(names)
+    if head is None or not feet:
+        return "y"
+    away = (positions[:, head] - positions[:, feet].mean(axis=1)).mean(axis=0)
+    return max(UP_AXES, key=lambda axis: float(away @ UP_AXES[axis]))
+
+
+def given_unit(unit: float | str, path: str | PathLike[str]) -> float:
+    """Metres of a unit of length, given by its name or in metres; raises FileError if it is no length."""
+    value = worth(unit, LENGTHS)
+    with suppress(ValueError):
+        value = float(unit) if value is None else value
+    if value is None or not 0 < value < math.inf:
+        raise FileError(f"unit {unit!r} is not a length", file=path, remedy="Give m, cm, mm, in, or metres per unit.")
+    return value
