@@ -1,7 +1,7 @@
-"""OpenSim's inverse kinematics on folders that `kinefit markers fit` wrote: RMS of the markers, and of kinefit's angles.
+"""OpenSim's inverse kinematics on folders of `kinefit markers fit`: RMS of the markers, by its angles and by kinefit's.
 
-Run as `python -m benchmarks.peers.opensim_sets FOLDER` with the peer's python. Every folder in it with a body.osim holds
-markers.trc, motion.mot and sigma.json {marker: standard deviation [m]}.
+Run as `python -m benchmarks.peers.opensim_sets FOLDER` with the peer's python. Every folder in it with a body.osim also
+holds markers.trc and motion.mot.
 """
 
 from __future__ import annotations
@@ -46,10 +46,6 @@ def main(folder: Path) -> None:
     out = {}
     for path in sorted(p.parent for p in folder.glob("*/body.osim")):
         tool, _model = own_tool(path)
-        sigma, tasks = json.loads((path / "sigma.json").read_text(encoding="utf-8")), tool.upd_IKTaskSet()
-        for i in range(tasks.getSize()):
-            tasks.get(i).setWeight(1e-4 / sigma.get(tasks.get(i).getName(), 0.01) ** 2)
-        tool.set_accuracy(1e-9)
         tool.setMarkerDataFileName(str(path / "markers.trc"))
         tool.setOutputMotionFileName(str(path / "ik.mot"))
         tool.setResultsDir(str(path))
@@ -57,7 +53,7 @@ def main(folder: Path) -> None:
         (errors,) = path.glob("*marker_errors.sto")
         names, table = read_mot(errors)
         rms = 1e3 * float(np.sqrt(np.mean(table[:, names.index("marker_error_RMS")] ** 2)))
-        out[path.name] = {"rms_mm": rms, "own_angles_mm": own_angles(path), "markers": tasks.getSize()}
+        out[path.name] = {"rms_mm": rms, "own_angles_mm": own_angles(path), "markers": tool.upd_IKTaskSet().getSize()}
     print(json.dumps(out), flush=True)
 
 

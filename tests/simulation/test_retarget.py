@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.readers.skeletons.bvh_variants import along, any_frames, turned, write_variant
 
 from kinefit.bodies import load_body
 from kinefit.bodies.joint_names import recorded_joints
 from kinefit.errors import BodyError, ObservationError
+from kinefit.findings import of_provenance
 from kinefit.geometry import se3
 from kinefit.motion import rotation_between_up
 from kinefit.observations import SkeletonMotion
@@ -162,3 +164,75 @@ def test_cut_and_resampled():
         resampled(motion, float("nan"))
     with pytest.raises(ObservationError, match="frames"):
         cut(motion, 60)
+
+
+def some_frames(skeleton, count=6):
+    """The first frame, often a T-pose, and some others."""
+    rows = np.linspace(0, len(skeleton) - 1, count).astype(int)
+    return replace(skeleton, Ts_world_joint=skeleton.Ts_world_joint[rows], rate=10.0)
+
+
+@pytest.fixture(scope="module")
+def walk(data_dir):
+    """Six frames of a walk with a T-pose first, and their motion."""
+    skeleton = some_frames(read(data_dir, "motion_cmu_bvh/cmu_12_01_walk.bvh"))
+    return skeleton, retarget(skeleton)
+
+
+def turn(motion, other):
+    """[deg] largest difference of angles, of the neck's and of all others."""
+    degrees = np.degrees(np.abs(motion.angles - other.angles)).max(axis=0)
+    neck = np.array([name.startswith("neck") for name in motion.body.tree.coordinates])
+    return degrees[neck].max(), degrees[~neck].max()
+
+
+@pytest.mark.parametrize("degrees", [(90, 0, 0), (-90, 0, 0), (180, 0, 0), (0, 0, 90), (0, 70, 0), (30, 40, 20)])
+def test_a_rest_pose_may_lie_in_any_way(walk, tmp_path, degrees):
+    skeleton, motion = walk
+    found = retarget(read_bvh(write_variant(skeleton, tmp_path / "a.bvh", turned(skeleton, *degrees))))
+    assert max(turn(found, motion)) < 0.1 and not of_provenance(found.provenance)
+
+
+@pytest.mark.parametrize(
+    ("frames", "offsets"), [(any_frames, True), (any_frames, False), (along, True), (lambda s: along(s, 2), True)]
+)
+def test_joint_frames_and_the_rest_pose_do_not_matter(walk, tmp_path, frames, offsets):
+    skeleton, motion = walk
+    found = retarget(read_bvh(write_variant(skeleton, tmp_path / "a.bvh", frames(skeleton), offsets=offsets)))
+    neck, others = turn(found, motion)
+    assert others < 0.1 and neck < 2.0  # the head of the first frame is 1.7 degrees off that of the rest pose
+    assert not of_provenance(found.provenance)
+
+
+def test_offsets_of_zero(walk, tmp_path):
+    skeleton, motion = walk
+    found = retarget(read_bvh(write_variant(skeleton, tmp_path / "a.bvh", turned(skeleton, 0, 0, 0), offsets=False)))
+    assert max(turn(found, motion)) < 0.1
+
+
+@pytest.mark.parametrize("case", ["bvh-rest-lying", "bvh-any-joint-frames", "bvh-bones-along-x", "bvh-zero-offsets"])
+def test_one_walk_in_four_files(data_dir, case):
+    cases = data_dir("cases_of_users")
+    motion = retarget(read_bvh(cases / "bvh-rest-lying" / "walk_upright_rest.bvh"), rate=2.0)
+    neck, others = turn(retarget(read_bvh(cases / case / "walk.bvh"), rate=2.0), motion)
+    assert others < 0.1 and neck < 2.0
+
+
+def test_a_zero_that_no_pose_gives_is_refused(data_dir, tmp_path):
+    jacks = some_frames(read(data_dir, "motion_animateddrawings_bvh/jumping_jacks.bvh"))
+    path = write_variant(jacks, tmp_path / "a.bvh", any_frames(jacks))
+    with pytest.raises(ObservationError, match=r"the rest pose is no upright person.*T-pose"):
+        retarget(read_bvh(path))
+    path = write_variant(jacks, tmp_path / "b.bvh", turned(jacks, 0, 0, 0), rotations=False)
+    with pytest.raises(ObservationError, match="does not rotate with its bone: the file has positions alone"):
+        retarget(read_bvh(path))
+
+
+@pytest.mark.parametrize("is_rest", [True, False])
+def test_a_zero_from_a_person_who_stands_is_doubtful(data_dir, tmp_path, is_rest):
+    wave = read(data_dir, "motion_animateddrawings_bvh/wave_hello.bvh")
+    stance = replace(wave, Ts_world_joint=wave.Ts_world_joint[[0, 388]])
+    frames = np.swapaxes(stance.Ts_world_joint[1, :, :3, :3], 1, 2) if is_rest else any_frames(stance)
+    motion = retarget(read_bvh(write_variant(stance, tmp_path / "a.bvh", frames)))
+    (found,) = of_provenance(motion.provenance)
+    assert found.severity == "doubt" and ("rest pose. A person" if is_rest else "frame 2") in found.text

@@ -16,13 +16,19 @@ from kinefit.motion import rotation_between_up
 from kinefit.observations import SkeletonMotion
 
 _MIN_BONE_LENGTH = 0.005  # [m]: a shorter bone has no direction
-_LEGS = tuple((f"{bone}_{s}", f"{far}_{s}") for s in SIDES for bone, far in (("thigh", "shank"), ("shank", "foot")))
+_CHAINS = tuple(
+    (f"{bone}_{s}", f"{far}_{s}")
+    for bone, far in (("thigh", "shank"), ("shank", "foot"), ("upperarm", "forearm"), ("forearm", "hand"))
+    for s in SIDES
+)
+_LEGS = _CHAINS[:4]
 _MAX_REST_DEG = 10.0  # of thighs and shanks in an upright rest pose, forward or backward of the vertical
 _MAX_TRUNK_DEG = 25.0  # likewise of the line from hips to neck, which leans backward by 14 degrees in CMU's skeletons
 _MAX_OFF_AXIS_DEG = 4.0  # nearer to one of the axes, a rest pose stands along that axis
 _MAX_STANCE_DEG = 8.0  # of thighs and shanks of a person who stands; while walking, 12 degrees or more
-_MAX_T_POSE_DEG = 1.0  # likewise of a pose set by a program, which no person holds
+_MAX_ASYMMETRY_DEG = 3.0  # between left and right limbs: 0 to 0.7 in poses set by programs, 4 to 20 in people who stand
 _MAX_BONE_TURN_DEG = 20.0  # of a bone in its joint's frame, which a rotating joint keeps at 0
+_REMEDY = "Export the motion again with an upright rest pose, or with a T-pose as its first frame."
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +181,7 @@ def _upright_pose(skeleton: SkeletonMotion, found: Recorded, positions: NDArray,
 
     Positions (F, J, 3) and rotations (F, J, 3, 3) are those of the frames, y up.
     """
-    for bone, far in _LEGS:
+    for bone, far in _CHAINS:
         bone_in_joint = _unit(_local(positions, rotations, found.joints[bone], found.joints[far]))
         if np.percentile(_angles(bone_in_joint, np.median(bone_in_joint, axis=0)), 90) > _MAX_BONE_TURN_DEG:
             raise ObservationError(
@@ -184,30 +190,27 @@ def _upright_pose(skeleton: SkeletonMotion, found: Recorded, positions: NDArray,
                 remedy="Export the motion again, with the rotations of all joints.",
             )  # fmt: skip
     R = _turn_upright(skeleton.rest, found)
-    rest = skeleton.rest @ R.T
-    if _leg_angle(rest[None], found)[0] < _MAX_REST_DEG:
-        return _pose(rest, np.broadcast_to(R, (len(rest), 3, 3)), found)
-    angles = _leg_angle(positions, found)
-    frame = int(np.argmin(angles))
-    if angles[frame] > _MAX_STANCE_DEG:
-        raise ObservationError(
-            "the rest pose is no upright person, and in no frame the person stands upright with straight legs "
-            f"(nearest: frame {frame + 1}, legs {angles[frame]:.0f}° off): the zero of the trunk's angles is unknown",
-            file=skeleton.source or None,
-            remedy="Export the motion again with an upright rest pose, or with a T-pose as its first frame.",
-        )
-    doubt = Finding(
-        "doubt", "rest", "The rest pose of the file is no upright person. The trunk's angles are zero in frame "
-        f"{frame + 1}, where the legs are within {angles[frame]:.0f}° of upright: they may be off by some degrees.",
-        remedy="Export the motion with an upright rest pose, or with a T-pose as its first frame.",
-    )  # fmt: skip
-    pose = _pose(positions[frame], rotations[frame], found)
-    return pose if angles[frame] < _MAX_T_POSE_DEG else replace(pose, doubt=doubt)
-
-
-def _pose(x: NDArray, rotations: NDArray, found: Recorded) -> _UprightPose:
+    x, frames, place = skeleton.rest @ R.T, np.broadcast_to(R, (len(skeleton.rest), 3, 3)), "the file's rest pose"
+    if _leg_angle(x[None], found)[0] > _MAX_REST_DEG:
+        angles = _leg_angle(positions, found)
+        best = int(np.argmin(angles))
+        if angles[best] > _MAX_STANCE_DEG:
+            raise ObservationError(
+                "the rest pose is no upright person, and the person stands upright with straight legs in no frame: "
+                "the zero of the trunk's angles is unknown", file=skeleton.source or None, remedy=_REMEDY,
+            )  # fmt: skip
+        x, frames, place = positions[best], rotations[best], f"frame {best + 1}, as the rest pose is no upright person"
     right = _unit(x[found.joints["thigh_r"]] - x[found.joints["thigh_l"]])
-    return _UprightPose(x, rotations, right, _unit(np.cross([0.0, 1.0, 0.0], right)))
+    mirror = np.eye(3) - 2.0 * np.outer(right, right)
+    bones = {name: x[found.joints[far]] - x[found.joints[name]] for name, far in _CHAINS}
+    asymmetry = max(float(_angles(bones[f"{n}_l"] @ mirror, bones[f"{n}_r"])) for n in ("thigh", "shank", "upperarm"))
+    doubt = Finding(
+        "doubt", "rest", f"The angles of trunk, head and hands are zero as in {place}. A person stands there "
+        f"({asymmetry:.0f}° between left and right), no pose set by a program: they may be off by some degrees, and "
+        "the rotation of the forearms by more.", remedy=_REMEDY,
+    )  # fmt: skip
+    forward = _unit(np.cross([0.0, 1.0, 0.0], right))
+    return _UprightPose(x, frames, right, forward, doubt if asymmetry > _MAX_ASYMMETRY_DEG else None)
 
 
 def _turn_upright(rest: NDArray, found: Recorded) -> NDArray:

@@ -1,16 +1,19 @@
 """`kinefit export` and `kinefit retarget`."""
 
+from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
 import pygltflib as gl
 import pytest
 from click.testing import CliRunner
+from tests.readers.skeletons.bvh_variants import any_frames, write_variant
 
 import kinefit
 from kinefit.bodies import load_body
 from kinefit.cli import main
 from kinefit.exporters import write_bvh, write_motion
+from kinefit.readers.skeletons.bvh import read_bvh
 from kinefit.rendering.person_skin import person_skin
 from kinefit.simulation import cut, squat_and_wave
 
@@ -128,6 +131,17 @@ def test_a_recorded_skeleton_becomes_a_motion_of_the_humanoid(motion, tmp_path, 
     walk = kinefit.read_motion(tmp_path / "w.npz")
     assert (walk.rate, walk.body.name) == (12.0, "humanoid")
     assert f"{len(walk)} frames at 12 Hz" in told.stdout
+
+
+def test_a_recorded_skeleton_of_another_unit_and_a_doubtful_zero(tmp_path, data_dir):
+    wave = read_bvh(data_dir("motion_animateddrawings_bvh") / "wave_hello.bvh")
+    wave = replace(wave, Ts_world_joint=wave.Ts_world_joint[[0, 388]])
+    path = write_variant(wave, tmp_path / "w.bvh", any_frames(wave), unit=0.3048)
+    told = run("retarget", path)
+    assert told.exit_code == 2 and "kinefit retarget --unit" in told.stderr
+    told = run("retarget", path, "--unit", "ft", "--up", "z")
+    assert told.exit_code == 0 and "zero as in frame 2" in told.stdout
+    assert np.ptp(kinefit.read_motion(tmp_path / "w.npz").positions()[0, :, 1]) == pytest.approx(1.7, abs=0.15)
 
 
 def test_a_skeleton_of_no_known_family_is_told(motion, tmp_path):

@@ -55,6 +55,8 @@ def test_known_positions(read):
     np.testing.assert_allclose(motion.positions[1] / UNIT, [[1, 3, 3], [1, 3, 3], [1, 3, 0], [0, 3, 0]], atol=1e-12)
     np.testing.assert_allclose(motion.offsets / UNIT, [[0, 1, 0], [0, 0, 0], [3, 0, 0], [0, 1, 0]])
     np.testing.assert_allclose(read(unit=1.0).positions, motion.positions / UNIT, atol=1e-12)
+    np.testing.assert_allclose(read(unit="cm").positions, 0.01 * motion.positions / UNIT, atol=1e-12)
+    assert read(up="z").up == "z"
 
 
 def test_skeleton(tmp_path):
@@ -101,7 +103,7 @@ def test_translating_bone(read):
     ("old", "new", "message"),
     [
         (":bonedata", ":bones", "no section :bonedata"),
-        ("length 0.5", "length 0", "unit of length is not positive"),
+        ("length 0.5", "length 0", "unit 0.0 is not a length"),
         ("direction 2 0 0", "direction 2 0", "line 16: 2 numbers instead of 3"),
         ("direction 2 0 0", "direction 0 0 0", "bone 'arm' has no direction"),
         ("direction 2 0 0", "direction nan 0 0", "line 16: holds a value that is not finite"),

@@ -119,6 +119,23 @@ def test_position_channels_of_a_joint(write, knee, expected):
     np.testing.assert_allclose(read_bvh(write(text), unit=1.0).positions[0, 1], expected)
 
 
+def test_positions_in_the_channels_give_the_lengths_of_bones(write):
+    """Where OFFSETs are zero, and where a bone is opposite to its OFFSET."""
+    text = SMALL.replace("CHANNELS 1 X", "CHANNELS 4 Xposition Yposition Zposition X").replace("0 -40 0", "{}")
+    text = text[: text.index("1 2 3")].replace("Frames: 2", "Frames: 1") + "0 0 0 0 0 0 1 41 0 0\n"
+    for offset in ("0 0 0", "0 -40 0"):
+        motion = read_bvh(write(text.replace("{}", offset)), unit="cm")
+        np.testing.assert_allclose(motion.offsets[1], [0.01, 0.41, 0.0])
+        np.testing.assert_allclose(motion.positions[0, 1], [0.01, 0.41, 0.0])
+
+
+def test_a_world_whose_vertical_axis_points_down(write):
+    text = SMALL.replace("left knee", "left foot").replace("hips", "head").replace("90 0 0 90", "0 0 0 0")
+    assert read_bvh(write(text)).up == "y"
+    text = text.replace("0 -40 0", "0 40 0").replace("0 -50 0", "0 50 0")
+    assert read_bvh(write(text), unit=0.01).up == "-y"
+
+
 @pytest.mark.parametrize(("root", "height"), [("300 92 -400", 92.0), ("300 -3 -400", 92.0)])
 def test_position_channels_of_the_root(write, root, height):
     text = SMALL.replace("OFFSET 0 0 0", "OFFSET 0 95 0", 1)
@@ -206,7 +223,7 @@ def test_missing_and_binary_files(tmp_path, write):
         read_bvh(write(b"HIERARCHY\0\0"))
     with pytest.raises(FileError, match="not a length"):
         read_bvh(write(SMALL), unit=-1.0)
-    with pytest.raises(FileError, match="not an axis"):
+    with pytest.raises(FileError, match="no vertical axis 'w'"):
         read_bvh(write(SMALL), unit=1.0, up="w")
 
 

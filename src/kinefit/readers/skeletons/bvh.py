@@ -46,9 +46,10 @@ def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str =
     """Read a BVH file.
 
     Rotation channels multiply from left to right in the order of the file. Position channels replace the joint's
-    OFFSET in some programs' files and are added to it in others'; the reader takes whichever is nearer to the
-    values (for the root: in height). The rest pose has all angles zero; a person may be unable to take it. Where
-    joints have position channels, its bones are the medians of those: some programs write OFFSETs of zero.
+    OFFSET in some programs' files and are added to it in others'; the reader takes them as replaced where their
+    lengths are nearer to the OFFSET's than to zero (for the root: their height). The rest pose has all angles zero;
+    a person may be unable to take it. Where joints have position channels, its bones are the medians of those, as
+    some programs write OFFSETs of zero.
 
     Parameters
     ----------
@@ -248,9 +249,9 @@ def _local_poses(joints: Sequence[_BvhJoint], values: NDArray) -> NDArray:
 
 
 def _is_added(positions: NDArray, offset: NDArray) -> bool:
-    """Whether position channels (F, P) are added to the OFFSET (P,), not in place of it."""
-    from_origin = np.median(np.linalg.norm(positions, axis=1))
-    return bool(from_origin <= np.median(np.linalg.norm(positions - offset, axis=1)))
+    """Whether position channels (F, P) are added to the OFFSET (P,), not in place of it: then they are not as long."""
+    lengths = np.linalg.norm(positions, axis=1)
+    return bool(np.median(lengths) <= np.median(np.abs(lengths - np.linalg.norm(offset))))
 
 
 def _root_shift(root: _BvhJoint, values: NDArray, up: str) -> NDArray:
@@ -284,7 +285,9 @@ def _human_unit(names: Sequence[str], parents: Sequence[int], offsets: NDArray, 
         raise FileError(
             f"the skeleton is {height:.4g} units tall: no known unit makes that a person",
             file=path,
-            remedy="Give the unit (--unit cm; in Python unit=0.01) if the person is as tall as that.",
+            remedy="Give the unit: `kinefit retarget --unit cm`; in Python unit=0.01."
+            if height > 0
+            else "Export the skeleton again, with the lengths of its bones.",
         )
     return unit
 
