@@ -50,6 +50,7 @@ PEERS: dict[str, Peer] = {
     "mink": Peer(*_MUJOCO, "mujoco_mink", ("mink",)),
     "opensim": Peer("opensim", (*_BASE, "opensim==4.6"), "opensim", "opensim_ik"),
     "opensim_takes": Peer("opensim", (*_BASE, "opensim==4.6"), "opensim", "opensim_takes"),
+    "opensim_sets": Peer("opensim", (*_BASE, "opensim==4.6"), "opensim", "opensim_sets"),
     "opensim_formats": Peer("opensim", (*_BASE, "opensim==4.6"), "opensim", "opensim_formats"),
     "blender_formats": Peer("blender", ("bpy==5.0.1",), "bpy", "blender_formats", pythons=("3.11",)),
     "pyvale": Peer("pyvale", ("pyvale==2026.10.2",), "pyvale.dic", "pyvale_dic"),
