@@ -199,7 +199,7 @@ def run() -> None:
         if not reason:
             apart = {n: [abs(found[n][key] - own[n]) for key in ("rms_mm", "own_angles_mm")] for n in own}
             for name, (solved, same) in apart.items():
-                print(f"# {name}: {own[name]:.2f} mm; OpenSim differs by {solved:.2f} mm, at kinefit's angles {same:.4f}")
+                print(f"# {name}: {own[name]:.2f} mm; OpenSim off by {solved:.2f}, at kinefit's angles {same:.4f}")
             worst = max(map(max, apart.values()))
     figure("faults_users_osim_rms", worst, "mm", "<= 0.5", reason)
 

@@ -16,12 +16,8 @@ from kinefit.motion import rotation_between_up
 from kinefit.observations import SkeletonMotion
 
 _MIN_BONE_LENGTH = 0.005  # [m]: a shorter bone has no direction
-_CHAINS = tuple(
-    (f"{bone}_{s}", f"{far}_{s}")
-    for bone, far in (("thigh", "shank"), ("shank", "foot"), ("upperarm", "forearm"), ("forearm", "hand"))
-    for s in SIDES
-)
-_LEGS = _CHAINS[:4]
+_FAR = {"thigh": "shank", "shank": "foot", "foot": "toes", "upperarm": "forearm", "forearm": "hand"}
+_CHAINS = tuple((f"{bone}_{s}", f"{far}_{s}") for bone, far in _FAR.items() for s in SIDES)
 _MAX_REST_DEG = 10.0  # of thighs and shanks in an upright rest pose, forward or backward of the vertical
 _MAX_TRUNK_DEG = 25.0  # likewise of the line from hips to neck, which leans backward by 14 degrees in CMU's skeletons
 _MAX_OFF_AXIS_DEG = 4.0  # nearer to one of the axes, a rest pose stands along that axis
@@ -138,10 +134,7 @@ def bone_directions(skeleton: SkeletonMotion, names: Mapping[str, str] | None = 
     else:
         bones["head"], across["head"] = end("head_top", "head") - neck, turned("head", "right")
     for s in SIDES:
-        chain = {
-            "thigh": "shank", "shank": "foot", "foot": "toes", "upperarm": "forearm", "forearm": "hand",
-        }  # fmt: skip
-        bones |= {f"{bone}_{s}": joint[f"{far}_{s}"] - joint[f"{bone}_{s}"] for bone, far in chain.items()}
+        bones |= {f"{bone}_{s}": joint[f"{far}_{s}"] - joint[f"{bone}_{s}"] for bone, far in _FAR.items()}
         bones[f"toes_{s}"] = end(f"toe_end_{s}", f"toes_{s}") - joint[f"toes_{s}"]
         bones[f"clavicle_{s}"] = joint[f"upperarm_{s}"] - neck
         bones[f"hand_{s}"] = end(f"knuckle_{s}", f"hand_{s}") - joint[f"hand_{s}"]
@@ -182,10 +175,11 @@ def _upright_pose(skeleton: SkeletonMotion, found: Recorded, positions: NDArray,
     Positions (F, J, 3) and rotations (F, J, 3, 3) are those of the frames, y up.
     """
     for bone, far in _CHAINS:
-        bone_in_joint = _unit(_local(positions, rotations, found.joints[bone], found.joints[far]))
+        joint, end = found.joints[bone], found.joints[far]
+        bone_in_joint = _unit(np.einsum("fji,fj->fi", rotations[:, joint], positions[:, end] - positions[:, joint]))
         if np.percentile(_angles(bone_in_joint, np.median(bone_in_joint, axis=0)), 90) > _MAX_BONE_TURN_DEG:
             raise ObservationError(
-                f"the joint '{skeleton.names[found.joints[bone]]}' does not rotate with its bone: the file has "
+                f"the joint '{skeleton.names[joint]}' does not rotate with its bone: the file has "
                 "positions alone, which leave the rotation of head and hands open", file=skeleton.source or None,
                 remedy="Export the motion again, with the rotations of all joints.",
             )  # fmt: skip
@@ -217,7 +211,8 @@ def _turn_upright(rest: NDArray, found: Recorded) -> NDArray:
     """(3, 3) smallest rotation of a rest pose (J, 3) that brings the line from ankles to hips upright (y)."""
     hip_l, hip_r, foot_l, foot_r = (rest[found.joints[name]] for name in ("thigh_l", "thigh_r", "foot_l", "foot_r"))
     across = _unit(hip_r - hip_l)
-    up = np.nan_to_num(_unit(hip_l + hip_r - foot_l - foot_r - ((hip_l + hip_r - foot_l - foot_r) @ across) * across))
+    legs = hip_l + hip_r - foot_l - foot_r
+    up = np.nan_to_num(_unit(legs - (legs @ across) * across))
     axis = np.eye(3)[np.argmax(np.abs(up))] * np.sign(up[np.argmax(np.abs(up))])
     return se3.shortest_turn(axis if _angles(up, axis) < _MAX_OFF_AXIS_DEG else up, np.array([[0.0, 1.0, 0.0]]))[0]
 
@@ -236,15 +231,10 @@ def _leg_angle(x: NDArray, found: Recorded) -> NDArray:
         ahead, above = _unit(np.stack([np.sum(v * forward, axis=1), v[:, 1]], axis=1)).T  # NaN of a lateral bone
         return np.degrees(np.arctan2(ahead, above))
 
-    parts = [np.degrees(np.arcsin(right[:, 1])), *(sagittal(joint[bone] - joint[far]) for bone, far in _LEGS)]
+    parts = [np.degrees(np.arcsin(right[:, 1])), *(sagittal(joint[bone] - joint[far]) for bone, far in _CHAINS[:4])]
     trunk = sagittal(joint["neck"] - 0.5 * (joint["thigh_l"] + joint["thigh_r"]))
     worst = np.abs(parts).max(axis=0)
     return np.where(np.isfinite(worst) & (np.abs(trunk) < _MAX_TRUNK_DEG), worst, np.inf)
-
-
-def _local(positions: NDArray, rotations: NDArray, joint: int, far: int) -> NDArray:
-    """(F, 3) [m] position of a joint in the frame of another one."""
-    return np.einsum("fji,fj->fi", rotations[:, joint], positions[:, far] - positions[:, joint])
 
 
 def _angles(a: NDArray, b: NDArray) -> NDArray:
@@ -254,8 +244,7 @@ def _angles(a: NDArray, b: NDArray) -> NDArray:
 
 def _upright(skeleton: SkeletonMotion, found: Recorded, pose: _UprightPose | None) -> dict[str, NDArray]:
     vectors = np.array(found.upright)
-    if found.upright is None:
-        assert pose is not None
+    if found.upright is None and pose is not None:
         joints, x = found.joints, pose.positions
         hips = x[[joints["thigh_l"], joints["thigh_r"]]].mean(axis=0)
         top = joints.get("head_top", _child(skeleton, joints["head"]))

@@ -109,8 +109,8 @@ def fit_file(
             files["osim"] = own / results.NAMES["osim"]
         if "markers" in formats:
             R = rotation_between_up(motion.up, "y")
-            names = tuple(plain_names(markers.names))  # as body.osim has them
-            seen = replace(markers, names=names, positions=markers.positions @ R.T, up="y")
+            names, x = tuple(plain_names(markers.names)), markers.positions @ R.T  # the names that body.osim has
+            seen = replace(markers, names=names, positions=x, up="y")
             write_markers(seen, own / _MARKERS, unit="m")
             files["markers"] = own / _MARKERS
         found[person] = motion, files

@@ -25,13 +25,12 @@ Examples:
     "--names-table", "table", type=click.Path(path_type=Path), metavar="TOML",
     help="Lines such as thigh_l = \"JointName\", for joints that are not recognised by name.",
 )
-@click.option("--unit", metavar="UNIT", help="Unit of length: m, cm, mm, in, or metres.  [default: found by the size]")
+@click.option("--unit", metavar="UNIT", default="auto", help="Unit of length: m, cm, mm, in.  [default: by the size]")
 @click.option("--up", metavar="AXIS", default="auto", help="Vertical axis: x, y, z, -x ...  [default: feet to head]")
 @_screen.verbose_option
 def retarget(
-    recording: Path, asf: Path | None, out: Path | None, rate: float | None, table: Path | None, unit: str | None,
-    up: str,
-) -> None:  # fmt: skip
+    recording: Path, asf: Path | None, out: Path | None, rate: float | None, table: Path | None, unit: str, up: str
+) -> None:
     """Retarget a recorded motion to the humanoid, by the directions of its bones."""
     from kinefit.cli._results import check_file
     from kinefit.exporters import write_motion
@@ -48,9 +47,7 @@ def retarget(
         raise click.UsageError("An .amc file needs its skeleton: give --asf FILE. With a .bvh file, leave out --asf.")
     out = out or recording.with_suffix(".npz")
     check_file(out)
-    skeleton = (
-        read_amc(asf, recording, unit=unit, up=up) if asf else read_bvh(recording, unit=unit or "auto", up=up)
-    )
+    skeleton = read_amc(asf, recording, unit=unit, up=up) if asf else read_bvh(recording, unit=unit, up=up)
     with _screen.bars() as step:
         step("retargeting", 0, 0)
         motion = retarget_motion(skeleton, rate=rate, names=read_names(table) if table else None)

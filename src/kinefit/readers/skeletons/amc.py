@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit.errors import FileError, check_choice, choices
-from kinefit.motion import UP_AXES
+from kinefit.errors import FileError, choices
 from kinefit.observations import SkeletonMotion
 from kinefit.readers.skeletons.asf import AsfSkeleton, Bone, read_asf
-from kinefit.readers.skeletons.common import euler_rotations, joint_poses, parse_numbers, read_text, up_axis
+from kinefit.readers.skeletons.common import euler_rotations, joint_poses, parse_numbers, read_text, vertical_axis
 
 
 @checked
@@ -49,7 +48,6 @@ def read_amc(
     FileError
         If a file is missing, truncated or contradicts the other, or holds a value that is not finite.
     """
-    check_choice("vertical axis", up, (*UP_AXES, "auto"), FileError, file=amc_path)
     skeleton = read_asf(asf_path, unit=unit)
     if not 0 < rate < np.inf:
         raise FileError(f"the rate {rate} is not positive", file=amc_path, remedy="Give frames a second.")
@@ -74,7 +72,7 @@ def read_amc(
         offsets=offsets,
         rate=float(rate),
         Ts_world_joint=Ts_world_joint,
-        up=up_axis(names, Ts_world_joint[..., :3, 3]) if up == "auto" else up,
+        up=vertical_axis(up, names, Ts_world_joint[..., :3, 3], amc_path),
         source=fspath(amc_path),
     )
 

@@ -82,7 +82,7 @@ def read_asf(path: str | PathLike[str], *, unit: float | str | None = None) -> A
             raise FileError(f"holds no section :{name}", file=path, remedy="Give a whole ASF file.")
     units = {words[0].lower(): (n, words[1]) for n, words in sections.get("units", []) if len(words) > 1}
     degrees = units.get("angle", (0, "deg"))[1].lower().startswith("deg")
-    if unit is None:
+    if unit is None or unit == "auto":
         line, length = units.get("length", (0, "1.0"))
         (scale,) = parse_numbers([length], file=path, line=line)
         unit = _INCH / scale if scale > 0 else 0.0

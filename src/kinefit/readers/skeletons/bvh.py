@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit.errors import FileError, check_choice
-from kinefit.motion import UP_AXES
+from kinefit.errors import FileError
 from kinefit.observations import SkeletonMotion
 from kinefit.readers.skeletons.common import (
     euler_rotations,
@@ -21,7 +20,7 @@ from kinefit.readers.skeletons.common import (
     landmarks,
     parse_numbers,
     read_text,
-    up_axis,
+    vertical_axis,
 )
 
 UNITS = (0.001, 0.01, 0.0254, 0.0254 / 0.45, 1.0)
@@ -30,6 +29,7 @@ UNITS = (0.001, 0.01, 0.0254, 0.0254 / 0.45, 1.0)
 _TYPICAL_STATURE = 1.7  # [m]
 _MIN_STATURE = 1.0  # [m] a child of six
 _MAX_STATURE = 2.2  # [m]
+_UNIT_REMEDY = "Give the unit: `kinefit retarget --unit cm`; in Python unit=0.01."
 _HEAD_TO_ANKLE_SHARE = 0.85  # of the stature: length of the chain of bones from the head's joint to the ankle
 
 
@@ -73,7 +73,6 @@ def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str =
         Missing, truncated, not BVH, numbers that are not finite, or no unit with a plausible stature.
     """
     text = read_text(path, "BVH")
-    check_choice("vertical axis", up, (*UP_AXES, "auto"), FileError, file=path)
     hierarchy, *motion = re.split(r"^[ \t]*MOTION\b", text, maxsplit=1, flags=re.M | re.I)
     joints = _read_hierarchy(hierarchy, path)
     if not motion:
@@ -88,8 +87,7 @@ def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str =
     offsets[0] = joints[0].offset
     scale = _human_unit(names, parents, offsets, path) if unit == "auto" else given_unit(unit, path)
     Ts_world_joint = joint_poses(parents, Ts_parent_joint)
-    if up == "auto":
-        up = up_axis(names, Ts_world_joint[..., :3, 3])
+    up = vertical_axis(up, names, Ts_world_joint[..., :3, 3], path)
     Ts_world_joint[..., :3, 3] += _root_shift(joints[0], values, up)
     Ts_world_joint[..., :3, 3] *= scale
     return SkeletonMotion(
@@ -285,9 +283,7 @@ def _human_unit(names: Sequence[str], parents: Sequence[int], offsets: NDArray, 
         raise FileError(
             f"the skeleton is {height:.4g} units tall: no known unit makes that a person",
             file=path,
-            remedy="Give the unit: `kinefit retarget --unit cm`; in Python unit=0.01."
-            if height > 0
-            else "Export the skeleton again, with the lengths of its bones.",
+            remedy=_UNIT_REMEDY if height > 0 else "Export the skeleton again, with the lengths of its bones.",
         )
     return unit
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from contextlib import suppress
 from os import PathLike
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import FileError
+from kinefit.errors import FileError, check_choice
 from kinefit.motion import UP_AXES
 from kinefit.readers.units import LENGTHS, worth
 
@@ -101,23 +100,25 @@ def landmarks(names: Sequence[str]) -> tuple[int | None, list[int]]:
     return (heads[0] if heads else None), feet
 
 
-def up_axis(names: Sequence[str], positions: NDArray) -> str:
-    """The axis, such as "y" or "-z", along which the head is above the feet on average in positions (F, J, 3).
+def vertical_axis(up: str, names: Sequence[str], positions: NDArray, path: str | PathLike[str]) -> str:
+    """The given axis, such as "y" or "-z"; for "auto" the one along which the head is above the feet on average.
 
-    "y" if no joint is named as head and feet.
+    Positions are (F, J, 3). "y" if no joint is named as head and feet. Raises FileError for another axis.
     """
+    check_choice("vertical axis", up, (*UP_AXES, "auto"), FileError, file=path)
     head, feet = landmarks(names)
-    if head is None or not feet:
-        return "y"
+    if up != "auto" or head is None or not feet:
+        return "y" if up == "auto" else up
     away = (positions[:, head] - positions[:, feet].mean(axis=1)).mean(axis=0)
     return max(UP_AXES, key=lambda axis: float(away @ UP_AXES[axis]))
 
 
 def given_unit(unit: float | str, path: str | PathLike[str]) -> float:
     """Metres of a unit of length, given by its name or in metres; raises FileError if it is no length."""
-    value = worth(unit, LENGTHS)
-    with suppress(ValueError):
-        value = float(unit) if value is None else value
-    if value is None or not 0 < value < math.inf:
+    try:
+        value = worth(unit, LENGTHS) or float(unit)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
         raise FileError(f"unit {unit!r} is not a length", file=path, remedy="Give m, cm, mm, in, or metres per unit.")
     return value
