@@ -270,7 +270,7 @@ def test_vicon_lenses_lead_from_distorted_to_ideal(tmp_path, square, k, second):
     ("made", "words"),
     [
         ({"frames": 2}, "2 key frames: the camera moves"),
-        ({"ORIENTATION": "0 0 0 0"}, "zero quaternion"),
+        ({"ORIENTATION": "0 0 0 0"}, "quaternion of length 0, not 1"),
         ({"ORIENTATION": None}, "camera 01, ORIENTATION.*4 numbers"),
         ({"POSITION": "1 2"}, "camera 01, POSITION.*3 numbers"),
         ({"FOCAL_LENGTH": "nan"}, "camera 01, FOCAL_LENGTH.*finite"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -9,8 +10,8 @@ from numpy.typing import NDArray
 
 from kinefit.errors import CalibrationError, choices
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.geometry.se3 import quaternion, rotation_from_quaternion
-from kinefit.readers.calibration.tables import build_camera, rigid
+from kinefit.geometry.se3 import quaternion
+from kinefit.readers.calibration.tables import build_camera, rigid, rotation_of
 
 # Parameters of every model, in COLMAP's order.
 _MODELS = {
@@ -27,6 +28,9 @@ _MODELS = {
 _RADTAN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _FISHEYE = ("k1", "k2", "k3", "k4")
 
+_POINTS = re.compile(r"(?:[-+.\deE]++\s++[-+.\deE]++\s++(?:-1|\d++)(?:\s++|$))+")
+"""X Y POINT3D_ID of each point; an image's line ends in a name, and has ten parts where that has no blank."""
+
 Intrinsics = tuple[tuple[int, int], NDArray, NDArray, str]
 
 
@@ -42,9 +46,8 @@ def colmap_cameras(folder: Path) -> list[Camera]:
     """
     intrinsics = _cameras(folder / "cameras.txt")
     path = folder / "images.txt"
-    images = _lines(path)[::2]  # every other line lists the points of the image above it
     entries = []
-    for number, line in images:
+    for number, line in _images(path):
         parts = line.split(maxsplit=9)
         place = f"line {number}"
         values = _floats(parts[:8], path, place)
@@ -53,24 +56,20 @@ def colmap_cameras(folder: Path) -> list[Camera]:
                 "not an image of a known camera",
                 file=path,
                 place=place,
-                remedy="Each image needs its line and a line (possibly empty) of points; cameras: "
-                + ", ".join(intrinsics)
-                + ".",
+                remedy="An image's line is: ID QW QX QY QZ TX TY TZ CAMERA_ID NAME. Its points may follow in one line "
+                f"of X Y POINT3D_ID each. Cameras: {', '.join(intrinsics)}.",
             )
         entries.append((place, values, intrinsics[parts[8]], PurePosixPath(parts[9])))
-    names = _names([image for *_, image in entries])
+    names = image_names([image for *_, image in entries])
     cameras = []
     for name, (place, values, (size, K, k, model), _) in zip(names, entries):
-        quaternion = values[1:5]
-        if not np.linalg.norm(quaternion) > 0:
-            raise CalibrationError("a zero quaternion", file=path, place=place, remedy="Export the model again.")
-        T = rigid(rotation_from_quaternion(quaternion), values[5:8], path, place)
+        T = rigid(rotation_of(values[1:5], path, place), values[5:8], path, place)
         cameras.append(build_camera(name, size, K, k, model, T, path))
     return cameras
 
 
-def _names(images: list[PurePosixPath]) -> list[str]:
-    """Names of the cameras: file names without folder and ending if these are unique, else with the folder."""
+def image_names(images: list[PurePosixPath]) -> list[str]:
+    """Names of the cameras of images: file names without folder and ending, or with the folder if two are equal."""
     stems = [image.stem for image in images]
     return stems if len(set(stems)) == len(stems) else [str(image.with_suffix("")) for image in images]
 
@@ -91,10 +90,10 @@ def colmap_texts(rig: Rig, folder: Path, metres_per_unit: float) -> dict[str, st
         Images that share a camera and now differ in their lens; a model that cannot be read.
     """
     path = folder / "images.txt"
-    images = [(number, line.split(maxsplit=9)) for number, line in _lines(path)[::2]]
+    images = [(number, line.split(maxsplit=9)) for number, line in _images(path)]
     texts = {name: (folder / name).read_text(encoding="utf-8").splitlines() for name in ("cameras.txt", "images.txt")}
     owners: dict[str, Camera] = {}
-    for name, (number, parts) in zip(_names([PurePosixPath(parts[9]) for _, parts in images]), images):
+    for name, (number, parts) in zip(image_names([PurePosixPath(parts[9]) for _, parts in images]), images):
         if name not in rig:
             continue
         camera, owner = rig[name], owners.setdefault(parts[8], rig[name])
@@ -154,17 +153,30 @@ def _cameras(path: Path) -> dict[str, Intrinsics]:
     return found
 
 
+def _images(path: Path) -> list[tuple[int, str]]:
+    """Lines of images with their numbers; after each, one line of its points is left out, where there is one."""
+    found = []
+    may_be_points = False
+    for number, line in _lines(path):
+        if line.strip():
+            may_be_points = may_be_points and _POINTS.fullmatch(line.strip()) is not None
+            found += [] if may_be_points else [(number, line)]
+            may_be_points = not may_be_points
+    return found
+
+
 def _lines(path: Path) -> list[tuple[int, str]]:
-    """Lines with their numbers, without comments; empty lines are kept, as they mean "no points"."""
+    """Lines with their numbers, without comments."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError):
         raise CalibrationError(
             "cannot be read as text",
             file=path,
-            remedy="Convert the model: colmap model_converter --output_type TXT.",
+            remedy=f"Convert a binary model: colmap model_converter --input_path {path.parent} --output_path "
+            f"{path.parent} --output_type TXT.",
         ) from None
-    return [(i, line) for i, line in enumerate(text.splitlines(), 1) if not line.startswith("#")]
+    return [(i, line) for i, line in enumerate(text.splitlines(), 1) if not line.lstrip().startswith("#")]
 
 
 def _floats(parts: list[str], path: Path, place: str) -> NDArray:

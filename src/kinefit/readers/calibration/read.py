@@ -20,17 +20,11 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
 from kinefit.readers.calibration.colmap import colmap_cameras
 from kinefit.readers.calibration.file_storage import parse_xml
+from kinefit.readers.calibration.keys import find
 from kinefit.readers.calibration.matlab import matlab_tree, read_mat
 from kinefit.readers.calibration.qualisys import qualisys_cameras
-from kinefit.readers.calibration.tables import (
-    Sizes,
-    camera_from_table,
-    camera_tables,
-    read_table,
-    stated_unit,
-    stereo_named,
-    stereo_tables,
-)
+from kinefit.readers.calibration.tables import Sizes, camera_from_table, read_table
+from kinefit.readers.calibration.trees import stereo_tables, tables_of
 from kinefit.readers.calibration.vicon import vicon_cameras
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.ros.rig import mcap_rig
@@ -45,6 +39,15 @@ MAX_CALIBRATION_BYTES = 2_000_000
 PAIRS = (("intrinsics", "extrinsics"), ("intri", "extri"))
 """Stems of two files that form one calibration: OpenCV's stereo calibration, EasyMocap."""
 
+_FOREIGN = {
+    "VIC-3D": (r"<!DOCTYPE\s+vpml|<vpml\b|<orientation>", "Its angles and lens have conventions of their own"),
+    "DICe": (r"DICe_xml_calibration", "kinefit does not read its parameters"),
+    "Agisoft Metashape": (
+        r"<document\b[^>]*>.*<sensors?\b|<calibration>\s*<projection>",
+        "In Metashape, export the cameras in COLMAP's format, as text, and give that folder",
+    ),
+}
+"""Programs whose XML is not read: what marks it, and the first words of what to do."""
 _MAX_CAMERAS = 1000  # of a rig; the largest domes have 500
 _XML_MAKERS = {"qualisys": qualisys_cameras, "vicon": vicon_cameras}  # both in millimetres
 _MAX_ORIGIN_DISTANCE = 200.0  # [m] a camera farther from the world's origin is not in metres
@@ -96,13 +99,13 @@ def read_calibration(
         return mcap_rig(recording[0])
     if path.is_dir():
         return _read_folder(path, unit, image_size, exteriors)
-    if path.name in ("cameras.txt", "images.txt"):
+    if path.stem in ("cameras", "images") and path.suffix in (".txt", ".bin"):
         return _read_folder(path.parent, unit, image_size, exteriors)
     kind, tree = _parse(path)
     if kind in _XML_MAKERS:
         return _rig(_XML_MAKERS[kind](tree, path), path, "mm" if unit == "auto" else unit)
     tables = [(name, table, path) for name, table in tables_of(tree, path.stem, path, exteriors)]
-    return _rig_of(tables, path, _chosen_unit(tree, unit), image_size, exteriors)
+    return _rig_of(tables, path, unit, image_size, exteriors)
 
 
 def read_opencv_stereo(
@@ -120,7 +123,7 @@ def read_opencv_stereo(
     path = Path(intrinsics)
     tree = _tree(path) | _tree(Path(extrinsics))
     tables = stereo_tables(tree, path, names)
-    return _rig_of([(name, table, path) for name, table in tables], path, _chosen_unit(tree, unit), image_size)
+    return _rig_of([(name, table, path) for name, table in tables], path, unit, image_size)
 
 
 @checked
@@ -181,21 +184,13 @@ def _read_folder(folder: Path, unit: str | float, image_size: Sizes | None, exte
     sources = calibration_sources(folder)
     if len(sources) == 1 and len(sources[0][1]) == 1:
         return read_calibration(sources[0][1][0], unit=unit, image_size=image_size, exteriors=exteriors)
-    tables, units = [], set()
+    tables = []
     for name, group in sources:
         tree: dict = {}
         for file in group:
             tree |= _tree(file)
-        found = tables_of(tree, name, group[0], exteriors)
-        tables += [(camera, table, group[0]) for camera, table in found]
-        units |= {_chosen_unit(tree, unit)} if found else set()
-    if len(units) > 1:
-        raise CalibrationError(
-            f"its files state different units: {', '.join(sorted(map(str, units)))}",
-            file=folder,
-            remedy="Pass the unit that all of them have.",
-        )
-    return _rig_of(tables, folder, units.pop() if units else unit, image_size, exteriors)
+        tables += [(camera, table, group[0]) for camera, table in tables_of(tree, name, group[0], exteriors)]
+    return _rig_of(tables, folder, unit, image_size, exteriors)
 
 
 def calibration_sources(path: Path) -> list[tuple[str, list[Path]]]:
@@ -219,14 +214,6 @@ def _calibration_files(folder: Path) -> list[Path]:
     return tables or files
 
 
-def tables_of(tree: dict, name: str, path: Path, exteriors: bool = True) -> list[tuple[str, dict]]:
-    """All tables of a parsed file that hold a camera, with the camera's name."""
-    tree = stereo_named(tree)
-    if "M1" in tree:
-        return stereo_tables(tree if exteriors else {"R": [0, 0, 0], "T": [0, 0, 0]} | tree, path)
-    return camera_tables(tree, name)
-
-
 def _rig_of(
     tables: list[tuple[str, dict, Path]],
     path: Path,
@@ -237,11 +224,12 @@ def _rig_of(
     if len(tables) > _MAX_CAMERAS:
         problem = f"{len(tables)} cameras, more than {_MAX_CAMERAS}"
         raise CalibrationError(problem, file=path, remedy="Remove the cameras that recorded nothing.")
+    pose_needed = len(tables) > 1 if exteriors else None
     cameras = [
-        camera_from_table(name, table, file, image_size=image_size, pose_needed=exteriors and len(tables) > 1)
+        camera_from_table(name, table, file, image_size=image_size, pose_needed=pose_needed)
         for name, table, file in tables
     ]
-    return _rig(cameras, path, unit)
+    return _rig(cameras, path, _chosen_unit([table for _, table, _ in tables], unit, path))
 
 
 def _parse(path: Path) -> tuple[str, Any]:
@@ -273,6 +261,12 @@ def _read_text(path: Path) -> str:
 
 def recognise(text: str, path: Path) -> str:
     """Detect "toml", "json", "yaml", "xml" (OpenCV), "qualisys" or "vicon" from the content; else raise FileError."""
+    for program, (mark, remedy) in _FOREIGN.items():
+        if text.lstrip().startswith("<") and re.search(mark, text, re.S | re.I):
+            raise CalibrationError(
+                "kinefit does not read this format", file=path, place=f"calibration of {program}",
+                remedy=f"{remedy}. Or write K, dist, R, t and size of each camera as JSON (docs/calibration.md).",
+            )  # fmt: skip
     start = text.lstrip()
     if start.startswith("<"):
         tag = _xml_root(text, path).tag.lower()
@@ -297,13 +291,19 @@ def _xml_root(text: str, path: Path) -> ElementTree.Element:
         raise CalibrationError(f"broken XML: {error}", file=path, remedy=remedy) from None
 
 
-def _chosen_unit(tree: dict, unit: str | float) -> str | float:
-    return unit if unit != "auto" else (stated_unit(tree) or "auto")
+def _chosen_unit(tables: list[dict], unit: str | float, path: Path) -> str | float:
+    """The unit that is asked for, else that which the tables of all cameras state."""
+    stated = [find(table, "unit") for table in tables] if unit == "auto" else [unit]
+    units = {one if one and type(one) in (str, int, float) else "auto" for one in stated}
+    if len(units) > 1:
+        problem = f"its cameras state different units: {', '.join(sorted(map(str, units)))}"
+        raise CalibrationError(problem, file=path, remedy="Pass the unit that all of them have.")
+    return units.pop() if units else unit
 
 
-def metres_per_unit(tree: dict, unit: str | float, path: Path) -> float:
-    """Metres per unit of length of a parsed file; 1 if it states none."""
-    return _factor(_chosen_unit(tree, unit), path) or 1.0
+def metres_per_unit(tables: list[dict], unit: str | float, path: Path) -> float:
+    """Metres per unit of length of the tables of cameras; 1 if they state none."""
+    return _factor(_chosen_unit(tables, unit, path), path) or 1.0
 
 
 def _factor(unit: str | float, path: Path) -> float | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,46 +14,30 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit._files import parse_toml
 from kinefit.errors import CalibrationError, located
 from kinefit.geometry.camera import Camera
-from kinefit.geometry.se3 import exp_so3, inverse, transform
+from kinefit.geometry.se3 import exp_so3, inverse, rotation_from_quaternion, transform
 from kinefit.readers.calibration.file_storage import storage_of_xml, storage_of_yaml
+from kinefit.readers.calibration.keys import (
+    Table,
+    conventions,
+    find,
+    find_all,
+    kind_of,
+    lens_model,
+    refuse_unread,
+    spelled,
+)
 
-Table = dict[str, Any]
 Sizes = tuple[int, int] | Callable[[str], tuple[int, int] | None]
 """(width, height) [px] of all images, or a function of the camera's name, None where it knows none."""
 
-# Names of each quantity in the formats, lower case, without underscores and blanks.
-_KEYS = {
-    "matrix": (
-        "matrix", "cameramatrix", "cammatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "intrinsicparameters",
-        "k", "m", "mtx",
-    ),
-    "distortion": (
-        "distortions", "distortion", "distortioncoefficients", "distortioncoeffs", "distortionparameters",
-        "distcoeffs", "distcoeff", "distcoef", "distcoefs", "dist", "d",
-    ),
-    "size": ("size", "imagesize", "imgsize", "resolution", "imageresolution", "framesize"),
-    "shape": ("imageshape", "imgshape", "frameshape"),  # as numpy has it: (height, width)
-    "width": ("imagewidth", "imgwidth", "framewidth", "width", "w"),
-    "height": ("imageheight", "imgheight", "frameheight", "height", "h"),
-    "rotation": ("rotation", "rotationmatrix", "rotationvector", "r", "rvec", "rot", "rmat", "rotmat"),
-    "translation": ("translation", "translationvector", "t", "tvec"),
-    "pose": (
-        "tcameraworld", "extrinsic", "extrinsics", "extrinsicmatrix", "extrinsicparameters", "rt", "tcw", "w2c",
-        "worldtocamera", "worldtocam", "world2camera", "world2cam",
-    ),
-    "inverse pose": ("tworldcamera", "twc", "c2w", "cameratoworld", "camtoworld", "camera2world", "cam2world"),
-    "model": ("distortionmodel", "model", "cameramodel"),
-    **{key: (key, f"{key[0]}l{key[1]}" if key[0] == "f" else f"pp{key[1]}") for key in ("fx", "fy", "cx", "cy")},
-}  # fmt: skip
 _MAX_NUMBER = 1e12
 """Coefficients of distortion reach millions, and squares must not overflow."""
-_FISHEYE = ("fisheye", "equidistant", "kannalabrandt")
-_OTHER_MODELS = (
-    "omni", "mei", "unified", "doublesphere", "eucm", "division", "fov", "scaramuzza", "ocam", "thinprism", "ftheta",
-    "inverse",
-)  # fmt: skip
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # OpenCV's order
-_OF_PAIR = re.compile(r"(?:(M|K|mtx|camera_?[mM]atrix)|(D|dist|dist_?[cC]oeffs))_?([12])")
+_PARTS_OF_LENS = ("radial", "tangential")
+_OPENGL_AXES = np.diag([1.0, -1.0, -1.0])  # its cameras look along -z with y up
+_MAX_ROTATION = 2 * np.pi + 1e-6  # [rad] of a rotation vector; the shortest one of a rotation has at most pi
+_MAX_STRETCH = 1e-3  # of a rotation's singular values from 1
+_MAX_QUATERNION_ERROR = 0.01  # of its length from 1: two decimals of every part
 _PARSERS: dict[str, Callable[[str], Any]] = {"json": json.loads, "yaml": storage_of_yaml, "xml": storage_of_xml}
 
 
@@ -87,128 +70,10 @@ def _matrix(table: Table) -> Any:
     return np.array(table["data"], dtype=float).reshape([int(n) for n in np.ravel(shape).tolist()]).tolist()
 
 
-def find_all(table: Table, kind: str) -> list[Any]:
-    """Values in a table under any of the names of a quantity, see `_KEYS`."""
-    return [value for key, value in table.items() if re.sub(r"[\W_]", "", str(key)).lower() in _KEYS[kind]]
-
-
-def find(table: Table, kind: str) -> Any:
-    """First value in a table under any of the names of a quantity, see `_KEYS`; None if there is none."""
-    return next(iter(find_all(table, kind)), None)
-
-
-def camera_tables(tree: Any, name: str) -> list[tuple[str, Table]]:
-    """All tables with a camera matrix, and the camera's name (its own, else its key)."""
-    if isinstance(tree, list):
-        inner = [camera_tables(entry, f"{name}_{i}") for i, entry in enumerate(tree)]
-        return [found for group in inner for found in group]
-    if not isinstance(tree, dict):
-        return []
-    for part in ("intrinsics", "intrinsic", "extrinsics", "extrinsic"):  # {"intrinsics": {"K": ...}, "extrinsics": ...}
-        if isinstance(tree.get(part), dict) and not _is_by_camera(tree[part]):
-            tree = {key: value for key, value in tree.items() if key != part} | tree[part]
-    tree = _with_scalars(_by_camera(tree))
-    if find(tree, "matrix") is not None and not isinstance(find(tree, "matrix"), dict):
-        own = tree.get("name") or tree.get("camera_name") or name
-        return [] if tree.get("ignore") else [(str(own), tree)]
-    inner = [camera_tables(value, name if key == "cameras" else str(key)) for key, value in tree.items()]
-    return [found for group in inner for found in group]
-
-
-def _is_by_camera(value: Any) -> bool:
-    """Whether a table has a matrix for each of several cameras: {"cam1": [[...]], "cam2": ...}."""
-    if not isinstance(value, dict) or not value or find(value, "matrix") is not None:
-        return False
-    return all(isinstance(v, list) and len(v) == 3 and isinstance(v[0], list) for v in value.values())
-
-
-def _by_camera(tree: Table) -> Table:
-    """Regroup a table by camera, if its keys contain the cameras' names or its values are tables by camera.
-
-    EasyMocap's intri.yml and extri.yml have keys K_01, dist_01, Rot_01 (R_01 is the same as a vector), T_01, H_01.
-    """
-    matrices = find(tree, "matrix")
-    if _is_by_camera(matrices):
-        parts = {key: value for key, value in tree.items() if isinstance(value, dict)}
-        common = {key: value for key, value in tree.items() if key not in parts}
-        return {name: common | {key: part[name] for key, part in parts.items() if name in part} for name in matrices}
-    names = [key[2:] for key, value in tree.items() if str(key).startswith("K_") and isinstance(value, list)]
-    if not names:
-        return tree
-    ends = {name: f"_{name}" for name in names}
-    return {
-        name: {key.removesuffix(end): value for key, value in tree.items() if key.endswith(end)}
-        for name, end in ends.items()
-    }
-
-
-def _with_scalars(table: Table) -> Table:
-    """The table with fx, fy, cx, cy as a matrix and k1, k2, p1 ... as a distortion, if it has only these."""
-    if "K" in table and "k" in table:  # a matrix and coefficients
-        table = {"distortion" if key == "k" else key: value for key, value in table.items()}
-    pinhole = [find(table, key) for key in ("fx", "fy", "cx", "cy")]
-    if find(table, "matrix") is None and None not in pinhole:
-        table = table | {"matrix": pinhole}
-    given = find(table, "distortion")
-    scalars = given if isinstance(given, dict) else table
-    if (given is None or given is scalars) and "k1" in scalars:
-        names = ("k1", "k2", "k3", "k4") if _is_fisheye(table) else _COEFFICIENTS
-        rest = {key: value for key, value in table.items() if value is not given}
-        table = rest | {"distortion": [scalars.get(key, 0.0) for key in names]}
-    return table
-
-
-def stereo_named(tree: Table) -> Table:
-    """The table with OpenCV's names M1, D1, M2, D2, if it is a stereo pair with R and T; else unchanged."""
-    named = {}
-    for key, value in tree.items():
-        found = _OF_PAIR.fullmatch(str(key))
-        named[f"{'M' if found[1] else 'D'}{found[3]}" if found else key] = value
-    return named if {"M1", "M2", "R", "T"} <= named.keys() else tree
-
-
-def stereo_tables(tree: Table, path: Path, names: tuple[str, str] = ("left", "right")) -> list[tuple[str, Table]]:
-    """The two cameras of OpenCV's stereo calibration; the first is the world. Lacking keys raise CalibrationError."""
-    missing = [key for key in ("M1", "D1", "M2", "D2", "R", "T") if key not in tree]
-    if missing:
-        raise CalibrationError(
-            f"{', '.join(missing)} missing in a stereo calibration",
-            file=path,
-            remedy="Give the folder that holds both intrinsics.yml and extrinsics.yml, or both to read_opencv_stereo.",
-        )
-    poses = (([0, 0, 0], [0, 0, 0]), (tree["R"], tree["T"]))
-    kinds = ("size", "shape", "width", "height", "model")
-    common = {key: value for kind in kinds for key, value in tree.items() if find({key: value}, kind) is not None}
-    common |= {"fisheye_model": tree.get("fisheye_model", False)}
-    return [
-        (name, common | {"matrix": tree[f"M{i}"], "distortion": tree[f"D{i}"], "rotation": R, "translation": t})
-        for i, (name, (R, t)) in enumerate(zip(names, poses), 1)
-    ]
-
-
-def stated_unit(tree: Table) -> str | None:
-    """Unit of length that a file states, or that its program is known to use; None if neither.
-
-    A file states `unit`, alone or under `metadata`. CMU Panoptic Studio (each camera has a `panel` and a `node`) uses
-    centimetres, FreeMoCap (`metadata` has `charuco_square_size`, mostly in mm) millimetres.
-    """
-    metadata = tree.get("metadata")
-    metadata = metadata if isinstance(metadata, dict) else {}
-    for table in (tree, metadata):
-        unit = table.get("unit", table.get("units"))
-        if isinstance(unit, str):
-            return unit
-    cameras = tree.get("cameras")
-    if isinstance(cameras, list) and all(isinstance(c, dict) and {"panel", "node"} <= c.keys() for c in cameras[:1]):
-        return "cm" if cameras else None
-    square = metadata.get("charuco_square_size")
-    return "mm" if isinstance(square, int | float) and square > 1 else None  # 1: in squares of a board
-
-
 def camera_from_table(
-    name: str, table: Table, path: Path, *, image_size: Sizes | None, pose_needed: bool
+    name: str, table: Table, path: Path, *, image_size: Sizes | None, pose_needed: bool | None
 ) -> Camera:
-    """Camera of one table; translation in the file's unit.
+    """Camera of one table; translation in the file's unit. `pose_needed`: None where nothing is asked of its pose.
 
     With a transposed matrix, [[fx, 0, 0], [s, fy, 0], [cx, cy, 1]], points are rows, as in MATLAB before R2022b and in
     JARVIS: x_camera = x_world R + t, so R is transposed, too.
@@ -216,12 +81,15 @@ def camera_from_table(
     Raises
     ------
     CalibrationError
-        No image size; a lens model that OpenCV lacks; a missing pose; entries of a wrong shape.
+        No image size; a lens model that OpenCV lacks; a missing pose; entries of a wrong shape; a key that speaks of
+        the lens, the pose or a convention and that kinefit does not read.
     """
     place = f"camera {name}"
+    model = lens_model(table, path, place)
     K = numbers(find(table, "matrix"), None, path, f"{place}, camera matrix")
     if K.shape == (4,):
-        K = np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1]])
+        skew = numbers(find(table, "skew") or 0.0, (), path, f"{place}, skew")
+        K = np.array([[K[0], skew, K[2]], [0, K[1], K[3]], [0, 0, 1]])
     K = numbers(K, (3, 3), path, f"{place}, camera matrix")
     of_rows = is_transposed(K)
     K = K.T if of_rows else K
@@ -232,17 +100,42 @@ def camera_from_table(
             remedy="Write size = [width, height] next to its matrix, or its video or size into the take's [[camera]] "
             "(from Python: image_size=(width, height)).",
         )  # fmt: skip
-    model = "fisheye" if _is_fisheye(table) else "radtan"
-    named = str(find(table, "model") or "").lower().replace("_", "")
-    if any(word in named for word in _OTHER_MODELS) and find(table, "distortion") is not None:
-        remedy = "Undistort the videos, or calibrate again with OpenCV's model: k1, k2, p1, p2, k3, or its fisheye."
-        raise CalibrationError(f"a lens of the model {find(table, 'model')}", file=path, place=place, remedy=remedy)
-    given = find(table, "distortion")
-    k = numbers([] if given is None else given, None, path, f"{place}, distortion").ravel()
-    allowed = 8 if model == "radtan" else 4
-    if k.size > allowed and not k[allowed:].any():  # OpenCV's unused thin-prism and tilt terms
-        k = k[:allowed]
-    return build_camera(name, size, K, k, model, _pose(table, of_rows, pose_needed, path, place), path)
+    k = _distortion(table, model, path, place)
+    T = _pose(table, of_rows, pose_needed, path, place)
+    refuse_unread(table, path, place, has_lens=k is not None, has_pose=T is not None or pose_needed is None)
+    T = np.eye(4) if T is None else T
+    return build_camera(name, size, K, np.zeros(0) if k is None else k, model, T, path)
+
+
+def _distortion(table: Table, model: str, path: Path, place: str) -> NDArray | None:
+    """Coefficients (k,) of the model in OpenCV's order; None if the table has none."""
+    place = f"{place}, distortion"
+    radial, tangential = (numbers(find(table, kind) or [], None, path, place).ravel() for kind in _PARTS_OF_LENS)
+    scalars = {spelled(key): value for key, value in table.items() if kind_of(str(key)) == "coefficient"}
+    scalars = {key: value for key, value in scalars.items() if not isinstance(value, list | dict)}  # P1: a matrix
+    names = _COEFFICIENTS if model == "radtan" else ("k1", "k2", "k3", "k4")
+    odd = [key for key in scalars if scalars[key] and (key not in names or (key == "k4" and "k5" not in scalars))]
+    if odd and (model == "radtan" or odd != ["k4"]):
+        raise CalibrationError(
+            f"{', '.join(odd)} of a lens whose model is not OpenCV's", file=path, place=place,
+            remedy='Write model = "fisheye" if it is (k1 k2 k3 k4 alone), else calibrate with k1, k2, p1, p2, k3.',
+        )  # fmt: skip
+    given = [numbers(value, None, path, place).ravel() for value in find_all(table, "distortion")]
+    if radial.size:
+        given.append(joined_distortion(radial, tangential) if model == "radtan" else np.append(radial, tangential))
+    if scalars:
+        given.append(numbers([scalars.get(key, 0.0) for key in names], None, path, place))
+    allowed = 8 if model == "radtan" else 4  # OpenCV writes unused thin-prism and tilt terms behind these
+    given = [k if k[allowed:].any() else k[:allowed] for k in given]
+    if any(not np.array_equal(np.trim_zeros(k, "b"), np.trim_zeros(given[0], "b")) for k in given[1:]):
+        raise CalibrationError("stated twice, differently", file=path, place=place, remedy="Remove the wrong one.")
+    return given[0] if given else None
+
+
+def joined_distortion(radial: NDArray, tangential: NDArray) -> NDArray:
+    """OpenCV's order (k1 k2 p1 p2 [k3 ...]) of radial (r,) and tangential (0 or 2,) coefficients."""
+    radial, tangential = (np.pad(part, (0, max(0, 2 - part.size))) for part in (radial, tangential))
+    return np.concatenate([radial[:2], tangential, radial[2:]])
 
 
 def is_transposed(K: ArrayLike) -> bool:
@@ -251,36 +144,50 @@ def is_transposed(K: ArrayLike) -> bool:
     return bool(K[2, :2].any()) and not K[:2, 2].any()
 
 
-def _pose(table: Table, of_rows: bool, pose_needed: bool, path: Path, place: str) -> NDArray:
-    """(4, 4) T_camera_world of a table, in the file's unit."""
-    rotation, translation = find(table, "rotation"), find(table, "translation")
+def _pose(table: Table, of_rows: bool, pose_needed: bool | None, path: Path, place: str) -> NDArray | None:
+    """(4, 4) T_camera_world of a table, in the file's unit; None if it has none and needs none."""
+    said = conventions(table, path, place)
+    T = _as_written(table, of_rows, path, place)
+    if T is None:
+        rotation, translation = (find(table, kind) is None for kind in ("rotation", "translation"))
+        if rotation and translation and not pose_needed:
+            return None
+        missing = " and ".join(["rotation"] * rotation + ["translation"] * translation)
+        remedy = "Calibrate the extrinsics too: every camera's pose."
+        raise CalibrationError(f"{missing} missing", file=path, place=place, remedy=remedy)
+    if "c2w" in said and find(table, "inverse pose") is None:
+        T = inverse(T)
+    return transform(_OPENGL_AXES, np.zeros(3)) @ T if "opengl" in said else T
+
+
+def _as_written(table: Table, of_rows: bool, path: Path, place: str) -> NDArray | None:
+    """(4, 4) transform of a table from world to camera, as its keys' names have it; None if it has none."""
     for kind in ("pose", "inverse pose"):
         pose = find(table, kind)
-        if pose is None:
+        matrix = numbers([] if pose is None else pose, None, path, f"{place}, pose")
+        if pose is None or (matrix.ndim == 2 and matrix.shape[1] == 6):  # OpenCV's views of the board
             continue
-        matrix = numbers(pose, None, path, f"{place}, pose")
+        matrix = matrix.reshape(-1, 4) if matrix.size in (12, 16) and 1 in (matrix.ndim, *matrix.shape) else matrix
         if matrix.shape not in ((3, 4), (4, 4)) or (matrix.shape == (4, 4) and np.any(matrix[3] != (0, 0, 0, 1))):
             problem = f"pose of shape {matrix.shape}" + ", whose last row is not 0 0 0 1" * (matrix.shape == (4, 4))
             raise CalibrationError(problem, file=path, place=place, remedy="Give (4, 4), a point being a column.")
         T = rigid(matrix[:3, :3], matrix[:3, 3], path, place)
         return T if kind == "pose" else inverse(T)
-    if rotation is not None and translation is not None:
-        R = numbers(rotation, None, path, f"{place}, rotation").squeeze()
-        t = numbers(translation, (3,), path, f"{place}, translation")
-        if R.shape not in ((3,), (3, 3)):
-            raise CalibrationError(
-                f"rotation has shape {R.shape}", file=path, place=place, remedy="Give a (3,) vector or a (3, 3) matrix."
-            )
-        R = exp_so3(R) if R.shape == (3,) else R.T if of_rows else R
-        return rigid(R, t, path, place)
-    if rotation is None and translation is None and not pose_needed:
-        return np.eye(4)
-    missing = " and ".join(
-        key for key, value in (("rotation", rotation), ("translation", translation)) if value is None
-    )
-    raise CalibrationError(
-        f"{missing} missing", file=path, place=place, remedy="Calibrate the extrinsics too: every camera's pose."
-    )
+    rotation, translation = find(table, "rotation"), find(table, "translation")
+    if rotation is None or translation is None:
+        return None
+    R = numbers(rotation, None, path, f"{place}, rotation").squeeze()
+    t = numbers(translation, (3,), path, f"{place}, translation")
+    R = R.reshape(3, 3) if R.shape == (9,) else R
+    if R.shape not in ((3,), (3, 3)):
+        raise CalibrationError(
+            f"rotation has shape {R.shape}", file=path, place=place, remedy="Give a (3,) vector or a (3, 3) matrix."
+        )
+    if R.shape == (3,) and np.linalg.norm(R) > _MAX_ROTATION:
+        problem = f"a rotation vector of {np.linalg.norm(R):.1f} radians, which is more than one turn"
+        remedy = "It may be in degrees, or be three angles: write a vector in radians, or the (3, 3) matrix."
+        raise CalibrationError(problem, file=path, place=place, remedy=remedy)
+    return rigid(exp_so3(R) if R.shape == (3,) else R.T if of_rows else R, t, path, place)
 
 
 def build_camera(
@@ -310,14 +217,27 @@ def rigid(R: NDArray, t: NDArray, path: Path, place: str) -> NDArray:
     if not np.abs(R).max() <= 2:  # not finite, too
         R = np.zeros((3, 3))
     left, stretch, right = np.linalg.svd(R)
-    if np.abs(stretch - 1).max() > 1e-3 or np.linalg.det(R) < 0:
-        raise CalibrationError(
-            "rotation is not orthonormal and right-handed",
-            file=path,
-            place=place,
-            remedy="Give the rotation world to camera, as a proper rotation.",
-        )
+    problem, remedy = "", "Give the rotation world to camera, as a proper rotation."
+    if np.ptp(stretch) > _MAX_STRETCH or not stretch.all():
+        problem = "rotation is not orthonormal and right-handed"
+    elif abs(stretch.mean() - 1) > _MAX_STRETCH:
+        problem = f"rotation is scaled by {stretch.mean():.4g}, so it is not orthonormal"
+        remedy = "If it is the scale of a reconstruction, divide rotation and translation by it."
+    elif np.linalg.det(R) < 0:
+        problem = "rotation mirrors: its determinant is -1, so it is not right-handed"
+        remedy = "Are its axes left-handed (Unity, Unreal)? Negate one axis of the world, or of the camera."
+    if problem:
+        raise CalibrationError(problem, file=path, place=place, remedy=remedy)
     return transform(left @ right, t)
+
+
+def rotation_of(quaternion: NDArray, path: Path, place: str) -> NDArray:
+    """Rotation (3, 3) of a quaternion (4,) w x y z; raises CalibrationError if its length is not 1."""
+    length = float(np.linalg.norm(quaternion))
+    if abs(length - 1) > _MAX_QUATERNION_ERROR:
+        remedy = "Calibrate this camera again, or export the calibration again."
+        raise CalibrationError(f"a quaternion of length {length:.3g}, not 1", file=path, place=place, remedy=remedy)
+    return rotation_from_quaternion(quaternion)
 
 
 def _size(table: Table, path: Path, place: str) -> tuple[int, int] | None:
@@ -332,9 +252,3 @@ def _size(table: Table, path: Path, place: str) -> tuple[int, int] | None:
     array = numbers(size if size is not None else (width, height), (2,), path, f"{place}, image size")
     return int(array[0]), int(array[1])
 
-
-def _is_fisheye(table: Table) -> bool:
-    flag = table.get("fisheye", table.get("fisheye_model", False))
-    model = find(table, "model")
-    named = isinstance(model, str) and any(word in model.lower().replace("_", "") for word in _FISHEYE)
-    return named or flag in (True, 1, "true", "True", "1")

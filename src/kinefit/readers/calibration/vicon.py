@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera
-from kinefit.geometry.se3 import rotation_from_quaternion
-from kinefit.readers.calibration.tables import build_camera, numbers, rigid
+from kinefit.readers.calibration.tables import build_camera, numbers, rigid, rotation_of
 
 _MAX_LENS_ERROR_PX = 0.01  # of the lens in OpenCV's terms against Vicon's, anywhere in the image
 _MAX_CENTRE_OFFSET_PX = 0.5  # of the distortion's centre from the principal point
@@ -55,10 +54,7 @@ def _camera(element: Element, path: Path) -> Camera:
         problem = "pixels are not square: PIXEL_ASPECT_RATIO or SKEW"
         raise CalibrationError(problem, file=path, place=place, remedy="Resample the video to square pixels.")
     K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
-    quaternion = values("ORIENTATION", (4,))
-    if not np.linalg.norm(quaternion) > 0:
-        raise CalibrationError("a zero quaternion", file=path, place=place, remedy="Calibrate this camera again.")
-    R = rotation_from_quaternion(np.roll(quaternion, 1))
+    R = rotation_of(np.roll(values("ORIENTATION", (4,)), 1), path, f"{place}, ORIENTATION")
     radial = _radial(frames[0], centre, path, place)
     corner = float(np.hypot(*np.maximum(centre, np.subtract((width, height), centre))))
     k = _opencv_radial(radial, corner, float(focal), path, place) if radial.any() else np.zeros(0)

@@ -18,16 +18,17 @@ from kinefit.errors import CalibrationError, ExportError, KinefitError, check_ch
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import inverse, log_so3
 from kinefit.readers.calibration.colmap import colmap_texts
+from kinefit.readers.calibration.keys import find, find_all
 from kinefit.readers.calibration.qualisys import qualisys_text
 from kinefit.readers.calibration.read import (
     calibration_sources,
     metres_per_unit,
     read_calibration,
     recognise,
-    tables_of,
 )
 from kinefit.readers.calibration.spans import value_span
-from kinefit.readers.calibration.tables import find, find_all, is_transposed, read_table
+from kinefit.readers.calibration.tables import is_transposed, read_table
+from kinefit.readers.calibration.trees import tables_of
 from kinefit.readers.ros.recordings import inside
 
 _REMEDY = "Write it as Pose2Sim TOML instead: kinefit.readers.calibration.read.write_calibration."
@@ -150,7 +151,7 @@ def _padded(camera: Camera) -> NDArray:
 def _texts(rig: Rig, like: Path, unit: str | float) -> tuple[dict[str, str], Rig]:
     """Text of each file by its path below `like` ("" for the file itself), and the rig in the format's frame."""
     if like.is_dir() and ((like / "cameras.txt").exists() or (like / "cameras.bin").exists()):
-        texts = colmap_texts(rig, like, metres_per_unit({}, unit, like))
+        texts = colmap_texts(rig, like, metres_per_unit([], unit, like))
         points = like / "points3D.txt"  # COLMAP opens no model without
         if points.exists():
             texts["points3D.txt"] = points.read_text(encoding="utf-8")
@@ -162,7 +163,7 @@ def _texts(rig: Rig, like: Path, unit: str | float) -> tuple[dict[str, str], Rig
         files = {file: file.read_bytes().decode("utf-8-sig") for file in group}
         kinds = {file: recognise(text, file) for file, text in files.items()}
         if "qualisys" in kinds.values():
-            scale = metres_per_unit({"unit": "mm"}, unit, like)
+            scale = metres_per_unit([{"unit": "mm"}], unit, like)
             files = {file: qualisys_text(rig, text, scale, file) for file, text in files.items()}
         else:
             rig = _replace_tables(rig, name, files, kinds, unit)
@@ -178,7 +179,7 @@ def _replace_tables(rig: Rig, name: str, files: dict[Path, str], kinds: dict[Pat
     tables = tables_of(merged, name, first, exteriors=False)
     if "M1" in merged and tables[0][0] in rig:
         rig = rig.moved(rig[tables[0][0]].T_camera_world)
-    scale = metres_per_unit(merged, unit, first)
+    scale = metres_per_unit([table for _, table in tables], unit, first)
     places = {at: (file, *spot) for file, tree in trees.items() for at, spot in _places(tree, kinds[file]).items()}
     edits: dict[Path, list[tuple[int, int, str]]] = {file: [] for file in files}
     roots = {file: _xml_root(files[file]) for file in files if kinds[file] == "xml"}
@@ -239,9 +240,9 @@ def _entries(camera: Camera, table: dict, scale: float) -> list[tuple[str, Any, 
     if given is None and not k.any():
         entries.pop()
     if pose is not None:
-        return [*entries, ("pose", pose, T if np.shape(pose) == (4, 4) else T[:3])]
+        return [*entries, ("pose", pose, _shaped(T[: np.size(pose) // 4], pose))]
     if inverse_pose is not None:
-        return [*entries, ("c2w", inverse_pose, inverse(T) if np.shape(inverse_pose) == (4, 4) else inverse(T)[:3])]
+        return [*entries, ("c2w", inverse_pose, _shaped(inverse(T)[: np.size(inverse_pose) // 4], inverse_pose))]
     R, translation = T[:3, :3], find(table, "translation")
     whole = R.T if of_rows else R
     rotations = [  # EasyMocap's Rot and R are the same
