@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit.errors import CalibrationError, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import quaternion
-from kinefit.readers.calibration.tables import build_camera, rigid, rotation_of
+from kinefit.readers.calibration.tables import build_camera, numbers, rigid, rotation_of
 
 # Parameters of every model, in COLMAP's order.
 _MODELS = {
@@ -50,7 +50,7 @@ def colmap_cameras(folder: Path) -> list[Camera]:
     for number, line in _images(path):
         parts = line.split(maxsplit=9)
         place = f"line {number}"
-        values = _floats(parts[:8], path, place)
+        values = numbers(parts[:8], None, path, place)
         if len(parts) != 10 or parts[8] not in intrinsics:
             raise CalibrationError(
                 "not an image of a known camera",
@@ -139,7 +139,7 @@ def _cameras(path: Path) -> dict[str, Intrinsics]:
                 choices("camera model", model, _MODELS), file=path, place=place, remedy="Undistort to one of these."
             )
         names = _MODELS[model].split()
-        values = _floats(parts[2:], path, place)
+        values = numbers(parts[2:], None, path, place)
         if len(values) != 2 + len(names):
             raise CalibrationError(
                 f"{len(values) - 2} parameters", file=path, place=place, remedy=f"{model} has: {_MODELS[model]}."
@@ -178,12 +178,3 @@ def _lines(path: Path) -> list[tuple[int, str]]:
         ) from None
     return [(i, line) for i, line in enumerate(text.splitlines(), 1) if not line.lstrip().startswith("#")]
 
-
-def _floats(parts: list[str], path: Path, place: str) -> NDArray:
-    try:
-        values = np.array([float(part) for part in parts])
-    except ValueError as error:
-        raise CalibrationError(str(error), file=path, place=place, remedy="Export the model again.") from None
-    if not np.isfinite(values).all():
-        raise CalibrationError("a number is not finite", file=path, place=place, remedy="Export the model again.")
-    return values

@@ -63,7 +63,7 @@ _HARMLESS = re.compile(
 )
 """Keys beside a camera that never change how it projects: quality, boards, settings of the program."""
 _LENS_SIZES = (4, 5, 8, 12, 14)  # of OpenCV's vectors of distortion
-_FISHEYE = ("fisheye", "equidistant", "kannalabrandt")
+_FISHEYE = ("fisheye", "equidistant", "kannalabrandt", "kb4", "kb8")
 _OPENCV_LENS = re.compile(
     r"|none|0|(?:simple)?(?:pinhole|radial)|perspective|rad(?:ial)?tan(?:gential)?|plumbbob|(?:full)?opencv|standard|"
     r"(?:opencv)?(?:brown(?:conrady)?|rational)(?:polynomial)?5?"
@@ -172,21 +172,23 @@ def refuse_unread(table: Table, path: Path, place: str, *, has_lens: bool, has_p
     """
     for key, value in table.items():
         name, values = spelled(key), _numbers(value)
-        if kind_of(str(key)) or not values.any() or _HARMLESS.search(name) or ("undistort" in name and not has_lens):
+        unused = name.endswith("undistorted") and not has_lens
+        if kind_of(str(key)) or not values.any() or unused or _HARMLESS.search(name):
             continue
         may_be_pose = (values.size >= 3 and _POSE.search(name)) or _POSE_SCALAR.fullmatch(name)
-        if _SCALE.fullmatch(name) and np.any(values != 1):
-            subject, remedy = "scale", 'Apply it to the translations, or write unit = "mm".'
-        elif _LENS.search(name) or (
-            not has_lens and not may_be_pose and values.size in _LENS_SIZES and np.any(values % 1)
-        ):
-            subject, remedy = "lens", "Write OpenCV's k1, k2, p1, p2, k3 as dist, or remove it if it is not the lens."
+        may_be_lens = not has_lens and not may_be_pose and values.size in _LENS_SIZES and np.any(values % 1)
+        if may_be_lens or _LENS.search(name):
+            subject, remedy = "lens", "Write OpenCV's k1, k2, p1, p2, k3 as dist"
         elif may_be_pose and not has_pose:
-            subject, remedy = "pose", "Write R (3, 3) and t (3), world to camera, or remove it if it is not the pose."
+            subject, remedy = "pose", "Write R (3, 3) and t (3), world to camera"
+        elif _SCALE.fullmatch(name) and np.any(values != 1):
+            subject, remedy = "unit of length", 'Apply it to the translations, or write unit = "mm"'
         else:
             continue
-        problem = f"kinefit does not read {key}, which may be its {subject}"
-        raise CalibrationError(problem, file=path, place=place, remedy=remedy)
+        raise CalibrationError(
+            f"kinefit does not read {key}, which may be its {subject}", file=path, place=place,
+            remedy=f"{remedy}; remove {key} if it is none.",
+        )  # fmt: skip
 
 
 def _numbers(value: Any) -> NDArray:

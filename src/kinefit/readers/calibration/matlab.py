@@ -9,7 +9,7 @@ import numpy as np
 
 from kinefit.errors import CalibrationError, FileError
 from kinefit.readers.calibration.keys import Table, find
-from kinefit.readers.calibration.tables import is_transposed, joined_distortion, numbers
+from kinefit.readers.calibration.tables import is_transposed, numbers
 from kinefit.readers.units import LENGTHS, worth
 
 _AS_STRUCT = "In MATLAB: s = toStruct(params); save('calibration.mat', '-struct', 's', '-v7')"
@@ -84,13 +84,8 @@ def matlab_tree(tree: Any, path: Path, of_mat: bool = False) -> Any:
         return {key: matlab_tree(value, path, of_mat) for key, value in tree.items()}
     K = numbers(matrix, (3, 3), path, "camera matrix")
     shift = np.array([[0, 0, 1.0], [0, 0, 1.0], [0, 0, 0]])
-    rest = {key: value for key, value in tree.items() if value is not matrix}
+    rest = {key: value for key, value in tree.items() if value is not matrix and key != "WorldUnits"}  # of the board
     out = {"matrix": (K - (shift.T if is_transposed(K) else shift)).tolist()}
-    if "RadialDistortion" in tree:
-        radial = numbers(rest.pop("RadialDistortion"), None, path, "RadialDistortion").ravel()
-        tangential = numbers(rest.pop("TangentialDistortion", [0, 0]), (2,), path, "TangentialDistortion")
-        out["distortion"] = joined_distortion(radial, tangential).tolist()
-        rest.pop("WorldUnits", None)  # of the board; these structs have no pose
     size = find(rest, "size")
     if isinstance(size, list) and len(size) == 2:
         rows, columns = numbers(size, (2,), path, "ImageSize")

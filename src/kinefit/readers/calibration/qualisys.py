@@ -10,7 +10,7 @@ import numpy as np
 
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.readers.calibration.tables import build_camera, rigid
+from kinefit.readers.calibration.tables import build_camera, numbers, rigid
 
 _SUBPIXELS = 64.0  # focal lengths and centres are in 1/64 px; distortion coefficients are not scaled
 _MAX_SIDE = 16384.0  # [px] of an image: a larger number is in 1/64 px
@@ -50,19 +50,8 @@ def _camera(element: Element, path: Path) -> Camera:
 
     def value(group: str, key: str, default: float | None = None) -> float:
         found = element.find(group)
-        text = None if found is None else found.get(key.lower())
-        try:
-            number = default if text is None else float(text)
-        except ValueError:
-            number = None
-        if number is None or not np.isfinite(number):
-            raise CalibrationError(
-                f"{key} is {'missing' if text is None else repr(text)}",
-                file=path,
-                place=f"camera {name}, {group}",
-                remedy="Export the calibration again from Qualisys Track Manager.",
-            )
-        return number
+        text = default if found is None else found.get(key.lower(), default)
+        return float(numbers(text, (), path, f"camera {name}, {group}, {key}"))
 
     left = top = 0.0
     subpixels = _SUBPIXELS

@@ -122,7 +122,9 @@ def _distortion(table: Table, model: str, path: Path, place: str) -> NDArray | N
         )  # fmt: skip
     given = [numbers(value, None, path, place).ravel() for value in find_all(table, "distortion")]
     if radial.size:
-        given.append(joined_distortion(radial, tangential) if model == "radtan" else np.append(radial, tangential))
+        first, second = (np.pad(part, (0, max(0, 2 - part.size))) for part in (radial, tangential))
+        ordered = [first[:2], second, first[2:]] if model == "radtan" else [radial, tangential]
+        given.append(np.concatenate(ordered))
     if scalars:
         given.append(numbers([scalars.get(key, 0.0) for key in names], None, path, place))
     allowed = 8 if model == "radtan" else 4  # OpenCV writes unused thin-prism and tilt terms behind these
@@ -130,12 +132,6 @@ def _distortion(table: Table, model: str, path: Path, place: str) -> NDArray | N
     if any(not np.array_equal(np.trim_zeros(k, "b"), np.trim_zeros(given[0], "b")) for k in given[1:]):
         raise CalibrationError("stated twice, differently", file=path, place=place, remedy="Remove the wrong one.")
     return given[0] if given else None
-
-
-def joined_distortion(radial: NDArray, tangential: NDArray) -> NDArray:
-    """OpenCV's order (k1 k2 p1 p2 [k3 ...]) of radial (r,) and tangential (0 or 2,) coefficients."""
-    radial, tangential = (np.pad(part, (0, max(0, 2 - part.size))) for part in (radial, tangential))
-    return np.concatenate([radial[:2], tangential, radial[2:]])
 
 
 def is_transposed(K: ArrayLike) -> bool:
@@ -207,15 +203,13 @@ def numbers(value: Any, shape: tuple[int, ...] | None, path: Path, place: str) -
         wanted = f"{' x '.join(map(str, shape))} numbers" if shape else "numbers"
         raise CalibrationError(f"expected {wanted}", file=path, place=place, remedy="Repair this entry.") from None
     if not np.isfinite(array).all() or np.abs(array).max(initial=0.0) > _MAX_NUMBER:
-        problem = "a number is not finite or absurdly large"
+        problem = "missing" if value is None else "a number is not finite or absurdly large"
         raise CalibrationError(problem, file=path, place=place, remedy="Repair this entry.")
     return array
 
 
 def rigid(R: NDArray, t: NDArray, path: Path, place: str) -> NDArray:
     """(4, 4) transform with the nearest rotation to R (3, 3); raises CalibrationError if R is not orthonormal."""
-    if not np.abs(R).max() <= 2:  # not finite, too
-        R = np.zeros((3, 3))
     left, stretch, right = np.linalg.svd(R)
     problem, remedy = "", "Give the rotation world to camera, as a proper rotation."
     if np.ptp(stretch) > _MAX_STRETCH or not stretch.all():

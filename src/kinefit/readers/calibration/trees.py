@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import re
-from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kinefit.errors import CalibrationError
 from kinefit.geometry.se3 import transform
@@ -16,6 +14,7 @@ from kinefit.readers.calibration.colmap import image_names
 from kinefit.readers.calibration.keys import Table, find, kind_of, spelled, statements
 from kinefit.readers.calibration.tables import numbers
 
+_KINDS_OF_PARTS = ("matrix", "distortion", "pose", "inverse pose")
 _PART = re.compile(r"(?:projection|distortion|mirror)(?:parameters)?|lens")
 """Keys of tables within a camera's table, beside those of a quantity."""
 _OF_PAIR = re.compile(r"(?:(M|K|mtx|camera_?[mM]atrix)|(D|dist|dist_?[cC]oeffs))_?([12])")
@@ -32,9 +31,9 @@ def tables_of(tree: Table, name: str, path: Path, exteriors: bool = True) -> lis
     Raises
     ------
     CalibrationError
-        A chain of poses that breaks, cameras whose poses have no common frame, a stereo pair that lacks a key.
+        A pose of a chain that cannot be read, cameras without a common world, a stereo pair that lacks a key.
     """
-    tree = _unchained(_of_transforms(stereo_named(tree), path), path, exteriors)
+    tree = _of_transforms(_of_multical(_of_kalibr(stereo_named(tree), path), path), path)
     unit = unit_of_program(tree)
     tree = {"unit": unit} | tree if unit else tree
     if "M1" in tree:
@@ -47,48 +46,38 @@ def tables_of(tree: Table, name: str, path: Path, exteriors: bool = True) -> lis
     return tables
 
 
-def _unchained(tree: Table, path: Path, exteriors: bool) -> Table:
-    """The tree with a pose from the world for each camera, where poses lead from one camera to another.
-
-    Kalibr's T_cn_cnm1 leads from the camera before, cam0 is the world. multical's `camera_poses` has "a" (from the
-    world) or "a_to_b", which, whatever its name, leads from b to a.
-    """
-    cameras = {k: v for k, v in tree.items() if isinstance(v, dict) and find(v, "matrix") is not None}
-    links: dict[str, tuple[str, NDArray]] = {}
-    if any("T_cn_cnm1" in table for table in cameras.values()):
-        order = sorted(cameras, key=lambda name: [int(digits) for digits in re.findall(r"\d+", name)])
-        links[order[0]] = ("", np.eye(4))
-        for before, name in pairwise(order):
-            if "T_cn_cnm1" in cameras[name]:
-                T = numbers(cameras[name]["T_cn_cnm1"], (4, 4), path, f"camera {name}, T_cn_cnm1")
-                links[name] = (before, T)
-    elif isinstance(tree.get("camera_poses"), dict) and isinstance(tree.get("cameras"), dict):
-        cameras = tree["cameras"]
-        for key, pose in tree["camera_poses"].items():
-            name, _, parent = str(key).partition("_to_")
-            place = f"camera_poses, {key}"
-            pose = pose if isinstance(pose, dict) else {}
-            R, t = (numbers(pose.get(part), shape, path, place) for part, shape in (("R", (3, 3)), ("T", (3,))))
-            links[name] = (parent, transform(R, t))
-    else:
+def _of_kalibr(tree: Table, path: Path) -> Table:
+    """The tree with each camera's pose where T_cn_cnm1 leads from the camera before to each; cam0 is the world."""
+    cameras = [key for key, value in tree.items() if isinstance(value, dict) and find(value, "matrix") is not None]
+    if not any("T_cn_cnm1" in tree[name] for name in cameras):
         return tree
-
-    def pose_of(name: str, after: tuple[str, ...] = ()) -> NDArray | None:
-        parent, T = links.get(name, (name, np.eye(4)))
-        if parent in (*after, name):  # no link, or a circle
-            return None
-        before = pose_of(parent, (*after, name)) if parent else np.eye(4)
-        return None if before is None else T @ before
-
-    out = {key: value for key, value in tree.items() if key not in ("cameras", "camera_poses", *cameras)}
-    for name, table in cameras.items():
-        T_camera_world = pose_of(name)
-        if T_camera_world is None and exteriors:
-            remedy = "Calibrate all cameras together, in one chain."
-            raise CalibrationError(f"no pose leads to camera {name}", file=path, remedy=remedy)
-        rest = {key: value for key, value in table.items() if key != "T_cn_cnm1"}
-        out[name] = rest if T_camera_world is None else rest | {"T_camera_world": T_camera_world.tolist()}
+    cameras.sort(key=lambda name: [int(digits) for digits in re.findall(r"\d+", name)])
+    T, out = np.eye(4), dict(tree)
+    for name in cameras:
+        step = tree[name].get("T_cn_cnm1", np.eye(4) if name == cameras[0] else None)
+        T = numbers(step, (4, 4), path, f"camera {name}, T_cn_cnm1") @ T
+        rest = {key: value for key, value in tree[name].items() if key != "T_cn_cnm1"}
+        out[name] = rest | {"T_camera_world": T.tolist()}
     return out
+
+
+def _of_multical(tree: Table, path: Path) -> Table:
+    """The tree with poses at the cameras, where `camera_poses` has one for each.
+
+    "a" leads from the world to a; "a_to_b", whatever its name says, from b to a.
+    """
+    cameras, poses = tree.get("cameras"), tree.get("camera_poses")
+    if not isinstance(cameras, dict) or not isinstance(poses, dict):
+        return tree
+    T = {"": np.eye(4)}
+    for key, pose in poses.items():
+        name, _, parent = str(key).partition("_to_")
+        if isinstance(pose, dict) and parent in T:
+            R, t = (find(pose, kind) for kind in ("rotation", "translation"))
+            R, t = numbers(R, (3, 3), path, f"camera_poses, {key}"), numbers(t, (3,), path, f"camera_poses, {key}")
+            T[name] = transform(R, t) @ T[parent]
+    posed = {name: {"T_camera_world": T[name].tolist()} for name in cameras if name in T}
+    return tree | {"cameras": {name: table | posed.get(name, {}) for name, table in cameras.items()}}
 
 
 def _of_transforms(tree: Table, path: Path) -> Table:
@@ -103,13 +92,9 @@ def _of_transforms(tree: Table, path: Path) -> Table:
     cameras = []
     for name, frame in zip(image_names([PurePosixPath(str(f.get("file_path", "?"))) for f in frames]), frames):
         lens = {key: value for key, value in (tree | frame).items() if kind_of(str(key))}
-        lacking = [key for key in ("fl_x", "fl_y", "cx", "cy") if key not in lens]
-        if lacking:
-            remedy = "Write the focal length and centre in pixels: fl_x, fl_y, cx, cy (and w, h)."
-            raise CalibrationError(f"{', '.join(lacking)} missing", file=path, place=f"camera {name}", remedy=remedy)
-        centre = {key: float(numbers(lens[key], (), path, f"camera {name}, {key}")) - 0.5 for key in ("cx", "cy")}
+        pinhole = [float(numbers(lens.get(k), (), path, f"camera {name}, {k}")) for k in ("fl_x", "fl_y", "cx", "cy")]
         pose = {"c2w": frame["transform_matrix"], "convention": "opengl"}
-        cameras.append({"name": name} | lens | centre | pose)
+        cameras.append({"name": name, "matrix": np.subtract(pinhole, (0, 0, 0.5, 0.5)).tolist()} | lens | pose)
     return {"cameras": cameras}
 
 
@@ -134,12 +119,13 @@ def camera_tables(tree: Any, name: str, stated: Table | None = None) -> list[tup
 
 def _merged(tree: Table) -> Table:
     """The table with the entries of its parts: {"intrinsics": {"K": ...}, "extrinsics": {"R": ...}}."""
+    by_camera = _is_by_camera(find(tree, "matrix"))
     for part, inner in tree.items():
         kind = kind_of(str(part))
-        is_part = kind in ("matrix", "distortion", "pose", "inverse pose") or _PART.fullmatch(spelled(part))
-        if not is_part or not isinstance(inner, dict) or _is_by_camera(inner) or _is_by_camera(find(tree, "matrix")):
+        if not isinstance(inner, dict) or not (kind in _KINDS_OF_PARTS or _PART.fullmatch(spelled(part))):
             continue
-        if any(kind_of(str(key)) and not isinstance(value, dict) for key, value in inner.items()) or kind == "matrix":
+        named = any(kind_of(str(key)) and isinstance(value, dict) == by_camera for key, value in inner.items())
+        if named or (kind == "matrix" and not _is_by_camera(inner)):
             direction = {"cam2world": True} if kind == "inverse pose" else {}
             return _merged({key: value for key, value in tree.items() if key != part} | direction | inner)
     return tree
