@@ -32,7 +32,8 @@ from kinefit.readers.units import LENGTHS, worth
 
 FORMATS = (
     "OpenCV YAML/XML/JSON, Pose2Sim, aniposelib, caliscope or FreeMoCap TOML, EasyMocap, CMU Panoptic, Qualisys or "
-    "Theia3D XML, Vicon .xcp, MATLAB .mat, COLMAP text (cameras.txt and images.txt), MCAP of ROS 2"
+    "Theia3D XML, Vicon .xcp, MATLAB .mat, COLMAP text (cameras.txt and images.txt), Kalibr, MC-Calib, multical, "
+    "transforms.json, MCAP of ROS 2"
 )
 MAX_CALIBRATION_BYTES = 2_000_000
 """Largest file of a calibration [bytes]; a camera takes about a thousand."""
@@ -40,14 +41,14 @@ PAIRS = (("intrinsics", "extrinsics"), ("intri", "extri"))
 """Stems of two files that form one calibration: OpenCV's stereo calibration, EasyMocap."""
 
 _FOREIGN = {
-    "VIC-3D": (r"<!DOCTYPE\s+vpml|<vpml\b|<orientation>", "Its angles and lens have conventions of their own"),
-    "DICe": (r"DICe_xml_calibration", "kinefit does not read its parameters"),
+    "VIC-3D": (r"<!DOCTYPE\s+vpml|<vpml\b|<orientation>", "Calibrate with `kinefit calibrate board`"),
+    "DICe": (r"DICe_xml_calibration", "Calibrate with `kinefit calibrate board`"),
     "Agisoft Metashape": (
         r"<document\b[^>]*>.*<sensors?\b|<calibration>\s*<projection>",
-        "In Metashape, export the cameras in COLMAP's format, as text, and give that folder",
+        "Export its cameras in COLMAP's format, and give that folder",
     ),
 }
-"""Programs whose XML is not read: what marks it, and the first words of what to do."""
+"""Programs whose XML is not read: what marks it, and what to do."""
 _MAX_CAMERAS = 1000  # of a rig; the largest domes have 500
 _XML_MAKERS = {"qualisys": qualisys_cameras, "vicon": vicon_cameras}  # both in millimetres
 _MAX_ORIGIN_DISTANCE = 200.0  # [m] a camera farther from the world's origin is not in metres
@@ -69,9 +70,10 @@ def read_calibration(
         OpenCV YAML/XML/JSON (one file with all cameras; a folder with one file or one folder a camera; a folder with
         intrinsics.yml and extrinsics.yml, or with EasyMocap's intri.yml and extri.yml), Pose2Sim, aniposelib,
         caliscope or FreeMoCap TOML, CMU Panoptic JSON, Qualisys or Theia3D XML, Vicon .xcp, MATLAB .mat (extra
-        `matlab`), COLMAP text (the folder), MCAP of ROS 2 (CameraInfo and /tf_static; extra `ros`). Other JSON, YAML
-        and TOML is read by the names of its keys (docs/calibration.md). Poses are world to camera unless their name
-        says otherwise. A single camera without a pose becomes the world.
+        `matlab`), COLMAP text (the folder), Kalibr's camchain, MC-Calib YAML, multical JSON, transforms.json of
+        nerfstudio and instant-ngp, MCAP of ROS 2 (CameraInfo and /tf_static; extra `ros`). Other JSON, YAML and TOML is
+        read by the names of its keys (docs/calibration.md). Poses are world to camera unless a key says otherwise. A
+        single camera without a pose becomes the world.
     unit : "auto", "m", "dm", "cm", "mm", "inch" or float [m]
         Unit of length of the file. "auto": as the file states (`unit = "mm"`, alone or under [metadata]), or as its
         format defines (Qualisys, Vicon, FreeMoCap: mm, Panoptic: cm), else metres, an error if that is implausible.
@@ -90,7 +92,8 @@ def read_calibration(
     FileError
         A missing file, or no known format.
     CalibrationError
-        A camera with a missing key, a wrong shape, numbers that are not finite, or a wrong unit.
+        A camera with a missing key, a wrong shape, numbers that are not finite, a wrong unit, or a key that speaks of
+        its lens, pose or convention and that kinefit does not read.
     """
     path = Path(path)
     if not path.exists():
@@ -265,7 +268,7 @@ def recognise(text: str, path: Path) -> str:
         if text.lstrip().startswith("<") and re.search(mark, text, re.S | re.I):
             raise CalibrationError(
                 "kinefit does not read this format", file=path, place=f"calibration of {program}",
-                remedy=f"{remedy}. Or write K, dist, R, t and size of each camera as JSON (docs/calibration.md).",
+                remedy=f"{remedy}, or write K, dist, R, t and size of each camera as JSON (docs/calibration.md).",
             )  # fmt: skip
     start = text.lstrip()
     if start.startswith("<"):
