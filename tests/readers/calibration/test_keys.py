@@ -159,6 +159,9 @@ def test_what_is_no_lens_and_no_convention_stays_silent(tmp_path):
     assert_right(read(tmp_path, lambda T: lens() | pose(T) | {k: v for k, v in harmless.items() if v is not None}))
     undistorted = lambda T: lens(dist=None) | pose(T) | {"undistorted": True}
     assert_right(read(tmp_path, undistorted), [0.0] * 5)
+    realsense = {"model": "distortion.inverse_brown_conrady", "coeffs": [0.0] * 5}
+    assert_right(read(tmp_path, lambda T: lens(dist=None) | pose(T) | realsense), [0.0] * 5)
+    assert_right(read(tmp_path, lambda T: lens() | pose(T) | {"camera_model": "OmniVision OV9281"}))
 
 
 R = POSES[0][:3, :3]
@@ -175,6 +178,7 @@ R = POSES[0][:3, :3]
         ({"dist": None, "k1": 0.1, "p1": 0.1, "fisheye": True}, "p1 of a lens"),
         ({"camera_model": "ds"}, "lens of the model ds"), ({"camera_model": "eucm"}, "model eucm"),
         ({"model": "thin_prism_fisheye"}, "model thin_prism"), ({"distortion_model": "fov"}, "model fov"),
+        ({"model": "inverse_brown_conrady"}, "model inverse"),
         ({"distortion_model": "my own"}, "model my own"), ({"projection": "equirectangular"}, "model equirect"),
         ({"convention": "unity"}, "convention = 'unity'"), ({"convention": "opencv y-up"}, "opencv y-up"),
         ({"handedness": "left"}, "handedness = 'left'"), ({"degrees": True}, "degrees = True"),

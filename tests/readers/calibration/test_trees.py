@@ -141,6 +141,27 @@ def test_multical_has_its_poses_apart(tmp_path, parent):
         read_calibration(tmp_path / "calibration.json")
 
 
+def test_cameras_may_be_called_as_quantities_are(tmp_path):
+    names = ["D", "K", "R"]
+    poses = [{"R": pose[:3, :3].tolist(), "t": pose[:3, 3].tolist()} for pose in T]
+    lens = {"K": K.tolist(), "dist": D.tolist(), "size": [1280, 720]}
+    (tmp_path / "a.json").write_text(json.dumps({name: lens | pose for name, pose in zip(names, poses)}))
+    assert_right(read_calibration(tmp_path / "a.json"), names, T)
+
+
+@pytest.mark.parametrize("first", ["K", "extrinsics"])
+def test_quantities_by_camera_within_parts(tmp_path, first):
+    names = ["left", "r"]
+    tree = {
+        "K": dict.fromkeys(names, K.tolist()), "dist": dict.fromkeys(names, D.tolist()), "size": [1280, 720],
+        "extrinsics": {"R": {n: T[i][:3, :3].tolist() for i, n in enumerate(names)},
+                       "t": {n: T[i][:3, 3].tolist() for i, n in enumerate(names)}},
+    }  # fmt: skip
+    tree = {first: tree[first]} | tree
+    (tmp_path / "a.json").write_text(json.dumps(tree))
+    assert_right(read_calibration(tmp_path / "a.json"), names, T[:2])
+
+
 # ---------------------------------------------------------------- NeRF, COLMAP
 
 

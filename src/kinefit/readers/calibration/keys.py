@@ -69,8 +69,8 @@ _OPENCV_LENS = re.compile(
     r"(?:opencv)?(?:brown(?:conrady)?|rational)(?:polynomial)?5?"
 )  # 0: of MC-Calib, which has 1 for fisheye
 _OTHER_LENS = re.compile(
-    r"omni|unified|doublesphere|eucm|division|scaramuzza|ocam|thinprism|ftheta|inverse|modified|equirect|spherical|"
-    r"panoram|orthograph|stereograph|equisolid|^(?:ds|ucm|mei|fov)$"
+    r"omnidir|unified|doublesphere|eucm|division|scaramuzza|ocamcalib|thinprism|ftheta|inverse|modified|equirect|"
+    r"spherical|panoram|orthograph|stereograph|equisolid|^(?:ds|ucm|mei|fov|omni|ocam)$"
 )
 _NO, _YES = ("false", "no", "0", "00", "none", ""), ("true", "yes", "1", "10")  # of 0.0 and 1.0, too
 
@@ -150,11 +150,13 @@ def lens_model(table: Table, path: Path, place: str) -> str:
 
     Raises CalibrationError for another model. `model` and `type` may name a product, which is no lens model.
     """
-    fisheye = any(spelled(value) in _YES for value in find_all(table, "fisheye"))
+    fisheye, given = any(spelled(value) in _YES for value in find_all(table, "fisheye")), find(table, "distortion")
     for kind in ("lens model", "model"):
         for value in find_all(table, kind):
             text = spelled(value) if isinstance(value, str | int | float) else ""
             known = _OPENCV_LENS.fullmatch(text) or text == "1" or any(word in text for word in _FISHEYE)
+            if re.search("inverse|modified", text) and given is not None and not _numbers(given).any():
+                continue  # as RealSense's colour cameras have it
             if _OTHER_LENS.search(text) or (kind == "lens model" and not known):
                 remedy = "Undistort the videos, or calibrate again with OpenCV's model: k1, k2, p1, p2, k3, or fisheye."
                 raise CalibrationError(f"a lens of the model {value}", file=path, place=place, remedy=remedy)

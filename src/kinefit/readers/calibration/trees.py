@@ -121,11 +121,12 @@ def _merged(tree: Table) -> Table:
     """The table with the entries of its parts: {"intrinsics": {"K": ...}, "extrinsics": {"R": ...}}."""
     by_camera = _is_by_camera(find(tree, "matrix"))
     for part, inner in tree.items():
-        kind = kind_of(str(part))
-        if not isinstance(inner, dict) or not (kind in _KINDS_OF_PARTS or _PART.fullmatch(spelled(part))):
+        kind, name = kind_of(str(part)), spelled(part)
+        if not isinstance(inner, dict) or not (kind in _KINDS_OF_PARTS or _PART.fullmatch(name)):
             continue
         named = any(kind_of(str(key)) and isinstance(value, dict) == by_camera for key, value in inner.items())
-        if named or (kind == "matrix" and not _is_by_camera(inner)):
+        is_camera = find(inner, "matrix") is not None  # with a name such as D
+        if (name.startswith("intrinsic") and not _is_by_camera(inner)) or (named and not is_camera):
             direction = {"cam2world": True} if kind == "inverse pose" else {}
             return _merged({key: value for key, value in tree.items() if key != part} | direction | inner)
     return tree
