@@ -55,6 +55,7 @@ SCALARS = dict(zip(("k1", "k2", "p1", "p2", "k3"), D))
         {"RadialDistortion": PARTS["radial"], "tangential_coeffs": PARTS["tangential"], "K": np.add(
             K, [[0, 0, 1], [0, 0, 1], [0, 0, 0]]).tolist(), "size": [720, 1280]},  # MATLAB counts from one
         {"distortion": SCALARS}, {"distortion": {"model": "brown-conrady", "coeffs": D}}, {"lens": {"kc": D}},
+        {"lens_model": {"name": "brown", "coeffs": D}}, {"distortion": {"type": "radtan", **PARTS}},
         {"distortion_parameters": SCALARS, "K": None, "model_type": "PINHOLE",
          "projection_parameters": {"fx": 900.0, "fy": 905.0, "cx": 641.5, "cy": 352.25}},
     ],
@@ -99,6 +100,8 @@ TURNED = {
         ("opengl", {"convention": "opengl"}), ("opengl", {"opengl": True}), ("opengl", {"is_opengl": 1}),
         ("opengl", {"coordinate_system": "Blender"}), ("opengl", {"camera_convention": "OpenGL, world to camera"}),
         ("c2w", {"c2w": True}), ("c2w", {"cam2world": "true"}), ("c2w", {"world2cam": False}), ("c2w", {"w2c": 0}),
+        ("opengl", {"camera_axes": "opengl"}), ("opengl", {"style": "OpenGL"}), ("c2w", {"direction": "cam_to_world"}),
+        ("none", {"distortion_order": ["k1", "k2", "p1", "p2", "k3"]}), ("none", {"transposed": False}),
         ("c2w", {"extrinsics_type": "camera-to-world"}), ("c2w", {"pose_type": "cam2world"}),
         ("both", {"convention": "opengl c2w"}), ("both", {"convention": "blender", "camera_to_world": True}),
         ("none", {"world2cam": True}), ("none", {"c2w": False}), ("none", {"convention": "OpenCV"}),
@@ -183,6 +186,9 @@ R = POSES[0][:3, :3]
         ({"convention": "unity"}, "convention = 'unity'"), ({"convention": "opencv y-up"}, "opencv y-up"),
         ({"handedness": "left"}, "handedness = 'left'"), ({"degrees": True}, "degrees = True"),
         ({"rotation_order": "zyx"}, "rotation_order = 'zyx'"), ({"opencv": False}, "opencv = False"),
+        ({"distortion_order": "k1 k2 k3 p1 p2"}, "distortion_order"), ({"unity": True}, "unity = True"),
+        ({"rvec_unit": "degrees"}, "rvec_unit"), ({"transposed": True}, "transposed"),
+        ({"frame": "left-handed"}, "frame"),
         ({"rotation_unit": "deg"}, "rotation_unit = 'deg'"), ({"flip_y": True}, "flip_y = True"),
         ({"c2w": True, "world2cam": True}, "contradict.*c2w and w2c"), ({"scale": 0.001}, "does not read scale"),
         ({"R": [57.3, 10.0, 20.0]}, "more than one turn.*degrees"), ({"R": (2.5 * R).tolist()}, "scaled by 2.5"),

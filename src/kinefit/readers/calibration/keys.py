@@ -20,7 +20,7 @@ _OPENGL = r"opengl|gl|blender|nerf(?:studio)?|instantngp|pyrender|arkit"  # righ
 _OPENCV = r"opencv|cv|colmap"
 _AS_HERE = re.compile(
     r"convention|coordinates?|system|camera|axes|world|matrix|pose|extrinsics?|righthand(?:ed)?|x?right|y?down|z?forward|"
-    r"rowmajor|rodrigues|axisangle|rotationvector|radians?|rad"
+    r"rowmajor|rodrigues|axisangle|rotationvector|radians?|rad|k1k2p1p2(?:k3)?"
 )
 """Words of a convention that say nothing, or what kinefit assumes."""
 _VALUES = r"(?:coef(?:f(?:icient)?)?|vec(?:tor)?|par(?:am(?:eter)?)?|value)?s?"
@@ -48,15 +48,18 @@ _KEYS = {
     }.items()
 }  # fmt: skip
 _CONVENTION = re.compile(
-    r"convention|coordinate|handed|degree|radian|angleunit|rotationunit|opengl|opencv|blender|flip|mirrored|"
-    r"(?:rotation|euler|quat(?:ernion)?|axis|matrix)order|(?:extrinsics?|pose|rotation|transform|matrix)(?:type|format|"
-    rf"direction)|^(?:is)?(?:{_TO_CAMERA}|{_TO_WORLD})$"
+    r"convention|coordinate|handed|degree|radian|(?:angle|rvec|rotation)s?units?|opengl|opencv|blender|unity|unreal|pytorch3d|"
+    r"flip|mirrored|transposed|rowvector|columnmajor|invert|^inversed?$|(?:rotation|euler|quat(?:ernion)?|axis|matrix|"
+    r"dist(?:ortion)?|coef\w*)order|(?:extrinsics?|pose|rotation|transform|matrix)(?:type|format|direction)|axes$|"
+    rf"^(?:is)?(?:{_TO_CAMERA}|{_TO_WORLD})$"
 )
-"""Keys whose text or truth says how poses are to be understood."""
+"""Keys whose text or truth says how numbers are to be understood."""
+_SAYS_IT = re.compile(rf"(?:opengl|lefthanded|{_TO_CAMERA}|{_TO_WORLD})+")
+"""Texts that say so under any key."""
 _LENS = re.compile(r"distor|distco|radial|tangen|coef|prism|fisheye|omni|^xi$|^[ksb]\d+$|^tau[xy]?$")
 _POSE = re.compile(r"rot|trans|pose|extrin|orient|position|quat|euler|cent(?:er|re)|^[qrt]\d*$")
 _POSE_SCALAR = re.compile(r"q[wxyz]|[tr][xyz]|yaw|pitch|roll")
-_SCALE = re.compile(r"(?:world|pose|translation)?scale(?:factor)?")
+_SCALE = re.compile(r"^(?:world|pose|translation)?scale(?:factor)?$")
 _HARMLESS = re.compile(
     r"err|rms|residual|std|deviation|sigma|covar|uncertain|^num|count|estimate|fix|flag|views|points|board|pattern|"
     r"square|vectors|matrices|roi|^new|optimal|rectif|projectionmatrix|resolutions|exposure|gain|plane|time"
@@ -102,14 +105,17 @@ def statements(tree: Any) -> Table:
     """Entries of a table, and of its `metadata`, that hold for all cameras in it: lens model, unit, conventions."""
     if not isinstance(tree, dict):
         return {}
-    kinds = ("lens model", "model", "fisheye", "unit")
-    own = {
-        key: value
-        for key, value in tree.items()
-        if not isinstance(value, list | dict)
-        and (kind_of(str(key)) in kinds or _CONVENTION.search(spelled(key)) or _SCALE.fullmatch(spelled(key)))
-    }
+    own = {}
+    for key, value in tree.items():
+        is_kind = kind_of(str(key)) in ("lens model", "model", "fisheye", "unit") or _SCALE.search(spelled(key))
+        if _states_convention(key, value) or (is_kind and not isinstance(value, list | dict)):
+            own[key] = value
     return statements(tree.get("metadata")) | own
+
+
+def _states_convention(key: Any, value: Any) -> bool:
+    is_text = not isinstance(value, list | dict) or (value and all(isinstance(v, str) for v in value))
+    return bool(is_text and (_CONVENTION.search(spelled(key)) or _SAYS_IT.fullmatch(spelled(value))))
 
 
 def conventions(table: Table, path: Path, place: str) -> set[str]:
@@ -123,7 +129,7 @@ def conventions(table: Table, path: Path, place: str) -> set[str]:
     said: set[str] = set()
     for key, value in table.items():
         name, text = spelled(key), spelled(value)
-        if isinstance(value, list | dict) or not _CONVENTION.search(name):
+        if not _states_convention(key, value):
             continue
         if text in _NO:
             text = "c2w" if re.search(_TO_CAMERA, name) else "not" if re.search("opencv|right", name) else ""

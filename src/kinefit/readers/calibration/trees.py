@@ -14,7 +14,7 @@ from kinefit.readers.calibration.colmap import image_names
 from kinefit.readers.calibration.keys import Table, find, kind_of, spelled, statements
 from kinefit.readers.calibration.tables import numbers
 
-_KINDS_OF_PARTS = ("matrix", "distortion", "pose", "inverse pose")
+_KINDS_OF_PARTS = ("matrix", "distortion", "pose", "inverse pose", "lens model", "model")
 _PART = re.compile(r"(?:projection|distortion|mirror)(?:parameters)?|lens")
 """Keys of tables within a camera's table, beside those of a quantity."""
 _OF_PAIR = re.compile(r"(?:(M|K|mtx|camera_?[mM]atrix)|(D|dist|dist_?[cC]oeffs))_?([12])")
@@ -128,6 +128,8 @@ def _merged(tree: Table) -> Table:
         is_camera = find(inner, "matrix") is not None  # with a name such as D
         if (name.startswith("intrinsic") and not _is_by_camera(inner)) or (named and not is_camera):
             direction = {"cam2world": True} if kind == "inverse pose" else {}
+            if kind not in ("matrix", "pose", "inverse pose"):
+                inner = {"distortion_model" if key in ("name", "type") else key: v for key, v in inner.items()}
             return _merged({key: value for key, value in tree.items() if key != part} | direction | inner)
     return tree
 
