@@ -158,6 +158,7 @@ def test_what_is_no_lens_and_no_convention_stays_silent(tmp_path):
         "board_size": [9, 6], "square_size": 0.025, "model": "Basler acA1920", "type": "hd", "lens": "Fujinon 8 mm",
         "lens_focal_length": 8.5, "world_position": [1.5, 2, 3], "world_orientation": K, "distance": 3.5, "skew": 0.0,
         "xi": 0, "cov": [0.1, 0.2, 0.3, 0.4], "roi": [0.5, 0, 640, 480], "undistorted": False, "thin_prism": [0.0] * 4,
+        "fov_degrees": 62.5, "software": "Blender",
     }  # fmt: skip
     assert_right(read(tmp_path, lambda T: lens() | pose(T) | {k: v for k, v in harmless.items() if v is not None}))
     undistorted = lambda T: lens(dist=None) | pose(T) | {"undistorted": True}

@@ -114,7 +114,9 @@ def statements(tree: Any) -> Table:
 
 
 def _states_convention(key: Any, value: Any) -> bool:
-    is_text = not isinstance(value, list | dict) or (value and all(isinstance(v, str) for v in value))
+    """Whether an entry is a text, a flag or a list of texts on how numbers are to be understood."""
+    texts = value if isinstance(value, list) and value else [value]
+    is_text = value in (0, 1) or all(isinstance(text, str) for text in texts)
     return bool(is_text and (_CONVENTION.search(spelled(key)) or _SAYS_IT.fullmatch(spelled(value))))
 
 
