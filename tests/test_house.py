@@ -19,7 +19,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 
 # Imports run downwards only. Parts of one level do not see each other, but for those in BESIDE.
 LEVELS = [
-    {"errors", "_jit"},
+    {"errors", "_jit", "_processes"},
     {"_arguments", "_files", "_image_headers", "_mapped", "_records", "_threads", "findings", "serving"},
     {"geometry", "_pictures"},
     {"bodies", "observations", "motion", "motion_columns"},

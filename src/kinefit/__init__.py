@@ -4,11 +4,18 @@ The public names stand in `__init__.pyi`. Each is loaded when it is first used, 
 line start at once.
 """
 
-import ast
-from functools import cache
-from importlib import import_module
-from pathlib import Path
-from typing import Any
+import os
+import sys
+
+_ROOT = os.path.dirname(os.path.dirname(__file__))
+if sys.argv[:1] == ["-m"] and "kinefit" in sys.orig_argv and sys.path[0] == os.getcwd() != _ROOT:
+    del sys.path[0]  # `python -m kinefit` imports nothing from the current folder, which may hold files of strangers
+
+import ast  # noqa: E402
+from functools import cache  # noqa: E402
+from importlib import import_module  # noqa: E402
+from pathlib import Path  # noqa: E402
+from typing import Any  # noqa: E402
 
 __version__ = "0.2.0"
 

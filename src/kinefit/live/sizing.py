@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
-from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
 
+from kinefit._processes import Pool
 from kinefit.bodies import Body
 from kinefit.errors import KinefitError
 from kinefit.frame.results import FrameResult
@@ -53,7 +53,7 @@ class LiveSize:
         }  # fmt: skip
         self._steps: list[list[Any]] = []
         self._next = -float("inf")
-        self._pool: ProcessPoolExecutor | None = None
+        self._pool: Pool | None = None
         self._future: Future[Body] | None = None
         self.outcome = ""
 
@@ -69,7 +69,7 @@ class LiveSize:
             self._steps.append(seen)
             self._next = result.time + _STEP_INTERVAL_S
             if self._pool is None:  # it starts while steps are collected
-                self._pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_lower_priority)
+                self._pool = Pool(1, _lower_priority)
                 self._pool.submit(warm_keypoints)
         if len(self._steps) == _FITTED_STEPS:
             assert self._pool is not None
