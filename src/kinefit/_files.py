@@ -89,10 +89,24 @@ def repeated(names: Iterable[str]) -> list[str]:
     return [name for name, count in Counter(names).items() if count > 1]
 
 
+def regular(path: str | os.PathLike[str]) -> Path:
+    """The path, if reading there ends; a missing file and a folder are for the reader to report.
+
+    Raises
+    ------
+    FileError
+        A named pipe, a socket or a device, or a link to one: reading may wait for ever, or never end.
+    """
+    if os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path):
+        remedy = "Copy what it gives into a file, and name that."
+        raise FileError("a pipe, socket or device, not a file", file=path, remedy=remedy)
+    return Path(path)
+
+
 def read_bytes(path: Path) -> bytes:
-    """All of a file; FileError where it cannot be read, or has no end (a device)."""
+    """All of a file; FileError where it cannot be read, or is no regular file."""
     try:
-        if path.exists() and not path.is_file():
+        if regular(path).is_dir():
             raise FileError("is not a file", file=path, remedy="Check the path.")
         return path.read_bytes()
     except (OSError, ValueError) as problem:

@@ -35,7 +35,7 @@ def image_sizes(file: BinaryIO) -> list[Size]:
         if start.startswith(signature):
             try:
                 return sizes(start, file)
-            except (struct.error, IndexError):
+            except (struct.error, IndexError, OverflowError, OSError):  # an offset beyond all files
                 return []
     return []
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from kinefit.errors import FileError, KinefitError
+from kinefit.readers.depth.images import natural
 from kinefit.readers.guess.files import VIDEOS
 from kinefit.readers.take.find import takes_in
 
@@ -43,7 +44,7 @@ class TakeFolder:
     @property
     def people(self) -> tuple[Path, ...]:
         """Folders of results, one a person, that hold a motion."""
-        many = sorted(self.out.glob("person-*/motion.npz"), key=lambda p: int(p.parent.name.rpartition("-")[2]))
+        many = sorted(self.out.glob("person-*/motion.npz"), key=lambda p: natural(p.parent.name))
         alone = self.out / "motion.npz"
         return (self.out,) if alone.is_file() and not many else tuple(motion.parent for motion in many)
 

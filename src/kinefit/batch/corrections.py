@@ -12,6 +12,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from kinefit._files import read_bytes
 from kinefit.bodies import load_body
 from kinefit.errors import KinefitError, TakeError, check_choice, choices
 from kinefit.exporters.atomic import write_bytes, write_text, writing
@@ -62,7 +63,7 @@ def choose_person(take: TakePath, person: int | str | None) -> None:
 
 def can_undo(take: TakePath) -> bool:
     """Whether there is an edit to take back."""
-    return any(_before(find_take(take).absolute()).glob("*.txt"))
+    return bool(_kept(find_take(take).absolute()))
 
 
 def set_height(take: TakePath, height: float | None) -> None:
@@ -134,13 +135,17 @@ def corrections_of(take: TakePath) -> tuple[str, ...]:
 def undo(take: TakePath) -> bool:
     """Take the last edit back, and what was changed in the take file since; False where there is none."""
     path = find_take(take).absolute()
-    kept = sorted(_before(path).glob("*.txt"))
-    if not kept:
+    if not (kept := _kept(path)):
         return False
     clicks = kept[-1].with_suffix(".json")
-    if clicks.exists() and (file := read_take(path).clicks) is not None:
-        _put(file, clicks.read_bytes())
-    write_bytes(path, kept[-1].read_bytes())
+    try:
+        with writing(path) as temporary:
+            temporary.write_bytes(read_bytes(kept[-1]))
+            read_take(temporary)
+            if clicks.exists() and (file := read_take(path).clicks) is not None:
+                _put(file, read_bytes(clicks))
+    except KinefitError as error:
+        raise type(error)(error.problem, file=kept[-1], place=error.place, remedy=error.remedy) from error
     for done in (kept[-1], clicks):
         done.unlink(missing_ok=True)
     return True
@@ -149,6 +154,14 @@ def undo(take: TakePath) -> bool:
 def _before(path: Path) -> Path:
     """Folder of the texts before each edit: 0001.txt, and 0001.json with the clicks, empty where there were none."""
     return path.with_name(f"{path.stem}-before")
+
+
+def _kept(path: Path) -> list[Path]:
+    """The texts before each edit, in order; other files there are none of ours."""
+    return sorted(
+        (file for file in _before(path).glob("*.txt") if file.stem.isdecimal() and file.is_file()),
+        key=lambda file: int(file.stem),
+    )
 
 
 def _put(file: Path, content: bytes) -> None:
@@ -167,7 +180,7 @@ def _opened(take: TakePath) -> tuple[Take, str]:
 
 def _write(path: Path, text: str, clicks: tuple[Path, str] | None = None) -> None:
     """Write the text of a take, and its clicks, if it is valid; keep what was there before."""
-    kept = sorted(_before(path).glob("*.txt"))
+    kept = _kept(path)
     copy = _before(path) / f"{int(kept[-1].stem) + 1 if kept else 1:04}.txt"
     former = clicks[0].read_bytes() if clicks and clicks[0].exists() else b""
     try:

@@ -20,8 +20,8 @@ from kinefit.readers.depth.images import PICTURES, counts_of, depth_picture, nat
 from kinefit.readers.keypoints import read_openpose
 
 _POLL_INTERVAL_S = 0.005
-_MIN_FILE_AGE_S = 0.05  # since the last change, of a complete file
-_FOLDER_TIME_RESOLUTION_S = 0.1  # within which a folder may change twice under one time
+_MIN_FILE_AGE_S = 0.05  # since a change was last seen, of a complete file
+_FOLDER_TIME_RESOLUTION_S = 2.0  # within which a folder may change twice under one time: FAT's, the coarsest
 _DEFAULT_COUNT = 0.001  # [m] of a 16-bit count
 
 
@@ -50,7 +50,8 @@ class FolderSource(ThreadSource):
         if not folder.is_dir():
             raise FileError("no such folder", file=folder, place=name, remedy="Create it, or correct stream.")
         self._known = {entry.name for entry in os.scandir(folder)}
-        self._changed, self._waiting = -1.0, True
+        self._changed: tuple[float, float] = -1.0, 0.0  # time of the folder's last change, and our clock's then
+        self._waiting: dict[str, tuple[tuple[int, int], float]] = {}  # size and time of a file, and our clock's then
 
     def read(self, path: Path, when: float) -> Any:
         """The content of a file, for the tracker; None if it cannot be read. Subclasses implement it.
@@ -76,28 +77,38 @@ class FolderSource(ThreadSource):
                     return
 
     def _new(self) -> list[Path]:
-        """New complete files; lists the folder only if it has changed, or has incomplete files."""
-        now, fresh, present = time.time(), list[str](), set[str]()
+        """New complete files; lists the folder only if it has changed lately, or has incomplete files.
+
+        Times of files are compared with each other alone: they may be of another computer's clock.
+        """
+        now, fresh, present = time.monotonic(), list[str](), set[str]()
         try:
-            changed = os.stat(self.folder).st_mtime
-            if changed == self._changed and not self._waiting and now - changed > _FOLDER_TIME_RESOLUTION_S:
+            if (changed := os.stat(self.folder).st_mtime) != self._changed[0]:
+                self._changed = changed, now
+            elif not self._waiting and now - self._changed[1] > _FOLDER_TIME_RESOLUTION_S:
                 return []
             entries = list(os.scandir(self.folder))
         except OSError as error:
             problem, remedy = f"the folder can no longer be read ({error.strerror})", "Create it again."
             raise FileError(problem, file=self.folder, place=self.name, remedy=remedy) from error
-        self._changed, self._waiting = changed, False
+        waiting, self._waiting = self._waiting, {}
         for entry in entries:
             present.add(entry.name)
             if entry.name in self._known or not entry.name.lower().endswith(self.endings):
                 continue
             try:
-                complete = now - entry.stat().st_mtime >= _MIN_FILE_AGE_S
+                if not entry.is_file():
+                    continue
+                found = os.stat(entry.path)  # Windows' list has the size of when the file was opened
             except FileNotFoundError:  # deleted meanwhile
                 continue
-            if complete:
+            state = found.st_size, found.st_mtime_ns
+            former, since = waiting.get(entry.name, (state, now))
+            since = since if state == former else now
+            if now - since >= _MIN_FILE_AGE_S:
                 fresh.append(entry.name)
-            self._waiting |= not complete
+            else:
+                self._waiting[entry.name] = state, since
         self._known = (self._known & present) | set(fresh)
         return [self.folder / name for name in sorted(fresh, key=natural)]
 

@@ -367,7 +367,7 @@ def test_matlab_files_that_are_refused(tmp_path, monkeypatch):
     (tmp_path / "fish.json").write_text(json.dumps({"Intrinsics": {"MappingCoefficients": [1, 2, 3, 4]}}))
     with pytest.raises(CalibrationError, match="fisheye model"):
         read_calibration(tmp_path / "fish.json")
-    monkeypatch.setitem(sys.modules, "scipy.io", None)
+    monkeypatch.setitem(sys.modules, "scipy", None)
     with pytest.raises(FileError, match=r"scipy.*kinefit\[matlab\].*jsonencode"):
         read_calibration(path)
 

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import importlib.util
+import json
+import subprocess
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from kinefit._files import regular
+from kinefit._processes import environment, python
 from kinefit.errors import CalibrationError, FileError
 from kinefit.readers.calibration.keys import Table, find
 from kinefit.readers.calibration.tables import is_transposed, numbers
 from kinefit.readers.units import LENGTHS, worth
 
 _AS_STRUCT = "In MATLAB: s = toStruct(params); save('calibration.mat', '-struct', 's', '-v7')"
+_MAX_READ_S = 60.0  # of a file; one of 20 MB takes 3 s on a slow computer
 
 
 def read_mat(path: Path) -> Table:
@@ -21,38 +27,29 @@ def read_mat(path: Path) -> Table:
     Raises
     ------
     FileError
-        The extra `matlab` is not installed; no file of MATLAB, or one of version 7.3.
+        The extra `matlab` is not installed; no file of MATLAB, one that is damaged, or one of version 7.3.
     CalibrationError
         Objects in place of structs.
     """
-    try:
-        from scipy.io import loadmat
-    except ImportError:
+    if importlib.util.find_spec("scipy") is None:
         remedy = "Run: pip install 'kinefit[matlab]'. Or in MATLAB: writelines(jsonencode(toStruct(params)), 'a.json')"
-        raise FileError("reading .mat files needs the package scipy", file=path, remedy=remedy) from None
+        raise FileError("reading .mat files needs the package scipy", file=path, remedy=remedy)
+    words = python(str(Path(__file__).with_name("mat_file.py")), str(regular(path)))
     try:
-        found = loadmat(path, simplify_cells=True)
-    except NotImplementedError:
+        done = subprocess.run(words, env=environment(), capture_output=True, timeout=_MAX_READ_S)
+        answer = json.loads(done.stdout) if done.returncode == 0 else {"damage": "scipy's reader crashes on it"}
+    except subprocess.TimeoutExpired:
+        answer = {"damage": f"scipy's reader does not end within {_MAX_READ_S:.0f} s"}
+    if "version" in answer:
         remedy = "Save it again: save('calibration.mat', '-struct', 's', '-v7')."
-        raise FileError("a MATLAB file of version 7.3, which kinefit does not read", file=path, remedy=remedy) from None
-    except Exception as error:  # a damaged file can raise anything
-        raise FileError(f"not a readable MATLAB file: {error}", file=path, remedy="Save it again.") from None
-    variables = {key: _plain(value, path) for key, value in found.items() if not key.startswith("__")}
+        raise FileError("a MATLAB file of version 7.3, which kinefit does not read", file=path, remedy=remedy)
+    if "object" in answer:
+        raise CalibrationError("MATLAB objects, which only MATLAB reads", file=path, remedy=f"{_AS_STRUCT}.")
+    if "damage" in answer:
+        raise FileError(f"not a readable MATLAB file: {answer['damage']}", file=path, remedy="Save it again.")
+    variables = answer["variables"]
     pair = next((v for v in variables.values() if isinstance(v, dict) and "CameraParameters1" in v), variables)
     return matlab_tree(pair, path, of_mat=True)
-
-
-def _plain(value: Any, path: Path) -> Any:
-    """Convert a value of scipy's reader to dicts, lists, texts and numbers."""
-    if isinstance(value, dict):
-        return {key: _plain(inner, path) for key, inner in value.items()}
-    if isinstance(value, np.ndarray) and value.dtype.names is None and value.dtype != object:
-        return value.tolist()
-    if isinstance(value, list | np.ndarray) and type(value).__name__ != "MatlabOpaque":
-        return [_plain(inner, path) for inner in value]
-    if not isinstance(value, str | int | float | np.generic):
-        raise CalibrationError("MATLAB objects, which only MATLAB reads", file=path, remedy=f"{_AS_STRUCT}.")
-    return value.item() if isinstance(value, np.generic) else value
 
 
 def matlab_tree(tree: Any, path: Path, of_mat: bool = False) -> Any:
