@@ -55,7 +55,7 @@ def read_table(
     """
     texts, rows = list[str](), list[list[float]]()
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with regular(path).open(encoding="utf-8-sig", newline="") as file:
             table = csv.reader(file)
             names = [name.strip() for name in next(table, [])]
             missing = [name for name in ([text] if text else []) + list(columns) if name not in names]
@@ -108,7 +108,7 @@ def read_bytes(path: Path) -> bytes:
     try:
         if regular(path).is_dir():
             raise FileError("is not a file", file=path, remedy="Check the path.")
-        return path.read_bytes()
+        return regular(path).read_bytes()
     except (OSError, ValueError) as problem:
         reason = getattr(problem, "strerror", None) or str(problem)
         raise FileError(f"cannot be read ({reason})", file=path, remedy="Check the path.") from problem
@@ -202,10 +202,12 @@ def read_npy(file: str | os.PathLike[str], *, remedy: str) -> NDArray:
     """The array of a numpy file; FileError where it is none, of objects, or longer than the file."""
     path = Path(file)
     try:
-        with path.open("rb") as stream:
+        with regular(path).open("rb") as stream:
             return _array(stream, path.stat().st_size, path.name)
     except FileNotFoundError as problem:
         raise FileError("no such file", file=path, remedy="Check the path.") from problem
+    except FileError:
+        raise
     except Exception as problem:
         reason = str(problem) if isinstance(problem, _Refused) else _reason(problem)
         raise FileError(f"not a numpy array, or damaged ({reason})", file=path, remedy=remedy) from problem
@@ -214,7 +216,7 @@ def read_npy(file: str | os.PathLike[str], *, remedy: str) -> NDArray:
 def npy_header(file: str | os.PathLike[str]) -> tuple[_Shape, np.dtype] | None:
     """Shape and type of the array in a numpy file, which is not read; None where it is none."""
     try:
-        with Path(file).open("rb") as stream:
+        with regular(file).open("rb") as stream:
             shape, _, dtype = _header(stream)
     except Exception:
         return None

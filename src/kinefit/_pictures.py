@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import read_bytes
+from kinefit._files import read_bytes, regular
 from kinefit._image_headers import IMAGE_KINDS, MAX_IMAGE_PIXELS, Size, image_sizes
 from kinefit.errors import FileError
 
@@ -65,7 +65,7 @@ def page_sizes(file: Path) -> list[Size]:
         No image of a kind that is read, a damaged header, or an image of more than `MAX_IMAGE_PIXELS`.
     """
     try:
-        with file.open("rb") as stream:
+        with regular(file).open("rb") as stream:
             return _checked_sizes(stream, file)
     except OSError as problem:
         raise FileError(f"cannot be read ({problem.strerror})", file=file, remedy="Check the path.") from problem

@@ -38,8 +38,9 @@ class KinefitError(Exception):
         place: str | None = None,
         remedy: str | None = None,
     ) -> None:
-        self.file, self.problem, self.place = file, shortened(problem), shortened(str(place), 120) if place else place
-        file_text = shortened(str(file), _MAX_PATH_CHARACTERS) if file else ""
+        problem, remedy = printable(problem), printable(remedy) if remedy else remedy
+        self.file, self.problem, self.place = file, shortened(problem), shortened(printable(place), 120) if place else place
+        file_text = shortened(printable(file), _MAX_PATH_CHARACTERS) if file else ""
         extra = max(len(file_text) - _TYPICAL_PATH_CHARACTERS, 0)
         room = _MAX_ERROR_CHARACTERS - len(self.problem) - len(self.place or "") - extra
         self.remedy = shortened(remedy, max(room, _MIN_REMEDY_CHARACTERS)) if remedy else remedy
@@ -85,6 +86,14 @@ _MAX_ERROR_CHARACTERS = 570  # of all parts together
 _MAX_PATH_CHARACTERS = 260  # also of a path that a file names
 _TYPICAL_PATH_CHARACTERS = 150
 _MIN_REMEDY_CHARACTERS = 60
+
+
+def printable(text: object) -> str:
+    """The text of something for people: "?" for what is no character, as in a file's name that is not UTF-8.
+
+    Every file, page and terminal can hold it.
+    """
+    return str(text).encode("utf-8", "replace").decode("utf-8")
 
 
 def shortened(text: str, longest: int = _MAX_PROBLEM_CHARACTERS) -> str:

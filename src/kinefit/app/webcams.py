@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import regular
 from kinefit.errors import KinefitError, ObservationError
 from kinefit.exporters.atomic import write_text
 from kinefit.exporters.pictures.overlay import write_pictures
@@ -88,7 +89,7 @@ def write_live_take(root: Path, sizes: Mapping[int, tuple[int, int]], calibratio
     """
     folder = root / "-".join(("webcams", *map(str, sizes)))
     file = folder / "take.toml"
-    text = file.read_text("utf-8") if file.exists() else "[take]\n"
+    text = regular(file).read_text("utf-8") if file.exists() else "[take]\n"
     text = text if file.exists() else with_keys(text, "take", None, {"name": '"live"', "rate": f"{_RATE}", "up": '"z"'})
     if calibration is not None:
         text = with_keys(text, "calibration", None, {"file": quoted(calibration.as_posix())})

@@ -12,7 +12,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from kinefit._files import read_bytes
+from kinefit._files import read_bytes, regular
 from kinefit.bodies import load_body
 from kinefit.errors import KinefitError, TakeError, check_choice, choices
 from kinefit.exporters.atomic import write_bytes, write_text, writing
@@ -175,7 +175,7 @@ def _put(file: Path, content: bytes) -> None:
 def _opened(take: TakePath) -> tuple[Take, str]:
     """A take, and the text of its file, line ends as they are."""
     read = read_take(take)
-    return read, read.path.read_bytes().decode("utf-8").removeprefix("\ufeff")
+    return read, regular(read.path).read_bytes().decode("utf-8").removeprefix("\ufeff")
 
 
 def _write(path: Path, text: str, clicks: tuple[Path, str] | None = None) -> None:
@@ -191,7 +191,7 @@ def _write(path: Path, text: str, clicks: tuple[Path, str] | None = None) -> Non
             read_take(temporary)
             if clicks:
                 write_bytes(copy.with_suffix(".json"), former)
-            write_bytes(copy, path.read_bytes())
+            write_bytes(copy, regular(path).read_bytes())
     except BaseException as error:
         if clicks:
             _put(clicks[0], former)

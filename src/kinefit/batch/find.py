@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from kinefit._files import parse_toml
+from kinefit._files import parse_toml, regular
 from kinefit.errors import FileError, KinefitError, command
 from kinefit.readers.take.find import is_take, takes_in
 
@@ -98,7 +98,7 @@ def _is_result(take: Path, base: Path) -> bool:
 
 def _may_be_take(file: Path) -> bool:
     try:
-        parse_toml(file.read_text("utf-8"), file)
+        parse_toml(regular(file).read_text("utf-8"), file)
     except (OSError, UnicodeDecodeError, KinefitError):
         return True
     return is_take(file)

@@ -13,7 +13,7 @@ from kinefit.batch.outcome import Row, failed
 from kinefit.batch.processes import Failure, run_here
 from kinefit.batch.summary import write_summary
 from kinefit.batch.work import TakeJob, work
-from kinefit.errors import ExportError
+from kinefit.errors import ExportError, printable
 
 TakesProgress = Callable[[int, int, tuple[Row, ...]], None]
 """Called with the number of takes that ended, the number of all takes, and the rows of the last one."""
@@ -77,7 +77,7 @@ def track_takes(
 
 def _job(found: Found, take: Path, out: Path, choices: Choices) -> TakeJob:
     folder = found.folder(take, out)
-    return TakeJob(take, found.label(take), folder, folder.relative_to(out).as_posix(), choices)
+    return TakeJob(take, printable(found.label(take)), folder, printable(folder.relative_to(out).as_posix()), choices)
 
 
 def _results(

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from kinefit._files import regular
 from kinefit.batch.find import RECORD
 from kinefit.batch.one import Choices, asked_take, people_of, track_person
 from kinefit.batch.outcome import DONE, Range, Row, failed
 from kinefit.batch.people_report import write_people_report
 from kinefit.batch.results import silent
-from kinefit.errors import KinefitError
+from kinefit.errors import KinefitError, printable
 from kinefit.findings import of_provenance
 
 if TYPE_CHECKING:
@@ -66,14 +67,14 @@ def work(job: TakeJob) -> tuple[Row, ...]:
     except KinefitError as error:
         return (failed(start, str(error)),)
     known = None if job.choices.restart else _read(job.out / RECORD)
-    if known is not None and known.take != str(job.take):
+    if known is not None and known.take != printable(job.take):
         problem = f"{job.folder} has the results of another take ({known.take})"
         return (failed(start, f"{problem}. Give another folder with --out, or overwrite them with --restart."),)
     if known is not None and known.key == key and all((job.out / name).exists() for name in known.files):
         return known.rows
     rows, made = _tracked(job, take, start, said)
     if all(row.status == DONE for row in rows):
-        _write(job.out / RECORD, _TakeRecord(str(job.take), key, tuple(made), rows))
+        _write(job.out / RECORD, _TakeRecord(printable(job.take), key, tuple(made), rows))
     return rows
 
 
@@ -143,7 +144,7 @@ def of_motion(row: Row, motion: Motion, notes: tuple[str, ...]) -> Row:
 def _read(path: Path) -> _TakeRecord | None:
     """The record of an earlier run; None if there is none that can be read."""
     try:
-        return msgspec.json.decode(path.read_bytes(), type=_TakeRecord)
+        return msgspec.json.decode(regular(path).read_bytes(), type=_TakeRecord)
     except (OSError, msgspec.MsgspecError):
         return None
 

@@ -5,7 +5,9 @@ Heavy imports stand inside the commands, so that help comes at once.
 
 from __future__ import annotations
 
+import io
 import os
+import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
@@ -134,3 +136,6 @@ def _meant(error: click.UsageError, words: Sequence[str]) -> str:
 def main() -> None:
     """Fit one articulated body to measurements of any sensors."""
     os.environ.update(environment())  # for what libraries start, too
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # names of files may not be UTF-8

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kinefit._files import regular
 from kinefit.cli import _screen
 from kinefit.errors import TakeError, TrackingError, choices
 
@@ -132,7 +133,7 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, steps: Seque
     )
     vectors = {"at": state.T_world_root[:3, 3], "forward": R[:, 0], "upward": R[:, 1]}
     lines = [f"{key} = [{', '.join(f'{v:.6f}' for v in vector)}]" for key, vector in vectors.items()]
-    text = re.sub(r"\n\[start\]  # clicked\n.*?(?=\n\[|\Z)", "", out.read_text("utf-8"), flags=re.S)
+    text = re.sub(r"\n\[start\]  # clicked\n.*?(?=\n\[|\Z)", "", regular(out).read_text("utf-8"), flags=re.S)
     text = re.sub(r"(?m)^body = .*$", f'body = "{BODY}"  # {body.name} of the clicked lengths', text, count=1)
     head = ["[start]  # clicked", f"step = {clicks.step}", f'clicks = "{CLICKS}"']
     start = "\n".join([*head, *lines, f"angles = {{ {written} }}"])

@@ -10,7 +10,7 @@ from glob import escape
 from os import PathLike
 from pathlib import Path
 
-from kinefit.errors import ExportError
+from kinefit.errors import ExportError, printable
 
 _REMEDIES = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "Free some space, or write to another disk."),
@@ -66,12 +66,12 @@ def _remove_of_the_dead(target: Path) -> None:
 def write_text(path: str | PathLike[str], text: str) -> None:
     """Write a whole text file (UTF-8, line ends as they are) or nothing."""
     with writing(path) as temporary:
-        temporary.write_bytes(text.encode("utf-8"))
+        temporary.write_bytes(printable(text).encode("utf-8"))
 
 
 def write_lines(path: str | PathLike[str], lines: Iterable[str]) -> None:
     """Write a whole text file (UTF-8), line by line as they are made, or nothing."""
-    with writing(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+    with writing(path) as temporary, temporary.open("w", encoding="utf-8", errors="replace", newline="\n") as file:
         file.writelines(f"{line}\n" for line in lines)
 
 

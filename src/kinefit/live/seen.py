@@ -10,6 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import regular
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_text
 from kinefit.exporters.pictures.detections import write_detections
@@ -51,7 +52,7 @@ class SeenRecord:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             other = self.folder / _TAKE_FILE
-            if other.exists() and not other.read_text(errors="replace").startswith(_TAKE_HEAD):
+            if other.exists() and not regular(other).read_text(errors="replace").startswith(_TAKE_HEAD):
                 remedy = "Give another folder with --out."
                 raise ExportError("the session would overwrite this take", file=other, remedy=remedy)
         except OSError as error:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from kinefit._files import regular
 from kinefit._threads import cores
 from kinefit.errors import AssetError, FileError, TakeError
 from kinefit.preparing.each_video import Step, Tell, each_video, video_key
@@ -268,7 +269,7 @@ def _name_of(quality: str | Path) -> str:
     if isinstance(quality, str):
         return quality
     try:
-        return hashlib.sha256(quality.read_bytes()).hexdigest()[:16]
+        return hashlib.sha256(regular(quality).read_bytes()).hexdigest()[:16]
     except OSError as error:
         raise FileError(f"cannot be read ({error.strerror})", file=quality, remedy="Check --network.") from error
 

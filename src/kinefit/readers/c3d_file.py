@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import regular
 from kinefit.errors import FileError
 
 _BLOCK_BYTES = 512
@@ -50,7 +51,7 @@ class C3d:
 def read_c3d(path: Path) -> C3d:
     """Read the points and all parameters; raises FileError for a damaged or truncated file."""
     try:
-        raw = path.read_bytes()
+        raw = regular(path).read_bytes()
     except FileNotFoundError as error:
         raise FileError("no such file", file=path) from error
     except OSError as error:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit._files import no_column, read_npy
+from kinefit._files import no_column, read_npy, regular
 from kinefit.errors import FileError, ObservationError, check_choice, choices
 from kinefit.observations import Keypoints
 from kinefit.readers.keypoint_arrays import FACE_POINTS, cut_frames, face_mesh, keypoint_record
@@ -181,7 +181,7 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
     path, pose = Path(path), len(KEYPOINT_SETS["MEDIAPIPE_33"])
     columns = ("sync_index", "port", "frame_time", "point_id", "img_loc_x", "img_loc_y")
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with regular(path).open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
             if missing := [c for c in columns if c not in (reader.fieldnames or ())]:
                 needed = f"Needed: {', '.join(columns)}."
@@ -295,7 +295,7 @@ def _numbered_files(folder: Path) -> list[Path]:
 
 def _read_people(path: Path, count: int, keypoint_set: str) -> NDArray:
     """(P, K, 3) x, y [px], confidence of all people of one frame."""
-    raw = path.read_bytes()
+    raw = regular(path).read_bytes()
     try:
         people = decode_openpose(raw).people
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
+from kinefit._files import regular
 from kinefit.errors import FileError, ObservationError, choices, shortened
 from kinefit.observations import MarkerEvent, Markers
 from kinefit.readers.c3d_file import C3d, read_c3d
@@ -48,7 +49,7 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             head = file.read(64)
     except FileNotFoundError as error:
         raise FileError("no such file", file=path) from error
@@ -151,7 +152,7 @@ def _events(c3d: C3d) -> tuple[MarkerEvent, ...]:
 
 
 def _read_trc(path: Path, unit: str | None) -> Markers:
-    text = path.read_bytes().decode("utf-8-sig", errors="replace")
+    text = regular(path).read_bytes().decode("utf-8-sig", errors="replace")
     lines = text.splitlines()
     if len(lines) < 5 or not lines[0].lstrip().lower().startswith("pathfiletype"):
         raise FileError("not a TRC file", file=path, place="line 1", remedy=_TRC_REMEDY)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
-from kinefit._files import parse_toml
+from kinefit._files import parse_toml, regular
 from kinefit.errors import FileError, ObservationError, check_choice
 
 
@@ -31,7 +31,7 @@ def read_static_points(
     """
     file = Path(path)
     try:
-        raw = parse_toml(file.read_text(encoding="utf-8"), file)
+        raw = parse_toml(regular(file).read_text(encoding="utf-8"), file)
     except FileNotFoundError as error:
         raise FileError("no such file of static points", file=file, remedy="Check the path.") from error
     except (OSError, UnicodeDecodeError) as error:

@@ -10,6 +10,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import regular
 from kinefit._image_headers import MAX_IMAGE_PIXELS
 from kinefit._pictures import check_image_size
 from kinefit.errors import FileError
@@ -156,7 +157,7 @@ def open_container(path: Path) -> Any:
         Not readable, or a video with frames that are too large.
     """
     try:
-        container = av.open(str(path), options={"max_pixels": str(MAX_IMAGE_PIXELS)})
+        container = av.open(str(regular(path)), options={"max_pixels": str(MAX_IMAGE_PIXELS)})
     except (av.FFmpegError, OSError, ValueError) as error:
         raise FileError(f"not a readable video, 0 frames ({_reason(error)})", file=path, remedy=_REMEDY) from error
     try:

@@ -32,7 +32,7 @@ def texts() -> Texts:
 
 def link(page: str, **parameters: object) -> str:
     """Path of a page with parameters, such as a take file."""
-    query = "&".join(f"{name}={quote(str(value), safe='')}" for name, value in parameters.items())
+    query = "&".join(f"{name}={quote(str(value), safe='', errors='replace')}" for name, value in parameters.items())
     return f"{page}?{query}" if query else page
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from functools import cache
 from importlib import resources
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from kinefit._files import parse_toml
+from kinefit._files import parse_toml, regular
 from kinefit.bodies.marker_sets.labels import plain
 from kinefit.errors import FileError, ObservationError, choices
 
@@ -96,7 +95,7 @@ def find_record(name_or_file: str | PathLike[str], known: tuple[str, ...]) -> tu
     name = str(name_or_file)
     if name.lower().endswith(".toml"):
         try:
-            text = Path(name_or_file).read_text("utf-8")
+            text = regular(name_or_file).read_text("utf-8")
         except (OSError, UnicodeDecodeError) as error:
             raise FileError(f"cannot read the marker set ({error})", file=name, remedy="Give a TOML file.") from error
         return parsed(text, name), name

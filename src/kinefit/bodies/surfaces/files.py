@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from kinefit._files import regular
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
 from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface, by_length
 from kinefit.bodies.surfaces.mesh import MeshSurface
@@ -104,7 +105,7 @@ def _series(record: SurfaceRecord, segment: int, source: str, place: str) -> Mes
 
     def read() -> tuple[FourierCurve | FourierSurface, Any]:
         try:
-            points = np.loadtxt(path, delimiter=",", ndmin=2)
+            points = np.loadtxt(regular(path), delimiter=",", ndmin=2)
         except (OSError, ValueError) as error:
             raise BodyError(f"points that cannot be read: {error}", remedy="Write lines of x,y,z.") from error
         if record.contour is not None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import regular
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.errors import BodyError, check_choice, located
 
@@ -30,7 +30,7 @@ def read_obj(path: str | PathLike[str]) -> tuple[NDArray, NDArray]:
         A file that cannot be read, an invalid line, or a file without faces.
     """
     try:
-        lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = regular(path).read_text(encoding="utf-8", errors="replace").splitlines()
     except (OSError, ValueError) as error:
         problem = f"cannot read the mesh ({getattr(error, 'strerror', None) or error})"
         raise BodyError(problem, file=path, remedy="Give the path of an OBJ file.") from error

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from kinefit._arguments import checked
-from kinefit._files import parse_toml, repeated
+from kinefit._files import parse_toml, regular, repeated
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.morphs.morph_files import morphs_of, with_images
 from kinefit.bodies.surfaces.files import surfaces_of
@@ -48,7 +48,7 @@ def _text(name_or_file: str | Path) -> tuple[str, str]:
     path = Path(name_or_file)
     if path.suffix == ".toml":
         try:
-            return path.read_text(encoding="utf-8"), str(path)
+            return regular(path).read_text(encoding="utf-8"), str(path)
         except (OSError, ValueError) as error:
             remedy = "Give the path of a text file (UTF-8) in TOML."
             problem = f"cannot read the body file ({getattr(error, 'strerror', None) or error})"

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from kinefit._arguments import checked
-from kinefit._files import no_column
+from kinefit._files import no_column, regular
 from kinefit.calibration.bar.targets import BarViews
 from kinefit.errors import CalibrationError, FileError
 
@@ -38,7 +38,7 @@ def read_centroids(
     path = Path(path)
     spots: dict[str, dict[int, list[list[float]]]] = {}
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with regular(path).open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file)
             missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
             if missing:

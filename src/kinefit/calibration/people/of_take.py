@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from kinefit._arguments import checked
+from kinefit._files import regular
 from kinefit.bodies import load_body
 from kinefit.calibration.people.altered import refuse_videos
 from kinefit.calibration.people.calibrate import GUESSED_FOCAL_SIGMA, STATED_FOCAL_SIGMA, calibrate_people
@@ -146,8 +147,8 @@ def _made_from(take: Take) -> str:
         if entry.excluded or entry.swapped:
             digest.update(repr((entry.camera, entry.excluded, entry.swapped)).encode())
         files = [] if entry.file is None else sorted(entry.file.rglob("*")) if entry.file.is_dir() else [entry.file]
-        for file in files:
-            digest.update(f"{file.name} {_content(file)}".encode())
+        for file in filter(Path.is_file, files):
+            digest.update(f"{file.name} {_content(file)}".encode(errors="surrogateescape"))
     steps = "all" if take.frames is None else f"{take.frames[0]} {take.frames[1]}"
     return f"{digest.hexdigest()[:32]} {steps}"
 
@@ -163,6 +164,6 @@ def _holds_for(known: str, asked: str) -> bool:
 def _content(file: Path) -> str:
     """What tells one version of a file from another: its bytes, or for one of thousands its size and time."""
     if file.suffix != ".json":
-        return hashlib.sha256(file.read_bytes()).hexdigest()
+        return hashlib.sha256(regular(file).read_bytes()).hexdigest()
     stat = file.stat()
     return f"{stat.st_size} {stat.st_mtime_ns}"

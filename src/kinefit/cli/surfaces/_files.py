@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import regular
 from kinefit._pictures import read_picture
 from kinefit.errors import FileError, ObservationError, shortened
 from kinefit.geometry.camera import Rig
@@ -100,7 +101,7 @@ def read_seeds(path: Path, views: int) -> list[Seeds]:
     """
     remedy = "Give u and v [px] of each point in every view, as in u1,v1,u2,v2."
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with regular(path).open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file)
             rows = [(reader.line_num, row) for row in reader if row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import regular
 from kinefit.errors import ExportError, FileError, ObservationError
 from kinefit.geometry.se3 import exp_so3, log_so3
 from kinefit.identification.model.model import MarkerJoint, MarkerModel
@@ -102,7 +103,7 @@ def load_model(path: str | PathLike[str]) -> MarkerModel:
     path = Path(path)
     remedy = "Make one with `kinefit markers learn`."
     try:
-        record = msgspec.json.decode(path.read_bytes(), type=_ModelFile)
+        record = msgspec.json.decode(regular(path).read_bytes(), type=_ModelFile)
     except OSError as error:
         raise FileError(f"cannot be read ({error.strerror or error})", file=path, remedy=remedy) from error
     except msgspec.ValidationError as error:

@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import regular
 from kinefit.errors import CalibrationError, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import quaternion
@@ -91,7 +92,7 @@ def colmap_texts(rig: Rig, folder: Path, metres_per_unit: float) -> dict[str, st
     """
     path = folder / "images.txt"
     images = [(number, line.split(maxsplit=9)) for number, line in _images(path)]
-    texts = {name: (folder / name).read_text(encoding="utf-8").splitlines() for name in ("cameras.txt", "images.txt")}
+    texts = {name: regular(folder / name).read_text("utf-8").splitlines() for name in ("cameras.txt", "images.txt")}
     owners: dict[str, Camera] = {}
     for name, (number, parts) in zip(image_names([PurePosixPath(parts[9]) for _, parts in images]), images):
         if name not in rig:
@@ -168,7 +169,7 @@ def _images(path: Path) -> list[tuple[int, str]]:
 def _lines(path: Path) -> list[tuple[int, str]]:
     """Lines with their numbers, without comments."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = regular(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError):
         raise CalibrationError(
             "cannot be read as text",

@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from kinefit._arguments import checked
+from kinefit._files import regular
 from kinefit.errors import CalibrationError, ExportError, FileError, choices, located
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
@@ -257,7 +258,7 @@ def _read_text(path: Path) -> str:
         if (size := path.stat().st_size) > MAX_CALIBRATION_BYTES:
             problem = f"{size / 1e6:.0f} MB, too large for a calibration"
             raise FileError(problem, file=path, remedy=f"Is it another file? kinefit reads {FORMATS}.")
-        return path.read_text(encoding="utf-8-sig")
+        return regular(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError):
         raise FileError("cannot be read as text", file=path, remedy=f"kinefit reads {FORMATS}.") from None
 

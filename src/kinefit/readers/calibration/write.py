@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
+from kinefit._files import regular
 from kinefit.errors import CalibrationError, ExportError, KinefitError, check_choice
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import inverse, log_so3
@@ -154,13 +155,13 @@ def _texts(rig: Rig, like: Path, unit: str | float) -> tuple[dict[str, str], Rig
         texts = colmap_texts(rig, like, metres_per_unit([], unit, like))
         points = like / "points3D.txt"  # COLMAP opens no model without
         if points.exists():
-            texts["points3D.txt"] = points.read_text(encoding="utf-8")
+            texts["points3D.txt"] = regular(points).read_text(encoding="utf-8")
         return texts, rig
     texts = {}
     for name, group in calibration_sources(like):
         if odd := [file for file in group if file.suffix.lower() in (".mat", ".xcp")]:
             raise CalibrationError("files of MATLAB and Vicon are read, not written", file=odd[0], remedy=_REMEDY)
-        files = {file: file.read_bytes().decode("utf-8-sig") for file in group}
+        files = {file: regular(file).read_bytes().decode("utf-8-sig") for file in group}
         kinds = {file: recognise(text, file) for file, text in files.items()}
         if "qualisys" in kinds.values():
             scale = metres_per_unit([{"unit": "mm"}], unit, like)

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from kinefit.errors import FileError, printable
 from kinefit.readers.guess.files import CalibrationFile
 
 CONFIDENCE_LEVELS = ("sure", "likely", "guess", "open")
@@ -117,7 +118,10 @@ def _table(title: str, keys: Entry, draft: Draft, active: bool = True) -> str:
 
 def _value(value: object, draft: Draft) -> str:
     if isinstance(value, Path):
-        value = _relative(value, draft.beside)
+        value = _relative(named := value, draft.beside)
+        if value != printable(value):
+            problem = "its name is not UTF-8, as names in a take file are"
+            raise FileError(problem, file=named, remedy="Rename the file or folder.")
     if isinstance(value, float):
         return f"{value:.9g}" if value != int(value) else f"{value:.1f}"
     return json.dumps(value, ensure_ascii=False)

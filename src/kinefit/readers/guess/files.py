@@ -97,7 +97,7 @@ def list_files(folder: Path) -> list[Path]:
         depth = len(Path(parent).relative_to(folder).parts)
         searched = folders if depth < _MAX_DEPTH else []
         folders[:] = [name for name in searched if not name.startswith(".") and not name.endswith(_RESULT_ENDINGS)]
-        found += [Path(parent) / name for name in names if not name.startswith(".")]
+        found += [path for name in names if not name.startswith(".") and (path := Path(parent) / name).is_file()]
     return sorted(found, key=lambda path: natural(str(path)))
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import parse_toml
+from kinefit._files import parse_toml, regular
 from kinefit.bodies.joint_names import ENDS, FAMILIES, FINGERS, SEGMENTS, VRM0_FINGERS, VRM1_FINGERS
 from kinefit.bodies.limbs import FACE
 from kinefit.errors import FileError, choices
@@ -106,7 +106,7 @@ def read_names(path: str | PathLike[str]) -> dict[str, str]:
         Not TOML, an unknown segment, or a name that is no text.
     """
     try:
-        table = parse_toml(Path(path).read_text(encoding="utf-8-sig"), path)
+        table = parse_toml(regular(path).read_text(encoding="utf-8-sig"), path)
     except (OSError, UnicodeDecodeError) as error:
         raise FileError(f"cannot be read ({error})", file=path, remedy="Give a TOML file.") from error
     for segment, name in table.items():
@@ -226,5 +226,5 @@ def _from_bvh(path: Path) -> Character:
     return Character(
         path, skeleton.names, parents, np.arange(len(parents)), rest @ R.T, R @ rotations, np.ones(len(parents)), R,
         np.ones(len(parents), bool), {}, np.zeros((0, 3)), np.zeros(0, int), unit=float(unit[1]) if unit else 1.0,
-        text=path.read_text(encoding="utf-8-sig", errors="replace"),
+        text=regular(path).read_text(encoding="utf-8-sig", errors="replace"),
     )  # fmt: skip

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from kinefit.errors import FileError, check_choice
 from kinefit.motion import UP_AXES
 from kinefit.readers.units import LENGTHS, worth
+from kinefit._files import regular
 
 
 def read_text(path: str | PathLike[str], kind: str) -> str:
     """Text of a file of the given kind ("BVH"); raises FileError if it cannot be read or is binary."""
     try:
-        with open(path, encoding="utf-8-sig", errors="replace") as file:
-            text = file.read()
+        text = regular(path).read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         problem = f"cannot be read: {error.strerror}"
         raise FileError(problem, file=path, remedy=f"Give the path of a {kind} file.") from error

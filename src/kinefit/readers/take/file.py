@@ -12,8 +12,8 @@ from typing import Any
 import msgspec
 
 from kinefit._arguments import checked
-from kinefit._files import BACKSLASHES, parse_toml
-from kinefit.errors import FileError, TakeError, check_choice, choices, shortened
+from kinefit._files import BACKSLASHES, parse_toml, regular
+from kinefit.errors import FileError, TakeError, check_choice, choices, printable, shortened
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.checks import check_take
 from kinefit.readers.take.entries import (
@@ -159,7 +159,7 @@ def read_take(path: str | PathLike[str]) -> Take:
     """
     path = find_take(path).absolute()
     try:
-        raw = parse_toml(path.read_text(encoding="utf-8"), path)
+        raw = parse_toml(regular(path).read_text(encoding="utf-8"), path)
     except FileNotFoundError as error:
         raise FileError("no such take file", file=path, remedy="Check the path.") from error
     except (OSError, UnicodeDecodeError) as error:
@@ -179,7 +179,7 @@ def read_take(path: str | PathLike[str]) -> Take:
     head, start = content.take, content.start or StartEntry()
     body = str(folder / head.body) if head.body.endswith((".toml", ".npz")) else head.body
     take = Take(
-        path=path, name=head.name or path.stem, rate=head.rate, up=head.up, body=body, height=head.height,
+        path=path, name=head.name or printable(path.stem), rate=head.rate, up=head.up, body=body, height=head.height,
         subject=head.subject, frames=head.frames, calibration=content.calibration, cameras=content.camera,
         keypoints=tuple(k for k in content.keypoints if k.format != "skin"), markers=content.markers,
         depth=content.depth, stereo=content.stereo,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
-from kinefit._files import parse_toml
+from kinefit._files import parse_toml, regular
 from kinefit.errors import FileError, KinefitError, TakeError, command
 from kinefit.readers.guess.files import MARKERS, VIDEOS
 from kinefit.readers.take.entries import TABLES
@@ -57,7 +57,7 @@ def is_take(file: Path) -> bool:
     if file.name == "take.toml":
         return True
     try:
-        tables = parse_toml(file.read_text("utf-8"), file)
+        tables = parse_toml(regular(file).read_text("utf-8"), file)
     except (OSError, UnicodeDecodeError, KinefitError):
         return False
     return bool(set(tables) - {"calibration"}) and not set(tables) - set(TABLES)  # which calibrations have, too

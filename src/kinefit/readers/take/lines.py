@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import regular
 from kinefit.errors import FileError, ObservationError, TakeError, choices, located
 from kinefit.geometry.camera import ImageFrame
 from kinefit.observations import ClickVideo, LineVideo
@@ -62,7 +63,7 @@ def read_lines(path: Path, names: Iterable[str]) -> tuple[NDArray, NDArray]:
 def _rows(path: Path) -> Iterable[tuple[str, Mapping[str, Any]]]:
     """Rows of a table, each with its place for messages."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = regular(path).read_text(encoding="utf-8-sig")
         if path.suffix.lower() == ".json":
             content = json.loads(text)
             if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):

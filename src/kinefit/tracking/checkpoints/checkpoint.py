@@ -175,7 +175,7 @@ def key_of(take: Take, **options: Any) -> str:
         for one in sorted(path.iterdir()) if path.is_dir() else [path]:
             with suppress(OSError):
                 info = one.stat()
-                digest.update(f"{one} {info.st_size} {info.st_mtime_ns}".encode())
+                digest.update(f"{one!r} {info.st_size} {info.st_mtime_ns}".encode())
     return digest.hexdigest()
 
 

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import regular
 from kinefit.bodies.surfaces.obj import MAX_LENGTH, UNITS, read_obj
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
 from kinefit.bodies.tree import KinematicTree
@@ -65,7 +66,7 @@ def read_weights(path: Path, count: int, tree: KinematicTree) -> NDArray:
         A file that cannot be read, an invalid line, an unknown segment or vertex, a duplicate weight.
     """
     try:
-        lines = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+        lines = list(csv.reader(regular(path).read_text(encoding="utf-8-sig").splitlines()))
     except (OSError, ValueError, csv.Error) as error:
         remedy = "Give the path of a CSV file with lines of vertex, segment, weight."
         problem = f"cannot read the weights ({getattr(error, 'strerror', None) or error})"
