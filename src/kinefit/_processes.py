@@ -41,7 +41,7 @@ def _elsewhere(folders: Iterable[str]) -> list[str]:
 
 @contextmanager
 def starting(**more: str) -> Iterator[None]:
-    """Context in which `multiprocessing` starts processes with `environment(**more)`, and with as little on `sys.path`."""
+    """Context in which `multiprocessing` starts processes with `environment(**more)` and a `sys.path` like it."""
     with _START_LOCK:
         changed = {name: text for name, text in environment(**more).items() if os.environ.get(name) != text}
         before, path = {name: os.environ.get(name) for name in changed}, sys.path

@@ -39,7 +39,8 @@ class KinefitError(Exception):
         remedy: str | None = None,
     ) -> None:
         problem, remedy = printable(problem), printable(remedy) if remedy else remedy
-        self.file, self.problem, self.place = file, shortened(problem), shortened(printable(place), 120) if place else place
+        self.file, self.problem = file, shortened(problem)
+        self.place = shortened(printable(place), 120) if place else place
         file_text = shortened(printable(file), _MAX_PATH_CHARACTERS) if file else ""
         extra = max(len(file_text) - _TYPICAL_PATH_CHARACTERS, 0)
         room = _MAX_ERROR_CHARACTERS - len(self.problem) - len(self.place or "") - extra

@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from kinefit.errors import FileError, KinefitError
+from kinefit.errors import FileError, KinefitError, printable
 from kinefit.readers.depth.images import natural
 from kinefit.readers.guess.files import VIDEOS
 from kinefit.readers.take.find import takes_in
@@ -86,8 +86,11 @@ def video_files(folder: Path) -> list[Path]:
         return []
 
 
-def takes_below(root: Path) -> list[TakeFolder]:
-    """Takes in a folder and the folders below it, by path."""
+def takes_below(root: Path, *, addressable: bool = True) -> list[TakeFolder]:
+    """Takes in a folder and the folders below it, by path.
+
+    `addressable`: those whose path a page's address can hold; False: the others, in folders whose names are not UTF-8.
+    """
     found: list[TakeFolder] = []
     at, looked = [(root, 0)], 0
     while at and looked < _MAX_FOLDERS:
@@ -98,4 +101,5 @@ def takes_below(root: Path) -> list[TakeFolder]:
             at += [(sub, depth + 1) for sub in subfolders(folder)] if depth < _MAX_DEPTH else []
         except (KinefitError, OSError):
             continue
+    found = [take for take in found if (printable(take.file) == str(take.file)) is addressable]
     return sorted(found, key=lambda take: take.file)

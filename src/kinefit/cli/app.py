@@ -30,12 +30,16 @@ def app(folder: Path, port: int, token: str | None, browser: bool) -> None:
     pip install 'kinefit[app]'.
     """
     from kinefit.app.server import serve
-    from kinefit.errors import FileError
+    from kinefit.errors import FileError, printable
     from kinefit.serving.access import Access
 
     root = folder.absolute()
     if not root.is_dir():
         raise FileError("no such folder", file=folder, remedy="Name the folder with your recordings.")
+
+    if printable(root) != str(root):
+        problem = "the name of this folder is not UTF-8, as the addresses of pages are"
+        raise FileError(problem, file=folder, remedy="Rename it.")
 
     def opened(address: str) -> None:
         _screen.say(f"kinefit app at {address}  (Ctrl-C ends)")

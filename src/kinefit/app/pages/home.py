@@ -12,7 +12,7 @@ from kinefit.app.desk import Desk
 from kinefit.app.folders import subfolders, takes_below, video_files
 from kinefit.app.pages.shell import card, in_thread, link, shell, short, show_error, texts
 from kinefit.app.texts import Texts
-from kinefit.errors import KinefitError
+from kinefit.errors import KinefitError, printable
 from kinefit.exporters.atomic import writing
 
 _MAX_UPLOAD_BYTES = 2**30  # of a dropped video; larger ones are opened where they are
@@ -70,14 +70,15 @@ class _FolderChoice:
             if self._at.parent != self._at:  # two elements an entry: hundreds of folders are listed in a moment
                 ui.item(f"↑ {t('home.up')}", on_click=lambda: self._go(self._at.parent))
             for folder in inside:
-                ui.item(folder.name, on_click=lambda folder=folder: self._go(folder))
-        names = ", ".join(video.name for video in videos[:_MAX_NAMES]) + (" ..." if len(videos) > _MAX_NAMES else "")
+                ui.item(printable(folder.name), on_click=lambda folder=folder: self._go(folder))
+        more = " ..." if len(videos) > _MAX_NAMES else ""
+        names = printable(", ".join(video.name for video in videos[:_MAX_NAMES]) + more)
         ui.label(t("home.videos_here", count=len(videos), names=names) if videos else t("home.no_videos"))
         ui.button(t("home.use"), icon="folder_open", on_click=self._open)
 
     def _go(self, folder: Path) -> None:
         self._at = folder
-        self._field.value = str(folder)
+        self._field.value = printable(folder)
         self._list.refresh()
 
     def _open(self) -> None:
@@ -111,6 +112,9 @@ def _drop_area(desk: Desk, t: Texts) -> None:
 
 async def _takes(desk: Desk, t: Texts) -> None:
     takes = await in_thread(takes_below, desk.root)
+    if others := await in_thread(lambda root: takes_below(root, addressable=False), desk.root):
+        names = ", ".join(short(take.file.parent, desk.root) for take in others[:_MAX_NAMES])
+        ui.label(t("home.session_unnamed", count=len(others), names=names))
     if not takes:
         ui.label(t("home.session_none"))
     for take in takes:

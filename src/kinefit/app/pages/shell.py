@@ -13,7 +13,7 @@ from nicegui import ui
 
 from kinefit.app.desk import Desk
 from kinefit.app.texts import Texts, preferred_language
-from kinefit.errors import KinefitError
+from kinefit.errors import KinefitError, printable
 from kinefit.rendering import colours
 
 Value = TypeVar("Value")
@@ -107,4 +107,4 @@ async def loaded(t: Texts, said: str, function: Callable[..., Value], *arguments
 
 def short(path: Path, root: Path) -> str:
     """A path relative to the session's folder where it lies in it."""
-    return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
+    return printable(path.relative_to(root).as_posix() if path.is_relative_to(root) else path)

@@ -10,10 +10,10 @@ from os import PathLike
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import regular
 from kinefit.errors import FileError, check_choice
 from kinefit.motion import UP_AXES
 from kinefit.readers.units import LENGTHS, worth
-from kinefit._files import regular
 
 
 def read_text(path: str | PathLike[str], kind: str) -> str:
