@@ -1,8 +1,14 @@
-"""A folder of recordings with code that writes down that it ran, and all roads by which kinefit starts a process."""
+"""What strangers may put into a folder: code that writes down that it ran, and files whose reading has no end."""
 
+import inspect
 import os
+import signal
+import socket
 import subprocess
 import sys
+from importlib import import_module
+
+from kinefit.errors import KinefitError
 
 NAMES = (
     "ast", "click", "concurrent", "cv2", "json", "kinefit_plugin", "multiprocessing", "numba", "numpy", "pickle", "pip",
@@ -19,7 +25,7 @@ from pathlib import Path
 from kinefit.app.jobs import Job
 job = Job(Path("take.toml"), ("check", "take.toml"))
 asyncio.run(job.run())
-assert "no [[camera]]" in job.error["problem"] or job.error, job
+assert job.error and "kinefit itself" not in job.error["problem"], job
 """,
     "a worker of a batch": """
 from kinefit.batch.processes import run_here
@@ -58,6 +64,12 @@ except KinefitError as error:
 """{road: the words after `python`, or a program for `python -P -c`, which is run in the folder}."""
 
 
+_PATH = """
+import os
+os.environ["PYTHONPATH"] = os.pathsep + os.environ.get("PYTHONPATH", "")  # an empty entry is the current folder
+"""
+
+
 def code_that_runs(road, folder):
     """Names of the files of strangers that a road runs in a folder, which is filled with them."""
     ran = folder / "ran"
@@ -67,10 +79,75 @@ def code_that_runs(road, folder):
         (folder / name).write_text(f"#!/bin/sh\necho {name} >> '{ran}'\n")
         (folder / name).chmod(0o755)
     (folder / "take.toml").write_text("[take]\n")
-    words = ROADS[road].split() if ROADS[road].startswith("-m") else ["-P", "-c", ROADS[road]]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(["", os.environ.get("PYTHONPATH", "")])}
-    if road.startswith("python"):  # with an empty entry it is the user's own wish
-        environment["PYTHONPATH"] = os.environ.get("PYTHONPATH", "")
-    done = subprocess.run([sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True)
+    words = ROADS[road].split() if ROADS[road].startswith("-m") else ["-P", "-c", _PATH + ROADS[road]]
+    done = subprocess.run([sys.executable, *words], cwd=folder, capture_output=True, text=True)
     assert "Traceback" not in done.stderr, done.stderr
     return ran.read_text().split() if ran.exists() else []
+
+
+ENDINGS = {
+    "kinefit.readers.markers:read_markers": ("a.c3d", "a.trc"),
+    "kinefit.readers.skeletons.bvh:read_bvh": ("a.bvh",),
+    "kinefit.readers.skeletons.asf:read_asf": ("a.asf",),
+    "kinefit.readers.skeletons.gltf:read_gltf": ("a.glb", "a.gltf"),
+    "kinefit.readers.skeletons.characters:read_names": ("a.toml", "a.csv"),
+    "kinefit.readers.calibration.read:read_calibration": ("a.toml", "a.json", "a.yml", "a.xml", "a.mat", "a.xcp"),
+    "kinefit.readers.take.file:read_take": ("take.toml",),
+    "kinefit.readers.take.surface_points:read_surface_points": ("a.csv", "a.npz"),
+    "kinefit.readers.clicks:read_clicks": ("a.json",),
+    "kinefit.readers.keypoints:read_caliscope_csv": ("a.csv",),
+    "kinefit.readers.body_trackers:read_body_trackers": ("a.csv",),
+    "kinefit.readers.static_points:read_static_points": ("a.toml",),
+    "kinefit.readers.take.lines:read_lines": ("a.csv", "a.json"),
+    "kinefit.readers.detections:read_detections": ("a.npz",),
+    "kinefit.readers.motion:read_motion": ("a.npz",),
+    "kinefit.readers.depth.recordings:read_depth": ("a.mcap", "a.png", "a.tiff", "a.raw", "a.npz", "a.bag"),
+    "kinefit.readers.depth.clouds:read_cloud": ("a.ply", "a.pcd"),
+    "kinefit.readers.video_files:first_image": ("a.mp4",),
+    "kinefit._pictures:read_picture": ("a.png", "a.jpg"),
+    "kinefit.bodies:load_body": ("a.toml",),
+    "kinefit.bodies.marker_sets.files:find_record": ("a.toml",),
+    "kinefit.bodies.surfaces.obj:read_obj": ("a.obj",),
+    "kinefit.identification.model.files:load_model": ("a.json",),
+}
+"""{module:function that reads a path: names of files that it reads}."""
+
+
+def without_end(folder):
+    """{kind: function that makes such a file at a path, whose reading waits for ever or never ends}."""
+    return {
+        "pipe": os.mkfifo,
+        "link to a pipe": lambda path: (os.mkfifo(folder / "queue"), path.symlink_to(folder / "queue")),
+        "link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
+        "socket": _listen,
+    }
+
+
+def _listen(path):
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(os.path.relpath(path))
+
+
+def outcome(reader, path, seconds=5):
+    """What a reader makes of a path: the error's text; "hangs", or the kind of an untyped error."""
+    module, name = reader.split(":")
+    read = getattr(import_module(module), name)
+
+    def wake(*_):
+        raise TimeoutError
+
+    asked = [p for p in list(inspect.signature(read).parameters.values())[1:]
+             if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]  # fmt: skip
+    signal.signal(signal.SIGALRM, wake)
+    signal.alarm(seconds)
+    try:
+        read(path, *(() for _ in asked))
+    except KinefitError as error:
+        return f"refused: {error}"
+    except TimeoutError:
+        return "hangs"
+    except Exception as error:
+        return f"untyped {type(error).__name__}: {error}"
+    finally:
+        signal.alarm(0)
+    return "read"

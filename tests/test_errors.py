@@ -1,10 +1,12 @@
 """Messages: short whatever a file holds, and commands that work when pasted."""
 
+import os
 import shlex
+from pathlib import Path
 
 import pytest
 
-from kinefit.errors import FileError, KinefitError, command, nearest, shortened, spelled
+from kinefit.errors import FileError, KinefitError, command, nearest, printable, shortened, spelled
 
 
 def test_a_message_stays_short_whatever_a_file_gave_it():
@@ -35,3 +37,10 @@ def test_a_command_is_quoted_and_starts_where_the_user_is(tmp_path, monkeypatch)
 @pytest.mark.parametrize(("text", "name"), [("OpenSim", "opensim"), ("H-Anim", "hanim"), ("xyz", "xyz")])
 def test_names_are_known_however_they_are_spelled(text, name):
     assert spelled(text, ("opensim", "hanim")) == name
+
+
+def test_names_that_are_not_utf8_are_printable():
+    name = os.fsdecode(b"rec\xff")
+    error = FileError(f"{name} is wrong", file=f"/{name}/take.toml", place=name, remedy=f"Rename {name}.")
+    assert str(error) == "/rec?/take.toml, rec?: rec? is wrong. Rename rec?." and str(error).encode("utf-8")
+    assert error.file == f"/{name}/take.toml" and printable(Path(name)) == "rec?" and printable("Größe €") == "Größe €"

@@ -1,13 +1,15 @@
 """TOML and numpy archives of any content: an answer within bounds, with the place and what would work."""
 
 import io
+import sys
 import time
 import zipfile
 
 import numpy as np
 import pytest
+from tests.strangers import ENDINGS, outcome, without_end
 
-from kinefit._files import npy_header, parse_toml, read_npy, read_npz
+from kinefit._files import npy_header, parse_toml, read_npy, read_npz, regular
 from kinefit.errors import BodyError, FileError
 
 
@@ -121,3 +123,25 @@ def test_flipped_bytes_of_packed_data_are_told(tmp_path):
     path.write_bytes(bytes(data))
     with pytest.raises(FileError, match="damaged"):
         read_npz(path, remedy="")
+
+
+_REMEDY = "Copy what it gives into a file, and name that."
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes in folders")
+@pytest.mark.parametrize("kind", ["pipe", "link to a pipe", "link to /dev/zero", "socket"])
+@pytest.mark.parametrize("reader", ENDINGS)
+def test_readers_refuse_files_without_an_end(reader, kind, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # a socket's path is short
+    for name in ENDINGS[reader]:
+        (tmp_path / name[2:]).mkdir()
+        path = tmp_path / name[2:] / name
+        without_end(path.parent)[kind](path)
+        assert outcome(reader, path).endswith(f"{name}: a pipe, socket or device, not a file. {_REMEDY}")
+
+
+def test_regular_files_folders_and_missing_ones_are_passed_on(tmp_path):
+    (tmp_path / "a").write_text("a")
+    (tmp_path / "b").symlink_to(tmp_path / "a")
+    for path in (tmp_path / "a", tmp_path / "b", tmp_path, tmp_path / "none", tmp_path / "a" / "none"):
+        assert regular(path) == path and regular(str(path)) == path

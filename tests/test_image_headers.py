@@ -184,3 +184,10 @@ def test_a_camera_of_more_pixels_than_any_image_is_refused():
     K = [[50, 0, 32], [0, 50, 24], [0, 0, 1]]
     with pytest.raises(CalibrationError, match=r"image size \(1048576, 1048576\)"):
         Camera("a", (2**20, 2**20), K)
+
+
+@pytest.mark.parametrize("offset", [1_700_000_000_000_000_000, 2**63, 2**64 - 1])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_page_of_a_bigtiff_beyond_all_files_is_no_image(offset, order):
+    start = (b"II" if order == "<" else b"MM") + struct.pack(f"{order}HHHQ", 43, 8, 0, offset)
+    assert image_sizes(io.BytesIO(start)) == []

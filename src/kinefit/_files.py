@@ -186,7 +186,7 @@ def read_npz(
         No such file, no archive, damaged, an array of objects, or one that would unpack to very much more than it is.
     """
     path = Path(file)
-    if not path.is_file():
+    if not regular(path).is_file():
         raise error("no such file", file=path, remedy="Check the path.")
     try:
         with zipfile.ZipFile(path) as archive:

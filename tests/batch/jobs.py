@@ -5,6 +5,8 @@ import signal
 import time
 from pathlib import Path
 
+from kinefit.batch.processes import _Beat, progress
+
 
 def square(number):
     return number * number
@@ -42,3 +44,17 @@ def killed_later(number):
 
 def threads(_):
     return os.environ["OMP_NUM_THREADS"], os.getpid()
+
+
+def reports(number):
+    for _ in range(3):
+        _Beat.last = 0.0
+        progress("step", 1, 3)
+    return number
+
+
+def hangs(number):
+    if number == 1:
+        progress("step", 1, 3)
+        time.sleep(600)
+    return number

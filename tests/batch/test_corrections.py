@@ -9,6 +9,7 @@ import pytest
 
 from kinefit.batch.corrections import (
     add_click,
+    can_undo,
     choose_person,
     corrections_of,
     exchange_sides,
@@ -281,3 +282,26 @@ def test_a_finding_is_written_into_its_camera(take):
     with pytest.raises(TakeError, match="cam9"):
         set_camera_keys(take, "cam9", {"time_offset": "0.1"})
     assert undo(take) and read_take(take).cameras == before
+
+
+def test_files_of_others_among_the_kept_texts_are_left_alone(copy_take, tmp_path):
+    take = copy_take(tmp_path)
+    before, original = tmp_path / "take-before", take.read_bytes()
+    before.mkdir()
+    for name in ("notes.txt", "v1.2.txt", "0003"):
+        (before / name).write_text("no take")
+    (before / "0007.txt").mkdir()
+    assert not can_undo(take) and not undo(take)
+    set_height(take, 1.8)
+    assert (before / "0001.txt").read_bytes() == original and undo(take) and take.read_bytes() == original
+
+
+@pytest.mark.parametrize("content", [b"no take", b"\xff\xfe\x00", b"[camera]\n"])
+def test_a_kept_text_that_is_no_take_is_not_put_back(copy_take, tmp_path, content):
+    take = copy_take(tmp_path)
+    original = take.read_bytes()
+    (tmp_path / "take-before").mkdir()
+    (tmp_path / "take-before" / "0004.txt").write_bytes(content)
+    with pytest.raises(KinefitError, match="take-before.*0004.txt"):
+        undo(take)
+    assert take.read_bytes() == original

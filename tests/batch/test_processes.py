@@ -80,3 +80,14 @@ def test_no_worker_outlives_the_process_that_was_killed(tmp_path):
     while worker.exists() and worker.read_text().split()[2] != "Z" and time.monotonic() - began < 10:
         time.sleep(0.02)
     assert time.monotonic() - began < 10
+
+
+def test_reports_of_progress_are_no_results():
+    assert results(jobs.reports, [4, 5]) == {0: 4, 1: 5}
+
+
+def test_a_job_without_progress_is_stopped_and_not_tried_again():
+    found = results(jobs.hangs, [0, 1, 2], workers=1, retries=2, limit=6.0)
+    assert found[0] == 0 and found[2] == 2
+    assert isinstance(found[1], Failure) and found[1] == (
+        "stopped after 0.1 min without progress; the limit is --time-limit")

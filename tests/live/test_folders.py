@@ -1,6 +1,7 @@
 """Folders that fill up: images, depth, keypoints; a recording that another program writes while it is followed."""
 
 import json
+import os
 import shutil
 import threading
 import time
@@ -211,3 +212,32 @@ def test_a_stream_is_no_recording(tmp_path):
         load_observations(read_take(tmp_path / "take.toml"))
     with pytest.raises(FileError, match="no such folder"):
         live_session(read_take(tmp_path / "take.toml"))
+
+
+@pytest.mark.parametrize("ahead", [3600.0, 2.0, -3600.0])
+def test_files_of_another_computers_clock_are_taken_when_they_come(tmp_path, ahead):
+    inbox = Inbox(["cam"], patience=0.0)
+    stream = ImageFolderStream("cam", tmp_path, (64, 48), SessionClock())
+    stream.start(inbox)
+    seen = []
+    for k in (1, 2, 3):
+        path = tmp_path / f"new_{k}.png"
+        cv2.imwrite(str(path), image(k))
+        for one in (path, tmp_path):
+            os.utime(one, (time.time() + ahead, time.time() + ahead))
+        seen += taken(inbox, 1)
+    stream.stop()
+    assert [int(one.seen[0, 0, 0]) for one in seen] == [1, 2, 3] and inbox.came == {"cam": 3}
+
+
+def test_a_file_that_grows_is_taken_once_it_is_whole_and_a_pipe_never(tmp_path):
+    stream = ImageFolderStream("cam", tmp_path, (64, 48), SessionClock())
+    os.mkfifo(tmp_path / "pipe.png")
+    file = tmp_path / "a.png"
+    for length in (1, 2, 3):
+        file.write_bytes(bytes(length))
+        assert stream._new() == []
+        (since,) = [since for _, since in stream._waiting.values()]
+        assert stream._waiting == {"a.png": ((length, file.stat().st_mtime_ns), since)}
+    time.sleep(0.06)
+    assert stream._new() == [file] and stream._new() == []

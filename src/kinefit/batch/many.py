@@ -23,7 +23,7 @@ TakesProgress = Callable[[int, int, tuple[Row, ...]], None]
 def track_takes(
     patterns: str | PathLike[str] | Found | Sequence[str | PathLike[str]], out: str | PathLike[str], *,
     choices: Choices | None = None, workers: int = 1, cluster: str | None = None, retries: int = 2,
-    progress: TakesProgress | None = None,
+    time_limit: float = 120.0, progress: TakesProgress | None = None,
 ) -> tuple[Row, ...]:  # fmt: skip
     """Track independent takes, in processes of this machine or on a cluster.
 
@@ -40,6 +40,7 @@ def track_takes(
     cluster : address of a Dask scheduler instead, such as "tcp://host:8786"; takes and `out` must be on a file system
         that its workers share, under the same paths
     retries : int, number of further trials of a take whose worker died or raised an unexpected error
+    time_limit : float [min] without progress after which a take on this machine is stopped, and reported as failed
     progress : called as takes end
 
     Returns
@@ -54,16 +55,16 @@ def track_takes(
     ExportError
         `workers` is below 1 or `retries` below 0; the cluster cannot be used; the summary cannot be written.
     """
-    if workers < 1 or retries < 0:
-        problem = f"workers = {workers} or retries = {retries} is too small"
-        raise ExportError(problem, remedy="Give at least one worker, and retries of 0 or more.")
+    if workers < 1 or retries < 0 or not time_limit > 0:
+        problem = f"workers = {workers}, retries = {retries} or time_limit = {time_limit:g} is too small"
+        raise ExportError(problem, remedy="Give at least one worker, retries of 0 or more, and some minutes.")
     if isinstance(patterns, str | PathLike):
         patterns = [patterns]
     found = patterns if isinstance(patterns, Found) else find_takes(patterns)
     out, choices = Path(out).absolute(), choices or Choices()
     jobs = [_job(found, take, out, choices) for take in found.takes]
     rows: dict[int, tuple[Row, ...]] = {}
-    for number, result in _results(jobs, workers, cluster, retries):
+    for number, result in _results(jobs, workers, cluster, retries, 60.0 * time_limit):
         if isinstance(result, Failure):
             rows[number] = (failed(Row(take=jobs[number].label), result),)
         else:
@@ -81,10 +82,10 @@ def _job(found: Found, take: Path, out: Path, choices: Choices) -> TakeJob:
 
 
 def _results(
-    jobs: Sequence[TakeJob], workers: int, cluster: str | None, retries: int
+    jobs: Sequence[TakeJob], workers: int, cluster: str | None, retries: int, limit: float
 ) -> Iterator[tuple[int, tuple[Row, ...] | Failure]]:
     if cluster is None:
-        return run_here(work, jobs, workers=min(workers, len(jobs)), retries=retries)
+        return run_here(work, jobs, workers=min(workers, len(jobs)), retries=retries, limit=limit)
     from kinefit.batch.cluster import run_there
 
     return run_there(work, jobs, address=cluster, retries=retries)

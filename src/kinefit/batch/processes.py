@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing as mp
 import os
 import signal
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
@@ -20,12 +22,31 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA
 """Set to 1 in every worker, unless the user set another number: workers share the cores."""
 
 
+_BEAT_INTERVAL_S = 1.0  # between two reports of progress, and between two looks at the time of the last one
+_SENDING = threading.Lock()
+_PIPES: list[Connection] = []  # of a worker process, to the process that waits for it; elsewhere empty
+
+
+class _Beat:
+    """What a worker sends while its job goes on."""
+
+    last = 0.0  # time.monotonic() of the worker
+
+
+def progress(*_: object) -> None:
+    """Report that the job of this worker goes on: in place of a `Step`. Elsewhere it does nothing."""
+    with _SENDING:
+        if _PIPES and time.monotonic() - _Beat.last > _BEAT_INTERVAL_S:
+            _Beat.last = time.monotonic()
+            _PIPES[0].send(_Beat())
+
+
 class Failure(str):
     """Error message of a job's last trial, in place of its result."""
 
 
 def run_here(
-    do: Callable[[T], R], jobs: Sequence[T], *, workers: int, retries: int
+    do: Callable[[T], R], jobs: Sequence[T], *, workers: int, retries: int, limit: float = math.inf
 ) -> Iterator[tuple[int, R | Failure]]:
     """Run jobs in worker processes; yields the number and result of each as it ends.
 
@@ -35,6 +56,7 @@ def run_here(
     jobs : arguments of the function, which are pickled
     workers : int, number of processes, each with one job at a time
     retries : int, number of further trials of a job that raised an error or whose process died
+    limit : float [s] without `progress` after which a job is stopped, and not tried again
     """
     waiting, tries = deque(range(len(jobs))), [0] * len(jobs)
     idle: list[_Worker] = []
@@ -47,14 +69,21 @@ def run_here(
                 tries[job] += 1
                 busy[worker.pipe] = worker, job
                 worker.give(jobs[job])
-            for pipe in wait(list(busy)):
+            for pipe in wait(list(busy), _BEAT_INTERVAL_S):
                 worker, job = busy.pop(pipe)
                 result, alive = worker.result()
+                if isinstance(result, _Beat):
+                    busy[pipe] = worker, job
+                    continue
                 (idle.append if alive else _Worker.end)(worker)
                 if isinstance(result, Failure) and tries[job] <= retries:
                     waiting.append(job)
                 else:
                     yield job, result
+            for worker, job in [of for of in busy.values() if time.monotonic() - of[0].last_beat > limit]:
+                del busy[worker.pipe]
+                worker.end()
+                yield job, Failure(f"stopped after {limit / 60:g} min without progress; the limit is --time-limit")
     finally:
         for worker in [*idle, *(worker for worker, _ in busy.values())]:
             worker.end()
@@ -70,6 +99,7 @@ class _Worker:
         theirs.close()
 
     def give(self, job: Any) -> None:
+        self.last_beat = time.monotonic()
         try:
             self.pipe.send(job)
         except OSError:  # the process died; `result` reports it
@@ -78,7 +108,9 @@ class _Worker:
     def result(self) -> tuple[Any, bool]:
         """Result of the worker's job, and whether the worker is alive."""
         try:
-            return self.pipe.recv(), True
+            found = self.pipe.recv()
+            self.last_beat = time.monotonic()
+            return found, True
         except (EOFError, OSError):
             self.process.join()
             code = self.process.exitcode or 0
@@ -95,6 +127,7 @@ def _serve(pipe: Connection, do: Callable[[Any], Any]) -> None:
     """Run jobs until there are no more; exits at once if the parent process dies."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    _PIPES.append(pipe)
     while True:
         try:
             job = pipe.recv()
@@ -104,7 +137,8 @@ def _serve(pipe: Connection, do: Callable[[Any], Any]) -> None:
             result = do(job)
         except Exception as error:
             result = Failure(f"{type(error).__name__}: {error}")
-        pipe.send(result)
+        with _SENDING:
+            pipe.send(result)
 
 
 def _end_with_parent() -> None:

@@ -16,7 +16,7 @@ from kinefit.batch.find import RECORD
 from kinefit.batch.one import Choices, asked_take, people_of, track_person
 from kinefit.batch.outcome import DONE, Range, Row, failed
 from kinefit.batch.people_report import write_people_report
-from kinefit.batch.results import silent
+from kinefit.batch.processes import progress
 from kinefit.errors import KinefitError, printable
 from kinefit.findings import of_provenance
 
@@ -92,7 +92,7 @@ def _warnings_in(said: list[str]) -> Iterator[None]:
 def _tracked(job: TakeJob, take: Take, start: Row, said: list[str]) -> tuple[tuple[Row, ...], list[str]]:
     """Track all people of a take; returns a row for each, and the written files relative to the folder of results."""
     try:
-        view, people = people_of(take, job.out, silent, said.append)
+        view, people = people_of(take, job.out, progress, said.append)
     except KinefitError as error:
         return (failed(start, str(error)),), []
     rows, made = [], []
@@ -105,7 +105,7 @@ def _tracked(job: TakeJob, take: Take, start: Row, said: list[str]) -> tuple[tup
             folder.mkdir(parents=True, exist_ok=True)
         files: dict[str, Path] = {}
         try:
-            done = track_person(person, folder, job.choices, view=view, step=silent, tell=silent, files=files)
+            done = track_person(person, folder, job.choices, view=view, step=progress, tell=progress, files=files)
         except KinefitError as error:  # the other people are tracked nevertheless
             rows.append(failed(msgspec.structs.replace(row, folder=""), str(error)))
             continue

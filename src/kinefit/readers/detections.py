@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit._files import read_npz
+from kinefit._files import read_npz, regular
 from kinefit.errors import FileError, KinefitError, command
 from kinefit.observations import Detections
 
@@ -56,7 +56,7 @@ def read_detections(path: str | PathLike[str]) -> Detections:
         No such file, not one of the detector's, damaged, or of a later version.
     """
     file = Path(path)
-    if not file.is_file():
+    if not regular(file).is_file():
         raise FileError("no such file of detections", file=file, remedy=f"Run: {_anew(file)}")
     again = f"Detect again: {_anew(file, '--force')}"
     try:

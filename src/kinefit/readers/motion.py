@@ -34,7 +34,7 @@ from urllib.parse import unquote
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit._files import read_npz
+from kinefit._files import read_npz, regular
 from kinefit.bodies.serial import body_from_arrays
 from kinefit.errors import FileError, KinefitError, command
 from kinefit.motion import UP_AXES, Motion, Residuals
@@ -84,7 +84,7 @@ def read_motion(path: str | PathLike[str]) -> Motion:
 
 
 def _load(file: Path) -> dict[str, NDArray]:
-    if not file.is_file():
+    if not regular(file).is_file():
         raise FileError("no such motion file", file=file, remedy="Check the path.")
     with file.open("rb") as stream:
         packed = stream.read(2) == b"PK"

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
+from kinefit._processes import python
 from kinefit.errors import CalibrationError, FileError, KinefitError
 from kinefit.readers.calibration.read import read_calibration, write_calibration
 from kinefit.readers.calibration.write import write_calibration_like
@@ -552,3 +553,22 @@ def _typed_or_rig(path):
         assert len(read_calibration(path, image_size=SIZE)) >= 1
     except KinefitError as error:
         assert str(path) in str(error) and error.remedy
+
+
+def test_a_matlab_file_that_ends_its_reader_is_damaged(tmp_path, monkeypatch):
+    path = tmp_path / "a.mat"
+    savemat(path, {"K": np.eye(3), "s": {"a": np.zeros((2, 3)), "n": "cam"}, "c": np.array([1, "x", [1, 2]], object)})
+    data = path.read_bytes()
+    for at, value in ((213, 8), (442, 216)):  # on which scipy 1.17 crashes, if both are there
+        data = data[:at] + bytes([value]) + data[at + 1 :]
+    path.write_bytes(data)
+    with pytest.raises((FileError, CalibrationError), match="a.mat"):
+        read_calibration(path)
+    words = python("-c", "import os; os.abort()")
+    monkeypatch.setattr("kinefit.readers.calibration.matlab.python", lambda *_: words)
+    with pytest.raises(FileError, match=r"a\.mat: not a readable MATLAB file: scipy's reader crashes"):
+        read_calibration(path)
+    words[:] = python("-c", "import time; time.sleep(60)")
+    monkeypatch.setattr("kinefit.readers.calibration.matlab._MAX_READ_S", 0.2)
+    with pytest.raises(FileError, match="does not end within"):
+        read_calibration(path)

@@ -37,12 +37,16 @@ Exit codes: 0 where all takes are done, 2 where some have failed (the others are
     "--retries", type=click.IntRange(min=0), default=2, show_default=True,
     help="How often a take is repeated if its worker process ends abnormally.",
 )
+@click.option(
+    "--time-limit", type=click.FloatRange(min=0, min_open=True), default=120.0, show_default=True, metavar="MINUTES",
+    help="A take that makes no progress for so long is stopped and reported as failed; not on a cluster.",
+)
 @choices_options
 @_screen.verbose_option
 @click.pass_context
 def batch(
     ctx: click.Context, patterns: tuple[str, ...], out: Path, workers: int | None, cluster: str | None, retries: int,
-    choices: Choices, wanted: bool,
+    time_limit: float, choices: Choices, wanted: bool,
 ) -> None:
     """Track every take that PATTERN matches, like `kinefit track`, and write summary.html over all of them.
 
@@ -68,7 +72,8 @@ def batch(
                 step("takes", done, total)
 
             rows = track_takes(
-                found, out, choices=choices, workers=workers or 1, cluster=cluster, retries=retries, progress=tell
+                found, out, choices=choices, workers=workers or 1, cluster=cluster, retries=retries,
+                time_limit=time_limit, progress=tell,
             )
     except KeyboardInterrupt as stopped:
         raise KeyboardInterrupt(f"Finished takes are in {out}; run the same command to continue.") from stopped

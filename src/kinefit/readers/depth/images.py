@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import read_npz
+from kinefit._files import read_npz, regular
 from kinefit._pictures import page_sizes, read_page, read_picture
 from kinefit.errors import FileError, ObservationError
 from kinefit.geometry.camera import Camera
@@ -70,7 +70,7 @@ def listed(path: Path) -> list[Path]:
         names = fnmatch.filter(os.listdir(path.parent), path.name) if path.parent.is_dir() else []
         found = [file for name in names if (file := path.parent / name).is_file()]
     else:
-        found = [path] if path.is_file() else []
+        found = [path] if regular(path).is_file() else []
     return sorted(found, key=lambda file: natural(file.name))
 
 
