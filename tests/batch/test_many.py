@@ -171,3 +171,21 @@ def test_a_take_that_was_stopped_goes_on_where_it_was(sessions, tmp_path, monkey
     assert work(job(take, tmp_path / "b" / "a")) == whole
     assert len(count) == 7 + 2  # of eight frames the last two
     assert contents(tmp_path / "b" / "a") == contents(tmp_path / "a")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes in folders, and no names but UTF-16")
+def test_takes_that_no_reader_can_end_and_names_that_are_not_utf8_are_in_the_summary(sessions, tmp_path):
+    pipe, zero, odd = (sessions / name for name in NAMES)
+    (pipe / "take.toml").unlink()
+    os.mkfifo(pipe / "take.toml")
+    (zero / "mediapipe_cam02.npy").unlink()
+    (zero / "mediapipe_cam02.npy").symlink_to("/dev/zero")
+    odd.rename(odd.with_name(os.fsdecode(b"pr\xe9")))
+    out = tmp_path / os.fsdecode(b"out\xff")
+    rows = track_takes(sessions, out, choices=CHOICES, workers=1)
+    assert {row.take: row.status for row in rows} == {
+        "s01/post/take.toml": "failed", "s01/pre/take.toml": "failed", "s02/pr?/take.toml": "done"}  # fmt: skip
+    assert all("a pipe, socket or device, not a file" in row.error for row in rows if row.status == "failed")
+    text = (out / "summary.csv").read_text("utf-8")
+    assert "s02/pr?/take.toml,,s02,pre" in text and "s02/pr?" in (out / "summary.html").read_text("utf-8")
+    assert rows[2].frames == 8 and track_takes(sessions, out, choices=CHOICES, workers=1) == rows

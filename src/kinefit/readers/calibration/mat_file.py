@@ -21,6 +21,7 @@ def _plain(value: object) -> object:
 
 
 if __name__ == "__main__":
+    answer: dict[str, object]
     try:
         found = loadmat(sys.argv[1], simplify_cells=True)
         answer = {"variables": {key: _plain(value) for key, value in found.items() if not key.startswith("__")}}

@@ -34,6 +34,7 @@ def read_mat(path: Path) -> Table:
     if importlib.util.find_spec("scipy") is None:
         remedy = "Run: pip install 'kinefit[matlab]'. Or in MATLAB: writelines(jsonencode(toStruct(params)), 'a.json')"
         raise FileError("reading .mat files needs the package scipy", file=path, remedy=remedy)
+    answer: dict[str, Any]
     words = python(str(Path(__file__).with_name("mat_file.py")), str(regular(path)))
     try:
         done = subprocess.run(words, env=environment(), capture_output=True, timeout=_MAX_READ_S)
