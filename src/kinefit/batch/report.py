@@ -9,7 +9,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kinefit._files import regular
 from kinefit.batch.results import Step
 
 if TYPE_CHECKING:
@@ -92,7 +91,7 @@ def provenance(take: Take, **more: Any) -> dict[str, Any]:
     if take.calibration is not None:
         out["calibration"] = {"file": take.calibration.file.name, "unit": take.calibration.unit}
         if take.calibration.file.is_file():
-            out["calibration"]["sha256"] = hashlib.sha256(regular(take.calibration.file).read_bytes()).hexdigest()
+            out["calibration"]["sha256"] = hashlib.sha256(take.calibration.file.read_bytes()).hexdigest()
     out["cameras"] = [
         {"name": c.name, "video": c.video.name if c.video else None, "image": c.image, "rotation": c.rotation,
          "time_offset": c.time_offset}

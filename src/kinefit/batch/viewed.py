@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kinefit._files import regular
 from kinefit.batch.results import Step, silent
 from kinefit.errors import ObservationError
 
@@ -108,7 +107,7 @@ def has_same_cameras(motion: Motion, take: Take) -> bool:
     stated = motion.provenance.get("calibration", {}).get("sha256")
     if stated is None or take.calibration is None or not take.calibration.file.is_file():
         return True
-    return bool(stated == hashlib.sha256(regular(take.calibration.file).read_bytes()).hexdigest())
+    return bool(stated == hashlib.sha256(take.calibration.file.read_bytes()).hexdigest())
 
 
 def _fitting(file: Path | None, name: str, tell: Tell) -> tuple[Take, Observations] | None:

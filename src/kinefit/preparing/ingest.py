@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import regular
 from kinefit.errors import TakeError
 from kinefit.preparing.detecting import detection_key, jobs_of_take
 from kinefit.preparing.each_video import Step, Tell
@@ -68,7 +67,7 @@ def hide_in_copies(path: Path, progress: Step | None, tell: Tell) -> list[Path]:
             own, of_copy = detection_key(job), detection_key(replace(job, video=copies[job.camera]))
             write_detections(found, job.file, key=key.replace(own, of_copy, 1))
     names = iter([f"{FOLDER}/{copies[camera.name].name}" for camera in take.cameras if camera.video is not None])
-    write_text(path, _VIDEO.sub(lambda line: f'video = "{next(names)}"', regular(path).read_text("utf-8")))
+    write_text(path, _VIDEO.sub(lambda line: f'video = "{next(names)}"', path.read_text("utf-8")))
     return list(copies.values())
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kinefit._files import regular
 from kinefit.calibration.check.sensor_verdicts import alignment_line, marker_lines, misfits, moved_cameras
 from kinefit.calibration.check.sensors import fit_sensors
 from kinefit.cli import _screen
@@ -104,7 +103,7 @@ def write_refined(found: Check, refined: Refined, path: Path) -> Path | None:
     from kinefit.readers.take.file import read_take
 
     assert found.take is not None and found.take.calibration is not None and found.observations is not None
-    take, old, text = found.take, found.take.calibration, regular(path).read_text("utf-8")
+    take, old, text = found.take, found.take.calibration, path.read_text("utf-8")
     markers = {marker_index(fit.sensor): marker_lines(fit, take) for fit in refined.moved if fit.kind == "markers"}
     moved = moved_cameras(refined.moved, take, found.observations.rig or Rig(()))
     rig = Rig((*(refined.cameras.rig if refined.cameras is not None else ()), *moved))
