@@ -13,7 +13,6 @@ PARTS = {
     "faults_inputs": "takes with wrong files that `kinefit track` names, and false alarms on right ones",
     "faults_users": "files as users have them: what they state is read, or named",
     "faults_sides": "mirrored worlds and exchanged sides of markers that are named, and false alarms",
-    "faults_strangers": "code, files and pages of strangers",
 }
 
 if __name__ == "__main__":
