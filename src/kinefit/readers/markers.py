@@ -250,7 +250,7 @@ def _trc_clock(numbers: NDArray, times: NDArray, rate: float, path: Path) -> tup
         return float(frames[-1]) / max(float(elapsed[-1]), 1e-9)
 
     trials = [(rows, rate, limit), (numbered, rate, limit)]
-    if np.median(np.diff(timed)) == 1:  # else DataRate is a multiple of the rate
+    if np.median(np.diff(timed)) == 1 and timed[-1] < 2 * len(times):  # else DataRate or a time is wrong
         trials.append((timed, rate, limit / 2.0))
     trials += [(frames, measured(frames), limit) for frames in (rows, numbered)]
     fitting = [

@@ -67,7 +67,7 @@ class Observations:
     ----------
     rate : float [Hz]
     frames : (start, stop)
-        Steps of the common time that every camera's streams have; t = step / rate.
+        Steps of the common time that every camera's streams have; t = step / rate + first_time.
     rig : Rig or None
         The take's cameras, in its order, then its depth sensors; None where there are none.
     keypoints : tuple of Keypoints
@@ -97,6 +97,8 @@ class Observations:
         In the order of `take.trackers`, whole, at their own rates.
     notes : tuple of str
         What is worth saying: depth of another rate, frames that are missing.
+    first_time : float [s]
+        Time of step 0: that of the first frame in a take of markers alone, so that forces of the trial stay in step.
     """
 
     rate: float
@@ -116,6 +118,7 @@ class Observations:
     surface_points: tuple[SurfacePointVideo, ...] = ()
     trackers: tuple[BodyTrackerVideo, ...] = ()
     notes: tuple[str, ...] = ()
+    first_time: float = 0.0
 
     @property
     def recordings(
@@ -204,6 +207,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     if not (streams or lines or clicks or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
         raise TakeError("the cameras have no video and no keypoints", file=take.path, remedy=remedy)
+    first_time = 0.0
     own = [*(recording.rate for recording in (*recordings, *lines, *clicks)), *(m.rate for m in markers)]
     rate = fastest or own[0]
     if streams:
@@ -223,12 +227,17 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     elif recordings or lines or clicks:
         frames = take.frames or _span(recordings or lines or clicks, rate)
     else:
+        first_time = float(min(times[0] for _, times in marked))
         end = max(times[-1] + 1.0 / m.rate for (_, times), m in zip(marked, markers))
-        frames = take.frames or (round(min(times[0] for _, times in marked) * rate), round(end * rate))
+        frames, marked = take.frames or (0, round((end - first_time) * rate)), []
     kinds = {LineVideo: "lines of camera", KeypointVideo: "keypoints of camera", SurfacePointVideo: "surface",
              BodyTrackerVideo: "trackers"}  # fmt: skip
     others = [(f"{kinds.get(type(r), 'depth')} {r.sensor}", r.times) for r in (*recordings, *lines, *skin)]
     _check_times([*others, *marked], frames, rate, take)
+    notes += [
+        f"{place}: {Path(m.source).name} begins at {times[0]:.6g} s of the take, by its own clock and time_offset"
+        for (place, times), m in zip(marked, markers) if m.first_time
+    ]  # fmt: skip
     cameras = (*(rig[entry.name] for entry in take.cameras if rig is not None), *sensors.cameras)
     return Observations(
         rate=rate, frames=frames, rig=Rig(cameras) if cameras else None,
@@ -240,6 +249,7 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         clicks=tuple(c for c in clicks if _within(np.rint(c.times * rate), [frames]).any()),
         surface_points=surfaces, trackers=trackers,
         notes=(*notes, *(n for m in markers for n in m.notes), *sensors.notes(rate), *found, *what_is_assumed(take)),
+        first_time=first_time,
     )
 
 
