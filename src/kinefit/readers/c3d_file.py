@@ -169,9 +169,9 @@ def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path
     if _differ(header_scale, scale):
         notes.append(f"the header's scale of residuals is {-header_scale:g}, POINT:SCALE's {-scale:g} counts")
     rate = _rate(rate, samples if analog else 0, parameters, path, notes)
-    used = _number(parameters, "POINT:USED")
-    if used is not None and int(used) % 65536 != count:
-        raise FileError(f"{count} points, POINT:USED says {used:.0f}", file=path, place="header", remedy=_REMEDY)
+    points_used = _number(parameters, "POINT:USED")
+    if points_used is not None and int(points_used) % 65536 != count:
+        raise FileError(f"{count} points, POINT:USED says {points_used:.0f}", file=path, place="header", remedy=_REMEDY)
     if not (np.isfinite(scale) and scale != 0 and np.isfinite(rate) and rate > 0):
         raise FileError(f"scale {scale:g}, rate {rate:g} Hz", file=path, place="header", remedy=_REMEDY)
     width = 4 if scale < 0 else 2
@@ -181,7 +181,10 @@ def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path
         space, step = len(raw) - (start - 1) * _BLOCK_BYTES, (4 * count + analog) * width
         return space - step * _count(parameters, first, last, space // step)
 
-    layouts = _layouts(start, analog, samples, rate, parameters)
+    used, ratio = int(_stated(parameters, "ANALOG:USED")), round(_stated(parameters, "ANALOG:RATE") / rate)
+    starts = dict.fromkeys((start, int(_stated(parameters, "POINT:DATA_START")) % 65536 or start))
+    analogs = dict.fromkeys((analog, *(used % 65536 * n for n in (samples, ratio) if used and n > 0)))
+    layouts = [(s, a) for s in starts for a in analogs]  # the header's, then what the parameters state otherwise
     exact = [layout for layout in layouts if count and layout[0] > 1 and 0 <= spare(*layout) < _BLOCK_BYTES]
     if len(layouts) > 1 and len(exact) != 1:
         listed = " or ".join(f"{a} analog values a frame from block {s} on" for s, a in layouts)
@@ -191,7 +194,7 @@ def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path
         )  # fmt: skip
     if exact and exact[0] != layouts[0]:
         start, analog = exact[0]
-        samples = analog // int(_stated(parameters, "ANALOG:USED") or analog or 1)
+        samples = analog // (used or analog or 1)
         notes.append(
             f"the header states {layouts[0][1]} analog values a frame from block {layouts[0][0]} on; {analog} from "
             f"block {start} on count, as the parameters state, which fit the file's length"
@@ -209,11 +212,15 @@ def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path
         )
     if (room - frames) * step >= _BLOCK_BYTES:
         notes.append(f"{room - frames} more frames have room in the file, which states {frames}")
-    first = _first_frame(parameters, first, last, frames, notes)
     data = np.frombuffer(raw, np.uint8, frames * step, begin).reshape(frames, step)
     if _count(parameters, first, last, 0) < frames:  # counted by the file's length: its last block is filled up
         empty = int(np.argmax(data[: -_BLOCK_BYTES // step - 1 : -1].any(axis=1)))
         data, frames = data[: frames - empty], frames - empty
+    trial = _trial(parameters)
+    if trial and first not in (trial[0] % 65536, _MAX_WORD):
+        notes.append(f"the header begins with frame {first}, TRIAL:ACTUAL_START_FIELD is {trial[0]}")
+    if trial and not last - first + 1 == frames != trial[1] - trial[0] + 1:
+        first = trial[0]  # else the header alone has the right number of frames
     with np.errstate(invalid="ignore"):  # signalling NaN
         values = _numbers(data[:, : 4 * count * width].tobytes(), width, processor)
         values = values.reshape(frames, count, 4).astype(float)
@@ -258,16 +265,6 @@ def _rate(header: float, samples: int, parameters: dict[str, Values], path: Path
     return supported[0]
 
 
-def _layouts(
-    start: int, analog: int, samples: int, rate: float, parameters: dict[str, Values]
-) -> list[tuple[int, int]]:
-    """First block and analog values a frame: the header's, then what the parameters state otherwise."""
-    used, ratio = int(_stated(parameters, "ANALOG:USED")), round(_stated(parameters, "ANALOG:RATE") / rate)
-    counts = [analog, *(used % 65536 * r for r in (samples, ratio) if used and r > 0)]
-    starts = [start, int(_stated(parameters, "POINT:DATA_START")) % 65536 or start]
-    return [(s, a) for s in dict.fromkeys(starts) for a in dict.fromkeys(counts)]
-
-
 def _count(parameters: dict[str, Values], first: int, last: int, room: int) -> int:
     """Number of frames: of the header, POINT:FRAMES, POINT:LONG_FRAMES or TRIAL, the largest that fits the file."""
     counts = [last - first + 1]
@@ -291,13 +288,3 @@ def _trial(parameters: dict[str, Values]) -> tuple[int, int] | None:
         return None
     start, stop = (int(e[0]) % 65536 + 65536 * (int(e[1]) % 65536) for e in ends)  # type: ignore[index]
     return start, stop
-
-
-def _first_frame(parameters: dict[str, Values], first: int, last: int, frames: int, notes: list[str]) -> int:
-    """Number of the first frame: TRIAL's, or the header's if that alone has the file's number of frames."""
-    trial = _trial(parameters)
-    if trial is None or trial[0] == first or first == _MAX_WORD or trial[0] % 65536 == first:
-        return first if trial is None else trial[0]
-    chosen = first if last - first + 1 == frames != trial[1] - trial[0] + 1 else trial[0]
-    notes.append(f"the header begins with frame {first}, TRIAL:ACTUAL_START_FIELD is {trial[0]}: {chosen} counts")
-    return chosen

@@ -236,46 +236,42 @@ def _trc_clock(numbers: NDArray, times: NDArray, rate: float, path: Path) -> tup
     rows = np.arange(len(times))
     if len(times) < 3:
         return rows, rate, []
-    elapsed, jumps = times - times[0], np.diff(numbers)
+    elapsed, jumps, notes = times - times[0], np.diff(numbers), []
     decimals = next((d for d in range(7) if np.allclose(times, np.round(times, d), rtol=0.0, atol=1e-9)), 7)
     rounding = 10.0**-decimals * rate  # [frames]
     limit = max(_MAX_JITTER_FRAMES, rounding)
     numbered = np.concatenate([[0.0], np.cumsum(jumps / np.median(jumps))]) if jumps.min() > 0 else rows
     timed = np.round(elapsed * rate)
+    if np.median(np.diff(timed)) != 1 or timed[-1] > 2 * len(times):  # DataRate or a time is wrong
+        timed = rows
 
     def jitter(frames: NDArray, rate: float) -> float:
-        return float(np.abs(elapsed * rate - frames).max())
+        """Largest distance [frames] of a row's time from its frame; infinite for frames that cannot be."""
+        possible = np.allclose(frames, np.round(frames)) and np.diff(frames).min() > 0
+        possible &= frames[-1] < 10 * len(times) + _MAX_MISSING_ROWS
+        return float(np.abs(elapsed * rate - frames).max()) if possible else np.inf
 
     def measured(frames: NDArray) -> float:
         return float(frames[-1]) / max(float(elapsed[-1]), 1e-9)
 
-    trials = [(rows, rate, limit), (numbered, rate, limit)]
-    if np.median(np.diff(timed)) == 1 and timed[-1] < 2 * len(times):  # else DataRate or a time is wrong
-        trials.append((timed, rate, limit / 2.0))
-    trials += [(frames, measured(frames), limit) for frames in (rows, numbered)]
-    fitting = [
-        (frames, r) for frames, r, most in trials
-        if jitter(frames, r) <= most and abs(r / rate - 1.0) < _MAX_RATE_ERROR and np.diff(frames).min() > 0
-        and np.allclose(frames, np.round(frames)) and frames[-1] < 10 * len(times) + _MAX_MISSING_ROWS
-    ]  # fmt: skip
-    if not fitting:
+    trials = [(rows, rate, limit), (numbered, rate, limit), (timed, rate, limit / 2.0)]
+    trials += [(f, measured(f), limit) for f in (rows, numbered) if abs(measured(f) / rate - 1.0) < _MAX_RATE_ERROR]
+    frames, found = next(((f, r) for f, r, most in trials if jitter(f, r) <= most), (rows, np.nan))
+    if np.isnan(found):
         raise ObservationError(
             f"DataRate {rate:g} Hz, but the {len(times)} rows go from {times[0]:g} to {times[-1]:g} s", file=path,
             place="line 3", remedy="Correct DataRate or the times.",
         )
-    frames, found = fitting[0]
-    own, notes = measured(frames), []
+    own = measured(frames)
     if abs(own / rate - 1.0) > _MIN_RATE_ERROR and jitter(frames, rate) > 4.0 * jitter(frames, own) + rounding:
         found = own
     if found != rate:
         notes.append(f"DataRate is {rate:g} Hz, the times of its rows give {found:.6g} Hz: the times count")
-    if frames[-1] > rows[-1]:
-        before = numbers[np.argmax(np.diff(frames) > 1)]
-        lacking = frames[-1] - rows[-1]
-        notes.append(f"{lacking:.0f} frames have no row, the first after frame {before:.0f}: they are empty")
-    elif numbered[-1] > rows[-1]:
-        before = numbers[np.argmax(jumps > np.median(jumps))]
-        notes.append(f"the frame numbers jump after frame {before:.0f}, the times do not: the times count")
+    lacking = frames[-1] - rows[-1]
+    if lacking or numbered[-1] > rows[-1]:
+        after = numbers[np.argmax(np.diff(frames if lacking else numbered) > 1)]
+        what = f"{lacking:.0f} frames have no row and are empty" if lacking else "the frame numbers jump, the times do not"
+        notes.append(f"{what}, first after frame {after:.0f}")
     return np.round(frames).astype(int), found, notes
 
 
