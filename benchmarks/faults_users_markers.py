@@ -17,7 +17,7 @@ import kinefit
 from kinefit.bodies import placement
 from kinefit.cli.markers._fit import fit_file
 from kinefit.errors import KinefitError
-from kinefit.exporters import write_c3d, write_markers
+from kinefit.exporters import write_markers
 from kinefit.exporters.c3d_file import c3d_bytes
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
@@ -70,7 +70,8 @@ def _c3d(
 
 
 def _same(markers: Markers, x: NDArray, names: tuple[str, ...] = LABELS) -> bool:
-    return markers.names == names and markers.positions.shape == x.shape and np.allclose(markers.positions, x, atol=1e-5)
+    alike = markers.names == names and markers.positions.shape == x.shape
+    return alike and np.allclose(markers.positions, x, atol=1e-5)
 
 
 def _refused(file: Path, *words: str) -> bool:
@@ -95,14 +96,12 @@ def _squat(path: Path, **changes: Any) -> None:
     write_markers(Markers(points.names, 60.0, truth.positions(points)[:40], up=truth.up, **changes), path)
 
 
-def _fitted(path: Path, out: Path, start: float, formats: tuple[str, ...] = ("motion", "mot", "trc", "markers")) -> bool:
+def _fitted(path: Path, out: Path, start: float) -> bool:
     """Whether the fit of a file and all that it writes begin at the file's time."""
-    (motion, files), *_ = fit_file(path, out, formats=formats).values()
-    starts = [motion.times[0], kinefit.read_motion(files["motion"]).times[0]]
-    starts += [read_markers(files[f]).times[0] for f in ("trc", "markers") if f in files]
-    starts += [_rows(files["mot"])[0, 0]] if "mot" in files else []
-    write_c3d(motion, out / "motion.c3d")
-    starts.append((read_markers(out / "motion.c3d").first_frame - 1) / motion.rate)
+    (motion, files), *_ = fit_file(path, out, formats=("motion", "mot", "trc", "c3d", "markers")).values()
+    starts = [motion.times[0], kinefit.read_motion(files["motion"]).times[0], _rows(files["mot"])[0, 0]]
+    starts += [_rows(files[f])[0, 1] for f in ("trc", "markers")]
+    starts.append(ezc3d.c3d(str(files["c3d"]))["header"]["points"]["first_frame"] / motion.rate)  # counted from 0
     return bool(np.allclose(starts, start, atol=1e-4))
 
 

@@ -217,11 +217,11 @@ def _trc_names(lines: list[str], count: int, path: Path) -> list[str]:
             return bases
         if names == [name for name in names[::3] for _ in range(3)]:
             return names[::3]
-    for width in (3, 2, 1):  # columns from a name to the next
+    for width in (3, 2, 1) if "\t" in lines[3] else (1,):  # columns from a name to the next
         first = 2 + (filled[0] - 2) % width if filled else 2
         named = {(k - first) // width: cells[k] for k in filled}
         wide = max([count, *(slot + 1 for slot in named)])
-        if all((k - first) % width == 0 for k in filled) and (width == 3 or wide == max(named) + 1 == count):
+        if all((k - first) % width == 0 for k in filled) and (width == 3 or wide == max(named, default=wide - 1) + 1 == count):
             return [named.get(slot, "") for slot in range(wide)]
     if len(names) < count:
         raise FileError(
