@@ -303,7 +303,7 @@ def test_missing_rows_are_empty_frames(data_dir, tmp_path):
         assert "4 frames have no row" in found.notes[0]
     path.write_text(trc(rows_at(np.arange(26) / 100, (kept + 1).tolist())))
     found = read_markers(path)
-    assert len(found) == 26 and "the frame numbers jump, the times do not, first after frame 10" in found.notes[0]
+    assert len(found) == 26 and "frame numbers jump, times do not, first after frame 10" in found.notes[0]
 
 
 @pytest.mark.parametrize(("stated", "true", "noted"), [(60, 59.94, True), (100, 99, True), (65.05, 65.0533, False)])

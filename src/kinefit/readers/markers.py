@@ -221,7 +221,8 @@ def _trc_names(lines: list[str], count: int, path: Path) -> list[str]:
         first = 2 + (filled[0] - 2) % width if filled else 2
         named = {(k - first) // width: cells[k] for k in filled}
         wide = max([count, *(slot + 1 for slot in named)])
-        if all((k - first) % width == 0 for k in filled) and (width == 3 or wide == max(named, default=wide - 1) + 1 == count):
+        whole = width == 3 or wide == max(named, default=wide - 1) + 1 == count
+        if whole and all((k - first) % width == 0 for k in filled):
             return [named.get(slot, "") for slot in range(wide)]
     if len(names) < count:
         raise FileError(
@@ -270,7 +271,7 @@ def _trc_clock(numbers: NDArray, times: NDArray, rate: float, path: Path) -> tup
     lacking = frames[-1] - rows[-1]
     if lacking or numbered[-1] > rows[-1]:
         after = numbers[np.argmax(np.diff(frames if lacking else numbered) > 1)]
-        what = f"{lacking:.0f} frames have no row and are empty" if lacking else "the frame numbers jump, the times do not"
+        what = f"{lacking:.0f} frames have no row and are empty" if lacking else "frame numbers jump, times do not"
         notes.append(f"{what}, first after frame {after:.0f}")
     return np.round(frames).astype(int), found, notes
 
