@@ -56,6 +56,35 @@ def test_trc_round_trip(tmp_path, unit):
     np.testing.assert_allclose(read.positions, markers.positions, rtol=1e-6)
 
 
+CLOCKS = [({"first_frame": 40}, 40), ({"first_frame": 1, "first_time": 12.5}, 1251)]
+
+
+@pytest.mark.parametrize(("given", "first"), CLOCKS)
+def test_the_clock_goes_into_every_file_and_back(tmp_path, given, first):
+    """C3D counts frames from 0 s; other programs read the same."""
+    ezc3d = pytest.importorskip("ezc3d")
+    x = np.random.default_rng(0).normal(size=(9, 2, 3))
+    markers = Markers(("A", "B"), 100.0, x, **given)
+    assert markers.times[0] == pytest.approx((first - 1) / 100)
+    for name in ("a.trc", "a.c3d"):
+        write_markers(markers, tmp_path / name)
+        np.testing.assert_allclose(read_markers(tmp_path / name).times, markers.times, atol=1e-9)
+    assert read_markers(tmp_path / "a.trc").first_frame == given["first_frame"]
+    assert ezc3d.c3d(str(tmp_path / "a.c3d"))["header"]["points"]["first_frame"] == first - 1  # which counts from 0
+    row = (tmp_path / "a.trc").read_text().splitlines()[6].split("\t")
+    assert (float(row[0]), float(row[1])) == (given["first_frame"], (first - 1) / 100)
+
+
+def test_a_row_never_ends_in_an_empty_cell(tmp_path):
+    """OpenSim refuses one: `python -m benchmarks.faults faults_users` writes such gaps."""
+    x = np.ones((4, 3, 3))
+    x[0, 2] = x[1, :] = x[2, 1] = np.nan
+    write_markers(Markers(("A", "B", "C"), 100.0, x), tmp_path / "a.trc", unit="m")
+    rows = [line.split("\t") for line in (tmp_path / "a.trc").read_text().splitlines()[6:]]
+    assert [(len(row), row[-1]) for row in rows] == [(11, "NaN"), (11, "NaN"), (11, "1"), (11, "1")]
+    np.testing.assert_array_equal(read_markers(tmp_path / "a.trc").positions, x)
+
+
 def test_a_copy_keeps_force_plates(data_dir, tmp_path):
     source = data_dir("markers_pycgm") / "Test_Files" / "Movement_trial.c3d"
     markers = read_markers(source)
@@ -105,4 +134,6 @@ def test_what_cannot_be_written_is_refused(tmp_path):
         write_markers(markers, tmp_path / "a.c3d", unit="furlong")
     with pytest.raises(FileError, match="no such file"):
         write_markers(markers, tmp_path / "a.c3d", like=tmp_path / "none.c3d")
+    with pytest.raises(ExportError, match=r"no frames before 0 s, the markers begin at -0\.5 s"):
+        write_markers(some_markers(first_time=-0.5), tmp_path / "a.c3d")
     assert not list(tmp_path.iterdir())

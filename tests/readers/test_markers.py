@@ -1,5 +1,8 @@
 """C3D and TRC: every real file, ezc3d as a second opinion, and damaged files that must not crash."""
 
+import gzip
+import re
+import struct
 from pathlib import Path
 
 import ezc3d
@@ -9,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kinefit.errors import FileError, KinefitError, ObservationError
+from kinefit.exporters.c3d_file import c3d_bytes
 from kinefit.readers.c3d_file import _values, read_c3d
 from kinefit.readers.markers import read_markers
 
@@ -54,6 +58,7 @@ def test_real_files(data_dir, name):
     found = (len(markers.names), len(markers), pytest.approx(markers.rate, abs=1e-3), markers.up, markers.first_frame)
     assert found == TABLE[name]
     assert len(set(markers.names)) == len(markers.names)
+    assert not markers.notes
     extent = np.nanmax(markers.positions, axis=(0, 1)) - np.nanmin(markers.positions, axis=(0, 1))
     assert 0.5 < np.linalg.norm(extent) < 20  # [m] a person in a laboratory: the unit is right
     seen = np.isfinite(markers.positions)
@@ -266,3 +271,161 @@ def test_missing_and_foreign_files(tmp_path):
 def test_a_parameter_of_no_numbers_in_dimensions_beyond_bounds_is_refused():
     with pytest.raises(FileError, match="impossible dimensions"):
         _values(bytes([2, 10, 0, *[255] * 9]), "intel", "POINT:X", Path("a.c3d"))
+
+
+def test_the_clock_is_the_files(data_dir, tmp_path):
+    markers = read_markers(data_dir("cases_of_users") / "trc-starts-at-12.5-s" / "take.trc")
+    np.testing.assert_allclose(markers.times, 12.5 + np.arange(100) / 100)
+    (path,) = data_dir("markers").rglob("*JA1Gait35.c3d")
+    walk = read_markers(path)
+    assert (walk.first_frame, walk.times[0]) == (833, pytest.approx(832 / 250))
+    assert walk.times[0] < walk.events[0].time < walk.times[-1]  # of the same clock
+    path = tmp_path / "a.trc"
+    path.write_text(trc([row.replace("\t0.0", "\t-0.5", 1) for row in ROWS[:1]]))
+    assert read_markers(path).first_time == -0.5
+
+
+def rows_at(times, numbers=None):
+    return [f"{n}\t{t:.5f}\t{i}\t2\t3\t4\t5\t6" for i, (n, t) in enumerate(zip(numbers or range(1, 99), times), 1)]
+
+
+def test_missing_rows_are_empty_frames(data_dir, tmp_path):
+    markers = read_markers(data_dir("cases_of_users") / "trc-rows-missing" / "take.trc")
+    empty = np.isnan(markers.positions).all(axis=(1, 2))
+    assert (len(markers), list(np.flatnonzero(empty)), markers.rate) == (200, [100, 101, 102], 100.0)
+    assert markers.times[103] == pytest.approx(1.03)
+    assert markers.notes == ("take.trc: 3 frames have no row and are empty, first after frame 100",)
+    path, kept = tmp_path / "a.trc", np.r_[:10, 14:30]
+    for numbers in (None, (kept + 1).tolist(), (5 * kept + 7).tolist()):  # of every fifth frame
+        path.write_text(trc(rows_at(kept / 100, numbers)))
+        found = read_markers(path)
+        np.testing.assert_array_equal(np.flatnonzero(np.isfinite(found.positions[:, 0, 0])), kept)
+        assert "4 frames have no row" in found.notes[0]
+    path.write_text(trc(rows_at(np.arange(26) / 100, (kept + 1).tolist())))
+    found = read_markers(path)
+    assert len(found) == 26 and "frame numbers jump, times do not, first after frame 10" in found.notes[0]
+
+
+@pytest.mark.parametrize(("stated", "true", "noted"), [(60, 59.94, True), (100, 99, True), (65.05, 65.0533, False)])
+def test_the_rate_is_that_of_the_times(tmp_path, stated, true, noted):
+    path = tmp_path / "a.trc"
+    path.write_text(trc(rows_at(np.arange(90) / true), rate=str(stated)))
+    found = read_markers(path)
+    assert found.rate == pytest.approx(true if noted else stated, rel=1e-5)
+    assert bool(found.notes) == noted == ("the times count" in "".join(found.notes))
+
+
+def test_times_in_whole_milliseconds_give_the_stated_rate(tmp_path):
+    path = tmp_path / "a.trc"
+    path.write_text(trc(rows_at(np.round(np.arange(90) / 150, 3)), rate="150"))
+    assert (read_markers(path).rate, read_markers(path).notes) == (150.0, ())
+
+
+NAMES = {
+    "A\t\t\tB\t\t\t": ("A", "B"), "\t\t\tB": ("*1", "B"), "A": ("A", "*2"), "": ("*1", "*2"), "\tA\t\t\tB": ("A", "B"),
+    "A\tB": ("A", "B"), "A\t\tB": ("A", "B"), "A\tA\tA\tB\tB\tB": ("A", "B"),
+    "A_x\tA_y\tA_z\tB_x\tB_y\tB_z": ("A", "B"),
+    "A:X\tA:Y\tA:Z\tB:X\tB:Y\tB:Z": ("A", "B"), "L ASI (X)\tL ASI (Y)\tL ASI (Z)\tB X\tB Y\tB Z": ("L ASI", "B"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("line", NAMES)
+def test_names_belong_to_the_columns_below(tmp_path, line):
+    path, usual = tmp_path / "a.trc", "Frame#\tTime\tA\t\t\tB\t\t"
+    assert usual in trc(ROWS)
+    path.write_text(trc(ROWS).replace(usual, f"Frame#\tTime\t{line}"))
+    markers = read_markers(path)
+    assert markers.names == NAMES[line]
+    np.testing.assert_allclose(markers.positions[0], [[0.001, 0.002, 0.003], [0.004, 0.005, 0.006]])
+
+
+def test_real_names_by_columns(data_dir):
+    cases = data_dir("cases_of_users")
+    markers = read_markers(cases / "trc-unnamed-column" / "take.trc")
+    assert markers.names == ("LASI", "*2", "LPSI", "RPSI", "C7")
+    np.testing.assert_allclose(markers.positions[0, 2], [-0.6014, 0.9321, -0.2611], atol=1e-4)
+    assert read_markers(cases / "trc-axis-labels-from-X5" / "take.trc").positions.shape == (60, 5, 3)
+
+
+@pytest.mark.parametrize("axes", ["\t\tX0\tY0\tZ0\tX1\tY1\tZ1", "\t\tX\tY\tZ\tX\tY\tZ", "(s)\t\t(mm)", ""])
+def test_a_line_of_axes_is_no_row(tmp_path, axes):
+    path = tmp_path / "a.trc"
+    path.write_text(trc(ROWS).replace("\t\tX1\tY1\tZ1\tX2\tY2\tZ2", axes))
+    assert len(read_markers(path)) == 4
+
+
+def test_a_missing_name_between_blanks_is_refused(tmp_path):
+    path = tmp_path / "a.trc"
+    path.write_text(trc(ROWS).replace("Frame#\tTime\tA\t\t\tB\t\t", "Frame# Time A"))
+    with pytest.raises(FileError, match="1 names for 2 markers") as caught:
+        read_markers(path)
+    assert caught.value.place == "line 4"
+
+
+PLACES = np.random.default_rng(0).normal(size=(60, 2, 3)).astype(np.float32)
+ANALOG = np.arange(60 * 40, dtype=np.float32).reshape(60, 40)
+EIGHT = {"ANALOG": {"USED": np.array(8, np.uint16), "RATE": np.array(500.0, np.float32)}}
+SEVEN = {"ANALOG": EIGHT["ANALOG"] | {"USED": np.array(7, np.uint16)}}
+
+
+def of_header(changes, *, points=PLACES, groups=None, first=1, **more):
+    """A C3D of two markers, whose header has other words or floats at some bytes."""
+    own = {"POINT": {"UNITS": ["m"], "LABELS": ["A", "B"]}, **(groups or {})}
+    own["POINT"] = {"UNITS": ["m"], "LABELS": ["A", "B"]} | own["POINT"]
+    raw = bytearray(c3d_bytes(points, np.zeros(points.shape[:2]), own, scale=-1.0, rate=100.0, first=first, **more))
+    for at, value in changes.items():
+        struct.pack_into("<f" if isinstance(value, float) else "<H", raw, at, value)
+    return bytes(raw)
+
+
+REFUSED_C3D = {
+    "header's rate is 60 Hz, POINT:RATE is 100 Hz": of_header({20: 60.0}),
+    "header's scale is 0.1, POINT:SCALE is -1 ": of_header({12: 0.1}),
+    "8 analog values a frame from block.*fits none": of_header({4: 8}, groups=SEVEN, analog=ANALOG, samples=5),
+}
+
+
+@pytest.mark.parametrize("problem", REFUSED_C3D)
+def test_a_c3d_that_contradicts_itself_is_refused(tmp_path, problem):
+    path = tmp_path / "a.c3d"
+    path.write_bytes(REFUSED_C3D[problem])
+    with pytest.raises(FileError, match=problem) as caught:
+        read_markers(path)
+    assert caught.value.file == path and "header" in caught.value.place
+
+
+NOTED_C3D = {
+    "60 Hz, POINT:RATE is 100 Hz: 100 Hz counts": of_header({20: 60.0}, groups=EIGHT, analog=ANALOG, samples=5),
+    "states 8 analog values.*40 from": of_header({4: 8}, groups=EIGHT, analog=ANALOG, samples=5),
+    "states 0 analog values.*40 from": of_header({4: 0, 18: 0}, groups=EIGHT, analog=ANALOG, samples=5),
+    "from block 9 on; 0 from block": of_header({16: 9}),
+    "begins with frame 1, TRIAL:ACTUAL_START_FIELD is 833": of_header({6: 1, 8: 60}, first=833),
+    "scale of residuals is 2, POINT:SCALE's 1 counts": of_header({12: -2.0}),
+}
+
+
+@pytest.mark.parametrize("note", NOTED_C3D)
+def test_a_contradiction_that_the_file_decides_is_noted(tmp_path, note):
+    path = tmp_path / "a.c3d"
+    path.write_bytes(NOTED_C3D[note])
+    markers = read_markers(path)
+    assert (markers.rate, len(markers.notes)) == (100.0, 1)
+    np.testing.assert_array_equal(markers.positions, PLACES.astype(float))
+    assert re.search(note, markers.notes[0])
+
+
+def test_frames_beyond_the_header_are_counted_by_parameters_or_length(data_dir, tmp_path):
+    path, long = tmp_path / "a.c3d", np.resize(PLACES, (66_000, 2, 3))
+    path.write_bytes(gzip.decompress((data_dir("cases_of_users") / "c3d-long-frames" / "take.c3d.gz").read_bytes()))
+    markers = read_markers(path)
+    assert (len(markers), markers.notes) == (66_000, ())
+    assert markers.positions[-1, 0, 0] == pytest.approx(0.5)
+    none = {"TRIAL": {"ACTUAL_END_FIELD": []}}
+    for raw in (of_header({}, points=long), of_header({}, points=long, groups=none) + bytes(300)):
+        path.write_bytes(raw)
+        markers = read_markers(path)
+        assert (len(markers), markers.notes) == (66_000, ())
+        np.testing.assert_array_equal(markers.positions[-2:], long[-2:].astype(float))
+    path.write_bytes(of_header({}, points=long)[:-10_000])
+    with pytest.raises(FileError, match="truncated: .* of 66000 frames"):
+        read_markers(path)

@@ -95,7 +95,8 @@ def content_of(
         tell("Cameras and images are left out: the calibration changed since the motion was computed. Track it again.")
         rig, videos = None, {}
     return ViewerContent(
-        tuple(motions), rig=rig, up=take.up, name=take.name, steps=np.arange(*seen.frames) / seen.rate,
+        tuple(motions), rig=rig, up=take.up, name=take.name,
+        steps=np.arange(*seen.frames) / seen.rate + seen.first_time,
         points=None if motions else _triangulated(take, seen, tell),
         pictures=CameraImages(cameras, videos, seen.images, offsets, rate=seen.rate) if videos else None,
         markers=seen.markers, marker_offsets=tuple(entry.time_offset for entry in take.markers),

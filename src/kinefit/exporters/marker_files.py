@@ -29,8 +29,9 @@ def write_markers(
 ) -> None:
     """Write markers as C3D or TRC, by the name's ending.
 
-    Reading the file gives the same labels, gaps, unit, rate, first frame and events, positions as 32-bit floats (TRC:
-    to seven digits), and residuals to 1/255 of the largest (C3D; TRC holds none).
+    Reading the file gives the same labels, gaps, unit, rate, clock and events, positions as 32-bit floats (TRC: to
+    seven digits), and residuals to 1/255 of the largest (C3D; TRC holds none). C3D counts the clock in whole frames, so
+    its first frame is the one at `first_time`, where frame 1 is at 0 s; TRC has that time and `first_frame`.
 
     Parameters
     ----------
@@ -43,7 +44,7 @@ def write_markers(
     Raises
     ------
     ExportError
-        Another ending, no frame, more than the format can hold, or the file cannot be written.
+        Another ending, no frame, more than the format can hold (C3D: a time before 0), or the file cannot be written.
     FileError
         `like` is damaged.
     """
@@ -62,7 +63,10 @@ def write_markers(
 
 
 def _c3d(markers: Markers, path: Path, unit: str, factor: float, like: C3d | None) -> bytes:
-    first = max(markers.first_frame, 1)
+    first = round(markers.first_time * markers.rate) + 1
+    if first < 1:
+        problem = f"C3D counts no frames before 0 s, the markers begin at {markers.first_time:g} s"
+        raise ExportError(problem, file=path, remedy="Write a .trc, or cut the markers to times from 0 on.")
     seen = np.isfinite(markers.positions).all(axis=2)
     residual = np.zeros(seen.shape) if markers.residual is None else np.nan_to_num(markers.residual) * factor
     scale = _residual_unit(residual[seen])
@@ -137,5 +141,6 @@ def _trc(markers: Markers, path: Path, unit: str, factor: float) -> str:
     seen = np.isfinite(markers.positions).all(axis=2)
     for f, (t, x) in enumerate(zip(markers.times.tolist(), (markers.positions * factor).tolist(), strict=True)):
         cells = [f"{p[0]:.7g}\t{p[1]:.7g}\t{p[2]:.7g}" if ok else "\t\t" for p, ok in zip(x, seen[f], strict=True)]
-        lines.append(f"{first + f}\t{t:.9f}\t" + "\t".join(cells))
+        end = "" if seen[f, -1] else "NaN"  # OpenSim refuses a row that ends in an empty cell
+        lines.append(f"{first + f}\t{t:.9f}\t" + "\t".join(cells) + end)
     return "\n".join(lines) + "\n"

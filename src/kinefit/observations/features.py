@@ -124,7 +124,7 @@ class NamedMarkers:
     sensor : name of the sensor
     markers : Markers, with these names
     marker_set : of the body, "" for its landmarks
-    time_offset : float [s]
+    time_offset : float [s] added to the times of the markers
     std : (K,) [m] standard deviation of the set's marker places on this person; None if the body has their places
     """
 
@@ -136,8 +136,9 @@ class NamedMarkers:
 
     def at(self, time: float) -> MarkerFrame | None:
         """The frame nearest to a time [s]; None if there is none within half a frame."""
-        k = round((time - self.time_offset) * self.markers.rate)
+        first = self.markers.first_time + self.time_offset
+        k = round((time - first) * self.markers.rate)
         if not 0 <= k < len(self.markers):
             return None
-        own = k / self.markers.rate + self.time_offset
+        own = k / self.markers.rate + first
         return MarkerFrame(self.sensor, own, self.markers.names, self.markers.positions[k], self.marker_set)

@@ -146,7 +146,7 @@ class MarkerEvent:
     Parameters
     ----------
     label : str, such as "Foot Strike"
-    time : float [s] on the recording's own clock, which starts with frame 1
+    time : float [s] on the recording's own clock, that of `Markers.times`
     context : str, such as "Left"; subject : str
     """
 
@@ -175,6 +175,11 @@ class Markers:
     source : str
     unit : str, of the source file ("mm", "m" ...); positions are always in metres
     events : marked in the recording
+    first_time : float [s]
+        Time of the first frame on the recording's own clock, which forces and events of the trial share. Default: that
+        of `first_frame`, where frame 1 is at 0 s, as in C3D.
+    notes : tuple of str
+        What the reader decided where the file contradicts itself, and what it lacks.
 
     Raises
     ------
@@ -191,9 +196,13 @@ class Markers:
     source: str = ""
     unit: str = "m"
     events: tuple[MarkerEvent, ...] = ()
+    first_time: float = np.nan
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_seen(self.source, self.rate, self.names)
+        if np.isnan(self.first_time):
+            object.__setattr__(self, "first_time", (self.first_frame - 1) / self.rate if self.first_frame > 1 else 0.0)
         freeze(self, positions=frozen(self.positions, float, "markers", ("frames", len(self.names), 3), self.source))
         if self.residual is not None:
             object.__setattr__(self, "residual", frozen(self.residual))
@@ -203,8 +212,8 @@ class Markers:
 
     @property
     def times(self) -> NDArray:
-        """(F,) [s] since the first frame."""
-        return np.arange(len(self)) / self.rate
+        """(F,) [s] on the recording's own clock: the first is `first_time`."""
+        return np.arange(len(self)) / self.rate + self.first_time
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,8 @@ from kinefit._files import regular
 from kinefit.errors import FileError
 
 _BLOCK_BYTES = 512
+_MAX_WORD = 65535  # what the header's counters hold
+_MAX_RATIO_ERROR = 1e-3  # between header and parameters: above the rounding of a 32-bit float, below 59.94 to 60 Hz
 _REMEDY = "Export the file again, or repair it with a C3D editor such as Mokka."
 _EVENT_KEY = 12345  # of the header's events
 _MAX_EVENTS = 18  # in the header
@@ -35,6 +37,7 @@ class C3d:
     parameters : {"GROUP:NAME": list of str or array}
     analog : (F, A) raw samples of every frame, channel by channel for each of `samples` times
     events : (label, time [s]) of the header
+    notes : which value counts where the file contradicts itself
     """
 
     points: NDArray
@@ -46,10 +49,11 @@ class C3d:
     analog: NDArray
     samples: int
     events: tuple[tuple[str, float], ...]
+    notes: tuple[str, ...] = ()
 
 
 def read_c3d(path: Path) -> C3d:
-    """Read the points and all parameters; raises FileError for a damaged or truncated file."""
+    """Read the points and all parameters; raises FileError for a damaged, truncated or contradictory file."""
     try:
         raw = regular(path).read_bytes()
     except FileNotFoundError as error:
@@ -146,21 +150,60 @@ def _number(parameters: dict[str, Values], key: str) -> float | None:
     return float(values.flat[0]) if isinstance(values, np.ndarray) and values.size else None
 
 
+def _stated(parameters: dict[str, Values], key: str) -> float:
+    """A number that is stated; else 0."""
+    value = _number(parameters, key) or 0.0
+    return value if np.isfinite(value) else 0.0
+
+
 def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path: Path) -> C3d:
     word = "<u2" if processor != "mips" else ">u2"
     count, analog, first, last, _, _, _, start, samples = (int(v) for v in np.frombuffer(raw[2:20], word))
-    scale, rate = (float(_numbers(raw[at : at + 4], 4, processor)[0]) for at in (12, 20))
-    scale, rate = _number(parameters, "POINT:SCALE") or scale, _number(parameters, "POINT:RATE") or rate
-    used = _number(parameters, "POINT:USED")
-    if used is not None and int(used) % 65536 != count:
-        raise FileError(f"{count} points, POINT:USED says {used:.0f}", file=path, place="header", remedy=_REMEDY)
+    header_scale, rate = (float(_numbers(raw[at : at + 4], 4, processor)[0]) for at in (12, 20))
+    notes: list[str] = []
+    scale = _number(parameters, "POINT:SCALE") or header_scale
+    if header_scale * scale < 0 or (_differ(header_scale, scale) and scale > 0):
+        raise FileError(
+            f"the header's scale is {header_scale:g}, POINT:SCALE is {scale:g} (negative: the data are floats, "
+            "positive: integers to be multiplied by it)", file=path, place="header, POINT:SCALE", remedy=_REMEDY,
+        )  # fmt: skip
+    if _differ(header_scale, scale):
+        notes.append(f"the header's scale of residuals is {-header_scale:g}, POINT:SCALE's {-scale:g} counts")
+    rate = _rate(rate, samples if analog else 0, parameters, path, notes)
+    points_used = _number(parameters, "POINT:USED")
+    if points_used is not None and int(points_used) % 65536 != count:
+        raise FileError(f"{count} points, POINT:USED says {points_used:.0f}", file=path, place="header", remedy=_REMEDY)
     if not (np.isfinite(scale) and scale != 0 and np.isfinite(rate) and rate > 0):
         raise FileError(f"scale {scale:g}, rate {rate:g} Hz", file=path, place="header", remedy=_REMEDY)
     width = 4 if scale < 0 else 2
+
+    def spare(start: int, analog: int) -> int:
+        """Bytes behind the last frame."""
+        space, step = len(raw) - (start - 1) * _BLOCK_BYTES, (4 * count + analog) * width
+        return space - step * _count(parameters, first, last, space // step)
+
+    used, ratio = int(_stated(parameters, "ANALOG:USED")), round(_stated(parameters, "ANALOG:RATE") / rate)
+    starts = dict.fromkeys((start, int(_stated(parameters, "POINT:DATA_START")) % 65536 or start))
+    analogs = dict.fromkeys((analog, *(used % 65536 * n for n in (samples, ratio) if used and n > 0)))
+    layouts = [(s, a) for s in starts for a in analogs]  # the header's, then what the parameters state otherwise
+    exact = [layout for layout in layouts if count and layout[0] > 1 and 0 <= spare(*layout) < _BLOCK_BYTES]
+    if len(layouts) > 1 and len(exact) != 1:
+        listed = " or ".join(f"{a} analog values a frame from block {s} on" for s, a in layouts)
+        raise FileError(
+            f"header, ANALOG and POINT:DATA_START contradict each other: {listed}; the file's length fits "
+            f"{len(exact) or 'none'} of them", file=path, place="header", remedy=_REMEDY,
+        )  # fmt: skip
+    if exact and exact[0] != layouts[0]:
+        start, analog = exact[0]
+        samples = analog // (used or analog or 1)
+        notes.append(
+            f"the header states {layouts[0][1]} analog values a frame from block {layouts[0][0]} on; {analog} from "
+            f"block {start} on count, as the parameters state, which fit the file's length"
+        )
     step = (4 * count + analog) * width
     begin = (start - 1) * _BLOCK_BYTES
     room = (len(raw) - begin) // step if step and start > 1 else 0
-    first, frames = _frames(parameters, first, last, room)
+    frames = _count(parameters, first, last, room)
     if count == 0 or frames <= 0:
         raise FileError(f"{max(frames, 0)} frames of {count} points: no markers in this file", file=path)
     if frames > room:
@@ -168,7 +211,17 @@ def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path
             f"the file is truncated: {max(room, 0)} of {frames} frames can be read", file=path,
             remedy="Copy or export it again.",
         )
+    if (room - frames) * step >= _BLOCK_BYTES:
+        notes.append(f"{room - frames} more frames have room in the file, which states {frames}")
     data = np.frombuffer(raw, np.uint8, frames * step, begin).reshape(frames, step)
+    if _count(parameters, first, last, 0) < frames:  # counted by the file's length: its last block is filled up
+        empty = int(np.argmax(data[: -_BLOCK_BYTES // step - 1 : -1].any(axis=1)))
+        data, frames = data[: frames - empty], frames - empty
+    trial = _trial(parameters)
+    if trial and first not in (trial[0] % 65536, _MAX_WORD):
+        notes.append(f"the header begins with frame {first}, TRIAL:ACTUAL_START_FIELD is {trial[0]}")
+    if trial and not last - first + 1 == frames != trial[1] - trial[0] + 1:
+        first = trial[0]  # else the header alone has the right number of frames
     with np.errstate(invalid="ignore"):  # signalling NaN
         values = _numbers(data[:, : 4 * count * width].tobytes(), width, processor)
         values = values.reshape(frames, count, 4).astype(float)
@@ -180,7 +233,7 @@ def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path
     if width == 2 and "".join(map(str, parameters.get("ANALOG:FORMAT", []))).upper().startswith("UNSIGNED"):
         sampled = sampled.astype(sampled.dtype.newbyteorder("=")).view(np.uint16)
     events = _header_events(raw, processor)
-    return C3d(points, missing, residual, rate, first, parameters, sampled, max(samples, 1), events)
+    return C3d(points, missing, residual, rate, first, parameters, sampled, max(samples, 1), events, tuple(notes))
 
 
 def _header_events(raw: bytes, processor: str) -> tuple[tuple[str, float], ...]:
@@ -194,16 +247,45 @@ def _header_events(raw: bytes, processor: str) -> tuple[tuple[str, float], ...]:
     return tuple((label, float(t)) for label, t in zip(labels, times, strict=True) if np.isfinite(t))
 
 
-def _frames(parameters: dict[str, Values], first: int, last: int, room: int) -> tuple[int, int]:
-    """First frame and number of frames: of the header, POINT:FRAMES or TRIAL, the largest that fits the file."""
+def _differ(a: float, b: float) -> bool:
+    """Whether two values of one quantity contradict each other; one that is not stated (0, NaN) never does."""
+    return bool(a and b and abs(abs(a / b) - 1.0) > _MAX_RATIO_ERROR)
+
+
+def _rate(header: float, samples: int, parameters: dict[str, Values], path: Path, notes: list[str]) -> float:
+    """Rate [Hz] of the points: POINT:RATE, or the header's if the analog rate supports that alone."""
+    rate = _number(parameters, "POINT:RATE") or header
+    if not _differ(header, rate):
+        return rate
+    analog = _stated(parameters, "ANALOG:RATE") / samples if samples else 0.0
+    supported = [r for r in (header, rate) if analog and not _differ(r, analog)]
+    what = f"the header's rate is {header:g} Hz, POINT:RATE is {rate:g} Hz"
+    if len(supported) != 1:
+        raise FileError(what, file=path, place="header, POINT:RATE", remedy=f"Correct the wrong one. {_REMEDY}")
+    notes.append(f"{what}: {supported[0]:g} Hz counts, which {samples} analog samples a frame support")
+    return supported[0]
+
+
+def _count(parameters: dict[str, Values], first: int, last: int, room: int) -> int:
+    """Number of frames: of the header, POINT:FRAMES, POINT:LONG_FRAMES or TRIAL, the largest that fits the file."""
     counts = [last - first + 1]
-    stated = _number(parameters, "POINT:FRAMES")
-    if stated is not None and np.isfinite(stated):
-        counts.append(int(stated) % 65536 if abs(stated) < 65536 else int(stated))
-    ends = [parameters.get(f"TRIAL:ACTUAL_{end}_FIELD") for end in ("START", "END")]
-    if all(isinstance(e, np.ndarray) and e.shape == (2,) and e.dtype.itemsize == 2 for e in ends):
-        start, stop = (int(e[0]) % 65536 + 65536 * (int(e[1]) % 65536) for e in ends)  # type: ignore[index]
-        first = start
-        counts.append(stop - start + 1)
+    for key in ("POINT:FRAMES", "POINT:LONG_FRAMES"):
+        stated = int(_stated(parameters, key))
+        counts.append(stated % 65536 if abs(stated) < 65536 else stated)
+    if trial := _trial(parameters):
+        counts.append(trial[1] - trial[0] + 1)
+    if last == _MAX_WORD and max(counts) > _MAX_WORD:
+        return max(counts)  # the header's words are full
+    if last == _MAX_WORD and not trial and "POINT:LONG_FRAMES" not in parameters:
+        counts.append(max(room, *counts))
     fitting = [n for n in counts if 0 < n <= room]
-    return first, max(fitting) if fitting else max(counts)
+    return max(fitting) if fitting else max(counts)
+
+
+def _trial(parameters: dict[str, Values]) -> tuple[int, int] | None:
+    """First and last frame by the group TRIAL, which counts beyond a word."""
+    ends = [parameters.get(f"TRIAL:ACTUAL_{end}_FIELD") for end in ("START", "END")]
+    if not all(isinstance(e, np.ndarray) and e.shape == (2,) and e.dtype.itemsize == 2 for e in ends):
+        return None
+    start, stop = (int(e[0]) % 65536 + 65536 * (int(e[1]) % 65536) for e in ends)  # type: ignore[index]
+    return start, stop

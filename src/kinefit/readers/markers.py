@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from os import PathLike
 from pathlib import Path
@@ -19,6 +20,12 @@ from kinefit.readers.units import LENGTHS, worth
 _MAX_NEAR_ORIGIN = 0.01  # [m] from the origin, of a person in metres that are read as millimetres
 _COMPUTED_POINTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  # of a C3D: no positions
 _STATE = 'State it: --unit mm on the command line, unit="mm" from Python, unit = "mm" in a take.'
+_OF_AXIS = re.compile(r"(.+?)[\s_.:(\[-]*([xyz])[)\]]?", re.IGNORECASE)  # a label that is repeated for each axis
+_NUMBER = re.compile(r"(?:^|\s)[-+.]?\d")  # at the beginning of a cell
+_MAX_JITTER_FRAMES = 0.5  # of a row's time from its frame: beyond, the next frame is nearer
+_MAX_RATE_ERROR = 0.02  # of DataRate against the times: beyond, neither is believed
+_MAX_MISSING_ROWS = 1000  # and nine for each row that is there: beyond, the times are wrong
+_MIN_RATE_ERROR = 1e-4  # of DataRate: below, it is a rounded number (65.05 for 65.0533 Hz)
 _TRC_REMEDY = "Expected: PathFileType, names and values of DataRate NumFrames NumMarkers Units, marker names, rows."
 
 
@@ -135,6 +142,7 @@ def _markers_of_c3d(c3d: C3d, path: Path, unit: str | None) -> Markers:
         tuple(_unique(labels)[i] for i in keep), c3d.rate, positions[:, keep], residual=c3d.residual[:, keep] * metres,
         up=screen if screen in ("x", "y", "z") else None, first_frame=c3d.first_frame, source=str(path),
         unit=str(unit).strip().lower(), events=_events(c3d),
+        notes=tuple(f"{path.name}: {note}" for note in c3d.notes),
     )
 
 
@@ -165,14 +173,13 @@ def _read_trc(path: Path, unit: str | None) -> Markers:
         raise FileError(problem, file=path, place="line 3", remedy=_TRC_REMEDY) from error
     if not 0 < rate < np.inf:
         raise FileError(f"rate {rate:g} Hz", file=path, place="line 3", remedy="Correct DataRate.")
-    cells = lines[3].split("\t") if "\t" in lines[3] else lines[3].split()
-    names = [cell.strip() for cell in cells if cell.strip()][2:]
     if not 0 <= count <= len(text) or stated < 0:  # a cell takes a character at least
         raise FileError(f"{count} markers in {stated} frames", file=path, place="line 3", remedy="Correct NumMarkers.")
-    names += [""] * (count - len(names))
+    names = _trc_names(lines, count, path)
     metres = _metres(unit or header.get("units"), path)
-    frames, times, positions = _trc_rows(lines, text.endswith(("\n", "\r")), len(names), path)
-    if len(frames) < stated - 1:  # some writers count one too many
+    frames, times, rows = _trc_rows(lines, text.endswith(("\n", "\r")), len(names), path)
+    steps, rate, notes = _trc_clock(frames, times, rate, path)
+    if len(steps) and steps[-1] + 1 < stated - 1:  # some writers count one too many
         raise FileError(
             f"the file is truncated: {len(frames)} of {stated} frames can be read", file=path,
             remedy="Copy or export it again; or, if it is complete, correct NumFrames in line 3.",
@@ -182,19 +189,92 @@ def _read_trc(path: Path, unit: str | None) -> Markers:
             f"{len(frames)} frames of {len(names)} markers: nothing in this file", file=path,
             remedy="Export it again, or choose another trial.",
         )
-    span = (times[-1] - times[0]) * rate
-    if len(times) > 2 and abs(span - len(times) + 1) > max(1.0, 0.02 * len(times)):
-        raise ObservationError(
-            f"DataRate {rate:g} Hz, but the {len(times)} rows go from {times[0]:g} to {times[-1]:g} s", file=path,
-            place="line 3", remedy="Correct DataRate or the times.",
-        )
+    positions = np.full((int(steps[-1]) + 1, len(names), 3), np.nan)
+    positions[steps] = rows
     missing = ~positions.any(axis=-1) | ~np.isfinite(positions).all(axis=-1)
     if missing.all():
         raise _unseen(len(names), len(frames), path)
     return Markers(
         _unique(names), rate, np.where(missing[..., None], np.nan, positions * metres), first_frame=int(frames[0]),
-        source=str(path), unit=str(unit or header.get("units")).strip().lower(),
+        source=str(path), unit=str(unit or header.get("units")).strip().lower(), first_time=float(times[0]),
+        notes=tuple(f"{path.name}: {note}" for note in notes),
     )
+
+
+def _cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.split("\t")] if "\t" in line else line.split()
+
+
+def _trc_names(lines: list[str], count: int, path: Path) -> list[str]:
+    """Names of the markers by the columns that they stand above, "" for one without; a name of three axes once."""
+    cells = _cells(lines[3])
+    filled = [k for k, cell in enumerate(cells) if cell][2:]
+    names = [cells[k] for k in filled]
+    columns = max(len(_cells(line.rstrip())) for line in lines[4:]) - 2
+    if names and len(names) % 3 == 0 and columns <= len(names):  # a name above every column
+        of_axes = [(m[1], m[2].lower()) if (m := _OF_AXIS.fullmatch(name)) else (name, "") for name in names]
+        bases = [base for base, _ in of_axes[::3]]
+        if of_axes == [(base, axis) for base in bases for axis in "xyz"]:
+            return bases
+        if names == [name for name in names[::3] for _ in range(3)]:
+            return names[::3]
+    for width in (3, 2, 1) if "\t" in lines[3] else (1,):  # columns from a name to the next
+        first = 2 + (filled[0] - 2) % width if filled else 2
+        named = {(k - first) // width: cells[k] for k in filled}
+        wide = max([count, *(slot + 1 for slot in named)])
+        whole = width == 3 or wide == max(named, default=wide - 1) + 1 == count
+        if whole and all((k - first) % width == 0 for k in filled):
+            return [named.get(slot, "") for slot in range(wide)]
+    if len(names) < count:
+        raise FileError(
+            f"{len(names)} names for {count} markers, and not above their columns", file=path, place="line 4",
+            remedy="Write each name above the first of its three columns, with tabs between the columns.",
+        )  # fmt: skip
+    return names
+
+
+def _trc_clock(numbers: NDArray, times: NDArray, rate: float, path: Path) -> tuple[NDArray, float, list[str]]:
+    """Frame (F,) of each row, from 0; the rate [Hz] of the times; notes on missing rows and contradictions."""
+    rows = np.arange(len(times))
+    if len(times) < 3:
+        return rows, rate, []
+    elapsed, jumps, notes = times - times[0], np.diff(numbers), []
+    decimals = next((d for d in range(7) if np.allclose(times, np.round(times, d), rtol=0.0, atol=1e-9)), 7)
+    rounding = 10.0**-decimals * rate  # [frames]
+    limit = max(_MAX_JITTER_FRAMES, rounding)
+    numbered = np.concatenate([[0.0], np.cumsum(jumps / np.median(jumps))]) if jumps.min() > 0 else rows
+    timed = np.round(elapsed * rate)
+    if np.median(np.diff(timed)) != 1 or timed[-1] > 2 * len(times):  # DataRate or a time is wrong
+        timed = rows
+
+    def jitter(frames: NDArray, rate: float) -> float:
+        """Largest distance [frames] of a row's time from its frame; infinite for frames that cannot be."""
+        possible = np.allclose(frames, np.round(frames)) and np.diff(frames).min() > 0
+        possible &= frames[-1] < 10 * len(times) + _MAX_MISSING_ROWS
+        return float(np.abs(elapsed * rate - frames).max()) if possible else np.inf
+
+    def measured(frames: NDArray) -> float:
+        return float(frames[-1]) / max(float(elapsed[-1]), 1e-9)
+
+    trials = [(rows, rate, limit), (numbered, rate, limit), (timed, rate, limit / 2.0)]
+    trials += [(f, measured(f), limit) for f in (rows, numbered) if abs(measured(f) / rate - 1.0) < _MAX_RATE_ERROR]
+    frames, found = next(((f, r) for f, r, most in trials if jitter(f, r) <= most), (rows, np.nan))
+    if np.isnan(found):
+        raise ObservationError(
+            f"DataRate {rate:g} Hz, but the {len(times)} rows go from {times[0]:g} to {times[-1]:g} s", file=path,
+            place="line 3", remedy="Correct DataRate or the times.",
+        )
+    own = measured(frames)
+    if abs(own / rate - 1.0) > _MIN_RATE_ERROR and jitter(frames, rate) > 4.0 * jitter(frames, own) + rounding:
+        found = own
+    if found != rate:
+        notes.append(f"DataRate is {rate:g} Hz, the times of its rows give {found:.6g} Hz: the times count")
+    lacking = frames[-1] - rows[-1]
+    if lacking or numbered[-1] > rows[-1]:
+        after = numbers[np.argmax(np.diff(frames if lacking else numbered) > 1)]
+        what = f"{lacking:.0f} frames have no row and are empty" if lacking else "frame numbers jump, times do not"
+        notes.append(f"{what}, first after frame {after:.0f}")
+    return np.round(frames).astype(int), found, notes
 
 
 def _trc_rows(lines: list[str], ended: bool, count: int, path: Path) -> tuple[NDArray, NDArray, NDArray]:
@@ -202,9 +282,9 @@ def _trc_rows(lines: list[str], ended: bool, count: int, path: Path) -> tuple[ND
     width = 2 + 3 * count
     rows: list[list[float]] = []
     for number, line in enumerate(lines[4:], start=5):
-        if not line.strip() or line.split()[0].upper() == "X1":
+        if not line.strip() or not (rows or _NUMBER.search(line)):
             continue
-        cells = [cell.strip() for cell in line.rstrip("\r\n").split("\t")] if "\t" in line else line.split()
+        cells = _cells(line)
         while len(cells) > width and not cells[-1]:
             cells.pop()
         short = width - len(cells)

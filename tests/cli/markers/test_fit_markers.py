@@ -23,7 +23,8 @@ def two_people(tmp_path_factory):
     x = [truth.positions(points) + (0, 2.0 * i, 0) for i, points in enumerate(sets)]
     path = tmp_path_factory.mktemp("people") / "two.c3d"
     ball = np.ones((len(truth), 1, 3))
-    write_markers(Markers((*names, "Ball:top"), 30.0, np.concatenate([*x, ball], axis=1), up="z"), path)
+    x = np.concatenate([*x, ball], axis=1)
+    write_markers(Markers((*names, "Ball:top"), 30.0, x, up="z", first_frame=76), path)
     return path
 
 
@@ -37,7 +38,13 @@ def test_every_person_has_a_folder(two_people, tmp_path):
         assert motion.up == "z"
     away = found["Bob"][0].Ts_world_root[:, :3, 3] - found["Anna"][0].Ts_world_root[:, :3, 3]
     assert np.abs(away - (0, 2, 0)).max() < 0.05
-    worn = read_markers(found["Anna"][1]["markers"])
+    files = found["Anna"][1]
+    worn = read_markers(files["markers"])
+    of_motions = found["Anna"][0].times, read_motion(files["motion"]).times
+    for times in (*of_motions, worn.times, read_markers(files["trc"]).times):
+        np.testing.assert_allclose(times, 2.5 + np.arange(60) / 30, atol=1e-6)  # of the C3D, whose first frame is 76
+    assert files["mot"].read_text().partition("endheader\n")[2].splitlines()[1].startswith("2.500000000\t")
+    assert files["trc"].read_text().splitlines()[6].startswith("76\t2.500000000\t")
     model = found["Anna"][1]["osim"].read_text()
     assert "RFWT" in worn.names and all(f'<Marker name="{n}">' in model for n in worn.names)
     assert np.nanmin(worn.positions[..., 1]) > -0.1  # OpenSim's world: y is up

@@ -87,7 +87,7 @@ def test_frames_that_are_missing_are_told(folder):
         ('camera = "nix"', "rate = 30", '[calibration]\nfile = "rig.toml"', "no calibration of camera 'nix'"),
         ('camera = "rgb"', "rate = 30", '[calibration]\nfile = "rig.toml"', r"64x48 px, its calibration is of \(640"),
         (ALONE, "rate = 30", '[[depth]]\nname = "tof"\nfile = "depth"', "two have this name"),
-        (ALONE, "rate = 30\nframes = [40, 50]", "", r"images are from 0 to 0.633 s"),
+        (ALONE, "rate = 30\nframes = [40, 50]", "", r"frames are from 0 to 0.633 s"),
         (ALONE + 'background = "nix"', "rate = 30", "", "no such file or folder"),
         (None, "rate = 30", '[[depth]]\nname = "a"\nfile = "depth/*.tif"', "no such file or folder"),
         (None, "", "[depth]\nx = 1", r"'depth' is not a table \[\[depth\]\]"),

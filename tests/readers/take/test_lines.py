@@ -95,7 +95,7 @@ def test_no_list_of_objects_no_file_and_another_time(tmp_path):
         read_lines(tmp_path / "l.json", ("a",))
     with pytest.raises(FileError, match="cannot read"):
         read_lines(tmp_path / "none.csv", ("a",))
-    with pytest.raises(KinefitError, match="its images are from 0 to 0.1 s"):
+    with pytest.raises(KinefitError, match="its frames are from 0 to 0.1 s"):
         load(tmp_path, head="rate = 30\nframes = [10, 20]")
     with pytest.raises(TakeError, match="the rate is not stated"):
         load(tmp_path, head="")

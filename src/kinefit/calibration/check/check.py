@@ -58,7 +58,8 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
     seen = loaded.observations
     if seen is not None:
         seen, covered = without_covered(loaded.take, seen)
-        found = (*loaded.findings, *covered, *noise_findings(loaded.take, seen.depth))
+        noted = (Finding("note", "markers", f"{text}.") for m in seen.markers for text in m.notes)
+        found = (*loaded.findings, *covered, *noise_findings(loaded.take, seen.depth), *noted)
         loaded = replace(loaded, observations=seen, findings=found)
     if seen is None or seen.rig is None or len({k.camera for k in seen.keypoints}) < 2:
         missing = list(loaded.findings)

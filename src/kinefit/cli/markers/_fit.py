@@ -13,6 +13,7 @@ from kinefit.bodies import Body, PointSet, load_body
 from kinefit.bodies.marker_sets import matched
 from kinefit.cli import _results
 from kinefit.cli._screen import Step
+from kinefit.cli.markers._name import read_file
 from kinefit.errors import ExportError
 from kinefit.exporters.skeletons.common import plain_names
 from kinefit.markers.subject import MarkerSubject
@@ -75,7 +76,6 @@ def fit_file(
     from kinefit.markers.fit import fit_markers
     from kinefit.markers.people import split_people
     from kinefit.markers.subject import fit_marker_subject
-    from kinefit.readers.markers import read_markers
 
     step, formats, options = step or (lambda what, done, total: None), tuple(formats), options or MarkerFitOptions()
     folder = out if out is not None else path.with_name(f"{path.stem}-kinefit")
@@ -84,8 +84,8 @@ def fit_file(
         raise ExportError(_results.no_format(unknown[0], (*results.NAMES, "markers")), remedy="Correct --formats.")
     _results.check_folder(folder)
     generic = load_body(options.body)
-    people = split_people(read_markers(path, unit=unit))
-    trials = split_people(read_markers(options.static, unit=unit)) if options.static else {}
+    people = split_people(read_file(path, unit))
+    trials = split_people(read_file(options.static, unit)) if options.static else {}
     found: dict[str, tuple[Motion, dict[str, Path]]] = {}
     for person, markers in people.items():
         trial = trials.get(person) or (next(iter(trials.values())) if len(trials) == 1 == len(people) else None)

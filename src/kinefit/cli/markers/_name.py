@@ -13,7 +13,7 @@ import numpy as np
 from kinefit.bodies import load_body
 from kinefit.bodies.marker_sets import bare, find_marker_set, load_marker_set
 from kinefit.cli._results import check_file
-from kinefit.cli._screen import Step
+from kinefit.cli._screen import Step, note
 from kinefit.errors import ObservationError
 from kinefit.identification.model.files import load_model
 from kinefit.identification.model.from_frame import model_from_frame
@@ -26,6 +26,16 @@ from kinefit.observations import Markers
 
 if TYPE_CHECKING:
     from kinefit.markers.first_set import FirstSet
+
+
+def read_file(path: str | PathLike[str], unit: str | None) -> Markers:
+    """Read markers of a C3D or TRC file, and print what the reader notes on it."""
+    from kinefit.readers.markers import read_markers
+
+    markers = read_markers(path, unit=unit)
+    for text in markers.notes:
+        note(f"{text}.")
+    return markers
 
 
 def learn_files(
@@ -45,9 +55,7 @@ def learn_files(
     KinefitError
         A file cannot be read, its labels do not fit the marker set, or no frame shows enough.
     """
-    from kinefit.readers.markers import read_markers
-
-    markers = one_after_the_other([read_markers(path, unit=unit) for path in paths])
+    markers = one_after_the_other([read_file(path, unit) for path in paths])
     name = name or Path(paths[0]).stem
     if frame is None:
         model = learn_model(markers, name=name, template=marker_set)
@@ -80,9 +88,8 @@ def write_first_set(
     """
     from kinefit.exporters.atomic import write_text
     from kinefit.markers.first_set import first_set
-    from kinefit.readers.markers import read_markers
 
-    markers = one_after_the_other([read_markers(path, unit=unit) for path in paths])
+    markers = one_after_the_other([read_file(path, unit) for path in paths])
     found = first_set(markers, body=load_body("humanoid"), name=name or Path(out).stem.upper())
     write_text(Path(out), found.text)
     return found
@@ -121,14 +128,13 @@ def identify_file(
     """
     from kinefit.exporters import write_markers
     from kinefit.exporters.atomic import write_text
-    from kinefit.readers.markers import read_markers
 
     source = Path(path)
     target = Path(out) if out is not None else source.with_name(f"{source.stem}-named{source.suffix}")
     check_file(target)
     given = [model] if isinstance(model, MarkerModel | str | PathLike) else list(model)
     models = [m if isinstance(m, MarkerModel) else load_model(m) for m in given]
-    markers = read_markers(source, unit=unit)
+    markers = read_file(source, unit)
     found = identify_people(models, markers, settings=settings, progress=step)
     labelled = _together(models, found, markers, rest)
     both_c3d = source.suffix.lower() == target.suffix.lower() == ".c3d"
@@ -170,11 +176,11 @@ def _prefixed(name: str, label: str) -> str:
 def _doubts(found: dict[str, TakeIdentification], markers: Markers, many: bool) -> str:
     """Doubtful frames as CSV, worst first; frames as the file counts them."""
     rows = sorted((d.confidence, d.first, name, d) for name, f in found.items() for d in f.doubts)
-    lines = ["first_frame,last_frame,first_time,last_time,label,kind,confidence"]
+    lines, times = ["first_frame,last_frame,first_time,last_time,label,kind,confidence"], markers.times
     for _, _, name, d in rows:
         label = _prefixed(name, d.label) if many else d.label
         lines.append(
-            f"{d.first + markers.first_frame},{d.last + markers.first_frame},{d.first / markers.rate:.3f},"
-            f"{d.last / markers.rate:.3f},{label},{d.kind},{d.confidence:.3f}"
+            f"{d.first + markers.first_frame},{d.last + markers.first_frame},{times[d.first]:.3f},"
+            f"{times[d.last]:.3f},{label},{d.kind},{d.confidence:.3f}"
         )
     return "\n".join(lines) + "\n"

@@ -235,15 +235,15 @@ def audit(
 ) -> None:  # fmt: skip
     """Find swapped labels, and markers off their segment, in labelled takes."""
     from kinefit.bodies.marker_sets import load_marker_set
+    from kinefit.cli.markers._name import read_file
     from kinefit.identification.audit.audit import audit_take
     from kinefit.identification.model.files import load_model
-    from kinefit.readers.markers import read_markers
 
     model = load_model(subject) if subject else None
     known = load_marker_set(marker_set) if marker_set else None
     wrong = False
     for take in takes:
-        findings = audit_take(read_markers(take, unit=unit), model=model, marker_set=known)
+        findings = audit_take(read_file(take, unit), model=model, marker_set=known)
         wrong = wrong or any(f.kind in ("swapped", "throughout") for f in findings)
         _screen.say(f"{take}: {'no wrong labels found' if not findings else ''}".rstrip())
         for f in findings:

@@ -47,11 +47,12 @@ def write_trc(
     points = motion.body.landmarks if points is None else points
     names = plain_names(points.names)
     check_up(up, path)
+    first = round(float(motion.times[0]) * motion.rate) + 1 if len(motion) else 1  # frame 1 is at 0 s, as in C3D
     axes = "".join(f"\tX{k}\tY{k}\tZ{k}" for k in range(1, len(names) + 1))
     lines = [
         f"PathFileType\t4\t(X/Y/Z)\t{Path(path).name}",
         "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
-        f"{motion.rate:g}\t{motion.rate:g}\t{len(motion)}\t{len(names)}\t{unit}\t{motion.rate:g}\t1\t{len(motion)}",
+        f"{motion.rate:g}\t{motion.rate:g}\t{len(motion)}\t{len(names)}\t{unit}\t{motion.rate:g}\t{first}\t{len(motion)}",
         "Frame#\tTime\t" + "\t\t\t".join(names),
         "\t" + axes,
         "",
@@ -59,7 +60,7 @@ def write_trc(
     row = "\t".join(["%d", "%.9f"] + ["%.8f"] * (3 * len(names)))
 
     def rows() -> Iterator[str]:
-        number = count(1)
+        number = count(first)
         for part in motion.parts():
             values = factor * part.turned(up).positions(points).reshape(len(part), -1) + 0.0
             yield from (row % (next(number), t, *v) for t, v in zip(part.times.tolist(), values.tolist()))

@@ -176,6 +176,8 @@ def _describe_markers(draft: Draft, files: Sequence[Path]) -> None:
     for path, record in records.items():
         file = Value(path, "sure", f"{len(record.names)} markers, {len(record.positions)} frames, {record.rate:g} Hz")
         draft.markers.append((path == used, {"file": file}))
+        for text in record.notes:
+            draft.note("markers", "open", text)
     if used is not None:
         record = records[used]
         extent = np.nanmedian(np.nanmax(record.positions, 1) - np.nanmin(record.positions, 1), axis=0)

@@ -67,13 +67,13 @@ class Observations:
     ----------
     rate : float [Hz]
     frames : (start, stop)
-        Steps of the common time that every camera's streams have; t = step / rate.
+        Steps of the common time that every camera's streams have; t = step / rate + first_time.
     rig : Rig or None
         The take's cameras, in its order, then its depth sensors; None where there are none.
     keypoints : tuple of Keypoints
         In the order of `take.keypoints`, all cut to `frames`, in the image frame of the calibration.
     markers : tuple of Markers
-        In the order of `take.markers`, whole, at their own rates.
+        In the order of `take.markers`, whole, at their own rates and on their own clocks.
     videos : {camera: Path}
     images : {camera: ImageFrame}
         How the video's image of each camera relates to the calibration's.
@@ -97,6 +97,8 @@ class Observations:
         In the order of `take.trackers`, whole, at their own rates.
     notes : tuple of str
         What is worth saying: depth of another rate, frames that are missing.
+    first_time : float [s]
+        Time of step 0: that of the first frame in a take of markers alone, so that forces of the trial stay in step.
     """
 
     rate: float
@@ -116,6 +118,7 @@ class Observations:
     surface_points: tuple[SurfacePointVideo, ...] = ()
     trackers: tuple[BodyTrackerVideo, ...] = ()
     notes: tuple[str, ...] = ()
+    first_time: float = 0.0
 
     @property
     def recordings(
@@ -200,9 +203,11 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         for k, e in enumerate(take.trackers)
     )  # fmt: skip
     recordings: tuple[_Timed, ...] = (*sensors.depth, *sensors.clouds, *surfaces, *trackers)
+    marked = [(f"[[markers]] {k}", e.time_offset + m.times) for k, (e, m) in enumerate(zip(take.markers, markers), 1)]
     if not (streams or lines or clicks or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
         raise TakeError("the cameras have no video and no keypoints", file=take.path, remedy=remedy)
+    first_time = 0.0
     own = [*(recording.rate for recording in (*recordings, *lines, *clicks)), *(m.rate for m in markers)]
     rate = fastest or own[0]
     if streams:
@@ -222,8 +227,17 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     elif recordings or lines or clicks:
         frames = take.frames or _span(recordings or lines or clicks, rate)
     else:
-        frames = take.frames or (0, max(round(len(m) * rate / m.rate) for m in markers))
-    _check_times((*recordings, *lines, *skin), frames, rate, take)
+        first_time = float(min(times[0] for _, times in marked))
+        end = max(times[-1] + 1.0 / m.rate for (_, times), m in zip(marked, markers))
+        frames, marked = take.frames or (0, round((end - first_time) * rate)), []
+    kinds = {LineVideo: "lines of camera", KeypointVideo: "keypoints of camera", SurfacePointVideo: "surface",
+             BodyTrackerVideo: "trackers"}  # fmt: skip
+    others = [(f"{kinds.get(type(r), 'depth')} {r.sensor}", r.times) for r in (*recordings, *lines, *skin)]
+    _check_times([*others, *marked], frames, rate, take)
+    notes += [
+        f"{place}: {Path(m.source).name} begins at {times[0]:.6g} s of the take, by its own clock and time_offset"
+        for (place, times), m in zip(marked, markers) if m.first_time
+    ]  # fmt: skip
     cameras = (*(rig[entry.name] for entry in take.cameras if rig is not None), *sensors.cameras)
     return Observations(
         rate=rate, frames=frames, rig=Rig(cameras) if cameras else None,
@@ -234,7 +248,8 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         regions=load_regions(take, rig, images), skin=skin, lines=lines,
         clicks=tuple(c for c in clicks if _within(np.rint(c.times * rate), [frames]).any()),
         surface_points=surfaces, trackers=trackers,
-        notes=(*notes, *sensors.notes(rate), *found, *what_is_assumed(take)),
+        notes=(*notes, *(n for m in markers for n in m.notes), *sensors.notes(rate), *found, *what_is_assumed(take)),
+        first_time=first_time,
     )
 
 
@@ -245,19 +260,17 @@ def _span(recordings: Sequence[_Timed], rate: float) -> tuple[int, int]:
 
 
 def _check_times(
-    recordings: Sequence[_Timed | KeypointVideo], frames: tuple[int, int], rate: float, take: Take
+    recordings: Sequence[tuple[str, NDArray]], frames: tuple[int, int], rate: float, take: Take
 ) -> None:
-    """Refuse what was not recorded at the time of the rest."""
-    for recording in recordings:
-        first, last = float(recording.times[0]), float(recording.times[-1])
+    """Refuse what was not recorded at the time of the rest; place and times (F,) [s] of each."""
+    for place, times in recordings:
+        first, last = float(times[0]), float(times[-1])
         if round(last * rate) < frames[0] or round(first * rate) >= frames[1]:
-            kinds = {LineVideo: "lines of camera", KeypointVideo: "keypoints of camera", SurfacePointVideo: "surface",
-                     BodyTrackerVideo: "trackers"}  # fmt: skip
             raise ObservationError(
-                f"its images are from {first:.3g} to {last:.3g} s, the steps [{frames[0]}, {frames[1]}] of the take "
-                f"from {frames[0] / rate:.3g} to {(frames[1] - 1) / rate:.3g} s", file=take.path,
-                place=f"{kinds.get(type(recording), 'depth')} {recording.sensor}",
-                remedy="Correct its time_offset, its rate, or frames.",
+                f"its frames are from {first:.3g} to {last:.3g} s, the steps [{frames[0]}, {frames[1]}] of the take "
+                f"from {frames[0] / rate:.3g} to {(frames[1] - 1) / rate:.3g} s", file=take.path, place=place,
+                remedy=f"Correct its rate or frames, or add {frames[0] / rate - first:.6g} s to its time_offset: "
+                "then both begin together.",
             )  # fmt: skip
 
 

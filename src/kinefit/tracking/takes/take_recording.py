@@ -68,7 +68,7 @@ def recording_of(
     start = _motion_start(take, body) if take.start is not None else posed_start(take, body, seen.frames)
     marked, body = _markers(take, seen, body)
     first, rate = seen.frames[0], seen.rate
-    times = np.arange(*seen.frames) / rate
+    times = np.arange(*seen.frames) / rate + seen.first_time
     videos = (*stereo, *seen.recordings)
 
     def steps(i: int) -> Sequence[Any]:
