@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import secrets
 import socket
 import warnings
 from collections.abc import Awaitable, Callable, MutableMapping
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
 from websockets.datastructures import Headers
 
 from kinefit.errors import ExportError
-from kinefit.serving.access import Access, Refusal
+from kinefit.serving.access import Access, Admission, Opening, Refusal
+from kinefit.serving.policy import APP_PAGES
+from kinefit.serving.server import HEADERS, OPENING
 from kinefit.viewers.stage import free_port
 
 Scope = MutableMapping[str, Any]
@@ -21,10 +25,17 @@ Application = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 _RECONNECT_S = 60.0  # that a page may be away, as on a machine that sleeps or computes, and goes on as it was
 _POLICY_VIOLATION = 1008  # close code of a WebSocket
+_OWN_SITES = ("same-origin", "none")  # of `Sec-Fetch-Site`: the app's own pages, and the user's address bar
+_POLICY = (
+    "default-src 'none'; script-src 'self' 'unsafe-eval' 'nonce-{nonce}'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; "
+    f"frame-src 'self' {APP_PAGES}; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
+)
+"""Of all answers: NiceGUI needs eval and styles in the page; scripts in attributes do not run."""
 
 
 class Gate:
-    """An application behind the rules of `Access`: requests without the token, or from other pages, end here."""
+    """An application behind the rules of `Access`: requests without the token, or led by other pages, end here."""
 
     def __init__(self, inside: Application, access: Access) -> None:
         self._inside, self._access = inside, access
@@ -35,25 +46,61 @@ class Gate:
             headers = Headers()
             for name, value in scope["headers"]:
                 headers[name.decode("latin-1")] = value.decode("latin-1")
-            found = self._access.check(scope["path"], headers, *scope["server"])
-            if isinstance(found, Refusal):
-                await _refuse(scope, receive, send, found)
+            peer_port = (scope["client"] or ("", 0))[1]
+            found = self._access.check(scope["path"], headers, *scope["server"], peer_port=peer_port)
+            if isinstance(found, Admission) and not set(headers.get_all("Sec-Fetch-Site")) <= set(_OWN_SITES):
+                reason = "Another page led here. Copy the printed address into the address bar instead."
+                found = Refusal(HTTPStatus.FORBIDDEN, reason)
+            send = _with_policy(send)
+            if not isinstance(found, Admission):
+                await _answer(scope, receive, send, found)
                 return
         await self._inside(scope, receive, send)
 
 
-async def _refuse(scope: Scope, receive: Receive, send: Send, refusal: Refusal) -> None:
+async def _answer(scope: Scope, receive: Receive, send: Send, found: Refusal | Opening) -> None:
+    status, said = found if isinstance(found, Refusal) else (HTTPStatus.OK, OPENING)
     if scope["type"] == "websocket":
         await receive()
-        await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": refusal.reason})
+        await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": said})
         return
-    kind = [(b"content-type", b"text/plain; charset=utf-8")]
-    await send({"type": "http.response.start", "status": int(refusal.status), "headers": kind})
-    await send({"type": "http.response.body", "body": f"{refusal.reason}\n".encode()})
+    headers = [(b"content-type", b"text/plain; charset=utf-8")]
+    if isinstance(found, Opening):
+        headers += [(b"refresh", f"0; url={found.path}".encode()), (b"cache-control", b"no-store")]
+    await send({"type": "http.response.start", "status": int(status), "headers": headers})
+    await send({"type": "http.response.body", "body": f"{said.rstrip()}\n".encode()})
 
 
-def serve(root: Path, port: int, access: Access, opened: Callable[[str], None]) -> None:
-    """Serve the app until Ctrl-C; `opened` is called with its address once it listens.
+def _with_policy(send: Send) -> Send:
+    """Send answers with the app's policy; the scripts of a page are marked as its own by a number used once."""
+    begun: list[Scope] = []  # of a page, until its text is whole
+    text, nonce = bytearray(), secrets.token_urlsafe(18)
+    own = [(b"content-security-policy", _POLICY.format(nonce=nonce).encode()), (b"x-frame-options", b"SAMEORIGIN")]
+    own += [(name.lower().encode(), value.encode()) for name, value in HEADERS.items() if name != "Cache-Control"]
+
+    async def sending(message: Scope) -> None:
+        if message["type"] == "http.response.start":
+            headers = dict(message["headers"]) | dict(own)
+            is_page = headers.get(b"content-type", b"").startswith(b"text/html")
+            if is_page:
+                headers.pop(b"content-length", None)
+            message = {**message, "headers": list(headers.items())}
+            if is_page:
+                begun.append(message)
+                return
+        elif begun and message["type"] == "http.response.body":
+            text.extend(message.get("body", b""))
+            if message.get("more_body"):
+                return
+            await send(begun.pop())
+            message = {**message, "body": bytes(text).replace(b"<script", f'<script nonce="{nonce}"'.encode())}
+        await send(message)
+
+    return sending
+
+
+def serve(root: Path, port: int, access: Access, opened: Callable[[int], None]) -> None:
+    """Serve the app until Ctrl-C; `opened` is called with its port once it listens.
 
     Parameters
     ----------
@@ -85,9 +132,10 @@ def serve(root: Path, port: int, access: Access, opened: Callable[[str], None]) 
     outer = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     pages.on_shutdown(desk.close)
     ui.run_with(
-        outer, title="kinefit", mount_path=desk.prefix, show_welcome_message=False, reconnect_timeout=_RECONNECT_S
+        outer, title="kinefit", mount_path=desk.prefix, show_welcome_message=False, reconnect_timeout=_RECONNECT_S,
+        gzip_middleware_factory=None,  # pages are marked by the gate
     )  # fmt: skip
-    pages.on_startup(lambda: opened(access.url(listener.getsockname()[1])))
+    pages.on_startup(lambda: opened(listener.getsockname()[1]))
     config = uvicorn.Config(
         Gate(outer, access), log_level="error", ws="websockets-sansio", timeout_graceful_shutdown=2
     )  # fmt: skip

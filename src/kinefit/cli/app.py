@@ -37,9 +37,11 @@ def app(folder: Path, port: int, token: str | None, browser: bool) -> None:
     if not root.is_dir():
         raise FileError("no such folder", file=folder, remedy="Name the folder with your recordings.")
 
-    def opened(address: str) -> None:
-        _screen.say(f"kinefit app at {address}  (Ctrl-C ends)")
-        if browser:
-            click.launch(address)
+    access = Access(token=token)
 
-    serve(root, port, Access(token=token), opened)
+    def opened(port: int) -> None:
+        _screen.say(f"kinefit app at {access.url(port)}  (Ctrl-C ends)")
+        if browser:
+            click.launch(access.opening(port))
+
+    serve(root, port, access, opened)

@@ -11,6 +11,7 @@ from nicegui import ui
 from kinefit.app.desk import Desk
 from kinefit.app.folders import subfolders, takes_below, video_files
 from kinefit.app.pages.shell import card, in_thread, link, shell, short, show_error, texts
+from kinefit.app.pages.take import use_folder
 from kinefit.app.texts import Texts
 from kinefit.errors import KinefitError
 from kinefit.exporters.atomic import writing
@@ -52,7 +53,7 @@ class _FolderChoice:
     """A list of folders to walk through by clicks, with a field for a path."""
 
     def __init__(self, desk: Desk, t: Texts) -> None:
-        self._t, self._at = t, desk.root
+        self._desk, self._t, self._at = desk, t, desk.root
         self._field = ui.input(t("home.path"), value=str(self._at)).classes("w-full")
         self._field.on("keydown.enter", lambda: self._go(Path(self._field.value).expanduser()))
         self._list()
@@ -81,7 +82,7 @@ class _FolderChoice:
         self._list.refresh()
 
     def _open(self) -> None:
-        ui.navigate.to(link("/take", path=Path(self._field.value).expanduser()))
+        use_folder(self._desk, Path(self._field.value).expanduser())
 
 
 def _drop_area(desk: Desk, t: Texts) -> None:
@@ -98,7 +99,7 @@ def _drop_area(desk: Desk, t: Texts) -> None:
             except (OSError, KinefitError) as error:
                 ui.notify(t("home.drop_failed", name=name, reason=error), type="negative", timeout=0)
                 return
-        ui.navigate.to(link("/take", path=folder))
+        use_folder(desk, folder)
 
     def refuse(_: Any) -> None:
         ui.notify(t("home.drop_refused"), type="negative", timeout=0)
