@@ -46,8 +46,8 @@ class Gate:
             headers = Headers()
             for name, value in scope["headers"]:
                 headers[name.decode("latin-1")] = value.decode("latin-1")
-            peer_port = (scope["client"] or ("", 0))[1]
-            found = self._access.check(scope["path"], headers, *scope["server"], peer_port=peer_port)
+            (address, port), peer = scope["server"], scope["client"] or ("", 0)
+            found = self._access.check(scope["path"], headers, address, port, peer[1])
             if isinstance(found, Admission) and not set(headers.get_all("Sec-Fetch-Site")) <= set(_OWN_SITES):
                 reason = "Another page led here. Copy the printed address into the address bar instead."
                 found = Refusal(HTTPStatus.FORBIDDEN, reason)

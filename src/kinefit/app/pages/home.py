@@ -111,14 +111,14 @@ def _drop_area(desk: Desk, t: Texts) -> None:
 
 
 async def _takes(desk: Desk, t: Texts) -> None:
-    takes = await in_thread(takes_below, desk.root)
+    takes = await in_thread(lambda: [(take, take.state) for take in takes_below(desk.root)])
     if not takes:
         ui.label(t("home.session_none"))
-    for take in takes:
+    for take, state in takes:
         job = desk.jobs.open(take.file)
         with ui.row().classes("items-center w-full"):
             ui.link(short(take.file.parent, desk.root), link("/take", path=take.file)).classes("flex-1")
-            ui.label(t(f"state.{job.state if job else take.state}"))
+            ui.label(t(f"state.{job.state if job else state}"))
     if takes:
         ui.link(t("home.session"), "/session")
     ui.link(t("home.live"), "/live")

@@ -28,6 +28,7 @@ from kinefit.app.review import Review
 from kinefit.app.texts import Texts
 from kinefit.batch import corrections
 from kinefit.batch.results import DESCRIPTIONS, NAMES, write_format
+from kinefit.batch.viewed import is_outdated
 from kinefit.errors import KinefitError
 from kinefit.exporters.report.moments import Moment, doubtful_moments
 from kinefit.rendering.colours import to_hex
@@ -221,6 +222,8 @@ class _ResultPage:
         except KinefitError as error:
             show_error(t, error)
             made = ()
+        if is_outdated(self._review.motion.provenance, self._take):
+            ui.label(t("take.outdated")).props('role="alert"')
         for sentence in made:
             ui.label(sentence).classes("text-sm")
         if not made:

@@ -68,7 +68,7 @@ def _state(desk: Desk, t: Texts, found: SessionRow) -> str:
     """That of the last job of the take unless it is done, else that of its files."""
     job = next((job for job in reversed(desk.jobs.jobs) if job.take == found.take.file and job.state != DONE), None)
     if job is None:
-        return t(f"state.{found.take.state}")
+        return t(f"state.{found.state}")
     share = [progress.share for progress in job.steps.values()][-1:] if job.state == RUNNING else []
     return t(f"state.{job.state}") + "".join(f" {100 * done:.0f} %" for done in share)
 

@@ -9,7 +9,7 @@ from typing import Any
 from nicegui import ui
 
 from kinefit.app.desk import Desk
-from kinefit.app.folders import NEW, UNFINISHED, TakeFolder, video_files
+from kinefit.app.folders import NEW, OUTDATED, UNFINISHED, TakeFolder, video_files
 from kinefit.app.jobs import DONE, FAILED, PAUSED, RUNNING, WAITING, Job
 from kinefit.app.pages.coming import coming_images
 from kinefit.app.pages.people import people_cards
@@ -263,6 +263,8 @@ class _TakePage:
 
     def _results(self) -> None:
         t, people = self._t, self._folder.people
+        if self._folder.state == OUTDATED:
+            ui.label(t("take.outdated")).props('role="alert"')
         with ui.row():
             for k, folder in enumerate(people, start=1):
                 said = t("take.result") if len(people) == 1 else t("take.result_of", number=k)
