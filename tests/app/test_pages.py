@@ -112,8 +112,10 @@ def test_a_correction_is_taken_back(session, open_page):
         go_to(page, 0.5)
         page.get_by_role("button", name="To here").click()
         page.get_by_role("button", name="Exchange left and right of cam01").click()
+        page.get_by_text("The take was changed after this result was computed.").wait_for()
         page.get_by_role("button", name="Take the last correction back").click()
         page.get_by_text("No correction yet.").wait_for()
+        assert page.get_by_text("The take was changed").count() == 0
     assert file.read_text() == text
 
 

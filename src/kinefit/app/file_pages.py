@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import secrets
 from pathlib import Path
 
@@ -27,17 +28,17 @@ class FilePages:
     """
 
     def __init__(self, root: Path) -> None:
-        self._folders = {root.resolve()}
+        self._folders = {_without_links(root)}
         self._keys: dict[Path, str] = {}
         self._server = PageServer(Access(), 0, page=self._page, talk=_hang_up)
 
     def admit(self, folder: Path) -> None:
         """Serve the pages in a folder and below it, too."""
-        self._folders.add(folder.resolve())
+        self._folders.add(_without_links(folder))
 
     def address(self, file: Path) -> str | None:
         """Address of a page; None where the file, after all links, is no page, or lies outside of all folders."""
-        if not self._is_served(found := file.resolve()):
+        if not self._is_served(found := _without_links(file)):
             return None
         return f"{self._server.url}{self._keys.setdefault(found, secrets.token_urlsafe(_KEY_BYTES))}"
 
@@ -51,12 +52,17 @@ class FilePages:
 
     def _page(self, path: str) -> Page | None:
         file = next((file for file, key in self._keys.items() if path == f"/{key}"), None)
-        if file is None or not self._is_served(file.resolve()):
+        if file is None or not self._is_served(_without_links(file)):
             return None
         try:
             return Page(file.read_bytes(), policy=_POLICY, framed_by=APP_PAGES)
         except OSError:
             return None
+
+
+def _without_links(path: Path) -> Path:
+    """Where a path leads; links that go in a circle lead nowhere, as `Path.resolve` does not say."""
+    return Path(os.path.realpath(path))
 
 
 async def _hang_up(connection: Connection) -> None:
