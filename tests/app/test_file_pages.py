@@ -51,7 +51,7 @@ def test_links_are_followed_and_refused_outside(pages, folder, tmp_path):
     refused = ("out.html", "far/secret.html", "../secret.html", "loop.html", "text.html", "notes.txt", "gone.html", "a")
     assert [pages.address(folder / name) for name in refused] == [None] * len(refused)
     assert got(pages.address(folder / "in.html"))[0] == "b.html"
-    pages.admit(tmp_path)
+    pages.folders.add(tmp_path)
     assert got(pages.address(folder / "out.html"))[0] == "secret.html"
 
 

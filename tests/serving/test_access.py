@@ -4,7 +4,7 @@ import pytest
 from websockets.datastructures import Headers
 
 from kinefit.errors import ExportError
-from kinefit.serving.access import Access, Admission, Opening, Refusal
+from kinefit.serving.access import Access, Admission, Refusal
 
 PORT = 8765
 TOKEN = "0123456789abcdef-_ABCDEF"
@@ -108,16 +108,14 @@ def opened(access, path):
     return access.check(path, Headers(Host=f"localhost:{PORT}"), "127.0.0.1", PORT)
 
 
-def test_a_one_time_address_has_no_token_and_leads_to_the_page_once(local, monkeypatch):
+def test_a_one_time_address_has_no_token_and_leads_to_the_page_once(local):
     address = local.opening(PORT)
     path = address.removeprefix(f"http://localhost:{PORT}")
     assert TOKEN not in address and opened(local, f"{path[:-1]}x/").status == 403
-    assert opened(local, path) == Opening(f"/{TOKEN}/")
-    assert opened(local, path).status == opened(local, "//").status == 403
+    found = opened(local, path)
+    assert found.status == 200 and found.headers == {"Refresh": f"0; url=/{TOKEN}/"}
+    assert opened(local, path).status == opened(local, "//").status == opened(local, "/").status == 403
     assert opened(local, f"/{TOKEN}/") == Admission("/", True)  # which is open as before
-    late = local.opening(PORT).removeprefix(f"http://localhost:{PORT}")
-    monkeypatch.setattr("time.monotonic", lambda: local._opens_until)
-    assert opened(local, late).status == 403
 
 
 def test_a_one_time_address_is_for_its_own_user_own_hosts_and_no_other_page(local, monkeypatch):
@@ -126,4 +124,4 @@ def test_a_one_time_address_is_for_its_own_user_own_hosts_and_no_other_page(loca
     monkeypatch.setattr("kinefit.serving.access.is_of_this_user", lambda peer_port, port: False)
     assert opened(local, path).status == 403
     monkeypatch.undo()
-    assert opened(local, path) == Opening(f"/{TOKEN}/")
+    assert opened(local, path).then == f"/{TOKEN}/"

@@ -172,5 +172,5 @@ def test_the_nearest_frame_is_within_one():
 
 
 def test_names_are_text_in_markdown():
-    assert scene.as_markdown("knee_angle_r é") == "knee\\_angle\\_r é"
+    assert scene.as_markdown("knee_angle_r é") == "knee_angle_r é"
     assert scene.as_markdown("<b>[x](y)") == "\\<b\\>\\[x\\]\\(y\\)"

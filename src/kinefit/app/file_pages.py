@@ -10,7 +10,6 @@ from kinefit.serving.access import Access
 from kinefit.serving.policy import APP_PAGES
 from kinefit.serving.server import Connection, Page, PageServer
 
-_SUFFIX = ".html"
 _KEY_BYTES = 18
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; font-src data:; "
@@ -25,20 +24,22 @@ class FilePages:
     Parameters
     ----------
     root : folder whose pages, and those in all folders below it, are served
+
+    Attributes
+    ----------
+    folders : set of Path, `root` and others whose pages are served
     """
 
     def __init__(self, root: Path) -> None:
-        self._folders = {_without_links(root)}
+        self.folders = {root}
         self._keys: dict[Path, str] = {}
         self._server = PageServer(Access(), 0, page=self._page, talk=_hang_up)
 
-    def admit(self, folder: Path) -> None:
-        """Serve the pages in a folder and below it, too."""
-        self._folders.add(_without_links(folder))
-
     def address(self, file: Path) -> str | None:
         """Address of a page; None where the file, after all links, is no page, or lies outside of all folders."""
-        if not self._is_served(found := _without_links(file)):
+        found = Path(os.path.realpath(file))  # `Path.resolve` raises where links go in a circle
+        within = any(found.is_relative_to(os.path.realpath(folder)) for folder in self.folders)
+        if not within or found.suffix.lower() != ".html" or not found.is_file():
             return None
         return f"{self._server.url}{self._keys.setdefault(found, secrets.token_urlsafe(_KEY_BYTES))}"
 
@@ -46,23 +47,11 @@ class FilePages:
         """Serve them no more."""
         self._server.close()
 
-    def _is_served(self, file: Path) -> bool:
-        within = any(file.is_relative_to(folder) for folder in self._folders)
-        return within and file.suffix.lower() == _SUFFIX and file.is_file()
-
     def _page(self, path: str) -> Page | None:
         file = next((file for file, key in self._keys.items() if path == f"/{key}"), None)
-        if file is None or not self._is_served(_without_links(file)):
+        if file is None or not (self.address(file) or "").endswith(path):  # a link by now
             return None
-        try:
-            return Page(file.read_bytes(), policy=_POLICY, framed_by=APP_PAGES)
-        except OSError:
-            return None
-
-
-def _without_links(path: Path) -> Path:
-    """Where a path leads; links that go in a circle lead nowhere, as `Path.resolve` does not say."""
-    return Path(os.path.realpath(path))
+        return Page(file.read_bytes(), policy=_POLICY, framed_by=APP_PAGES)
 
 
 async def _hang_up(connection: Connection) -> None:

@@ -6,7 +6,6 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -66,16 +65,11 @@ class TakeFolder:
 
 def _provenance(folder: Path) -> Mapping[str, Any]:
     """What the motion in a folder of results was computed from; empty where it cannot be read."""
-    motion = folder / "motion.npz"
     try:
-        return _read_provenance(motion, motion.stat().st_mtime_ns)
-    except (KinefitError, OSError, KeyError, ValueError):
+        arrays = read_npz(folder / "motion.npz", "provenance", remedy="")
+        return dict(json.loads(str(arrays["provenance"])))
+    except (KinefitError, KeyError, ValueError):
         return {}
-
-
-@lru_cache(4096)
-def _read_provenance(motion: Path, changed: int) -> dict[str, Any]:
-    return dict(json.loads(str(read_npz(motion, "provenance", remedy="")["provenance"])))
 
 
 def subfolders(folder: Path) -> list[Path]:

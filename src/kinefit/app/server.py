@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 import socket
 import warnings
-from collections.abc import Awaitable, Callable, MutableMapping
+from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,9 @@ from typing import Any
 from websockets.datastructures import Headers
 
 from kinefit.errors import ExportError
-from kinefit.serving.access import Access, Admission, Opening, Refusal
+from kinefit.serving.access import Access, Refusal
 from kinefit.serving.policy import APP_PAGES
-from kinefit.serving.server import HEADERS, OPENING
+from kinefit.serving.server import HEADERS
 from kinefit.viewers.stage import free_port
 
 Scope = MutableMapping[str, Any]
@@ -25,7 +25,7 @@ Application = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 _RECONNECT_S = 60.0  # that a page may be away, as on a machine that sleeps or computes, and goes on as it was
 _POLICY_VIOLATION = 1008  # close code of a WebSocket
-_OWN_SITES = ("same-origin", "none")  # of `Sec-Fetch-Site`: the app's own pages, and the user's address bar
+_OWN_SITES = {"same-origin", "none"}  # of `Sec-Fetch-Site`: the app's own pages, and the user's address bar
 _POLICY = (
     "default-src 'none'; script-src 'self' 'unsafe-eval' 'nonce-{nonce}'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self'; "
@@ -48,55 +48,49 @@ class Gate:
                 headers[name.decode("latin-1")] = value.decode("latin-1")
             (address, port), peer = scope["server"], scope["client"] or ("", 0)
             found = self._access.check(scope["path"], headers, address, port, peer[1])
-            if isinstance(found, Admission) and not set(headers.get_all("Sec-Fetch-Site")) <= set(_OWN_SITES):
+            if not (isinstance(found, Refusal) or set(headers.get_all("Sec-Fetch-Site")) <= _OWN_SITES):
                 reason = "Another page led here. Copy the printed address into the address bar instead."
                 found = Refusal(HTTPStatus.FORBIDDEN, reason)
             send = _with_policy(send)
-            if not isinstance(found, Admission):
-                await _answer(scope, receive, send, found)
+            if isinstance(found, Refusal):
+                await _refuse(scope, receive, send, found)
                 return
         await self._inside(scope, receive, send)
 
 
-async def _answer(scope: Scope, receive: Receive, send: Send, found: Refusal | Opening) -> None:
-    status, said = found if isinstance(found, Refusal) else (HTTPStatus.OK, OPENING)
+async def _refuse(scope: Scope, receive: Receive, send: Send, refusal: Refusal) -> None:
     if scope["type"] == "websocket":
         await receive()
-        await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": said})
+        await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": refusal.reason})
         return
-    headers = [(b"content-type", b"text/plain; charset=utf-8")]
-    if isinstance(found, Opening):
-        headers += [(b"refresh", f"0; url={found.path}".encode()), (b"cache-control", b"no-store")]
-    await send({"type": "http.response.start", "status": int(status), "headers": headers})
-    await send({"type": "http.response.body", "body": f"{said.rstrip()}\n".encode()})
+    headers = _encoded({"Content-Type": "text/plain; charset=utf-8", "Cache-Control": "no-store", **refusal.headers})
+    await send({"type": "http.response.start", "status": int(refusal.status), "headers": [*headers.items()]})
+    await send({"type": "http.response.body", "body": f"{refusal.reason}\n".encode()})
 
 
 def _with_policy(send: Send) -> Send:
     """Send answers with the app's policy; the scripts of a page are marked as its own by a number used once."""
-    begun: list[Scope] = []  # of a page, until its text is whole
-    text, nonce = bytearray(), secrets.token_urlsafe(18)
-    own = [(b"content-security-policy", _POLICY.format(nonce=nonce).encode()), (b"x-frame-options", b"SAMEORIGIN")]
-    own += [(name.lower().encode(), value.encode()) for name, value in HEADERS.items() if name != "Cache-Control"]
+    nonce, is_page = secrets.token_urlsafe(18), False
+    kept = {name: value for name, value in HEADERS.items() if name != "Cache-Control"}  # scripts and styles are cached
+    own = kept | {"Content-Security-Policy": _POLICY.format(nonce=nonce), "X-Frame-Options": "SAMEORIGIN"}
 
     async def sending(message: Scope) -> None:
+        nonlocal is_page
         if message["type"] == "http.response.start":
-            headers = dict(message["headers"]) | dict(own)
+            headers = dict(message["headers"]) | _encoded(own)
             is_page = headers.get(b"content-type", b"").startswith(b"text/html")
             if is_page:
                 headers.pop(b"content-length", None)
-            message = {**message, "headers": list(headers.items())}
-            if is_page:
-                begun.append(message)
-                return
-        elif begun and message["type"] == "http.response.body":
-            text.extend(message.get("body", b""))
-            if message.get("more_body"):
-                return
-            await send(begun.pop())
-            message = {**message, "body": bytes(text).replace(b"<script", f'<script nonce="{nonce}"'.encode())}
+            message["headers"] = [*headers.items()]
+        elif is_page and message["type"] == "http.response.body":
+            message["body"] = message.get("body", b"").replace(b"<script", f'<script nonce="{nonce}"'.encode())
         await send(message)
 
     return sending
+
+
+def _encoded(headers: Mapping[str, str]) -> dict[bytes, bytes]:
+    return {name.lower().encode(): value.encode() for name, value in headers.items()}
 
 
 def serve(root: Path, port: int, access: Access, opened: Callable[[int], None]) -> None:

@@ -7,7 +7,6 @@ import ipaddress
 import re
 import secrets
 import socket
-import time
 from http import HTTPStatus
 from typing import NamedTuple
 
@@ -19,7 +18,6 @@ from kinefit.serving.peers import is_of_this_user
 
 _TOKEN_BYTES = 18  # 144 random bits: 24 characters of the address
 _TOKEN = re.compile(r"[A-Za-z0-9_-]{16,128}")  # stands in an address as it is; a shorter one can be tried out
-_MAX_OPENING_S = 120.0  # from the start of a browser to its first request, on a slow computer
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 _ALL_ADDRESSES = ("", "0.0.0.0", "::")
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::(\d{1,5}))?")
@@ -34,16 +32,16 @@ class Admission(NamedTuple):
 
 
 class Refusal(NamedTuple):
-    """A request that ends here: its HTTP status, and the reason in one sentence."""
+    """A request that ends here: its HTTP status, the reason in one sentence, and what the browser asks for next."""
 
     status: HTTPStatus
     reason: str
+    then: str = ""  # path of the page, after a one-time address: asked for by a page of this server
 
-
-class Opening(NamedTuple):
-    """A request at the one-time address: the path at which the browser goes on."""
-
-    path: str
+    @property
+    def headers(self) -> dict[str, str]:
+        """Further headers of the answer."""
+        return {"Refresh": f"0; url={self.then}"} if self.then else {}
 
 
 class Access:
@@ -73,7 +71,7 @@ class Access:
             raise ExportError(f"a token of {len(self.token)} characters is not valid", remedy=remedy)
         self.is_local = host == "localhost" or (_is_number(host) and ipaddress.ip_address(host).is_loopback)
         self._readers = readers and self.is_local
-        self._opening, self._opens_until = "", 0.0
+        self._opening = ""
 
     @property
     def warning(self) -> str | None:
@@ -91,16 +89,14 @@ class Access:
         return f"http://{f'[{host}]' if ':' in host else host}:{port}/{self.token}/"
 
     def opening(self, port: int) -> str:
-        """Address that leads to the page once, within two minutes, and has no token.
+        """Address that leads to the page once, and has no token.
 
         It is for a browser's command line, which other users of the computer can read.
         """
-        self._opening, self._opens_until = secrets.token_urlsafe(_TOKEN_BYTES), time.monotonic() + _MAX_OPENING_S
+        self._opening = secrets.token_urlsafe(_TOKEN_BYTES)
         return f"{self.url(port).removesuffix(f'{self.token}/')}{self._opening}/"
 
-    def check(
-        self, path: str, headers: Headers, address: str, port: int, peer_port: int = 0
-    ) -> Admission | Refusal | Opening:  # fmt: skip
+    def check(self, path: str, headers: Headers, address: str, port: int, peer: int = 0) -> Admission | Refusal:
         """Whether a request may go on.
 
         Parameters
@@ -108,7 +104,7 @@ class Access:
         path : of the request
         headers : of the request
         address, port : of this computer, at which the request arrived
-        peer_port : from which it was sent; 0: unknown
+        peer : port from which it was sent; 0: unknown
         """
         hosts = [host.lower() for host in headers.get_all("Host")]
         if len(hosts) != 1 or not self._is_own(hosts[0], address, port):
@@ -117,22 +113,18 @@ class Access:
         if origins and origins != [f"http://{hosts[0]}"]:
             return Refusal(HTTPStatus.FORBIDDEN, "Pages of other servers may not connect.")
         given, _, rest = path.partition("?")[0].removeprefix("/").partition("/")
-        if hmac.compare_digest(given.encode(errors="surrogateescape"), self.token.encode()):
+        secret = given.encode(errors="surrogateescape")
+        if hmac.compare_digest(secret, self.token.encode()):
             return Admission(f"/{rest}", True)
-        if self._is_opening(given) and is_of_this_user(peer_port, port):
+        if given and hmac.compare_digest(secret, self._opening.encode()) and is_of_this_user(peer, port):
             self._opening = ""
-            return Opening(f"/{self.token}/")
+            return Refusal(HTTPStatus.OK, "The page opens.", f"/{self.token}/")
         if given:
             reason = "The address has another token than this server, or was used before. Open the printed address."
             return Refusal(HTTPStatus.FORBIDDEN, reason)
         if self._readers and not origins and "Upgrade" in headers:
             return Admission("/", False)
         return Refusal(HTTPStatus.FORBIDDEN, "Open the address that the command printed: it ends with the token.")
-
-    def _is_opening(self, given: str) -> bool:
-        """Whether the one-time address is given, and was not used before."""
-        is_same = hmac.compare_digest(given.encode(errors="surrogateescape"), self._opening.encode())
-        return bool(self._opening) and is_same and time.monotonic() < self._opens_until
 
     def _is_own(self, host: str, address: str, port: int) -> bool:
         """Whether a `Host` is an address of this server.

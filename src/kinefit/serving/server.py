@@ -20,7 +20,7 @@ from websockets.frames import CloseCode, Frame
 from websockets.http11 import Request, Response
 
 from kinefit.errors import ExportError
-from kinefit.serving.access import Access, Opening, Refusal
+from kinefit.serving.access import Access, Refusal
 
 MAX_MESSAGE_BYTES = 2**18
 """Of one message of a client: clicks of 100 joints in 50 images; a longer one closes the connection."""
@@ -47,7 +47,7 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
-"""Of every answer to who may connect."""
+"""Of every answer."""
 
 
 class Page(NamedTuple):
@@ -142,9 +142,6 @@ def _report(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         loop.default_exception_handler(context)
 
 
-OPENING = "The page opens.\n"
-"""At a one-time address, which goes on by itself: from there, the browser's next request is the page's own."""
-
 Respond = Callable[[Any, Request], Response | None]
 
 
@@ -153,14 +150,12 @@ def guard(access: Access, respond: Respond) -> Respond:
 
     def process(connection: ServerConnection, request: Request) -> Response | None:
         address, port = connection.transport.get_extra_info("sockname")[:2]
-        peer_port = connection.transport.get_extra_info("peername", (None, 0))[1]
-        found = access.check(request.path, request.headers, address, port, peer_port)
+        peer = connection.transport.get_extra_info("peername", ("", 0))[1]
+        found = access.check(request.path, request.headers, address, port, peer)
         if isinstance(found, Refusal):
-            return connection.respond(found.status, f"{found.reason}\n")
-        if isinstance(found, Opening):
-            opens = connection.respond(HTTPStatus.OK, OPENING)
-            opens.headers.update(HEADERS | {"Refresh": f"0; url={found.path}"})
-            return opens
+            ends = connection.respond(found.status, f"{found.reason}\n")
+            ends.headers.update(HEADERS | found.headers)
+            return ends
         request.path, connection.has_token = found  # type: ignore[attr-defined]
         response = respond(connection, request)
         if response is not None:

@@ -208,8 +208,8 @@ def angle_line(motion: Motion, coordinate: str, frame: int) -> str:
 
 
 def as_markdown(name: str) -> str:
-    """Markdown that shows a name of a file as it is."""
-    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", name)
+    """Markdown that shows a name of a file as it is: without elements, links, images, code and emphasis of its own."""
+    return re.sub(r"([\\`*\[\]()<>!&#|~])", r"\\\1", name)
 
 
 def advance(position: float, elapsed: float, *, rate: float, speed: float, count: int) -> float:

@@ -29,9 +29,8 @@ BACKGROUND_IMAGE_PX = 1080  # the same, behind the scene when looking through th
 _PLANES = {"x": "yz", "y": "xz", "z": "xy"}
 _SHADE = (70, 75, 85)
 POLICY = (
-    "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; "
     "connect-src 'self' data: blob:; img-src 'self' data: blob:; font-src data:; media-src 'none'; frame-src 'none'; "
-    "object-src 'none'; base-uri 'none'; form-action 'none'"
+    "object-src 'none'; base-uri 'none'; form-action 'none'; default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
 )
 """Content security policy of viser's page: its scripts are its own, but what they see they can send nowhere else."""
 

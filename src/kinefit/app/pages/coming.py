@@ -8,7 +8,7 @@ from collections.abc import Callable
 from nicegui import ui
 
 from kinefit.app.jobs import RUNNING, Job
-from kinefit.app.pages.shell import link, with_props
+from kinefit.app.pages.shell import link
 from kinefit.readers.take.file import CameraEntry, Take
 
 STEP = "frames"
@@ -36,8 +36,8 @@ def coming_images(take: Take, job: Job) -> Callable[[], None]:
             images[camera.name].set_source(source)
             return
         with row:
-            image = ui.image(source).classes("w-40 min-h-[6rem]").props("no-spinner")
-            images[camera.name] = with_props(image, alt=camera.name)
+            image = images[camera.name] = ui.image(source).classes("w-40 min-h-[6rem]").props("no-spinner")
+            image.props["alt"] = camera.name
 
     return update
 

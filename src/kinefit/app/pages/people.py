@@ -8,7 +8,7 @@ from typing import Any
 from nicegui import ui
 
 from kinefit.app.desk import Desk
-from kinefit.app.pages.shell import in_thread, link, with_props
+from kinefit.app.pages.shell import in_thread, link
 from kinefit.app.people import PersonPicture
 from kinefit.app.texts import Texts
 from kinefit.batch import corrections
@@ -47,7 +47,8 @@ def people_cards(desk: Desk, t: Texts, take: Path, who: ui.select) -> None:
                 with ui.column().classes("gap-1 items-center"):
                     source = link("/image/person", path=take, number=number)
                     image = ui.image(source).classes("w-28 h-40 cursor-pointer").props("fit=contain")
-                    with_props(image, alt=said).on("click", lambda n=number: choose(n))
+                    image.props["alt"] = said
+                    image.on("click", lambda n=number: choose(n))
                     _button(said, number == chosen, lambda n=number: choose(n))
             _button(t("people.everybody"), not chosen, lambda: choose(None))
         if chosen:

@@ -10,7 +10,7 @@ from nicegui import ui
 from kinefit.app.desk import Desk
 from kinefit.app.jobs import DONE, RUNNING
 from kinefit.app.overview import SessionRow, recordings
-from kinefit.app.pages.shell import in_thread, link, shell, short, texts, with_props
+from kinefit.app.pages.shell import in_thread, link, shell, short, texts
 from kinefit.app.texts import Texts
 
 _REFRESH_S = 2.0  # between two looks at the folders
@@ -32,7 +32,7 @@ async def session_page(desk: Desk) -> None:
         ]  # fmt: skip
         table = ui.table(columns=columns, rows=[], row_key="key", selection="multiple")
         table.classes("w-full").props("dense hide-selected-banner")
-        with_props(table, no_data_label=t("session.reading"))
+        table.props["no-data-label"] = t("session.reading")
         table.add_slot("body-cell-take", _LINK)
         with ui.row():
             ui.button(t("session.compute"), icon="play_arrow", on_click=lambda: _compute(desk, t, table))
@@ -44,7 +44,7 @@ async def session_page(desk: Desk) -> None:
             rows = [_row(desk, t, found) for found in await in_thread(recordings, desk.root)]
             if rows != table.rows:
                 table.rows = rows
-            with_props(table, no_data_label=t("home.session_none"))
+            table.props["no-data-label"] = t("home.session_none")
 
         ui.timer(_REFRESH_S, look)
 

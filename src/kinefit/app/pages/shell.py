@@ -17,7 +17,6 @@ from kinefit.errors import KinefitError
 from kinefit.rendering import colours
 
 Value = TypeVar("Value")
-Shown = TypeVar("Shown", bound=ui.element)
 
 COLOURS = {
     "fault": colours.RIGHT_COLOUR, "doubt": (176, 132, 0), "note": colours.LEFT_COLOUR, "good": colours.CENTRE_COLOUR,
@@ -65,15 +64,11 @@ def face_switch(desk: Desk, t: Texts) -> None:
     switch.props("dark color=white").tooltip(t("shell.faces_change"))
 
 
-def with_props(element: Shown, **properties: str) -> Shown:
-    """An element with properties as they are: `.props("...")` would take parts of a file's name for more of them."""
-    element.props.update({name.replace("_", "-"): value for name, value in properties.items()})
-    return element
-
-
 def page_frame(address: str, title: str) -> ui.element:
     """Another page within this one."""
-    return with_props(ui.element("iframe"), src=address, title=title)
+    made = ui.element("iframe")
+    made.props.update(src=address, title=title)  # as values: a text would be read for further properties
+    return made
 
 
 def card(title: str) -> ui.card:

@@ -13,18 +13,7 @@ from kinefit.app.folders import NEW, OUTDATED, UNFINISHED, TakeFolder, video_fil
 from kinefit.app.jobs import DONE, FAILED, PAUSED, RUNNING, WAITING, Job
 from kinefit.app.pages.coming import coming_images
 from kinefit.app.pages.people import people_cards
-from kinefit.app.pages.shell import (
-    COLOURS,
-    card,
-    link,
-    loaded,
-    page_frame,
-    shell,
-    short,
-    show_error,
-    texts,
-    with_props,
-)
+from kinefit.app.pages.shell import COLOURS, card, link, loaded, page_frame, shell, short, show_error, texts
 from kinefit.app.texts import Texts
 from kinefit.batch import corrections
 from kinefit.errors import KinefitError
@@ -67,7 +56,7 @@ async def take_page(desk: Desk, path: str) -> None:
         opened = await loaded(t, t("take.reading"), opened_take, at, guess)
         if opened is not None:
             file, take, notes = opened
-            desk.files.admit(file.parent)
+            desk.files.folders.add(file.parent)
             _TakePage(desk, t, TakeFolder(file), take, notes)
 
 
@@ -84,7 +73,7 @@ def first_images(path: Path) -> None:
         for video in videos:
             with ui.column().classes("gap-0"):
                 image = ui.image(link("/image/first", path=video)).classes("w-48 min-h-[6rem]")
-                with_props(image, alt=video.stem)
+                image.props["alt"] = video.stem
                 ui.label(video.name).classes("text-sm")
 
 
