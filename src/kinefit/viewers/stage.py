@@ -30,7 +30,8 @@ _PLANES = {"x": "yz", "y": "xz", "z": "xy"}
 _SHADE = (70, 75, 85)
 POLICY = (
     "connect-src 'self' data: blob:; img-src 'self' data: blob:; font-src data:; media-src 'none'; frame-src 'none'; "
-    "object-src 'none'; base-uri 'none'; form-action 'none'; default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
+    "object-src 'none'; base-uri 'none'; form-action 'none'; "
+    "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
 )
 """Content security policy of viser's page: its scripts are its own, but what they see they can send nowhere else."""
 
