@@ -1,9 +1,25 @@
 """Takes and results in the folders of a session."""
 
+from dataclasses import replace
+
 import pytest
 
-from kinefit.app.folders import COMPLETE, NEW, UNFINISHED, TakeFolder, subfolders, takes_below, video_files
+from kinefit.app.folders import (
+    COMPLETE,
+    NEW,
+    OUTDATED,
+    UNFINISHED,
+    TakeFolder,
+    subfolders,
+    takes_below,
+    video_files,
+)
+from kinefit.batch import corrections
+from kinefit.batch.viewed import inputs_entry
 from kinefit.errors import FileError
+from kinefit.exporters import write_motion
+from kinefit.readers.take.file import read_take
+from kinefit.simulation import cut, squat_and_wave
 
 
 def take_in(folder):
@@ -20,6 +36,21 @@ def test_states_of_a_take(tmp_path):
     (take.out / "unfinished").rmdir()
     (take.out / "motion.npz").write_bytes(b"")
     assert take.state == COMPLETE and take.people == (take.out,)
+
+
+def test_a_result_is_older_than_its_take_until_the_change_is_taken_back(copy_take, tmp_path):
+    take = TakeFolder(copy_take(tmp_path / "a"))
+    motion = cut(squat_and_wave(), 0, 3)
+    made_from = {"take": "take.toml", **inputs_entry(read_take(take.file))}
+    write_motion(replace(motion, provenance=made_from), take.out / "motion.npz")
+    assert take.state == COMPLETE
+    corrections.trim(take.file, 0, 20)
+    assert take.state == OUTDATED
+    corrections.undo(take.file)
+    assert take.state == COMPLETE
+    write_motion(motion, take.out / "motion.npz")  # of an earlier kinefit: nobody knows
+    corrections.trim(take.file, 0, 20)
+    assert take.state == COMPLETE
 
 
 def test_people_are_in_the_order_of_their_numbers(tmp_path):

@@ -112,8 +112,10 @@ def test_a_correction_is_taken_back(session, open_page):
         go_to(page, 0.5)
         page.get_by_role("button", name="To here").click()
         page.get_by_role("button", name="Exchange left and right of cam01").click()
+        page.get_by_text("The take was changed after this result was computed.").wait_for()
         page.get_by_role("button", name="Take the last correction back").click()
         page.get_by_text("No correction yet.").wait_for()
+        assert page.get_by_text("The take was changed").count() == 0
     assert file.read_text() == text
 
 
@@ -254,3 +256,18 @@ def test_a_joint_is_placed_and_the_person_meant_stays(session, open_page):
     with Video(take.cameras[1].video) as video:
         expected = video.size[0] / 2, video.size[1] / 4
     assert clicks.points["cam02"]["r_knee"] == pytest.approx(expected, abs=0.02 * max(expected))
+
+
+def test_a_folder_gets_its_take_file_by_a_click_and_not_by_its_address(session, open_page):
+    folder = session / "new"
+    folder.mkdir()
+    shutil.copy(session / "wave" / "cam01.mp4", folder)
+    with running_app(session) as (_, address):
+        page = open_page(address, f"/take?path={quote(str(folder))}")
+        page.get_by_text(re.compile("There is no take file in .*new yet")).wait_for()
+        page.reload()
+        page.get_by_role("button", name="Open this folder").wait_for()
+        assert not (folder / "take.toml").exists()
+        page.get_by_role("button", name="Open this folder").click()
+        page.get_by_role("button", name="Compute the motion").wait_for()
+        assert read_take(folder).cameras[0].name == "cam01"

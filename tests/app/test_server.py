@@ -2,9 +2,11 @@
 
 import http.client
 import os
+import re
 import signal
 import sys
 from contextlib import closing
+from importlib import resources
 from urllib.parse import quote, urlsplit
 
 import pytest
@@ -45,6 +47,35 @@ def test_only_with_the_token_from_this_host_and_these_pages(app):
     socket = f"/{TOKEN}/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
     assert asked(address, socket, Origin="http://attacker.example", **upgrade)[0] == 403
     assert asked(address, socket.replace(TOKEN, "another-token-0000"), **upgrade)[0] == 403
+
+
+def test_where_a_page_was_led_from(app):
+    _, address, _ = app
+    own = f"/{TOKEN}/"
+    assert [asked(address, own, **{"Sec-Fetch-Site": site})[0] for site in ("none", "same-origin")] == [200, 200]
+    for site in ("cross-site", "same-site", "", "None"):
+        for path in (own, f"{own}take?path=x", f"{own}image/first?path=x"):
+            assert asked(address, path, **{"Sec-Fetch-Site": site})[0] == 403
+
+
+def test_every_answer_has_a_policy_and_only_the_pages_own_scripts_run(app):
+    _, address, _ = app
+    for path in (f"/{TOKEN}/", f"/{TOKEN}/gone", f"/{TOKEN}/file?path=x", "/"):
+        _, headers, body = asked(address, path)
+        policy = headers["content-security-policy"]
+        assert policy.startswith("default-src 'none'") and "frame-ancestors 'self'" in policy
+        assert "'unsafe-inline'" not in policy.partition("style-src")[0] and "connect-src 'self';" in policy
+        assert headers["x-frame-options"] == "SAMEORIGIN" and headers["referrer-policy"] == "same-origin"
+        nonce = re.search("'nonce-([^']+)'", policy)[1]
+        assert body.count(b"<script") == body.count(f'<script nonce="{nonce}"'.encode())
+    first, second = (asked(address, f"/{TOKEN}/")[1]["content-security-policy"] for _ in range(2))
+    assert first != second
+
+
+def test_properties_are_values_in_all_pages():
+    pages = resources.files("kinefit.app") / "pages"
+    texts = {file.name: file.read_text() for file in pages.iterdir() if file.name.endswith(".py")}
+    assert len(texts) > 9 and [name for name, text in texts.items() if re.search(r"props\(\s*f", text)] == []
 
 
 def test_no_image_before_the_choice_of_faces(app, drawn_take):

@@ -6,6 +6,7 @@ import shutil
 import threading
 import urllib.request
 from dataclasses import replace
+from urllib.parse import urljoin
 
 import cv2
 import msgspec
@@ -233,7 +234,10 @@ def test_joints_are_clicked_in_the_browser(folder, monkeypatch):
         place[0] += 40.0
         place[1] += 80.0
 
-    def browser(url):
+    def browser(opening):
+        with urllib.request.urlopen(opening, timeout=20) as answer:  # a one-time address, which leads to the page
+            url = urljoin(opening, answer.headers["Refresh"].removeprefix("0; url="))
+
         def ask(path):
             with urllib.request.urlopen(url + path, timeout=20) as answer:
                 return answer.read(), answer.headers["Content-Security-Policy"]

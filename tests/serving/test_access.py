@@ -102,3 +102,26 @@ def test_tokens_are_new_each_time_and_those_given_are_long_enough():
         with pytest.raises(ExportError, match="token of") as error:
             Access(token=token)
         assert token == "" or token not in str(error.value)
+
+
+def opened(access, path):
+    return access.check(path, Headers(Host=f"localhost:{PORT}"), "127.0.0.1", PORT)
+
+
+def test_a_one_time_address_has_no_token_and_leads_to_the_page_once(local):
+    address = local.opening(PORT)
+    path = address.removeprefix(f"http://localhost:{PORT}")
+    assert TOKEN not in address and opened(local, f"{path[:-1]}x/").status == 403
+    found = opened(local, path)
+    assert found.status == 200 and found.headers == {"Refresh": f"0; url=/{TOKEN}/"}
+    assert opened(local, path).status == opened(local, "//").status == opened(local, "/").status == 403
+    assert opened(local, f"/{TOKEN}/") == Admission("/", True)  # which is open as before
+
+
+def test_a_one_time_address_is_for_its_own_user_own_hosts_and_no_other_page(local, monkeypatch):
+    path = local.opening(PORT).removeprefix(f"http://localhost:{PORT}")
+    assert ask(local, path, origin="https://evil.example") == 403 and ask(local, path, host="evil.example") == 421
+    monkeypatch.setattr("kinefit.serving.access.is_of_this_user", lambda peer_port, port: False)
+    assert opened(local, path).status == 403
+    monkeypatch.undo()
+    assert opened(local, path).then == f"/{TOKEN}/"

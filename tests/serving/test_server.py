@@ -163,3 +163,12 @@ def test_a_server_that_is_closed_does_nothing(server):
     server.close()
     server.call(print, "never")
     server.close()
+
+
+def test_a_one_time_address_goes_on_to_the_page(server):
+    address = server.access.opening(server.port)
+    with urllib.request.urlopen(address, timeout=10) as answer:
+        assert answer.headers["Refresh"] == f"0; url=/{server.access.token}/" and b"hello" not in answer.read()
+        assert answer.headers["Cache-Control"] == "no-store"
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(address, timeout=10)

@@ -169,3 +169,8 @@ def test_the_nearest_frame_is_within_one():
     times = np.arange(5) / 10 + 2
     assert [show.nearest(times, t, 10.0) for t in (1.95, 2.04, 2.06, 2.45, 2.6, 0.0)] == [0, 0, 1, 4, None, None]
     assert show.nearest(np.zeros(0), 0.0, 10.0) is None
+
+
+def test_names_are_text_in_markdown():
+    assert scene.as_markdown("knee_angle_r é") == "knee_angle_r é"
+    assert scene.as_markdown("<b>[x](y)") == "\\<b\\>\\[x\\]\\(y\\)"

@@ -60,7 +60,9 @@ def test_the_page_is_served(server, motion):
     address = ACCESS.url(server.get_port())
     with urllib.request.urlopen(address, timeout=10) as answer:
         assert answer.status == 200 and b"<html" in answer.read()[:1000].lower()
-        assert "connect-src 'self'" in answer.headers["Content-Security-Policy"]
+        policy = answer.headers["Content-Security-Policy"]
+        assert "connect-src 'self'" in policy and "default-src 'self'" in policy
+        assert policy.endswith("frame-ancestors http://localhost:* http://127.0.0.1:*")
     with viser_client(address) as client:
         assert len(client.recv(timeout=10)) > 1000  # the scene so far, compressed
 

@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from kinefit.app.compare import Comparison
+from kinefit.app.file_pages import FilePages
 from kinefit.app.jobs import Job, JobQueue
 from kinefit.app.people import PeoplePictures
 from kinefit.app.review import Review
@@ -26,6 +27,9 @@ class Desk:
     ----------
     hide_faces : bool or None
         The user's choice at the start; None until it is made, and nothing of a video is shown before.
+    chosen : set of Path
+        Folders without a take file in which the user asked for one; opening a page alone writes nothing.
+    files : FilePages, which serves reports and check pages
     jobs : JobQueue
     people : PeoplePictures of all takes
     recorder : of cameras of this computer, while it records
@@ -34,6 +38,8 @@ class Desk:
     def __init__(self, root: Path, prefix: str) -> None:
         self.root, self.prefix = root, prefix
         self.hide_faces: bool | None = None
+        self.chosen: set[Path] = set()
+        self.files = FilePages(root)
         self.jobs = JobQueue()
         self._reviews: dict[Path, Review] = {}
         self._comparisons: dict[tuple[Path, Path], Comparison] = {}
@@ -72,6 +78,7 @@ class Desk:
 
     async def close(self) -> None:
         """Pause all jobs, end the recording and close all results."""
+        self.files.close()
         for review in self._reviews.values():
             review.close()
         for comparison in self._comparisons.values():

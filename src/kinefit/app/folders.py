@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from kinefit._files import read_npz
+from kinefit.batch.viewed import is_outdated
 from kinefit.errors import FileError, KinefitError, printable
 from kinefit.readers.depth.images import natural
 from kinefit.readers.guess.files import VIDEOS
@@ -14,7 +19,8 @@ from kinefit.readers.take.find import takes_in
 NEW = "new"
 UNFINISHED = "unfinished"
 COMPLETE = "tracked"
-"""States of a take: not tracked yet, stopped before its end, tracked."""
+OUTDATED = "outdated"
+"""States of a take: not tracked yet, stopped before its end, tracked, changed since it was tracked."""
 
 _MAX_DEPTH = 3  # of folders below the session's in which takes are looked for
 _MAX_FOLDERS = 2000  # that are looked into, so that a whole disk ends in a moment
@@ -50,10 +56,21 @@ class TakeFolder:
 
     @property
     def state(self) -> str:
-        """NEW, UNFINISHED or COMPLETE."""
+        """NEW, UNFINISHED, COMPLETE or OUTDATED."""
         if (self.out / "unfinished").exists() or any(self.out.glob("person-*/unfinished")):
             return UNFINISHED
-        return COMPLETE if self.people else NEW
+        if not (people := self.people):
+            return NEW
+        return OUTDATED if any(is_outdated(_provenance(folder), self.file) for folder in people) else COMPLETE
+
+
+def _provenance(folder: Path) -> Mapping[str, Any]:
+    """What the motion in a folder of results was computed from; empty where it cannot be read."""
+    try:
+        arrays = read_npz(folder / "motion.npz", "provenance", remedy="")
+        return dict(json.loads(str(arrays["provenance"])))
+    except (KinefitError, KeyError, ValueError):
+        return {}
 
 
 def subfolders(folder: Path) -> list[Path]:

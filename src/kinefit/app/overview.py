@@ -24,6 +24,7 @@ class SessionRow:
     folder : Path of the person's results; None if there are none
     session : {"subject": ..., "date": ..., "movement": ...}, what the take's `[session]` states
     problem : what is wrong with the take file; "" if nothing is
+    state : of the take, as `TakeFolder.state` has it
     seconds, agreement : float [s], and mean quality, 0 to 1; None without results
     """
 
@@ -32,6 +33,7 @@ class SessionRow:
     folder: Path | None
     session: Mapping[str, str]
     problem: str
+    state: str
     seconds: float | None = None
     agreement: float | None = None
 
@@ -44,12 +46,12 @@ def recordings(root: Path) -> list[SessionRow]:
             session, problem = _session(take.file, take.file.stat().st_mtime_ns), ""
         except (KinefitError, OSError) as error:
             session, problem = {}, str(error)
-        people = take.people
+        people, state = take.people, take.state
         for k, folder in enumerate(people, start=1):
             number = k if len(people) > 1 else 0
-            found.append(SessionRow(take, number, folder, session, problem, *measures(folder / "motion.npz")))
+            found.append(SessionRow(take, number, folder, session, problem, state, *measures(folder / "motion.npz")))
         if not people:
-            found.append(SessionRow(take, 0, None, session, problem))
+            found.append(SessionRow(take, 0, None, session, problem, state))
     return found
 
 

@@ -141,6 +141,7 @@ def track_person(
         Tracking or writing fails.
     """
     from kinefit.batch.report import provenance, write_track_report
+    from kinefit.batch.viewed import OUTDATED, inputs_entry, is_outdated
     from kinefit.findings import CLOCKS, STATURE
     from kinefit.multiview import followed
     from kinefit.tracking import cameras
@@ -152,7 +153,7 @@ def track_person(
 
     notes: list[str] = []
     how: dict[str, Any] = {"smooth": choices.smooth, "contacts": choices.contacts, "lag": choices.lag}
-    total = 0
+    total, inputs = 0, inputs_entry(take)
     with ExitStack() as work:
         unfinished = work.enter_context(Checkpoint(out / "unfinished", key_of(take, **how), restart=choices.restart))
         for sentence in unfinished.said():
@@ -174,7 +175,9 @@ def track_person(
             notes += [*motion.provenance.get(STATURE, ()), *floor_sentences(motion.provenance)]
         except TrackingInterrupted as stopped:
             motion, total = stopped.motion, stopped.total
-        motion = replace(motion, provenance=provenance(take, **motion.provenance))
+        motion = replace(motion, provenance=provenance(take, **inputs, **motion.provenance))
+        if is_outdated(motion.provenance, take.path):  # changed meanwhile
+            notes.append(f"{OUTDATED}.")
         write_results(motion, out, choices.formats, step, files)
         if choices.draws and not total:
             write_overlays(motion, take, seen, out, step, files, skin=choices.overlay_skin)

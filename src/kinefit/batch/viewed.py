@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from kinefit.batch.results import Step, silent
-from kinefit.errors import ObservationError
+from kinefit.errors import KinefitError, ObservationError
+from kinefit.readers.take.file import read_take
+
+OUTDATED = "The take was changed after this motion was computed: run kinefit track again"
+"""What is said of a result for which `is_outdated` holds."""
+
+_INPUTS = "inputs_sha256"  # key of `Motion.provenance`
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -86,6 +92,8 @@ def content_of(
     cameras = {camera.name: camera for camera in seen.rig or ()}
     offsets = {entry.name: entry.time_offset for entry in take.cameras}
     for motion in motions:
+        if is_outdated(motion.provenance, take.path):
+            tell(f"{motion.name}: {OUTDATED}.")
         if motion.up != take.up:
             tell(f"{motion.name} is rotated from up = {motion.up} to the take's up = {take.up}.")
     if take.hide_faces and seen.videos and find:
@@ -111,11 +119,31 @@ def has_same_cameras(motion: Motion, take: Take) -> bool:
     return bool(stated == hashlib.sha256(take.calibration.file.read_bytes()).hexdigest())
 
 
+def inputs_entry(take: Take) -> dict[str, str]:
+    """Entry of `Motion.provenance`: what a motion is computed from that a user edits, wherever it lies.
+
+    That are the take file, its clicks, its body and its T-pose take; changes of the calibration are noticed apart.
+    """
+    digest = hashlib.sha256(take.digest.encode())
+    for file in (take.clicks, take.subject, Path(take.body)):
+        if file is not None and file.is_absolute() and file.is_file():
+            digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return {_INPUTS: digest.hexdigest()}
+
+
+def is_outdated(provenance: Mapping[str, Any], take: Path) -> bool:
+    """Whether a take was changed after a motion was computed from it, as far as the motion's provenance says."""
+    if _INPUTS not in provenance or provenance.get("take") != take.name:
+        return False
+    try:
+        return inputs_entry(read_take(take))[_INPUTS] != provenance[_INPUTS]
+    except (KinefitError, OSError):
+        return False
+
+
 def _fitting(file: Path | None, name: str, tell: Tell) -> tuple[Take, Observations] | None:
     """The take beside a folder of results and what its sensors saw, where it can be read and is the motion's."""
     from kinefit.calibration.people.of_take import find_cameras
-    from kinefit.errors import KinefitError
-    from kinefit.readers.take.file import read_take
     from kinefit.readers.take.load import load_observations
 
     if file is None:

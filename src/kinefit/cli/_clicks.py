@@ -65,7 +65,7 @@ def _ask(out: Path, take: Take, seen: Observations, body: Body, step: int, brows
     try:
         _screen.say(f"Click the joints at {page.url} ; Ctrl-C ends without a [start].")
         if browser:
-            webbrowser.open(page.url)
+            webbrowser.open(page.opening())
         while not page.done.wait(0.5):
             pass
     finally:

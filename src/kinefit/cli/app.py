@@ -40,10 +40,11 @@ def app(folder: Path, port: int, token: str | None, browser: bool) -> None:
     if printable(root) != str(root):
         problem = "the name of this folder is not UTF-8, as the addresses of pages are"
         raise FileError(problem, file=folder, remedy="Rename it.")
+    access = Access(token=token)
 
-    def opened(address: str) -> None:
-        _screen.say(f"kinefit app at {address}  (Ctrl-C ends)")
+    def opened(port: int) -> None:
+        _screen.say(f"kinefit app at {access.url(port)}  (Ctrl-C ends)")
         if browser:
-            click.launch(address)
+            click.launch(access.opening(port))
 
-    serve(root, port, Access(token=token), opened)
+    serve(root, port, access, opened)

@@ -73,7 +73,7 @@ def _serve(recording: ViewerContent, port: int, access: Access, browser: bool, c
         address = access.url(server.get_port())
         _screen.say(f"{recording.name}: {len(recording.times)} frames at {address}  (Ctrl-C ends)")
         if browser:
-            click.launch(address)
+            click.launch(access.opening(server.get_port()))
         player.run()
     except KeyboardInterrupt:
         _screen.note("Closed.")

@@ -14,6 +14,7 @@ from websockets.datastructures import Headers
 
 from kinefit.errors import ExportError
 from kinefit.serving import TOKEN_VARIABLE
+from kinefit.serving.peers import is_of_this_user
 
 _TOKEN_BYTES = 18  # 144 random bits: 24 characters of the address
 _TOKEN = re.compile(r"[A-Za-z0-9_-]{16,128}")  # stands in an address as it is; a shorter one can be tried out
@@ -31,10 +32,16 @@ class Admission(NamedTuple):
 
 
 class Refusal(NamedTuple):
-    """A request that ends here: its HTTP status, and the reason in one sentence."""
+    """A request that ends here: its HTTP status, the reason in one sentence, and what the browser asks for next."""
 
     status: HTTPStatus
     reason: str
+    then: str = ""  # path of the page, after a one-time address: asked for by a page of this server
+
+    @property
+    def headers(self) -> dict[str, str]:
+        """Further headers of the answer."""
+        return {"Refresh": f"0; url={self.then}"} if self.then else {}
 
 
 class Access:
@@ -64,6 +71,7 @@ class Access:
             raise ExportError(f"a token of {len(self.token)} characters is not valid", remedy=remedy)
         self.is_local = host == "localhost" or (_is_number(host) and ipaddress.ip_address(host).is_loopback)
         self._readers = readers and self.is_local
+        self._opening = ""
 
     @property
     def warning(self) -> str | None:
@@ -80,7 +88,15 @@ class Access:
         host = "localhost" if self.host in (*_ALL_ADDRESSES, "127.0.0.1") else self.host
         return f"http://{f'[{host}]' if ':' in host else host}:{port}/{self.token}/"
 
-    def check(self, path: str, headers: Headers, address: str, port: int) -> Admission | Refusal:
+    def opening(self, port: int) -> str:
+        """Address that leads to the page once, and has no token.
+
+        It is for a browser's command line, which other users of the computer can read.
+        """
+        self._opening = secrets.token_urlsafe(_TOKEN_BYTES)
+        return f"{self.url(port).removesuffix(f'{self.token}/')}{self._opening}/"
+
+    def check(self, path: str, headers: Headers, address: str, port: int, peer: int = 0) -> Admission | Refusal:
         """Whether a request may go on.
 
         Parameters
@@ -88,6 +104,7 @@ class Access:
         path : of the request
         headers : of the request
         address, port : of this computer, at which the request arrived
+        peer : port from which it was sent; 0: unknown
         """
         hosts = [host.lower() for host in headers.get_all("Host")]
         if len(hosts) != 1 or not self._is_own(hosts[0], address, port):
@@ -96,10 +113,15 @@ class Access:
         if origins and origins != [f"http://{hosts[0]}"]:
             return Refusal(HTTPStatus.FORBIDDEN, "Pages of other servers may not connect.")
         given, _, rest = path.partition("?")[0].removeprefix("/").partition("/")
-        if hmac.compare_digest(given.encode(errors="surrogateescape"), self.token.encode()):
+        secret = given.encode(errors="surrogateescape")
+        if hmac.compare_digest(secret, self.token.encode()):
             return Admission(f"/{rest}", True)
+        if given and hmac.compare_digest(secret, self._opening.encode()) and is_of_this_user(peer, port):
+            self._opening = ""
+            return Refusal(HTTPStatus.OK, "The page opens.", f"/{self.token}/")
         if given:
-            return Refusal(HTTPStatus.FORBIDDEN, "The address has another token than this server.")
+            reason = "The address has another token than this server, or was used before. Open the printed address."
+            return Refusal(HTTPStatus.FORBIDDEN, reason)
         if self._readers and not origins and "Upgrade" in headers:
             return Admission("/", False)
         return Refusal(HTTPStatus.FORBIDDEN, "Open the address that the command printed: it ends with the token.")

@@ -6,6 +6,9 @@ import base64
 import hashlib
 from collections.abc import Iterable
 
+APP_PAGES = "http://localhost:* http://127.0.0.1:*"
+"""Pages of `kinefit app`, whose port is not known, as the policies `frame-src` and `frame-ancestors` have them."""
+
 
 def inline_policy(scripts: Iterable[str], styles: Iterable[str], more: str = "") -> str:
     """A policy under which a page runs exactly these inline scripts and styles, by their hashes, and fetches nothing.

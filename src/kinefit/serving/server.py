@@ -41,12 +41,13 @@ _PROBLEM_CONNECTIONS = "too many connections are opened"
 _OPEN_TIMEOUT_S = 5.0  # of a handshake
 _CLOSE_TIMEOUT_S = 1.0
 
-_HEADERS = {
+HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "same-origin",  # the address has the token
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
+"""Of every answer."""
 
 
 class Page(NamedTuple):
@@ -149,13 +150,16 @@ def guard(access: Access, respond: Respond) -> Respond:
 
     def process(connection: ServerConnection, request: Request) -> Response | None:
         address, port = connection.transport.get_extra_info("sockname")[:2]
-        found = access.check(request.path, request.headers, address, port)
+        peer = connection.transport.get_extra_info("peername", ("", 0))[1]
+        found = access.check(request.path, request.headers, address, port, peer)
         if isinstance(found, Refusal):
-            return connection.respond(found.status, f"{found.reason}\n")
+            ends = connection.respond(found.status, f"{found.reason}\n")
+            ends.headers.update(HEADERS | found.headers)
+            return ends
         request.path, connection.has_token = found  # type: ignore[attr-defined]
         response = respond(connection, request)
         if response is not None:
-            response.headers.update(_HEADERS)
+            response.headers.update(HEADERS)
         return response
 
     return process

@@ -59,6 +59,10 @@ class ClickPage:
         """Of the page."""
         return self._server.url
 
+    def opening(self) -> str:
+        """Address that leads to the page once."""
+        return self._server.access.opening(self._server.port)
+
     def close(self) -> None:
         """Serve it no more."""
         self._server.close()

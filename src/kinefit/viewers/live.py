@@ -14,7 +14,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.errors import BodyError, CalibrationError, choices
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.serving.access import Access
-from kinefit.viewers import figure, pictures, stage
+from kinefit.viewers import figure, pictures, scene, stage
 
 _TELL_INTERVAL_S, _RATE_INTERVAL_S = 0.2, 2.0  # of the words on the page; of the mean of the frame rate
 
@@ -141,7 +141,8 @@ class View:
             self._time.content = f"**{time:.3f} s**, {rate:.0f} Hz" if time is not None else f"{rate:.0f} Hz"
             tree = self.body.tree
             scales = np.where(tree.prismatic, 1000.0, 180 / np.pi)
-            values = zip(tree.coordinates, scales * state.angles, tree.prismatic, strict=True)
+            names = map(scene.as_markdown, tree.coordinates)
+            values = zip(names, scales * state.angles, tree.prismatic, strict=True)
             self._angles.content = "\n\n".join(f"{n} **{v:.1f}**{' mm' if slides else '°'}" for n, v, slides in values)
             if now - self._since > _RATE_INTERVAL_S:
                 self._shown, self._since = 0, now

@@ -196,7 +196,7 @@ def summary(motion: Motion, frame: int) -> str:
     lines = [f"quality **{motion.quality[frame]:.2f}** of 1"]
     lost = [name for name, gone in zip(motion.body.tree.segments, motion.lost[frame]) if gone]
     if lost:
-        lines.append("lost: " + ", ".join(lost))
+        lines.append("lost: " + ", ".join(map(scene.as_markdown, lost)))
     for name, residuals in motion.residuals.items():
         norms = residuals.norms[frame]
         seen = np.isfinite(norms)
@@ -205,7 +205,7 @@ def summary(motion: Motion, frame: int) -> str:
         out = int((seen & (residuals.weights[frame] < scene.OUTLIER_WEIGHT)).sum())
         extra = f", {out} rejected" if out else ""
         extra += ", left/right swap corrected" if residuals.swapped[frame] else ""
-        lines.append(f"{name}: {middle}{extra}")
+        lines.append(f"{scene.as_markdown(name)}: {middle}{extra}")
     return "\n\n".join(lines)
 
 
@@ -243,7 +243,8 @@ class _Angle:
         name = self.box.value
         if name != self.chosen:
             self.chosen, self.plot.scales = name, self._scales(name)
-        self.line.content = "**" + scene.angle_line(self.motion, name, frame).replace(" ", "** ", 1)
+        value = scene.angle_line(self.motion, name, frame).removeprefix(name)
+        self.line.content = f"**{scene.as_markdown(name)}**{value}"
         self.plot.data = course(self.motion, name, frame)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -204,6 +205,11 @@ def angle_line(motion: Motion, coordinate: str, frame: int) -> str:
     scale, unit, digits = (180 / np.pi, "°", 1) if turn else (1000.0, " mm", 0)
     spread = f"± {2 * scale * std:.{digits}f}{unit}" if np.isfinite(std) else "(not observed)"
     return f"{coordinate} {scale * value:.{digits}f}{unit} {spread}"
+
+
+def as_markdown(name: str) -> str:
+    """Markdown that shows a name of a file as it is: without elements, links, images, code and emphasis of its own."""
+    return re.sub(r"([\\`*\[\]()<>!&#|~])", r"\\\1", name)
 
 
 def advance(position: float, elapsed: float, *, rate: float, speed: float, count: int) -> float:

@@ -18,6 +18,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import UP_AXES
 from kinefit.serving.access import Access
+from kinefit.serving.policy import APP_PAGES
 from kinefit.viewers.pictures import PinholeView, flat_view
 
 if TYPE_CHECKING:
@@ -29,7 +30,8 @@ _PLANES = {"x": "yz", "y": "xz", "z": "xy"}
 _SHADE = (70, 75, 85)
 POLICY = (
     "connect-src 'self' data: blob:; img-src 'self' data: blob:; font-src data:; media-src 'none'; frame-src 'none'; "
-    "object-src 'none'; base-uri 'none'; form-action 'none'"
+    "object-src 'none'; base-uri 'none'; form-action 'none'; "
+    "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:"
 )
 """Content security policy of viser's page: its scripts are its own, but what they see they can send nowhere else."""
 
@@ -86,7 +88,7 @@ def _guarded(access: Access) -> Iterator[list[int]]:
         def respond(connection: Any, request: Any) -> Any:
             response = process_request(connection, request)
             if response is not None:
-                response.headers["Content-Security-Policy"] = POLICY
+                response.headers["Content-Security-Policy"] = f"{POLICY}; frame-ancestors {APP_PAGES}"
             return response
 
         used.append(port)

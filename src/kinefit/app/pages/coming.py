@@ -36,7 +36,8 @@ def coming_images(take: Take, job: Job) -> Callable[[], None]:
             images[camera.name].set_source(source)
             return
         with row:
-            images[camera.name] = ui.image(source).classes("w-40 min-h-[6rem]").props(f'alt="{camera.name}" no-spinner')
+            image = images[camera.name] = ui.image(source).classes("w-40 min-h-[6rem]").props("no-spinner")
+            image.props["alt"] = camera.name
 
     return update
 

@@ -8,7 +8,7 @@ from nicegui import ui
 
 from kinefit.app.compare import Comparison
 from kinefit.app.desk import Desk
-from kinefit.app.pages.shell import card, link, loaded, shell, short, texts
+from kinefit.app.pages.shell import card, link, loaded, page_frame, shell, short, texts
 from kinefit.app.texts import Texts
 from kinefit.rendering import colours
 
@@ -32,8 +32,7 @@ async def compare_page(desk: Desk, before: Path, after: Path) -> None:
         if both is None:
             return
         with card(t("compare.scene")):
-            scene = ui.element("iframe").props(f'src="{both.scene.address}" title="{t("compare.scene")}"')
-            scene.classes("w-full h-[32rem] border")
+            page_frame(both.scene.address, t("compare.scene")).classes("w-full h-[32rem] border")
         with card(t("compare.angle")):
             _angles(t, both, names)
         with card(t("compare.ranges")):

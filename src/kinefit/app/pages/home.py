@@ -11,6 +11,7 @@ from nicegui import ui
 from kinefit.app.desk import Desk
 from kinefit.app.folders import subfolders, takes_below, video_files
 from kinefit.app.pages.shell import card, in_thread, link, shell, short, show_error, texts
+from kinefit.app.pages.take import use_folder
 from kinefit.app.texts import Texts
 from kinefit.errors import KinefitError, printable
 from kinefit.exporters.atomic import writing
@@ -52,7 +53,7 @@ class _FolderChoice:
     """A list of folders to walk through by clicks, with a field for a path."""
 
     def __init__(self, desk: Desk, t: Texts) -> None:
-        self._t, self._at = t, desk.root
+        self._desk, self._t, self._at = desk, t, desk.root
         self._field = ui.input(t("home.path"), value=str(self._at)).classes("w-full")
         self._field.on("keydown.enter", lambda: self._go(Path(self._field.value).expanduser()))
         self._list()
@@ -82,7 +83,7 @@ class _FolderChoice:
         self._list.refresh()
 
     def _open(self) -> None:
-        ui.navigate.to(link("/take", path=Path(self._field.value).expanduser()))
+        use_folder(self._desk, Path(self._field.value).expanduser())
 
 
 def _drop_area(desk: Desk, t: Texts) -> None:
@@ -99,7 +100,7 @@ def _drop_area(desk: Desk, t: Texts) -> None:
             except (OSError, KinefitError) as error:
                 ui.notify(t("home.drop_failed", name=name, reason=error), type="negative", timeout=0)
                 return
-        ui.navigate.to(link("/take", path=folder))
+        use_folder(desk, folder)
 
     def refuse(_: Any) -> None:
         ui.notify(t("home.drop_refused"), type="negative", timeout=0)
@@ -111,17 +112,17 @@ def _drop_area(desk: Desk, t: Texts) -> None:
 
 
 async def _takes(desk: Desk, t: Texts) -> None:
-    takes = await in_thread(takes_below, desk.root)
+    takes = await in_thread(lambda: [(take, take.state) for take in takes_below(desk.root)])
     if others := await in_thread(lambda root: takes_below(root, addressable=False), desk.root):
         names = ", ".join(short(take.file.parent, desk.root) for take in others[:_MAX_NAMES])
         ui.label(t("home.session_unnamed", count=len(others), names=names))
     if not takes:
         ui.label(t("home.session_none"))
-    for take in takes:
+    for take, state in takes:
         job = desk.jobs.open(take.file)
         with ui.row().classes("items-center w-full"):
             ui.link(short(take.file.parent, desk.root), link("/take", path=take.file)).classes("flex-1")
-            ui.label(t(f"state.{job.state if job else take.state}"))
+            ui.label(t(f"state.{job.state if job else state}"))
     if takes:
         ui.link(t("home.session"), "/session")
     ui.link(t("home.live"), "/live")

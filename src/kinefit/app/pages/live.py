@@ -12,7 +12,7 @@ from kinefit.app.desk import Desk
 from kinefit.app.images import jpeg, unrecognisable
 from kinefit.app.jobs import FAILED, Job
 from kinefit.app.live import followable, found_cameras, is_up, page_of, recorded_take, start_live
-from kinefit.app.pages.shell import card, in_thread, link, shell, short, show_error, texts
+from kinefit.app.pages.shell import card, in_thread, link, page_frame, shell, short, show_error, texts
 from kinefit.app.texts import Texts
 from kinefit.app.webcams import Recorder, Webcam, find_webcams, write_live_take
 from kinefit.errors import KinefitError
@@ -67,8 +67,7 @@ class _LivePage:
         if job is not None and job.is_open:
             ui.label(short(job.take, self._desk.root)).classes("break-all")
             if self._shown and self._shown[-1]:
-                page = page_of(job)
-                ui.element("iframe").props(f'src="{page}" title="{t("live.page")}"').classes("w-full h-[36rem] border")
+                page_frame(page_of(job), t("live.page")).classes("w-full h-[36rem] border")
             else:
                 ui.label(t("live.starting"))
             ui.button(t("live.stop"), icon="stop", on_click=job.pause)
@@ -118,7 +117,8 @@ class _LivePage:
             for webcam in self._webcams:
                 with ui.column().classes("gap-0"):
                     image = unrecognisable(webcam.image) if self._desk.hide_faces else webcam.image
-                    ui.image(_data(jpeg(image, _PREVIEW_PX))).classes("w-60").props(f'alt="{webcam.name}"')
+                    preview = ui.image(_data(jpeg(image, _PREVIEW_PX))).classes("w-60")
+                    preview.props["alt"] = webcam.name
                     boxes[webcam.number] = ui.checkbox(webcam.name, value=True)
         ui.label(t("live.one_alone"))
         places = {"": t("live.no_calibration")}

@@ -46,7 +46,8 @@ def people_cards(desk: Desk, t: Texts, take: Path, who: ui.select) -> None:
                 number, said = picture.number, t("people.choose", number=picture.number)
                 with ui.column().classes("gap-1 items-center"):
                     source = link("/image/person", path=take, number=number)
-                    image = ui.image(source).classes("w-28 h-40 cursor-pointer").props(f'fit=contain alt="{said}"')
+                    image = ui.image(source).classes("w-28 h-40 cursor-pointer").props("fit=contain")
+                    image.props["alt"] = said
                     image.on("click", lambda n=number: choose(n))
                     _button(said, number == chosen, lambda n=number: choose(n))
             _button(t("people.everybody"), not chosen, lambda: choose(None))

@@ -12,11 +12,12 @@ import numpy as np
 from nicegui import events, ui
 
 from kinefit.app.desk import Desk
-from kinefit.app.pages.shell import COLOURS, card, in_thread, link, loaded, shell, show_error, texts
+from kinefit.app.pages.shell import COLOURS, card, in_thread, link, loaded, page_frame, shell, show_error, texts
 from kinefit.app.review import Review
 from kinefit.app.texts import Texts
 from kinefit.batch import corrections
 from kinefit.batch.results import DESCRIPTIONS, NAMES, write_format
+from kinefit.batch.viewed import is_outdated
 from kinefit.errors import KinefitError
 from kinefit.exporters.report.moments import Moment, doubtful_moments
 from kinefit.rendering.colours import to_hex
@@ -52,12 +53,12 @@ class _ResultPage:
         if not review.has_cameras:
             ui.label(t("result.other_cameras")).props('role="alert"')
         with ui.row().classes("w-full items-stretch"):
-            figure = ui.element("iframe").props(f'src="{review.scene.address}" title="3D"')
-            figure.classes("flex-1 min-w-[320px] min-h-[28rem] border")
+            page_frame(review.scene.address, "3D").classes("flex-1 min-w-[320px] min-h-[28rem] border")
             with ui.row().classes("flex-1 min-w-[320px] content-start gap-1"):
                 for camera in review.cameras:
                     image = ui.interactive_image(on_mouse=lambda event, camera=camera: self._click(camera, event))
-                    self._images[camera] = image.props(f'alt="{camera}"')
+                    image.props["alt"] = camera
+                    self._images[camera] = image
                     self._enlarge(camera, False)
         self._time_line()
         with card(t("result.angle")):
@@ -94,7 +95,7 @@ class _ResultPage:
         )
         ui.html(f'<div style="position:relative;height:8px">{marks}</div>', sanitize=False).classes("w-full")
         self._slider = ui.slider(min=0, max=last, step=1, value=0).classes("w-full")
-        self._slider.props(f'aria-label="{t("result.frame")}"')
+        self._slider.props["aria-label"] = t("result.frame")
         self._slider.on("update:model-value", lambda event: self._go(event.args), throttle=0.05)
         with ui.row().classes("items-center"):
             self._play = ui.button(t("result.play"), icon="play_arrow", on_click=self._toggle).props("outline")
@@ -127,7 +128,7 @@ class _ResultPage:
         """Bring images and read-outs to the frame of the 3D figure."""
         clock, motion, t = self._review.scene.player.clock, self._review.motion, self._t
         icon, said = ("pause", "result.stop") if clock.playing else ("play_arrow", "result.play")
-        self._play.props(f"icon={icon}").text = t(said)
+        self._play.icon, self._play.text = icon, t(said)
         if clock.frame == self._shown:
             return
         self._shown = frame = clock.frame
@@ -211,6 +212,8 @@ class _ResultPage:
         except KinefitError as error:
             show_error(t, error)
             made = ()
+        if is_outdated(self._review.motion.provenance, self._take):
+            ui.label(t("take.outdated")).props('role="alert"')
         for sentence in made:
             ui.label(sentence).classes("text-sm")
         if not made:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from fastapi import Response
-from fastapi.responses import FileResponse
+from fastapi.responses import RedirectResponse
 from nicegui import app, ui
 from numpy.typing import NDArray
 
@@ -23,9 +23,6 @@ from kinefit.errors import KinefitError
 from kinefit.readers.video_files import first_image, image_at
 
 _THUMBNAIL_PX = 384
-_PAGES = (".html",)  # files that are shown as pages: reports and check pages
-_SANDBOX = {"Content-Security-Policy": "sandbox allow-scripts allow-downloads", "Cache-Control": "no-store"}
-"""Pages that lie in folders of recordings run apart from the app, whose addresses they cannot read."""
 
 
 def add_pages(desk: Desk) -> None:
@@ -94,9 +91,8 @@ def add_pages(desk: Desk) -> None:
     def file(path: str) -> Response:
         if desk.hide_faces is None:
             return Response(status_code=403)
-        if Path(path).suffix.lower() not in _PAGES or not Path(path).is_file():
-            return Response(status_code=404)
-        return FileResponse(path, headers=_SANDBOX)
+        address = desk.files.address(Path(path))
+        return Response(status_code=404) if address is None else RedirectResponse(address, status_code=303)
 
 
 def _image(content: bytes) -> Response:

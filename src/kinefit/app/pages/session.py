@@ -31,7 +31,8 @@ async def session_page(desk: Desk) -> None:
              "align": "left" if key in _TEXTS else "right"} for key in (*_TEXTS, *_NUMBERS)
         ]  # fmt: skip
         table = ui.table(columns=columns, rows=[], row_key="key", selection="multiple")
-        table.classes("w-full").props(f'dense hide-selected-banner no-data-label="{t("session.reading")}"')
+        table.classes("w-full").props("dense hide-selected-banner")
+        table.props["no-data-label"] = t("session.reading")
         table.add_slot("body-cell-take", _LINK)
         with ui.row():
             ui.button(t("session.compute"), icon="play_arrow", on_click=lambda: _compute(desk, t, table))
@@ -43,7 +44,7 @@ async def session_page(desk: Desk) -> None:
             rows = [_row(desk, t, found) for found in await in_thread(recordings, desk.root)]
             if rows != table.rows:
                 table.rows = rows
-            table.props(f'no-data-label="{t("home.session_none")}"')
+            table.props["no-data-label"] = t("home.session_none")
 
         ui.timer(_REFRESH_S, look)
 
@@ -67,7 +68,7 @@ def _state(desk: Desk, t: Texts, found: SessionRow) -> str:
     """That of the last job of the take unless it is done, else that of its files."""
     job = next((job for job in reversed(desk.jobs.jobs) if job.take == found.take.file and job.state != DONE), None)
     if job is None:
-        return t(f"state.{found.take.state}")
+        return t(f"state.{found.state}")
     share = [progress.share for progress in job.steps.values()][-1:] if job.state == RUNNING else []
     return t(f"state.{job.state}") + "".join(f" {100 * done:.0f} %" for done in share)
 

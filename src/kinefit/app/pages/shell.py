@@ -64,6 +64,13 @@ def face_switch(desk: Desk, t: Texts) -> None:
     switch.props("dark color=white").tooltip(t("shell.faces_change"))
 
 
+def page_frame(address: str, title: str) -> ui.element:
+    """Another page within this one."""
+    made = ui.element("iframe")
+    made.props.update(src=address, title=title)  # as values: a text would be read for further properties
+    return made
+
+
 def card(title: str) -> ui.card:
     """A card with a heading."""
     made = ui.card().classes("w-full")

@@ -9,17 +9,17 @@ from typing import Any
 from nicegui import ui
 
 from kinefit.app.desk import Desk
-from kinefit.app.folders import NEW, UNFINISHED, TakeFolder, video_files
+from kinefit.app.folders import NEW, OUTDATED, UNFINISHED, TakeFolder, video_files
 from kinefit.app.jobs import DONE, FAILED, PAUSED, RUNNING, WAITING, Job
 from kinefit.app.pages.coming import coming_images
 from kinefit.app.pages.people import people_cards
-from kinefit.app.pages.shell import COLOURS, card, link, loaded, shell, short, show_error, texts
+from kinefit.app.pages.shell import COLOURS, card, link, loaded, page_frame, shell, short, show_error, texts
 from kinefit.app.texts import Texts
 from kinefit.batch import corrections
 from kinefit.errors import KinefitError
 from kinefit.exporters.atomic import write_text
 from kinefit.readers.guess.draft import Note
-from kinefit.readers.guess.folder import guess_take
+from kinefit.readers.guess.folder import Guess, guess_take
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.find import find_take, takes_in
 from kinefit.rendering.colours import to_hex
@@ -36,17 +36,34 @@ _REFINE = {
 
 
 async def take_page(desk: Desk, path: str) -> None:
-    """Build the page of a take file, or of a folder, whose take file is written where there is none."""
-    t = texts()
-    with shell(desk, t, short(Path(path), desk.root)):
+    """Build the page of a take file, or of a folder, whose take file is written if the user asked for it."""
+    t, at, guess = texts(), Path(path), None
+    is_asked_for = at in desk.chosen
+    desk.chosen.discard(at)
+    with shell(desk, t, short(at, desk.root)):
         if desk.hide_faces is None:
             ui.navigate.to("/")
             return
-        first_images(Path(path))
-        opened = await loaded(t, t("take.reading"), opened_take, Path(path))
+        first_images(at)
+        if at.is_dir() and not takes_in(at):
+            guess = await loaded(t, t("take.reading"), guess_take, at)
+            if guess is None:
+                return
+            if not is_asked_for:
+                ui.label(t("take.no_file", folder=at))
+                ui.button(t("home.use"), icon="folder_open", on_click=lambda: use_folder(desk, at))
+                return
+        opened = await loaded(t, t("take.reading"), opened_take, at, guess)
         if opened is not None:
             file, take, notes = opened
+            desk.files.folders.add(file.parent)
             _TakePage(desk, t, TakeFolder(file), take, notes)
+
+
+def use_folder(desk: Desk, folder: Path) -> None:
+    """Open a folder, as the user asked for it: its first take file is written then."""
+    desk.chosen.add(folder)
+    ui.navigate.to(link("/take", path=folder))
 
 
 def first_images(path: Path) -> None:
@@ -55,25 +72,23 @@ def first_images(path: Path) -> None:
     with ui.row().classes("w-full"):
         for video in videos:
             with ui.column().classes("gap-0"):
-                ui.image(link("/image/first", path=video)).classes("w-48 min-h-[6rem]").props(f'alt="{video.stem}"')
+                image = ui.image(link("/image/first", path=video)).classes("w-48 min-h-[6rem]")
+                image.props["alt"] = video.stem
                 ui.label(video.name).classes("text-sm")
 
 
-def opened_take(path: Path) -> tuple[Path, Take, tuple[Note, ...]]:
-    """The take file at a path, what it says, and what was guessed for it; a folder without one gets its first.
+def opened_take(path: Path, guess: Guess | None) -> tuple[Path, Take, tuple[Note, ...]]:
+    """The take file at a path, what it says, and what was guessed for it; a guess for a folder is written first.
 
     Raises
     ------
     KinefitError
         Nothing is there, or nothing of which a take can be made; a take file that is invalid.
     """
-    notes: tuple[Note, ...] = ()
-    if path.is_dir() and not takes_in(path):
-        guess = guess_take(path)
+    if guess is not None:
         write_text(path / "take.toml", guess.text)
-        notes = guess.notes
     file = find_take(path).absolute()
-    return file, read_take(file), notes
+    return file, read_take(file), guess.notes if guess is not None else ()
 
 
 class _TakePage:
@@ -237,6 +252,8 @@ class _TakePage:
 
     def _results(self) -> None:
         t, people = self._t, self._folder.people
+        if self._folder.state == OUTDATED:
+            ui.label(t("take.outdated")).props('role="alert"')
         with ui.row():
             for k, folder in enumerate(people, start=1):
                 said = t("take.result") if len(people) == 1 else t("take.result_of", number=k)
@@ -274,8 +291,7 @@ class _TakePage:
                     to = link("/take", path=job.result["refined"])
                     ui.button(t("take.use_refined"), on_click=lambda: ui.navigate.to(to))
             page = link("/file", path=self._folder.check_page)
-            frame = ui.element("iframe").props(f'src="{self._desk.prefix}{page}" title="{t("take.check_page")}"')
-            frame.classes("w-full h-[36rem] border")
+            page_frame(f"{self._desk.prefix}{page}", t("take.check_page")).classes("w-full h-[36rem] border")
             ui.link(t("take.check_page"), page, new_tab=True)
 
 

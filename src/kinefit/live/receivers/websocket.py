@@ -19,10 +19,9 @@ from kinefit.exporters.report.figure import live_figure
 from kinefit.live.packets import PosePacket
 from kinefit.live.wishes import Answer
 from kinefit.serving.access import Access
-from kinefit.serving.policy import inline_policy
+from kinefit.serving.policy import APP_PAGES, inline_policy
 from kinefit.serving.server import Connection, Page, PageServer
 
-_APP = "http://localhost:* http://127.0.0.1:*"  # `kinefit app` shows the page in its own
 _MAX_WAITING_ANSWERS = 100  # a client that leaves more unread is disconnected
 Ask = Callable[[bytes, Answer], None]
 
@@ -166,7 +165,7 @@ _WAITING = '<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" cont
 def live_page(title: str, body: Body | None, up: str) -> Page:
     """Self-contained HTML page; without a body it reloads until there is one."""
     if body is None:
-        return Page(_WAITING.encode(), framed_by=_APP)
+        return Page(_WAITING.encode(), framed_by=APP_PAGES)
     report = resources.files("kinefit.exporters.report")
     own = resources.files("kinefit.live.receivers")
     style = (report / "page.css").read_text("utf-8") + (own / "page.css").read_text("utf-8")
@@ -177,4 +176,4 @@ def live_page(title: str, body: Body | None, up: str) -> Page:
         f'<h1>{escape(title)}</h1><p id="status">waiting</p>{live_figure(body, up)}<aside id="panel"></aside></main>'
         f"{''.join(f'<script>{script}</script>' for script in scripts)}</body></html>"
     )
-    return Page(html.encode(), policy=inline_policy(scripts, [style], "connect-src 'self'"), framed_by=_APP)
+    return Page(html.encode(), policy=inline_policy(scripts, [style], "connect-src 'self'"), framed_by=APP_PAGES)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -106,6 +108,8 @@ class Take:
         Whether images and videos that are made from the take's show no faces.
     cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines, surface_points, trackers : tuples
         Of entries; `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
+    digest : str
+        SHA-256 of the file's tables as they are written, without comments and spacing; "" for a take of no file.
     """
 
     path: Path
@@ -136,6 +140,7 @@ class Take:
     trackers: tuple[TrackerEntry, ...] = ()
     session: SessionEntry = field(default_factory=SessionEntry)
     hide_faces: bool = False
+    digest: str = ""
 
     @property
     def other_sensors(self) -> tuple[object, ...]:
@@ -164,6 +169,7 @@ def read_take(path: str | PathLike[str]) -> Take:
         raise FileError("no such take file", file=path, remedy="Check the path.") from error
     except (OSError, UnicodeDecodeError) as error:
         raise FileError(f"cannot be read ({error})", file=path, remedy="Give a text file in UTF-8.") from error
+    digest = hashlib.sha256(json.dumps(raw, sort_keys=True, default=str).encode()).hexdigest()
     _check_keys(raw, path)
     _rename(raw, path)
     for row in raw.get("depth", []):
@@ -188,6 +194,7 @@ def read_take(path: str | PathLike[str]) -> Take:
         pose=None if start.is_clicks_alone else content.start, clicks=start.clicks, click_sigma=start.click_sigma,
         size=head.size, person=head.person, session=content.session,
         surface_points=content.surface_points, trackers=content.tracker, hide_faces=head.hide_faces,
+        digest=digest,
     )  # fmt: skip
     check_take(take)
     return take
