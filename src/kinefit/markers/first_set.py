@@ -12,16 +12,13 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.bodies.body import Body
 from kinefit.bodies.marker_sets.files import LANDMARK_SPREAD, MarkerRecord, SetRecord, catalogue
-from kinefit.bodies.marker_sets.labels import bare, plain
+from kinefit.bodies.marker_sets.labels import bare, plain, side_pairs
 from kinefit.bodies.marker_sets.placement import placed
 from kinefit.errors import KinefitError
 from kinefit.identification.model.learn import learn_model, usable_markers
 from kinefit.markers.fit import fit_markers
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.observations import Markers
-
-PREFIXES = (("Right", "Left"), ("right", "left"), ("R", "L"), ("r", "l"), ("r", "L"), ("R", "l"))
-SUFFIXES = (("_R", "_L"), ("_r", "_l"), (".R", ".L"), (".r", ".l"), ("_Right", "_Left"), ("R", "L"))
 
 MAX_SPREAD = 2 * LANDMARK_SPREAD
 """[m] largest spread of a marker whose word places a label: words of wands and clusters do not."""
@@ -76,7 +73,7 @@ def first_set(markers: Markers, *, body: Body, name: str = "MY_SET") -> FirstSet
     """
     _, labels, _ = usable_markers(markers, None)
     labels = [bare(label) for label in labels]
-    pairs = sides(labels)
+    pairs = side_pairs(labels)
     words = known_words(labels, pairs)
     found = _fit_segments(markers, labels, pairs, words, body)
     if found is None:
@@ -87,21 +84,6 @@ def first_set(markers: Markers, *, body: Body, name: str = "MY_SET") -> FirstSet
         return FirstSet(_toml(name, segments, links, {}, {}), segments, (), tuple(pairs.items()))
     segments, links, places, at = found
     return FirstSet(_toml(name, segments, links, places, at), segments, tuple(places), tuple(pairs.items()))
-
-
-def sides(labels: Sequence[str]) -> dict[str, str]:
-    """Pairs of right and left labels that differ by their side only: a dictionary from right to left."""
-    known, out = set(labels), dict[str, str]()
-    for label in labels:
-        for right, left in PREFIXES:
-            image = left + label[len(right) :]
-            if label.startswith(right) and label not in out and image in known and image != label:
-                out[label] = image
-        for right, left in SUFFIXES:
-            image = label[: len(label) - len(right)] + left
-            if label.endswith(right) and label not in out and image in known and image != label:
-                out[label] = image
-    return out
 
 
 def known_words(labels: Sequence[str], pairs: dict[str, str]) -> dict[str, tuple[MarkerRecord, bool]]:
