@@ -23,6 +23,17 @@ from kinefit.observations import Markers
 MAX_SPREAD = 2 * LANDMARK_SPREAD
 """[m] largest spread of a marker whose word places a label: words of wands and clusters do not."""
 
+BONES = {  # landmark of the right side by parts of a word, the more special ones first
+    ("knee", "med"): "femoral_medial_epicondyle",
+    ("ank", "med"): "medial_malleolus", ("malleol", "med"): "medial_malleolus",
+    ("elb", "med"): "humeral_medial_epicondyle", ("wri", "uln"): "ulnar_styloid", ("wri", "med"): "ulnar_styloid",
+    ("asis",): "asis", ("psis",): "psis", ("acrom",): "acromion", ("should",): "acromion", ("wri",): "radial_styloid",
+    ("heel",): "calcaneus_posterior", ("calc",): "calcaneus_posterior", ("met", "1"): "metatarsal_phalanx_1",
+    ("met", "5"): "metatarsal_phalanx_5", ("mt", "1"): "metatarsal_phalanx_1", ("mt", "5"): "metatarsal_phalanx_5",
+    ("knee",): "femoral_lateral_epicondyle", ("ankle",): "lateral_malleolus", ("malleol",): "lateral_malleolus",
+    ("elbow",): "humeral_lateral_epicondyle", ("troch",): "trochanterion", ("asi",): "asis", ("psi",): "psis",
+}
+
 MIN_KNOWN_LABELS = 8
 MIN_SEGMENTS = 3
 """Labels with a known word, and their segments, that a body can be fitted to."""
@@ -103,8 +114,9 @@ def known_words(labels: Sequence[str], pairs: dict[str, str]) -> dict[str, tuple
                 out[label] = middle[plain(label)], False
             continue
         word = plain(_common_word(left.get(label, label), pairs))
-        if word in sided:
-            out[label] = sided[word], label in left
+        bone = next((bone for parts, bone in BONES.items() if all(part in word for part in parts)), None)
+        if word in sided or bone:
+            out[label] = sided.get(word) or MarkerRecord(landmark=f"r_{bone}", spread=MAX_SPREAD), label in left
     return out
 
 

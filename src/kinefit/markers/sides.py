@@ -88,12 +88,10 @@ def label_findings(
     trial = _trial(body, markers, placed)
     if trial is None or not trial.pairs:
         return tuple(notes)
-    if sides == "labelled":
-        return (*_exchanged_labels(trial), *notes)
     mirrored = replace(trial, x=trial.x * [1.0, 1.0, -1.0])
     ratio = float(np.median(trial.misfits / mirrored.misfits))
     if ratio > _MIN_MIRROR_RATIO and np.median(mirrored.misfits) < _MAX_MISFIT:
-        return _sides_fault(trial, mirrored, markers.up), *notes
+        return tuple(notes) if sides == "labelled" else (_sides_fault(trial, mirrored, markers.up), *notes)
     found = [*_exchanged_labels(trial)]
     if not found and 1.0 / ratio < _MIN_MIRROR_RATIO:
         text = f"Left and right are undecided: the {len(trial.points)} known labels fit their mirror image as well."
