@@ -1,8 +1,8 @@
 """Left and right of real marker takes, mirrored and exchanged: `python -m benchmarks.faults faults_sides`.
 
 Every labelled take of a person is checked by `label_findings`, the function behind `kinefit markers fit`, `track`,
-`check` and `markers audit`: as it is, mirrored, with left and right labels exchanged, with both at once, and with one
-pair exchanged in all its frames. Thresholds were chosen on the takes of `markers` (`SETTINGS`); the others are held out,
+`check` and `markers audit`: as it is, mirrored, with left and right labels exchanged, with both, and with one
+pair exchanged in all its frames. Thresholds were chosen on the takes of `SETTINGS`. The others are held out,
 and their figures are printed apart. All frames are given; the check looks at 24 of them.
 """
 
@@ -32,7 +32,7 @@ NEIGHBOURS = (  # of one side: knee and ankle, heel and toe, by the labels of se
     ("RKNE", "RANK"), ("LHEE", "LTOE"), ("r_knee", "r_ankle"), ("L_calc", "L_toe"), ("R.Knee", "R.Ankle"),
     ("R.Heel", "R.Toe"), ("RLEPI", "RLMAL"), ("RHEEL", "RTOE"),
 )  # fmt: skip
-LEGS = ("shank", "foot", "toes")  # segments of knees' far side and feet: where both are marked, the sides are decided
+LEGS = ("thigh", "shank", "foot")  # segments of knees and feet: where all are marked, the sides have to be decided
 
 
 def labelled(folders: tuple[str, ...], body: Body) -> Iterator[tuple[str, Markers]]:
@@ -74,13 +74,13 @@ def run() -> None:
     """Print how many faults are named, of the takes on which thresholds were chosen and of the others."""
     body = load_body("humanoid")
     pairs_each = amount(4, 1)
-    totals = {key: [] for key in ("mirrored", "exchanged", "clear", "false", "both", "pair")}
+    totals: dict[str, list[bool]] = {key: [] for key in ("mirrored", "exchanged", "clear", "false", "both", "pair")}
     for what, folders in (("chosen", SETTINGS), ("held out", HELD)):
         counts = {key: list[bool]() for key in totals}
         for k, (name, take) in enumerate(labelled(folders, body)):
             points = find_placement(body, take.names).points
             marked = {body.tree.segments[s] for s in points.segments}
-            clear = all(any(s.startswith(part) for s in marked) for part in ("thigh", "shank", "foot"))
+            clear = all(any(s.startswith(part) for s in marked) for part in LEGS)
             if name.endswith(MIRRORED):
                 take = mirrored(take)
             before = label_findings(body, take)
@@ -94,20 +94,17 @@ def run() -> None:
                     print(f"{name}: {key} passes")
             counts["both"].append(verdict(label_findings(body, exchanged(mirrored(take)))) == verdict(before))
             if not verdict(before):
-                named = [p for p in side_pairs(points.names).items()]
+                named = [*side_pairs(points.names).items()]
                 named = [named[i] for i in np.unique(np.linspace(0, len(named) - 1, pairs_each).astype(int))]
-                own = dict(zip(points.names, (n for n in points.names)))
-                for a, b in [*named, *(p for p in NEIGHBOURS if p[0] in own and p[1] in own)]:
-                    labels = {n.replace(" ", ""): n for n in take.names}
-                    if a not in labels or b not in labels:
-                        continue
+                for a, b in [p for p in (*named, *NEIGHBOURS) if {*p} <= {*take.names} and {*p} <= {*points.names}]:
                     found = label_findings(body, exchanged(take, (a, b)))
-                    hit = any(f.kind == "labels" and f.severity == "fault" and {a, b} <= {*f.text.split()} for f in found)
+                    faults = [f.text.split() for f in found if (f.kind, f.severity) == ("labels", "fault")]
+                    hit = any({a, b} <= {*words} for words in faults)
                     counts["pair"].append(hit)
                     if not hit:
                         print(f"{name}: {a} and {b} exchanged pass")
-        print(f"{what}: {len(counts['false'])} takes; " + ", ".join(
-            f"{key} {100 * np.mean(v):.1f} % of {len(v)}" for key, v in counts.items() if v))  # fmt: skip
+        each = [f"{key} {100 * np.mean(v):.1f} % of {len(v)}" for key, v in counts.items() if v]
+        print(f"{what}, {len(counts['false'])} takes: {', '.join(each)}", flush=True)
         for key, values in counts.items():
             totals[key] += values
     share = {key: 100.0 * float(np.mean(v)) if v else None for key, v in totals.items()}

@@ -13,6 +13,7 @@ from kinefit.exporters import write_markers
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
 
+_WORLD, _LABELS = "mirrored (left-handed)", "labels are exchanged"
 _STANFORD = "data__grf__Subject4__MarkerData__%s1.trc"
 
 
@@ -41,22 +42,22 @@ def _take(folder: Path, markers: Markers, name: str, extra: str = "") -> Path:
 
 def _mirrored_world(folder: Path) -> bool:
     code, text = _kinefit("markers", "fit", folder / "walk.trc", "--formats", "mot", "-o", folder.name + "-none")
-    return code == 2 and "mirrored (left-handed)" in text
+    return code == 2 and _WORLD in text
 
 
 def _sides_exchanged(folder: Path) -> bool:
     code, text = _kinefit("markers", "fit", folder / "walk.trc", "--formats", "mot", "-o", folder.name + "-none")
-    return code == 2 and "left and right labels are exchanged" in text
+    return code == 2 and _LABELS in text
 
 
-def _track(folder: Path, markers: Markers, name: str) -> bool:
+def _track(folder: Path, markers: Markers, name: str, words: str) -> bool:
     code, text = _kinefit("track", _take(folder, markers, name), "-o", folder / "out")
-    return code == 2 and "labels are exchanged" in text and name in text
+    return code == 2 and words in text and name in text
 
 
-def _check(folder: Path, markers: Markers, name: str) -> bool:
+def _check(folder: Path, markers: Markers, name: str, words: str) -> bool:
     code, text = _kinefit("check", _take(folder, markers, name), "--strict", "-o", folder / "check.html")
-    return code == 2 and "labels are exchanged" in text
+    return code == 2 and words in text
 
 
 def _audit(folder: Path, markers: Markers, words: str) -> bool:
@@ -77,11 +78,14 @@ CASES: dict[str, Callable[[Path], bool]] = {
     "markers-sides-exchanged-whole-body": _sides_exchanged,
 }
 SIBLINGS: dict[str, Callable[[Path], bool]] = {
-    "sides: mirrored squats as TRC, to track": lambda to: _track(to, mirrored(_part(_STANFORD % "squats")), "squats.trc"),
-    "sides: mirrored jump as C3D, to check": lambda to: _check(to, mirrored(_part(_STANFORD % "DJ"), 0), "jump.c3d"),
-    "sides: exchanged walk as C3D, to track": lambda to: _track(to, exchanged(_part(_STANFORD % "walking")), "walk.c3d"),
+    "sides: mirrored squats as TRC, to track": lambda to: _track(
+        to, mirrored(_part(_STANFORD % "squats")), "squats.trc", _WORLD),
+    "sides: mirrored jump as C3D, to check": lambda to: _check(
+        to, mirrored(_part(_STANFORD % "DJ"), 0), "jump.c3d", _WORLD),
+    "sides: exchanged walk as C3D, to track": lambda to: _track(
+        to, exchanged(_part(_STANFORD % "walking")), "walk.c3d", _LABELS),
     "sides: exchanged walk, to audit": lambda to: _audit(
-        to, exchanged(_part(_STANFORD % "walking")), "labels are exchanged"),
+        to, exchanged(_part(_STANFORD % "walking")), _LABELS),
     "sides: knees exchanged, to audit": lambda to: _audit(
         to, exchanged(_part(_STANFORD % "walking"), ("r_knee", "L_knee")), "r_knee and L_knee are exchanged"),
     "sides: heel and toe exchanged, to audit": lambda to: _audit(
