@@ -94,9 +94,11 @@ def run() -> None:
                     print(f"{name}: {key} passes")
             counts["both"].append(verdict(label_findings(body, exchanged(mirrored(take)))) == verdict(before))
             if not verdict(before):
-                named = [*side_pairs(points.names).items()]
+                share = np.isfinite(take.positions[..., 0]).mean(axis=0)
+                seen = {n for n, part in zip(take.names, share, strict=True) if part > 0.5}  # not those of a static trial
+                named = [p for p in side_pairs(points.names).items() if {*p} <= seen]
                 named = [named[i] for i in np.unique(np.linspace(0, len(named) - 1, pairs_each).astype(int))]
-                for a, b in [p for p in (*named, *NEIGHBOURS) if {*p} <= {*take.names} and {*p} <= {*points.names}]:
+                for a, b in [p for p in (*named, *NEIGHBOURS) if {*p} <= seen and {*p} <= {*points.names}]:
                     found = label_findings(body, exchanged(take, (a, b)))
                     faults = [f.text.split() for f in found if (f.kind, f.severity) == ("labels", "fault")]
                     hit = any({a, b} <= {*words} for words in faults)
@@ -107,10 +109,10 @@ def run() -> None:
         print(f"{what}, {len(counts['false'])} takes: {', '.join(each)}", flush=True)
         for key, values in counts.items():
             totals[key] += values
-    share = {key: 100.0 * float(np.mean(v)) if v else None for key, v in totals.items()}
-    figure("faults_sides_mirrored", share["mirrored"], "%", "== 100")
-    figure("faults_sides_exchanged", share["exchanged"], "%", "== 100")
-    figure("faults_sides_named", share["clear"], "%", "== 100")
+    shares = {key: 100.0 * float(np.mean(v)) if v else None for key, v in totals.items()}
+    figure("faults_sides_mirrored", shares["mirrored"], "%", "== 100")
+    figure("faults_sides_exchanged", shares["exchanged"], "%", "== 100")
+    figure("faults_sides_named", shares["clear"], "%", "== 100")
     figure("faults_sides_false", float(sum(totals["false"])) if totals["false"] else None, "takes", "== 0")
-    figure("faults_sides_both_silent", share["both"], "%", "== 100")
-    figure("faults_sides_pair", share["pair"], "%", "== 100")
+    figure("faults_sides_both_silent", shares["both"], "%", "== 100")
+    figure("faults_sides_pair", shares["pair"], "%", "== 100")

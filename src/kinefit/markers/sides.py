@@ -46,6 +46,7 @@ are exchanged (markers of the sternum, 5 cm apart), at most -3 where they are ri
 _MIN_OTHER_GAIN = 30.0
 """The same of two other labels: 47 and more of exchanged heel and toe, knee and ankle, at most 19 where they are right
 (markers about the shoulder, whose places laboratories choose)."""
+_MIN_GROUP_MISFIT = 1.4  # sigmas, from which all labels of the legs, or of the rest, are tried
 _MIN_FRAME_SHARE = 0.8  # of the frames, in which the exchange is better
 _MAX_PAIRS = 4  # that are named
 _MAX_TRIALS = 6  # exchanges that are fitted, those with most gain at the poses found
@@ -208,6 +209,7 @@ def _exchanged_labels(trial: _Trial) -> Iterator[Finding]:
     segments = [trial.body.tree.segments[s] for s in trial.points.segments]
     legs = [p for p in trial.pairs if segments[p[0]].startswith(_LEGS)]
     groups = {"legs": legs, "upper body": [p for p in trial.pairs if p not in legs]}
+    groups = groups if np.median(trial.misfits) > _MIN_GROUP_MISFIT else {}
     for _ in range(_MAX_PAIRS):
         names = {f"Left and right labels of the {what} are": pairs for what, pairs in groups.items() if len(pairs) > 1}
         names |= {f"{trial.points.names[a]} and {trial.points.names[b]} are": [(a, b)] for a, b in _promising(trial)}

@@ -159,7 +159,7 @@ class Loaded:
 
 def load_leniently(take: Take) -> Loaded:
     """Read a take; unreadable parts are skipped or guessed, each with a finding."""
-    if take.calibration is None and not take.depth:
+    if take.calibration is None and not take.depth and (take.cameras or not take.markers):
         return Loaded(
             take,
             None,
