@@ -95,7 +95,7 @@ def run() -> None:
             counts["both"].append(verdict(label_findings(body, exchanged(mirrored(take)))) == verdict(before))
             if not verdict(before):
                 share = np.isfinite(take.positions[..., 0]).mean(axis=0)
-                seen = {n for n, part in zip(take.names, share, strict=True) if part > 0.5}  # not those of a static trial
+                seen = {n for n, part in zip(take.names, share, strict=True) if part > 0.5}
                 named = [p for p in side_pairs(points.names).items() if {*p} <= seen]
                 named = [named[i] for i in np.unique(np.linspace(0, len(named) - 1, pairs_each).astype(int))]
                 for a, b in [p for p in (*named, *NEIGHBOURS) if {*p} <= seen and {*p} <= {*points.names}]:
