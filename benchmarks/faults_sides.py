@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.figures import amount, data, figure
 from kinefit.bodies import Body, load_body
-from kinefit.bodies.marker_sets import find_placement, side_pairs
+from kinefit.bodies.marker_sets import find_placement, matched, side_pairs
 from kinefit.errors import KinefitError
 from kinefit.findings import Finding
 from kinefit.markers.people import split_people
@@ -94,12 +94,13 @@ def run() -> None:
                     print(f"{name}: {key} passes")
             counts["both"].append(verdict(label_findings(body, exchanged(mirrored(take)))) == verdict(before))
             if not verdict(before):
-                share = np.isfinite(take.positions[..., 0]).mean(axis=0)
-                seen = {n for n, part in zip(take.names, share, strict=True) if part > 0.5}
-                named = [p for p in side_pairs(points.names).items() if {*p} <= seen]
-                named = [named[i] for i in np.unique(np.linspace(0, len(named) - 1, pairs_each).astype(int))]
-                for a, b in [p for p in (*named, *NEIGHBOURS) if {*p} <= seen and {*p} <= {*points.names}]:
-                    found = label_findings(body, exchanged(take, (a, b)))
+                share = np.isfinite(take.positions[..., 0]).mean(axis=0)  # some labels are of a static trial alone
+                known = zip(matched(take.names, points.names), take.names, share, strict=True)
+                own = {label: name for label, name, part in known if label and part > 0.5}
+                pairs = [p for p in side_pairs(points.names).items() if {*p} <= {*own}]
+                few = {pairs[i] for i in np.linspace(0, len(pairs) - 1, min(pairs_each, len(pairs))).astype(int)}
+                for a, b in sorted(few | {p for p in NEIGHBOURS if {*p} <= {*own}}):
+                    found = label_findings(body, exchanged(take, (own[a], own[b])))
                     faults = [f.text.split() for f in found if (f.kind, f.severity) == ("labels", "fault")]
                     hit = any({a, b} <= {*words} for words in faults)
                     counts["pair"].append(hit)

@@ -34,15 +34,15 @@ _MAX_SQUARE = 100.0  # of a marker's distance in sigmas: a wrong label has no fu
 _MIN_MIRROR_RATIO = 1.5
 """Ratio of the misfits of a take and of its mirror image from which one of them is right.
 
-The right one's ratio is 2.4 to 4.6 in the labelled takes of `markers` (walks, squats, jumps, dances, a sprint), on
-which this was chosen, and 2.6 to 6.3 in the others (`benchmarks.faults_sides`); 1.0 where labels say nothing of sides.
+The right one's ratio is 2.4 to 5.0 in the labelled takes of `markers` (walks, squats, jumps, dances, a sprint), on
+which this was chosen, and 2.7 to 6.3 in the others (`benchmarks.faults_sides`); 1.0 where labels say nothing of sides.
 """
 _MAX_MISFIT = 3.0  # sigmas of the better fit, the root mean square: 0.1 to 2.0 where labels are right
 _MIN_ONE_SIDED_GAIN = 4.0  # sum of squares by which markers of one side decide: one of 4 cm sigma, 16 cm off, has 12
 
 _MIN_PAIR_GAIN = 3.0
 """Sum of squares of a frame by which the exchange of a left and a right label lowers the misfit: at least 4 where they
-are exchanged (markers of the sternum, 5 cm apart), at most -3 where they are right."""
+are exchanged (markers of the sternum, 5 cm apart), at most -4 where they are right."""
 _MIN_OTHER_GAIN = 30.0
 """The same of two other labels: 47 and more of exchanged heel and toe, knee and ankle, at most 19 where they are right
 (markers about the shoulder, whose places laboratories choose)."""
