@@ -20,6 +20,9 @@ FINDINGS = "findings"
 CLOCKS = "clocks"
 """Key of `Motion.provenance`: sentences about cameras whose clocks are off, with what to write."""
 
+LABELS = "labels"
+"""Key of `Motion.provenance`: sentences about marker labels that were ignored, or that do not decide left and right."""
+
 STATURE = "stature"
 """Key of `Motion.provenance`: sentences about a person who is as tall as few adults are, with what to do."""
 
@@ -55,6 +58,9 @@ class Finding:
     confidence: str = ""
     remedy: str = ""
     keys: tuple[tuple[str, str], ...] = ()
+
+    def __str__(self) -> str:
+        return " ".join(part for part in (self.text, self.confidence, self.remedy) if part)
 
 
 def faults_of(findings: Iterable[Finding]) -> tuple[Finding, ...]:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from kinefit import load_body
-from kinefit.bodies.marker_sets import find_marker_set, load_marker_set
+from kinefit.bodies.marker_sets import find_marker_set, load_marker_set, side_pairs
 from kinefit.identification.model.learn import learn_model
-from kinefit.markers.first_set import first_set, known_words, sides
+from kinefit.markers.first_set import first_set, known_words
 from kinefit.readers.markers import read_markers
 
 BODY = load_body("humanoid")
@@ -30,12 +30,12 @@ def walk(data_dir):
     ],
 )
 def test_right_labels_find_their_left_ones(labels, pairs):
-    assert sides(labels) == pairs
+    assert side_pairs(labels) == pairs
 
 
 def test_words_of_the_catalogue_are_known_on_either_side():
     labels = ["RASI", "LASI", "Knee_R", "Knee_L", "C7", "Q9"]
-    words = known_words(labels, sides(labels))
+    words = known_words(labels, side_pairs(labels))
     assert set(words) >= {"RASI", "LASI", "Knee_R", "Knee_L", "C7"} and "Q9" not in words
     assert words["RASI"][0] == words["LASI"][0] and (words["RASI"][1], words["LASI"][1]) == (False, True)
     assert words["RASI"][0].landmark == "r_asis"

@@ -142,7 +142,7 @@ def track_person(
     """
     from kinefit.batch.report import provenance, write_track_report
     from kinefit.batch.viewed import OUTDATED, inputs_entry, is_outdated
-    from kinefit.findings import CLOCKS, STATURE
+    from kinefit.findings import CLOCKS, LABELS, STATURE
     from kinefit.multiview import followed
     from kinefit.tracking import cameras
     from kinefit.tracking.agreement import sentences
@@ -171,7 +171,7 @@ def track_person(
             notes += [*seen.notes, *sentences(motion.provenance["contradictions"])]
             notes += followed.sentences(motion.provenance, asked=take.person is not None)
             notes += cameras.sentences(motion.provenance, settings_of(take).camera_errors)
-            notes += motion.provenance.get(CLOCKS, ())
+            notes += [*motion.provenance.get(CLOCKS, ()), *motion.provenance.get(LABELS, ())]
             notes += [*motion.provenance.get(STATURE, ()), *floor_sentences(motion.provenance)]
         except TrackingInterrupted as stopped:
             motion, total = stopped.motion, stopped.total

@@ -13,7 +13,7 @@ from kinefit.diagnostics.images import fit_image
 from kinefit.diagnostics.keypoints import Check, check_keypoints
 from kinefit.diagnostics.person import size_findings
 from kinefit.errors import KinefitError
-from kinefit.findings import CLOCKS, FINDINGS, INVERTED, STATURE, Finding, as_records, faults_of
+from kinefit.findings import CLOCKS, FINDINGS, INVERTED, LABELS, STATURE, Finding, as_records, faults_of
 from kinefit.motion import UP_AXES, Motion
 from kinefit.observations import Keypoints
 from kinefit.readers.guess.views import nearest_axis
@@ -101,18 +101,19 @@ def motion_findings(motion: Motion, height: float | None) -> tuple[Finding, ...]
 
 
 def with_findings(motion: Motion, findings: Sequence[Finding], seen: Observations, height: float | None) -> Motion:
-    """Add faults, clock errors and an implausible stature to a motion's `provenance`.
+    """Add faults, clock errors, notes on labels and an implausible stature to a motion's `provenance`.
 
     With metric sensors the faults include those of `motion_findings`.
 
     height [m]: stature as the take states it, or None.
     """
     late = [f"{found.text} {found.remedy}" for found in findings if found.severity == "doubt"]
+    notes = [str(found) for found in findings if found.severity == "note"]
     findings = faults_of(findings)
     if len({k.camera for k in seen.keypoints}) < 2 and (seen.markers or seen.depth or seen.clouds):
         inverted = inverted_findings(motion.provenance, motion.up)
         findings = [*findings, *motion_findings(motion, height), *inverted]
-    entries: dict[str, Any] = {CLOCKS: late} if late else {}
+    entries: dict[str, Any] = {key: texts for key, texts in ((CLOCKS, late), (LABELS, notes)) if texts}
     sizes = size_findings(motion.body.stature, height) if motion.body.stature and height is None else []
     if any(f.severity == "doubt" for f in sizes) and not any(f.kind == "scale" for f in findings):
         entries[STATURE] = [f"{f.text} {f.remedy}" for f in sizes]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.bodies.body import Body
 from kinefit.bodies.marker_sets.files import LANDMARK_SPREAD, MarkerRecord, SetRecord, catalogue
-from kinefit.bodies.marker_sets.labels import bare, plain
+from kinefit.bodies.marker_sets.labels import bare, plain, side_pairs
 from kinefit.bodies.marker_sets.placement import placed
 from kinefit.errors import KinefitError
 from kinefit.identification.model.learn import learn_model, usable_markers
@@ -20,11 +20,19 @@ from kinefit.markers.fit import fit_markers
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.observations import Markers
 
-PREFIXES = (("Right", "Left"), ("right", "left"), ("R", "L"), ("r", "l"), ("r", "L"), ("R", "l"))
-SUFFIXES = (("_R", "_L"), ("_r", "_l"), (".R", ".L"), (".r", ".l"), ("_Right", "_Left"), ("R", "L"))
-
 MAX_SPREAD = 2 * LANDMARK_SPREAD
 """[m] largest spread of a marker whose word places a label: words of wands and clusters do not."""
+
+BONES = {  # landmark of the right side by parts of a word, the more special ones first
+    ("knee", "med"): "femoral_medial_epicondyle",
+    ("ank", "med"): "medial_malleolus", ("malleol", "med"): "medial_malleolus",
+    ("elb", "med"): "humeral_medial_epicondyle", ("wri", "uln"): "ulnar_styloid", ("wri", "med"): "ulnar_styloid",
+    ("asis",): "asis", ("psis",): "psis", ("acrom",): "acromion", ("should",): "acromion", ("wri",): "radial_styloid",
+    ("heel",): "calcaneus_posterior", ("calc",): "calcaneus_posterior", ("met", "1"): "metatarsal_phalanx_1",
+    ("met", "5"): "metatarsal_phalanx_5", ("mt", "1"): "metatarsal_phalanx_1", ("mt", "5"): "metatarsal_phalanx_5",
+    ("knee",): "femoral_lateral_epicondyle", ("ankle",): "lateral_malleolus", ("malleol",): "lateral_malleolus",
+    ("elbow",): "humeral_lateral_epicondyle", ("troch",): "trochanterion", ("asi",): "asis", ("psi",): "psis",
+}
 
 MIN_KNOWN_LABELS = 8
 MIN_SEGMENTS = 3
@@ -76,7 +84,7 @@ def first_set(markers: Markers, *, body: Body, name: str = "MY_SET") -> FirstSet
     """
     _, labels, _ = usable_markers(markers, None)
     labels = [bare(label) for label in labels]
-    pairs = sides(labels)
+    pairs = side_pairs(labels)
     words = known_words(labels, pairs)
     found = _fit_segments(markers, labels, pairs, words, body)
     if found is None:
@@ -87,21 +95,6 @@ def first_set(markers: Markers, *, body: Body, name: str = "MY_SET") -> FirstSet
         return FirstSet(_toml(name, segments, links, {}, {}), segments, (), tuple(pairs.items()))
     segments, links, places, at = found
     return FirstSet(_toml(name, segments, links, places, at), segments, tuple(places), tuple(pairs.items()))
-
-
-def sides(labels: Sequence[str]) -> dict[str, str]:
-    """Pairs of right and left labels that differ by their side only: a dictionary from right to left."""
-    known, out = set(labels), dict[str, str]()
-    for label in labels:
-        for right, left in PREFIXES:
-            image = left + label[len(right) :]
-            if label.startswith(right) and label not in out and image in known and image != label:
-                out[label] = image
-        for right, left in SUFFIXES:
-            image = label[: len(label) - len(right)] + left
-            if label.endswith(right) and label not in out and image in known and image != label:
-                out[label] = image
-    return out
 
 
 def known_words(labels: Sequence[str], pairs: dict[str, str]) -> dict[str, tuple[MarkerRecord, bool]]:
@@ -121,8 +114,9 @@ def known_words(labels: Sequence[str], pairs: dict[str, str]) -> dict[str, tuple
                 out[label] = middle[plain(label)], False
             continue
         word = plain(_common_word(left.get(label, label), pairs))
-        if word in sided:
-            out[label] = sided[word], label in left
+        bone = next((bone for parts, bone in BONES.items() if all(part in word for part in parts)), None)
+        if word in sided or bone:
+            out[label] = sided.get(word) or MarkerRecord(landmark=f"r_{bone}", spread=MAX_SPREAD), label in left
     return out
 
 

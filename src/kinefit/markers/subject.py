@@ -128,7 +128,7 @@ def fit_marker_subject(
     visible = np.isfinite(x).all(axis=2)
     placed, x, visible = _visible_markers(placed, x, visible)
     known = height / body.stature if height and body.stature else None
-    size = known if known is not None else _first_size(body, placed, x)
+    size = known if known is not None else first_size(body, placed, x)
     generic = replace(body, marker_sets={placed.name: placed.points}, surfaces=(), skin=None)
     lengths, groups = SegmentScales(generic, known, size), len(body.scale_groups)
     sigma = floor = np.hypot(_MIN_SIGMA, _SLIDING_SHARE * placed.spread)
@@ -178,7 +178,7 @@ def _visible_markers(placed: MarkerPlacement, x: NDArray, seen: NDArray) -> tupl
     return placed.select(placed.points.names[k] for k in np.flatnonzero(keep)), x[:, keep], seen[:, keep]
 
 
-def _first_size(body: Body, placed: MarkerPlacement, x: NDArray) -> float:
+def first_size(body: Body, placed: MarkerPlacement, x: NDArray) -> float:
     """Size of the subject relative to the generic body, from distances that hardly depend on posture."""
     rng, tree = np.random.default_rng(0), body.tree
     away = 0.5 * tree.spread * rng.normal(size=(_RANDOM_POSTURES, len(tree.usual)))

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.marker_sets.files import LANDMARK_SPREAD, MarkerRecord, SetRecord, find_record, set_names
-from kinefit.bodies.marker_sets.labels import matched
+from kinefit.bodies.marker_sets.files import LANDMARK_SPREAD, MarkerRecord, SetRecord, catalogue, find_record, set_names
+from kinefit.bodies.marker_sets.labels import matched, plain
 from kinefit.bodies.marker_sets.sets import MIN_COMMON_LABELS
 from kinefit.errors import FileError, ObservationError
 
@@ -80,17 +80,18 @@ def find_placement(
     Raises
     ------
     ObservationError
-        Fewer than four labels match the set, or any set.
+        Fewer than four labels match the set, or any set; or the default explains neither half of the labels nor half of
+        its own.
     """
     labels = tuple(labels)
     names = [marker_set] if marker_set else [*body.marker_sets, *placed_set_names()]
-    best: MarkerPlacement | None = None
+    best, size = None, 0
     for name in names:
         whole = placement(body, name)
         known = set(matched(labels, whole.points.names))
         shared = whole.select(n for n in whole.points.names if n in known)
         if best is None or len(shared.points) > len(best.points):
-            best = shared
+            best, size = shared, len(whole.points)
     if (best is None or not len(best.points)) and labels and all(label.startswith("*") for label in labels):
         raise ObservationError(
             f"{len(labels)} trajectories without names",
@@ -105,7 +106,23 @@ def find_placement(
             remedy=f"Sets: {', '.join(str(n) for n in [*body.marker_sets, *placed_set_names()])}; or a file (--set): "
             "`kinefit markers set` writes a first one.",
         )
+    ignored = ignored_labels(best, labels)
+    if not marker_set and len(best.points) < min(len(ignored), (size + 1) // 2):
+        raise ObservationError(
+            f"no marker set explains most of the labels: {best.name} knows {len(best.points)} of "
+            f"{len(best.points) + len(ignored)}, not {_listed(ignored)}",
+            remedy="`kinefit markers set` writes a set for these labels (then --set FILE); "
+            f"or fit the few that are known (--set {best.name}; in a take: set).",
+        )
     return best
+
+
+def ignored_labels(placed: MarkerPlacement, labels: Iterable[str]) -> tuple[str, ...]:
+    """Labels of a recording that a set does not place: without computed points, and points without names ("*1")."""
+    known = catalogue().get(placed.name)
+    computed = set() if known is None else {plain(n) for c in known.computed for n in (c, known.mirror(c) or c)}
+    found = zip(labels, matched(labels, placed.points.names))
+    return tuple(n for n, own in found if own is None and not n.startswith("*") and plain(n) not in computed)
 
 
 def known_set(body: Body, labels: Iterable[str], marker_set: str | None = None) -> str:

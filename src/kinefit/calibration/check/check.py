@@ -32,7 +32,7 @@ from kinefit.readers.take.load import Observations, load_observations
 from kinefit.readers.take.pictures import TakePictures
 from kinefit.subject.subject import Subject
 from kinefit.tracking.sizing import SizedPerson, sized_by_depth
-from kinefit.tracking.takes.take_recording import recording_of
+from kinefit.tracking.takes.take_recording import label_findings_of, recording_of
 
 _DEFAULT_PERSON = "moving"  # of several people: a standing one covers little of the volume, and no clock offsets
 
@@ -62,9 +62,11 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
         found = (*loaded.findings, *covered, *noise_findings(loaded.take, seen.depth), *noted)
         loaded = replace(loaded, observations=seen, findings=found)
     if seen is None or seen.rig is None or len({k.camera for k in seen.keypoints}) < 2:
-        missing = list(loaded.findings)
+        missing = [*loaded.findings, *_of_labels(loaded.take, seen)]
         if seen is not None and seen.depth and not (take.cameras or take.markers):
             missing += _of_depth_alone(loaded.take, seen)
+        elif seen is not None and take.markers and not take.cameras:
+            missing.append(Finding("note", "load", "Markers alone: their labels are checked, and nothing else."))
         elif seen is not None:
             text = (
                 f"Keypoints of {len({k.camera for k in seen.keypoints})} camera(s): a check needs those of two or more."
@@ -79,7 +81,8 @@ def check_take(take: Take | str | PathLike[str], *, progress: Progress | None = 
     with TakePictures(loaded.take, seen) as pictures:
         person = follow(rig, seen.keypoints, take.person or _DEFAULT_PERSON, images=pictures)
     seen = replace(seen, keypoints=person.keypoints)
-    begun = Check(take.name, (*loaded.findings, *_others(person, take.person is not None)), loaded.take, seen)
+    known = (*loaded.findings, *_of_labels(loaded.take, seen))
+    begun = Check(take.name, (*known, *_others(person, take.person is not None)), loaded.take, seen)
     check = check_keypoints(
         rig.select(tuple(n for n in rig.names if n in named)), seen.keypoints, body=take.body, up=take.up,
         height=take.height, begun=begun, progress=progress,
@@ -94,6 +97,13 @@ def _others(person: PersonKeypoints, asked: bool) -> list[Finding]:
     why = "" if asked else ", who moves most and so shows the cameras' errors best"
     text = f"{len(person.people)} people are in view; the check is by person {person.number}{why}."
     return [Finding("note", "people", text, remedy="For another person, write person = 2 (or its number) into [take].")]
+
+
+def _of_labels(take: Take, seen: Observations | None) -> tuple[Finding, ...]:
+    """Findings of the labels of the take's markers; those without names, by its models, are not looked at."""
+    if seen is None or not take.markers or any(entry.model for entry in take.markers):
+        return ()
+    return label_findings_of(take, seen, load_body(take.body))
 
 
 def _of_depth_alone(take: Take, seen: Observations) -> list[Finding]:
@@ -150,7 +160,7 @@ class Loaded:
 
 def load_leniently(take: Take) -> Loaded:
     """Read a take; unreadable parts are skipped or guessed, each with a finding."""
-    if take.calibration is None and not take.depth:
+    if take.calibration is None and not take.depth and (take.cameras or not take.markers):
         return Loaded(
             take,
             None,

@@ -10,14 +10,16 @@ import numpy as np
 
 from kinefit.batch import results
 from kinefit.bodies import Body, PointSet, load_body
-from kinefit.bodies.marker_sets import matched
+from kinefit.bodies.marker_sets import matched, read_sides
 from kinefit.cli import _results
 from kinefit.cli._screen import Step
 from kinefit.cli.markers._name import read_file
-from kinefit.errors import ExportError
+from kinefit.errors import ExportError, located
 from kinefit.exporters.skeletons.common import plain_names
+from kinefit.findings import FINDINGS, Finding, as_records, faults_of
 from kinefit.markers.subject import MarkerSubject
 from kinefit.motion import Motion, rotation_between_up
+from kinefit.observations import Markers
 
 FORMATS = ("motion", "mot", "osim", "trc", "bvh", "glb", "markers")
 """Formats that are written where none are named."""
@@ -39,6 +41,7 @@ class MarkerFitOptions:
     height : float [m], optional, of the subject, barefoot.
     up : str, optional, vertical axis of the world where the file does not state it; default: found from the markers.
     limits : bool, whether joints stay within their ranges.
+    sides : str, optional, one of `bodies.marker_sets.SIDES`: how sides are read; default: as labelled, checked.
     """
 
     body: str | Path = "humanoid"
@@ -47,11 +50,12 @@ class MarkerFitOptions:
     height: float | None = None
     up: str | None = None
     limits: bool = True
+    sides: str | None = None
 
 
 def fit_file(
     path: Path, out: Path | None = None, options: MarkerFitOptions | None = None, *, unit: str | None = None,
-    formats: Iterable[str] = FORMATS, step: Step | None = None,
+    formats: Iterable[str] = FORMATS, step: Step | None = None, notes: list[Finding] | None = None,
 ) -> dict[str, tuple[Motion, dict[str, Path]]]:  # fmt: skip
     """Fit a file of labelled markers and write what was found.
 
@@ -62,6 +66,7 @@ def fit_file(
     unit : str, optional, of files that state none or a wrong one.
     formats : names of `results.NAMES`, and "markers" for the measured ones as OpenSim takes them.
     step : (what, done, total) -> None, called as the fit advances.
+    notes : filled with what is to be said about labels, once for each person.
 
     Returns
     -------
@@ -70,11 +75,13 @@ def fit_file(
     Raises
     ------
     KinefitError
-        A file cannot be read or written, too few labels are known, or no frame shows enough: see `fit_markers`.
+        A file cannot be read or written, too few labels are known, no frame shows enough (see `fit_markers`), or left
+        and right are wrong (see `label_findings`).
     """
+    from kinefit.diagnostics.quick import motion_findings
     from kinefit.exporters import write_markers, write_osim, write_trc
     from kinefit.markers.fit import fit_markers
-    from kinefit.markers.people import split_people
+    from kinefit.markers.sides import label_findings, refuse_wrong_sides
     from kinefit.markers.subject import fit_marker_subject
 
     step, formats, options = step or (lambda what, done, total: None), tuple(formats), options or MarkerFitOptions()
@@ -84,11 +91,17 @@ def fit_file(
         raise ExportError(_results.no_format(unknown[0], (*results.NAMES, "markers")), remedy="Correct --formats.")
     _results.check_folder(folder)
     generic = load_body(options.body)
-    people = split_people(read_file(path, unit))
-    trials = split_people(read_file(options.static, unit)) if options.static else {}
+    people = read_people(path, unit, options.sides)
+    trials = read_people(options.static, unit, options.sides) if options.static else {}
     found: dict[str, tuple[Motion, dict[str, Path]]] = {}
     for person, markers in people.items():
         trial = trials.get(person) or (next(iter(trials.values())) if len(trials) == 1 == len(people) else None)
+        found_labels: tuple[Finding, ...] = ()
+        for file, trial_markers in ((options.static, trial), (path, markers)):
+            if trial_markers is not None:
+                with located(file, person or None):
+                    found_labels = label_findings(generic, trial_markers, options.marker_set, sides=options.sides)
+                    refuse_wrong_sides(found_labels)
         subject = fit_marker_subject(
             generic, [markers] if trial is None else [trial, markers], options.marker_set, height=options.height,
             progress=step,
@@ -96,6 +109,10 @@ def fit_file(
         motion = fit_markers(
             subject.body, markers, subject.marker_set, sigma=subject.sigma, limits=options.limits, up=options.up
         )
+        findings = [*faults_of(found_labels), *motion_findings(motion, options.height)]
+        motion = replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings)})
+        if notes is not None:
+            notes += [*findings, *(f for f in found_labels if f.severity == "note")]
         files: dict[str, Path] = {}
         own = folder / person if len(people) > 1 else folder
         worn = worn_body(subject, markers.names)
@@ -135,3 +152,15 @@ def worn_body(subject: MarkerSubject, labels: Iterable[str]) -> Body:
     return replace(
         body, landmarks=PointSet((*found, *kept.names), np.concatenate(segments), np.concatenate(places))
     )  # fmt: skip
+
+
+def read_people(file: Path, unit: str | None, sides: str | None = None) -> dict[str, Markers]:
+    """The people of a file, by the prefix of their labels, with left and right as `sides` states (see `read_sides`)."""
+    from kinefit.markers.people import split_people
+
+    markers = read_file(file, unit)
+    if sides:
+        with located(file):
+            names, positions = read_sides(markers.names, markers.positions, sides)
+        markers = replace(markers, names=names, positions=positions)
+    return split_people(markers)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -14,7 +15,8 @@ from kinefit.bodies import load_body
 from kinefit.bodies.marker_sets import bare, find_marker_set, load_marker_set
 from kinefit.cli._results import check_file
 from kinefit.cli._screen import Step, note
-from kinefit.errors import ObservationError
+from kinefit.errors import KinefitError, ObservationError
+from kinefit.findings import Finding
 from kinefit.identification.model.files import load_model
 from kinefit.identification.model.from_frame import model_from_frame
 from kinefit.identification.model.gate import TrainingFinding, training_gate
@@ -184,3 +186,15 @@ def _doubts(found: dict[str, TakeIdentification], markers: Markers, many: bool) 
             f"{times[d.last]:.3f},{label},{d.kind},{d.confidence:.3f}"
         )
     return "\n".join(lines) + "\n"
+
+
+def check_labels(markers: Markers, marker_set: str | None) -> list[Finding]:
+    """Check sides and labels of every person of a take on the humanoid, where it has the labels (`label_findings`)."""
+    from kinefit.markers.people import split_people
+    from kinefit.markers.sides import label_findings
+
+    found: list[Finding] = []
+    for person in split_people(markers).values():
+        with suppress(KinefitError):  # labels of a model or of a set without places on a body
+            found += label_findings(load_body("humanoid"), person, marker_set)
+    return found

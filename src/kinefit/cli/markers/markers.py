@@ -11,6 +11,7 @@ from kinefit.cli import _results, _screen
 from kinefit.cli._group import CommandGroup
 
 if TYPE_CHECKING:
+    from kinefit.findings import Finding
     from kinefit.identification.take.takes import TakeIdentification
     from kinefit.observations import Markers
 
@@ -182,13 +183,16 @@ Examples:
 @click.option("--set", "marker_set", metavar="NAME", help="Marker set.  [default: the set that has the labels]")
 @click.option("--height", type=click.FloatRange(0.5, 2.6), metavar="M", help="Height of the subject, barefoot [m].")
 @click.option("--up", type=click.Choice(["x", "y", "z"]), help="Vertical axis.  [default: estimated]")
+@click.option("--sides", type=click.Choice(["labelled", "exchanged", "mirrored-x", "mirrored-y", "mirrored-z"]),
+              help="How left and right are read: exchanged labels, a world with one axis negated, or as labelled "
+              "without a check.  [default: as labelled, checked]")
 @click.option("--limits/--no-limits", default=True, show_default=True, help="Keep joint angles within their limits.")
 @click.option("--formats", metavar="LIST", help="Formats to write.  [default: motion,mot,osim,trc,bvh,glb,markers]")
 @_unit
 @_screen.verbose_option
 def fit(
     take: Path, out: Path | None, subjects: tuple[Path, ...], static: Path | None, body: str, marker_set: str | None,
-    height: float | None, up: str | None, limits: bool, formats: str | None, unit: str | None,
+    height: float | None, up: str | None, sides: str | None, limits: bool, formats: str | None, unit: str | None,
 ) -> None:  # fmt: skip
     """Fit a body to markers: size and marker offsets from all frames, then joint angles of each frame."""
     from kinefit.cli._summary import print_summary
@@ -205,10 +209,13 @@ def fit(
             labelled, named, files = identify_file(take, list(subjects), target, unit=unit, step=step)
             source, unit = files["markers"], None
         known = Path(body) if Path(body).suffix else body
-        options = MarkerFitOptions(known, static, marker_set, height, up, limits)
-        found = fit_file(source, out, options, unit=unit, formats=chosen, step=step)
+        options = MarkerFitOptions(known, static, marker_set, height, up, limits, sides)
+        notes: list[Finding] = []
+        found = fit_file(source, out, options, unit=unit, formats=chosen, step=step, notes=notes)
     if subjects:
         _tell(labelled, named)
+    for note in notes:
+        _screen.tell_finding(note)
     for motion, _ in found.values():
         print_summary(motion, points=_screen.is_verbose())
     _screen.say("\nWritten:")
@@ -233,9 +240,9 @@ def audit(
     ctx: click.Context, takes: tuple[Path, ...], subject: Path | None, marker_set: str | None, strict: bool,
     unit: str | None,
 ) -> None:  # fmt: skip
-    """Find swapped labels, and markers off their segment, in labelled takes."""
+    """Find swapped labels, exchanged sides, a mirrored world, and markers off their segment, in labelled takes."""
     from kinefit.bodies.marker_sets import load_marker_set
-    from kinefit.cli.markers._name import read_file
+    from kinefit.cli.markers._name import check_labels, read_file
     from kinefit.identification.audit.audit import audit_take
     from kinefit.identification.model.files import load_model
 
@@ -243,10 +250,13 @@ def audit(
     known = load_marker_set(marker_set) if marker_set else None
     wrong = False
     for take in takes:
-        findings = audit_take(read_file(take, unit), model=model, marker_set=known)
-        wrong = wrong or any(f.kind in ("swapped", "throughout") for f in findings)
-        _screen.say(f"{take}: {'no wrong labels found' if not findings else ''}".rstrip())
-        for f in findings:
+        markers = read_file(take, unit)
+        findings = audit_take(markers, model=model, marker_set=known)
+        labels = check_labels(markers, marker_set)
+        faults = [f for f in labels if f.severity == "fault"]
+        wrong = wrong or bool(faults) or any(f.kind in ("swapped", "throughout") for f in findings)
+        _screen.say(f"{take}: {'no wrong labels found' if not (findings or faults) else ''}".rstrip())
+        for f in (*labels, *findings):
             _screen.say(f"  {f}")
     if strict and wrong:
         ctx.exit(2)

@@ -165,6 +165,7 @@ class MarkersEntry(_PlacedEntry, frozen=True, kw_only=True):
 
     unit: str | None = None  # where the file does not state it
     set: str | None = None  # the body's marker set that its labels belong to; default: the one that fits
+    sides: Literal["labelled", "exchanged", "mirrored-x", "mirrored-y", "mirrored-z"] | None = None  # None: checked
     model: Path | None = None  # of the subject, for markers without names; default: they have names
 
 

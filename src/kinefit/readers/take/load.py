@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
+from kinefit.bodies.marker_sets import read_sides
 from kinefit.errors import ObservationError, TakeError, command
 from kinefit.geometry import se3
 from kinefit.geometry.camera import ImageFrame, Rig
@@ -318,6 +319,9 @@ def _read_keypoints(
 def _read_markers(entry: MarkersEntry) -> Markers:
     """A marker recording in the take's world."""
     markers = read_markers(entry.file, unit=entry.unit)
+    if entry.sides:
+        names, positions = read_sides(markers.names, markers.positions, entry.sides)
+        markers = replace(markers, names=names, positions=positions)
     if not (any(entry.shift) or any(entry.turn)):
         return markers
     up = markers.up if max(abs(v) for v in entry.turn) < _LEVEL else None

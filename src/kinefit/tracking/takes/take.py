@@ -32,7 +32,7 @@ from kinefit.tracking.checkpoints.checkpoint import Checkpoint
 from kinefit.tracking.checkpoints.interrupted import TrackingInterrupted
 from kinefit.tracking.takes.floor_level import on_floor, rig_on_floor
 from kinefit.tracking.takes.in_view import InView, people_in_view
-from kinefit.tracking.takes.take_recording import from_afar, recording_of
+from kinefit.tracking.takes.take_recording import from_afar, label_findings_of, recording_of
 from kinefit.tracking.video import Progress, track
 
 _DEFAULT_BODY = "humanoid"  # body of a take that names none
@@ -91,7 +91,9 @@ def track_take(
         recording = view.recording(recording, body, take.person, settings)
     if take.pose is not None:
         recording = from_afar(recording, body, settings, low_pass=take.pose.low_pass)
-    findings = input_findings(take, seen, recording.followed.keypoints if recording.followed else (), body)
+    labels = label_findings_of(take, seen, body, refuse=True)
+    followed = recording.followed.keypoints if recording.followed else ()
+    findings = (*labels, *input_findings(take, seen, followed, body))
     try:
         motion = track(
             recording, body, trial=trial_of(take), height=take.height, smooth=smooth, contacts=contacts,

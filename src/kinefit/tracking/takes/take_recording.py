@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
-from kinefit.bodies.marker_sets import bare, find_placement, known_set, matched
+from kinefit.bodies.marker_sets import LANDMARK_SPREAD, MarkerPlacement, bare, find_placement, known_set, matched
 from kinefit.errors import BodyError, KinefitError, ObservationError, TakeError, choices, located
+from kinefit.findings import Finding
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.images.depth_scene import background_model
 from kinefit.initialization.from_silhouettes import coarse_to_fine
+from kinefit.markers.sides import label_findings, refuse_wrong_sides
 from kinefit.motion import UP_AXES
 from kinefit.multiview.people import PersonTrack
 from kinefit.observations import (
@@ -246,6 +248,29 @@ def _markers(take: Take, seen: Observations, body: Body) -> tuple[list[NamedMark
     return out, body
 
 
+def label_findings_of(take: Take, seen: Observations, body: Body, *, refuse: bool = False) -> tuple[Finding, ...]:
+    """Check the labels of every marker recording (see `label_findings`), where it has enough of them.
+
+    Raises
+    ------
+    ObservationError
+        With `refuse`: the sides of a recording are wrong.
+    """
+    out: list[Finding] = []
+    for k, (entry, markers) in enumerate(zip(take.markers, seen.markers)):
+        with located(entry.file, f"[[markers]] {k + 1}"):
+            found: tuple[Finding, ...] = ()
+            with suppress(KinefitError):  # which tracking raises
+                own, points, std = _set_of(body, markers.names, entry.set)
+                spread = np.full(len(points), LANDMARK_SPREAD) if std is None else std
+                placed = MarkerPlacement(own or body.name, points, spread)
+                found = label_findings(body, markers, placed, sides=entry.sides)
+            if refuse:
+                refuse_wrong_sides(found)
+            out += found
+    return tuple(out)
+
+
 def _set_of(body: Body, labels: Sequence[str], wanted: str | None) -> tuple[str, PointSet, NDArray | None]:
     """The set that labels belong to, its points, and how far each may sit elsewhere, where the catalogue says so.
 
@@ -261,7 +286,7 @@ def _set_of(body: Body, labels: Sequence[str], wanted: str | None) -> tuple[str,
     try:
         placed = find_placement(body, {bare(n) for n in labels}, wanted)
     except KinefitError:
-        if own is None or wanted:
+        if own is None or wanted or 2 * count < len(labels):
             raise
         return own, known, None
     if own is not None and not wanted and count >= len(placed.points):
