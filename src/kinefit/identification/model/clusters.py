@@ -97,7 +97,8 @@ def complete_linkage(costs: NDArray, most: float) -> list[set[int]]:
     from scipy.cluster.hierarchy import fcluster, linkage
     from scipy.spatial.distance import squareform
 
-    of = fcluster(linkage(squareform(costs, checks=False), "complete"), most, "distance")
+    finite = np.minimum(costs, 2.0 * most)  # which changes no group: beyond `most` nothing is merged
+    of = fcluster(linkage(squareform(finite, checks=False), "complete"), most, "distance")
     return [set(np.flatnonzero(of == of[k]).tolist()) for k in sorted(np.unique(of, return_index=True)[1])]
 
 
