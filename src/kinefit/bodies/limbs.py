@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies.body import Body
+from kinefit.bodies.body import Body, PointSet
 
 _MAX_BRANCHES = 4  # of a trunk segment; one with more, none of which branches again, is a hand
 
@@ -84,4 +84,26 @@ def of_fingers(body: Body, segment: NDArray, x_rest: NDArray) -> NDArray:
     for s, knuckle in knuckles(body).items():
         own = segment == s
         out[own] = (x_rest[own] - body.tree.rest[s]) @ knuckle > knuckle @ knuckle
+    return out
+
+
+def rigid_pairs(body: Body, points: PointSet) -> list[tuple[int, int, int, float]]:
+    """Pairs of points on one segment, whose distance is constant: (point, point, scale group, distance at rest [m]).
+
+    A point at a joint's centre belongs to both segments there.
+    """
+    tree = body.tree
+    hosts: list[dict[int, NDArray]] = []
+    for s, x in zip(points.segments, points.points, strict=True):
+        here = {int(s): x}
+        if np.linalg.norm(x) < 1e-9 and tree.parents[s] >= 0:
+            here[int(tree.parents[s])] = tree.offsets[s]
+        hosts.append(here)
+    out = []
+    for i in range(len(hosts)):
+        for j in range(i + 1, len(hosts)):
+            for s in hosts[i].keys() & hosts[j].keys():
+                length = float(np.linalg.norm(hosts[i][s] - hosts[j][s]))
+                if length > 0.05:
+                    out.append((i, j, int(body.segment_scale[s]), length))
     return out
