@@ -11,8 +11,7 @@ from kinefit.correspondences.occupancy.collisions import collision_rows
 from kinefit.correspondences.occupancy.depth_image import depth_image_rows
 from kinefit.correspondences.occupancy.free_space import free_space_rows
 from kinefit.correspondences.parameters import limit_rows, prediction_rows, prior_rows
-from kinefit.correspondences.pixels import pixel_rows
-from kinefit.correspondences.points import plane_rows, point_rows, ray_rows
+from kinefit.correspondences.points import pixel_rows, plane_rows, point_rows, ray_rows
 from kinefit.correspondences.surfaces import field_rows, surface_rows
 
 __all__ = [
