@@ -1,9 +1,8 @@
 """Row makers: observations and a body at a state to linearised measurements, one file for each kind."""
 
 from kinefit.correspondences.anchored import anchored_rows, target_rows
-from kinefit.correspondences.bands import Bands, band_rows, joint_bands
+from kinefit.correspondences.bands import Bands, band_rows, coincidence_rows, joint_bands
 from kinefit.correspondences.closures import closure_rows
-from kinefit.correspondences.coincidence import coincidence_rows
 from kinefit.correspondences.contours.morphed import morphed_outline_rows, morphed_rows
 from kinefit.correspondences.contours.outlines import outline_pairs, outline_rows
 from kinefit.correspondences.occupancy.collisions import collision_rows
