@@ -4,21 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from os import PathLike
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import find_marker_set
-from kinefit.errors import ObservationError
+from kinefit.errors import ObservationError, located
 from kinefit.findings import runs_of
 from kinefit.identification.frame.beliefs import Beliefs
 from kinefit.identification.frame.identify import Identification, IdentifySettings, identify
+from kinefit.identification.model.files import load_model
 from kinefit.identification.model.model import MarkerModel
 from kinefit.identification.take.consistency import fill_gaps
 from kinefit.identification.take.naming import INLIER_SIGMAS, OUTLIER_SIGMAS, Naming, Step
 from kinefit.identification.take.pieces import find_pieces
 from kinefit.observations import Markers
+from kinefit.readers.take.file import Take
+from kinefit.readers.take.load import Observations
 
 FIRST_FRAMES = 12
 """Frames that are identified first, to check the model."""
@@ -238,3 +242,53 @@ def list_doubts(
             )
             out.append(Doubt(first, last, label, kind, least, text))
     return sorted(out, key=lambda d: (d.confidence, d.first))
+
+
+def named_markers(
+    markers: Markers, model: MarkerModel | str | PathLike[str], *, settings: TakeSettings | None = None,
+    progress: Step | None = None,
+) -> Markers:
+    """Label markers by a subject's model, whatever the names of their columns and wherever trajectories break.
+
+    Only measured points with a certain label are kept: gaps are not filled, and unassigned points are excluded.
+
+    Parameters
+    ----------
+    model : of the subject, or its file: see `learn_model`, `kinefit markers learn`
+    settings : TakeSettings; `certain` is the least confidence (0 to 1) of a label that is kept
+    progress : (what, done, total) -> None
+
+    Returns
+    -------
+    Markers of the model's M labels with the rate, unit and events of `markers`; NaN where a label is unknown.
+
+    Raises
+    ------
+    ObservationError
+        No frame shows three points, or the model is of another subject.
+    FileError
+        The file is no marker model.
+    """
+    model = model if isinstance(model, MarkerModel) else load_model(model)
+    settings = replace(settings or TakeSettings(), fill=0.0, fill_alone=0.0)
+    found = identify_take(model, markers, settings=settings, progress=progress)
+    out = found.markers(markers)
+    is_certain = found.confidence >= settings.certain
+    return replace(out, positions=np.where(is_certain[..., None], out.positions, np.nan))
+
+
+def with_names(take: Take, seen: Observations, *, progress: Step | None = None) -> Observations:
+    """Label the markers of every `[[markers]]` entry of a take that has a `model`.
+
+    Raises
+    ------
+    ObservationError, FileError
+        As `named_markers`, with the entry.
+    """
+    if not any(entry.model for entry in take.markers):
+        return seen
+    out = []
+    for entry, markers in zip(take.markers, seen.markers):
+        with located(take.path, f"markers {entry.file.name}"):
+            out.append(named_markers(markers, entry.model, progress=progress) if entry.model else markers)
+    return replace(seen, markers=tuple(out))
