@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure, quick
+from benchmarks.synthetic_points import random_pose, synthetic_body
 from kinefit.identification.frame.identify import identify
-from kinefit.identification.frame.synthetic import random_pose, synthetic_body
 from kinefit.identification.model.model import MarkerModel
 from kinefit.recipes.sapm import sapm
 

@@ -17,6 +17,7 @@ from click.testing import CliRunner
 from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
+from benchmarks.textured import textured_picture
 from kinefit.bodies import BodyState, load_body
 from kinefit.bodies.surfaces.triangles import body_mesh
 from kinefit.geometry import se3
@@ -25,7 +26,6 @@ from kinefit.motion import Motion
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.motion import read_motion
 from kinefit.simulation.rendering.scenes import SimulatedScene
-from kinefit.simulation.rendering.textured import textured_picture
 
 OFF = {"arm_flex_r": 4.0, "arm_add_r": -4.0, "arm_rot_r": 4.0, "elbow_flex_r": -4.0, "pro_sup_r": 5.0}  # [deg]
 

@@ -23,8 +23,10 @@ from click.testing import CliRunner
 from numpy.typing import NDArray
 from tests.exporters.skeletons.character_file import write_character_glb
 
+from benchmarks.bar_scene import draw_bar, wave_bar
 from benchmarks.figures import amount, figure
 from benchmarks.surface_body import frames_of, moving_arm
+from benchmarks.textured import textured_picture
 from kinefit.bodies.surfaces.triangles import body_mesh
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
@@ -33,9 +35,7 @@ from kinefit.motion import Motion
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.motion import read_motion
 from kinefit.simulation import squat_and_wave
-from kinefit.simulation.bar import draw_bar, wave_bar
 from kinefit.simulation.rendering.scenes import SimulatedScene
-from kinefit.simulation.rendering.textured import textured_picture
 from kinefit.subject.parameters import World
 from kinefit.subject.surfaces import CylinderShape
 

@@ -6,6 +6,7 @@ import shutil
 
 import cv2
 import numpy as np
+from benchmarks.bar_scene import bar_rig, draw_bar, wave_bar
 from benchmarks.curves import curves
 from benchmarks.silhouettes_track import take_text
 from numpy.typing import NDArray
@@ -25,7 +26,6 @@ from kinefit.readers.video import Video
 from kinefit.rendering import render_body
 from kinefit.rendering.colours import LEFT, RIGHT, to_hex
 from kinefit.simulation import cut, movement, retarget, squat_and_wave, write_synthetic_take
-from kinefit.simulation.bar import bar_rig, draw_bar, wave_bar
 
 _TO_CALIBRATION = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
 

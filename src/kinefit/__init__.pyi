@@ -43,7 +43,7 @@ from kinefit.identification.frame.identify import identify as identify
 from kinefit.identification.model.from_frame import model_from_frame as model_from_frame
 from kinefit.identification.model.gate import training_gate as training_gate
 from kinefit.identification.model.learn import learn_model as learn_model
-from kinefit.identification.take.people import identify_people as identify_people
+from kinefit.identification.take.takes import identify_people as identify_people
 from kinefit.identification.take.takes import identify_take as identify_take
 from kinefit.markers.fit import fit_markers as fit_markers
 from kinefit.markers.people import split_people as split_people

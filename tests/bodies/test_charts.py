@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.charts import off_the_limits, twin
+from kinefit.bodies.tree import off_the_limits, twin
 
 BODY = load_body("humanoid")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body
-from kinefit.bodies.fingers import knuckles, of_fingers
+from kinefit.bodies.limbs import knuckles, of_fingers
 
 
 def test_fingers_begin_at_the_knuckles_of_both_hands_and_nowhere_else():

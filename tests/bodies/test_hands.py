@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.fingers import knuckles
-from kinefit.bodies.limbs import finger_groups, limbs
+from kinefit.bodies.limbs import finger_groups, knuckles, limbs
 from kinefit.exporters.report.moments import spoken_segments
 
 BODY = load_body("humanoid_hands")

@@ -6,6 +6,7 @@ from functools import cache
 
 import cv2
 import numpy as np
+from benchmarks.bar_scene import bar_rig, draw_bar, wave_bar
 from tests.calibration.board import test_calibrate as boards
 
 import kinefit
@@ -17,7 +18,6 @@ from kinefit.observations import SilhouetteFrame
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.rendering import render_body
 from kinefit.simulation import cut, draw_figure, simulate_keypoints, squat_and_wave, studio_rig
-from kinefit.simulation.bar import bar_rig, draw_bar, wave_bar
 
 RATE = 30.0
 FRAMES = 16

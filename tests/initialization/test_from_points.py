@@ -7,7 +7,7 @@ import pytest
 from tests.oracle import posture, rig_around
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.rigid_pairs import rigid_pairs
+from kinefit.bodies.limbs import rigid_pairs
 from kinefit.errors import TrackingError
 from kinefit.geometry import se3
 from kinefit.initialization.from_points import aligned_root, first_scales, pose_from_points

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from av.codec.context import Flags
 
-from kinefit.photogrammetry.fields import field_of
+from kinefit.cli.surfaces._measure import field_of
 from kinefit.photogrammetry.least_squares_matching import match
 from kinefit.photogrammetry.matching.correlation import search_box
 from kinefit.photogrammetry.spline_image import SplineImage

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from benchmarks.surface_body import cameras, moving_arm
+from benchmarks.textured import textured_picture
 
 from kinefit.bodies.surfaces.triangles import body_mesh
 from kinefit.errors import ObservationError
@@ -13,7 +14,6 @@ from kinefit.photogrammetry.returning import Vanished
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
 from kinefit.simulation.rendering.scenes import SimulatedScene
-from kinefit.simulation.rendering.textured import textured_picture
 
 RIG = cameras(320)
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from tests.photogrammetry import scenes
 
+from kinefit.cli.surfaces._measure import field_camera, field_of
 from kinefit.errors import CalibrationError, ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.photogrammetry.fields import field_camera, field_of
 from kinefit.photogrammetry.intersection import intersect
 from kinefit.photogrammetry.region_growing import Grid
 from kinefit.photogrammetry.spline_image import SplineImage

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from benchmarks.synthetic_points import random_pose, synthetic_body
 
 from kinefit.errors import ObservationError
-from kinefit.identification.frame.synthetic import random_pose, synthetic_body
 from kinefit.identification.model.model import MarkerModel
 from kinefit.recipes._sapm_steps import (
     CandidateTable,

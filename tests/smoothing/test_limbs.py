@@ -1,7 +1,7 @@
 """Degrees of freedom that go together."""
 
 from kinefit.bodies import load_body
-from kinefit.smoothing.limbs import limbs, noise_groups
+from kinefit.smoothing.process_noise import limbs, noise_groups
 
 BODY = load_body("humanoid")
 TREE = BODY.tree

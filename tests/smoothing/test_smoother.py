@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from kinefit import Motion, Recording, load_body, track
 from kinefit.bodies import PointSet
-from kinefit.bodies.charts import twin
+from kinefit.bodies.tree import twin
 from kinefit.evaluation import angle_errors, joint_errors
 from kinefit.geometry import se3
 from kinefit.sensors.observability import levers, moves_points, near

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies.body import Body
+from kinefit.bodies.body import Body, PointSet
 
 _MAX_BRANCHES = 4  # of a trunk segment; one with more, none of which branches again, is a hand
 
@@ -59,3 +59,51 @@ def _is_hand(parents: NDArray) -> NDArray:
         if parents[s] >= 0:
             below[parents[s]] |= forks[s] | below[s]
     return (children > _MAX_BRANCHES) & (parents >= 0) & ~below
+
+
+KNUCKLE = "metacarpal_phalanx_3"
+"""End of the name of the landmark at the middle finger's knuckle."""
+
+
+def knuckles(body: Body) -> dict[int, NDArray]:
+    """Knuckle of the middle finger {segment: (3,) [m] in its frame}, of hands without finger segments."""
+    leaf = ~np.isin(np.arange(len(body.tree.parents)), body.tree.parents)
+    points = body.landmarks
+    return {
+        int(s): x for name, s, x in zip(points.names, points.segments, points.points)
+        if name.endswith(KNUCKLE) and leaf[s]
+    }  # fmt: skip
+
+
+def of_fingers(body: Body, segment: NDArray, x_rest: NDArray) -> NDArray:
+    """Whether points of segments (N,) lie beyond the knuckles: (N,) bool, from x_rest (N, 3) [m] in the root's frame.
+
+    A fist leaves these points empty. A measurement there supports the hand, a missing one does not contradict it.
+    """
+    out = np.zeros(len(segment), bool)
+    for s, knuckle in knuckles(body).items():
+        own = segment == s
+        out[own] = (x_rest[own] - body.tree.rest[s]) @ knuckle > knuckle @ knuckle
+    return out
+
+
+def rigid_pairs(body: Body, points: PointSet) -> list[tuple[int, int, int, float]]:
+    """Pairs of points on one segment, whose distance is constant: (point, point, scale group, distance at rest [m]).
+
+    A point at a joint's centre belongs to both segments there.
+    """
+    tree = body.tree
+    hosts: list[dict[int, NDArray]] = []
+    for s, x in zip(points.segments, points.points, strict=True):
+        here = {int(s): x}
+        if np.linalg.norm(x) < 1e-9 and tree.parents[s] >= 0:
+            here[int(tree.parents[s])] = tree.offsets[s]
+        hosts.append(here)
+    out = []
+    for i in range(len(hosts)):
+        for j in range(i + 1, len(hosts)):
+            for s in hosts[i].keys() & hosts[j].keys():
+                length = float(np.linalg.norm(hosts[i][s] - hosts[j][s]))
+                if length > 0.05:
+                    out.append((i, j, int(body.segment_scale[s]), length))
+    return out

@@ -1,20 +1,15 @@
 """Row makers: observations and a body at a state to linearised measurements, one file for each kind."""
 
 from kinefit.correspondences.anchored import anchored_rows, target_rows
-from kinefit.correspondences.bands import Bands, band_rows, joint_bands
+from kinefit.correspondences.bands import Bands, band_rows, coincidence_rows, joint_bands
 from kinefit.correspondences.closures import closure_rows
-from kinefit.correspondences.coincidence import coincidence_rows
 from kinefit.correspondences.contours.morphed import morphed_outline_rows, morphed_rows
 from kinefit.correspondences.contours.outlines import outline_pairs, outline_rows
-from kinefit.correspondences.image_lines import edge_rows, image_line_rows
 from kinefit.correspondences.occupancy.collisions import collision_rows
 from kinefit.correspondences.occupancy.depth_image import depth_image_rows
 from kinefit.correspondences.occupancy.free_space import free_space_rows
 from kinefit.correspondences.parameters import limit_rows, prediction_rows, prior_rows
-from kinefit.correspondences.pixels import pixel_rows
-from kinefit.correspondences.planes import plane_rows
-from kinefit.correspondences.points import point_rows
-from kinefit.correspondences.rays import ray_rows
+from kinefit.correspondences.points import edge_rows, image_line_rows, pixel_rows, plane_rows, point_rows, ray_rows
 from kinefit.correspondences.surfaces import field_rows, surface_rows
 
 __all__ = [

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.bodies.rigid_pairs import rigid_pairs
+from kinefit.bodies.limbs import rigid_pairs
 from kinefit.diagnostics.views import KeypointViews
 from kinefit.findings import Finding
 from kinefit.geometry.camera import Rig

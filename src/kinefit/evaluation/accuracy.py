@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies.charts import twin
+from kinefit.bodies.tree import twin
 from kinefit.errors import ObservationError
 from kinefit.motion import Motion
 

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.fingers import of_fingers
-from kinefit.bodies.limbs import limbs
+from kinefit.bodies.limbs import limbs, of_fingers
 from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh
 from kinefit.correspondences.occupancy.collisions import CollisionPairs, collision_pairs
 from kinefit.rendering import Canvas, rasterise

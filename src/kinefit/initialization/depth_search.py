@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.fingers import knuckles
-from kinefit.bodies.limbs import limbs
+from kinefit.bodies.limbs import knuckles, limbs
 from kinefit.correspondences import prior_rows, surface_rows
 from kinefit.initialization._kernels_reach import reach_for
 from kinefit.initialization.depth_score import MAX_DEPTH_ERROR, Score, prior_sigmas

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
-from kinefit.bodies.rigid_pairs import rigid_pairs
+from kinefit.bodies.limbs import rigid_pairs
 from kinefit.correspondences import prior_rows
 from kinefit.errors import TrackingError
 from kinefit.geometry import se3

@@ -12,7 +12,7 @@ from kinefit._threads import cores
 from kinefit.bodies import Body, load_body
 from kinefit.errors import CalibrationError, TakeError, located
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
-from kinefit.identification.take.named import with_names
+from kinefit.identification.take.takes import with_names
 from kinefit.images.depth_scene import background_model
 from kinefit.images.detectors.models import Models
 from kinefit.live.cameras import CameraStream, SessionClock, VideoReplay

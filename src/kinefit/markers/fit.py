@@ -22,7 +22,7 @@ from kinefit.motion import UP_AXES, Motion, Residuals
 from kinefit.observations import Markers
 from kinefit.sensors.points.markers import of_points
 from kinefit.sensors.settings import MARKER_LOSS
-from kinefit.smoothing.gaps import bridged
+from kinefit.smoothing.smoother import bridged
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.solvers.sequence import Certainty, fit_sequence
 

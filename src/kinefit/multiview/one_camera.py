@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.geometry.lifting import placed
+from kinefit.geometry.triangulation import placed
 from kinefit.multiview.association import confidences
 from kinefit.multiview.people import SPEED_INTERVAL_S, PersonTrack, min_person_frames
 from kinefit.observations import Keypoints

@@ -15,7 +15,6 @@ from kinefit.losses import Loss
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import Channels
 from kinefit.smoothing.foot_contacts import Contacts
-from kinefit.smoothing.limbs import limbs, noise_groups
 from kinefit.smoothing.linearised import Linearised, OtherSensors, squares_of, with_quadratic
 from kinefit.smoothing.shared_errors import SharedErrors, shared_by
 from kinefit.smoothing.spool import Spool, stretches
@@ -342,3 +341,23 @@ def _deviation(r2: NDArray, variance: NDArray) -> float:
     remaining = float(np.median(r2[known])) / _MEDIAN_SQUARE_2D
     absorbed = 0.5 * float(np.median(variance[known]))
     return float(np.sqrt(remaining + min(absorbed, remaining)))
+
+
+def limbs(body: Body) -> NDArray:
+    """(n,) int: number of the limb of each degree of freedom: trunk, head, each arm, each leg (between two forks)."""
+    tree = body.tree
+    children = np.bincount(np.maximum(tree.parents, 0), minlength=len(tree.segments))
+    children[0] -= 1  # the root is no child of its own
+    out = np.zeros(len(tree.segments), int)
+    for s in range(1, len(out)):
+        parent = tree.parents[s]
+        out[s] = out[parent] if children[parent] == 1 else s
+    return np.concatenate([np.zeros(6, int), out[tree.owners]])
+
+
+def noise_groups(body: Body) -> NDArray:
+    """(n,) int: number of the group that shares a process noise: the root's shift, its turn, left and right joints."""
+    groups: dict[str, int] = {}
+    names = ["shift"] * 3 + ["turn"] * 3
+    names += [c[:-2] if c.endswith(("_l", "_r")) else c for c in body.tree.coordinates]
+    return np.array([groups.setdefault(name, len(groups)) for name in names])

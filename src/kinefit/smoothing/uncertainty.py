@@ -35,9 +35,8 @@ from kinefit.solvers.bundle.border_frames import gram
 from kinefit.solvers.bundle.whitened import PoseScrews, columns
 from kinefit.solvers.equations import block_diagonal, joint_moves, product
 from kinefit.solvers.trajectory.variance_components import VarianceComponents, variance_components
-from kinefit.subject.closure_moves import ClosureMoves
 from kinefit.subject.matched_frames import closing_moves, point_moves
-from kinefit.subject.point_moves import PointMoves
+from kinefit.subject.point_moves import ClosureMoves, PointMoves
 from kinefit.subject.sensor_parameters import CameraExtrinsics, same_cameras
 from kinefit.subject.subject import Subject
 

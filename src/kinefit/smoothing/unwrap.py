@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies.charts import SIGNS, twin
-from kinefit.bodies.tree import KinematicTree
+from kinefit.bodies.tree import SIGNS, KinematicTree, twin
 
 _TURN = 2.0 * np.pi
 _MAX_STEP = 1.5  # [rad] sum over the three angles: a smaller step stays in its form, since the next is 2 π away

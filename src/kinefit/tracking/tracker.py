@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import renamed
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.charts import off_the_limits
 from kinefit.bodies.parts import carry_dofs, carry_state
+from kinefit.bodies.tree import off_the_limits
 from kinefit.errors import BodyError, ObservationError, choices
 from kinefit.frame.fit import Fitted, FrameFit
 from kinefit.frame.prediction import Prediction

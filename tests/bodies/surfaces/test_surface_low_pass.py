@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from kinefit.bodies import load_body
-from kinefit.bodies.morphs.morphing import Morphing
+from kinefit.bodies.morphs.morphing import Morphing, low_pass
 from kinefit.bodies.surfaces.fourier import FourierSurface, levels
-from kinefit.bodies.surfaces.skins.low_pass import low_pass
 
 
 def bumpy(height):

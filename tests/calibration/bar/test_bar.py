@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from benchmarks.bar_scene import bar_rig, draw_bar, see_bar, wave_bar
 
 from kinefit.calibration.bar.bundle import INTERIOR, POSE, BarProblem
 from kinefit.calibration.bar.calibrate import calibrate_bar
@@ -14,7 +15,6 @@ from kinefit.calibration.board.bundle import moved_camera
 from kinefit.errors import CalibrationError, FileError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.simulation.bar import bar_rig, draw_bar, see_bar, wave_bar
 
 LENGTH = 0.9
 

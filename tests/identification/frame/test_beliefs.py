@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from benchmarks.synthetic_points import random_pose, synthetic_body
 
 from kinefit.identification.frame.beliefs import MAX_NOISE, MIN_NOISE, Beliefs, learn_beliefs
 from kinefit.identification.frame.identify import identify
 from kinefit.identification.frame.search import LabelSearch, UnlabelledFrame
-from kinefit.identification.frame.synthetic import random_pose, synthetic_body
 from kinefit.identification.frame.tables import segment_tables
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from benchmarks.synthetic_points import random_pose, synthetic_body
 
 from kinefit.errors import ObservationError
 from kinefit.identification.frame.explain import at_level, explain, gain_of
 from kinefit.identification.frame.identify import identify
 from kinefit.identification.frame.polish import cost_of, labels_of, polish, resolve_conflicts, rivals, shared_points
 from kinefit.identification.frame.search import LabelSearch, UnlabelledFrame
-from kinefit.identification.frame.synthetic import random_pose, synthetic_body
 from kinefit.identification.frame.tables import segment_tables
 
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from benchmarks.synthetic_points import mean_length, random_pose, synthetic_body
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kinefit.errors import ObservationError
 from kinefit.identification.frame._kernels_evidence import evidence, largest_quaternion, least_squares, rigid
 from kinefit.identification.frame.identify import IdentifySettings, identify
-from kinefit.identification.frame.synthetic import mean_length, random_pose, synthetic_body
 from kinefit.identification.frame.tables import marker_sigmas, segment_tables
 
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from benchmarks.synthetic_points import synthetic_body
 from scipy.optimize import minimize
 
 from kinefit.geometry.se3 import exp_so3, log_so3
 from kinefit.identification.frame._kernels_posture import inverse, rotate_by, turn_costs, turn_of
 from kinefit.identification.frame.identify import identify, posture_of
-from kinefit.identification.frame.synthetic import synthetic_body
 from kinefit.identification.model.learn import learn_model
 from kinefit.observations import Markers
 

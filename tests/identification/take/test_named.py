@@ -9,7 +9,7 @@ from kinefit.errors import FileError, ObservationError
 from kinefit.exporters import write_markers
 from kinefit.identification.model.files import save_model
 from kinefit.identification.model.learn import learn_model
-from kinefit.identification.take.named import named_markers, with_names
+from kinefit.identification.take.takes import named_markers, with_names
 from kinefit.observations import Markers
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations

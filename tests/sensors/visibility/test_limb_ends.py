@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body
-from kinefit.bodies.fingers import of_fingers
+from kinefit.bodies.limbs import of_fingers
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import Canvas, render_body
 from kinefit.sensors.visibility.visibility import Layers, judge_segments

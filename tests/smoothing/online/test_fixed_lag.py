@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.tracking.movements import BODY, RATE, STILL, a_motion, a_rig, a_tracker, depth_frame, keypoint_frame, off
 
 from kinefit import BodyState, Recording, load_body, track
-from kinefit.bodies.charts import twin
+from kinefit.bodies.tree import twin
 from kinefit.errors import ObservationError
 from kinefit.smoothing.online.fixed_lag import FixedLag
 from kinefit.smoothing.online.known_noise import KnownNoise

@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit._jit import cache_directory
 from kinefit.bodies.anny.cylinders import as_wide, widths
 from kinefit.bodies.anny.files import FACTORS, AnnyData, read_anny
-from kinefit.bodies.anny.rest import frame, swapped
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.state import BodyState
@@ -344,3 +343,18 @@ def _with(values: NDArray, k: int, value: float) -> NDArray:
     out = values.copy()
     out[k] = value
     return out
+
+
+def swapped(joints: NDArray, base: Body) -> NDArray:
+    """Joints (S, 3) with right and left swapped."""
+    tree = base.tree
+    twin = lambda n: n[:-2] + {"_r": "_l", "_l": "_r"}[n[-2:]] if n[-2:] in ("_r", "_l") else n
+    return joints[[tree.segment(twin(n)) for n in tree.segments]]
+
+
+def frame(along: NDArray, hinge: NDArray) -> NDArray:
+    """Rotation (3, 3) that points a limb's direction (3,) down and its hinge axis (3,) to the right (z)."""
+    y = -along / np.linalg.norm(along)
+    z = hinge - (hinge @ y) * y
+    z /= np.linalg.norm(z)
+    return np.stack([np.cross(y, z), y, z])

@@ -20,7 +20,7 @@ from kinefit.errors import ObservationError
 from kinefit.frame.routing import Sensors
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.identification.take.named import with_names
+from kinefit.identification.take.takes import with_names
 from kinefit.motion import Motion
 from kinefit.observations import sensor_of
 from kinefit.readers.take.entries import sensor_name

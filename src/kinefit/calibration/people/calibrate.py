@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked, renamed
 from kinefit.bodies import Body, PointSet
-from kinefit.bodies.rigid_pairs import rigid_pairs
+from kinefit.bodies.limbs import rigid_pairs
 from kinefit.calibration.people.first_rig import first_rig
 from kinefit.calibration.people.floor import centre_of_mass, settled
 from kinefit.calibration.people.skeletons import first_cameras, in_step

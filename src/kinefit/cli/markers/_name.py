@@ -22,8 +22,7 @@ from kinefit.identification.model.from_frame import model_from_frame
 from kinefit.identification.model.gate import TrainingFinding, training_gate
 from kinefit.identification.model.learn import learn_model
 from kinefit.identification.model.model import MarkerModel
-from kinefit.identification.take.people import identify_people, one_after_the_other
-from kinefit.identification.take.takes import TakeIdentification, TakeSettings
+from kinefit.identification.take.takes import TakeIdentification, TakeSettings, identify_people, one_after_the_other
 from kinefit.observations import Markers
 
 if TYPE_CHECKING:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._pictures import read_picture
 from kinefit.cli.surfaces._files import PHOTOGRAPHS, StateImages, read_photograph, read_seeds
-from kinefit.errors import FileError, ObservationError, TrackingError
+from kinefit.errors import CalibrationError, FileError, ObservationError, TrackingError
 from kinefit.exporters.surface_files import (
     point_columns,
     write_field_picture,
@@ -23,10 +23,9 @@ from kinefit.exporters.surface_files import (
     write_returns_csv,
     write_surface_vtk,
 )
-from kinefit.geometry.camera import Rig
+from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import Motion
 from kinefit.observations.clocks import is_even
-from kinefit.photogrammetry.fields import field_camera, field_of
 from kinefit.photogrammetry.flat import measure_flat
 from kinefit.photogrammetry.least_squares_matching import windows_by_texture
 from kinefit.photogrammetry.region_growing import MIN_CORRELATION, Grid
@@ -298,3 +297,32 @@ def _surroundings(paths: Trajectories) -> float:
     gaps = np.linalg.norm(x[:, None] - x[None, :200], axis=2)
     gaps[gaps == 0] = np.inf
     return 5.0 * float(np.median(gaps.min(axis=0)))
+
+
+Field = Literal["odd", "even"]
+
+
+def field_of(image: NDArray, field: Field) -> NDArray:
+    """Lines of one field of an image (H, W, ...), about half as many; "odd" are the first, third, ... line."""
+    return np.ascontiguousarray(image[_first(field) :: 2])
+
+
+def field_camera(camera: Camera, field: Field) -> Camera:
+    """Camera of a field: the same rays with half the pixels in the vertical direction.
+
+    Raises
+    ------
+    CalibrationError
+        The image has a single line.
+    """
+    width, height = camera.size
+    if height < 2:
+        raise CalibrationError("an image of one line", place=f"camera {camera.name}", remedy="Give two lines or more.")
+    matrix, start = camera.matrix.copy(), _first(field)
+    matrix[1, 1] *= 0.5
+    matrix[1, 2] = 0.5 * (matrix[1, 2] - start)
+    return replace(camera, size=(width, (height - start + 1) // 2), matrix=matrix)
+
+
+def _first(field: Field) -> int:
+    return 0 if field == "odd" else 1

@@ -220,11 +220,12 @@ def _toe_off(spans: NDArray, leaves: NDArray) -> NDArray:
 
 def _smoothed(values: NDArray, rate: float) -> NDArray:
     """Without what is faster than about 6 Hz (zero phase, a Gaussian): walking has 99 % of its power below (Winter)."""
+    from scipy.ndimage import gaussian_filter1d
+
     sigma = rate / (2 * np.pi * 6.0) * np.sqrt(np.log(2.0))
-    reach = int(np.ceil(4 * sigma))
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    padded = np.pad(values, reach, mode="reflect", reflect_type="odd") if len(values) > reach else values
-    return np.convolve(padded, kernel / kernel.sum(), "valid" if len(values) > reach else "same")
+    reach = min(int(np.ceil(4 * sigma)), len(values) - 1)
+    padded = np.pad(values, reach, mode="reflect", reflect_type="odd")
+    return np.asarray(gaussian_filter1d(padded, sigma)[reach : reach + len(values)])
 
 
 def _peaks(values: NDArray, prominence: float, apart: int) -> NDArray:
@@ -232,20 +233,14 @@ def _peaks(values: NDArray, prominence: float, apart: int) -> NDArray:
 
     The valley of a first or last peak may lie on one side only, but a peak is never the first or last frame.
     """
-    tops = np.flatnonzero((values[1:-1] > values[:-2]) & (values[1:-1] >= values[2:])) + 1
+    from scipy.signal import find_peaks
+
+    if np.ptp(values) < prominence:
+        return np.empty(0, int)
+    low = values.min() - prominence  # beyond the ends nothing is known: what lies there limits no peak
+    tops = find_peaks([low, *values, low], prominence=prominence)[0] - 1
     kept: list[int] = []
     for k in tops[np.argsort(-values[tops], kind="stable")]:
-        if all(abs(k - other) >= apart for other in kept) and _prominence(values, int(k)) >= prominence:
+        if 0 < k < len(values) - 1 and all(abs(k - other) >= apart for other in kept):
             kept.append(int(k))
     return np.array(sorted(kept), int)
-
-
-def _prominence(values: NDArray, at: int) -> float:
-    """Height of a peak above the higher of its valleys, each up to the next higher value; open ends are no valleys."""
-    drops = []
-    for side in (values[:at][::-1], values[at + 1 :]):
-        higher = np.flatnonzero(side > values[at])
-        valley = side[: higher[0]] if len(higher) else side
-        drops.append((float(values[at] - valley.min()) if len(valley) else 0.0, bool(len(higher))))
-    closed = [drop for drop, is_closed in drops if is_closed]
-    return min(closed) if closed else max(drop for drop, _ in drops)

@@ -56,11 +56,12 @@ def learn_segments(positions: NDArray, labels: Sequence[str], mean: NDArray, dev
     firm = (deviation <= MAX_PAIR_SIGMA) & (mean <= MAX_PAIR_DISTANCE)
     np.fill_diagonal(firm, True)
     costs = np.where(firm, deviation + DISTANCE_PENALTY * mean, np.inf)
-    groups = reassign_markers(positions, linkage(costs, MAX_SEGMENT_SIGMA), firm)
+    groups = reassign_markers(positions, complete_linkage(costs, MAX_SEGMENT_SIGMA), firm)
     small = [g for g in groups if len(g) < 3]
     index = sorted(set().union(*small))  # of these, pairs that nearly form a segment are joined
     groups = [g for g in groups if len(g) >= 3]
-    groups += [{index[i] for i in g} for g in linkage(costs[np.ix_(index, index)], WIDENING_FACTOR * MAX_SEGMENT_SIGMA)]
+    near = complete_linkage(costs[np.ix_(index, index)], WIDENING_FACTOR * MAX_SEGMENT_SIGMA)
+    groups += [{index[i] for i in g} for g in near]
     members = [tuple(sorted(g)) for g in groups]
     widened = [widen_group(g, costs) for g in groups]
     shared = share_markers(positions, members, widened, firm)
@@ -83,7 +84,7 @@ def learn_segments(positions: NDArray, labels: Sequence[str], mean: NDArray, dev
     )
 
 
-def linkage(costs: NDArray, most: float) -> list[set[int]]:
+def complete_linkage(costs: NDArray, most: float) -> list[set[int]]:
     """Complete linkage: merge the two groups with the least largest cost until it exceeds `most`.
 
     Parameters
@@ -91,19 +92,14 @@ def linkage(costs: NDArray, most: float) -> list[set[int]]:
     costs : (M, M) [m] cost of each pair
     most : [m]
     """
-    groups = [{i} for i in range(len(costs))]
-    d = np.array(costs, float)
-    np.fill_diagonal(d, np.inf)
-    while len(groups) > 1:
-        i, j = np.unravel_index(np.argmin(d), d.shape)
-        if d[i, j] > most:
-            break
-        i, j = min(i, j), max(i, j)
-        groups[i] |= groups.pop(j)
-        d[i] = d[:, i] = np.maximum(d[i], d[j])
-        d = np.delete(np.delete(d, j, 0), j, 1)
-        d[i, i] = np.inf
-    return groups
+    if len(costs) < 2:
+        return [{k} for k in range(len(costs))]
+    from scipy.cluster.hierarchy import fcluster, linkage
+    from scipy.spatial.distance import squareform
+
+    finite = np.minimum(costs, 2.0 * most)  # which changes no group: beyond `most` nothing is merged
+    of = fcluster(linkage(squareform(finite, checks=False), "complete"), most, "distance")
+    return [set(np.flatnonzero(of == of[k]).tolist()) for k in sorted(np.unique(of, return_index=True)[1])]
 
 
 def reassign_markers(positions: NDArray, groups: list[set[int]], firm: NDArray) -> list[set[int]]:

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import find_marker_set
-from kinefit.errors import ObservationError
+from kinefit.errors import ObservationError, located
 from kinefit.findings import runs_of
 from kinefit.identification.frame.beliefs import Beliefs
 from kinefit.identification.frame.identify import Identification, IdentifySettings, identify
+from kinefit.identification.model.files import load_model
 from kinefit.identification.model.model import MarkerModel
 from kinefit.identification.take.consistency import fill_gaps
 from kinefit.identification.take.naming import INLIER_SIGMAS, OUTLIER_SIGMAS, Naming, Step
 from kinefit.identification.take.pieces import find_pieces
 from kinefit.observations import Markers
+from kinefit.readers.take.file import Take
+from kinefit.readers.take.load import Observations
 
 FIRST_FRAMES = 12
 """Frames that are identified first, to check the model."""
@@ -238,3 +242,112 @@ def list_doubts(
             )
             out.append(Doubt(first, last, label, kind, least, text))
     return sorted(out, key=lambda d: (d.confidence, d.first))
+
+
+def named_markers(
+    markers: Markers, model: MarkerModel | str | PathLike[str], *, settings: TakeSettings | None = None,
+    progress: Step | None = None,
+) -> Markers:
+    """Label markers by a subject's model, whatever the names of their columns and wherever trajectories break.
+
+    Only measured points with a certain label are kept: gaps are not filled, and unassigned points are excluded.
+
+    Parameters
+    ----------
+    model : of the subject, or its file: see `learn_model`, `kinefit markers learn`
+    settings : TakeSettings; `certain` is the least confidence (0 to 1) of a label that is kept
+    progress : (what, done, total) -> None
+
+    Returns
+    -------
+    Markers of the model's M labels with the rate, unit and events of `markers`; NaN where a label is unknown.
+
+    Raises
+    ------
+    ObservationError
+        No frame shows three points, or the model is of another subject.
+    FileError
+        The file is no marker model.
+    """
+    model = model if isinstance(model, MarkerModel) else load_model(model)
+    settings = replace(settings or TakeSettings(), fill=0.0, fill_alone=0.0)
+    found = identify_take(model, markers, settings=settings, progress=progress)
+    out = found.markers(markers)
+    is_certain = found.confidence >= settings.certain
+    return replace(out, positions=np.where(is_certain[..., None], out.positions, np.nan))
+
+
+def with_names(take: Take, seen: Observations, *, progress: Step | None = None) -> Observations:
+    """Label the markers of every `[[markers]]` entry of a take that has a `model`.
+
+    Raises
+    ------
+    ObservationError, FileError
+        As `named_markers`, with the entry.
+    """
+    if not any(entry.model for entry in take.markers):
+        return seen
+    out = []
+    for entry, markers in zip(take.markers, seen.markers):
+        with located(take.path, f"markers {entry.file.name}"):
+            out.append(named_markers(markers, entry.model, progress=progress) if entry.model else markers)
+    return replace(seen, markers=tuple(out))
+
+
+@checked
+def identify_people(
+    models: Sequence[MarkerModel], markers: Markers, *, settings: TakeSettings | None = None,
+    progress: Step | None = None,
+) -> list[TakeIdentification]:
+    """Label several subjects in one take, one after the other, the one with most markers first.
+
+    Each subject is searched among the points that are not certainly labelled yet. Columns refer to `markers`.
+
+    Parameters
+    ----------
+    models : of the subjects, with different names
+    markers : (F, N, 3) [m], unlabelled or wrongly labelled
+    settings : default: `TakeSettings()`
+    progress : (what, done, total) -> None
+
+    Returns
+    -------
+    one result per model, in the order of `models`
+
+    Raises
+    ------
+    ObservationError
+        There is no model, two have the same name, or a subject is not found.
+    """
+    names = [m.name for m in models]
+    if not models or len(set(names)) < len(names):
+        problem = f"subjects called {', '.join(names)}" if names else "no subject"
+        raise ObservationError(problem, remedy="Give every subject a name of its own: kinefit markers learn --name.")
+    settings = settings or TakeSettings()
+    remaining = np.array(markers.positions)
+    out: dict[int, TakeIdentification] = {}
+    for i in sorted(range(len(models)), key=lambda i: -len(models[i])):
+        out[i] = identify_take(models[i], replace(markers, positions=remaining), settings=settings, progress=progress)
+        column, is_certain = out[i].column, out[i].confidence >= settings.certain
+        rows = np.broadcast_to(np.arange(len(column))[:, None], column.shape)
+        remaining[rows[is_certain], column[is_certain]] = np.nan
+    return [out[i] for i in range(len(models))]
+
+
+def one_after_the_other(takes: Sequence[Markers]) -> Markers:
+    """Concatenate takes; a label is NaN in takes without it.
+
+    Raises
+    ------
+    ObservationError
+        There is no take.
+    """
+    if not takes:
+        raise ObservationError("no take", remedy="Name at least one.")
+    names = tuple(dict.fromkeys(n for t in takes for n in t.names))
+    positions = np.full((sum(map(len, takes)), len(names), 3), np.nan)
+    at = 0
+    for t in takes:
+        positions[at : at + len(t), [names.index(n) for n in t.names]] = t.positions
+        at += len(t)
+    return Markers(names, takes[0].rate, positions, up=takes[0].up, source=takes[0].source, unit=takes[0].unit)

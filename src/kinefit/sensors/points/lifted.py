@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
-from kinefit.bodies.rigid_pairs import rigid_pairs
-from kinefit.geometry.lifting import placed
+from kinefit.bodies.limbs import rigid_pairs
+from kinefit.geometry.triangulation import placed
 from kinefit.observations import LiftedFrame
 from kinefit.rows import AnyRows, PairRows
 from kinefit.sensors.base import Hints, Matched, Measurement, Sensor

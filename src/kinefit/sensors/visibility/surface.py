@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.fingers import of_fingers
+from kinefit.bodies.limbs import of_fingers
 from kinefit.bodies.morphs.morphing import MorphedPose, Morphing
 from kinefit.bodies.surfaces import BodyMesh, body_mesh, sample
 from kinefit.correspondences.contours.rims import RimFinder

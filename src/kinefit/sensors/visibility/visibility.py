@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.bodies.fingers import knuckles
-from kinefit.bodies.limbs import limbs
+from kinefit.bodies.limbs import knuckles, limbs
 from kinefit.bodies.surfaces import BodyMesh, body_mesh
 from kinefit.correspondences.targets import check_depth_image
 from kinefit.geometry.camera import Camera

@@ -12,7 +12,7 @@ from kinefit.bodies import load_body
 from kinefit.diagnostics.images import load_uncovered
 from kinefit.diagnostics.quick import input_findings, with_cause, with_findings
 from kinefit.errors import KinefitError, TakeError, command
-from kinefit.identification.take.named import with_names
+from kinefit.identification.take.takes import with_names
 from kinefit.motion import Motion
 from kinefit.multiview.association import choose_people, person_records
 from kinefit.multiview.followed import follow
