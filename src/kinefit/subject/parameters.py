@@ -89,8 +89,8 @@ class Parameters(Protocol):
 class SegmentScales:
     """Logarithms of the scales of a body's lengths: `Body.scale_groups`.
 
-    All lengths follow the person's size, with a standard deviation of `about_std`, or 2 % if `size` is given. Each length
-    differs from it by 5 % (`PROPORTIONS`), so an unmeasured length follows the measured ones.
+    All lengths follow the person's size, with a standard deviation of `about_std`, or 2 % if `size` is given. Each
+    length differs from it by 5 % (`PROPORTIONS`), so an unmeasured length follows the measured ones.
 
     Parameters
     ----------

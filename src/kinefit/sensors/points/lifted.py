@@ -32,7 +32,7 @@ SIZE_STD = 0.08
 """Standard deviation of the logarithm of a person's size by a network's metres, `person_size`: 5 % between the cameras
 of one person, and the network takes all people for nearly as tall: 9 % too much and too little for two others."""
 
-_NETWORK_SIZE = 0.91  # of a person in the network's metres: 0.94, 0.94, 0.90, 0.85 by each camera of the balancing trial
+_NETWORK_SIZE = 0.91  # of a person, by its metres: 0.94, 0.94, 0.90, 0.85 in each camera of the balancing trial
 _MIN_BONE_SHARE = 0.5  # of the longest bone: lengths in face, hands and feet are 0.2 to 1.5 times the person's
 
 
