@@ -73,7 +73,7 @@ def deviations(
     """Standard deviations of the degrees of freedom (n,) [m, rad] and of the joint centres (S, 3) [m].
 
     They are infinite where the data explain less than a tenth of the prior's variance. A joint centre's is infinite
-    where it reaches what the unobserved coordinates give it by the prior alone.
+    where unobserved coordinates make up most of its variance, and it reaches what they give it by the prior alone.
 
     Parameters
     ----------
@@ -96,9 +96,10 @@ def deviations(
     joints = np.sqrt(variances)
     if blind.any():
         unknown = np.square(moves) @ np.square(np.where(blind, np.minimum(prior, 1e3), 0.0))
-        along = of_joints[..., blind]
-        share = np.einsum("...i,...i->...", along @ _inverse(covariance[np.ix_(blind, blind)]), along)
-        most = np.minimum(unknown, share) > np.maximum(_MIN_JOINT_SHIFT**2, _MAX_UNOBSERVED_SHARE * variances)
+        own, directly, along = covariance[np.ix_(blind, blind)], moves[..., blind], of_joints[..., blind]
+        share = np.einsum("...i,...i->...", along @ _inverse(own), along)
+        share = np.minimum(share, np.einsum("...i,...i->...", directly @ own, directly))
+        most = (unknown > _MIN_JOINT_SHIFT**2) & (share > _MAX_UNOBSERVED_SHARE * variances)
         joints = np.where(most & (variances > UNOBSERVED_STD_RATIO**2 * unknown), np.inf, joints)
     return np.where(blind, np.inf, std), joints
 
