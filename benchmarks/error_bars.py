@@ -46,8 +46,20 @@ def without(keypoints: list[Keypoints], camera: int, start: int, stop: int) -> l
     return out
 
 
-def scene(name: str, keypoint_set: str, motions: dict[str, Motion]) -> dict[str, ErrorBarCoverage]:
-    """Coverage of each group of joints over all motions."""
+def elbows(truth: Motion, motion: Motion) -> tuple[float, float]:
+    """Share of frames in which an elbow's bars are finite, and of its coordinates that lie inside those."""
+    own = [truth.body.tree.segment(f"forearm_{side}") for side in "lr"]
+    turned = motion if motion.up == truth.up else motion.turned(truth.up)
+    error, std = np.abs(turned.joint_centres - truth.joint_centres)[:, own], turned.joint_std[:, own]
+    finite = np.isfinite(std)
+    return float(finite.all(axis=2).mean()), float(np.mean(error[finite] <= 1.96 * std[finite]))
+
+
+def scene(
+    name: str, keypoint_set: str, motions: dict[str, Motion]
+) -> tuple[dict[str, ErrorBarCoverage], list[tuple[float, float]]]:
+    """Coverage of each group of joints over all motions, and what `elbows` gives for each motion."""
+    of_elbows = []
     told: dict[str, list[tuple[float, float]]] = {}
     for number, truth in enumerate(motions.values()):
         random = np.random.default_rng(number)
@@ -61,9 +73,11 @@ def scene(name: str, keypoint_set: str, motions: dict[str, Motion]) -> dict[str,
             seen = without(seen, number % len(rig), middle - 15, middle + 15)
         recording = Recording.of_keypoints(rig, seen, sigma=ACCURACY, up=truth.up)
         motion = track(recording, load_body("humanoid"))
+        of_elbows.append(elbows(truth, motion))
         for group, share in coverage_of_groups(truth, motion).items():
             told.setdefault(group, []).append((share.joints, share.angles))
-    return {group: ErrorBarCoverage(*(mean(column) for column in zip(*shares))) for group, shares in told.items()}
+    groups = {group: ErrorBarCoverage(*(mean(column) for column in zip(*shares))) for group, shares in told.items()}
+    return groups, of_elbows
 
 
 def mean(shares: tuple[float, ...]) -> float:
@@ -74,16 +88,21 @@ def mean(shares: tuple[float, ...]) -> float:
 
 def run() -> None:
     """Print coverage of every scene."""
-    motions = library()
+    motions, of_elbows = library(), list[tuple[float, float]]()
+    absent = "the recorded motions are absent"
     for keypoint_set in amount(("BODY_25B", "MEDIAPIPE_33"), ("BODY_25B",)):
         for name in amount(tuple(SCENES), ("camera_lost",)):
             tag = f"{name}_{keypoint_set.lower()}"
-            told = scene(name, keypoint_set, motions) if motions else {}
+            told, of_scene = scene(name, keypoint_set, motions) if motions else ({}, [])
+            of_elbows += of_scene
             for what in ("joints", "angles"):
                 shares = {g: 100 * getattr(c, what) for g, c in told.items()}
                 known = {g: s for g, s in shares.items() if np.isfinite(s)}
                 print(f"# {tag}, {what}: " + ", ".join(f"{g} {s:.0f} %" for g, s in known.items()), flush=True)
                 low, high = (min(known.values()), max(known.values())) if known else (None, None)
-                absent = "the recorded motions are absent"
                 figure(f"error_bars_{what}_{tag}_lowest", low, "%", ">= 90", absent)
                 figure(f"error_bars_{what}_{tag}_highest", high, "%", "<= 98", absent)
+    finite, covered = (100 * mean(column) for column in zip(*of_elbows)) if of_elbows else (None, None)
+    figure("error_bars_elbows_finite", finite, "% of frames", ">= 95", absent)
+    figure("error_bars_elbows_covered_least", covered, "% of coordinates in 95 % intervals", ">= 90", absent)
+    figure("error_bars_elbows_covered_most", covered, "% of coordinates in 95 % intervals", "<= 98", absent)

@@ -19,7 +19,8 @@ UNOBSERVED_STD_RATIO = 0.95
 tenth of the prior's variance."""
 ROOT_PRIOR_STD = 1.0
 """[m, rad] prior standard deviation of an unobserved root."""
-_MIN_JOINT_SHIFT = 1e-3  # [m] by which an unobserved coordinate must move a joint centre to leave it unknown
+_MIN_JOINT_SHIFT = 1e-3  # [m] by which unobserved coordinates must move a joint centre to leave it unknown
+_MAX_UNOBSERVED_SHARE = 0.5  # of a joint's variance that may come from unobserved coordinates
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +73,7 @@ def deviations(
     """Standard deviations of the degrees of freedom (n,) [m, rad] and of the joint centres (S, 3) [m].
 
     They are infinite where the data explain less than a tenth of the prior's variance. A joint centre's is infinite
-    where it reaches what the unobserved coordinates give it by the prior alone.
+    where unobserved coordinates make up most of its variance, and it reaches what they give it by the prior alone.
 
     Parameters
     ----------
@@ -86,17 +87,38 @@ def deviations(
     blind = std > UNOBSERVED_STD_RATIO * prior
     if observed is not None:
         blind[6:] |= ~observed
-        covariance = np.array(covariance)
         never = 6 + np.flatnonzero(~observed & np.isfinite(tree.spread))
-        covariance[never, never] = np.maximum(covariance[never, never], prior[never] ** 2)
+        covariance = _with_variances(covariance, never, prior[never] ** 2)
     blind[:6] &= tree.root_free
     moves = joint_moves(body, state)
-    joints = np.sqrt(np.maximum(np.einsum("...i,...i->...", moves @ covariance, moves), 0.0))
+    of_joints = moves @ covariance
+    variances = np.maximum(np.einsum("...i,...i->...", of_joints, moves), 0.0)
+    joints = np.sqrt(variances)
     if blind.any():
-        alone = np.square(np.where(blind, np.minimum(prior, 1e3), 0.0))
-        unknown = np.sqrt(np.square(moves) @ alone)
-        joints = np.where((unknown > _MIN_JOINT_SHIFT) & (joints > UNOBSERVED_STD_RATIO * unknown), np.inf, joints)
+        unknown = np.square(moves) @ np.square(np.where(blind, np.minimum(prior, 1e3), 0.0))
+        own, directly, along = covariance[np.ix_(blind, blind)], moves[..., blind], of_joints[..., blind]
+        share = np.einsum("...i,...i->...", along @ _inverse(own), along)
+        share = np.minimum(share, np.einsum("...i,...i->...", directly @ own, directly))
+        most = (unknown > _MIN_JOINT_SHIFT**2) & (share > _MAX_UNOBSERVED_SHARE * variances)
+        joints = np.where(most & (variances > UNOBSERVED_STD_RATIO**2 * unknown), np.inf, joints)
     return np.where(blind, np.inf, std), joints
+
+
+def _with_variances(covariance: NDArray, some: NDArray, variances: NDArray) -> NDArray:
+    """Covariance (n, n) in which some coordinates (k,) have at least these variances (k,).
+
+    All others keep their distribution given those: what data know of a sum of angles stays known.
+    """
+    own = covariance[np.ix_(some, some)]
+    along = covariance[:, some] @ _inverse(own)
+    along[some] = np.eye(len(some))
+    more = np.maximum(variances - np.diag(own), 0.0)
+    return np.asarray(covariance + (along * more) @ along.T)
+
+
+def _inverse(covariance: NDArray) -> NDArray:
+    """Of coordinates that closures may tie to each other: their covariance is then singular."""
+    return np.linalg.pinv(covariance, rcond=1e-9, hermitian=True)
 
 
 def evidence_of(scene: Scene, matched: Sequence[Matched]) -> list[Evidence]:

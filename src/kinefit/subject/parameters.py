@@ -89,21 +89,23 @@ class Parameters(Protocol):
 class SegmentScales:
     """Logarithms of the scales of a body's lengths: `Body.scale_groups`.
 
-    All lengths follow the person's size, with a standard deviation of 20 %, or 2 % if `size` is given. Each length
-    differs from it by 5 % (`PROPORTIONS`), so an unmeasured length follows the measured ones.
+    All lengths follow the person's size, with a standard deviation of `about_std`, or 2 % if `size` is given. Each
+    length differs from it by 5 % (`PROPORTIONS`), so an unmeasured length follows the measured ones.
 
     Parameters
     ----------
     body : Body, of scales 1
     size : float, optional
         Size of the person as a share of the body's, if the stature is known.
-    about : float, prior mean of an unknown size, as a share of the body's
+    about, about_std : float
+        Prior mean of an unknown size, as a share of the body's, and standard deviation of its logarithm.
     proportions : standard deviation of the logarithm of each length about the size
     """
 
     body: Body
     size: float | None = None
     about: float = 1.0
+    about_std: float = UNKNOWN_SIZE_STD
     proportions: float = PROPORTIONS
     of_points = True
 
@@ -125,7 +127,7 @@ class SegmentScales:
     @property
     def information(self) -> NDArray:
         """(G, G) prior information of the logarithms."""
-        common = UNKNOWN_SIZE_STD if self.size is None else KNOWN_SIZE_STD
+        common = self.about_std if self.size is None else KNOWN_SIZE_STD
         return np.linalg.inv(np.eye(len(self.names)) * self.proportions**2 + common**2)
 
     @property

@@ -328,13 +328,13 @@ def _fitted_at(
 
 def _by_joint(person: SizedPerson, found: SubjectFit) -> SizedPerson:
     """The person as a fit of several kinds of sensors found it; with its lengths where they were sought."""
-    subject, count = person.subject, len(person.subject.scales)
-    if any(isinstance(p, SegmentScales) for p in found.parameters):
-        base = subject.scales if found.prior_world.body is subject.body else 1.0
-        subject = replace(
-            subject, scales=base * np.exp(found.mean[:count]), fit=None, covariance=None,
-            length_share=found.std[:count],
-        )  # fmt: skip
+    subject, first = person.subject, 0
+    for kind in found.parameters:
+        own = slice(first, first := first + len(kind.names))
+        if isinstance(kind, SegmentScales):
+            base = subject.scales if found.prior_world.body is subject.body else 1.0
+            scales = base * np.exp(found.mean[own])
+            subject = replace(subject, scales=scales, fit=None, covariance=None, length_share=found.std[own])
     shape = {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in zip(found.names, found.mean, found.std)}
     shape = {**person.provenance.get("shape", {}), **shape}
     person = replace(person, subject=replace(subject, body=found.body)).reporting(shape=shape)

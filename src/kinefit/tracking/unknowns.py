@@ -10,9 +10,19 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.geometry.camera import Rig
+from kinefit.multiview.one_camera import only_lifted
+from kinefit.sensors.points.lifted import SIZE_STD, person_size
 from kinefit.sensors.settings import CameraErrors
 from kinefit.subject.gear import Gear
-from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales, World, place_spread
+from kinefit.subject.parameters import (
+    UNKNOWN_SIZE_STD,
+    KnownLengths,
+    Parameters,
+    PointOffsets,
+    SegmentScales,
+    World,
+    place_spread,
+)
 from kinefit.subject.sensor_parameters import CameraExtrinsics, OwnUnknowns
 from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.subject.surfaces import shape_of
@@ -87,7 +97,9 @@ def of_points(
     places = {name: generic.markers(name).select(points.names) for name, points in worn.items()}
     stds = {n: _SEAT if s is None else _of(s, generic.markers(n), places[n]) for n, s in sets.items()}
     generic = replace(generic, marker_sets={**generic.marker_sets, **places})
-    lengths = SegmentScales(generic, height / generic.stature if height and generic.stature else None)
+    lengths = _size_by_network(generic, recording)
+    if height and generic.stature:
+        lengths = SegmentScales(generic, height / generic.stature)
     if trial is not None and trial.covariance is not None:
         count = len(trial.scales)
         lengths = KnownLengths(generic, scales=trial.scales, covariance=trial.covariance[:count, :count])
@@ -95,7 +107,7 @@ def of_points(
     found += list(_keypoint_offsets(generic, subject).values())
     if recording.alone is not None:
         one = PointOffsets(generic, recording.keypoints[0].keypoint_set, _ONE_CAMERA)
-        found.append((one, one.mean))
+        found.insert(0, (one, one.mean))  # offsets are of the generic body: in metres, they would favour a small one
     scaled = generic.scaled(subject.scales)
     for name in sets:
         offsets = PointOffsets(generic, name, stds[name])
@@ -107,6 +119,16 @@ def of_points(
         poses = CameraExtrinsics.of(cameras, recording.rig, used, factors, calibrated)
         found.append((poses, np.zeros(len(poses.names))))
     return _together(World(generic, recording.rig), found)
+
+
+def _size_by_network(body: Body, recording: Recording) -> SegmentScales:
+    """Lengths whose common size is that of people, and by a network's metres where it lifted landmarks to space."""
+    record = only_lifted(recording.keypoints)
+    size = np.nan if record is None else person_size(body, record)
+    if not np.isfinite(size):
+        return SegmentScales(body)
+    share = UNKNOWN_SIZE_STD**2 / (UNKNOWN_SIZE_STD**2 + SIZE_STD**2)
+    return SegmentScales(body, about=size**share, about_std=SIZE_STD * share**0.5)
 
 
 def _of(values: NDArray, whole: PointSet, part: PointSet) -> NDArray:
@@ -130,7 +152,7 @@ def of_all(
     """
     found: list[tuple[Parameters, NDArray]] = []
     if size and lengths and (surfaces or recording.markers):
-        found.append((SegmentScales(body), np.zeros(len(body.scale_groups))))
+        found.append((_size_by_network(body, recording), np.zeros(len(body.scale_groups))))
     if size and surfaces:
         found += [(shape, shape.mean) for shape in shape_of(body)]
     gear = Gear(body)

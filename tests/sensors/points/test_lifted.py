@@ -1,5 +1,7 @@
 """Landmarks lifted from one image: rows that say how far each is behind the hips, and hints of where the person is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.oracle import central_differences, design
@@ -7,10 +9,10 @@ from tests.sensors.scenes import posture, ring
 
 from kinefit.bodies import load_body
 from kinefit.errors import BodyError, CalibrationError, ObservationError
-from kinefit.observations import LiftedFrame
+from kinefit.observations import Keypoints, LiftedFrame
 from kinefit.rows import PairRows
 from kinefit.sensors.channels import known_points
-from kinefit.sensors.points.lifted import HIPS, LiftedSensor
+from kinefit.sensors.points.lifted import HIPS, LiftedSensor, person_size
 from kinefit.sensors.scene import Scene
 
 BODY, SET = load_body("humanoid"), "MEDIAPIPE_33"
@@ -59,6 +61,29 @@ def test_the_size_of_the_networks_person_does_not_count(size):
     state = posture(BODY, 3)
     one, other = (rows_of(lifted(state, s), state, state)[1] for s in (1.0, size))
     assert np.allclose(one.residual, other.residual, atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [0.7, 1.3])
+def test_depths_favour_no_size(scale):
+    """Bodies of any size are as far from the network's pose, each by its own standard deviations."""
+    state, other = posture(BODY, 3), posture(BODY, 6)
+    matched, rows = rows_of(lifted(state), other, other)
+    scaled = matched.rows(Scene(BODY.scaled(np.full(len(BODY.scale_groups), scale)), other, RIG))[0]
+    costs = [np.sum(r.weight * r.residual**2) for r in (rows, scaled)]
+    assert costs[1] == pytest.approx(costs[0], rel=1e-6) and costs[0] > 0.1
+
+
+@pytest.mark.parametrize("person", [0.69, 1.0, 1.1])
+def test_a_network_measures_the_persons_size(person):
+    """A child of 1.20 m and a man of 1.93; face, hands and feet of a network are of any size, and do not count."""
+    frames = [lifted(posture(BODY, k), 0.91 * person) for k in (1, 3, 6)]
+    x, uv = (np.stack([getattr(f, name) for f in frames])[:, None] for name in ("x", "uv"))
+    names, confidence = frames[0].names, np.ones(uv.shape[:3])
+    x[..., [k for k, name in enumerate(names) if name.endswith(("eye", "index", "pinky", "heel"))], :] *= 0.5
+    record = Keypoints(CAMERA.name, SET, names, 30.0, uv, confidence, lifted=x)
+    assert person_size(BODY, record) == pytest.approx(person, rel=0.01)
+    assert np.isnan(person_size(BODY, replace(record, lifted=None)))
+    assert np.isnan(person_size(BODY, replace(record, lifted=np.full(x.shape, np.nan))))
 
 
 def test_hints_are_where_the_person_is():

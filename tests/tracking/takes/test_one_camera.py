@@ -51,15 +51,16 @@ def folder(tmp_path_factory):
     return folder
 
 
-def write_phone(path, T):
+def write_phone(path, T, size=1.0, metres=0.95, depth_error=0.06):
+    """Detections of the person, so many times as large and as far away, and a network's metres of all that."""
     motion, rng = truth()[0], np.random.default_rng(1)
     x = motion.positions(motion.body.keypoints("MEDIAPIPE_33").select(MEDIAPIPE_33)) @ T[:3, :3].T + T[:3, 3]
     focal = 0.5 * max(SIZE) / np.tan(np.radians(DEFAULT_FIELD_OF_VIEW) / 2)
     own = np.stack([x[..., 0], -x[..., 2], x[..., 1]], axis=-1)  # along u, v and away
     uv = focal * own[..., :2] / own[..., 2:] + (np.array(SIZE) - 1) / 2 + rng.normal(scale=3.0, size=(*x.shape[:2], 2))
     hips = own[:, [MEDIAPIPE_33.index(n) for n in ("left_hip", "right_hip")]].mean(axis=1, keepdims=True)
-    lifted = 0.95 * (own - hips)
-    lifted[..., 2] += rng.normal(scale=0.06, size=33)
+    lifted = size * metres * (own - hips)
+    lifted[..., 2] += rng.normal(scale=depth_error, size=33)
     nothing = np.zeros(0, np.uint32), np.zeros(len(x) + 1, int)
     sure = np.full((len(x), 1, 33), 0.9)
     write_detections(
@@ -126,6 +127,18 @@ def test_lengths_are_unsure_where_no_height_is_stated(folder):
     motion, seen = track_take(folder / "short.toml")
     assert 0.05 < motion.provenance["length_std_m"]["thigh_r-shank_r"] / 0.43 < 0.2
     assert any("no height is stated" in note for note in seen.notes)
+
+
+@pytest.mark.parametrize("size", [0.7, 1.0, 1.1])
+def test_the_network_measures_the_size_where_no_height_is_stated(folder, size):
+    """A child of 1.22 m, and taller people, as far as people's sizes (20 %) leave it to a network (8 %)."""
+    write_phone(folder / "sized.npz", truth()[1], size, metres=0.91, depth_error=0.01)
+    (folder / "sized.toml").write_text(HEAD + "frames = [0, 30]\n" + CAMERA + DETECTED.replace("phone.", "sized."))
+    motion, _ = track_take(folder / "sized.toml")
+    shape = motion.provenance["shape"]
+    lengths = np.array([value for name, value in shape.items() if name.startswith("length")])
+    assert np.mean(lengths[:, 0]) == pytest.approx(np.log(size) * 0.2**2 / (0.2**2 + 0.08**2), abs=0.04)
+    assert np.all((lengths[:, 1] > 0.06) & (lengths[:, 1] < 0.11))
 
 
 def test_who_is_in_view_is_told(folder):

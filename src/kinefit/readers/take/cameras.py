@@ -71,7 +71,7 @@ def what_is_assumed(take: Take) -> list[str]:
         "wider places the person 10 % nearer. Error bars do not include this."
     ]
     if take.height is None:
-        out.append("no height is stated: lengths and distances are uncertain by about 10 %, as the person's size is")
+        out.append("no height is stated: lengths and distances are uncertain by about 9 %, as the person's size is")
     return out
 
 
