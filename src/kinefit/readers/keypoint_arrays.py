@@ -12,6 +12,7 @@ from kinefit._mapped import kept
 from kinefit.errors import ObservationError
 from kinefit.observations import Keypoints
 from kinefit.observations.arrays import sealed
+from kinefit.observations.keypoint_values import check_pixels, confidence_of
 from kinefit.readers.keypoint_sets import keypoint_names
 
 if TYPE_CHECKING:
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
 
 FACE_POINTS = 468, 478
 """Points of a face mesh without and with irises."""
-
-_MAX_NORMALISED = 2.0  # coordinate as a share of the image size, which may lie outside of the image
 
 
 def cut_frames(items: Any, frames: tuple[int, int] | None, file: Path) -> tuple[Any, int]:
@@ -35,18 +34,9 @@ def cut_frames(items: Any, frames: tuple[int, int] | None, file: Path) -> tuple[
     return items[frames[0] : frames[1]], frames[0]
 
 
-def face_mesh(data: NDArray, path: Path) -> NDArray:
-    """(F, 478, 3) x, y [px] and 1 where detected, of a face mesh (F, 468 or 478, 3) whose third column is a depth.
-
-    Raises
-    ------
-    ObservationError
-        Coordinates in shares of the image's size.
-    """
+def face_mesh(data: NDArray) -> NDArray:
+    """(F, 478, 3) x, y [px] and 1 where detected, of a face mesh (F, 468 or 478, 3) whose third column is a depth."""
     uv = data[..., :2]
-    if 0.0 < np.abs(uv).max(initial=0.0) <= _MAX_NORMALISED:
-        remedy = "Multiply x by the image's width and y by its height."
-        raise ObservationError("coordinates of a face run from 0 to 1, not over pixels", file=path, remedy=remedy)
     seen = np.concatenate([uv, uv.any(axis=-1, keepdims=True)], axis=-1)
     return np.pad(seen, ((0, 0), (0, max(FACE_POINTS) - data.shape[1]), (0, 0)))
 
@@ -57,12 +47,13 @@ def keypoint_record(
 ) -> Keypoints:  # fmt: skip
     """Make a record of (F, P, K, 3) x, y [px], confidence 0..1; zeros where a point was not detected.
 
-    rate [Hz], time_offset [s]; raises ObservationError for a rate that is not positive.
+    rate [Hz], time_offset [s]; raises ObservationError for a rate that is not positive, and what `Keypoints` raises.
     """
     if not rate > 0 or not np.isfinite(rate):
         raise ObservationError(f"rate {rate} Hz", file=source, remedy="Give a positive frame rate.")
-    confidence = np.clip(data[..., 2], 0, 1)
-    points = data[..., :2]
+    what = f"keypoints of camera {camera}"
+    points, confidence = data[..., :2], confidence_of(data[..., 2], what, str(source))
+    check_pixels(points, confidence, what, str(source))  # before they are converted
     seen = (confidence > 0) | points.any(axis=-1)
     if image_frame is not None:
         points = image_frame.to_calibration(points)

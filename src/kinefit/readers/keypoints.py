@@ -141,7 +141,7 @@ def read_mediapipe(
             remedy="A frame without a person must be all NaN (or zero).",
         )
     if keypoint_set == "MEDIAPIPE_478":
-        data = face_mesh(data, path)
+        data = face_mesh(data)
     if not data[..., 2].any():
         raise ObservationError(
             f"no person is detected in any of the {len(data)} frames of camera {camera}", file=path,
