@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from kinefit.errors import FileError, ObservationError
 from kinefit.geometry.camera import ImageFrame
+from kinefit.observations import Keypoints
 from kinefit.readers.keypoint_sets import KEYPOINT_SETS, keypoint_names
 from kinefit.readers.keypoints import (
     read_caliscope_csv,
@@ -16,6 +17,8 @@ from kinefit.readers.keypoints import (
     read_mediapipe,
     read_openpose,
 )
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
 
 
 def person(count=17, value=100.0, confidence=0.9):
@@ -290,3 +293,83 @@ def test_any_format(data_dir, tmp_path):
     assert read_keypoints(folder / "mediapipe_landmarks_cam03.npy", camera="c", rate=60).keypoint_set == "MEDIAPIPE_33"
     with pytest.raises(ObservationError, match="no keypoint format 'alphapose'; there are: openpose, mediapipe"):
         read_keypoints(tmp_path, format="alphapose", camera="c", rate=60)
+
+
+def depths(rng, shape):
+    return rng.normal(0.0, 0.15, shape)
+
+
+def of_record(data):
+    names = keypoint_names("MEDIAPIPE_33")
+    return Keypoints("c", "MEDIAPIPE_33", names, 30.0, data[:, None, :, :2], data[:, None, :, 2])
+
+
+NO_CONFIDENCE = {  # of a third value: what it is, and what is said of it
+    "z in shares of the width": (depths, "% of them below 0", "depth"),
+    "z in pixels": (lambda rng, shape: 900.0 * depths(rng, shape), "% of them below 0", "depth"),
+    "z of somebody far away": (lambda rng, shape: 0.05 * depths(rng, shape), "% of them below 0", "depth"),
+    "logits": (lambda rng, shape: rng.normal(3.0, 2.5, shape), "% of them below 0", "logits"),
+    "percentages": (lambda rng, shape: rng.uniform(20.0, 100.0, shape), "from 20", "divide them by 100"),
+    "metres from the camera": (lambda rng, shape: rng.uniform(2.0, 3.5, shape), "from 2 to 3.5", "depth"),
+    "millimetres from the camera": (lambda rng, shape: rng.uniform(1900.0, 2600.0, shape), "from 1.9e+03 to", "depth"),
+}
+
+
+@pytest.mark.parametrize("kind", NO_CONFIDENCE)
+@pytest.mark.parametrize("format", ["array", "json", "record"])
+def test_a_third_value_that_is_no_confidence(tmp_path, kind, format):
+    make, problem, cause = NO_CONFIDENCE[kind]
+    rng = np.random.default_rng(0)
+    data = np.dstack([rng.uniform(100.0, 900.0, (20, 33, 2)), make(rng, (20, 33, 1))])
+    with pytest.raises(ObservationError, match="no confidence or visibility") as caught:
+        if format == "array":
+            np.save(tmp_path / "m.npy", data)
+            read_mediapipe(tmp_path / "m.npy", camera="c", rate=30)
+        elif format == "json":
+            rows = {i: [{"pose_keypoints_2d": frame[:17].ravel().tolist()}] for i, frame in enumerate(data)}
+            read(write(tmp_path / "json", rows))
+        else:
+            of_record(data)
+    assert problem in caught.value.problem and cause in caught.value.remedy
+    assert caught.value.file == {"array": tmp_path / "m.npy", "json": tmp_path / "json", "record": None}[format]
+
+
+def test_scores_that_detectors_give():
+    def confidence(scores):
+        scores = np.array(scores, float).reshape(1, 1, -1)
+        names, uv = tuple(f"p{k}" for k in range(scores.size)), np.full((*scores.shape, 2), 300.0)
+        return Keypoints("c", "any", names, 30.0, uv, scores).confidence[0, 0].tolist()
+
+    assert confidence([0.2, 1.4, 0.97, 1.1]) == [0.2, 1.0, 0.97, 1.0]  # heatmaps of OpenPose
+    assert confidence([-0.02, 0.3, *[0.9] * 20]) == [0.0, 0.3, *[0.9] * 20]  # by little below 0
+    assert confidence([6.8, 0.4, 2.1, 5.5]) == [1.0, 0.4, 1.0, 1.0]  # SimCC of RTMW
+    assert confidence([2, 1, 0, 2]) == [1.0, 0.5, 0.0, 1.0]  # COCO's flags
+    assert confidence([1, 0, 1]) == [1.0, 0.0, 1.0]
+    assert confidence([-1, 0.8, -1]) == [0.0, 0.8, 0.0]  # not detected
+    assert confidence([-1, -1]) == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("format", ["array", "json", "record"])
+@pytest.mark.parametrize("low", [0.0, -1.0])
+def test_coordinates_in_shares_of_the_image(tmp_path, format, low):
+    rng = np.random.default_rng(0)
+    data = np.dstack([rng.uniform(low, 1.0, (20, 33, 2)), rng.uniform(0.2, 1.0, (20, 33, 1))])
+    with pytest.raises(ObservationError, match="from 0 to 1 .shares of the image's size.") as caught:
+        if format == "array":
+            np.save(tmp_path / "m.npy", data)
+            turned = ImageFrame.rotated((1920, 1080), 90)  # by which they become large
+            read_mediapipe(tmp_path / "m.npy", camera="c", rate=30, image_frame=turned)
+        elif format == "json":
+            rows = {i: [{"pose_keypoints_2d": frame[:17].ravel().tolist()}] for i, frame in enumerate(data)}
+            read(write(tmp_path / "json", rows))
+        else:
+            of_record(data)
+    assert "Multiply x by the image's width" in caught.value.remedy
+
+
+def test_users_arrays_with_a_depth_in_the_third_column(data_dir):
+    for case in ("keypoints-z-in-place-of-visibility", "keypoints-normalised-z"):
+        take = data_dir("cases_of_users") / case / "take.toml"
+        with pytest.raises(ObservationError, match="36 % of them below 0") as caught:
+            load_observations(read_take(take))
+        assert caught.value.file == take.with_name("mp1.npy")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from os import PathLike
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +23,7 @@ _INSTEAD = (
 )
 
 
-def confidence_of(scores: NDArray, what: str, file: str | None = None) -> NDArray:
+def confidence_of(scores: NDArray, what: str, file: str | PathLike[str] | None = None) -> NDArray:
     """Confidence 0..1 of a detector's scores (any shape), 0 for undetected points.
 
     Scores of heatmaps exceed 1 and fall below 0 by little; they are clipped. COCO's flags 0 (not labelled), 1 (occluded)
@@ -54,11 +56,11 @@ def confidence_of(scores: NDArray, what: str, file: str | None = None) -> NDArra
         extent, cause = "", "This may be a depth, or scores without a limit."
     else:
         return np.clip(scores, 0.0, 1.0)
-    problem = f"{what}: the value after x and y is no confidence or visibility: from {low:.3g} to {high:.3g}{extent}"
+    problem = f"{what}: the value after x and y is no confidence or visibility: from {values.min():.3g} to {high:.3g}{extent}"
     raise ObservationError(problem, file=file, remedy=f"{cause} {_INSTEAD}")
 
 
-def check_pixels(points: NDArray, confidence: NDArray, what: str, file: str | None = None) -> None:
+def check_pixels(points: NDArray, confidence: NDArray, what: str, file: str | PathLike[str] | None = None) -> None:
     """Check that the coordinates of points (..., 2) with a confidence (...) 0..1 are pixels.
 
     Raises

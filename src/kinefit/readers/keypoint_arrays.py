@@ -52,8 +52,8 @@ def keypoint_record(
     if not rate > 0 or not np.isfinite(rate):
         raise ObservationError(f"rate {rate} Hz", file=source, remedy="Give a positive frame rate.")
     what = f"keypoints of camera {camera}"
-    points, confidence = data[..., :2], confidence_of(data[..., 2], what, str(source))
-    check_pixels(points, confidence, what, str(source))  # before they are converted
+    points, confidence = data[..., :2], confidence_of(data[..., 2], what, source)
+    check_pixels(points, confidence, what, source)  # before they are converted
     seen = (confidence > 0) | points.any(axis=-1)
     if image_frame is not None:
         points = image_frame.to_calibration(points)
