@@ -19,6 +19,7 @@ from kinefit.readers.keypoints import (
 )
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
+from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 
 
 def person(count=17, value=100.0, confidence=0.9):
@@ -373,3 +374,47 @@ def test_users_arrays_with_a_depth_in_the_third_column(data_dir):
         with pytest.raises(ObservationError, match="36 % of them below 0") as caught:
             load_observations(read_take(take))
         assert caught.value.file == take.with_name("mp1.npy")
+
+
+MOTION = squat_and_wave(duration=1.0)
+RIG = studio_rig(MOTION)
+
+
+def people_of(keypoint_set, folder, order=None):
+    """A folder of OpenPose's json of one camera, with points of a set, in another order where one is given."""
+    record = simulate_keypoints(MOTION, RIG, keypoint_set, noise_px=3.0)[0]
+    rows = np.nan_to_num(np.dstack([record.points[:, 0], record.confidence[:, 0]]))
+    rows = rows if order is None else rows[:, order]
+    return write(folder, {i: [{"pose_keypoints_2d": frame.ravel().tolist()}] for i, frame in enumerate(rows)})
+
+
+@pytest.mark.parametrize("keypoint_set", ["BODY_25", "BODY_25B", "COCO_17", "HALPE_26"])
+def test_the_set_follows_from_the_number_of_points_and_the_bones(tmp_path, keypoint_set):
+    folder = people_of(keypoint_set, tmp_path / "json")
+    seen = read_openpose(folder, camera="c", rate=30)
+    assert seen.keypoint_set == keypoint_set and seen.names == KEYPOINT_SETS[keypoint_set]
+    stated = read_openpose(folder, camera="c", rate=30, keypoint_set=keypoint_set)
+    np.testing.assert_array_equal(stated.points, seen.points)
+
+
+@pytest.mark.parametrize(("right", "wrong"), [("BODY_25", "BODY_25B"), ("BODY_25B", "BODY_25")])
+def test_a_stated_set_of_as_many_points_that_does_not_fit(tmp_path, right, wrong):
+    folder = people_of(right, tmp_path / "json")
+    with pytest.raises(ObservationError, match=f"order of {right}: as {wrong}, bones are 2.. times as long") as caught:
+        read_openpose(folder, camera="c", rate=30, keypoint_set=wrong)
+    assert f'set = "{right}"' in caught.value.remedy and caught.value.file == str(folder)
+
+
+def test_points_in_the_order_of_another_program(tmp_path):
+    coco = KEYPOINT_SETS["COCO_17"]
+    other = "Nose RHip RKnee RAnkle LHip LKnee LAnkle RHip Nose LEar REar "  # its hip, spine and head are near these
+    other += "LShoulder LElbow LWrist RShoulder RElbow RWrist"
+    folder = people_of("COCO_17", tmp_path / "json", [coco.index(name) for name in other.split()])
+    with pytest.raises(ObservationError, match="the order of Human3.6M .17 points.: as COCO_17") as caught:
+        read_openpose(folder, camera="c", rate=30)
+    assert "in the order of COCO_17" in caught.value.remedy
+
+
+def test_openpose_s_own_model_without_a_set(data_dir):
+    seen = load_observations(read_take(data_dir("cases_of_users") / "openpose-body25-without-set" / "take.toml"))
+    assert [k.keypoint_set for k in seen.keypoints] == 4 * ["BODY_25"]

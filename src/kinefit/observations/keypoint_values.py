@@ -1,4 +1,4 @@
-"""Check that 2D keypoints are pixels with a confidence, not shares of the image's size, depths, logits or percentages."""
+"""Check that 2D keypoints are pixels with a confidence: no shares of the image's size, depths, logits, percentages."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ _INSTEAD = (
 def confidence_of(scores: NDArray, what: str, file: str | PathLike[str] | None = None) -> NDArray:
     """Confidence 0..1 of a detector's scores (any shape), 0 for undetected points.
 
-    Scores of heatmaps exceed 1 and fall below 0 by little; they are clipped. COCO's flags 0 (not labelled), 1 (occluded)
-    and 2 (visible) become 0, 0.5 and 1, and -1 for an undetected point 0.
+    Scores of heatmaps exceed 1 and fall below 0 by little; they are clipped. COCO's flags 0 (not labelled), 1
+    (occluded) and 2 (visible) become 0, 0.5 and 1, and -1 for an undetected point 0.
 
     Parameters
     ----------
@@ -56,7 +56,8 @@ def confidence_of(scores: NDArray, what: str, file: str | PathLike[str] | None =
         extent, cause = "", "This may be a depth, or scores without a limit."
     else:
         return np.clip(scores, 0.0, 1.0)
-    problem = f"{what}: the value after x and y is no confidence or visibility: from {values.min():.3g} to {high:.3g}{extent}"
+    extent = f"from {values.min():.3g} to {high:.3g}{extent}"
+    problem = f"{what}: the value after x and y is no confidence or visibility: {extent}"
     raise ObservationError(problem, file=file, remedy=f"{cause} {_INSTEAD}")
 
 

@@ -40,6 +40,17 @@ KEYPOINT_SETS: dict[str, tuple[str, ...]] = {
     "MEDIAPIPE_478": MEDIAPIPE_478,
 }  # names in each detector's own order; of OpenPose both hands come after the body, left first
 
+SET_OF_COUNT = {len(KEYPOINT_SETS[name]): name for name in sorted(KEYPOINT_SETS)}
+"""The set of a number of points; of 25 BODY_25B."""
+
+OTHER_ORDERS: dict[str, tuple[str, ...]] = {
+    "Human3.6M (17 points)": tuple(
+        "Hip RHip RKnee RAnkle LHip LKnee LAnkle Spine Thorax Neck HeadTop LShoulder LElbow LWrist RShoulder RElbow "
+        "RWrist".split()
+    ),
+}
+"""Orders of points that are not read, but as long as a set that is."""
+
 HAND_POINTS = 21
 """Number of points of one hand, the same for every detector."""
 
