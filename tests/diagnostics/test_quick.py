@@ -136,7 +136,8 @@ def test_samples_of_nothing_are_empty():
 @pytest.mark.parametrize("seed", range(3))
 def test_points_in_another_order_are_no_wrong_scale(seed):
     order = np.random.default_rng(seed).permutation(len(SEEN[0].names))
-    found = quick(keypoints=[replace(k, points=k.points[:, :, order], confidence=k.confidence[:, :, order]) for k in SEEN])
+    seen = [replace(k, points=k.points[:, :, order], confidence=k.confidence[:, :, order]) for k in SEEN]
+    found = quick(keypoints=seen)
     assert found[0].kind == "set" and f"not those of {SEEN[0].keypoint_set}" in found[0].text
     assert "scale" not in {f.kind for f in found}
 

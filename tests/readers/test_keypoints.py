@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from kinefit.errors import FileError, ObservationError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.observations import Keypoints
-from kinefit.readers.keypoint_sets import KEYPOINT_SETS, keypoint_names
+from kinefit.readers.guess.files import find_keypoints
+from kinefit.readers.keypoint_sets import KEYPOINT_SETS, SPLIT, keypoint_names
 from kinefit.readers.keypoints import (
     read_caliscope_csv,
     read_keypoints,
@@ -418,3 +419,34 @@ def test_points_in_the_order_of_another_program(tmp_path):
 def test_openpose_s_own_model_without_a_set(data_dir):
     seen = load_observations(read_take(data_dir("cases_of_users") / "openpose-body25-without-set" / "take.toml"))
     assert [k.keypoint_set for k in seen.keypoints] == 4 * ["BODY_25"]
+
+
+COCO = {"category_id": 1, "keypoints": [1.0, 2.0, 0.9] * 17}
+RESULTS = {  # the start of a file: what it is
+    "alphapose.json": (json.dumps([{"image_id": "0.jpg"} | COCO]), "AlphaPose"),
+    "coco.json": (json.dumps([COCO | {"image_id": 7, "score": 1}]), "COCO"),
+    "by_image.json": (json.dumps({"0.jpg": {"version": 0.1, "bodies": [{"joints": [1.0, 2.0, 0.9]}]}}), "AlphaPose"),
+    "mmpose.json": (json.dumps([{"frame_id": 0, "instances": [{"keypoints": [[1.0, 2.0]]}]}]), "MMPose"),
+    "dlc.csv": ("scorer,net,net,net\nbodyparts,nose,nose,nose\ncoords,x,y,likelihood\n0,1,2,0.9\n", "DeepLabCut"),
+}
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_files_of_other_programs_are_said_for_what_they_are(tmp_path, name):
+    text, program = RESULTS[name]
+    path = tmp_path / name
+    path.write_text(text)
+    for format in ("openpose", None, "mediapipe"):
+        with pytest.raises(ObservationError, match=f"{program}.*which are not read") as caught:
+            read_keypoints(path, format=format, camera="c", rate=30.0)
+        assert caught.value.file == path and "pose_keypoints_2d" in caught.value.remedy
+    what = caught.value.problem.removesuffix(", which are not read")
+    assert find_keypoints([path])[1] == [f"{name}: {what}; not used. {SPLIT}"]
+
+
+def test_alphapose_s_results_beside_a_video(data_dir):
+    path = data_dir("cases_of_users") / "keypoints-alphapose-results" / "alphapose-results.json"
+    for named in (path, path.parent):
+        with pytest.raises(ObservationError, match="AlphaPose's or COCO's results, a list of all frames'") as caught:
+            read_openpose(named, camera="c", rate=30.0)
+        assert caught.value.file == path

@@ -53,7 +53,7 @@ def confidence_of(scores: NDArray, what: str, file: str | PathLike[str] | None =
     elif is_high and 50.0 < high <= 100.0:
         extent, cause = "", "If these are percentages, divide them by 100. Else this may be a depth."
     elif is_high:
-        extent, cause = "", "This may be a depth, or scores without a limit."
+        extent, cause = "", "This may be a depth, or logits."
     else:
         return np.clip(scores, 0.0, 1.0)
     extent = f"from {values.min():.3g} to {high:.3g}{extent}"

@@ -24,7 +24,9 @@ from kinefit.readers.keypoint_sets import (
     MEDIAPIPE_SETS,
     OPENPOSE_HANDS,
     SET_OF_COUNT,
+    SPLIT,
     keypoint_names,
+    other_keypoints,
 )
 
 if TYPE_CHECKING:
@@ -251,6 +253,8 @@ def read_keypoints(path: str | PathLike[str], *, format: str | None = None, **op
     ObservationError, FileError
         An unknown format; and what those raise.
     """
+    if Path(path).is_file() and (other := other_keypoints(Path(path))):
+        raise ObservationError(f"{other}, which are not read", file=path, remedy=SPLIT)
     formats = {"openpose": read_openpose, "mediapipe": read_mediapipe, "caliscope": _caliscope_camera}
     if format is None:
         format = "openpose" if Path(path).is_dir() else "mediapipe"
@@ -283,6 +287,8 @@ def _numbered_files(folder: Path) -> list[Path]:
             continue
         match = _FRAME_NUMBER.search(path.name)
         if not match:
+            if other := other_keypoints(path):
+                raise ObservationError(f"{other}, which are not read", file=path, remedy=SPLIT)
             raise ObservationError("no frame number in this name", file=path, remedy="Expected NAME_0012.json.")
         number = int(match[1])
         if number in numbered:
@@ -312,6 +318,8 @@ def _read_people(path: Path) -> list[OpenPosePerson]:
     try:
         return decode_openpose(raw).people
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        if other := other_keypoints(path):
+            raise ObservationError(f"{other}, which are not read", file=path, remedy=SPLIT) from error
         infinite = re.search(rb"[\[,:]\s*-?(NaN|Inf)", raw, re.IGNORECASE)
         problem = "NaN or infinity among the keypoints" if infinite else f"broken json ({error})"
         raise ObservationError(problem, file=path, remedy="Run the detector again on this frame.") from error

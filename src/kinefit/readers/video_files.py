@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,7 @@ class VideoFile:
             self._container = _open(self.path)
             self._stream = self._container.streams.video[0]
             self._stream.thread_type = "AUTO"
-        self._decoder = self._container.decode(self._stream)
+        self._decoder = _frames(self._container)
         self._next = 0  # lower bound of the frame that comes next
 
     def _decode(self, i: int) -> Any:
@@ -106,7 +107,7 @@ def first_image(path: Path) -> NDArray[np.uint8]:
     """
     container = _open(path)
     try:
-        frame = next(container.decode(video=0))
+        frame = next(_frames(container))
     except (av.FFmpegError, StopIteration, ValueError) as error:
         raise FileError(f"no image can be decoded ({error})", file=path, remedy=_REMEDY) from error
     finally:
@@ -138,7 +139,7 @@ def image_at(
         container.streams.video[0].codec_context.skip_frame = "NONREF"  # what no other image needs
         try:
             container.seek(round(aim * av.time_base) + (container.start_time or 0), backward=True)
-            for found in container.decode(video=0):
+            for found in _frames(container):
                 begin = (container.start_time or 0) / av.time_base
                 if found.time is None or found.time - begin >= aim or time.monotonic() > until:
                     break
@@ -184,6 +185,13 @@ def _open(path: Path) -> Any:
         container.close()
         raise FileError("a video of a codec that FFmpeg does not know", file=path, remedy=_REMEDY)
     return container
+
+
+def _frames(container: Any) -> Iterator[Any]:
+    """Decode the frames of the first video stream; empty packets, which stand for dropped frames, are passed over."""
+    for packet in container.demux(container.streams.video[0]):
+        if packet.size or packet.dts is None:
+            yield from packet.decode()
 
 
 def _reason(error: Exception) -> str:
@@ -243,7 +251,7 @@ def _presentation_times(path: Path) -> tuple[list[int], list[int]]:
 def _decoded_times(path: Path) -> list[int | None]:
     with _open(path) as container:
         try:
-            pts = [frame.pts for frame in container.decode(video=0)]
+            pts = [frame.pts for frame in _frames(container)]
         except (av.FFmpegError, ValueError) as error:
             raise FileError(f"the video cannot be decoded ({error})", file=path, remedy=_REMEDY) from error
     if None in pts:
