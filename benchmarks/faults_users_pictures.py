@@ -158,18 +158,22 @@ def _stated_wrongly(folder: Path) -> bool:
     return stops(take, "the order of BODY_25B", 'set = "BODY_25B"')
 
 
-def _shuffled(folder: Path) -> bool:
-    order = np.random.default_rng(0).permutation(25)
-    take = write_take(folder, [[a[:, order]] for a in openpose()])
+def _in_order(folder: Path, columns: Sequence[int], *words: str) -> bool:
+    """Whether `track` says of points in another order what they are, and blames no camera."""
+    take = write_take(folder, [[a[:, columns]] for a in openpose()])
     told = run("track", take, *QUIET, "--out", folder / "out")[1]
-    return "not those of" in told and not any(blame in told for blame in BLAMES)
+    return all(word in told for word in words) and not any(blame in told for blame in BLAMES)
+
+
+def _shuffled(folder: Path) -> bool:
+    return _in_order(folder, np.random.default_rng(0).permutation(25).tolist(), "not those of BODY_25")
 
 
 def _human36m(folder: Path) -> bool:
     names = KEYPOINT_SETS["BODY_25B"]
-    legs, rest = "RHip RKnee RAnkle LHip LKnee LAnkle", "UpperNeck HeadTop LShoulder LElbow LWrist RShoulder RElbow RWrist"
-    columns = [names.index(n) for n in f"LHip {legs} LHip UpperNeck {rest}".split()]
-    return stops(write_take(folder, [[a[:, columns]] for a in openpose()]), "the order of Human3.6M")
+    legs, arms = "RHip RKnee RAnkle LHip LKnee LAnkle", "LShoulder LElbow LWrist RShoulder RElbow RWrist"
+    columns = [names.index(n) for n in f"LHip {legs} LHip UpperNeck UpperNeck HeadTop {arms}".split()]
+    return _in_order(folder, columns, "not those of COCO_17", "order in which the points are written")
 
 
 def _alphapose(folder: Path) -> bool:

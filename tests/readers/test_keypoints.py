@@ -406,16 +406,6 @@ def test_a_stated_set_of_as_many_points_that_does_not_fit(tmp_path, right, wrong
     assert f'set = "{right}"' in caught.value.remedy and caught.value.file == str(folder)
 
 
-def test_points_in_the_order_of_another_program(tmp_path):
-    coco = KEYPOINT_SETS["COCO_17"]
-    other = "Nose RHip RKnee RAnkle LHip LKnee LAnkle RHip Nose LEar REar "  # its hip, spine and head are near these
-    other += "LShoulder LElbow LWrist RShoulder RElbow RWrist"
-    folder = people_of("COCO_17", tmp_path / "json", [coco.index(name) for name in other.split()])
-    with pytest.raises(ObservationError, match="the order of Human3.6M .17 points.: as COCO_17") as caught:
-        read_openpose(folder, camera="c", rate=30)
-    assert "in the order of COCO_17" in caught.value.remedy
-
-
 def test_openpose_s_own_model_without_a_set(data_dir):
     seen = load_observations(read_take(data_dir("cases_of_users") / "openpose-body25-without-set" / "take.toml"))
     assert [k.keypoint_set for k in seen.keypoints] == 4 * ["BODY_25"]

@@ -14,7 +14,7 @@ from kinefit.errors import ObservationError
 from kinefit.observations import Keypoints
 from kinefit.observations.arrays import sealed
 from kinefit.observations.keypoint_values import check_pixels, confidence_of
-from kinefit.readers.keypoint_sets import KEYPOINT_SETS, OTHER_ORDERS, keypoint_names
+from kinefit.readers.keypoint_sets import KEYPOINT_SETS, keypoint_names
 
 if TYPE_CHECKING:
     from kinefit.geometry.camera import ImageFrame
@@ -28,8 +28,8 @@ _BONES = (
 _MAX_COMPARED_FRAMES = 60  # spread over the recording
 _MIN_COMPARED_PEOPLE = 5  # in these, with half of their points: fewer do not contradict what is stated
 _MAX_LENGTH_RATIO = 0.7
-"""Mean length of the bones in the right order of points to that in a wrong one: 0.37 to 0.52 for BODY_25 and BODY_25B
-in recordings, 0.65 for Human3.6M read as COCO_17, which read right has at most as long ones as read as Human3.6M."""
+"""Mean length of the bones in the right order of points to that in the other one: 0.37 to 0.52 for BODY_25 and BODY_25B
+in recordings."""
 
 FACE_POINTS = 468, 478
 """Points of a face mesh without and with irises."""
@@ -64,34 +64,27 @@ def in_right_order(record: Keypoints, *, stated: bool) -> Keypoints:
     Raises
     ------
     ObservationError
-        The points are clearly in another order than stated, or in one that is not read.
+        The points are clearly in another order than stated.
     """
-    orders = {n: names for n, names in {**KEYPOINT_SETS, **OTHER_ORDERS}.items() if len(names) == len(record.names)}
-    rows = slice(None, None, len(record) // _MAX_COMPARED_FRAMES + 1)
+    own, rows = record.keypoint_set, slice(None, None, len(record) // _MAX_COMPARED_FRAMES + 1)
     uv = np.where((record.confidence[rows] > 0.0)[..., None], record.points[rows], np.nan)
     uv = uv[np.isfinite(uv[..., 0]).mean(axis=-1) > 0.5]
-    lengths = {name: _mean_bone(uv, names) for name, names in orders.items()} if len(orders) > 1 and len(uv) else {}
-    best = min(lengths, key=lambda name: lengths[name], default="")
-    if not best or not 0.0 < lengths[best] < _MAX_LENGTH_RATIO * lengths[record.keypoint_set]:
+    orders = [name for name, names in KEYPOINT_SETS.items() if len(names) == len(record.names)]
+    lengths = {name: _mean_bone(uv, KEYPOINT_SETS[name]) for name in orders} if len(orders) > 1 else {own: 0.0}
+    best = min(lengths, key=lambda name: lengths[name])
+    if not 0.0 < lengths[best] < _MAX_LENGTH_RATIO * lengths[own] or (stated and len(uv) < _MIN_COMPARED_PEOPLE):
         return record
-    if best in KEYPOINT_SETS and not stated:
-        return record.first_points(best, KEYPOINT_SETS[best])
-    if len(uv) < _MIN_COMPARED_PEOPLE:
-        return record
-    longer = lengths[record.keypoint_set] / lengths[best]
-    problem = f"the points are in the order of {best}: as {record.keypoint_set}, bones are {longer:.1f} times as long"
-    remedy = f"Write the points in the order of {record.keypoint_set}; {best} is not read."
-    remedy = f'Write set = "{best}" into [[keypoints]].' if best in KEYPOINT_SETS else remedy
-    raise ObservationError(problem, file=record.source, remedy=remedy)
+    if stated:
+        longer = lengths[own] / lengths[best]
+        problem = f"the points are in the order of {best}: as {own}, bones are {longer:.1f} times as long"
+        raise ObservationError(problem, file=record.source, remedy=f'Write set = "{best}" into [[keypoints]].')
+    return record.first_points(best, KEYPOINT_SETS[best])
 
 
 def _mean_bone(uv: NDArray, names: Sequence[str]) -> float:
     """Mean length of the bones of people (N, K, 2) [px], as a share of their extent; infinite without bones."""
-    ends = [(names.index(a), names.index(b)) for a, b in _BONES if a in names and b in names]
-    if not ends:
-        return np.inf
+    start, end = np.array([(names.index(a), names.index(b)) for a, b in _BONES]).T
     extent = np.linalg.norm(np.fmax.reduce(uv, axis=1) - np.fmin.reduce(uv, axis=1), axis=-1)
-    start, end = np.array(ends).T
     lengths = np.linalg.norm(uv[:, start] - uv[:, end], axis=-1) / np.maximum(extent, 1.0)[:, None]
     known = np.isfinite(lengths).any(axis=0)
     return float(np.nanmedian(lengths[:, known], axis=0).mean()) if known.any() else np.inf

@@ -46,14 +46,6 @@ KEYPOINT_SETS: dict[str, tuple[str, ...]] = {
 SET_OF_COUNT = {len(KEYPOINT_SETS[name]): name for name in sorted(KEYPOINT_SETS)}
 """The set of a number of points; of 25 BODY_25B."""
 
-OTHER_ORDERS: dict[str, tuple[str, ...]] = {
-    "Human3.6M (17 points)": tuple(
-        "Hip RHip RKnee RAnkle LHip LKnee LAnkle Spine Thorax Neck HeadTop LShoulder LElbow LWrist RShoulder RElbow "
-        "RWrist".split()
-    ),
-}
-"""Orders of points that are not read, but as long as a set that is."""
-
 HAND_POINTS = 21
 """Number of points of one hand, the same for every detector."""
 
@@ -94,3 +86,9 @@ def other_keypoints(path: Path) -> str:
     with path.open("rb") as file:
         start = file.read(_MAX_START_BYTES).lstrip()
     return next((what for pattern, what in _OTHER_FILES.items() if re.match(pattern, start, re.DOTALL)), "")
+
+
+def refuse_other_keypoints(path: Path) -> None:
+    """Raise ObservationError for a file of another program's keypoints."""
+    if other := other_keypoints(path):
+        raise ObservationError(f"{other}, which are not read", file=path, remedy=SPLIT)

@@ -17,17 +17,9 @@ from kinefit._arguments import checked
 from kinefit._files import no_column, read_npy
 from kinefit.errors import FileError, ObservationError, check_choice, choices
 from kinefit.observations import Keypoints
+from kinefit.readers import keypoint_sets
 from kinefit.readers.keypoint_arrays import FACE_POINTS, cut_frames, face_mesh, in_right_order, keypoint_record
-from kinefit.readers.keypoint_sets import (
-    HAND_POINTS,
-    KEYPOINT_SETS,
-    MEDIAPIPE_SETS,
-    OPENPOSE_HANDS,
-    SET_OF_COUNT,
-    SPLIT,
-    keypoint_names,
-    other_keypoints,
-)
+from kinefit.readers.keypoint_sets import HAND_POINTS, KEYPOINT_SETS, MEDIAPIPE_SETS, OPENPOSE_HANDS, keypoint_names
 
 if TYPE_CHECKING:
     from kinefit.geometry.camera import ImageFrame
@@ -96,7 +88,7 @@ def read_openpose(
     paths, start = cut_frames(_numbered_files(folder), frames, folder)
     read = [_read_people(path) for path in paths]
     first = next((len(people[0].pose_keypoints_2d) // 3 for people in read if people), 0)
-    named = keypoint_set or SET_OF_COUNT.get(first, "BODY_25B")
+    named = keypoint_set or keypoint_sets.SET_OF_COUNT.get(first, "BODY_25B")
     names = keypoint_names(named)
     people = [_numbers(persons, path, named) for persons, path in zip(read, paths, strict=True)]
     if folder.is_dir() and not any(map(len, people)):
@@ -253,8 +245,8 @@ def read_keypoints(path: str | PathLike[str], *, format: str | None = None, **op
     ObservationError, FileError
         An unknown format; and what those raise.
     """
-    if Path(path).is_file() and (other := other_keypoints(Path(path))):
-        raise ObservationError(f"{other}, which are not read", file=path, remedy=SPLIT)
+    if Path(path).is_file():
+        keypoint_sets.refuse_other_keypoints(Path(path))
     formats = {"openpose": read_openpose, "mediapipe": read_mediapipe, "caliscope": _caliscope_camera}
     if format is None:
         format = "openpose" if Path(path).is_dir() else "mediapipe"
@@ -287,8 +279,7 @@ def _numbered_files(folder: Path) -> list[Path]:
             continue
         match = _FRAME_NUMBER.search(path.name)
         if not match:
-            if other := other_keypoints(path):
-                raise ObservationError(f"{other}, which are not read", file=path, remedy=SPLIT)
+            keypoint_sets.refuse_other_keypoints(path)
             raise ObservationError("no frame number in this name", file=path, remedy="Expected NAME_0012.json.")
         number = int(match[1])
         if number in numbered:
@@ -318,8 +309,7 @@ def _read_people(path: Path) -> list[OpenPosePerson]:
     try:
         return decode_openpose(raw).people
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        if other := other_keypoints(path):
-            raise ObservationError(f"{other}, which are not read", file=path, remedy=SPLIT) from error
+        keypoint_sets.refuse_other_keypoints(path)
         infinite = re.search(rb"[\[,:]\s*-?(NaN|Inf)", raw, re.IGNORECASE)
         problem = "NaN or infinity among the keypoints" if infinite else f"broken json ({error})"
         raise ObservationError(problem, file=path, remedy="Run the detector again on this frame.") from error
