@@ -171,7 +171,7 @@ def _openpose(folder: Path) -> Seed:
 
     (folder / "json").mkdir()
     for i in range(3):
-        people = [{"pose_keypoints_2d": [float(v) for v in range(75)]}]
+        people = [{"pose_keypoints_2d": [v if v % 3 < 2 else 0.9 for v in map(float, range(75))]}]
         (folder / "json" / f"a_{i:04d}_keypoints.json").write_text(json.dumps({"version": 1.3, "people": people}))
     files = tuple(sorted((folder / "json").iterdir()))
     return Seed(files, lambda: read_openpose(folder / "json", camera="a", rate=30.0))
@@ -180,7 +180,7 @@ def _openpose(folder: Path) -> Seed:
 def _mediapipe(folder: Path) -> Seed:
     from kinefit.readers.keypoints import read_mediapipe
 
-    np.save(folder / "a.npy", np.random.default_rng(0).random((4, 33, 3)))
+    np.save(folder / "a.npy", np.random.default_rng(0).random((4, 33, 3)) * (640, 480, 1))
     return Seed((folder / "a.npy",), lambda: read_mediapipe(folder / "a.npy", camera="a", rate=30.0))
 
 

@@ -40,6 +40,14 @@ def test_everybody_in_view_is_tracked(take, tmp_path):
         assert f"2 people are in view; person {k} is tracked" in told.stdout
 
 
+def test_a_point_that_no_camera_ever_sees(tmp_path):
+    told = run("track", write_take(tmp_path, never=("HeadTop", "LBigToe")), *QUIET, "--out", tmp_path / "out")
+    assert told.exit_code == 0, told.output
+    found = [kinefit.read_motion(tmp_path / "out" / f"person-{k}" / "motion.npz") for k in (1, 2)]
+    gaps = np.array([[joint_gap(one, truth) for truth in motions()] for one in found])
+    assert sorted(gaps.argmin(axis=1)) == [0, 1] and gaps.min(axis=1).max() < 0.03
+
+
 def test_what_the_cameras_saw_is_read_once_for_all(take, tmp_path, monkeypatch):
     from kinefit.multiview import followed
     from kinefit.tracking.takes import in_view

@@ -7,9 +7,11 @@ import pytest
 
 import kinefit
 from kinefit import Recording, load_body, track
+from kinefit.diagnostics.arrangement import sample
 from kinefit.diagnostics.groups import group_findings
 from kinefit.diagnostics.keypoints import check_keypoints
 from kinefit.diagnostics.quick import input_findings, motion_findings, with_cause, with_findings
+from kinefit.diagnostics.views import make_views
 from kinefit.errors import TrackingError
 from kinefit.findings import CLOCKS, FINDINGS, INVERTED, STATURE, Finding, faults_of, of_provenance
 from kinefit.geometry import se3
@@ -115,6 +117,29 @@ def test_exchanged_names_of_left_and_right_show_in_face_toes_and_knees():
                                               exchanged(k).confidence), points=exchanged(k).points)
                for k in SEEN]  # fmt: skip
     assert [f.kind for f in quick(keypoints=without)] == ["mirrored"]  # by the knees alone
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_points_of_little_confidence_are_said_before_cameras_are_blamed(whole):
+    weak = [replace(k, confidence=0.25 * k.confidence / k.confidence.max()) for k in SEEN]
+    found = check_keypoints(RIG, weak, quick=not whole).findings
+    assert [(f.kind, f.cameras) for f in faults_of(found)] == [("coverage", (name,)) for name in RIG.names]
+    assert all(f"in {c} with a confidence above 0.3 (highest: 0.25)" in f.text for f, c in zip(found, RIG.names))
+
+
+def test_samples_of_nothing_are_empty():
+    views = make_views(RIG, SEEN)
+    assert sample(views.select([])).shape[1:] == (0, 2)
+    assert sample(views.at(np.zeros(0, int))).shape == (0, 4, 2)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_in_another_order_are_no_wrong_scale(seed):
+    order = np.random.default_rng(seed).permutation(len(SEEN[0].names))
+    seen = [replace(k, points=k.points[:, :, order], confidence=k.confidence[:, :, order]) for k in SEEN]
+    found = quick(keypoints=seen)
+    assert found[0].kind == "set" and f"not those of {SEEN[0].keypoint_set}" in found[0].text
+    assert "scale" not in {f.kind for f in found}
 
 
 def parted(who):

@@ -40,6 +40,14 @@ def test_the_image_in_a_mirror_is_nobody_else(listed_first):
     assert sentences(followed.as_record(), asked=False)[-1] == "person 2 is the mirror image of person 1"
 
 
+def test_a_mirror_image_is_found_with_a_point_that_is_never_seen():
+    x = along(line((-0.5, 0.0, 0.3), (0.5, 0.0, 0.5), FRAMES), 1)
+    x[:, NAMES.index("Nose")] = np.nan
+    keypoints, _ = records([x, behind_glass(x, np.array([0.0, 0.0, -1.0]), -1.5)], seed=3, rig=RIG)
+    told = mark_mirror_images(RIG, keypoints, people_of(RIG, keypoints))
+    assert [one.image_of for one in told] == [None, 0] and all(np.isfinite(one.size) for one in told)
+
+
 @pytest.mark.parametrize("alike", ["the same side", "half a second later", "still"])
 def test_two_who_move_alike_are_two(alike):
     start, end = ((-0.5, 0.0, 0.3), (0.5, 0.0, 0.5)) if alike != "still" else ((0.0, 0.0, 0.4),) * 2

@@ -1,5 +1,7 @@
 """People before one camera: each column of the detector is one of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -40,6 +42,16 @@ def test_everybody_is_told_with_place_and_speed():
     stands, walks = found.people
     assert np.linalg.norm(stands.place - STANDS[0]) < 0.15 and stands.speed < 0.02
     assert walks.speed == pytest.approx(1.5 * RATE / (FRAMES - 1), abs=0.1) and walks.views.sum() == FRAMES - 10
+
+
+def test_a_point_that_is_never_seen_changes_neither_size_nor_speed_nor_place():
+    whole = record(STANDS, WALKS)
+    points, lifted, confidence = (np.array(v) for v in (whole.points, whole.lifted, whole.confidence))
+    points[:, :, 7], lifted[:, :, 7], confidence[:, :, 7] = np.nan, np.nan, 0.0
+    part = replace(whole, points=points, lifted=lifted, confidence=confidence)
+    for one, other in zip(follow(RIG, [part]).people, follow(RIG, [whole]).people, strict=True):
+        assert one.speed == pytest.approx(other.speed, abs=0.02) and one.size == pytest.approx(other.size, rel=0.1)
+        assert np.linalg.norm(one.place - other.place) < 0.05
 
 
 @pytest.mark.parametrize(

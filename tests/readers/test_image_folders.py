@@ -1,5 +1,7 @@
 """Folders of images as videos: order, rate, sizes, gaps, and a take that is made of them."""
 
+import struct
+
 import cv2
 import numpy as np
 import pytest
@@ -29,6 +31,32 @@ def test_images_are_frames_by_their_number(tmp_path, ending):
             red, green, _ = video.read(i)[16, 24]
             assert abs(int(red) - 5 * (8 + i)) <= 3 and green <= 3
         assert len(list(video.frames(2, 5))) == 3
+
+
+ORIENTATIONS = {  # of Exif: what is shown of the stored image
+    1: lambda image: image,
+    2: np.fliplr,
+    3: lambda image: np.rot90(image, 2),
+    4: np.flipud,
+    5: lambda image: image.transpose(1, 0, 2),
+    6: lambda image: np.rot90(image, -1),
+    7: lambda image: np.rot90(image, 2).transpose(1, 0, 2),
+    8: np.rot90,
+}
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+def test_photographs_are_upright_and_mirrored_as_they_state(tmp_path, orientation):
+    stored = np.kron(np.random.default_rng(0).integers(0, 255, (4, 6, 3)), np.ones((16, 16, 1))).astype(np.uint8)
+    jpeg = cv2.imencode(".jpg", stored[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+    tag = struct.pack(">4sIHHHIHHI", b"MM\0*", 8, 1, 0x112, 3, 1, orientation, 0, 0)
+    exif = b"\xff\xe1" + struct.pack(">H", 8 + len(tag)) + b"Exif\0\0" + tag
+    for i in range(2):
+        (tmp_path / f"img{i}.jpg").write_bytes(jpeg[:2] + exif + jpeg[2:])
+    expected = ORIENTATIONS[orientation](stored)
+    with Video(tmp_path, rate=10.0) as video:
+        assert video.size == expected.shape[1::-1]
+        assert np.abs(video.read(1).astype(int) - expected).mean() < 10
 
 
 def test_a_pattern_names_the_images_of_one_camera(tmp_path):

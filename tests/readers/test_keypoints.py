@@ -9,13 +9,18 @@ from hypothesis import strategies as st
 
 from kinefit.errors import FileError, ObservationError
 from kinefit.geometry.camera import ImageFrame
-from kinefit.readers.keypoint_sets import KEYPOINT_SETS, keypoint_names
+from kinefit.observations import Keypoints
+from kinefit.readers.guess.files import find_keypoints
+from kinefit.readers.keypoint_sets import KEYPOINT_SETS, SPLIT, keypoint_names
 from kinefit.readers.keypoints import (
     read_caliscope_csv,
     read_keypoints,
     read_mediapipe,
     read_openpose,
 )
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
+from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 
 
 def person(count=17, value=100.0, confidence=0.9):
@@ -290,3 +295,148 @@ def test_any_format(data_dir, tmp_path):
     assert read_keypoints(folder / "mediapipe_landmarks_cam03.npy", camera="c", rate=60).keypoint_set == "MEDIAPIPE_33"
     with pytest.raises(ObservationError, match="no keypoint format 'alphapose'; there are: openpose, mediapipe"):
         read_keypoints(tmp_path, format="alphapose", camera="c", rate=60)
+
+
+def depths(rng, shape):
+    return rng.normal(0.0, 0.15, shape)
+
+
+def of_record(data):
+    names = keypoint_names("MEDIAPIPE_33")
+    return Keypoints("c", "MEDIAPIPE_33", names, 30.0, data[:, None, :, :2], data[:, None, :, 2])
+
+
+NO_CONFIDENCE = {  # of a third value: what it is, and what is said of it
+    "z in shares of the width": (depths, "% of them below 0", "depth"),
+    "z in pixels": (lambda rng, shape: 900.0 * depths(rng, shape), "% of them below 0", "depth"),
+    "z of somebody far away": (lambda rng, shape: 0.05 * depths(rng, shape), "% of them below 0", "depth"),
+    "logits": (lambda rng, shape: rng.normal(3.0, 2.5, shape), "% of them below 0", "logits"),
+    "percentages": (lambda rng, shape: rng.uniform(20.0, 100.0, shape), "from 20", "divide them by 100"),
+    "metres from the camera": (lambda rng, shape: rng.uniform(2.0, 3.5, shape), "from 2 to 3.5", "depth"),
+    "millimetres from the camera": (lambda rng, shape: rng.uniform(1900.0, 2600.0, shape), "from 1.9e+03 to", "depth"),
+}
+
+
+@pytest.mark.parametrize("kind", NO_CONFIDENCE)
+@pytest.mark.parametrize("format", ["array", "json", "record"])
+def test_a_third_value_that_is_no_confidence(tmp_path, kind, format):
+    make, problem, cause = NO_CONFIDENCE[kind]
+    rng = np.random.default_rng(0)
+    data = np.dstack([rng.uniform(100.0, 900.0, (20, 33, 2)), make(rng, (20, 33, 1))])
+    with pytest.raises(ObservationError, match="no confidence or visibility") as caught:
+        if format == "array":
+            np.save(tmp_path / "m.npy", data)
+            read_mediapipe(tmp_path / "m.npy", camera="c", rate=30)
+        elif format == "json":
+            rows = {i: [{"pose_keypoints_2d": frame[:17].ravel().tolist()}] for i, frame in enumerate(data)}
+            read(write(tmp_path / "json", rows))
+        else:
+            of_record(data)
+    assert problem in caught.value.problem and cause in caught.value.remedy
+    assert caught.value.file == {"array": tmp_path / "m.npy", "json": tmp_path / "json", "record": None}[format]
+
+
+def test_scores_that_detectors_give():
+    def confidence(scores):
+        scores = np.array(scores, float).reshape(1, 1, -1)
+        names, uv = tuple(f"p{k}" for k in range(scores.size)), np.full((*scores.shape, 2), 300.0)
+        return Keypoints("c", "any", names, 30.0, uv, scores).confidence[0, 0].tolist()
+
+    assert confidence([0.2, 1.4, 0.97, 1.1]) == [0.2, 1.0, 0.97, 1.0]  # heatmaps of OpenPose
+    assert confidence([-0.02, 0.3, *[0.9] * 20]) == [0.0, 0.3, *[0.9] * 20]  # by little below 0
+    assert confidence([6.8, 0.4, 2.1, 5.5]) == [1.0, 0.4, 1.0, 1.0]  # SimCC of RTMW
+    assert confidence([2, 1, 0, 2]) == [1.0, 0.5, 0.0, 1.0]  # COCO's flags
+    assert confidence([1, 0, 1]) == [1.0, 0.0, 1.0]
+    assert confidence([-1, 0.8, -1]) == [0.0, 0.8, 0.0]  # not detected
+    assert confidence([-1, -1]) == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("format", ["array", "json", "record"])
+@pytest.mark.parametrize("low", [0.0, -1.0])
+def test_coordinates_in_shares_of_the_image(tmp_path, format, low):
+    rng = np.random.default_rng(0)
+    data = np.dstack([rng.uniform(low, 1.0, (20, 33, 2)), rng.uniform(0.2, 1.0, (20, 33, 1))])
+    with pytest.raises(ObservationError, match="from 0 to 1 .shares of the image's size.") as caught:
+        if format == "array":
+            np.save(tmp_path / "m.npy", data)
+            turned = ImageFrame.rotated((1920, 1080), 90)  # by which they become large
+            read_mediapipe(tmp_path / "m.npy", camera="c", rate=30, image_frame=turned)
+        elif format == "json":
+            rows = {i: [{"pose_keypoints_2d": frame[:17].ravel().tolist()}] for i, frame in enumerate(data)}
+            read(write(tmp_path / "json", rows))
+        else:
+            of_record(data)
+    assert "Multiply x by the image's width" in caught.value.remedy
+
+
+def test_users_arrays_with_a_depth_in_the_third_column(data_dir):
+    for case in ("keypoints-z-in-place-of-visibility", "keypoints-normalised-z"):
+        take = data_dir("cases_of_users") / case / "take.toml"
+        with pytest.raises(ObservationError, match="36 % of them below 0") as caught:
+            load_observations(read_take(take))
+        assert caught.value.file == take.with_name("mp1.npy")
+
+
+MOTION = squat_and_wave(duration=1.0)
+RIG = studio_rig(MOTION)
+
+
+def people_of(keypoint_set, folder, order=None):
+    """A folder of OpenPose's json of one camera, with points of a set, in another order where one is given."""
+    record = simulate_keypoints(MOTION, RIG, keypoint_set, noise_px=3.0)[0]
+    rows = np.nan_to_num(np.dstack([record.points[:, 0], record.confidence[:, 0]]))
+    rows = rows if order is None else rows[:, order]
+    return write(folder, {i: [{"pose_keypoints_2d": frame.ravel().tolist()}] for i, frame in enumerate(rows)})
+
+
+@pytest.mark.parametrize("keypoint_set", ["BODY_25", "BODY_25B", "COCO_17", "HALPE_26"])
+def test_the_set_follows_from_the_number_of_points_and_the_bones(tmp_path, keypoint_set):
+    folder = people_of(keypoint_set, tmp_path / "json")
+    seen = read_openpose(folder, camera="c", rate=30)
+    assert seen.keypoint_set == keypoint_set and seen.names == KEYPOINT_SETS[keypoint_set]
+    stated = read_openpose(folder, camera="c", rate=30, keypoint_set=keypoint_set)
+    np.testing.assert_array_equal(stated.points, seen.points)
+
+
+@pytest.mark.parametrize(("right", "wrong"), [("BODY_25", "BODY_25B"), ("BODY_25B", "BODY_25")])
+def test_a_stated_set_of_as_many_points_that_does_not_fit(tmp_path, right, wrong):
+    folder = people_of(right, tmp_path / "json")
+    with pytest.raises(ObservationError, match=f"order of {right}: as {wrong}, bones are 2.. times as long") as caught:
+        read_openpose(folder, camera="c", rate=30, keypoint_set=wrong)
+    assert f'set = "{right}"' in caught.value.remedy and caught.value.file == str(folder)
+
+
+def test_openpose_s_own_model_without_a_set(data_dir):
+    seen = load_observations(read_take(data_dir("cases_of_users") / "openpose-body25-without-set" / "take.toml"))
+    assert [k.keypoint_set for k in seen.keypoints] == 4 * ["BODY_25"]
+
+
+COCO = {"category_id": 1, "keypoints": [1.0, 2.0, 0.9] * 17}
+RESULTS = {  # the start of a file: what it is
+    "alphapose.json": (json.dumps([{"image_id": "0.jpg"} | COCO]), "AlphaPose"),
+    "coco.json": (json.dumps([COCO | {"image_id": 7, "score": 1}]), "COCO"),
+    "by_image.json": (json.dumps({"0.jpg": {"version": 0.1, "bodies": [{"joints": [1.0, 2.0, 0.9]}]}}), "AlphaPose"),
+    "mmpose.json": (json.dumps([{"frame_id": 0, "instances": [{"keypoints": [[1.0, 2.0]]}]}]), "MMPose"),
+    "dlc.csv": ("scorer,net,net,net\nbodyparts,nose,nose,nose\ncoords,x,y,likelihood\n0,1,2,0.9\n", "DeepLabCut"),
+}
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_files_of_other_programs_are_said_for_what_they_are(tmp_path, name):
+    text, program = RESULTS[name]
+    path = tmp_path / name
+    path.write_text(text)
+    for format in ("openpose", None, "mediapipe"):
+        with pytest.raises(ObservationError, match=f"{program}.*which are not read") as caught:
+            read_keypoints(path, format=format, camera="c", rate=30.0)
+        assert caught.value.file == path and "pose_keypoints_2d" in caught.value.remedy
+    what = caught.value.problem.removesuffix(", which are not read")
+    assert find_keypoints([path])[1] == [f"{name}: {what}; not used. {SPLIT}"]
+
+
+def test_alphapose_s_results_beside_a_video(data_dir):
+    path = data_dir("cases_of_users") / "keypoints-alphapose-results" / "alphapose-results.json"
+    for named in (path, path.parent):
+        with pytest.raises(ObservationError, match="AlphaPose's or COCO's results, a list of all frames'") as caught:
+            read_openpose(named, camera="c", rate=30.0)
+        assert caught.value.file == path

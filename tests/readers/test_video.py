@@ -10,11 +10,18 @@ import pytest
 
 from kinefit.errors import FileError, ObservationError
 from kinefit.readers.video import Video, VideoSet, common_frames
-from kinefit.readers.video_files import _rotation
+from kinefit.readers.video_files import _display_axes, first_image
 
 COUNT, WIDTH, HEIGHT = 40, 160, 96
-MATRICES = {  # clockwise turn: a, b, c, d of the display matrix, tx, ty
-    90: (0, 1, -1, 0, HEIGHT, 0), 180: (-1, 0, 0, -1, WIDTH, HEIGHT), 270: (0, -1, 1, 0, 0, WIDTH)
+MATRICES = {  # a, b, c, d of the display matrix: what FFmpeg 9 shows of it
+    (1, 0, 0, 1): lambda image: image,
+    (0, 1, -1, 0): lambda image: np.rot90(image, -1),
+    (-1, 0, 0, -1): lambda image: np.rot90(image, 2),
+    (0, -1, 1, 0): np.rot90,
+    (-1, 0, 0, 1): np.fliplr,
+    (1, 0, 0, -1): np.flipud,
+    (0, 1, 1, 0): lambda image: image.transpose(1, 0, 2),
+    (0, -1, -1, 0): lambda image: np.rot90(image, 2).transpose(1, 0, 2),
 }
 
 
@@ -33,7 +40,7 @@ def number(image):
 def write(path, count=COUNT, rate=30, codec="mpeg4", **options):
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=rate)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, options.get("pixels", "yuv420p")
         stream.codec_context.gop_size = 12
         stream.codec_context.max_b_frames = options.get("b_frames", 2)
         pts = options.get("pts", range(count))
@@ -68,17 +75,26 @@ def test_webm_hidden_frames_are_not_counted(tmp_path):
         assert number(video.read(COUNT - 1)) == COUNT - 1
 
 
-@pytest.mark.parametrize("turn", MATRICES)
-def test_display_rotation_is_applied(tmp_path, turn):
+@pytest.mark.parametrize("matrix", MATRICES)
+def test_the_image_is_upright_and_mirrored_as_the_file_states(tmp_path, matrix):
     raw = write(tmp_path / "v.mp4").read_bytes()
     unity = np.array([65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30], ">i4").tobytes()
-    a, b, c, d, x, y = (65536 * v for v in MATRICES[turn])
+    a, b, c, d = (65536 * v for v in matrix)
     at = raw.index(unity, raw.index(b"tkhd"))
     turned = tmp_path / "turned.mp4"
-    turned.write_bytes(raw[:at] + np.array([a, b, 0, c, d, 0, x, y, 1 << 30], ">i4").tobytes() + raw[at + 36 :])
+    turned.write_bytes(raw[:at] + np.array([a, b, 0, c, d, 0, 0, 0, 1 << 30], ">i4").tobytes() + raw[at + 36 :])
     with Video(tmp_path / "v.mp4") as plain, Video(turned) as video:
-        assert video.size == ((HEIGHT, WIDTH) if turn != 180 else (WIDTH, HEIGHT))
-        np.testing.assert_array_equal(video.read(5), np.rot90(plain.read(5), -turn // 90))
+        assert video.size == ((WIDTH, HEIGHT) if a else (HEIGHT, WIDTH))
+        np.testing.assert_array_equal(video.read(5), MATRICES[matrix](plain.read(5)))
+    np.testing.assert_array_equal(first_image(turned), MATRICES[matrix](first_image(tmp_path / "v.mp4")))
+
+
+def test_a_front_camera_s_mirrored_video(data_dir):
+    with Video(data_dir("cases_of_users") / "video-mirrored-flag" / "cam.mp4") as video:
+        image = video.read(0)
+    assert (len(video), video.size) == (60, (320, 180))
+    assert image[10, -10].argmax() == 0 and image[10, -10, 0] > 200  # red at the top right
+    assert image[10, 10].argmax() == 2 and image[-10, 10].argmax() == 1
 
 
 def test_missing_and_foreign_files(tmp_path):
@@ -138,6 +154,80 @@ def test_cameras_in_step_with_time_offsets(tmp_path):
 
 
 DROPPED = [i for i in range(40) if not (12 <= i < 26 and i % 2)]  # frames that a telephone kept
+
+
+def test_empty_packets_of_avi_are_dropped_frames(data_dir):
+    with Video(data_dir("cases_of_users") / "video-avi-dropped-frames" / "cam.avi") as video:
+        np.testing.assert_allclose(video.times, np.r_[0:20, 25:60] / 30, atol=1e-9)
+        assert video.unevenness.endswith("5 frames lacking between 0.633 and 0.833 s")
+        assert video.read(54).shape == (180, 320, 3)
+
+
+@pytest.mark.parametrize("codec", ["mjpeg", "mpeg4", "libx264"])
+def test_avi_that_dropped_frames(tmp_path, codec):
+    if codec not in av.codecs_available:
+        pytest.skip(f"this FFmpeg cannot write {codec}")
+    pixels = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+    with Video(write(tmp_path / "v.avi", codec=codec, pixels=pixels, pts=DROPPED, b_frames=0)) as video:
+        np.testing.assert_allclose(video.times, np.array(DROPPED) / 30, atol=1e-9)
+        assert video.rate == pytest.approx(30) and "7 frames lacking" in video.unevenness
+        assert [number(video.read(i)) for i in (20, 0, 32, 13)] == [20, 0, 32, 13]
+
+
+def test_avi_whose_last_frames_were_dropped(tmp_path):
+    path = write(tmp_path / "v.avi", b_frames=0)
+    raw = bytearray(path.read_bytes())
+    length = raw.index(b"strh") + 40  # number of frames of the stream
+    assert raw[length : length + 4] == COUNT.to_bytes(4, "little")
+    raw[length : length + 4] = (COUNT + 5).to_bytes(4, "little")
+    path.write_bytes(raw)
+    with Video(path) as video:
+        assert len(video) == COUNT and not video.unevenness
+    path.write_bytes(raw[:-2000])
+    with pytest.raises(FileError, match="truncated"):
+        Video(path)
+
+
+def test_mp4_with_empty_packets(tmp_path):
+    path = write(tmp_path / "v.mp4", codec="mjpeg", pixels="yuvj420p", b_frames=0)
+    with av.open(str(path)) as container:
+        at = [packet.pos for packet in container.demux(video=0) if packet.size]
+    raw, removed = bytearray(path.read_bytes()), at[15] - at[12]
+    sizes, chunks = raw.index(b"stsz") + 16, raw.index(b"stco") + 8
+    raw[sizes + 4 * 12 : sizes + 4 * 15] = bytes(12)  # samples 12 to 14 have no size
+    count = int.from_bytes(raw[chunks : chunks + 4], "big")
+    for k in range(chunks + 4, chunks + 4 + 4 * count, 4):
+        offset = int.from_bytes(raw[k : k + 4], "big")
+        raw[k : k + 4] = (offset - removed * (offset > at[12])).to_bytes(4, "big")
+    mdat = raw.index(b"mdat") - 4
+    raw[mdat : mdat + 4] = (int.from_bytes(raw[mdat : mdat + 4], "big") - removed).to_bytes(4, "big")
+    del raw[at[12] : at[15]]
+    path.write_bytes(raw)
+    with Video(path) as video:
+        assert [number(image) for image in video.frames()] == [*range(12), *range(15, COUNT)]
+        np.testing.assert_allclose(video.times, np.r_[0:12, 15:COUNT] / 30, atol=1e-6)
+        assert "3 frames lacking between 0.367 and 0.5 s" in video.unevenness
+
+
+def test_mpeg4_frames_that_repeat_the_one_before(tmp_path):
+    """DivX and Xvid write a packet of a few bytes in place of a dropped frame."""
+    path = tmp_path / "v.avi"
+    with av.open(str(write(tmp_path / "whole.avi", b_frames=0))) as source, av.open(str(path), "w") as target:
+        given = source.streams.video[0]
+        copied = getattr(target, "add_stream_from_template", None)  # of PyAV 14 on
+        stream = copied(given) if copied else target.add_stream(template=given)
+        for packet in source.demux(given):
+            if packet.size:
+                if 21 <= packet.dts < 24:  # a predicted frame that is not coded: start, type, second, time, end
+                    bits = f"0101{packet.dts:05b}10".ljust(15, "0") + "1"
+                    dropped = av.Packet(b"\0\0\1\xb6" + int(bits, 2).to_bytes(2, "big"))
+                    dropped.pts, dropped.dts, dropped.time_base = packet.pts, packet.dts, packet.time_base
+                    packet = dropped
+                packet.stream = stream
+                target.mux(packet)
+    with Video(path) as video:
+        assert [number(image) for image in video.frames()] == [*range(21), *range(24, COUNT)]
+        np.testing.assert_allclose(video.times, np.r_[0:21, 24:COUNT] / 30, atol=1e-9)
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
@@ -231,9 +321,9 @@ class SideData(Mapping):
 def test_rotation_is_found_whatever_the_side_data_iterates_over(over):
     matrix = np.array([0, -65536, 0, 65536, 0, 0, 0, 0, 1 << 30], np.int32).tobytes()
     kept = {"SEI_UNREGISTERED": b"x264", "DISPLAYMATRIX": matrix}
-    assert _rotation(SimpleNamespace(side_data=SideData(kept, over))) == 90.0
+    assert _display_axes(SimpleNamespace(side_data=SideData(kept, over)), "v.mp4") == (True, False, True)
     del kept["DISPLAYMATRIX"]
-    assert _rotation(SimpleNamespace(side_data=SideData(kept, over))) == 0.0
+    assert _display_axes(SimpleNamespace(side_data=SideData(kept, over)), "v.mp4") == (False, False, False)
 
 
 def test_streams_that_began_when_they_liked_have_what_all_saw():

@@ -27,19 +27,19 @@ def joint_gap(a, b):
     return float(np.linalg.norm(a.segment_poses()[..., :3, 3] - b.segment_poses()[..., :3, 3], axis=-1).mean())
 
 
-def write_take(folder):
-    """The take's path; keypoints as OpenPose's JSON."""
+def write_take(folder, *, never=()):
+    """The take's path; keypoints as OpenPose's JSON, without the points `never` of anybody in any camera."""
     rig = studio_rig(motions()[0])
     write_calibration(rig, folder / "calibration.toml")
     text = f'[take]\nrate = 30.0\nup = "{motions()[0].up}"\n[calibration]\nfile = "calibration.toml"\n'
     each = [simulate_keypoints(m, rig, SET, noise_px=2.0, seed=s) for s, m in enumerate(motions())]
-    order = np.random.default_rng(3)
+    order, seen = np.random.default_rng(3), ~np.isin(each[0][0].names, never)[:, None]
     for camera, *people in zip(rig.names, *each):
         (folder / camera).mkdir()
         for f in range(COUNT):
             listed = [
                 {"person_id": [k], "pose_keypoints_2d": np.nan_to_num(
-                    np.column_stack([p.points[f, 0], p.confidence[f, 0]])).ravel().tolist()}
+                    seen * np.column_stack([p.points[f, 0], p.confidence[f, 0]])).ravel().tolist()}
                 for k, p in enumerate(people)
             ]  # fmt: skip
             if order.uniform() < 0.5:

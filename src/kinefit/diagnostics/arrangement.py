@@ -44,7 +44,8 @@ def sample(views: KeypointViews) -> NDArray:
     """Sample (N, C, 2) [px] of the points of some frames."""
     frames = np.unique(np.linspace(0, len(views) - 1, min(_SAMPLE_FRAMES, len(views))).astype(int))
     points = np.unique(np.linspace(0, len(views.names) - 1, _SAMPLE_POINTS).astype(int))
-    return views.uv[np.ix_(frames, points)].reshape(-1, len(views.rig), 2)
+    uv = views.uv[np.ix_(frames, points)]
+    return uv.reshape(len(frames) * len(points), len(views.rig), 2)
 
 
 def points_of_others(views: KeypointViews, c: int) -> NDArray:

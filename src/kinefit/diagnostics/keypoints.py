@@ -15,12 +15,12 @@ from kinefit.diagnostics.bias import CameraBias, camera_biases, disagreement
 from kinefit.diagnostics.distortion import distortion_findings
 from kinefit.diagnostics.groups import group_findings
 from kinefit.diagnostics.mistakes import focal_findings, mistake_findings
-from kinefit.diagnostics.person import size_findings, stature, upright_findings
+from kinefit.diagnostics.person import bone_ratios, order_findings, size_findings, stature, upright_findings
 from kinefit.diagnostics.scene import CameraCoverage, coverage, coverage_findings, lens_findings, placement_findings
 from kinefit.diagnostics.sensor_fit import SensorAlignment
 from kinefit.diagnostics.timing import TimeOffsets, fast_pixels, shifted, time_offsets
 from kinefit.diagnostics.verdicts import bias_findings, explained, side_findings, time_findings
-from kinefit.diagnostics.views import KeypointViews, make_views, meet, with_sides_right
+from kinefit.diagnostics.views import MIN_CONFIDENCE, KeypointViews, make_views, meet, with_sides_right
 from kinefit.errors import KinefitError
 from kinefit.findings import Finding, faults_of, ranked
 from kinefit.geometry.camera import Rig
@@ -135,8 +135,10 @@ def check_keypoints(
         findings += more
     gross = mistake_findings(views.spread(_SAMPLE_FRAMES), file.name)
     if not gross:
-        views, more = _with_person(views)
+        views, more = _with_person(views, keypoints)
         findings += more
+        if not len(views.rig):
+            return ended()
         done(2)
         gross = group_findings(rig, keypoints, observations.frames[0] if observations is not None else 0)
     if not gross:
@@ -166,8 +168,12 @@ def check_keypoints(
     biases = camera_biases(sampled)
     done(4)
     sets = list(dict.fromkeys(k.keypoint_set for k in keypoints))
-    size = size_findings(stature(load_body(body) if isinstance(body, str) else body, sets, sampled, x), height)
-    findings += (focal_findings(sampled) if size[0].severity == "fault" else []) or size
+    body = load_body(body) if isinstance(body, str) else body
+    ratios = bone_ratios(body, sets, sampled, x)
+    size = size_findings(stature(body, ratios), height)
+    if size[0].severity == "fault":
+        size = order_findings(ratios, sets) or focal_findings(sampled) or size
+    findings += size
     findings += upright_findings(views.rig, x, views.names, up)
     done(5)
     findings += distortion_findings(sampled)
@@ -206,13 +212,15 @@ def _most_motion(record: Keypoints, keypoints: Sequence[Keypoints]) -> Keypoints
     return record.rows(slice(start, min(start + _QUICK_FRAMES, length)), record.time_offset)
 
 
-def _with_person(views: KeypointViews) -> tuple[KeypointViews, list[Finding]]:
+def _with_person(views: KeypointViews, keypoints: Sequence[Keypoints]) -> tuple[KeypointViews, list[Finding]]:
     """The views of cameras in which a person was detected, and findings on the others."""
     detected = np.isfinite(views.uv).any(axis=(0, 1, 3))
     out = []
     for name in (n for n, s in zip(views.rig.names, detected, strict=True) if not s):
+        highest = max(float(k.confidence.max(initial=0.0)) for k in keypoints if k.camera == name)
+        few = f" with a confidence above {MIN_CONFIDENCE} (highest: {highest:.2g})" if highest > 0.0 else ""
         remedy = "Check its video and keypoints, or remove it from the take."
-        out.append(Finding("fault", "coverage", f"No person was detected in {name}.", (name,), remedy=remedy))
+        out.append(Finding("fault", "coverage", f"No person was detected in {name}{few}.", (name,), remedy=remedy))
     return views.select([n for n, s in zip(views.rig.names, detected, strict=True) if s]), out
 
 

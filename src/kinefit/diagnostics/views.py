@@ -15,7 +15,7 @@ from kinefit.observations import Keypoints
 from kinefit.observations.recordings import mirror_name
 
 MAX_ERROR_SHARE = 0.03  # of the image's diagonal: cameras that differ by more did not detect the same point
-_MIN_CONFIDENCE = 0.3  # of a point; detectors give occluded points less
+MIN_CONFIDENCE = 0.3  # of a point; detectors give occluded points less
 _MIN_PAIRS = 3  # left-right pairs needed to decide the sides
 _MAX_SWAPPED_ERROR = 0.6  # of swapped pairs, as a share of their error before; else the detector is believed
 
@@ -121,7 +121,7 @@ def _of_person(record: Keypoints, chosen: NDArray, filled: bool) -> NDArray:
     With `filled`, also of the tallest one in single frames without agreement.
     """
     frames = np.arange(len(chosen))
-    points = np.where((record.confidence > _MIN_CONFIDENCE)[..., None], record.points, np.nan)[: len(chosen)]
+    points = np.where((record.confidence > MIN_CONFIDENCE)[..., None], record.points, np.nan)[: len(chosen)]
     if not points.shape[1]:
         return np.full((len(chosen), len(record.names), 2), np.nan)
     seen = np.isfinite(points).all(-1)

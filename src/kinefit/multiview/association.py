@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,7 +13,7 @@ from kinefit.errors import TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
 from kinefit.multiview.boxes import match_by_boxes
-from kinefit.multiview.medians import medians
+from kinefit.multiview.medians import heights, medians
 from kinefit.observations import MEDIAPIPE_478, Keypoints
 from kinefit.observations.arrays import sealed
 
@@ -207,10 +206,8 @@ def _meeting_points_of(pair: Rig, a: NDArray, b: NDArray) -> NDArray:
     uv = np.where(np.isfinite(uv).all(axis=(2, 3))[..., None, None], uv, np.nan)
     x = triangulate(pair, uv.reshape(-1, 2, 2)).reshape(*uv.shape[:2], 3)
     error = np.stack([np.linalg.norm(c.project(x) - uv[:, :, k], axis=-1) for k, c in enumerate(pair)], axis=-1)
-    with warnings.catch_warnings():  # frames without a common point stay NaN
-        warnings.simplefilter("ignore", RuntimeWarning)
-        size = np.mean(np.nanmax(uv[..., 1], axis=1) - np.nanmin(uv[..., 1], axis=1), axis=1)
-        consistent = medians(error.reshape(len(uv), -1)) < _MAX_ERROR_SHARE * size
+    size = np.mean(heights(np.moveaxis(uv, 1, 2)), axis=1)  # NaN without a common point
+    consistent = medians(error.reshape(len(uv), -1)) < _MAX_ERROR_SHARE * size
     consistent &= np.isfinite(error).all(axis=-1).sum(axis=1) >= _MIN_POINTS
     return np.where(consistent[:, None], medians(np.moveaxis(x, 1, -1)), np.nan)
 

@@ -1,4 +1,4 @@
-"""Medians of finite values, and median image distances between people and detections."""
+"""Medians of finite values, and image heights and median distances of people and detections."""
 
 from __future__ import annotations
 
@@ -15,6 +15,11 @@ def medians(values: NDArray) -> NDArray:
     out = np.empty(len(rows))
     _kernels_medians.medians(rows, np.empty(rows.shape[1]), out)
     return out.reshape(values.shape[:-1])
+
+
+def heights(uv: NDArray) -> NDArray:
+    """(...) heights [px] in the image of people with points (..., K, 2) [px]; NaN without any finite point."""
+    return np.fmax.reduce(uv[..., 1], axis=-1) - np.fmin.reduce(uv[..., 1], axis=-1)
 
 
 def distances(camera: Camera, x_world: NDArray, uv: NDArray) -> NDArray:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.multiview.medians import heights, medians
 from kinefit.multiview.people import PersonTrack
 from kinefit.observations import Keypoints
 from kinefit.observations.recordings import mirror_name
@@ -67,7 +68,7 @@ def _is_mirror_image(rig: Rig, keypoints: Sequence[Keypoints], one: PersonTrack,
     offsets = middle @ normal
     plane = float(np.median(offsets))
     miss = np.linalg.norm(across - np.outer(across @ normal, normal), axis=1) + 2.0 * np.abs(offsets - plane)
-    motion = np.linalg.norm(a - np.nanmedian(a, axis=0), axis=2)[visible]
+    motion = np.linalg.norm(a - medians(np.moveaxis(a, 0, -1)), axis=2)[visible]
     if np.median(miss) > _MAX_MIRROR_ERROR or np.median(motion) < _MIN_MOTION:
         return None
     cameras = np.median([camera.centre_world @ normal for camera in rig]) - plane
@@ -81,7 +82,7 @@ def _points(rig: Rig, keypoints: Sequence[Keypoints], person: PersonTrack, frame
         [np.where((k.confidence[frames, 0] > _MIN_CONFIDENCE)[..., None], k.points[frames, 0], np.nan) for k in chosen],
         axis=2,
     )
-    height = float(np.nanmedian(np.ptp(uv[..., 1], axis=1)))
+    height = float(medians(heights(np.moveaxis(uv, 1, 2)).ravel()))
     own = rig.select(tuple(k.camera for k in keypoints))
-    x, _, _ = triangulate_robust(own, uv.reshape(-1, *uv.shape[2:]), max_residual_px=max(_MAX_ERROR * height, 1.0))
+    x, _, _ = triangulate_robust(own, uv.reshape(-1, *uv.shape[2:]), max_residual_px=max(1.0, _MAX_ERROR * height))
     return x.reshape(*uv.shape[:2], 3)

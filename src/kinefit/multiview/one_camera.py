@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.triangulation import placed
 from kinefit.multiview.association import confidences
+from kinefit.multiview.medians import heights, medians
 from kinefit.multiview.people import SPEED_INTERVAL_S, PersonTrack, min_person_frames
 from kinefit.observations import Keypoints
 
@@ -39,8 +40,8 @@ def people_of_one_camera(rig: Rig, keypoints: Sequence[Keypoints], record: Keypo
             continue
         chosen = np.where(visible, column, -1)
         x = _points_world(rig[record.camera], record, column)
-        speed, size = _speed(x, record.rate), np.nanmean(np.ptp(record.points[visible, column, :, 1], axis=1))
-        place = np.nanmedian(x[visible].mean(axis=1), axis=0)
+        speed, size = _speed(x, record.rate), np.nanmean(heights(record.points[visible, column]))
+        place = np.nanmedian(np.nanmean(x[visible], axis=1), axis=0)
         choices = tuple(chosen if k is record else np.full(frames, -1) for k in keypoints)
         total = float(confidence[:, column].sum())
         people.append(PersonTrack(choices, visible.astype(int), total, speed, float(size), place))
@@ -57,5 +58,6 @@ def _speed(x: NDArray, rate: float) -> float:
     """[m/s] speed of points (F, K, 3) [m]: mean over time of their median; 0 if visible too briefly."""
     interval = max(round(SPEED_INTERVAL_S * rate), 1)
     moved = np.linalg.norm(x[interval:] - x[:-interval], axis=2)
-    complete = moved[np.isfinite(moved).all(axis=1)]
-    return float(np.median(complete, axis=1).mean() * rate / interval) if len(complete) else 0.0
+    middles = medians(moved)
+    known = np.isfinite(middles)
+    return float(middles[known].mean() * rate / interval) if known.any() else 0.0

@@ -20,7 +20,7 @@ from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.multiview.association import MAX_SPEED, MAX_STEP, Node, confidences, group_views, link_views, some_columns
 from kinefit.multiview.boxes import match_by_boxes, suppress_duplicates
 from kinefit.multiview.likeness import ImageSource
-from kinefit.multiview.medians import distances, medians
+from kinefit.multiview.medians import distances, heights, medians
 from kinefit.multiview.returns import MAX_SHORT_ABSENCE_S, Chain, PresenceSpan, Return, link_spans
 from kinefit.observations import MEDIAPIPE_478, Keypoints
 from kinefit.observations.recordings import mirror_name
@@ -308,9 +308,9 @@ class _Search:
         while len(nodes) > 1:
             each = [(self.swapped_uv if node in sides else self.uv)[node[0]][frame, node[1]] for node in nodes]
             uv = np.stack(each, axis=1)
-            height = float(medians(np.nanmax(uv[..., 1], axis=0) - np.nanmin(uv[..., 1], axis=0)))
+            height = float(medians(heights(np.moveaxis(uv, 0, 1))))
             rig = self.rig.select(tuple(self.keypoints[q].camera for q, _ in nodes))
-            x, _, _ = triangulate_robust(rig, uv, max_residual_px=max(_MAX_VIEW_ERROR * height, 1.0))
+            x, _, _ = triangulate_robust(rig, uv, max_residual_px=max(1.0, _MAX_VIEW_ERROR * height))
             errors = np.array([self._view_error(x, node, own) for node, own in zip(nodes, each)])
             jumps = expected is not None and len(nodes) == 2 and _distance(x, expected) > reach
             if errors.max() <= _MAX_VIEW_ERROR and not jumps:
@@ -329,13 +329,11 @@ class _Search:
         step = max(round(SPEED_INTERVAL_S * self.rate), 1)
         nodes, path = chain.span.nodes, chain.span.path
         moved = [path[f + step] - x for f, x in path.items() if f + step in path]
-        sizes = [np.ptp(uv[np.isfinite(uv)]) for uv in (
-            self.uv[q][f, p, :, 1] for f, each in nodes.items() for q, p in each
-        )]  # fmt: skip
+        sizes = [heights(self.uv[q][f, p]) for f, each in nodes.items() for q, p in each]
         confidence = sum(float(self.scores[q][f, p]) for f, each in nodes.items() for q, p in each)
         place = medians(medians(np.moveaxis(np.array(list(path.values())), 1, 2)).T)
         speed = float(np.mean(medians(np.linalg.norm(moved, axis=2)))) * self.rate / step if moved else 0.0
-        return PersonTrack(tuple(chosen), views, confidence, speed, float(np.mean(sizes)), place, chain.returns)
+        return PersonTrack(tuple(chosen), views, confidence, speed, float(np.nanmean(sizes)), place, chain.returns)
 
 
 def _visible_points(record: Keypoints, columns: Sequence[int] | NDArray) -> NDArray:

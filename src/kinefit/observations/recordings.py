@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.observations.arrays import check_seen, freeze, frozen
+from kinefit.observations.arrays import check_seen, freeze, frozen, sealed
+from kinefit.observations.keypoint_values import check_pixels, confidence_of
 
 KEYPOINT_SIGMA = 8.0
 """[px] default standard deviation of a keypoint of confidence 1: typical of detectors in images of 1,000 to 2,000 px in
@@ -39,7 +40,7 @@ class Keypoints:
         In the image frame of the camera's calibration (not of a scaled or letterboxed video). NaN for undetected
         keypoints. P is the largest number of people in any frame; their order has no meaning.
     confidence : (F, P, K)
-        The detector's own confidence in 0..1; 0 for undetected keypoints.
+        The detector's own confidence in 0..1; 0 for undetected keypoints. Other scores: see `confidence_of`.
     time_offset : float [s]
         Added to frame / rate to get the time of the take.
     source : str
@@ -52,7 +53,8 @@ class Keypoints:
     Raises
     ------
     ObservationError
-        Arrays of other shapes.
+        Arrays of other shapes; a confidence that is none (a depth, logits, percentages); coordinates that are shares
+        of the image's size.
     """
 
     camera: str
@@ -72,6 +74,9 @@ class Keypoints:
         points = frozen(self.points, float, what, ("frames", "people", len(self.names), 2), self.source)
         shape, lifted = points.shape[:3], self.lifted
         confidence = frozen(self.confidence, float, f"the confidence of {what}", shape, self.source)
+        if points is not self.points or confidence is not self.confidence:  # no arrays of a record, which are checked
+            confidence = sealed(confidence_of(confidence, what, self.source or None))
+            check_pixels(points, confidence, what, self.source or None)
         if lifted is not None:
             lifted = frozen(lifted, float, f"lifted {what}", (*shape, 3), self.source)
         sides_known = self.sides_known

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,15 +13,26 @@ from kinefit._mapped import kept
 from kinefit.errors import ObservationError
 from kinefit.observations import Keypoints
 from kinefit.observations.arrays import sealed
-from kinefit.readers.keypoint_sets import keypoint_names
+from kinefit.observations.keypoint_values import check_pixels, confidence_of
+from kinefit.readers.keypoint_sets import KEYPOINT_SETS, keypoint_names
 
 if TYPE_CHECKING:
     from kinefit.geometry.camera import ImageFrame
 
+_BONES = (
+    ("Nose", "LEye"), ("Nose", "REye"), ("LEye", "LEar"), ("REye", "REar"), ("LHip", "RHip"),
+    ("LShoulder", "RShoulder"), *((f"{side}{a}", f"{side}{b}") for side in "LR" for a, b in (
+        ("Shoulder", "Elbow"), ("Elbow", "Wrist"), ("Shoulder", "Hip"), ("Hip", "Knee"), ("Knee", "Ankle"),
+    )),
+)  # fmt: skip
+_MAX_COMPARED_FRAMES = 60  # spread over the recording
+_MIN_COMPARED_PEOPLE = 5  # in these, with half of their points: fewer do not contradict what is stated
+_MAX_LENGTH_RATIO = 0.7
+"""Mean length of the bones in the right order of points to that in the other one: 0.37 to 0.52 for BODY_25 and BODY_25B
+in recordings."""
+
 FACE_POINTS = 468, 478
 """Points of a face mesh without and with irises."""
-
-_MAX_NORMALISED = 2.0  # coordinate as a share of the image size, which may lie outside of the image
 
 
 def cut_frames(items: Any, frames: tuple[int, int] | None, file: Path) -> tuple[Any, int]:
@@ -35,20 +47,47 @@ def cut_frames(items: Any, frames: tuple[int, int] | None, file: Path) -> tuple[
     return items[frames[0] : frames[1]], frames[0]
 
 
-def face_mesh(data: NDArray, path: Path) -> NDArray:
-    """(F, 478, 3) x, y [px] and 1 where detected, of a face mesh (F, 468 or 478, 3) whose third column is a depth.
+def face_mesh(data: NDArray) -> NDArray:
+    """(F, 478, 3) x, y [px] and 1 where detected, of a face mesh (F, 468 or 478, 3) whose third column is a depth."""
+    uv = data[..., :2]
+    seen = np.concatenate([uv, uv.any(axis=-1, keepdims=True)], axis=-1)
+    return np.pad(seen, ((0, 0), (0, max(FACE_POINTS) - data.shape[1]), (0, 0)))
+
+
+def in_right_order(record: Keypoints, *, stated: bool) -> Keypoints:
+    """The record as the keypoint set of as many points that it fits: in the right order bones are short.
+
+    Parameters
+    ----------
+    stated : whether the user states the record's set, else it is a guess.
 
     Raises
     ------
     ObservationError
-        Coordinates in shares of the image's size.
+        The points are clearly in another order than stated.
     """
-    uv = data[..., :2]
-    if 0.0 < np.abs(uv).max(initial=0.0) <= _MAX_NORMALISED:
-        remedy = "Multiply x by the image's width and y by its height."
-        raise ObservationError("coordinates of a face run from 0 to 1, not over pixels", file=path, remedy=remedy)
-    seen = np.concatenate([uv, uv.any(axis=-1, keepdims=True)], axis=-1)
-    return np.pad(seen, ((0, 0), (0, max(FACE_POINTS) - data.shape[1]), (0, 0)))
+    own, rows = record.keypoint_set, slice(None, None, len(record) // _MAX_COMPARED_FRAMES + 1)
+    uv = np.where((record.confidence[rows] > 0.0)[..., None], record.points[rows], np.nan)
+    uv = uv[np.isfinite(uv[..., 0]).mean(axis=-1) > 0.5]
+    orders = [name for name, names in KEYPOINT_SETS.items() if len(names) == len(record.names)]
+    lengths = {name: _mean_bone(uv, KEYPOINT_SETS[name]) for name in orders} if len(orders) > 1 else {own: 0.0}
+    best = min(lengths, key=lambda name: lengths[name])
+    if not 0.0 < lengths[best] < _MAX_LENGTH_RATIO * lengths[own] or (stated and len(uv) < _MIN_COMPARED_PEOPLE):
+        return record
+    if stated:
+        longer = lengths[own] / lengths[best]
+        problem = f"the points are in the order of {best}: as {own}, bones are {longer:.1f} times as long"
+        raise ObservationError(problem, file=record.source, remedy=f'Write set = "{best}" into [[keypoints]].')
+    return record.first_points(best, KEYPOINT_SETS[best])
+
+
+def _mean_bone(uv: NDArray, names: Sequence[str]) -> float:
+    """Mean length of the bones of people (N, K, 2) [px], as a share of their extent; infinite without bones."""
+    start, end = np.array([(names.index(a), names.index(b)) for a, b in _BONES]).T
+    extent = np.linalg.norm(np.fmax.reduce(uv, axis=1) - np.fmin.reduce(uv, axis=1), axis=-1)
+    lengths = np.linalg.norm(uv[:, start] - uv[:, end], axis=-1) / np.maximum(extent, 1.0)[:, None]
+    known = np.isfinite(lengths).any(axis=0)
+    return float(np.nanmedian(lengths[:, known], axis=0).mean()) if known.any() else np.inf
 
 
 def keypoint_record(
@@ -57,12 +96,13 @@ def keypoint_record(
 ) -> Keypoints:  # fmt: skip
     """Make a record of (F, P, K, 3) x, y [px], confidence 0..1; zeros where a point was not detected.
 
-    rate [Hz], time_offset [s]; raises ObservationError for a rate that is not positive.
+    rate [Hz], time_offset [s]; raises ObservationError for a rate that is not positive, and what `Keypoints` raises.
     """
     if not rate > 0 or not np.isfinite(rate):
         raise ObservationError(f"rate {rate} Hz", file=source, remedy="Give a positive frame rate.")
-    confidence = np.clip(data[..., 2], 0, 1)
-    points = data[..., :2]
+    what = f"keypoints of camera {camera}"
+    points, confidence = data[..., :2], confidence_of(data[..., 2], what, source)
+    check_pixels(points, confidence, what, source)  # before they are converted
     seen = (confidence > 0) | points.any(axis=-1)
     if image_frame is not None:
         points = image_frame.to_calibration(points)

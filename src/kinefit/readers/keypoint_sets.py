@@ -1,6 +1,9 @@
-"""Names of the points of detectors, in each detector's own order."""
+"""Names of the points of detectors, in each detector's own order; files of other programs, which are not read."""
 
 from __future__ import annotations
+
+import re
+from pathlib import Path
 
 from kinefit.errors import ObservationError, check_choice
 from kinefit.observations import MEDIAPIPE_33, MEDIAPIPE_75, MEDIAPIPE_478
@@ -40,6 +43,9 @@ KEYPOINT_SETS: dict[str, tuple[str, ...]] = {
     "MEDIAPIPE_478": MEDIAPIPE_478,
 }  # names in each detector's own order; of OpenPose both hands come after the body, left first
 
+SET_OF_COUNT = {len(KEYPOINT_SETS[name]): name for name in sorted(KEYPOINT_SETS)}
+"""The set of a number of points; of 25 BODY_25B."""
+
 HAND_POINTS = 21
 """Number of points of one hand, the same for every detector."""
 
@@ -60,3 +66,29 @@ def keypoint_names(keypoint_set: str) -> tuple[str, ...]:
     """Names of a keypoint set in the detector's order; raises ObservationError for an unknown set."""
     check_choice("keypoint set", keypoint_set, KEYPOINT_SETS, ObservationError)
     return KEYPOINT_SETS[keypoint_set]
+
+
+_OTHER_FILES = {  # what such a file has near its start, after spaces: what it is
+    rb"\[\s*\{(?=.*\"image_id\")(?=.*\"keypoints\")": "AlphaPose's or COCO's results, a list of all frames' people",
+    rb"\{\s*\"[^\"]*\.(?:jpg|jpeg|png)\"\s*:": "AlphaPose's results, all frames' people by image",
+    rb"(?=.*\"(?:instances|instance_info)\")": "MMPose's predictions, all frames' people",
+    rb"\{(?=.*\"(?:annotations|categories|file_name)\")": "COCO's annotations of many images",
+    rb"scorer,.*\nbodyparts,|scorer,.*\nindividuals,": "DeepLabCut's keypoints, a table of all frames",
+    rb"\x89HDF\r\n": "keypoints of DeepLabCut or SLEAP, or another HDF5 file",
+}
+_MAX_START_BYTES = 4096  # in which these are
+SPLIT = 'Write one file a frame, NAME_0000.json: {"people": [{"pose_keypoints_2d": [x, y, confidence, ...]}]}.'
+"""How keypoints of other programs are to be written."""
+
+
+def other_keypoints(path: Path) -> str:
+    """What a file of another program's keypoints is; "" for any other file."""
+    with path.open("rb") as file:
+        start = file.read(_MAX_START_BYTES).lstrip()
+    return next((what for pattern, what in _OTHER_FILES.items() if re.match(pattern, start, re.DOTALL)), "")
+
+
+def refuse_other_keypoints(path: Path) -> None:
+    """Raise ObservationError for a file of another program's keypoints."""
+    if other := other_keypoints(path):
+        raise ObservationError(f"{other}, which are not read", file=path, remedy=SPLIT)

@@ -17,7 +17,8 @@ from kinefit._arguments import checked
 from kinefit._files import no_column, read_npy, regular
 from kinefit.errors import FileError, ObservationError, check_choice, choices
 from kinefit.observations import Keypoints
-from kinefit.readers.keypoint_arrays import FACE_POINTS, cut_frames, face_mesh, keypoint_record
+from kinefit.readers import keypoint_sets
+from kinefit.readers.keypoint_arrays import FACE_POINTS, cut_frames, face_mesh, in_right_order, keypoint_record
 from kinefit.readers.keypoint_sets import HAND_POINTS, KEYPOINT_SETS, MEDIAPIPE_SETS, OPENPOSE_HANDS, keypoint_names
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ decode_openpose = msgspec.json.Decoder(_OpenPoseFrame).decode
 
 @checked
 def read_openpose(
-    folder: str | PathLike[str], *, camera: str, rate: float, keypoint_set: str = "BODY_25B",
+    folder: str | PathLike[str], *, camera: str, rate: float, keypoint_set: str | None = None,
     frames: tuple[int, int] | None = None, time_offset: float = 0.0, image_frame: ImageFrame | None = None,
 ) -> Keypoints:  # fmt: skip
     """Read a folder with one json file per frame, in the format of OpenPose.
@@ -61,8 +62,9 @@ def read_openpose(
         of one frame, which may have no people.
     camera : str
     rate : float [Hz]
-    keypoint_set : str
-        One of `KEYPOINT_SETS`; the files do not state it.
+    keypoint_set : str, optional
+        One of `KEYPOINT_SETS`; the files do not state it. Default: the one of as many points; of BODY_25 and BODY_25B
+        the one in which the bones are shorter.
     frames : (start, stop), optional
         Only these; their times are kept.
     time_offset : float [s]
@@ -77,14 +79,18 @@ def read_openpose(
     Raises
     ------
     ObservationError
-        A missing or repeated frame number, broken json, NaN, a wrong number of keypoints, no people.
+        A missing or repeated frame number, broken json, NaN, a wrong number of keypoints, points that are clearly in
+        the order of another set, no people.
     FileError
         No such folder, or no json in it.
     """
     folder = Path(folder)
-    names = keypoint_names(keypoint_set)
     paths, start = cut_frames(_numbered_files(folder), frames, folder)
-    people = [_read_people(path, len(names), keypoint_set) for path in paths]
+    read = [_read_people(path) for path in paths]
+    first = next((len(people[0].pose_keypoints_2d) // 3 for people in read if people), 0)
+    named = keypoint_set or keypoint_sets.SET_OF_COUNT.get(first, "BODY_25B")
+    names = keypoint_names(named)
+    people = [_numbers(persons, path, named) for persons, path in zip(read, paths, strict=True)]
     if folder.is_dir() and not any(map(len, people)):
         raise ObservationError(
             f"no person is detected in any of the {len(paths)} frames of camera {camera}", file=folder,
@@ -93,7 +99,8 @@ def read_openpose(
     data = np.zeros((len(people), max(map(len, people)), len(names), 3))
     for row, persons in zip(data, people, strict=True):
         row[: len(persons)] = persons
-    return keypoint_record(data, camera, keypoint_set, rate, time_offset, start, folder, image_frame)
+    record = keypoint_record(data, camera, named, rate, time_offset, start, folder, image_frame)
+    return in_right_order(record, stated=keypoint_set is not None)
 
 
 @checked
@@ -141,7 +148,7 @@ def read_mediapipe(
             remedy="A frame without a person must be all NaN (or zero).",
         )
     if keypoint_set == "MEDIAPIPE_478":
-        data = face_mesh(data, path)
+        data = face_mesh(data)
     if not data[..., 2].any():
         raise ObservationError(
             f"no person is detected in any of the {len(data)} frames of camera {camera}", file=path,
@@ -238,6 +245,8 @@ def read_keypoints(path: str | PathLike[str], *, format: str | None = None, **op
     ObservationError, FileError
         An unknown format; and what those raise.
     """
+    if Path(path).is_file():
+        keypoint_sets.refuse_other_keypoints(Path(path))
     formats = {"openpose": read_openpose, "mediapipe": read_mediapipe, "caliscope": _caliscope_camera}
     if format is None:
         format = "openpose" if Path(path).is_dir() else "mediapipe"
@@ -270,6 +279,7 @@ def _numbered_files(folder: Path) -> list[Path]:
             continue
         match = _FRAME_NUMBER.search(path.name)
         if not match:
+            keypoint_sets.refuse_other_keypoints(path)
             raise ObservationError("no frame number in this name", file=path, remedy="Expected NAME_0012.json.")
         number = int(match[1])
         if number in numbered:
@@ -293,15 +303,21 @@ def _numbered_files(folder: Path) -> list[Path]:
     return [numbered[i] for i in range(first, last + 1)]
 
 
-def _read_people(path: Path, count: int, keypoint_set: str) -> NDArray:
-    """(P, K, 3) x, y [px], confidence of all people of one frame."""
+def _read_people(path: Path) -> list[OpenPosePerson]:
+    """All people of one frame."""
     raw = regular(path).read_bytes()
     try:
-        people = decode_openpose(raw).people
+        return decode_openpose(raw).people
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        keypoint_sets.refuse_other_keypoints(path)
         infinite = re.search(rb"[\[,:]\s*-?(NaN|Inf)", raw, re.IGNORECASE)
         problem = "NaN or infinity among the keypoints" if infinite else f"broken json ({error})"
         raise ObservationError(problem, file=path, remedy="Run the detector again on this frame.") from error
+
+
+def _numbers(people: list[OpenPosePerson], path: Path, keypoint_set: str) -> NDArray:
+    """(P, K, 3) x, y [px], confidence of all people of one frame."""
+    count = len(keypoint_names(keypoint_set))
     values = [p.with_hands() if keypoint_set == OPENPOSE_HANDS else p.pose_keypoints_2d for p in people]
     for i, numbers in enumerate(values):
         if len(numbers) != 3 * count:

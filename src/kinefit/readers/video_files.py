@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,9 @@ from kinefit.errors import FileError
 from kinefit.observations.clocks import is_even, nominal_rate
 
 _MAX_SKIPPED_FRAMES = 64  # decoded and dropped; over more, seeking is faster
+_MIN_CHUNKS_SHARE = 0.9  # of an AVI that its chunks fill; an unfinished one has a size of 0 there
 _CODECS_WITH_HIDDEN_FRAMES = ("vp8",)  # their packets cannot be counted: some show nothing
+_MIN_MPEG4_BYTES = 10  # of a frame; less says only that it repeats the one before, and nothing is decoded
 _REMEDY = "Copy the file again from its source, or re-encode it."
 
 
@@ -29,17 +32,17 @@ class VideoFile:
         self._container = _open(path)
         try:
             self._stream = self._container.streams.video[0]
-            self._pts = _presentation_times(self.path)
+            self._pts, shown = _presentation_times(self.path)
             self._index = {pts: i for i, pts in enumerate(self._pts)}
             self._restart()
             first = self._decode(0)
-            self._quarter_turns = _quarter_turns(first)
+            self._display = _display_axes(first, path)
         except BaseException:
             self.close()
             raise
-        height, width = (first.height, first.width) if self._quarter_turns % 2 == 0 else (first.width, first.height)
-        self.size: tuple[int, int] = (width, height)
-        self.times: NDArray = (np.array(self._pts) - self._pts[0]) * float(self._stream.time_base or 0)
+        size = first.width, first.height
+        self.size: tuple[int, int] = size[::-1] if self._display[0] else size
+        self.times: NDArray = (np.array(shown) - shown[0]) * float(self._stream.time_base or 0)
         self.rate: float = self._measure_rate()
         self._restart()
 
@@ -52,7 +55,7 @@ class VideoFile:
 
     def image(self, i: int) -> NDArray[np.uint8]:
         """Frame `i` as (H, W, 3) uint8 RGB, upright."""
-        return _upright(self._decode(i), self._quarter_turns)
+        return _upright(self._decode(i), self._display)
 
     def _restart(self, i: int = 0) -> None:
         """Restart the decoder at or before frame `i`."""
@@ -63,7 +66,7 @@ class VideoFile:
             self._container = _open(self.path)
             self._stream = self._container.streams.video[0]
             self._stream.thread_type = "AUTO"
-        self._decoder = self._container.decode(self._stream)
+        self._decoder = _frames(self._container)
         self._next = 0  # lower bound of the frame that comes next
 
     def _decode(self, i: int) -> Any:
@@ -105,12 +108,12 @@ def first_image(path: Path) -> NDArray[np.uint8]:
     """
     container = _open(path)
     try:
-        frame = next(container.decode(video=0))
+        frame = next(_frames(container))
     except (av.FFmpegError, StopIteration, ValueError) as error:
         raise FileError(f"no image can be decoded ({error})", file=path, remedy=_REMEDY) from error
     finally:
         container.close()
-    return _upright(frame, _quarter_turns(frame))
+    return _upright(frame, _display_axes(frame, path))
 
 
 def image_at(
@@ -137,7 +140,7 @@ def image_at(
         container.streams.video[0].codec_context.skip_frame = "NONREF"  # what no other image needs
         try:
             container.seek(round(aim * av.time_base) + (container.start_time or 0), backward=True)
-            for found in container.decode(video=0):
+            for found in _frames(container):
                 begin = (container.start_time or 0) / av.time_base
                 if found.time is None or found.time - begin >= aim or time.monotonic() > until:
                     break
@@ -145,7 +148,7 @@ def image_at(
             raise FileError(f"no image can be decoded ({error})", file=path, remedy=_REMEDY) from error
         if found is None:
             raise FileError("no image can be decoded", file=path, remedy=_REMEDY)
-        return _upright(found, _quarter_turns(found))
+        return _upright(found, _display_axes(found, path))
 
 
 def open_container(path: Path) -> Any:
@@ -185,6 +188,13 @@ def _open(path: Path) -> Any:
     return container
 
 
+def _frames(container: Any) -> Iterator[Any]:
+    """Decode the frames of the first video stream; empty packets, which stand for dropped frames, are passed over."""
+    for packet in container.demux(container.streams.video[0]):
+        if packet.size or packet.dts is None:
+            yield from packet.decode()
+
+
 def _reason(error: Exception) -> str:
     """FFmpeg's message, without its error number and the path."""
     if isinstance(error, MemoryError):  # also for impossible counts in a file
@@ -192,30 +202,39 @@ def _reason(error: Exception) -> str:
     return str(getattr(error, "strerror", None) or error)
 
 
-def _presentation_times(path: Path) -> list[int]:
-    """Presentation times of all frames, sorted, in the stream's time base."""
+def _presentation_times(path: Path) -> tuple[list[int], list[int]]:
+    """Times of all frames by which FFmpeg names them, and at which they are shown, sorted, in the stream's time base.
+
+    AVI states no times of presentation. Where its frames are in order they are shown in their places, but FFmpeg names
+    some by the place of the next one.
+    """
     pts: list[int | None] = []
+    dts: list[int] = []
     packets, problem = 0, ""
     with _open(path) as container:
         stream = container.streams.video[0]
         stated, rate, base = stream.frames, float(stream.average_rate or 0), float(stream.time_base or 0)
+        codec = stream.codec_context.name
+        hidden = codec in _CODECS_WITH_HIDDEN_FRAMES
         alone = len(container.streams) == 1 and container.duration and container.size > 0
         duration = container.duration / av.time_base if alone else 0.0
         try:
             for packet in container.demux(stream):
                 if packet.size and packet.is_corrupt:
                     problem = problem or "damaged packet"
-                elif packet.size:
-                    packets += 1
-                    if not packet.is_discard:
+                elif packet.size or packet.dts is not None:
+                    packets += 1  # an empty one stands for a dropped frame
+                    if packet.size and not packet.is_discard:
+                        hidden |= codec == "mpeg4" and packet.size < _MIN_MPEG4_BYTES
                         pts.append(packet.pts)
+                        dts += [packet.dts] if packet.dts is not None else []
         except (av.FFmpegError, ValueError) as error:
             problem = str(error)
-        hidden = stream.codec_context.name in _CODECS_WITH_HIDDEN_FRAMES
+        is_avi = container.format.name == "avi"
     last = base * max((time for time in pts if time is not None), default=0)
     if not stated and last < 0.98 * duration - 3.0 / (rate or np.inf):  # the duration is rounded
         stated = int(duration * rate * 0.98) - 2
-    if problem or packets < stated:
+    if problem or (packets < stated and not (is_avi and _is_whole(path))):
         total = f" of {stated}" if stated > packets else ""
         raise FileError(
             f"the video is truncated: {packets}{total} frames can be read" + (f" ({problem})" if problem else ""),
@@ -225,13 +244,15 @@ def _presentation_times(path: Path) -> list[int]:
         pts = _decoded_times(path)
     if not pts:
         raise FileError("no frame of this video can be decoded", file=path, remedy=_REMEDY)
-    return sorted(set(pts))  # type: ignore[type-var,arg-type]  # of two frames at one time, the first counts
+    named: list[int] = sorted(set(pts))  # type: ignore[type-var,arg-type]  # of two at one time, the first counts
+    in_places = is_avi and named == pts and len(dts) == len(pts) and bool(np.all(np.diff(dts) > 0))
+    return named, dts if in_places else named
 
 
 def _decoded_times(path: Path) -> list[int | None]:
     with _open(path) as container:
         try:
-            pts = [frame.pts for frame in container.decode(video=0)]
+            pts = [frame.pts for frame in _frames(container)]
         except (av.FFmpegError, ValueError) as error:
             raise FileError(f"the video cannot be decoded ({error})", file=path, remedy=_REMEDY) from error
     if None in pts:
@@ -239,19 +260,37 @@ def _decoded_times(path: Path) -> list[int | None]:
     return pts
 
 
-def _upright(frame: Any, quarter_turns: int) -> NDArray[np.uint8]:
+def _is_whole(path: Path) -> bool:
+    """Whether an AVI ends where its chunks do.
+
+    FFmpeg passes over the empty packets by which capture programs mark dropped frames, which the header counts.
+    """
+    size, end = path.stat().st_size, 0
+    with path.open("rb") as file:
+        while (chunk := file.read(8))[:4] == b"RIFF":
+            end += 8 + int.from_bytes(chunk[4:], "little")
+            end += end % 2
+            file.seek(end)
+    return _MIN_CHUNKS_SHARE * size < end <= size + 1
+
+
+def _upright(frame: Any, display: tuple[bool, bool, bool]) -> NDArray[np.uint8]:
+    """Image (H, W, 3) of a frame as it is to be shown, see `_display_axes`."""
+    is_transposed, is_mirrored, is_flipped = display
     image = frame.to_ndarray(format="rgb24")
-    return np.ascontiguousarray(np.rot90(image, quarter_turns)) if quarter_turns else image
+    image = image.transpose(1, 0, 2) if is_transposed else image
+    return np.ascontiguousarray(image[:: -1 if is_flipped else 1, :: -1 if is_mirrored else 1])
 
 
-def _quarter_turns(frame: Any) -> int:
-    return round(_rotation(frame) / 90) % 4
-
-
-def _rotation(frame: Any) -> float:
-    """Counterclockwise display rotation [deg] that the file states."""
-    data = frame.side_data.get("DISPLAYMATRIX")  # by name: PyAV up to 18 iterates over values, from 19 on over keys
+def _display_axes(frame: Any, path: Path) -> tuple[bool, bool, bool]:
+    """Whether a frame is shown transposed, then mirrored left to right, then upside down, as the file states."""
+    try:
+        data = frame.side_data.get("DISPLAYMATRIX")  # by name: PyAV up to 18 iterates over values, from 19 on over keys
+    except ValueError as error:  # of a kind that this PyAV does not know, such as Exif
+        problem = f"metadata of its frames cannot be read, which may state how they are turned ({error})"
+        remedy = "Re-encode it: ffmpeg -i IN -c:v libx264 -crf 10 OUT.mp4."
+        raise FileError(problem, file=path, remedy=remedy) from error
     if data is None:
-        return 0.0
-    a, b = np.frombuffer(bytes(data), np.int32)[:2]
-    return float(-np.degrees(np.arctan2(b, a)))
+        return False, False, False
+    a, b, _, c, d = (int(v) for v in np.frombuffer(bytes(data), np.int32)[:5])  # shown at (a x + c y, b x + d y)
+    return (True, c < 0, b < 0) if abs(b) > abs(a) else (False, a < 0, d < 0)

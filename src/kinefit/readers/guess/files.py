@@ -23,6 +23,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, PAIRS, read_calibration
 from kinefit.readers.guess.names import camera_of, natural
 from kinefit.readers.image_folders import ENDINGS, ImageFolder
+from kinefit.readers.keypoint_sets import SPLIT, other_keypoints
 from kinefit.readers.keypoints import decode_openpose
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.video import Video
@@ -44,6 +45,7 @@ _RESULT_ENDINGS = ("-kinefit", "-detect")  # of the folders that kinefit writes
 _MAX_DEPTH = 6  # folders below the given one
 _MIN_SEQUENCE = 12  # numbered json files in one folder are a detector's frames, fewer may be cameras
 _JSON_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.I)
+_MAYBE_KEYPOINTS = (".json", ".csv", ".h5")
 _CALISCOPE_COLUMNS = {"sync_index", "port", "point_id", "img_loc_x", "img_loc_y"}
 _CALIBRATION_NAME = re.compile(r"calib|intrin|extrin|cam", re.IGNORECASE)  # else a broken file may be anything
 _UNITS = ("mm", "cm", "inch", "dm")
@@ -291,6 +293,8 @@ def find_keypoints(files: list[Path]) -> tuple[list[KeypointFile], list[str]]:
             remarks.append(f"{path.name}: an array of shape {shape}; {known}")
         if suffix == ".csv" and (frames := _caliscope_frames(path)):
             found.append(KeypointFile(path, "caliscope", frames, 33))
+        elif suffix in _MAYBE_KEYPOINTS and (other := other_keypoints(path)):
+            remarks.append(f"{path.name}: {other}; not used. {SPLIT}")
     return found, remarks
 
 

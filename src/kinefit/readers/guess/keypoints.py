@@ -7,16 +7,14 @@ from collections.abc import Mapping, Sequence
 from kinefit.errors import KinefitError, ObservationError
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.observations import Keypoints
-from kinefit.readers.guess import views as guess_views
 from kinefit.readers.guess.draft import Draft, Value
 from kinefit.readers.guess.files import STATIC, KeypointFile
 from kinefit.readers.guess.names import Trial, camera_number, common_words, trials
-from kinefit.readers.keypoint_sets import HAND_POINTS, KEYPOINT_SETS, OPENPOSE_HANDS, SETS_WITH_HANDS
+from kinefit.readers.keypoint_sets import HAND_POINTS, OPENPOSE_HANDS, SET_OF_COUNT, SETS_WITH_HANDS
 from kinefit.readers.keypoints import read_keypoints
 
 Source = dict[str, KeypointFile]  # camera -> its file, of one detector
 
-_SET_BY_COUNT = {len(KEYPOINT_SETS[name]): name for name in sorted(KEYPOINT_SETS)}  # 25 points: BODY_25B
 _AMBIGUOUS_COUNTS = (25, 25 + 2 * HAND_POINTS)  # points of BODY_25 and BODY_25B, without hands and with them
 _FORMATS = ("openpose", "mediapipe", "caliscope")  # the first that is there: its confidence is the most informative
 _MAX_LENGTH_ERROR = 0.1  # share of the video's frames; keypoints with a larger error are of another recording
@@ -71,20 +69,17 @@ def read_sources(draft: Draft, sources: Sequence[Source]) -> list[dict[str, Keyp
 def _read(file: KeypointFile, camera: str) -> Keypoints:
     """Read the keypoints of a camera, at 1 Hz if the format states no rate."""
     if file.format == "openpose":
-        if file.points not in _SET_BY_COUNT:
-            known = ", ".join(map(str, sorted(_SET_BY_COUNT)))
+        if file.points not in SET_OF_COUNT:
+            known = ", ".join(map(str, sorted(SET_OF_COUNT)))
             raise ObservationError(f"{file.points} points; there are sets of {known}")
-        name = _SET_BY_COUNT[file.points]
-        record = read_keypoints(file.path, format=file.format, camera=camera, rate=1.0, keypoint_set=name)
-        if file.points in _AMBIGUOUS_COUNTS:
-            name = guess_views.guess_body_25(record)
-            name = OPENPOSE_HANDS if file.points > 25 and name == "BODY_25" else name
-            record = record.first_points(name, KEYPOINT_SETS[name])
+        record = read_keypoints(file.path, format=file.format, camera=camera, rate=1.0)
+        if record.keypoint_set == "BODY_25" and file.points > 25:
+            record = read_keypoints(
+                file.path, format=file.format, camera=camera, rate=1.0, keypoint_set=OPENPOSE_HANDS
+            )
     else:
         rate = None if file.format == "caliscope" else 1.0
         record = read_keypoints(file.path, format=file.format, camera=camera, rate=rate)
-    if guess_views.looks_normalised(record):
-        raise ObservationError("its coordinates run from 0 to 1, not over pixels: multiply by width and height")
     return record
 
 
@@ -113,7 +108,7 @@ def keypoint_entries(
         entry = {"camera": Value(name), "file": Value(source[name].path), "format": Value(format)}
         if format == "openpose":
             of_two = source[name].points in _AMBIGUOUS_COUNTS
-            why = f"{source[name].points} points" + ", recognised by the positions of neck and hips" * of_two
+            why = f"{source[name].points} points" + ", recognised by the lengths of the bones" * of_two
             entry["set"] = Value(record.keypoint_set, "likely" if of_two else "sure", why)
         if frame is not None and name in images:
             entry["frame"] = frame

@@ -136,26 +136,6 @@ def spread_frames(count: int) -> NDArray:
     return np.unique(np.linspace(0, count - 1, _MAX_FRAMES).astype(int))
 
 
-def looks_normalised(record: Keypoints) -> bool:
-    """Whether coordinates are shares 0..1 of the image size, not pixels."""
-    return bool(np.nanmax(np.abs(record.points)) <= 2.0)
-
-
-def guess_body_25(record: Keypoints) -> str:
-    """"BODY_25" or "BODY_25B", which both have 25 points, by the positions of neck and hips."""
-    points = one_person(record, spread_frames(len(record)))
-
-    def off(middle: int, left: int, right: int) -> NDArray:
-        width = np.linalg.norm(points[:, left] - points[:, right], axis=-1) + 1.0
-        return np.linalg.norm(points[:, middle] - 0.5 * (points[:, left] + points[:, right]), axis=-1) / width
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        body_25 = np.nanmedian(np.stack([off(1, 2, 5), off(8, 9, 12)]))  # Neck, MidHip
-        body_25b = np.nanmedian(np.stack([off(17, 5, 6), off(0, 1, 2)]))  # UpperNeck, nose between the eyes
-    return "BODY_25" if body_25 < body_25b else "BODY_25B"
-
-
 def keypoint_frame(
     rig: Rig, records: Mapping[str, Keypoints], images: Mapping[str, ImageFrame], sizes: Mapping[str, Size]
 ) -> Value | None:
