@@ -60,8 +60,8 @@ def learn_segments(positions: NDArray, labels: Sequence[str], mean: NDArray, dev
     small = [g for g in groups if len(g) < 3]
     index = sorted(set().union(*small))  # of these, pairs that nearly form a segment are joined
     groups = [g for g in groups if len(g) >= 3]
-    near = complete_linkage(costs[np.ix_(index, index)], WIDENING_FACTOR * MAX_SEGMENT_SIGMA)
-    groups += [{index[i] for i in g} for g in near]
+    joined = complete_linkage(costs[np.ix_(index, index)], WIDENING_FACTOR * MAX_SEGMENT_SIGMA)
+    groups += [{index[i] for i in g} for g in joined]
     members = [tuple(sorted(g)) for g in groups]
     widened = [widen_group(g, costs) for g in groups]
     shared = share_markers(positions, members, widened, firm)

@@ -1,8 +1,7 @@
-"""MATLAB's camera parameters, in .mat files (extra `matlab`) and in JSON, as tables with OpenCV's conventions."""
+"""MATLAB's camera parameters, in .mat files and in JSON, as tables with OpenCV's conventions."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import subprocess
 from pathlib import Path
@@ -27,13 +26,10 @@ def read_mat(path: Path) -> Table:
     Raises
     ------
     FileError
-        The extra `matlab` is not installed; no file of MATLAB, one that is damaged, or one of version 7.3.
+        No file of MATLAB, one that is damaged, or one of version 7.3.
     CalibrationError
         Objects in place of structs.
     """
-    if importlib.util.find_spec("scipy") is None:
-        remedy = "Run: pip install 'kinefit[matlab]'. Or in MATLAB: writelines(jsonencode(toStruct(params)), 'a.json')"
-        raise FileError("reading .mat files needs the package scipy", file=path, remedy=remedy)
     answer: dict[str, Any]
     words = python(str(Path(__file__).with_name("mat_file.py")), str(regular(path)))
     try:
