@@ -10,6 +10,7 @@ PARTS = {
     "faults_folder": "classes that an unfinished folder of results brings in, and kills that it survives",
     "faults_readers": "images that claim much and files that take long: seconds and memory until the error",
     "faults_strangers": "code, files and clocks of strangers in folders of recordings that run, hang or are lost",
+    "faults_strangers_window": "attacks on the window in a real browser that succeed",
     "faults_inputs": "takes with wrong files that `kinefit track` names, and false alarms on right ones",
     "faults_users": "files as users have them: what they state is read, or named",
     "faults_sides": "mirrored worlds and exchanged sides of markers that are named, and false alarms",

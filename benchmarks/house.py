@@ -17,6 +17,7 @@ from benchmarks.figures import figure, run_parts
 
 PARTS = {
     "house": "code lines, questions of type, parameters, rooms and class names of the package",
+    "house_record": "commands, options, take keys, formats, findings and public names that are lost",
     "house_words": "private words, names of constants, docstrings of public functions",
 }
 PACKAGE = Path(__file__).resolve().parents[1] / "src" / "kinefit"
