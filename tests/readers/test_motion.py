@@ -10,8 +10,8 @@ from kinefit.bodies import KinematicTree, catalogue, load_body
 from kinefit.bodies.serial import body_from_arrays, body_to_arrays
 from kinefit.errors import BodyError, ExportError, FileError
 from kinefit.exporters import write_motion
-from kinefit.motion import Residuals
-from kinefit.readers.motion import ARRAYS, read_motion
+from kinefit.motion import ARRAYS, Residuals
+from kinefit.readers.motion import read_motion
 
 
 def assert_same_arrays(a, b):

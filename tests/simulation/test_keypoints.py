@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ExportError, ObservationError
-from kinefit.motion import UP_AXES
+from kinefit.motion import ARRAYS, UP_AXES
 from kinefit.observations.recordings import mirror_name
 from kinefit.readers.keypoint_sets import KEYPOINT_SETS
-from kinefit.readers.motion import ARRAYS
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.readers.video import Video

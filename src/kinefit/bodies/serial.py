@@ -18,8 +18,18 @@ radians:
     surfaces/starts, ends, sides (C, 3)                in the segment's frame [m]; sides: directions
     surfaces/radii (C, 2, 2)                           half axes at both ends [m]
     surfaces/K/vertices (V, 3), faces (T, 3)           of surface K where it is a mesh [m]
+    surfaces/K/centres, radii (B, 3), weights (B,), axes (B, 3, 3)            of surface K where it is metaballs
     aliases/CONVENTION (N, 2)                          pairs: segment, name in the convention
-    morphs/..., skin/...                               see `serial_morphs`
+    morphs/K/kind ()                                   "joint", "global", "surface" or "local"; K counts from 0
+    morphs/K/angle ()  span (2,)  beyond ()            coordinate; its values of weight 0 and 1 [rad] or [m]
+    morphs/K/weight () or (N, 2)                       name of the weighting, or t and ω (of a function, too)
+    morphs/K/segment ()                                "" for none
+    morphs/K/twist (6,)                                of a joint's motion
+    morphs/K/target (V, 3)                             of a global morph [m]
+    morphs/K/centre, radii (n,)  shift (3,)  on (N,)   of a local morph [m]
+    morphs/K/moves ()                                  whether it moves with its segment; may be missing
+    morphs/K/surfaces/...                              of a segment's second shape, as those of a body
+    skin/nodes (V, K, 3)  faces (T, 3)  owners, weights (V, K)                K owners of each node
     closures, dimensions                               each as JSON, fields as of `closures`; may be missing
 
 Names that are part of a key are percent-encoded.
@@ -28,10 +38,10 @@ Names that are part of a key are percent-encoded.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from os import PathLike
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 from urllib.parse import quote, unquote
 
 import msgspec
@@ -42,51 +52,115 @@ from kinefit._arguments import checked
 from kinefit._files import read_npz
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.closures import KINDS, Closure, Dimension
-from kinefit.bodies.morphs.serial_morphs import (
-    morphs_from_arrays,
-    morphs_to_arrays,
-    skin_from_arrays,
-    skin_to_arrays,
-)
-from kinefit.bodies.surfaces import MeshSurface, Metaballs, Surface, TaperedCylinder
+from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph
+from kinefit.bodies.morphs.steering import Steering
+from kinefit.bodies.surfaces import MeshSurface, Metaballs, SkinnedMesh, Surface, TaperedCylinder
 from kinefit.bodies.toml.records import stature_of
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError
 
+Arrays = Mapping[str, NDArray]
 _Kind = TypeVar("_Kind")
-_TREE = ("parents", "offsets", "owners", "axes", "prismatic", "lower", "upper", "usual", "spread")
+_WEIGHT_ROWS = 1025  # of a stored weighting function
+
+# Shapes of the arrays of each record, as `fields_of` reads them
+_TREE = {
+    "segments": "S$", "parents": "S", "offsets": "S 3", "coordinates": "D$", "owners": "D<S", "axes": "D 3",
+    "prismatic": "D", "lower": "D", "upper": "D", "usual": "D", "spread": "D", "root_free": "", "couplings": "C D",
+}  # fmt: skip
+_BODY = {"name": "$", "stature": "", "joints": "S$", "scale_groups": "G$", "segment_scale": "S<G"}
+_POINTS = {"names": "k$", "segments": "k<S", "points": "k 3!"}
+_SKIN = {"nodes": "v k 3", "faces": "t 3", "owners": "v k<S", "weights": "v k"}
+_CYLINDERS = {"segments": "c<S", "starts": "c 3", "ends": "c 3", "radii": "c 2 2", "sides": "c 3"}
+_ROUND = {"segments": "c<S", "ends": "c 3", "radii": "c 2"}  # of older files: cylinders from the joint
+_MESH = {"vertices": "v 3", "faces": "t 3"}
+_BALLS = {"centres": "b 3", "radii": "b 3", "weights": "b", "axes": "b 3 3"}
+_MORPH = {"kind": "$", "angle": "$", "span": "2", "beyond": "", "segment": "$"}
+_OPERATORS: dict[str, tuple[type[Operator], dict[str, str]]] = {
+    "joint": (JointMotion, {"twist": "6!"}),
+    "global": (GlobalMorph, {"target": "v 3!"}),
+    "surface": (SegmentMorph, {}),
+    "local": (LocalMorph, {"centre": "n!", "radii": "n", "shift": "3!", "on": "s$", "moves": ""}),
+}
+
+
+def arrays_of(record: object, shapes: Mapping[str, str], prefix: str = "") -> dict[str, NDArray]:
+    """The fields of a record that `shapes` names, but for those that are None, as arrays; keys begin with `prefix`."""
+    values = ((name, shape, getattr(record, name)) for name, shape in shapes.items())
+    return {prefix + n: np.array(v, np.str_ if "$" in shape else None) for n, shape, v in values if v is not None}
+
+
+def fields_of(arrays: Arrays, shapes: Mapping[str, str], sizes: dict[str, int], prefix: str = "") -> dict[str, Any]:
+    """Fields of a record from arrays: numbers and texts from those without axes, tuples from those of texts.
+
+    Parameters
+    ----------
+    shapes : of each array: numbers and names of lengths, of capitals for a whole file, of small letters for one record;
+        "D<S" for (D,) indices below S, "k 3!" for finite numbers, "S$" for texts.
+    sizes : lengths of the file by name; those that are read first are added.
+
+    Raises
+    ------
+    BodyError
+        An array is missing, of another shape or type, an index is out of range or a number not finite.
+    """
+    out, own = {}, dict[str, int]()
+    for name, shape in shapes.items():
+        key, axes, limit = prefix + name, shape.strip("!$").partition("<")[0].split(), shape.partition("<")[2]
+        if key not in arrays:
+            raise BodyError(f"no array '{key}'")
+        array, known = arrays[key], sizes | own
+        wanted = [int(n) if n.isdigit() else known.get(n, n) for n in axes]
+        if array.ndim != len(axes) or any(isinstance(n, int) and n != m for n, m in zip(wanted, array.shape)):
+            expected = ", ".join("any" if isinstance(n, str) else str(n) for n in wanted)
+            raise BodyError(f"array '{key}' has shape {array.shape} instead of ({expected})")
+        for n, m in zip(wanted, array.shape):
+            if isinstance(n, str):
+                (sizes if n.isupper() else own)[n] = m
+        if ("$" in shape) != (array.dtype.kind == "U"):
+            remedy = f"It holds {'texts' if '$' in shape else 'numbers'}."
+            raise BodyError(f"array '{key}' is of {array.dtype}", remedy=remedy)
+        if limit and not np.all((array >= 0) & (array < sizes[limit])):
+            remedy = f"Its indices run from 0 to {sizes[limit] - 1}."
+            raise BodyError(f"array '{key}' has an index out of range", remedy=remedy)
+        if "!" in shape and not np.isfinite(array).all():
+            place = f"entry {np.argwhere(~np.isfinite(array))[0][0]}"
+            raise BodyError(f"array '{key}' has a number that is not finite", place=place, remedy="Give metres.")
+        out[name] = array.item() if not axes else tuple(array.tolist()) if "$" in shape else array
+    return out
+
+
+def below(arrays: Arrays, prefix: str) -> dict[str, NDArray]:
+    """The arrays whose keys begin with a prefix, without it."""
+    return {key.removeprefix(prefix): array for key, array in arrays.items() if key.startswith(prefix)}
+
+
+def sets_below(arrays: Arrays, kind: str) -> Iterator[tuple[str, dict[str, NDArray]]]:
+    """Names of a kind of sets, such as "keypoints", decoded, each with the arrays below it."""
+    for name in dict.fromkeys(key.split("/")[1] for key in arrays if key.startswith(f"{kind}/")):
+        yield unquote(name), below(arrays, f"{kind}/{name}/")
 
 
 def body_to_arrays(body: Body) -> dict[str, NDArray]:
     """Convert a body to arrays, with the keys of the module's docstring, such as offsets (S, 3) [m]."""
-    tree = body.tree
-    out: dict[str, NDArray] = {
-        "name": np.array(body.name),
-        "stature": np.array(float(body.stature)),
-        "root_free": np.array(tree.root_free),
-        "segments": text_array(tree.segments),
-        "joints": text_array(body.joints),
-        "coordinates": text_array(tree.coordinates),
-        "scale_groups": text_array(body.scale_groups),
-        "segment_scale": np.array(body.segment_scale, np.int64),
-    }
-    out |= _surfaces_to_arrays(body.surfaces)
-    out |= morphs_to_arrays(body.morphs, _surfaces_to_arrays) | skin_to_arrays(body.skin)
-    out |= {name: np.array(getattr(tree, name)) for name in (*_TREE, "couplings")}
-    out |= _points_to_arrays("landmarks", body.landmarks)
+    out = arrays_of(body, _BODY) | arrays_of(body.tree, _TREE) | _surfaces_to_arrays(body.surfaces)
+    for k, morph in enumerate(body.morphs):
+        out |= {f"morphs/{k}/{name}": array for name, array in _morph_to_arrays(morph).items()}
+    if body.skin is not None:
+        out |= arrays_of(body.skin, _SKIN, "skin/")
+    out |= arrays_of(body.landmarks, _POINTS, "landmarks/")
     for kind, sets in (("keypoints", body.keypoint_sets), ("markers", body.marker_sets)):
         for name, points in sets.items():
-            out |= _points_to_arrays(f"{kind}/{quote(name, safe='')}", points)
-    for key in ("closures", "dimensions"):
-        if getattr(body, key):
-            out[key] = text_array([msgspec.json.encode(record).decode() for record in getattr(body, key)])
+            out |= arrays_of(points, _POINTS, f"{kind}/{quote(name, safe='')}/")
+    for key, records in (("closures", body.closures), ("dimensions", body.dimensions)):
+        if records:
+            out[key] = np.array([msgspec.json.encode(record).decode() for record in records])
     for convention, names in body.aliases.items():
-        pairs = [text_array(names), text_array(names.values())]
-        out[f"aliases/{quote(convention, safe='')}"] = np.stack(pairs, axis=1)
+        out[f"aliases/{quote(convention, safe='')}"] = np.array(list(names.items()), np.str_).reshape(-1, 2)
     return out
 
 
-def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
+def body_from_arrays(arrays: Arrays) -> Body:
     """Body from arrays with the keys of the module's docstring, such as offsets (S, 3) [m].
 
     Raises
@@ -94,43 +168,33 @@ def body_from_arrays(arrays: Mapping[str, NDArray]) -> Body:
     BodyError
         An array is missing, has the wrong shape, or an index out of range.
     """
-    n_segments, n_coordinates = len(_array(arrays, "segments", (None,))), len(_array(arrays, "coordinates", (None,)))
-    shapes = {"offsets": (n_segments, 3), "axes": (n_coordinates, 3), "parents": (n_segments,)}
-    tree = KinematicTree(
-        segments=_texts(arrays, "segments"),
-        coordinates=_texts(arrays, "coordinates"),
-        root_free=bool(_array(arrays, "root_free", ())),
-        couplings=_array(arrays, "couplings", (None, n_coordinates)) if "couplings" in arrays else np.empty((0, 0)),
-        **{name: _array(arrays, name, shapes.get(name, (n_coordinates,))) for name in _TREE},  # type: ignore[arg-type]
-    )
-    _check_indices(tree.owners, n_segments, "owners")
-    if n_segments == 0 or tree.parents[0] != -1:
+    sizes = dict[str, int]()
+    no_couplings = np.empty((0, np.size(arrays.get("coordinates", ()))))
+    tree = KinematicTree(**fields_of({"couplings": no_couplings, **arrays}, _TREE, sizes))
+    if sizes["S"] == 0 or tree.parents[0] != -1:
         raise BodyError("the first segment is not the root")
-    _check_indices(tree.parents[1:], n_segments, "parents")
-    groups, segment_scale = _texts(arrays, "scale_groups"), _array(arrays, "segment_scale", (n_segments,))
-    _check_indices(segment_scale, len(groups), "segment_scale")
+    if (tree.parents[1:] < 0).any():
+        raise BodyError("array 'parents' has an index out of range", remedy="Only the root has none, -1.")
+    own = fields_of(arrays, _BODY, sizes)
+    points = lambda part: PointSet(**fields_of(part, _POINTS, sizes))
+    aliases = {key: fields_of(arrays, {key: "n 2$"}, {})[key] for key in arrays if key.startswith("aliases/")}
     body = Body(
-        name=str(_array(arrays, "name", ())),
+        **own | {"stature": stature_of(own["stature"])},
         tree=tree,
-        joints=_texts(arrays, "joints", n_segments),
-        scale_groups=groups,
-        segment_scale=segment_scale,
-        landmarks=_points_from_arrays(arrays, "landmarks", n_segments),
-        keypoint_sets=_sets(arrays, "keypoints", n_segments),
-        marker_sets=_sets(arrays, "markers", n_segments),
-        surfaces=_surfaces_from_arrays(arrays, n_segments),
-        aliases={
-            unquote(key.split("/")[1]): {str(a): str(b) for a, b in _array(arrays, key, (None, 2))}
-            for key in arrays
-            if key.startswith("aliases/")
-        },
-        stature=stature_of(float(_array(arrays, "stature", ()))),
-        morphs=morphs_from_arrays(arrays, lambda own: _surfaces_from_arrays(own, n_segments)),
-        skin=skin_from_arrays(arrays, n_segments),
+        landmarks=PointSet(**fields_of(arrays, _POINTS, sizes, "landmarks/")),
+        keypoint_sets={name: points(part) for name, part in sets_below(arrays, "keypoints")},
+        marker_sets={name: points(part) for name, part in sets_below(arrays, "markers")},
+        surfaces=_surfaces_from_arrays(arrays, sizes),
+        aliases={unquote(key.split("/")[1]): dict(pairs) for key, pairs in aliases.items()},
+        morphs=tuple(_morphs_from_arrays(arrays, sizes)),
+        skin=SkinnedMesh(**fields_of(arrays, _SKIN, sizes, "skin/")) if below(arrays, "skin/") else None,
         closures=_decoded(arrays, "closures", Closure),
         dimensions=_decoded(arrays, "dimensions", Dimension),
     )
-    return _check_closures(body)
+    for c in body.closures:
+        if c.kind not in KINDS or not {c.point, c.to or c.point} <= set(body.landmarks.names):
+            raise BodyError(f"closure '{c.name}' has an unknown kind or unknown landmarks")
+    return body
 
 
 @checked
@@ -173,109 +237,80 @@ def saved_body(path: str | PathLike[str]) -> Body:
         raise BodyError(f"cannot read the body ({error})", file=path, remedy=remedy) from error
 
 
-def text_array(names: object) -> NDArray:
-    """Array (N,) of text, also for N = 0."""
-    return np.array(list(names), dtype=np.str_)  # type: ignore[call-overload]
-
-
-_BALL_FIELDS = ("centres", "radii", "weights", "axes")
-
-
 def _surfaces_to_arrays(surfaces: tuple[Surface, ...]) -> dict[str, NDArray]:
     count = len(surfaces)
-    out = {"surfaces/segments": np.array([c.segment for c in surfaces], np.int64)}
-    out |= {f"surfaces/{name}": np.full((count, 3), np.nan) for name in ("starts", "ends", "sides")}
-    out["surfaces/radii"] = np.full((count, 2, 2), np.nan)
+    out = {"surfaces/segments": np.array([s.segment for s in surfaces], np.int64)}
+    shapes = {"starts": 3, "ends": 3, "sides": 3, "radii": (2, 2)}
+    cylinders = {name: np.full(np.append(count, shape), np.nan) for name, shape in shapes.items()}
     for k, surface in enumerate(surfaces):
-        if isinstance(surface, TaperedCylinder):
-            for name in ("starts", "ends", "sides"):
-                out[f"surfaces/{name}"][k] = getattr(surface, name[:-1])
-            out["surfaces/radii"][k] = surface.radii
-        elif isinstance(surface, Metaballs):
-            out |= {f"surfaces/{k}/{name}": np.array(getattr(surface, name)) for name in _BALL_FIELDS}
-        else:
-            out |= {f"surfaces/{k}/{name}": np.array(getattr(surface, name)) for name in ("vertices", "faces")}
-    return out
+        if isinstance(surface, MeshSurface):
+            out |= arrays_of(surface, _BALLS if isinstance(surface, Metaballs) else _MESH, f"surfaces/{k}/")
+            continue
+        for name, values in cylinders.items():
+            values[k] = surface.radii if name == "radii" else getattr(surface, name[:-1])
+    return out | {f"surfaces/{name}": values for name, values in cylinders.items()}
 
 
-def _surfaces_from_arrays(arrays: Mapping[str, NDArray], n_segments: int) -> tuple[Surface, ...]:
-    owners = _array(arrays, "surfaces/segments", (None,))
-    _check_indices(owners, n_segments, "surfaces/segments")
-    count, out = len(owners), list[Surface]()
-    ends = _array(arrays, "surfaces/ends", (count, 3))
-    if "surfaces/starts" not in arrays:  # older files, with round cylinders: two radii, from the joint
-        radii = _array(arrays, "surfaces/radii", (count, 2))
-        return tuple(TaperedCylinder.round(int(s), e, (r[0], r[1])) for s, e, r in zip(owners, ends, radii))
-    starts, sides = (_array(arrays, f"surfaces/{name}", (count, 3)) for name in ("starts", "sides"))
-    radii = _array(arrays, "surfaces/radii", (count, 2, 2))
-    for k, segment in enumerate(owners):
-        if f"surfaces/{k}/centres" in arrays:
-            shapes = (None, 3), (None, 3), (None,), (None, 3, 3)
-            balls = [_array(arrays, f"surfaces/{k}/{name}", shape) for name, shape in zip(_BALL_FIELDS, shapes)]
-            out.append(Metaballs.of(int(segment), *balls))
-        elif f"surfaces/{k}/vertices" in arrays:
-            vertices, faces = (_array(arrays, f"surfaces/{k}/{name}", (None, 3)) for name in ("vertices", "faces"))
-            out.append(MeshSurface(int(segment), vertices, faces))
+def _surfaces_from_arrays(arrays: Arrays, sizes: dict[str, int]) -> tuple[Surface, ...]:
+    if "surfaces/starts" not in arrays:
+        rounds = fields_of(arrays, _ROUND, sizes, "surfaces/")
+        return tuple(TaperedCylinder.round(*one) for one in zip(*rounds.values()))
+    out = list[Surface]()
+    for k, (segment, *cylinder) in enumerate(zip(*fields_of(arrays, _CYLINDERS, sizes, "surfaces/").values())):
+        prefix = f"surfaces/{k}/"
+        if f"{prefix}centres" in arrays:
+            out.append(Metaballs.of(int(segment), **fields_of(arrays, _BALLS, sizes, prefix)))
+        elif f"{prefix}vertices" in arrays:
+            out.append(MeshSurface(int(segment), **fields_of(arrays, _MESH, sizes, prefix)))
         else:
-            numbers = (v[k].tolist() for v in (starts, ends, radii, sides))
-            out.append(TaperedCylinder(int(segment), *numbers))
+            out.append(TaperedCylinder(int(segment), *(value.tolist() for value in cylinder)))
     return tuple(out)
 
 
-def _points_to_arrays(key: str, points: PointSet) -> dict[str, NDArray]:
-    arrays = {"names": text_array(points.names), "segments": points.segments, "points": points.points}
-    return {f"{key}/{name}": np.array(array) for name, array in arrays.items()}
+def _morph_to_arrays(morph: Operator) -> dict[str, NDArray]:
+    s, weight = morph.steering, morph.steering.weight
+    kind = next(kind for kind, (cls, _) in _OPERATORS.items() if isinstance(morph, cls))
+    if callable(weight):
+        t = np.linspace(0.0, 1.0, _WEIGHT_ROWS)
+        weight = np.stack([t, [float(weight(float(x))) for x in t]], 1)
+    own = {
+        "kind": kind, "angle": s.coordinate, "span": [s.start, s.end], "beyond": s.beyond, "weight": weight,
+        "segment": getattr(morph, "segment", None) or "",
+    }  # fmt: skip
+    surfaces = _surfaces_to_arrays(morph.surfaces) if isinstance(morph, SegmentMorph) else {}
+    return {name: np.array(value) for name, value in own.items()} | arrays_of(morph, _OPERATORS[kind][1]) | surfaces
 
 
-def _points_from_arrays(arrays: Mapping[str, NDArray], key: str, n_segments: int) -> PointSet:
-    names = _texts(arrays, f"{key}/names")
-    segments = _array(arrays, f"{key}/segments", (len(names),))
-    _check_indices(segments, n_segments, f"{key}/segments")
-    points = _array(arrays, f"{key}/points", (len(names), 3))
-    if not (finite := np.isfinite(points).all(axis=1)).all():
-        place = f"{key}, {names[np.argmin(finite)]}"
-        raise BodyError("a point that is not finite", place=place, remedy="Give three numbers in metres.")
-    return PointSet(names, segments, points)
+def _morphs_from_arrays(arrays: Arrays, sizes: dict[str, int]) -> Iterator[Operator]:
+    k = 0
+    while own := below(arrays, f"morphs/{k}/"):
+        try:
+            yield _morph_from_arrays({"moves": np.array(False), **own}, sizes)
+        except (BodyError, KeyError, ValueError, TypeError) as error:
+            raise BodyError(f"arrays of morph {k} are wrong ({error})") from error
+        k += 1
 
 
-def _sets(arrays: Mapping[str, NDArray], kind: str, n_segments: int) -> dict[str, PointSet]:
-    keys = dict.fromkeys(key.split("/")[1] for key in arrays if key.startswith(f"{kind}/"))
-    return {unquote(key): _points_from_arrays(arrays, f"{kind}/{key}", n_segments) for key in keys}
+def _morph_from_arrays(own: Arrays, sizes: dict[str, int]) -> Operator:
+    head, weight = fields_of(own, _MORPH, sizes), own["weight"]
+    if head["kind"] not in _OPERATORS:
+        raise BodyError(f"an unknown kind '{head['kind']}'")
+    cls, shapes = _OPERATORS[head["kind"]]
+    start, end = map(float, head["span"])
+    weighting = str(weight) if weight.dtype.kind == "U" else weight
+    fields = fields_of(own, shapes, sizes)
+    fields["steering"] = Steering(head["angle"], start, end, weighting, bool(head["beyond"]))
+    if cls is not GlobalMorph:
+        fields["segment"] = head["segment"] or (None if cls is LocalMorph else "")
+    if cls is SegmentMorph:
+        fields["surfaces"] = _surfaces_from_arrays(own, sizes)
+    return cls(**fields)
 
 
-def _decoded(arrays: Mapping[str, NDArray], key: str, kind: type[_Kind]) -> tuple[_Kind, ...]:
+def _decoded(arrays: Arrays, key: str, kind: type[_Kind]) -> tuple[_Kind, ...]:
     """Closures or dimensions from JSON; empty for older files."""
-    if key not in arrays:
-        return ()
     try:
-        return tuple(msgspec.json.decode(str(text), type=kind) for text in _array(arrays, key, (None,)))
+        texts = fields_of(arrays, {key: "n$"}, {})[key] if key in arrays else ()
+        return tuple(msgspec.json.decode(text, type=kind) for text in texts)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise BodyError(f"{key} that cannot be read ({error})") from error
-
-
-def _check_closures(body: Body) -> Body:
-    for c in body.closures:
-        points = (c.point, *([c.to] if c.to else []))
-        if c.kind not in KINDS or any(p not in body.landmarks.names for p in points):
-            raise BodyError(f"closure '{c.name}' has an unknown kind or unknown landmarks")
-    return body
-
-
-def _array(arrays: Mapping[str, NDArray], key: str, shape: tuple[int | None, ...]) -> NDArray:
-    if key not in arrays:
-        raise BodyError(f"no array '{key}'")
-    array = arrays[key]
-    if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape)):
-        expected = ", ".join("any" if n is None else str(n) for n in shape)
-        raise BodyError(f"array '{key}' has shape {array.shape} instead of ({expected})")
-    return array
-
-
-def _texts(arrays: Mapping[str, NDArray], key: str, count: int | None = None) -> tuple[str, ...]:
-    return tuple(str(v) for v in _array(arrays, key, (count,)))
-
-
-def _check_indices(indices: NDArray, count: int, key: str) -> None:
-    if indices.size and not (np.min(indices) >= 0 and np.max(indices) < count):
-        remedy = f"Its indices run from 0 to {count - 1}."
-        raise BodyError(f"array '{key}' has an index out of range", remedy=remedy)

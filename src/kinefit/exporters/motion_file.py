@@ -10,14 +10,13 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit.bodies.serial import body_to_arrays, text_array
+from kinefit.bodies.serial import arrays_of, body_to_arrays
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import writing
 from kinefit.motion import Motion
-from kinefit.readers.motion import ARRAYS, FORMAT, RESIDUAL_ARRAYS, SURFACE_ARRAYS, VERSION
+from kinefit.readers.motion import FORMAT, RESIDUAL_SHAPES, SHAPES, SURFACE_SHAPES, VERSION
 
 
 @checked
@@ -31,21 +30,11 @@ def write_motion(motion: Motion, path: str | PathLike[str]) -> None:
     """
     if Path(path).suffix != ".npz":
         raise ExportError("a motion file ends in .npz", file=path, remedy=f"Call it {Path(path).stem}.npz.")
-    arrays: dict[str, NDArray] = {
-        "format": np.array(FORMAT),
-        "version": np.array(VERSION),
-        "name": np.array(motion.name),
-        "up": np.array(motion.up),
-        "rate": np.array(float(motion.rate)),
-        "provenance": np.array(_json(motion.provenance)),
-    }
-    arrays |= {key: getattr(motion, key) for key in ARRAYS}
+    head = {"format": FORMAT, "version": VERSION, "provenance": _json(motion.provenance)}
+    arrays = {key: np.array(value) for key, value in head.items()} | arrays_of(motion, SHAPES)
     arrays |= {f"body/{key}": array for key, array in body_to_arrays(motion.body).items()}
     for sensor, residuals in motion.residuals.items():
-        for key in (*RESIDUAL_ARRAYS, *(() if residuals.of_points else SURFACE_ARRAYS)):
-            value = getattr(residuals, key)
-            array = text_array(value) if key == "names" else np.asarray(value)
-            arrays[f"residuals/{quote(sensor, safe='')}/{key}"] = array
+        arrays |= arrays_of(residuals, RESIDUAL_SHAPES | SURFACE_SHAPES, f"residuals/{quote(sensor, safe='')}/")
     with writing(path) as temporary:
         np.savez_compressed(temporary, **arrays)  # type: ignore[arg-type]
 

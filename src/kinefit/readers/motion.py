@@ -29,20 +29,26 @@ import json
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from urllib.parse import unquote
 
+import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import read_npz, regular
-from kinefit.bodies.serial import body_from_arrays
-from kinefit.errors import FileError, KinefitError, command
-from kinefit.motion import UP_AXES, Motion, Residuals
+from kinefit.bodies.serial import below, body_from_arrays, fields_of, sets_below
+from kinefit.errors import FileError, KinefitError, command, located
+from kinefit.motion import Motion, Residuals
 
 FORMAT, VERSION = "kinefit motion", 1
-ARRAYS = ("times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality")
-SURFACE_ARRAYS = ("rms", "count")
-RESIDUAL_ARRAYS = ("names", "segments", "unit", "values", "weights", "measured", "swapped")
+SHAPES = {
+    "name": "$", "up": "$", "rate": "", "times": "F", "Ts_world_root": "F 4 4", "angles": "F D", "dof_std": "F N",
+    "joint_std": "F S 3", "quality": "F", "segment_quality": "F S",
+}  # fmt: skip
+RESIDUAL_SHAPES = {
+    "names": "k$", "segments": "k<S", "unit": "$", "values": "F k n", "weights": "F k", "measured": "F k n",
+    "swapped": "F",
+}  # fmt: skip
+SURFACE_SHAPES = {"rms": "F k", "count": "F k"}
 _REMEDY = "Write it again with kinefit, or copy it again from its source."
 
 
@@ -76,9 +82,7 @@ def read_motion(path: str | PathLike[str]) -> Motion:
         return _motion(arrays)
     except FileError:
         raise
-    except KeyError as error:
-        raise FileError(f"motion file without the array {error}", file=file, remedy=_REMEDY) from error
-    except (KinefitError, ValueError, TypeError, IndexError, RecursionError) as error:
+    except (KinefitError, KeyError, ValueError, TypeError, IndexError, RecursionError) as error:
         problem = f"motion file whose contents do not fit together ({error})"
         raise FileError(problem, file=file, remedy=_REMEDY) from error
 
@@ -102,47 +106,21 @@ def _load(file: Path) -> dict[str, NDArray]:
 
 
 def _motion(arrays: Mapping[str, NDArray]) -> Motion:
-    body = body_from_arrays(_below(arrays, "body/"))
-    F, S, D = len(arrays["times"]), len(body.tree.segments), len(body.tree.coordinates)
-    shapes = ((F,), (F, 4, 4), (F, D), (F, 6 + D), (F, S, 3), (F,), (F, S))
-    for key, shape in zip(ARRAYS, shapes):
-        _check(key, arrays[key], shape)
-    up = str(arrays["up"])
-    if up not in UP_AXES:
-        raise ValueError(f"vertical axis '{up}'")
-    sensors = dict.fromkeys(key.split("/")[1] for key in arrays if key.startswith("residuals/"))
-    return Motion(
-        body=body,
-        rate=float(arrays["rate"]),
-        **{key: arrays[key] for key in ARRAYS},  # type: ignore[arg-type]
-        residuals={unquote(s): _residuals(_below(arrays, f"residuals/{s}/"), s, F, S) for s in sensors},
-        up=up,
-        name=str(arrays["name"]),
-        provenance=json.loads(str(arrays["provenance"])) if "provenance" in arrays else {},
-    )
+    for array in arrays.values():
+        array.flags.writeable = False
+    body = body_from_arrays(below(arrays, "body/"))
+    D = len(body.tree.coordinates)
+    sizes = {"F": np.size(arrays["times"]), "S": len(body.tree.segments), "D": D, "N": 6 + D}
+    provenance = json.loads(str(arrays["provenance"])) if "provenance" in arrays else {}
+    residuals = {sensor: _residuals(own, sensor, sizes) for sensor, own in sets_below(arrays, "residuals")}
+    return Motion(body=body, **fields_of(arrays, SHAPES, sizes), residuals=residuals, provenance=provenance)
 
 
-def _residuals(arrays: Mapping[str, NDArray], sensor: str, F: int, S: int) -> Residuals:
-    K, N = len(arrays["names"]), {"px": 2, "m": 3}[str(arrays["unit"])]
-    surface = "rms" in arrays
-    N = 1 if surface else N
-    shapes: dict[str, tuple[int, ...]] = {
-        "segments": (K,), "values": (F, K, N), "measured": (F, K, N), "weights": (F, K), "swapped": (F,),
-        **({"rms": (F, K), "count": (F, K)} if surface else {}),
-    }  # fmt: skip
-    for key, shape in shapes.items():
-        _check(f"residuals/{sensor}/{key}", arrays[key], shape)
-        arrays[key].flags.writeable = False
-    if K and not (0 <= arrays["segments"].min() and arrays["segments"].max() < S):
-        raise ValueError(f"residuals/{sensor}/segments names a segment that the body lacks")
-    names = tuple(str(name) for name in arrays["names"])
-    return Residuals(names=names, unit=str(arrays["unit"]), **{key: arrays[key] for key in shapes})
-
-
-def _below(arrays: Mapping[str, NDArray], prefix: str) -> dict[str, NDArray]:
-    return {key[len(prefix) :]: array for key, array in arrays.items() if key.startswith(prefix)}
-
-
-def _check(key: str, array: NDArray, shape: tuple[int, ...]) -> None:
-    if array.shape != shape:
-        raise ValueError(f"array '{key}' has shape {array.shape} instead of {shape}")
+def _residuals(arrays: Mapping[str, NDArray], sensor: str, sizes: dict[str, int]) -> Residuals:
+    with located(place=f"residuals of {sensor}"):
+        shapes = RESIDUAL_SHAPES | (SURFACE_SHAPES if "rms" in arrays else {})
+        out = Residuals(**fields_of(arrays, shapes, sizes))
+    axes = {"px": 2, "m": 3}[out.unit]
+    if out.values.shape[2] != (axes if out.of_points else 1):
+        raise ValueError(f"residuals of {sensor} in {out.unit} of shape {out.values.shape}")
+    return out

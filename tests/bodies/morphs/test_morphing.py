@@ -271,7 +271,7 @@ def steered(**changes):
         (lambda b, m: [GlobalMorph(m.vertices[:-1], steered())], "a morph to"),
         (lambda b, m: [GlobalMorph(m.vertices * np.nan, steered())], "not finite"),
         (lambda b, m: [LocalMorph([0] * 2, [1] * 2, [0] * 3, steered())], "a bulge with centre"),
-        (lambda b, m: [LocalMorph([0] * 3, [1, 0, 1], [0] * 3, steered())], "a bulge with centre"),
+        (lambda b, m: [LocalMorph([0] * 3, [1, 0, 1], [0] * 3, steered())], "radii .* of a bulge"),
         (lambda b, m: steered(start=1.0, end=1.0), "steered by arm_add_r from 1.0 to 1.0"),
         (lambda b, m: steered(weight="cubic"), "no weighting 'cubic'"),
         (lambda b, m: steered(weight=lambda t: t), r"ω\(0\) = 0.0"),

@@ -143,7 +143,7 @@ class LocalMorph:
     Raises
     ------
     BodyError
-        A moving bulge without a segment.
+        A moving bulge without a segment, radii that are not positive.
     """
 
     centre: NDArray
@@ -157,6 +157,8 @@ class LocalMorph:
     def __post_init__(self) -> None:
         if self.moves and self.segment is None:
             raise BodyError("a bulge that moves needs a segment", remedy="Name the segment that carries it.")
+        if not np.all(np.asarray(self.radii) > 0.0):
+            raise BodyError(f"radii {list(self.radii)} of a bulge", remedy="Give positive ones; inf is no limit.")
 
     def placed(self, tree: KinematicTree) -> LocalMorph:
         """The morph with its centre in the root frame at rest."""
