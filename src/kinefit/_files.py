@@ -10,13 +10,15 @@ import zipfile
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import FileError, KinefitError, ObservationError
 
+_Record = TypeVar("_Record")
 _MIN_STEP_S = 1e-6  # between frames of a table; shorter or longer than its inverse, times are in another unit
 _MAX_TOML_CHARACTERS = 4_000_000  # which tomllib reads in about 2 s; kinefit's own files have thousands
 _DOTTED = re.compile(r"(?<![\w.-])(?:(?:[\w-]++|\"[^\"\n]*+\"|'[^'\n]*+')[ \t]*+\.[ \t]*+){50}")
@@ -140,6 +142,31 @@ def parse_toml(text: str, file: str | os.PathLike[str], error: type[KinefitError
     except (RecursionError, ValueError) as problem:
         reason = "not TOML: nested too deep, or a number too long"
         raise error(reason, file=file, remedy="Correct it there.") from problem
+
+
+def record_of(
+    data: Any, kind: type[_Record], what: str, file: str | os.PathLike[str], remedy: str,
+    error: type[KinefitError] = FileError,
+) -> _Record:  # fmt: skip
+    """The msgspec record of the tables of a TOML text, or of the bytes of a JSON text.
+
+    Parameters
+    ----------
+    what, file, remedy : for messages, such as "a body file".
+    error : what is raised.
+
+    Raises
+    ------
+    `error`
+        No JSON, or values that such a record does not have, with their place.
+    """
+    try:
+        return msgspec.json.decode(data, type=kind) if isinstance(data, bytes) else msgspec.convert(data, kind)
+    except msgspec.ValidationError as problem:
+        reason, _, place = str(problem).partition(" - at `$")
+        raise error(f"not {what}: {reason}", file=file, place=place.strip(".`") or None, remedy=remedy) from problem
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as problem:
+        raise error(f"not valid JSON ({problem})", file=file, remedy=remedy) from problem
 
 
 def _remedy(text: str, problem: str) -> str:

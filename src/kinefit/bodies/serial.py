@@ -240,8 +240,8 @@ def saved_body(path: str | PathLike[str]) -> Body:
 def _surfaces_to_arrays(surfaces: tuple[Surface, ...]) -> dict[str, NDArray]:
     count = len(surfaces)
     out = {"surfaces/segments": np.array([s.segment for s in surfaces], np.int64)}
-    shapes = {"starts": 3, "ends": 3, "sides": 3, "radii": (2, 2)}
-    cylinders = {name: np.full(np.append(count, shape), np.nan) for name, shape in shapes.items()}
+    cylinders = {name: np.full((count, 3), np.nan) for name in ("starts", "ends", "sides")}
+    cylinders["radii"] = np.full((count, 2, 2), np.nan)
     for k, surface in enumerate(surfaces):
         if isinstance(surface, MeshSurface):
             out |= arrays_of(surface, _BALLS if isinstance(surface, Metaballs) else _MESH, f"surfaces/{k}/")

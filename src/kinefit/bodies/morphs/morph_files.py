@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -53,32 +55,6 @@ class MorphRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         """Description of the entry, for messages."""
         return f"{self.kind} morph of {self.segment or self.target or 'the surface'} by {self.angle}"
 
-    def mirrored(self, name: Callable[[str], str]) -> MorphRecord:
-        """Mirror the morph to the other side of the body; `name` maps a right name to the left one."""
-        flip = lambda v, signs: None if v is None else tuple(s * x for s, x in zip(signs, v))
-        surface = self.surface
-        other = [r.mirrored() for r in surface] if isinstance(surface, list) else surface and surface.mirrored()
-        return msgspec.structs.replace(
-            self,
-            angle=name(self.angle),
-            segment=self.segment and name(self.segment),
-            shift=flip(self.shift, (1.0, 1.0, -1.0)),
-            turn=flip(self.turn, (-1.0, -1.0, 1.0)),
-            centre=flip(self.centre, (1.0, 1.0, -1.0)),
-            on=self.on and [name(n) for n in self.on],
-            surface=other,
-        )
-
-
-def with_images(records: Sequence[MorphRecord], name: Callable[[str], str]) -> list[MorphRecord]:
-    """Records, and the mirror image of each that depends on an angle of the right side; not of global ones."""
-    out = []
-    for record in records:
-        out.append(record)
-        if name(record.angle) != record.angle and record.kind != "global":
-            out.append(record.mirrored(name))
-    return out
-
 
 def morphs_of(records: Sequence[MorphRecord], tree: KinematicTree, source: str) -> tuple[Operator, ...]:
     """Operators of a body from its records.
@@ -112,8 +88,6 @@ def _morph(record: MorphRecord, tree: KinematicTree, source: str) -> Operator:
         return _joint_motion(record, record.segment, tree, steering)
     if record.kind == "local":
         assert record.centre and record.radii and record.shift
-        if not all(radius > 0.0 for radius in record.radii):
-            raise BodyError(f"radii {list(record.radii)} of a bulge", remedy="Give positive ones; inf is no limit.")
         placed = np.array(record.centre), np.array(record.radii), np.array(record.shift)
         return LocalMorph(*placed, steering, record.segment, tuple(record.on or ()), bool(record.moves))
     if record.kind == "surface":
@@ -166,44 +140,31 @@ def _entry(morph: Operator, tree: KinematicTree) -> str:
     degrees = 1.0 if tree.prismatic[tree.coordinate(s.coordinate)] else 180.0 / math.pi
     if callable(s.weight):
         raise BodyError("a file cannot hold a weighting by a function", remedy="Give a table of t and ω.")
-    weight = f'"{s.weight}"' if isinstance(s.weight, str) else _numbers(s.weight)
-    lines = [f'angle = "{s.coordinate}"', f"start = {_number(s.start * degrees)}", f"end = {_number(s.end * degrees)}"]
-    lines += [f"weight = {weight}"] + ["beyond = true"] * s.beyond
     if isinstance(morph, JointMotion):
-        to_joint = se3.transform(np.eye(3), -tree.rest[tree.segment(morph.segment)])
-        T = se3.exp(se3.adjoint(to_joint) @ morph.twist)
-        own = [f'segment = "{morph.segment}"', f"shift = {_numbers(T[:3, 3])}"]
-        kind, own = "joint", own + [f"turn = {_numbers(np.degrees(se3.log(T)[3:]))}"]
+        T = se3.exp(se3.adjoint(se3.transform(np.eye(3), -tree.rest[tree.segment(morph.segment)])) @ morph.twist)
+        own = {"kind": "joint", "segment": morph.segment, "shift": T[:3, 3], "turn": np.degrees(se3.log(T)[3:])}
     elif isinstance(morph, LocalMorph):
-        segment = morph.segment or tree.segments[0]
-        own = [f'segment = "{segment}"', f"centre = {_numbers(morph.centre)}", f"radii = {_numbers(morph.radii)}"]
-        own += [f"shift = {_numbers(morph.shift)}"] + [f"on = {list(morph.on)}".replace("'", '"')] * bool(morph.on)
-        own += ["moves = true"] * morph.moves
-        kind = "local"
+        own = {"kind": "local"} | {name: getattr(morph, name) for name in ("centre", "radii", "shift")}
+        own |= {"segment": morph.segment or tree.segments[0], "on": morph.on or None, "moves": morph.moves}
     elif isinstance(morph, SegmentMorph):
-        kind, own = "surface", [f'segment = "{morph.segment}"', f"surface = {_surfaces(morph)}"]
+        if not all(isinstance(c, TaperedCylinder) for c in morph.surfaces):
+            remedy = "Name its OBJ file in the body file."
+            raise BodyError("a body file cannot hold a morph to a mesh", remedy=remedy)
+        own = {"kind": "surface", "segment": morph.segment, "surface": [vars(c) for c in morph.surfaces]}
     else:
         remedy = "Write the nodes to an OBJ file, and name that as `target`."
         raise BodyError("a body file cannot hold a morph to single nodes", remedy=remedy)
-    return "\n".join(["[[morph]]", f'kind = "{kind}"', *own, *lines, ""])
+    own |= {"angle": s.coordinate, "start": s.start * degrees, "end": s.end * degrees, "weight": s.weight}
+    own |= {"beyond": s.beyond}
+    lines = [f"{key} = {_toml(value)}" for key, value in own.items() if value is not None]
+    return "\n".join(["[[morph]]", *lines, ""])
 
 
-def _surfaces(morph: SegmentMorph) -> str:
-    out = []
-    for c in morph.surfaces:
-        if not isinstance(c, TaperedCylinder):
-            remedy = "Name its OBJ file in the body file."
-            raise BodyError("a body file cannot hold a morph to a mesh", remedy=remedy)
-        side = f", side = {_numbers(c.side)}" if c.side is not None else ""
-        radii = _numbers(np.array(c.radii))
-        out.append(f"{{ start = {_numbers(c.start)}, end = {_numbers(c.end)}, radii = {radii}{side} }}")
-    return f"[{', '.join(out)}]"
-
-
-def _number(value: float) -> str:
-    return repr(round(float(value), 12))
-
-
-def _numbers(values: object) -> str:
-    array = np.asarray(values, float)
-    return f"[{', '.join(_numbers(v) if np.ndim(v) else _number(v) for v in array)}]"
+def _toml(value: Any) -> str:
+    """A value of TOML."""
+    if isinstance(value, dict):
+        shape = {key: value[key] for key in ("start", "end", "radii", "side")}
+        return f"{{ {', '.join(f'{key} = {_toml(one)}' for key, one in shape.items())} }}"
+    if isinstance(value, str | bool):
+        return json.dumps(value, ensure_ascii=False)
+    return f"[{', '.join(map(_toml, value))}]" if np.ndim(value) else repr(round(float(value), 12))

@@ -57,11 +57,6 @@ class SurfaceRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     mirror: bool = False
     balls: tuple[BallRecord, ...] = ()
 
-    def mirrored(self) -> SurfaceRecord:
-        """Mirror the surface to the other side of the body."""
-        places = {name: _mirrored(value) for name in ("start", "end", "side") if (value := getattr(self, name))}
-        return msgspec.structs.replace(self, **places, mirror=not self.mirror)
-
 
 def surfaces_of(
     records: SurfaceRecord | Sequence[SurfaceRecord] | None, segment: int, source: str, place: str
@@ -126,8 +121,3 @@ def _metaballs(record: SurfaceRecord, segment: int, source: str, place: str) -> 
     with located(source, place):
         out = Metaballs.of(segment, [b.at for b in balls], [b.radii for b in balls], [b.weight for b in balls], axes)
     return out.mirrored() if record.mirror else out
-
-
-def _mirrored(vector: Vector) -> Vector:
-    x, y, z = vector
-    return x, y, -z

@@ -2,38 +2,42 @@
 
 from __future__ import annotations
 
-import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from kinefit._arguments import checked
-from kinefit._files import parse_toml, regular, repeated
+from kinefit._files import parse_toml, record_of, regular, repeated
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.morphs.morph_files import morphs_of, with_images
+from kinefit.bodies.morphs.morph_files import morphs_of
 from kinefit.bodies.surfaces.files import surfaces_of
 from kinefit.bodies.surfaces.skins.skin_files import skin_of
-from kinefit.bodies.toml.closures import closed, with_closure_images
-from kinefit.bodies.toml.couplings import coupled, with_coupling_images, with_posture
+from kinefit.bodies.toml.closures import closed
 from kinefit.bodies.toml.records import (
+    CouplingRecord,
     FileRecord,
     JointRecord,
     MarkerSetRecord,
+    PointRecord,
     SegmentRecord,
     Vector,
+    axes_of,
+    direction,
     extended,
+    left,
     merged,
+    mirrored,
     stature_of,
+    with_images,
 )
 from kinefit.bodies.tree import KinematicTree
-from kinefit.errors import BodyError, check_choice, choices
+from kinefit.errors import BodyError, check_choice, choices, located
 
 JOINT_TYPES = {"fixed": 0, "revolute": 1, "prismatic": 1, "universal": 2, "ball": 3, "free": 6}
-_AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
-_AXES |= {f"-{name}": [-v for v in axis] for name, axis in _AXES.items()}
 _MAX_SEGMENTS = 1000  # and couplings etc.; detailed skeletons have 200, and tables of all pairs grow by the square
 _CHOOSE = "Use one of these, or add it."
 
@@ -85,19 +89,20 @@ def catalogue_text(name: str) -> str:
 def parse_body(text: str, source: str = "body") -> Body:
     """Parse a body from TOML text; `source` names it in messages. Raises a BodyError as `load_body` does."""
     record = _record(text, source)
-    mirror = bool(record.body.mirror)
-    segments = _in_order(_mirrored(record.segment) if mirror else list(record.segment), source)
-    points = {n: (p.segment, p.at) for n, p in record.landmarks.items()}
-    if mirror:
-        mirrored = {_left(n): (_left(p), (x, y, -z)) for n, (p, (x, y, z)) in points.items() if _left(n) != n}
-        points |= {n: p for n, p in mirrored.items() if n not in points}
+    segments, points, usual, coupling, morph, closure = (
+        record.segment, record.landmarks, record.usual, record.coupling, record.morph, record.closure
+    )  # fmt: skip
+    if record.body.mirror:
+        segments = _beside(segments, lambda s: s.name.endswith("_r"))
+        points = points | {left(n): mirrored(p) for n, p in points.items() if left(n) not in points}
+        usual = {left(n): v for n, v in usual.items()} | usual
+        coupling, closure = with_images(coupling), with_images(closure)
+        morph = _beside(morph, lambda m: m.kind != "global" and left(m.angle) != m.angle)
+    segments = _in_order(segments, source)
     groups = tuple(dict.fromkeys(s.scale or s.name for s in segments))
     index = {s.name: i for i, s in enumerate(segments)}
     landmarks = _points(points, index, source)
-    sets = extended(record.keypoints)
-    usual = {**({_left(n): v for n, v in record.usual.items()} if mirror else {}), **record.usual}
-    couplings = with_coupling_images(record.coupling, _left) if mirror else record.coupling
-    tree = with_posture(coupled(_tree(segments, index, source), couplings, source), usual, source)
+    tree = _with_posture(_coupled(_tree(segments, index, source), coupling, source), usual, source)
     body = Body(
         name=record.body.name,
         tree=tree,
@@ -105,31 +110,29 @@ def parse_body(text: str, source: str = "body") -> Body:
         scale_groups=groups,
         segment_scale=np.array([groups.index(s.scale or s.name) for s in segments]),
         landmarks=landmarks,
-        keypoint_sets={n: _renamed(s, landmarks, f"keypoints.{n}", source) for n, s in sets.items()},
+        keypoint_sets={
+            n: _renamed(s, landmarks, f"keypoints.{n}", source) for n, s in extended(record.keypoints).items()
+        },
         marker_sets={n: _markers(s, landmarks, index, f"markers.{n}", source) for n, s in record.markers.items()},
         surfaces=tuple(
             surface for s in segments
             for surface in surfaces_of(s.surface, index[s.name], source, f"surface of segment {s.name}")
         ),
-        aliases={c: {s.name: s.names[c] for s in segments if c in s.names} for c in _conventions(segments)},
+        aliases={
+            c: {s.name: s.names[c] for s in segments if c in s.names}
+            for c in dict.fromkeys(c for s in segments for c in s.names)
+        },
         stature=stature_of(record.body.stature or 0.0, source),
         skin=skin_of(record.skin, tree, source),
-        morphs=morphs_of(with_images(record.morph, _left) if mirror else record.morph, tree, source),
-    )
-    if not (record.closure or record.dimension):
-        return body
-    closures = with_closure_images(record.closure, _left) if mirror else record.closure
-    return closed(body, closures, record.dimension, source)
+        morphs=morphs_of(morph, tree, source),
+    )  # fmt: skip
+    return closed(body, closure, record.dimension, source) if closure or record.dimension else body
 
 
 def _record(text: str, source: str, above: tuple[str, ...] = ()) -> FileRecord:
     """Record of a body file, merged with its base."""
-    try:
-        record = msgspec.convert(parse_toml(text, source, BodyError), FileRecord)
-    except msgspec.ValidationError as error:
-        problem, _, place = str(error).partition(" - at `$")
-        where, remedy = place.strip(".`") or None, "See docs/bodies.md for its keys."
-        raise BodyError(f"not a body file: {problem}", file=source, place=where, remedy=remedy) from error
+    remedy = "See docs/bodies.md for its keys."
+    record = record_of(parse_toml(text, source, BodyError), FileRecord, "a body file", source, remedy, BodyError)
     most = max(len(record.segment), len(record.coupling), len(record.closure), len(record.dimension))
     if most > _MAX_SEGMENTS:
         problem = f"{most} segments, couplings, closures or dimensions, more than {_MAX_SEGMENTS}"
@@ -147,51 +150,9 @@ def _record(text: str, source: str, above: tuple[str, ...] = ()) -> FileRecord:
     return merged(_record(below, file, (*above, base)), record)
 
 
-def _left(name: str) -> str:
-    if name.endswith("_r"):
-        return name[:-2] + "_l"
-    if name.startswith("r_"):
-        return "l_" + name[2:]
-    return name.replace("Right", "Left")
-
-
-def _mirrored(segments: list[SegmentRecord]) -> list[SegmentRecord]:
-    out = []
-    for s in segments:
-        out.append(s)
-        if not s.name.endswith("_r"):
-            continue
-        axes = [_mirrored_axis(axis, slides) for axis, slides in zip(*_axes(s.joint))]
-        x, y, z = s.joint.at
-        joint = msgspec.structs.replace(
-            s.joint,
-            name=_left(s.joint.name),
-            at=(x, y, -z),
-            axes=axes,
-            coordinates=[_left(c) for c in s.joint.coordinates],
-        )
-        other = [r.mirrored() for r in s.surface] if isinstance(s.surface, list) else s.surface and s.surface.mirrored()
-        names = {k: _left(n) if _left(n) != n else re.sub("^r", "l", n) for k, n in s.names.items()}  # CMU: rfemur
-        parent = _left(s.parent) if s.parent else None
-        out.append(
-            msgspec.structs.replace(s, name=_left(s.name), parent=parent, joint=joint, surface=other, names=names)
-        )
-    return out
-
-
-def _axes(joint: JointRecord) -> tuple[list[str | Vector], list[bool]]:
-    """Axes of a joint, and whether it slides along each."""
-    if joint.type == "free":
-        return list(joint.axes) or ["x", "y", "z", "x", "y", "z"], [True] * 3 + [False] * 3
-    return list(joint.axes), [joint.type == "prismatic"] * len(joint.axes)
-
-
-def _mirrored_axis(axis: str | Vector, slides: bool) -> str | Vector:
-    """Mirror an axis at z = 0: rotations about x and y and slides along z change their sign."""
-    if isinstance(axis, str) and axis not in _AXES:
-        return axis
-    x, y, z = _AXES[axis] if isinstance(axis, str) else axis
-    return (x, y, -z) if slides else (-x, -y, z)
+def _beside(records: Iterable[Any], sided: Callable[[Any], bool]) -> list[Any]:
+    """Records, and beside each that is of the right side its image."""
+    return [one for r in records for one in ((r, mirrored(r)) if sided(r) else (r,))]
 
 
 def _in_order(segments: list[SegmentRecord], source: str) -> list[SegmentRecord]:
@@ -223,94 +184,110 @@ def _in_order(segments: list[SegmentRecord], source: str) -> list[SegmentRecord]
     return out
 
 
-def _refuse_repeated(what: str, names: list[str], source: str) -> None:
+def _refuse_repeated(what: str, names: Iterable[str], source: str) -> None:
     if twice := repeated(names):
         problem = f"{what} named twice: {', '.join(sorted(twice))}"
         raise BodyError(problem, file=source, remedy="Rename one of them.")
 
 
 def _tree(segments: list[SegmentRecord], index: dict[str, int], source: str) -> KinematicTree:
-    names: list[str] = []
-    rows: list[tuple[int, Any, bool, float, float, float, float]] = []
+    rows: list[tuple[Any, ...]] = []
     for i, s in enumerate(segments):
-        j, place = s.joint, f"joint {s.joint.name}"
-        check_choice("joint type", j.type, JOINT_TYPES, BodyError, file=source, place=place, remedy="Use one of these.")
-        if i == 0 and any(j.at):
-            raise BodyError(
-                "the root's joint is the origin of the body", file=source, place=place, remedy="Remove `at`."
-            )
-        _finite(j.at, source, place)
-        if j.type == "free" and i == 0:
-            continue
-        axes, slides = _axes(j)
-        count = JOINT_TYPES[j.type]
-        coordinates = j.coordinates or ([j.name] if count == 1 else [f"{j.name}_{k + 1}" for k in range(count)])
-        if len(axes) != count or len(coordinates) != count or {len(j.range), len(j.usual), len(j.spread)} - {0, count}:
-            raise BodyError(
-                f"a {j.type} joint has {count} axes, coordinates and, if any, ranges, usuals and spreads; "
-                f"here {len(axes)}, {len(coordinates)}, {len(j.range)}, {len(j.usual)} and {len(j.spread)}",
-                file=source,
-                place=place,
-                remedy="Give each of these lists one entry for each axis.",
-            )
-        for k in range(count):
-            named = axes[k]
-            axis = np.array(_AXES.get(named, [np.nan] * 3) if isinstance(named, str) else named, float)
-            norm = np.linalg.norm(axis)
-            if not 1e-9 < norm < np.inf:
-                raise BodyError(
-                    f"axis {axes[k]!r} of {coordinates[k]} has no direction",
-                    file=source,
-                    place=place,
-                    remedy='Use "x", "-y", ... or three numbers that are not all zero.',
-                )
-            low, high = j.range[k] if j.range else (-np.inf, np.inf)
-            if not low <= high:
-                problem = f"range [{low}, {high}] of {coordinates[k]} is empty"
-                raise BodyError(problem, file=source, place=place, remedy="Give the lower end first.")
-            spread = j.spread[k] if j.spread else max(0.5 * (high - low), 1e-3)
-            if not spread > 0:
-                problem = f"spread {spread} of {coordinates[k]} is not positive"
-                raise BodyError(problem, file=source, place=place, remedy="Give inf for no prior.")
-            usual = j.usual[k] if j.usual else min(max(0.0, low), high)
-            if not (low <= usual <= high and np.isfinite(usual)):
-                problem = f"usual {usual} of {coordinates[k]} is out of its range"
-                raise BodyError(problem, file=source, place=place, remedy=f"Give a number from {low} to {high}.")
-            unit = 1.0 if slides[k] else np.pi / 180.0
-            names.append(coordinates[k])
-            rows.append((i, axis / norm, slides[k], low * unit, high * unit, usual * unit, spread * unit))
-    _refuse_repeated("coordinate", names, source)
+        with located(source, f"joint {s.joint.name}"):
+            rows += _coordinates(i, s.joint)
+    names = ("coordinates", "owners", "axes", "prismatic", "lower", "upper", "usual", "spread")
+    columns = dict(zip(names, zip(*rows) if rows else [()] * len(names)))
+    _refuse_repeated("coordinate", columns["coordinates"], source)
     return KinematicTree(
-        segments=tuple(s.name for s in segments),
+        segments=tuple(index),
         parents=np.array([index[s.parent] if s.parent else -1 for s in segments]),
-        offsets=np.array([s.joint.at if s.parent else (0.0, 0.0, 0.0) for s in segments]),
-        coordinates=tuple(names),
-        owners=np.array([r[0] for r in rows], np.int64),
-        axes=np.array([r[1] for r in rows]),
-        prismatic=np.array([r[2] for r in rows], bool),
-        lower=np.array([r[3] for r in rows]),
-        upper=np.array([r[4] for r in rows]),
-        usual=np.array([r[5] for r in rows]),
-        spread=np.array([r[6] for r in rows]),
+        offsets=np.array([s.joint.at for s in segments]),
         root_free=segments[0].joint.type == "free",
+        **columns,  # type: ignore[arg-type]
     )
 
 
-def _finite(at: Vector, source: str, place: str) -> None:
-    if not np.all(np.isfinite(at)):
-        problem = f"`at` is not finite: {list(at)}"
-        raise BodyError(problem, file=source, place=place, remedy="Give three numbers in metres.")
+def _coordinates(owner: int, j: JointRecord) -> Iterator[tuple[Any, ...]]:
+    """Name, owner, axis, whether it slides, lower, upper, usual and spread of each coordinate of a joint."""
+    check_choice("joint type", j.type, JOINT_TYPES, BodyError, remedy="Use one of these.")
+    if owner == 0 and any(j.at):
+        raise BodyError("the root's joint is the origin of the body", remedy="Remove `at`.")
+    _check_finite(j.at)
+    if j.type == "free" and owner == 0:
+        return
+    axes, slides = axes_of(j)
+    count = JOINT_TYPES[j.type]
+    coordinates = j.coordinates or ([j.name] if count == 1 else [f"{j.name}_{k + 1}" for k in range(count)])
+    if len(axes) != count or len(coordinates) != count or {len(j.range), len(j.usual), len(j.spread)} - {0, count}:
+        problem = f"a {j.type} joint has {count} axes, coordinates and, if any, ranges, usuals and spreads; "
+        problem += f"here {len(axes)}, {len(coordinates)}, {len(j.range)}, {len(j.usual)} and {len(j.spread)}"
+        raise BodyError(problem, remedy="Give each of these lists one entry for each axis.")
+    for k, name in enumerate(coordinates):
+        axis = direction(axes[k])
+        if axis is None:
+            remedy = 'Use "x", "-y", ... or three numbers that are not all zero.'
+            raise BodyError(f"axis {axes[k]!r} of {name} has no direction", remedy=remedy)
+        low, high = j.range[k] if j.range else (-np.inf, np.inf)
+        if not low <= high:
+            raise BodyError(f"range [{low}, {high}] of {name} is empty", remedy="Give the lower end first.")
+        spread = j.spread[k] if j.spread else max(0.5 * (high - low), 1e-3)
+        if not spread > 0:
+            raise BodyError(f"spread {spread} of {name} is not positive", remedy="Give inf for no prior.")
+        usual = j.usual[k] if j.usual else min(max(0.0, low), high)
+        if not (low <= usual <= high and np.isfinite(usual)):
+            remedy = f"Give a number from {low} to {high}."
+            raise BodyError(f"usual {usual} of {name} is out of its range", remedy=remedy)
+        unit = 1.0 if slides[k] else np.pi / 180.0
+        yield name, owner, axis, slides[k], low * unit, high * unit, usual * unit, spread * unit
+
+
+def _coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord], source: str) -> KinematicTree:
+    """Add the couplings of a file to a tree; weights have no unit, spreads are in degrees."""
+    lines = np.zeros((len(couplings), len(tree.coordinates)))
+    for line, c in zip(lines, couplings):
+        with located(source, f"coupling {c.name}"):
+            for name, weight in c.of.items():
+                check_choice("coordinate", name, tree.coordinates, BodyError, remedy="Use one of these.")
+                line[tree.coordinate(name)] = weight
+            if not (np.isfinite(line).all() and line.any() and 0.0 < c.spread < np.inf):
+                problem = f"spread {c.spread}, weights {list(c.of.values())}"
+                raise BodyError(problem, remedy="Give a positive spread, weights other than 0.")
+            if tree.prismatic[line != 0.0].any():
+                raise BodyError("it couples a coordinate that slides", remedy="Couple angles.")
+        line /= np.radians(c.spread)
+    with located(source, "coupling"):
+        return replace(tree, couplings=lines)
+
+
+def _with_posture(tree: KinematicTree, usual: Mapping[str, float], source: str) -> KinematicTree:
+    """Change the mean posture of a tree: values [deg] or [m] of some coordinates."""
+    out = np.array(tree.usual)
+    for name, value in usual.items():
+        with located(source, f"usual {name}"):
+            check_choice("coordinate", name, tree.coordinates, BodyError, remedy="Use one of these.")
+            d = tree.coordinate(name)
+            unit = 1.0 if tree.prismatic[d] else np.pi / 180.0
+            if not (np.isfinite(value) and tree.lower[d] <= value * unit <= tree.upper[d]):
+                ends = f"{tree.lower[d] / unit:g} to {tree.upper[d] / unit:g}"
+                raise BodyError(f"{value:g} is out of its range", remedy=f"Give {ends}.")
+            out[d] = value * unit
+    return replace(tree, usual=out)
+
+
+def _check_finite(at: Vector) -> None:
+    if not np.isfinite(at).all():
+        raise BodyError(f"`at` is not finite: {list(at)}", remedy="Give three numbers in metres.")
 
 
 def _points(
-    points: dict[str, tuple[str, Vector]], index: dict[str, int], source: str, what: str = "landmark "
+    points: Mapping[str, PointRecord], index: dict[str, int], source: str, what: str = "landmark "
 ) -> PointSet:
-    for name, (segment, at) in points.items():
-        check_choice("segment", segment, index, BodyError, file=source, place=what + name, remedy=_CHOOSE)
-        _finite(at, source, what + name)
-    return PointSet(
-        tuple(points), np.array([index[s] for s, _ in points.values()]), np.array([a for _, a in points.values()])
-    )
+    for name, p in points.items():
+        with located(source, what + name):
+            check_choice("segment", p.segment, index, BodyError, remedy=_CHOOSE)
+            _check_finite(p.at)
+    records = points.values()
+    return PointSet(tuple(points), np.array([index[p.segment] for p in records]), np.array([p.at for p in records]))
 
 
 def _renamed(entries: dict[str, str], landmarks: PointSet, place: str, source: str) -> PointSet:
@@ -319,15 +296,13 @@ def _renamed(entries: dict[str, str], landmarks: PointSet, place: str, source: s
         if landmark not in known:
             problem = choices("landmark", landmark, landmarks.names)
             raise BodyError(problem, file=source, place=f"{place}.{name}", remedy=_CHOOSE)
-    chosen = landmarks.select(tuple(entries.values()))
-    return PointSet(tuple(entries), chosen.segments, chosen.points)
+    return replace(landmarks.select(tuple(entries.values())), names=tuple(entries))
 
 
 def _markers(entry: MarkerSetRecord, landmarks: PointSet, index: dict[str, int], place: str, source: str) -> PointSet:
     on_landmarks = _renamed({n: n for n in entry.points}, landmarks, place, source)
-    placed = _points({n: (p.segment, p.at) for n, p in entry.placed.items()}, index, source, f"{place}.")
-    twice = sorted(entry.placed.keys() & set(entry.points))
-    if twice:
+    placed = _points(entry.placed, index, source, f"{place}.")
+    if twice := sorted(entry.placed.keys() & set(entry.points)):
         problem = f"marker named twice: {', '.join(twice)}"
         raise BodyError(problem, file=source, place=place, remedy="Keep it in points or in placed.")
     return PointSet(
@@ -335,7 +310,3 @@ def _markers(entry: MarkerSetRecord, landmarks: PointSet, index: dict[str, int],
         np.concatenate([on_landmarks.segments, placed.segments]),
         np.concatenate([on_landmarks.points, placed.points]),
     )
-
-
-def _conventions(segments: list[SegmentRecord]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(c for s in segments for c in s.names))
