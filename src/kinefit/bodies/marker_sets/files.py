@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from kinefit._files import parse_toml, regular
+from kinefit._files import parse_toml, record_of, regular
 from kinefit.bodies.marker_sets.labels import plain
 from kinefit.errors import FileError, ObservationError, choices
 
@@ -121,12 +121,7 @@ def parsed(text: str, source: str) -> SetRecord:
     FileError
         No TOML, or no marker set.
     """
-    try:
-        record = msgspec.convert(parse_toml(text, source), SetRecord)
-    except msgspec.ValidationError as error:
-        problem, _, place = str(error).partition(" - at `$")
-        where = place.strip(".`") or None
-        raise FileError(f"not a marker set: {problem}", file=source, place=where, remedy=_REMEDY) from error
+    record = record_of(parse_toml(text, source), SetRecord, "a marker set", source, _REMEDY)
     if not record.segment and not record.markers:
         raise FileError("no segment and no markers", file=source, remedy=_REMEDY)
     for label, entry in record.markers.items():

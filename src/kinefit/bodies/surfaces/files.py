@@ -68,30 +68,28 @@ def surfaces_of(
     BodyError
         An invalid surface: see `TaperedCylinder`, `mesh_surface`.
     """
-    out: list[TaperedCylinder | MeshSurface] = []
-    for record in [records] if isinstance(records, SurfaceRecord) else records or ():
-        is_cylinder = record.end is not None and record.radii is not None
-        is_series = record.fourier is not None and record.grid is not None
-        is_contour = record.contour is not None
-        if is_cylinder + (record.mesh is not None) + is_series + is_contour + bool(record.balls) != 1:
+    given = [records] if isinstance(records, SurfaceRecord) else records or ()
+    return [_surface(record, segment, source, place) for record in given]
+
+
+def _surface(record: SurfaceRecord, segment: int, source: str, place: str) -> TaperedCylinder | MeshSurface:
+    cylinder = record.end is not None and record.radii is not None
+    series = record.fourier is not None and record.grid is not None
+    shapes = (cylinder, series, record.mesh is not None, record.contour is not None, bool(record.balls))
+    with located(source, place):
+        if sum(shapes) != 1:
             remedy = "Give `end` and `radii` of a cylinder, or `mesh`, the path of an OBJ file, "
             remedy += "or `fourier` and `grid`, or `contour`, or `balls`."
-            raise BodyError("a surface needs exactly one shape", file=source, place=place, remedy=remedy)
-        if record.mesh is not None:
-            path = Path(source).parent / record.mesh
-            out.append(mesh_surface(path, segment, unit=record.unit, mirror=record.mirror, place=place))
-            continue
-        if is_series or is_contour:
-            out.append(_series(record, segment, source, place))
-            continue
+            raise BodyError("a surface needs exactly one shape", remedy=remedy)
         if record.balls:
-            out.append(_metaballs(record, segment, source, place))
-            continue
-        assert record.end is not None and record.radii is not None
-        first, last = (r if isinstance(r, tuple) else (r, r) for r in record.radii)
-        with located(source, place):
-            out.append(TaperedCylinder(segment, record.start, record.end, (first, last), record.side))
-    return out
+            return _metaballs(record, segment)
+        if record.end is not None and record.radii is not None:
+            first, last = (r if isinstance(r, tuple) else (r, r) for r in record.radii)
+            return TaperedCylinder(segment, record.start, record.end, (first, last), record.side)
+    if record.mesh is not None:
+        path = Path(source).parent / record.mesh
+        return mesh_surface(path, segment, unit=record.unit, mirror=record.mirror, place=place)
+    return _series(record, segment, source, place)
 
 
 def _series(record: SurfaceRecord, segment: int, source: str, place: str) -> MeshSurface:
@@ -115,9 +113,8 @@ def _series(record: SurfaceRecord, segment: int, source: str, place: str) -> Mes
     return surface_of_file(path, segment, read, unit=record.unit, mirror=record.mirror, place=place)
 
 
-def _metaballs(record: SurfaceRecord, segment: int, source: str, place: str) -> Metaballs:
+def _metaballs(record: SurfaceRecord, segment: int) -> Metaballs:
     balls = record.balls
     axes = exp_so3(np.radians([b.turn for b in balls])).swapaxes(1, 2)
-    with located(source, place):
-        out = Metaballs.of(segment, [b.at for b in balls], [b.radii for b in balls], [b.weight for b in balls], axes)
+    out = Metaballs.of(segment, [b.at for b in balls], [b.radii for b in balls], [b.weight for b in balls], axes)
     return out.mirrored() if record.mirror else out

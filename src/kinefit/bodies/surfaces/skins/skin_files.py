@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -13,9 +14,7 @@ from kinefit._files import regular
 from kinefit.bodies.surfaces.obj import MAX_LENGTH, UNITS, read_obj
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
 from kinefit.bodies.tree import KinematicTree
-from kinefit.errors import BodyError, check_choice, choices
-
-_PLACE = "skin"
+from kinefit.errors import BodyError, check_choice, located
 
 
 class SkinRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -24,7 +23,7 @@ class SkinRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     mesh: str
     weights: str
     unit: str = "m"
-    owners: int = 4
+    owners: Annotated[int, msgspec.Meta(ge=1)] = 4
 
 
 def skin_of(record: SkinRecord | None, tree: KinematicTree, source: str) -> SkinnedMesh | None:
@@ -38,21 +37,20 @@ def skin_of(record: SkinRecord | None, tree: KinematicTree, source: str) -> Skin
     """
     if record is None:
         return None
-    check_choice("unit", record.unit, UNITS, BodyError, file=source, place=_PLACE, remedy="Use one of these.")
-    if record.owners < 1:
-        raise BodyError(f"{record.owners} owners a node", file=source, place=_PLACE, remedy="Give 1 or more.")
-    mesh, table = Path(source).parent / record.mesh, Path(source).parent / record.weights
-    vertices, faces = read_obj(mesh)
-    vertices = UNITS[record.unit] * vertices
-    if (size := float(np.ptp(vertices, axis=0).max())) > MAX_LENGTH:
-        problem = f"the skin is {size:.4g} m long"
-        raise BodyError(problem, file=mesh, place=_PLACE, remedy='State the unit of its file, such as unit = "mm".')
-    weights = read_weights(table, len(vertices), tree)
-    try:
-        return SkinnedMesh.of(vertices, faces, weights, tree, owners=record.owners)
-    except BodyError as error:
-        file = table if "weights" in error.problem else mesh
-        raise BodyError(error.problem, file=file, place=_PLACE, remedy=error.remedy) from error
+    mesh, table = (Path(source).parent / name for name in (record.mesh, record.weights))
+    with located(source, "skin"):
+        check_choice("unit", record.unit, UNITS, BodyError, remedy="Use one of these.")
+        vertices, faces = read_obj(mesh)
+        vertices = UNITS[record.unit] * vertices
+        if (size := float(np.ptp(vertices, axis=0).max())) > MAX_LENGTH:
+            remedy = 'State the unit of its file, such as unit = "mm".'
+            raise BodyError(f"the skin is {size:.4g} m long", file=mesh, remedy=remedy)
+        weights = read_weights(table, len(vertices), tree)
+        try:
+            return SkinnedMesh.of(vertices, faces, weights, tree, owners=record.owners)
+        except BodyError as error:
+            file = table if "weights" in error.problem else mesh
+            raise BodyError(error.problem, file=file, remedy=error.remedy) from error
 
 
 def read_weights(path: Path, count: int, tree: KinematicTree) -> NDArray:
@@ -70,25 +68,23 @@ def read_weights(path: Path, count: int, tree: KinematicTree) -> NDArray:
     except (OSError, ValueError, csv.Error) as error:
         remedy = "Give the path of a CSV file with lines of vertex, segment, weight."
         problem = f"cannot read the weights ({getattr(error, 'strerror', None) or error})"
-        raise BodyError(problem, file=path, place=_PLACE, remedy=remedy) from error
+        raise BodyError(problem, file=path, remedy=remedy) from error
     out = np.full((count, len(tree.segments)), np.nan)
     for number, line in enumerate(lines, 1):
         cells = [cell.strip() for cell in line]
         if not any(cells) or (number == 1 and not cells[0].isdigit()):
             continue
-        where = f"{_PLACE}, line {number}"
-        try:
-            vertex, segment = int(cells[0]), cells[1]
-            weight = float(cells[2]) if len(cells) > 2 and cells[2] else 1.0
-        except (ValueError, IndexError) as error:
-            remedy = "A line has a vertex counted from 1, a segment, and a weight."
-            raise BodyError(f"not a weight: '{','.join(line)[:60]}'", file=path, place=where, remedy=remedy) from error
-        if segment not in tree.segments:
-            problem = choices("segment", segment, tree.segments)
-            raise BodyError(problem, file=path, place=where, remedy="Use one of these.")
-        s = tree.segments.index(segment)
-        if not 1 <= vertex <= count or not np.isnan(out[vertex - 1, s]):
-            problem = f"vertex {vertex} of {count} " + ("twice" if 1 <= vertex <= count else "is not there")
-            raise BodyError(problem, file=path, place=where, remedy="Give each of the mesh's vertices, from 1, once.")
+        with located(path, f"line {number}"):
+            try:
+                vertex, segment = int(cells[0]), cells[1]
+                weight = float(cells[2]) if len(cells) > 2 and cells[2] else 1.0
+            except (ValueError, IndexError) as error:
+                remedy = "A line has a vertex counted from 1, a segment, and a weight."
+                raise BodyError(f"not a weight: '{','.join(line)[:60]}'", remedy=remedy) from error
+            check_choice("segment", segment, tree.segments, BodyError, remedy="Use one of these.")
+            s, known = tree.segments.index(segment), 1 <= vertex <= count
+            if not known or not np.isnan(out[vertex - 1, s]):
+                problem = f"vertex {vertex} of {count} " + ("twice" if known else "is not there")
+                raise BodyError(problem, remedy="Give each of the mesh's vertices, from 1, once.")
         out[vertex - 1, s] = weight
     return np.nan_to_num(out, nan=0.0)
