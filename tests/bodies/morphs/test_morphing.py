@@ -5,7 +5,6 @@ import pytest
 from tests.oracle import random_body
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.morphs import morphing_cga as printed
 from kinefit.bodies.morphs.morphing import GlobalMorph, JointMotion, LocalMorph, Morphing, radial_basis
 from kinefit.bodies.morphs.steering import WEIGHTS, Steering, weight_function
 from kinefit.bodies.surfaces import BodyMesh, SkinnedMesh, body_mesh
@@ -101,21 +100,38 @@ def test_radial_basis_is_that_of_the_paper():
     np.testing.assert_allclose(radial_basis(np.c_[x, y], [c_x, 0], [1, np.inf]), np.exp(-((x - c_x) ** 2)), rtol=1e-12)
 
 
+def printed_joint_motion(psi, other, t):
+    """Mₜ Ψ M̃ₜ with Mₜ = exp(−½ t 2π Ξ) (P1 3.1)."""
+    M_t = cga.interpolate(cga.between(psi, other), t)
+    return (M_t * psi * ~M_t).grade(2)
+
+
+def printed_global_morph(F_1, F_2, t, omega):
+    """F_t = F_1 ω(t) + F_2 (1 − ω(t)) (P1 3.2), of Euclidean vectors."""
+    return F_1 * omega(t) + F_2 * (1.0 - omega(t))
+
+
+def printed_local_morph(F, r, scale, theta, direction):
+    """T_r F T̃_r with T_r = 1 + ½ e t r and t = λ θ d (P1 3.3)."""
+    translator = cga.translator(cga.vector(r[..., None] * (scale * theta * direction)))
+    return cga.versor(translator, F)
+
+
 def test_the_printed_forms_are_the_fast_ones():
     x = random.normal(size=(40, 3))
     d, r = np.array([0.0, 0.0, 1.0]), radial_basis(x, x[3], [0.5, 0.5, 0.5])
     bulge = LocalMorph(x[3], [0.5] * 3, 0.1 * d, Steering("q", 0.0, 1.0, beyond=True))
-    found = cga.coordinates(printed.local_morph(cga.point(x), r, 0.1, 0.7, d))
+    found = cga.coordinates(printed_local_morph(cga.point(x), r, 0.1, 0.7, d))
     np.testing.assert_allclose(found, x + bulge.steering.at(0.7)[0] * bulge.field(x, None), atol=1e-12)
     y = x + random.normal(size=x.shape)
     blend = GlobalMorph(y, Steering("q", 0.0, 2.0, "square"))
-    printed_form = printed.global_morph(cga.vector(x), cga.vector(y), 0.35, lambda t: 1 - t * t)
+    printed_form = printed_global_morph(cga.vector(x), cga.vector(y), 0.35, lambda t: 1 - t * t)
     fast = x + blend.steering.at(0.7)[0] * blend.field(x, None)
     np.testing.assert_allclose(np.moveaxis(printed_form.values, 0, -1), fast, atol=1e-12)
     line, other = lines.line_through(*random.normal(size=(2, 3))), lines.line_through(*random.normal(size=(2, 3)))
     hinge = JointMotion.between("s", line, other, Steering("q"))
     for t in (0.0, 0.3, 1.0):
-        psi = printed.joint_motion(cga.screw(cga.line_of(line), 0.4), cga.screw(cga.line_of(other), 0.4), t)
+        psi = printed_joint_motion(cga.screw(cga.line_of(line), 0.4), cga.screw(cga.line_of(other), 0.4), t)
         moved = lines.move_line(se3.exp(t * hinge.twist), line)
         np.testing.assert_allclose(cga.twist_coordinates(psi), 0.4 * np.roll(moved, 3), atol=1e-12)
     np.testing.assert_allclose(lines.move_line(se3.exp(hinge.twist), line), other, atol=1e-12)

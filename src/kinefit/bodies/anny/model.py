@@ -7,6 +7,7 @@ and keypoints. It is transformed to the humanoid's rest pose: arms hanging, palm
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -15,13 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit._jit import cache_directory
-from kinefit.bodies.anny.cylinders import as_wide, widths
 from kinefit.bodies.anny.files import FACTORS, AnnyData, read_anny
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.state import BodyState
-from kinefit.bodies.surfaces import TaperedCylinder
-from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh, strongest
+from kinefit.bodies.surfaces import SkinnedMesh, TaperedCylinder
+from kinefit.bodies.surfaces.skins.skinning import strongest
 from kinefit.bodies.toml.bodies import read_toml_body
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError, check_choice
@@ -33,6 +33,7 @@ NAMES = tuple(FACTORS)
 MEAN_SHAPE = np.array([0.5, 0.5, 0.5, 0.5, 0.5, 0.5])  # age: 0 a child, 0.5 young, 1 old
 _FITTED = tuple(name for name in NAMES if name != "age")
 _DIFFERENCE_STEP = 1e-4  # of a shape parameter, for numerical derivatives
+_MIN_NODES = 6  # of a skin near the end of a cylinder; with fewer, its width is that of the whole cylinder
 _MAX_OWNERS = 6  # segments that blend one node; reached at a shoulder
 _MIRROR = np.diag([1.0, 1.0, -1.0])
 
@@ -155,7 +156,7 @@ class AnnyModel:
             landmarks=grown(base.landmarks),
             keypoint_sets={name: grown(p) for name, p in base.keypoint_sets.items()},
             marker_sets={name: grown(p) for name, p in base.marker_sets.items()},
-            surfaces=as_wide(self._longer(factors), skin, new.rest, *self._usual),
+            surfaces=_as_wide(self._longer(factors), skin, new.rest, *self._usual),
             stature=stature,
             skin=skin,
             family=AnnyFamily(self, np.array(values, float)),
@@ -186,7 +187,7 @@ class AnnyModel:
         """Widths of the mean shape's skin (C, 2, 2) [m] about each cylinder, and the cylinders' radii (C, 2, 2) [m]."""
         tree, skin, factors, _ = self._made(MEAN_SHAPE)
         longer = self._longer(factors)
-        return widths(longer, skin, tree.rest), np.array([c.radii for c in longer])
+        return _widths(longer, skin, tree.rest), np.array([c.radii for c in longer])
 
     def jacobian(self, values: ArrayLike, state: BodyState) -> NDArray:
         """Derivative (V, 3, 6) [m] of the skin's nodes in the world by the shape parameters (6,), at a state."""
@@ -358,3 +359,33 @@ def frame(along: NDArray, hinge: NDArray) -> NDArray:
     z = hinge - (hinge @ y) * y
     z /= np.linalg.norm(z)
     return np.stack([np.cross(y, z), y, z])
+
+
+def _widths(cylinders: Sequence[TaperedCylinder], skin: SkinnedMesh, rest: NDArray) -> NDArray:
+    """Widths (C, 2, 2) [m] of the skin about each cylinder: standard deviation at both ends, along both half axes.
+
+    Parameters
+    ----------
+    cylinders : C of the body
+    skin : of the body, at rest
+    rest : (S, 3) [m] joint centres at rest
+    """
+    out = np.ones((len(cylinders), 2, 2))
+    for c, cylinder in enumerate(cylinders):
+        x = skin.vertices[skin.segment == cylinder.segment] - rest[cylinder.segment]
+        start, way = np.array(cylinder.start), np.subtract(cylinder.end, cylinder.start)
+        t = (x - start) @ way / (way @ way)
+        x, t = x[(t > 0.0) & (t < 1.0)], t[(t > 0.0) & (t < 1.0)]
+        for end, near in enumerate((t < 0.5, t >= 0.5)):
+            own = x[near] if near.sum() >= _MIN_NODES else x
+            if len(own) >= _MIN_NODES:
+                out[c, end] = (own @ np.array(cylinder.axes[:2]).T).std(axis=0)
+    return out
+
+
+def _as_wide(
+    cylinders: Sequence[TaperedCylinder], skin: SkinnedMesh, rest: NDArray, usual: NDArray, radii: NDArray
+) -> tuple[TaperedCylinder, ...]:
+    """Scale radii (C, 2, 2) [m] of cylinders by the skin's widths relative to those of the mean shape (C, 2, 2) [m]."""
+    wide = (radii * _widths(cylinders, skin, rest) / usual).reshape(-1, 4).tolist()
+    return tuple(replace(c, radii=((a0, b0), (a1, b1))) for c, (a0, b0, a1, b1) in zip(cylinders, wide))

@@ -6,7 +6,7 @@ Every operator depends on one joint angle, which gives a weight s from 0 to 1:
     global morph    F = F1 ω + F2 (1 − ω), s = 1 − ω: from the surface at rest to another of its topology  (P1 3.2)
     local morph     every node is shifted by s r(node) d, r a radial basis function                        (P1 3.3)
 
-Shifts of nodes add up, so several operators may act on one patch. `morphing_cga` has the published form.
+Shifts of nodes add up, so several operators may act on one patch.
 """
 
 from __future__ import annotations
