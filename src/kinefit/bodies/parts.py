@@ -17,7 +17,7 @@ from kinefit.bodies.closures import without_landmarks
 from kinefit.bodies.morphs.operators import Operator
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces import MeshSurface, Surface
-from kinefit.bodies.tree import KinematicTree
+from kinefit.bodies.tree import COLUMNS, KinematicTree
 from kinefit.errors import BodyError
 
 # Corners of a box by the bits of their index (x: 1, y: 2, z: 4), two triangles a side, counter-clockwise from outside.
@@ -217,22 +217,23 @@ def _is_about(morph: Operator, segment: str, coordinates: tuple[str, ...], own: 
 
 def _with_segment(tree: KinematicTree, name: str, parent: int, joint: PartJoint) -> KinematicTree:
     k = len(joint.coordinates)
-    axes, at = np.array(joint.axes, float).reshape(-1, 3), np.array(joint.at, float)
+    at = np.array(joint.at, float)
     columns = {
-        "slides": np.array(joint.slides or (False,) * k),
+        "axes": np.array(joint.axes, float).reshape(-1, 3),
+        "prismatic": np.array(joint.slides or (False,) * k),
         "lower": np.array(joint.lower or (-np.inf,) * k, float),
         "upper": np.array(joint.upper or (np.inf,) * k, float),
         "usual": np.array(joint.usual or (0.0,) * k, float),
         "spread": np.array(joint.spread or (np.inf,) * k, float),
     }
-    mismatched = [n for n, v in columns.items() if len(v) != k] + ["axes"] * (len(axes) != k)
-    if mismatched:
-        problem = f"{mismatched[0]} of its joint do not match its {k} coordinates"
+    if mismatched := [n for n, v in columns.items() if len(v) != k]:
+        problem = f"{mismatched[0].replace('prismatic', 'slides')} of its joint do not match its {k} coordinates"
         raise BodyError(problem, place=f"part {name}", remedy="Give one for each coordinate.")
-    length = np.linalg.norm(axes, axis=1)
+    length = np.linalg.norm(columns["axes"], axis=1, keepdims=True)
     if not (np.isfinite(length).all() and (length > 1e-9).all() and at.shape == (3,) and np.isfinite(at).all()):
         problem = "an axis of its joint has no direction, or `at` is not three finite numbers"
         raise BodyError(problem, place=f"part {name}", remedy="Give axes of some length, and `at` in metres.")
+    columns["axes"] /= length
     low, high, usual = columns["lower"], columns["upper"], columns["usual"]
     if not ((low <= usual) & (usual <= high) & np.isfinite(usual) & (columns["spread"] > 0)).all():
         problem = "its joint's usual values are outside of their limits, or a spread is not positive"
@@ -244,13 +245,8 @@ def _with_segment(tree: KinematicTree, name: str, parent: int, joint: PartJoint)
         offsets=np.concatenate([tree.offsets, at[None]]),
         coordinates=(*tree.coordinates, *joint.coordinates),
         owners=np.append(tree.owners, np.full(k, len(tree.segments))),
-        axes=np.concatenate([tree.axes, axes / length[:, None]]),
-        prismatic=np.append(tree.prismatic, columns["slides"]),
-        lower=np.append(tree.lower, low),
-        upper=np.append(tree.upper, high),
-        usual=np.append(tree.usual, usual),
-        spread=np.append(tree.spread, columns["spread"]),
         couplings=np.pad(tree.couplings, ((0, 0), (0, k))),
+        **{n: np.concatenate([getattr(tree, n), columns[n]]) for n in COLUMNS},  # type: ignore[arg-type]
     )
 
 
@@ -264,13 +260,8 @@ def _without_segment(tree: KinematicTree, removed: int) -> KinematicTree:
         offsets=tree.offsets[kept],
         coordinates=tuple(c for c, keep in zip(tree.coordinates, own) if keep),
         owners=owners - (owners > removed),
-        axes=tree.axes[own],
-        prismatic=tree.prismatic[own],
-        lower=tree.lower[own],
-        upper=tree.upper[own],
-        usual=tree.usual[own],
-        spread=tree.spread[own],
         couplings=tree.couplings[(tree.couplings[:, ~own] == 0.0).all(axis=1)][:, own],
+        **{name: getattr(tree, name)[own] for name in COLUMNS},
     )
 
 

@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 from kinefit.bodies import _kernels
 from kinefit.errors import BodyError, check_choice
 
+COLUMNS = ("axes", "prismatic", "lower", "upper", "usual", "spread")
+"""Arrays of a tree with an entry for each coordinate, but for the owners."""
+
 ROOT_DOFS = ("root_tx", "root_ty", "root_tz", "root_rx", "root_ry", "root_rz")
 
 

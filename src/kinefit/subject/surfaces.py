@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body
 from kinefit.bodies.anny import AnnyFamily, AnnyModel
-from kinefit.bodies.flesh import with_flesh
 from kinefit.bodies.surfaces import Metaballs, Surface, TaperedCylinder
 from kinefit.errors import BodyError
 from kinefit.subject.metaballs import MetaballShape
@@ -251,3 +250,44 @@ def shape_of(body: Body) -> list[Parameters]:
     cylinders = any(isinstance(s, TaperedCylinder) for s in body.surfaces)
     out: list[Parameters] = [CylinderShape(body)] if cylinders and not body.skin else []
     return [*out, MetaballShape(body)] if any(isinstance(s, Metaballs) for s in body.surfaces) else out
+
+
+def with_flesh(body: Body, other: Body, usual: Body) -> Body:
+    """Transfer the skin of another body with the same segments, and scale the radii of cylinders accordingly.
+
+    The skin of a segment is stretched with the segment, then moved with its joint. Bones and points do not change.
+
+    Parameters
+    ----------
+    body, other : of the same segments and surfaces
+    usual : body of the shape that `body` has now. The radii of `body` grow by the ratio of `other`'s to its radii.
+    """
+    fitted, before = (_scaled_to(b, body) for b in (other, usual))
+    skin = fitted.skin
+    if skin is not None:
+        skin = replace(skin, nodes=skin.nodes + (body.tree.rest - fitted.tree.rest)[skin.owners])
+    return replace(
+        body,
+        skin=skin,
+        surfaces=tuple(_wider(*three) for three in zip(body.surfaces, fitted.surfaces, before.surfaces, strict=True)),
+        family=other.family,
+    )
+
+
+def _scaled_to(source: Body, body: Body) -> Body:
+    target_sizes, sizes = _sizes(body), _sizes(source)
+    return source.scaled(np.where(sizes > 0.0, target_sizes / np.maximum(sizes, 1e-12), 1.0))
+
+
+def _wider(surface: Surface, made: Surface, usual: Surface) -> Surface:
+    if not all(isinstance(s, TaperedCylinder) for s in (surface, made, usual)):
+        return surface
+    radii = np.array(surface.radii) * made.radii / np.array(usual.radii)  # type: ignore[union-attr]
+    (a0, b0), (a1, b1) = radii.tolist()
+    return replace(surface, radii=((a0, b0), (a1, b1)))  # type: ignore[call-arg, arg-type]
+
+
+def _sizes(body: Body) -> NDArray:
+    """Size (G,) [m] of each scale group: the sum of its landmarks' distances from their joints."""
+    points, group = body.landmarks, body.segment_scale[body.landmarks.segments]
+    return np.bincount(group, np.linalg.norm(points.points, axis=1), len(body.scale_groups))

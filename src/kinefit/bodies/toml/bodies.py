@@ -34,7 +34,7 @@ from kinefit.bodies.toml.records import (
     stature_of,
     with_images,
 )
-from kinefit.bodies.tree import KinematicTree
+from kinefit.bodies.tree import COLUMNS, KinematicTree
 from kinefit.errors import BodyError, check_choice, choices, located
 
 JOINT_TYPES = {"fixed": 0, "revolute": 1, "prismatic": 1, "universal": 2, "ball": 3, "free": 6}
@@ -195,7 +195,7 @@ def _tree(segments: list[SegmentRecord], index: dict[str, int], source: str) -> 
     for i, s in enumerate(segments):
         with located(source, f"joint {s.joint.name}"):
             rows += _coordinates(i, s.joint)
-    names = ("coordinates", "owners", "axes", "prismatic", "lower", "upper", "usual", "spread")
+    names = ("coordinates", "owners", *COLUMNS)
     columns = dict(zip(names, zip(*rows) if rows else [()] * len(names)))
     _refuse_repeated("coordinate", columns["coordinates"], source)
     return KinematicTree(

@@ -5,7 +5,7 @@ import pytest
 from tests.bodies.anny.test_anny import made_up
 
 from kinefit.bodies.anny import AnnyModel
-from kinefit.bodies.flesh import with_flesh
+from kinefit.subject.surfaces import with_flesh
 
 
 @pytest.fixture(scope="module")
