@@ -116,6 +116,18 @@ def read_bytes(path: Path) -> bytes:
         raise FileError(f"cannot be read ({reason})", file=path, remedy="Check the path.") from problem
 
 
+def read_text(
+    path: str | os.PathLike[str], what: str, *, remedy: str, error: type[KinefitError] = FileError,
+    errors: str = "strict",
+) -> str:  # fmt: skip
+    """The text (UTF-8) of a file; `error` where it cannot be read, such as "cannot read the mesh (...)"."""
+    try:
+        return regular(path).read_text("utf-8-sig", errors)
+    except (OSError, ValueError) as problem:
+        reason = getattr(problem, "strerror", None) or problem
+        raise error(f"cannot read {what} ({reason})", file=path, remedy=remedy) from problem
+
+
 def parse_toml(text: str, file: str | os.PathLike[str], error: type[KinefitError] = FileError) -> dict[str, Any]:
     """The tables of a TOML text.
 

@@ -37,7 +37,7 @@ def test_what_is_wrong_is_told_with_its_place(tmp_path, text, place, message):
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(FileError, match="no such file"):
+    with pytest.raises(FileError, match="No such file"):
         read_static_points(tmp_path / "none.toml", ("cam1",))
     with pytest.raises(FileError, match="not TOML"):
         read_static_points(written(tmp_path, "[beam\n"), ("cam1",))

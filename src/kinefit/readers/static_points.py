@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
-from kinefit._files import parse_toml, regular
-from kinefit.errors import FileError, ObservationError, check_choice
+from kinefit._files import parse_toml, read_text
+from kinefit.errors import ObservationError, check_choice
 
 
 def read_static_points(
@@ -30,12 +30,7 @@ def read_static_points(
         An unknown camera, a pixel that is not two finite numbers, a point in fewer than two cameras, no points.
     """
     file = Path(path)
-    try:
-        raw = parse_toml(regular(file).read_text(encoding="utf-8"), file)
-    except FileNotFoundError as error:
-        raise FileError("no such file of static points", file=file, remedy="Check the path.") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileError(f"cannot be read ({error})", file=file, remedy="Give a TOML file in UTF-8.") from error
+    raw = parse_toml(read_text(file, "the static points", remedy="Give the path of a TOML file in UTF-8."), file)
     form = "Write [name] and below it camera = [u, v] for two or more cameras."
     out: dict[str, dict[str, tuple[float, float]]] = {}
     for name, views in raw.items():

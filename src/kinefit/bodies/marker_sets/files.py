@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from kinefit._files import parse_toml, record_of, regular
+from kinefit._files import parse_toml, read_text, record_of
 from kinefit.bodies.marker_sets.labels import plain
 from kinefit.errors import FileError, ObservationError, choices
 
@@ -94,11 +94,7 @@ def find_record(name_or_file: str | PathLike[str], known: tuple[str, ...]) -> tu
     """
     name = str(name_or_file)
     if name.lower().endswith(".toml"):
-        try:
-            text = regular(name_or_file).read_text("utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise FileError(f"cannot read the marker set ({error})", file=name, remedy="Give a TOML file.") from error
-        return parsed(text, name), name
+        return parsed(read_text(name, "the marker set", remedy="Give a TOML file."), name), name
     for record in catalogue().values():
         if plain(name) in map(plain, (record.name, *record.also)):
             return record, record.name

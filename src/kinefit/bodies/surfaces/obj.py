@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import regular
+from kinefit._files import read_text
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.errors import BodyError, check_choice, located
 
@@ -29,11 +29,8 @@ def read_obj(path: str | PathLike[str]) -> tuple[NDArray, NDArray]:
     BodyError
         A file that cannot be read, an invalid line, or a file without faces.
     """
-    try:
-        lines = regular(path).read_text(encoding="utf-8", errors="replace").splitlines()
-    except (OSError, ValueError) as error:
-        problem = f"cannot read the mesh ({getattr(error, 'strerror', None) or error})"
-        raise BodyError(problem, file=path, remedy="Give the path of an OBJ file.") from error
+    remedy = "Give the path of an OBJ file."
+    lines = read_text(path, "the mesh", remedy=remedy, error=BodyError, errors="replace").splitlines()
     vertices: list[list[float]] = []
     faces: list[tuple[int, int, int]] = []
     for number, line in enumerate(lines, 1):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from kinefit._arguments import checked
-from kinefit._files import parse_toml, record_of, regular, repeated
+from kinefit._files import parse_toml, read_text, record_of, repeated
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.morphs.morph_files import morphs_of
 from kinefit.bodies.surfaces.files import surfaces_of
@@ -51,20 +51,12 @@ def _text(name_or_file: str | Path) -> tuple[str, str]:
     """Text of a body file, and its name for messages."""
     path = Path(name_or_file)
     if path.suffix == ".toml":
-        try:
-            return regular(path).read_text(encoding="utf-8"), str(path)
-        except (OSError, ValueError) as error:
-            remedy = "Give the path of a text file (UTF-8) in TOML."
-            problem = f"cannot read the body file ({getattr(error, 'strerror', None) or error})"
-            raise BodyError(problem, file=path, remedy=remedy) from error
-    else:
-        if str(name_or_file) not in catalogue():
-            raise BodyError(
-                choices("body in the catalogue named", str(name_or_file), catalogue()),
-                remedy="A body file of your own is given by its path, ending in .toml.",
-            )
-        entry = resources.files("kinefit.bodies") / "catalogue" / f"{name_or_file}.toml"
-        return entry.read_text(encoding="utf-8"), f"catalogue body {name_or_file}"
+        remedy = "Give the path of a text file (UTF-8) in TOML."
+        return read_text(path, "the body file", remedy=remedy, error=BodyError), str(path)
+    name, remedy = str(name_or_file), "A body file of your own is given by its path, ending in .toml."
+    check_choice("body in the catalogue named", name, catalogue(), BodyError, remedy=remedy)
+    entry = resources.files("kinefit.bodies") / "catalogue" / f"{name}.toml"
+    return entry.read_text(encoding="utf-8"), f"catalogue body {name}"
 
 
 def catalogue() -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import parse_toml, regular
+from kinefit._files import parse_toml, read_text
 from kinefit.bodies.joint_names import ENDS, FAMILIES, FINGERS, SEGMENTS, VRM0_FINGERS, VRM1_FINGERS
 from kinefit.bodies.limbs import FACE
 from kinefit.errors import FileError, choices
@@ -105,10 +105,7 @@ def read_names(path: str | PathLike[str]) -> dict[str, str]:
     FileError
         Not TOML, an unknown segment, or a name that is no text.
     """
-    try:
-        table = parse_toml(regular(path).read_text(encoding="utf-8-sig"), path)
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileError(f"cannot be read ({error})", file=path, remedy="Give a TOML file.") from error
+    table = parse_toml(read_text(path, "the table", remedy="Give a TOML file."), path)
     for segment, name in table.items():
         if segment not in (known := (*SEGMENTS, *FINGERS, *FACE, *ENDS)):
             remedy = 'A line is: thigh_l = "LeftUpLeg".'
