@@ -1,6 +1,6 @@
 """The catalogue of marker sets: labels, segments, positions on a body; and the matching of labels."""
 
-from kinefit.bodies.marker_sets.files import LANDMARK_SPREAD
+from kinefit.bodies.marker_sets.files import GIVE, LANDMARK_SPREAD, RANGE, marker_set_names
 from kinefit.bodies.marker_sets.labels import SIDES, bare, matched, read_sides, side_pairs, subject_of
 from kinefit.bodies.marker_sets.placement import (
     MarkerPlacement,
@@ -11,14 +11,11 @@ from kinefit.bodies.marker_sets.placement import (
     placement,
 )
 from kinefit.bodies.marker_sets.sets import (
-    GIVE,
     MIN_COMMON_LABELS,
-    RANGE,
     MarkerSet,
     SetSegment,
     find_marker_set,
     load_marker_set,
-    marker_set_names,
 )
 
 __all__ = [

@@ -72,8 +72,8 @@ class SetRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         return next((left + label[len(right) :] for right, left in self.sides if label.startswith(right)), None)
 
 
-def set_names(*, placed: bool = False) -> tuple[str, ...]:
-    """Names of the sets of the catalogue; `placed`: of those with positions of markers on a body."""
+def marker_set_names(*, placed: bool = False) -> tuple[str, ...]:
+    """Names of the marker sets that come with kinefit; `placed`: of those with positions of markers on a body."""
     return tuple(sorted(n for n, record in catalogue().items() if record.markers or not placed))
 
 

@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.marker_sets.files import LANDMARK_SPREAD, MarkerRecord, SetRecord, catalogue, find_record, set_names
+from kinefit.bodies.marker_sets.files import (
+    LANDMARK_SPREAD,
+    MarkerRecord,
+    SetRecord,
+    catalogue,
+    find_record,
+    marker_set_names,
+)
 from kinefit.bodies.marker_sets.labels import matched, plain
 from kinefit.bodies.marker_sets.sets import MIN_COMMON_LABELS
 from kinefit.errors import FileError, ObservationError
@@ -40,7 +47,7 @@ class MarkerPlacement:
 
 def placed_set_names() -> tuple[str, ...]:
     """Names of the marker sets of the catalogue with positions of markers on a body."""
-    return set_names(placed=True)
+    return marker_set_names(placed=True)
 
 
 def placement(body: Body, marker_set: str | PathLike[str] | MarkerPlacement) -> MarkerPlacement:

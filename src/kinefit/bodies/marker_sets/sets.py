@@ -11,21 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.marker_sets.files import (
-    GIVE,
     RANGE,
     MarkerSegmentRecord,
     SetRecord,
     catalogue,
     find_record,
-    set_names,
+    marker_set_names,
 )
 from kinefit.bodies.marker_sets.labels import matched, plain
 from kinefit.errors import FileError, choices
-
-__all__ = [
-    "GIVE", "MIN_COMMON_LABELS", "RANGE", "MarkerSet", "SetSegment", "find_marker_set", "load_marker_set",
-    "marker_set_names",
-]  # fmt: skip
 
 MIN_COMMON_LABELS = 4
 """Of a set and a take, and half of the take's or the set's labels: fewer agree by chance."""
@@ -89,11 +83,6 @@ class MarkerSet:
     def is_computed(self, label: str) -> bool:
         """Whether a label names a computed point, not a marker."""
         return plain(label) in {plain(c) for c in self.computed}
-
-
-def marker_set_names() -> tuple[str, ...]:
-    """Names of the marker sets that come with kinefit."""
-    return set_names()
 
 
 def load_marker_set(name_or_file: str | PathLike[str]) -> MarkerSet:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from kinefit._arguments import checked
-from kinefit._files import parse_toml, read_text, record_of, repeated
+from kinefit._files import parse_toml, read_text, record_of
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.morphs.morph_files import morphs_of
 from kinefit.bodies.surfaces.files import surfaces_of
@@ -31,6 +31,7 @@ from kinefit.bodies.toml.records import (
     left,
     merged,
     mirrored,
+    refuse_repeated,
     stature_of,
     with_images,
 )
@@ -150,8 +151,8 @@ def _beside(records: Iterable[Any], sided: Callable[[Any], bool]) -> list[Any]:
 def _in_order(segments: list[SegmentRecord], source: str) -> list[SegmentRecord]:
     """Sort segments depth first from the root: parents before children, limbs contiguous."""
     children: dict[str | None, list[SegmentRecord]] = {s.name: [] for s in segments}
-    _refuse_repeated("segment", [s.name for s in segments], source)
-    _refuse_repeated("joint", [s.joint.name for s in segments], source)
+    refuse_repeated("segment", [s.name for s in segments], source)
+    refuse_repeated("joint", [s.joint.name for s in segments], source)
     roots = [s for s in segments if s.parent is None]
     if len(roots) != 1:
         found = ", ".join(s.name for s in roots) or "none"
@@ -176,12 +177,6 @@ def _in_order(segments: list[SegmentRecord], source: str) -> list[SegmentRecord]
     return out
 
 
-def _refuse_repeated(what: str, names: Iterable[str], source: str) -> None:
-    if twice := repeated(names):
-        problem = f"{what} named twice: {', '.join(sorted(twice))}"
-        raise BodyError(problem, file=source, remedy="Rename one of them.")
-
-
 def _tree(segments: list[SegmentRecord], index: dict[str, int], source: str) -> KinematicTree:
     rows: list[tuple[Any, ...]] = []
     for i, s in enumerate(segments):
@@ -189,7 +184,7 @@ def _tree(segments: list[SegmentRecord], index: dict[str, int], source: str) -> 
             rows += _coordinates(i, s.joint)
     names = ("coordinates", "owners", *COLUMNS)
     columns = dict(zip(names, zip(*rows) if rows else [()] * len(names)))
-    _refuse_repeated("coordinate", columns["coordinates"], source)
+    refuse_repeated("coordinate", columns["coordinates"], source)
     return KinematicTree(
         segments=tuple(index),
         parents=np.array([index[s.parent] if s.parent else -1 for s in segments]),

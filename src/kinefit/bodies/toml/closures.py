@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import repeated
 from kinefit.bodies.body import Body
 from kinefit.bodies.closures import KINDS, Closure, Dimension, with_dimensions
-from kinefit.bodies.toml.records import ClosureRecord, DimensionRecord, Vector, direction
+from kinefit.bodies.toml.records import ClosureRecord, DimensionRecord, Vector, direction, refuse_repeated
 from kinefit.errors import BodyError, check_choice, located
 
 ESTIMATE = "estimate"
@@ -33,9 +32,8 @@ def closed(
     if body.morphs:
         problem = "closures of a body whose joints or surfaces morph"
         raise BodyError(problem, file=source, place="closure", remedy="Remove the morphs, or the closures.")
-    for what, names in (("closure", [c.name for c in closures]), ("dimension", [d.name for d in dimensions])):
-        if twice := sorted(repeated(names)):
-            raise BodyError(f"{what} named twice: {', '.join(twice)}", file=source, remedy="Rename one of them.")
+    refuse_repeated("closure", [c.name for c in closures], source)
+    refuse_repeated("dimension", [d.name for d in dimensions], source)
     made, drawn, wanted = list[Closure](), list[Dimension](), dict[str, float]()
     for c in closures:
         with located(source, f"closure {c.name}"):

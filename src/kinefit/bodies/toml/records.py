@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from os import PathLike
 from typing import Any, TypeVar
 
@@ -10,6 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import repeated
 from kinefit.bodies.morphs.morph_files import MorphRecord
 from kinefit.bodies.surfaces.files import SurfaceRecord
 from kinefit.bodies.surfaces.skins.skin_files import SkinRecord
@@ -223,6 +225,13 @@ def _mirrored_axis(axis: str | Vector, slides: bool) -> str | Vector:
         return axis
     x, y, z = named
     return (x, y, -z) if slides else (-x, -y, z)
+
+
+def refuse_repeated(what: str, names: Iterable[str], source: str) -> None:
+    """Raise a BodyError for names that a file gives twice, such as of segments."""
+    if twice := repeated(names):
+        problem = f"{what} named twice: {', '.join(sorted(twice))}"
+        raise BodyError(problem, file=source, remedy="Rename one of them.")
 
 
 _EXTENDS = {"MEDIAPIPE_75": "MEDIAPIPE_33", "BODY_25_HANDS": "BODY_25", "COCO_WHOLEBODY_133": "COCO_17"}
