@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
@@ -69,6 +69,10 @@ class PointSet:
         """
         check_choice("point", name, self.names, BodyError)
         return self.names.index(name)
+
+    def scaled(self, factors: NDArray) -> PointSet:
+        """The points of segments that are scaled by factors (S,)."""
+        return PointSet(self.names, self.segments, self.points * factors[self.segments][:, None])
 
     def select(self, names: tuple[str, ...]) -> PointSet:
         """The named points, in that order; a BodyError is raised for an unknown name."""
@@ -214,11 +218,8 @@ class Body:
         old, parents = self.tree, np.maximum(self.tree.parents, 0)
         tree = old.with_offsets(old.offsets * per_segment[parents][:, None])
         stretched = replace(
-            self,
+            self.with_points(lambda points: points.scaled(per_segment)),
             tree=tree,
-            landmarks=_stretch(self.landmarks, per_segment),
-            keypoint_sets={name: _stretch(s, per_segment) for name, s in self.keypoint_sets.items()},
-            marker_sets={name: _stretch(s, per_segment) for name, s in self.marker_sets.items()},
             surfaces=tuple(surface.scaled(float(per_segment[surface.segment])) for surface in self.surfaces),
             morphs=tuple(morph.stretched(old, tree, per_segment) for morph in self.morphs),
             skin=self.skin and self.skin.stretched(old.rest, tree.rest, per_segment),
@@ -234,6 +235,15 @@ class Body:
         """Distance [m] from the lowest to the highest landmark or joint at rest."""
         heights = np.concatenate([self.points_rest(self.landmarks)[:, 1], self.tree.rest[:, 1]])
         return float(np.ptp(heights)) if len(heights) else 0.0
+
+    def with_points(self, change: Callable[[PointSet], PointSet]) -> Body:
+        """The body with a change of its landmarks, and of each of its sets of keypoints and markers."""
+        return replace(
+            self,
+            landmarks=change(self.landmarks),
+            keypoint_sets={name: change(points) for name, points in self.keypoint_sets.items()},
+            marker_sets={name: change(points) for name, points in self.marker_sets.items()},
+        )
 
     def with_keypoints(self, name: str, points: NDArray) -> Body:
         """Replace the points of one keypoint set by (K, 3) [m] in the segments' frames, such as estimated offsets."""
@@ -272,7 +282,3 @@ class Body:
                 name = f"{self.tree.segments[parent]}-{self.tree.segments[child]}"
                 out[name] = float(np.linalg.norm(self.tree.offsets[child]))
         return out
-
-
-def _stretch(points: PointSet, per_segment: NDArray) -> PointSet:
-    return PointSet(points.names, points.segments, points.points * per_segment[points.segments][:, None])

@@ -122,22 +122,19 @@ def without_part(body: Body, name: str) -> Body:
         raise BodyError(f"it has the children {', '.join(children)}", place=f"part {name}", remedy=remedy)
     kept = np.arange(len(tree.segments)) != removed
     used = sorted(set(body.segment_scale[kept].tolist()))
-    landmarks = _remaining_points(body.landmarks, removed)
+    left = body.with_points(lambda points: _remaining_points(points, removed))
     return replace(
-        body,
+        left,
         tree=_without_segment(tree, removed),
         joints=tuple(j for j, keep in zip(body.joints, kept) if keep),
         scale_groups=tuple(body.scale_groups[g] for g in used),
         segment_scale=np.searchsorted(used, body.segment_scale[kept]),
-        landmarks=landmarks,
-        keypoint_sets={n: _remaining_points(p, removed) for n, p in body.keypoint_sets.items()},
-        marker_sets={n: _remaining_points(p, removed) for n, p in body.marker_sets.items()},
         surfaces=tuple(
             replace(s, segment=s.segment - (s.segment > removed)) for s in body.surfaces if s.segment != removed
         ),
         aliases={c: {s: n for s, n in names.items() if s != name} for c, names in body.aliases.items()},
         morphs=tuple(m for m in body.morphs if not _is_about(m, name, tree.coordinates, tree.owners == removed)),
-        closures=without_landmarks(body.closures, landmarks.names),
+        closures=without_landmarks(body.closures, left.landmarks.names),
         dimensions=tuple(d for d in body.dimensions if name not in d.moves),
     )
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit._jit import cache_directory
 from kinefit.bodies.anny.files import FACTORS, AnnyData, read_anny
-from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.body import Body
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces import SkinnedMesh, TaperedCylinder
@@ -146,16 +146,11 @@ class AnnyModel:
         BodyError
             Parameters that are not six from 0 to 1.
         """
-        base = self._base
         new, skin, factors, stature = self._made(values)
-        grown = lambda p: PointSet(p.names, p.segments, p.points * factors[p.segments][:, None])
         return replace(
-            base,
+            self._base.with_points(lambda points: points.scaled(factors)),
             name="anny",
             tree=new,
-            landmarks=grown(base.landmarks),
-            keypoint_sets={name: grown(p) for name, p in base.keypoint_sets.items()},
-            marker_sets={name: grown(p) for name, p in base.marker_sets.items()},
             surfaces=_as_wide(self._longer(factors), skin, new.rest, *self._usual),
             stature=stature,
             skin=skin,
