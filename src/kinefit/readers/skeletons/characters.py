@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import parse_toml, read_text
+from kinefit._files import parse_toml, read_text, regular
 from kinefit.bodies.joint_names import ENDS, FAMILIES, FINGERS, SEGMENTS, VRM0_FINGERS, VRM1_FINGERS
 from kinefit.bodies.limbs import FACE
 from kinefit.errors import FileError, choices
