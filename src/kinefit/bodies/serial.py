@@ -65,25 +65,29 @@ Arrays = Mapping[str, NDArray]
 _Kind = TypeVar("_Kind")
 _WEIGHT_ROWS = 1025  # of a stored weighting function
 
-# Shapes of the arrays of each record, as `fields_of` reads them
-_TREE = {
-    "segments": "S$", "parents": "S", "offsets": "S 3", "coordinates": "D$", "owners": "D<S", "axes": "D 3",
-    "prismatic": "D", "lower": "D", "upper": "D", "usual": "D", "spread": "D", "root_free": "", "couplings": "C D",
+_SHAPES = {
+    "body": {"name": "$", "stature": "", "joints": "S$", "scale_groups": "G$", "segment_scale": "S<G"},
+    "tree": {
+        "segments": "S$", "parents": "S", "offsets": "S 3", "coordinates": "D$", "owners": "D<S", "axes": "D 3",
+        "prismatic": "D", "lower": "D", "upper": "D", "usual": "D", "spread": "D", "root_free": "", "couplings": "C D",
+    },
+    "points": {"names": "k$", "segments": "k<S", "points": "k 3!"},
+    "skin": {"nodes": "v k 3", "faces": "t 3", "owners": "v k<S", "weights": "v k"},
+    "cylinders": {"segments": "c<S", "starts": "c 3", "ends": "c 3", "radii": "c 2 2", "sides": "c 3"},
+    "round cylinders": {"segments": "c<S", "ends": "c 3", "radii": "c 2"},  # of older files: from the joint
+    "mesh": {"vertices": "v 3", "faces": "t 3"},
+    "balls": {"centres": "b 3", "radii": "b 3", "weights": "b", "axes": "b 3 3"},
+    "morph": {"kind": "$", "angle": "$", "span": "2", "beyond": "", "segment": "$"},
+    "joint": {"twist": "6!"},
+    "global": {"target": "v 3!"},
+    "surface": {},
+    "local": {"centre": "n!", "radii": "n", "shift": "3!", "on": "s$", "moves": ""},
 }  # fmt: skip
-_BODY = {"name": "$", "stature": "", "joints": "S$", "scale_groups": "G$", "segment_scale": "S<G"}
-_POINTS = {"names": "k$", "segments": "k<S", "points": "k 3!"}
-_SKIN = {"nodes": "v k 3", "faces": "t 3", "owners": "v k<S", "weights": "v k"}
-_CYLINDERS = {"segments": "c<S", "starts": "c 3", "ends": "c 3", "radii": "c 2 2", "sides": "c 3"}
-_ROUND = {"segments": "c<S", "ends": "c 3", "radii": "c 2"}  # of older files: cylinders from the joint
-_MESH = {"vertices": "v 3", "faces": "t 3"}
-_BALLS = {"centres": "b 3", "radii": "b 3", "weights": "b", "axes": "b 3 3"}
-_MORPH = {"kind": "$", "angle": "$", "span": "2", "beyond": "", "segment": "$"}
-_OPERATORS: dict[str, tuple[type[Operator], dict[str, str]]] = {
-    "joint": (JointMotion, {"twist": "6!"}),
-    "global": (GlobalMorph, {"target": "v 3!"}),
-    "surface": (SegmentMorph, {}),
-    "local": (LocalMorph, {"centre": "n!", "radii": "n", "shift": "3!", "on": "s$", "moves": ""}),
-}
+"""Arrays of each record, and of each kind of morph, with shapes as `fields_of` reads them."""
+
+_MORPHS: dict[str, type[Operator]] = {
+    "joint": JointMotion, "global": GlobalMorph, "surface": SegmentMorph, "local": LocalMorph
+}  # fmt: skip
 
 
 def arrays_of(record: object, shapes: Mapping[str, str], prefix: str = "") -> dict[str, NDArray]:
@@ -137,23 +141,23 @@ def below(arrays: Arrays, prefix: str) -> dict[str, NDArray]:
     return {key.removeprefix(prefix): array for key, array in arrays.items() if key.startswith(prefix)}
 
 
-def sets_below(arrays: Arrays, kind: str) -> Iterator[tuple[str, dict[str, NDArray]]]:
-    """Names of a kind of sets, such as "keypoints", decoded, each with the arrays below it."""
-    for name in dict.fromkeys(key.split("/")[1] for key in arrays if key.startswith(f"{kind}/")):
-        yield unquote(name), below(arrays, f"{kind}/{name}/")
+def prefixes(arrays: Arrays, kind: str) -> dict[str, str]:
+    """Names of a kind of sets, such as "keypoints", decoded, each with the beginning of its keys."""
+    names = dict.fromkeys(key.split("/")[1] for key in arrays if key.startswith(f"{kind}/"))
+    return {unquote(name): f"{kind}/{name}/" for name in names}
 
 
 def body_to_arrays(body: Body) -> dict[str, NDArray]:
     """Convert a body to arrays, with the keys of the module's docstring, such as offsets (S, 3) [m]."""
-    out = arrays_of(body, _BODY) | arrays_of(body.tree, _TREE) | _surfaces_to_arrays(body.surfaces)
+    out = arrays_of(body, _SHAPES["body"]) | arrays_of(body.tree, _SHAPES["tree"]) | _surfaces_to_arrays(body.surfaces)
     for k, morph in enumerate(body.morphs):
         out |= {f"morphs/{k}/{name}": array for name, array in _morph_to_arrays(morph).items()}
     if body.skin is not None:
-        out |= arrays_of(body.skin, _SKIN, "skin/")
-    out |= arrays_of(body.landmarks, _POINTS, "landmarks/")
+        out |= arrays_of(body.skin, _SHAPES["skin"], "skin/")
+    out |= arrays_of(body.landmarks, _SHAPES["points"], "landmarks/")
     for kind, sets in (("keypoints", body.keypoint_sets), ("markers", body.marker_sets)):
         for name, points in sets.items():
-            out |= arrays_of(points, _POINTS, f"{kind}/{quote(name, safe='')}/")
+            out |= arrays_of(points, _SHAPES["points"], f"{kind}/{quote(name, safe='')}/")
     for key, records in (("closures", body.closures), ("dimensions", body.dimensions)):
         if records:
             out[key] = np.array([msgspec.json.encode(record).decode() for record in records])
@@ -172,24 +176,24 @@ def body_from_arrays(arrays: Arrays) -> Body:
     """
     sizes = dict[str, int]()
     no_couplings = np.empty((0, np.size(arrays.get("coordinates", ()))))
-    tree = KinematicTree(**fields_of({"couplings": no_couplings, **arrays}, _TREE, sizes))
+    tree = KinematicTree(**fields_of({"couplings": no_couplings, **arrays}, _SHAPES["tree"], sizes))
     if sizes["S"] == 0 or tree.parents[0] != -1:
         raise BodyError("the first segment is not the root")
     if (tree.parents[1:] < 0).any():
         raise BodyError("array 'parents' has an index out of range", remedy="Only the root has none, -1.")
-    own = fields_of(arrays, _BODY, sizes)
-    points = lambda part: PointSet(**fields_of(part, _POINTS, sizes))
+    own = fields_of(arrays, _SHAPES["body"], sizes)
+    points = lambda prefix: PointSet(**fields_of(arrays, _SHAPES["points"], sizes, prefix))
     aliases = {key: fields_of(arrays, {key: "n 2$"}, {})[key] for key in arrays if key.startswith("aliases/")}
     body = Body(
         **own | {"stature": stature_of(own["stature"])},
         tree=tree,
-        landmarks=PointSet(**fields_of(arrays, _POINTS, sizes, "landmarks/")),
-        keypoint_sets={name: points(part) for name, part in sets_below(arrays, "keypoints")},
-        marker_sets={name: points(part) for name, part in sets_below(arrays, "markers")},
+        landmarks=points("landmarks/"),
+        keypoint_sets={name: points(prefix) for name, prefix in prefixes(arrays, "keypoints").items()},
+        marker_sets={name: points(prefix) for name, prefix in prefixes(arrays, "markers").items()},
         surfaces=_surfaces_from_arrays(arrays, sizes),
         aliases={unquote(key.split("/")[1]): dict(pairs) for key, pairs in aliases.items()},
         morphs=tuple(_morphs_from_arrays(arrays, sizes)),
-        skin=SkinnedMesh(**fields_of(arrays, _SKIN, sizes, "skin/")) if below(arrays, "skin/") else None,
+        skin=SkinnedMesh(**fields_of(arrays, _SHAPES["skin"], sizes, "skin/")) if below(arrays, "skin/") else None,
         closures=_decoded(arrays, "closures", Closure),
         dimensions=_decoded(arrays, "dimensions", Dimension),
     )
@@ -264,7 +268,7 @@ def _surfaces_to_arrays(surfaces: tuple[Surface, ...]) -> dict[str, NDArray]:
     cylinders["radii"] = np.full((count, 2, 2), np.nan)
     for k, surface in enumerate(surfaces):
         if isinstance(surface, MeshSurface):
-            out |= arrays_of(surface, _BALLS if isinstance(surface, Metaballs) else _MESH, f"surfaces/{k}/")
+            out |= arrays_of(surface, _SHAPES["balls" if isinstance(surface, Metaballs) else "mesh"], f"surfaces/{k}/")
             continue
         for name, values in cylinders.items():
             values[k] = surface.radii if name == "radii" else getattr(surface, name[:-1])
@@ -273,15 +277,15 @@ def _surfaces_to_arrays(surfaces: tuple[Surface, ...]) -> dict[str, NDArray]:
 
 def _surfaces_from_arrays(arrays: Arrays, sizes: dict[str, int]) -> tuple[Surface, ...]:
     if "surfaces/starts" not in arrays:
-        rounds = fields_of(arrays, _ROUND, sizes, "surfaces/")
+        rounds = fields_of(arrays, _SHAPES["round cylinders"], sizes, "surfaces/")
         return tuple(TaperedCylinder.round(*one) for one in zip(*rounds.values()))
-    out = list[Surface]()
-    for k, (segment, *cylinder) in enumerate(zip(*fields_of(arrays, _CYLINDERS, sizes, "surfaces/").values())):
+    out, rows = list[Surface](), fields_of(arrays, _SHAPES["cylinders"], sizes, "surfaces/")
+    for k, (segment, *cylinder) in enumerate(zip(*rows.values())):
         prefix = f"surfaces/{k}/"
         if f"{prefix}centres" in arrays:
-            out.append(Metaballs.of(int(segment), **fields_of(arrays, _BALLS, sizes, prefix)))
+            out.append(Metaballs.of(int(segment), **fields_of(arrays, _SHAPES["balls"], sizes, prefix)))
         elif f"{prefix}vertices" in arrays:
-            out.append(MeshSurface(int(segment), **fields_of(arrays, _MESH, sizes, prefix)))
+            out.append(MeshSurface(int(segment), **fields_of(arrays, _SHAPES["mesh"], sizes, prefix)))
         else:
             out.append(TaperedCylinder(int(segment), *(value.tolist() for value in cylinder)))
     return tuple(out)
@@ -289,7 +293,7 @@ def _surfaces_from_arrays(arrays: Arrays, sizes: dict[str, int]) -> tuple[Surfac
 
 def _morph_to_arrays(morph: Operator) -> dict[str, NDArray]:
     s, weight = morph.steering, morph.steering.weight
-    kind = next(kind for kind, (cls, _) in _OPERATORS.items() if isinstance(morph, cls))
+    kind = next(kind for kind, cls in _MORPHS.items() if isinstance(morph, cls))
     if callable(weight):
         t = np.linspace(0.0, 1.0, _WEIGHT_ROWS)
         weight = np.stack([t, [float(weight(float(x))) for x in t]], 1)
@@ -298,7 +302,7 @@ def _morph_to_arrays(morph: Operator) -> dict[str, NDArray]:
         "segment": getattr(morph, "segment", None) or "",
     }  # fmt: skip
     surfaces = _surfaces_to_arrays(morph.surfaces) if isinstance(morph, SegmentMorph) else {}
-    return {name: np.array(value) for name, value in own.items()} | arrays_of(morph, _OPERATORS[kind][1]) | surfaces
+    return {name: np.array(value) for name, value in own.items()} | arrays_of(morph, _SHAPES[kind]) | surfaces
 
 
 def _morphs_from_arrays(arrays: Arrays, sizes: dict[str, int]) -> Iterator[Operator]:
@@ -312,13 +316,13 @@ def _morphs_from_arrays(arrays: Arrays, sizes: dict[str, int]) -> Iterator[Opera
 
 
 def _morph_from_arrays(own: Arrays, sizes: dict[str, int]) -> Operator:
-    head, weight = fields_of(own, _MORPH, sizes), own["weight"]
-    if head["kind"] not in _OPERATORS:
+    head, weight = fields_of(own, _SHAPES["morph"], sizes), own["weight"]
+    if head["kind"] not in _MORPHS:
         raise BodyError(f"an unknown kind '{head['kind']}'")
-    cls, shapes = _OPERATORS[head["kind"]]
+    cls = _MORPHS[head["kind"]]
     start, end = map(float, head["span"])
     weighting = str(weight) if weight.dtype.kind == "U" else weight
-    fields = fields_of(own, shapes, sizes)
+    fields = fields_of(own, _SHAPES[head["kind"]], sizes)
     fields["steering"] = Steering(head["angle"], start, end, weighting, bool(head["beyond"]))
     if cls is not GlobalMorph:
         fields["segment"] = head["segment"] or (None if cls is LocalMorph else "")

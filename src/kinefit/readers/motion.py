@@ -30,13 +30,12 @@ from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 
-import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import read_npz, regular
-from kinefit.bodies.serial import below, body_from_arrays, fields_of, sets_below
-from kinefit.errors import FileError, KinefitError, command, located
+from kinefit.bodies.serial import below, body_from_arrays, fields_of, prefixes
+from kinefit.errors import FileError, KinefitError, command
 from kinefit.motion import Motion, Residuals
 
 FORMAT, VERSION = "kinefit motion", 1
@@ -110,17 +109,18 @@ def _motion(arrays: Mapping[str, NDArray]) -> Motion:
         array.flags.writeable = False
     body = body_from_arrays(below(arrays, "body/"))
     D = len(body.tree.coordinates)
-    sizes = {"F": np.size(arrays["times"]), "S": len(body.tree.segments), "D": D, "N": 6 + D}
+    sizes = {"S": len(body.tree.segments), "D": D, "N": 6 + D}
+    own = fields_of(arrays, SHAPES, sizes)
     provenance = json.loads(str(arrays["provenance"])) if "provenance" in arrays else {}
-    residuals = {sensor: _residuals(own, sensor, sizes) for sensor, own in sets_below(arrays, "residuals")}
-    return Motion(body=body, **fields_of(arrays, SHAPES, sizes), residuals=residuals, provenance=provenance)
+    sensors = prefixes(arrays, "residuals")
+    residuals = {sensor: _residuals(arrays, prefix, sizes) for sensor, prefix in sensors.items()}
+    return Motion(body=body, **own, residuals=residuals, provenance=provenance)
 
 
-def _residuals(arrays: Mapping[str, NDArray], sensor: str, sizes: dict[str, int]) -> Residuals:
-    with located(place=f"residuals of {sensor}"):
-        shapes = RESIDUAL_SHAPES | (SURFACE_SHAPES if "rms" in arrays else {})
-        out = Residuals(**fields_of(arrays, shapes, sizes))
-    axes = {"px": 2, "m": 3}[out.unit]
-    if out.values.shape[2] != (axes if out.of_points else 1):
-        raise ValueError(f"residuals of {sensor} in {out.unit} of shape {out.values.shape}")
+def _residuals(arrays: Mapping[str, NDArray], prefix: str, sizes: dict[str, int]) -> Residuals:
+    shapes = RESIDUAL_SHAPES | (SURFACE_SHAPES if f"{prefix}rms" in arrays else {})
+    out = Residuals(**fields_of(arrays, shapes, sizes, prefix))
+    axes = {"px": 2, "m": 3}.get(out.unit)
+    if axes is None or out.values.shape[2] != (axes if out.of_points else 1):
+        raise ValueError(f"{prefix}values in {out.unit} of shape {out.values.shape}")
     return out
