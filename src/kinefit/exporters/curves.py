@@ -52,9 +52,8 @@ def curves(motion: Motion) -> list[Curve]:
         values, std, speed = motion.angles[:, d], motion.dof_std[:, 6 + d], float(speeds[6 + d])
         if not slides:
             values, std, speed = np.degrees(np.unwrap(values)), np.degrees(std), float(np.degrees(speed))
-        side, joint = _side(name), motion.body.joints[tree.owners[d]]
-        whole = joint[:-2] if _side(joint) else joint
-        out.append(Curve(name, whole, side, "m" if slides else "deg", values, std, speed))
+        joint, _ = split_side(motion.body.joints[tree.owners[d]])
+        out.append(Curve(name, joint, split_side(name)[1], "m" if slides else "deg", values, std, speed))
     return out
 
 
@@ -66,8 +65,10 @@ def _speeds(motion: Motion) -> NDArray:
     return np.array([float(speed_std.get(name, np.nan)) for name in motion.body.dof_names])
 
 
-def _side(name: str) -> str:
-    return {"_l": "left", "_r": "right"}.get(name[-2:], "")
+def split_side(name: str) -> tuple[str, str]:
+    """A name without its side, and "left", "right" or "": hand_l becomes ("hand", "left")."""
+    side = {"_l": "left", "_r": "right"}.get(name[-2:], "")
+    return (name[:-2] if side else name), side
 
 
 def _root_turns(y_up: Motion) -> tuple[NDArray, NDArray]:

@@ -198,13 +198,10 @@ def summary(motion: Motion, frame: int) -> str:
     if lost:
         lines.append("lost: " + ", ".join(map(scene.as_markdown, lost)))
     for name, residuals in motion.residuals.items():
-        norms = residuals.norms[frame]
-        seen = np.isfinite(norms)
-        scale, unit = (1.0, "px") if residuals.unit == "px" else (1000.0, "mm")
-        middle = f"{scale * np.median(norms[seen]):.1f} {unit}" if seen.any() else "no data"
-        out = int((seen & (residuals.weights[frame] < scene.OUTLIER_WEIGHT)).sum())
+        out = int(residuals.rejected[frame].sum())
         extra = f", {out} rejected" if out else ""
         extra += ", left/right swap corrected" if residuals.swapped[frame] else ""
+        middle = residuals.median_text(residuals.norms[frame])
         lines.append(f"{scene.as_markdown(name)}: {middle}{extra}")
     return "\n\n".join(lines)
 

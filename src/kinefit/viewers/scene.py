@@ -12,14 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, PointSet, TaperedCylinder
 from kinefit.geometry.camera import Camera
-from kinefit.motion import UP_AXES, Motion, Residuals
+from kinefit.motion import OUTLIER_WEIGHT, UP_AXES, Motion, Residuals
 from kinefit.rendering.colours import RGB, quality_ramp
 from kinefit.rendering.looks import Mesh
 
 OTHERS: tuple[RGB, ...] = ((204, 121, 167), (86, 180, 233), (230, 159, 0), (120, 90, 60))
 """Colours of the second, third ... motion, which have one colour for both sides."""
 
-OUTLIER_WEIGHT = 0.05  # robust weight below which a measurement had no say
 OUTLIER = (255, 30, 30)
 LARGEST_ELLIPSOID = 0.5  # [m] half axis beyond which "somewhere there" says nothing more, and hides the rest
 _PIECES = 5  # of a bone: dashes and gaps of a lost one in turn
@@ -160,13 +159,6 @@ def camera_rays(
     colours[np.asarray(weights)[seen] < OUTLIER_WEIGHT] = OUTLIER
     points = np.concatenate([np.stack([np.broadcast_to(centre, feet.shape), feet], 1), np.stack([feet, x], 1)])
     return Rays(points, np.repeat(np.tile(colours, (2, 1))[:, None], 2, axis=1))
-
-
-def middling_residual(motion: Motion) -> float:
-    """[px] median of all keypoints that the cameras saw; 1 where there are none."""
-    norms = [r.norms.ravel() for r in motion.residuals.values() if r.unit == "px"]
-    known = np.concatenate(norms)[np.isfinite(np.concatenate(norms))] if norms else np.zeros(0)
-    return float(np.median(known)) if known.size else 1.0
 
 
 def root_path(motion: Motion) -> NDArray:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
-from kinefit.motion import Motion
+from kinefit.motion import Motion, known_median, nearest_frame
 from kinefit.observations import Markers
 from kinefit.viewers import figure, scene, stage
 from kinefit.viewers.pictures import CameraImages
@@ -180,7 +180,9 @@ class Show:
         self._fitted = [
             {name: scene.fitted_points(m.body, r) for name, r in m.residuals.items()} for m in recording.motions[:1]
         ]
-        self._middling = scene.middling_residual(recording.motions[0]) if recording.motions else 1.0
+        norms = [r.norms.ravel() for m in recording.motions[:1] for r in m.residuals.values() if r.unit == "px"]
+        middling = known_median(np.concatenate([*norms, np.zeros(0)]))
+        self._middling = middling if np.isfinite(middling) else 1.0  # [px]
         self._clouds = list(self._make_clouds())
         self._rays: Any = None
         self._last = Choice(frozenset(LAYERS))  # as the nodes were made
@@ -191,7 +193,7 @@ class Show:
             self._show_layers(choice)
             time = float(self.recording.times[i])
             for n, (fig, motion) in enumerate(zip(self.figures, self.recording.motions)):
-                f = nearest(motion.times, time, motion.rate)
+                f = motion.frame_at(time)
                 fig.show_all(f is not None)
                 if f is not None:
                     fig.pose(
@@ -224,7 +226,7 @@ class Show:
     def _show_points(self, time: float, choice: Choice) -> None:
         """Triangulated keypoints and markers, which no segment carries."""
         for cloud, layer, values, times, rate in self._clouds:
-            f = nearest(times, time, rate)
+            f = nearest_frame(times, time, rate)
             cloud.show(values[f] if f is not None and layer in choice.layers else None)
 
     def _make_clouds(self) -> Iterator[tuple[figure.ScenePoints, str, NDArray, NDArray, float]]:
@@ -285,14 +287,6 @@ class Show:
             through = choice.through == name
             behind = pictures.read(name, time, stage.BACKGROUND_IMAGE_PX) if through and pictures is not None else None
             node.look(behind)
-
-
-def nearest(times: NDArray, time: float, rate: float) -> int | None:
-    """Frame nearest to a time [s], None where there is none within one frame."""
-    if not len(times):
-        return None
-    i = int(np.argmin(np.abs(times - time)))
-    return i if abs(times[i] - time) < 1.0 / rate else None
 
 
 def _without_strays(x: NDArray) -> NDArray:

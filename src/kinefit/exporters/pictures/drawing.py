@@ -14,7 +14,7 @@ from kinefit.bodies.limbs import finger_groups
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.geometry.camera import Camera, ImageFrame
-from kinefit.motion import Motion, Residuals
+from kinefit.motion import OUTLIER_WEIGHT, Motion, Residuals
 from kinefit.rendering import Canvas
 from kinefit.rendering.colours import LOST_COLOUR, side_colour
 from kinefit.rendering.looks import segment_looks, side_colours, triangle_segments, uncertain_segments
@@ -22,7 +22,6 @@ from kinefit.rendering.tubes import TubeMesh, body_mesh
 
 DARK, WHITE = (15, 15, 15), (255, 255, 255)
 MEASURED, OUTLIER, WAY = (255, 240, 60), (255, 40, 40), (255, 90, 220)
-OUTLIER_WEIGHT = 0.05
 _SAMPLES = np.linspace(0.0, 1.0, 6)[:, None]  # along a bone, which a lens may bend
 _LIMB_WIDTH, _FINGER_WIDTH = 0.022, 0.007  # [m] of a bone as drawn
 _SUBPIXEL_BITS, _MAX_DRAWN_PX = 4, 20000.0  # OpenCV's sub-pixel bits; [px] beyond which nothing is drawn

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kinefit._threads import ahead
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes, writing
-from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT, WHITE, draw_body, draw_residuals, draw_skin, write_lines
+from kinefit.exporters.pictures.drawing import WHITE, draw_body, draw_residuals, draw_skin, write_lines
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
 from kinefit.readers.video import Video
@@ -71,7 +71,7 @@ def write_overlay(
 
     def drawn() -> Iterator[NDArray[np.uint8]]:
         for i, image in zip(span, video.frames(span.start, span.stop)):
-            frame = nearest_frame(motion, video.times[i] + time_offset)
+            frame = motion.frame_at(video.times[i] + time_offset)
             label = f"frame {i}"
             yield draw_overlay(
                 image, motion, frame, camera, image_frame=image_frame, residuals=residuals, label=label, skin=skin
@@ -109,14 +109,6 @@ def frames_of(motion: Motion, times: NDArray) -> range:
     margin = 0.5 / motion.rate
     inside = np.flatnonzero((times > motion.times[0] - margin) & (times < motion.times[-1] + margin))
     return range(inside[0], inside[-1] + 1) if len(inside) else range(len(times))
-
-
-def nearest_frame(motion: Motion, time: float) -> int | None:
-    """Frame of a motion nearest to a time [s], None where there is none within one frame."""
-    if not len(motion):
-        return None
-    i = int(np.argmin(np.abs(motion.times - time)))
-    return i if abs(motion.times[i] - time) < 1.0 / motion.rate else None
 
 
 def draw_overlay(
@@ -189,7 +181,7 @@ def write_montage(
 def _told(residuals: Residuals, frame: int) -> str:
     norms = residuals.norms[frame]
     seen = np.isfinite(norms)
-    used = seen & (residuals.weights[frame] >= OUTLIER_WEIGHT)
+    used = seen & ~residuals.rejected[frame]
     if not seen.any():
         return "no keypoints"
     text = f"residual: median {np.median(norms[seen]):.1f}, mean {np.mean(norms[seen]):.1f} px, {used.sum()} points"

@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT
 from kinefit.exporters.report.angles import thinned
-from kinefit.exporters.report.moments import POORLY_SUPPORTED, Moment, frame_residuals
+from kinefit.exporters.report.moments import POORLY_SUPPORTED, Moment
 from kinefit.exporters.report.page import SERIES, Html, joined, moment, plot, shaded, table
 from kinefit.findings import runs_of
-from kinefit.motion import Motion, Residuals
+from kinefit.motion import SHOWN_UNITS, Motion, Residuals, known_median
 
-UNITS = {"px": (1.0, "px"), "m": (1000.0, "mm")}
 _SHIFTED = 0.5  # of the median residual: a constant shift above makes up most of what a camera is off by
 
 
@@ -52,9 +50,7 @@ def overall_median(motion: Motion, unit: str = "px") -> float:
     """Median residual of all points, or else surfaces, of a unit ("px", or "m", shown in mm); NaN without any."""
     own = [r for r in motion.residuals.values() if r.unit == unit]
     chosen = [r for r in own if r.of_points] or own
-    norms = [r.norms[np.isfinite(r.norms)] for r in chosen]
-    values = np.concatenate(norms) if norms else np.zeros(0)
-    return UNITS[unit][0] * float(np.median(values)) if len(values) else np.nan
+    return SHOWN_UNITS[unit][0] * known_median(np.concatenate([*(r.norms.ravel() for r in chosen), np.zeros(0)]))
 
 
 def sensor_table(motion: Motion, fits: Sequence[SensorFit]) -> Html:
@@ -70,7 +66,7 @@ def sensor_table(motion: Motion, fits: Sequence[SensorFit]) -> Html:
         more = " …" if len(swaps) > 6 else ""
         swapped = joined(f"{f.swapped} frames: ", Html(", ".join(links)), more) if swaps else "–"
         rows.append(
-            [f.name, _told(f.median, f.unit), _told(f.most, f.unit), *(shift[:2] if flat else shift),
+            [f.name, told(f.median, f.unit), told(f.most, f.unit), *(shift[:2] if flat else shift),
              f"{100 * f.seen:.0f} %", f"{100 * f.left_out:.1f} %", swapped]
         )  # fmt: skip
     if flat:
@@ -83,11 +79,14 @@ def point_table(motion: Motion) -> Html:
     """Median residual of every point in every sensor, the darker the larger; the share left out where it is much."""
     sensors = dict(motion.residuals)
     names = list(dict.fromkeys(name for r in sensors.values() for name in r.names))
-    medians = {sensor: dict(zip(r.names, _point_medians(r))) for sensor, r in sensors.items()}
-    left_out = {sensor: dict(zip(r.names, _point_left_out(r))) for sensor, r in sensors.items()}
+    medians = {sensor: point_medians(r) for sensor, r in sensors.items()}
+    left_out = {
+        sensor: dict(zip(r.names, r.rejected.sum(axis=0) / np.maximum(np.isfinite(r.norms).sum(axis=0), 1)))
+        for sensor, r in sensors.items()
+    }
     largest = {
         unit: max((v for s, r in sensors.items() if r.unit == unit for v in medians[s].values() if v > 0), default=1.0)
-        for unit in UNITS
+        for unit in SHOWN_UNITS
     }
     rows = []
     for name in names:
@@ -97,7 +96,7 @@ def point_table(motion: Motion) -> Html:
             text = f"{value:.1f}" if np.isfinite(value) else "–"
             cells.append(shaded(text + (f" ({100 * share:.0f} %)" if share >= 0.05 else ""), value / largest[r.unit]))
         rows.append(cells)
-    heads = [f"{s} [{UNITS[r.unit][1]}]" for s, r in sensors.items()]
+    heads = [f"{s} [{SHOWN_UNITS[r.unit][1]}]" for s, r in sensors.items()]
     caption = "Median residual of every point; in brackets the share rejected as outliers, if it is 5 % or more."
     return table(["point", *heads], rows, caption=caption)
 
@@ -113,8 +112,8 @@ def quality_plot(motion: Motion, moments: Sequence[Moment]) -> Html:
     }]  # fmt: skip
     units = list(dict.fromkeys(r.unit for r in motion.residuals.values()))
     for k, (name, r) in enumerate(motion.residuals.items()):
-        factor, unit = UNITS[r.unit]
-        level = factor * frame_residuals(r)
+        factor, unit = SHOWN_UNITS[r.unit]
+        level = factor * np.array([known_median(norms) for norms in r.norms])
         known = np.flatnonzero(np.isfinite(level))
         chosen = np.arange(len(level)) if len(level) <= 1000 or not len(known) else known[thinned(level[known])]
         traces.append({
@@ -135,36 +134,30 @@ def quality_plot(motion: Motion, moments: Sequence[Moment]) -> Html:
     }  # fmt: skip
     for k, unit in enumerate(units, 1):
         top = 1 - k * (tall + gap)
-        title = f"residual [{UNITS[unit][1]}]"
+        title = f"residual [{SHOWN_UNITS[unit][1]}]"
         layout[f"yaxis{k + 1}"] = {"title": title, "rangemode": "tozero", "domain": [max(0.0, top - tall), top]}
     return plot(traces, layout, height=height, label="quality and residuals over time", seeks=True)
 
 
 def _fit(name: str, r: Residuals) -> SensorFit:
-    factor, unit = UNITS[r.unit]
-    norms, weights = r.norms, np.asarray(r.weights)
-    seen = np.isfinite(norms)
-    found = factor * norms[seen]
-    used = seen & (weights >= OUTLIER_WEIGHT)
+    factor, unit = SHOWN_UNITS[r.unit]
+    seen, rejected = np.isfinite(r.norms), r.rejected
+    found, used = factor * r.norms[seen], seen & ~rejected
     shift = factor * np.median(r.values[used], axis=0) if used.any() else np.full(r.values.shape[-1], np.nan)
     return SensorFit(
-        name, unit, int(seen.sum()), float(np.median(found)) if len(found) else np.nan,
-        float(np.percentile(found, 95)) if len(found) else np.nan, float(seen.mean()) if seen.size else 0.0,
-        float(np.mean(weights[seen] < OUTLIER_WEIGHT)) if len(found) else 0.0, shift, int(np.sum(r.swapped)),
-    )  # fmt: skip
+        name, unit, len(found), known_median(found), float(np.percentile(found, 95)) if len(found) else np.nan,
+        float(seen.mean()) if seen.size else 0.0, float(rejected.sum() / max(len(found), 1)), shift,
+        int(np.sum(r.swapped)),
+    )
 
 
-def _point_medians(r: Residuals) -> NDArray:
-    norms = UNITS[r.unit][0] * r.norms
-    return np.array([np.median(v[np.isfinite(v)]) if np.isfinite(v).any() else np.nan for v in norms.T])
+def point_medians(r: Residuals) -> dict[str, float]:
+    """Point -> median residual as shown [px, mm], NaN where it was not seen."""
+    return {name: SHOWN_UNITS[r.unit][0] * known_median(norms) for name, norms in zip(r.names, r.norms.T)}
 
 
-def _point_left_out(r: Residuals) -> NDArray:
-    seen = np.isfinite(r.norms)
-    return np.sum(seen & (np.asarray(r.weights) < OUTLIER_WEIGHT), axis=0) / np.maximum(seen.sum(axis=0), 1)
-
-
-def _told(value: float, unit: str) -> str:
+def told(value: float, unit: str) -> str:
+    """A residual in words."""
     return f"{value:.1f} {unit}" if np.isfinite(value) else "no data"
 
 

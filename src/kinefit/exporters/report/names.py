@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from kinefit.exporters.curves import split_side
+
 DIGITS = {"thumb": "Thumb"} | {digit: f"{digit.capitalize()} finger" for digit in ("index", "middle", "ring", "little")}
 """Digits of a hand, as coordinates and segments begin, in words."""
 
@@ -29,7 +31,6 @@ NAMES = {
 
 def spoken(coordinate: str) -> str:
     """Clinical name of a coordinate, with its side in words: hip_flexion_l becomes "left hip flexion"."""
-    side = {"_l": "left ", "_r": "right "}.get(coordinate[-2:], "")
-    stem = coordinate[:-2] if side else coordinate
+    stem, side = split_side(coordinate)
     name = NAMES.get(stem, stem.replace("_", " "))
-    return side + name[0].lower() + name[1:]
+    return f"{side} {name[0].lower()}{name[1:]}".strip()
