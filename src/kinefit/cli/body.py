@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from kinefit.cli import _screen
-from kinefit.cli._group import CommandGroup
+from kinefit.cli._screen import CommandGroup
 
 _FILE = click.Path(path_type=Path)
 

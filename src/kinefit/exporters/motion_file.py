@@ -1,4 +1,4 @@
-"""Writing the motion file; `kinefit.readers.motion` tells what is in it."""
+"""Writing the files of kinefit's own, which `kinefit.readers.motion` and `kinefit.readers.detections` read."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit.bodies.serial import body_to_arrays, text_array
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import writing
 from kinefit.motion import Motion
-from kinefit.readers.motion import ARRAYS, FORMAT, RESIDUAL_ARRAYS, SURFACE_ARRAYS, VERSION
+from kinefit.observations import Detections
+from kinefit.readers import detections as detections_format
+from kinefit.readers import motion as motion_format
 
 
 @checked
@@ -29,25 +30,16 @@ def write_motion(motion: Motion, path: str | PathLike[str]) -> None:
     ExportError
         The name does not end in .npz, or the file cannot be written.
     """
-    if Path(path).suffix != ".npz":
-        raise ExportError("a motion file ends in .npz", file=path, remedy=f"Call it {Path(path).stem}.npz.")
-    arrays: dict[str, NDArray] = {
-        "format": np.array(FORMAT),
-        "version": np.array(VERSION),
-        "name": np.array(motion.name),
-        "up": np.array(motion.up),
-        "rate": np.array(float(motion.rate)),
-        "provenance": np.array(_json(motion.provenance)),
-    }
-    arrays |= {key: getattr(motion, key) for key in ARRAYS}
-    arrays |= {f"body/{key}": array for key, array in body_to_arrays(motion.body).items()}
+    arrays: dict[str, Any] = {
+        "name": motion.name, "up": motion.up, "rate": float(motion.rate), "provenance": _json(motion.provenance),
+        **{key: getattr(motion, key) for key in motion_format.ARRAYS},
+        **{f"body/{key}": array for key, array in body_to_arrays(motion.body).items()},
+    }  # fmt: skip
     for sensor, residuals in motion.residuals.items():
-        for key in (*RESIDUAL_ARRAYS, *(() if residuals.of_points else SURFACE_ARRAYS)):
+        for key in (*motion_format.RESIDUAL_ARRAYS, *(() if residuals.of_points else motion_format.SURFACE_ARRAYS)):
             value = getattr(residuals, key)
-            array = text_array(value) if key == "names" else np.asarray(value)
-            arrays[f"residuals/{quote(sensor, safe='')}/{key}"] = array
-    with writing(path) as temporary:
-        np.savez_compressed(temporary, **arrays)  # type: ignore[arg-type]
+            arrays[f"residuals/{quote(sensor, safe='')}/{key}"] = text_array(value) if key == "names" else value
+    _write(path, "a motion file", motion_format, arrays)
 
 
 def _json(provenance: Mapping[str, Any]) -> str:
@@ -56,3 +48,29 @@ def _json(provenance: Mapping[str, Any]) -> str:
     except (TypeError, ValueError) as error:
         remedy = "Give numbers, texts, lists and mappings of them."
         raise ExportError(f"a provenance that JSON cannot hold ({error})", remedy=remedy) from error
+
+
+def write_detections(detections: Detections, path: str | PathLike[str], *, key: str = "") -> None:
+    """Write a file that `read_detections` reads, whole or not at all.
+
+    Raises
+    ------
+    ExportError
+        The name does not end in .npz, or the file cannot be written.
+    """
+    arrays: dict[str, Any] = {
+        name: array.astype(np.float32)
+        for name in ("points", "confidence", "lifted", "hands", "hand_confidence", "face", "face_confidence")
+        if (array := getattr(detections, name)) is not None
+    }  # fmt: skip
+    keys = ("camera", "rate", "size", "mask_runs", "mask_starts", *(() if detections.times is None else ("times",)))
+    arrays |= {"key": key, **{name: getattr(detections, name) for name in keys}}
+    _write(path, "a file of detections", detections_format, arrays)
+
+
+def _write(path: str | PathLike[str], kind: str, form: Any, arrays: Mapping[str, Any]) -> None:
+    if Path(path).suffix != ".npz":
+        raise ExportError(f"{kind} ends in .npz", file=path, remedy=f"Call it {Path(path).stem}.npz.")
+    head = {"format": form.FORMAT, "version": form.VERSION}
+    with writing(path) as temporary:
+        np.savez_compressed(temporary, **{key: np.asarray(value) for key, value in (head | arrays).items()})

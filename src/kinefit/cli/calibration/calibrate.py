@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from kinefit.cli import _screen
-from kinefit.cli._group import CommandGroup
+from kinefit.cli._screen import CommandGroup
 
 if TYPE_CHECKING:
     from kinefit.calibration.board.calibrate import BoardCalibration

@@ -25,6 +25,8 @@ MEASURED, OUTLIER, WAY = (255, 240, 60), (255, 40, 40), (255, 90, 220)
 _SAMPLES = np.linspace(0.0, 1.0, 6)[:, None]  # along a bone, which a lens may bend
 _LIMB_WIDTH, _FINGER_WIDTH = 0.022, 0.007  # [m] of a bone as drawn
 _SUBPIXEL_BITS, _MAX_DRAWN_PX = 4, 20000.0  # OpenCV's sub-pixel bits; [px] beyond which nothing is drawn
+_BLOCKS = 4  # over the head: a face is known down to about ten
+_ALL_BLOCKS = 12  # over the longer side of a picture that shows faces one knows not where
 _SKIN_OPACITY = 0.75
 _TO_LIGHT = np.array([-0.36, -0.48, -0.8])  # in the camera's frame
 _DASH_WIDTHS = 3.0  # length of a dash, and of a gap, over the width of its line: its ends are round
@@ -199,3 +201,31 @@ def _dot(image: NDArray, uv: NDArray, radius: float, colour: tuple[int, int, int
     if np.isfinite(uv).all() and (np.abs(uv) < _MAX_DRAWN_PX).all():
         x, y, r = (round(float(v) * (1 << _SUBPIXEL_BITS)) for v in (uv[0], uv[1], radius))
         cv2.circle(image, (x, y), r, colour, thickness, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def hide_circles(image: NDArray[np.uint8], circles: NDArray) -> NDArray[np.uint8]:
+    """A copy of a picture (H, W, 3) uint8 in which nothing can be made out within circles (N, 3) [px] u, v, radius."""
+    out = np.array(image, order="C")
+    classes = np.ceil(np.log2(np.maximum(circles[:, 2], 1.0)))
+    for size in np.unique(classes):  # circles of nearly one radius at once, large ones last
+        mask = np.zeros(image.shape[:2], np.uint8)
+        for u, v, radius in circles[classes == size]:
+            cv2.circle(mask, (round(u), round(v)), max(1, round(radius)), 1, -1)
+        left, top, width, height = cv2.boundingRect(mask)
+        if width and height:
+            part, inside = (a[top : top + height, left : left + width] for a in (out, mask))
+            cv2.copyTo(_coarse(part, 2 * 2**size / _BLOCKS), inside, part)
+    return out
+
+
+def hide_all(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A copy of a picture in which nobody can be recognised."""
+    return _coarse(image, max(image.shape[:2]) / _ALL_BLOCKS)
+
+
+def _coarse(image: NDArray[np.uint8], block: float) -> NDArray[np.uint8]:
+    """The picture in blocks of so many pixels, blended."""
+    height, width = image.shape[:2]
+    few = (max(1, round(width / block)), max(1, round(height / block)))
+    small = cv2.resize(image, few, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)

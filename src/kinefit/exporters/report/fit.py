@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.exporters.report.angles import thinned
 from kinefit.exporters.report.moments import POORLY_SUPPORTED, Moment
-from kinefit.exporters.report.page import SERIES, Html, joined, moment, plot, shaded, table
+from kinefit.exporters.report.page import SERIES, Html, joined, moment, shaded, table
+from kinefit.exporters.report.plots import MAX_CURVE_POINTS, line, mark, stacked, thinned
 from kinefit.findings import runs_of
 from kinefit.motion import SHOWN_UNITS, Motion, Residuals, known_median
 
@@ -103,40 +103,28 @@ def point_table(motion: Motion) -> Html:
 
 def quality_plot(motion: Motion, moments: Sequence[Moment]) -> Html:
     """Quality and every sensor's residual over time, doubtful moments shaded; a click moves the 3D figure."""
-    times, at = motion.times, thinned(motion.quality)
-    mode = "lines" if len(motion) > 2 else "markers"
-    traces: list[dict] = [{
-        "x": times[at], "y": motion.quality[at], "mode": mode, "name": "quality",
-        "line": {"color": "#4d4d4d", "width": 1.8}, "hovertemplate": "quality %{y:.2f}<extra></extra>",
-        "showlegend": False,
-    }]  # fmt: skip
+    times, at, half = motion.times, thinned(motion.quality), 0.5 / motion.rate
+    hover = "quality %{y:.2f}"
+    traces = [line(times[at], motion.quality[at], "quality", "#4d4d4d", 1.8, hover=hover)]
     units = list(dict.fromkeys(r.unit for r in motion.residuals.values()))
     for k, (name, r) in enumerate(motion.residuals.items()):
         factor, unit = SHOWN_UNITS[r.unit]
         level = factor * np.array([known_median(norms) for norms in r.norms])
         known = np.flatnonzero(np.isfinite(level))
-        chosen = np.arange(len(level)) if len(level) <= 1000 or not len(known) else known[thinned(level[known])]
-        traces.append({
-            "x": times[chosen], "y": level[chosen], "mode": mode, "name": name,
-            "line": {"color": SERIES[k % len(SERIES)], "width": 1.4}, "yaxis": f"y{2 + units.index(r.unit)}",
-            "hovertemplate": f"{name} %{{y:.1f}} {unit}<extra></extra>",
-        })  # fmt: skip
-    n = 1 + len(units)
-    height = 170 * n + 80
-    gap = 26 / (170 * n)
-    tall = (1 - gap * (n - 1)) / n
-    layout: dict[str, Any] = {
-        "yaxis": {"title": "quality", "range": [0, 1.03], "domain": [1 - tall, 1.0]},
-        "xaxis": {"title": "time [s]", "anchor": f"y{n}" if n > 1 else "y"},
-        "legend": {"orientation": "h", "x": 0, "y": 1 + 8 / height, "yanchor": "bottom"},
-        "margin": {"l": 56, "r": 12, "t": 46, "b": 42},
-        "shapes": [_shade(m, motion) for m in moments[:100]] + [_level(POORLY_SUPPORTED)],
-    }  # fmt: skip
-    for k, unit in enumerate(units, 1):
-        top = 1 - k * (tall + gap)
-        title = f"residual [{SHOWN_UNITS[unit][1]}]"
-        layout[f"yaxis{k + 1}"] = {"title": title, "rangemode": "tozero", "domain": [max(0.0, top - tall), top]}
-    return plot(traces, layout, height=height, label="quality and residuals over time", seeks=True)
+        at = np.arange(len(level)) if len(level) <= MAX_CURVE_POINTS or not len(known) else known[thinned(level[known])]
+        hover, row = f"{name} %{{y:.1f}} {unit}", 1 + units.index(r.unit)
+        traces.append(
+            line(times[at], level[at], name, SERIES[k % len(SERIES)], 1.4, hover=hover, row=row, legend=True)
+        )
+    axes: list[dict[str, Any]] = [{"title": "quality", "range": [0, 1.03]}]
+    axes += [{"title": f"residual [{SHOWN_UNITS[unit][1]}]", "rangemode": "tozero"} for unit in units]
+    marks: list[dict[str, Any]] = [
+        {"type": "rect", "xref": "x", "yref": "paper", "y0": 0, "y1": 1, "x0": times[m.start] - half,
+         "x1": times[m.stop - 1] + half, "fillcolor": "rgba(224,161,0,0.25)", "line": {"width": 0}, "layer": "below"}
+        for m in moments[:100]
+    ]  # fmt: skip
+    marks.append(mark("y", POORLY_SUPPORTED, "#a87600", 1, "dot"))
+    return stacked(traces, axes, "time [s]", "quality and residuals over time", marks=marks, seeks=True)
 
 
 def _fit(name: str, r: Residuals) -> SensorFit:
@@ -159,17 +147,3 @@ def point_medians(r: Residuals) -> dict[str, float]:
 def told(value: float, unit: str) -> str:
     """A residual in words."""
     return f"{value:.1f} {unit}" if np.isfinite(value) else "no data"
-
-
-def _shade(m: Moment, motion: Motion) -> dict:
-    half = 0.5 / motion.rate
-    return {
-        "type": "rect", "xref": "x", "yref": "paper", "y0": 0, "y1": 1, "x0": motion.times[m.start] - half,
-        "x1": motion.times[m.stop - 1] + half, "fillcolor": "rgba(224,161,0,0.25)",
-        "line": {"width": 0}, "layer": "below",
-    }  # fmt: skip
-
-
-def _level(value: float) -> dict:
-    line = {"color": "#a87600", "width": 1, "dash": "dot"}
-    return {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "yref": "y", "y0": value, "y1": value, "line": line}

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body
 from kinefit.bodies.limbs import finger_groups
-from kinefit.exporters.curves import split_side
+from kinefit.exporters.curves import DIGITS, split_side
 from kinefit.exporters.report.doubt import contradicted, doubtful, end_sigmas, uncertain_throughout
-from kinefit.exporters.report.names import DIGITS
 from kinefit.findings import runs_of
 from kinefit.motion import Motion, Residuals
 
