@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, TaperedCylinder
 from kinefit.bodies.surfaces import Surface
 from kinefit.errors import ExportError
-from kinefit.exporters.skeletons.common import plain_names
+from kinefit.exporters.skeletons.common import euler, numbers, plain_names
 
 PERSON = 75.0  # [kg]
 SHARES = {
@@ -59,7 +59,7 @@ def model(body: Body, root_coordinates: list[str], path: str | PathLike[str]) ->
     for label, s, at in zip(plain_names(points.names), points.segments, points.points):
         marker = ET.SubElement(markers, "Marker", name=label)
         _text(marker, "socket_parent_frame", f"/bodyset/{names[s]}")
-        _text(marker, "location", _numbers(at))
+        _text(marker, "location", at)
         _text(marker, "fixed", "true")
     return out
 
@@ -74,15 +74,15 @@ def _joint(
         coordinates = ET.SubElement(joint, "coordinates")
         for coordinate, _, (low, high) in turns + ways:
             entry = ET.SubElement(coordinates, "Coordinate", name=coordinate)
-            _text(entry, "default_value", _numbers([np.clip(0.0, low, high)]))
-            _text(entry, "range", _numbers([low, high]))
+            _text(entry, "default_value", np.clip(0.0, low, high))
+            _text(entry, "range", [low, high])
             _text(entry, "clamped", "false")
             _text(entry, "locked", "false")
     frames = ET.SubElement(joint, "frames")
     for frame, socket, offset in ((f"{name}_parent", parent, at), (f"{name}_child", f"/bodyset/{child}", np.zeros(3))):
         entry = ET.SubElement(frames, "PhysicalOffsetFrame", name=frame)
         _text(entry, "socket_parent", socket)
-        _text(entry, "translation", _numbers(offset))
+        _text(entry, "translation", offset)
         _text(entry, "orientation", _ZERO)
     if turns or ways:
         transform = ET.SubElement(joint, "SpatialTransform")
@@ -115,7 +115,7 @@ def _three_axes(axes: Sequence[NDArray]) -> NDArray:
 def _transform_axis(transform: ET.Element, name: str, axis: NDArray, coordinate: str | None) -> None:
     entry = ET.SubElement(transform, "TransformAxis", name=name)
     _text(entry, "coordinates", coordinate or "")
-    _text(entry, "axis", _numbers(axis))
+    _text(entry, "axis", axis)
     if coordinate:
         _text(ET.SubElement(entry, "LinearFunction", name="function"), "coefficients", "1 0")
     else:
@@ -129,9 +129,9 @@ def _limits(low: float, high: float) -> tuple[float, float]:
 def _body(name: str, segment: str, surfaces: Sequence[Surface]) -> ET.Element:
     mass, centre, inertia = mass_properties(segment, surfaces)
     out = ET.Element("Body", name=name)
-    _text(out, "mass", _numbers([mass]))
-    _text(out, "mass_center", _numbers(centre))
-    _text(out, "inertia", _numbers([inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]))
+    _text(out, "mass", mass)
+    _text(out, "mass_center", centre)
+    _text(out, "inertia", [inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))])
     components = ET.SubElement(out, "components") if surfaces else out
     for k, surface in enumerate(surfaces):
         middle, R_body_cylinder, length, radii = _rod(surface)
@@ -139,13 +139,13 @@ def _body(name: str, segment: str, surfaces: Sequence[Surface]) -> ET.Element:
         frame = ET.SubElement(components, "PhysicalOffsetFrame", name=f"{label}_axis")
         geometry = ET.SubElement(ET.SubElement(frame, "attached_geometry"), "Cylinder", name=f"{label}_surface")
         radius = float(np.mean(radii))
-        _text(geometry, "radius", _numbers([radius]))
-        _text(geometry, "half_height", _numbers([0.5 * length]))
+        _text(geometry, "radius", radius)
+        _text(geometry, "half_height", 0.5 * length)
         if abs(radii[0] - radii[1]) > 1e-9:
-            _text(geometry, "scale_factors", _numbers([radii[0] / radius, 1.0, radii[1] / radius]))
+            _text(geometry, "scale_factors", [radii[0] / radius, 1.0, radii[1] / radius])
         _text(frame, "socket_parent", "..")
-        _text(frame, "translation", _numbers(middle))
-        _text(frame, "orientation", _numbers(_turns(R_body_cylinder)))
+        _text(frame, "translation", middle)
+        _text(frame, "orientation", euler(R_body_cylinder[None], "xyz"))
     return out
 
 
@@ -165,14 +165,6 @@ def _rod(surface: Surface) -> tuple[NDArray, NDArray, float, NDArray]:
     return middle, R, float(size[0]), 0.5 * size[1:]
 
 
-def _turns(R: NDArray) -> NDArray:
-    """(3,) [rad] turns about x, y, z, each carried along, as OpenSim writes orientations: R = Rx Ry Rz."""
-    y = np.arcsin(np.clip(R[0, 2], -1.0, 1.0))
-    if abs(R[0, 2]) > 1 - 1e-12:
-        return np.array([np.arctan2(R[1, 0], R[1, 1]), y, 0.0])
-    return np.array([np.arctan2(-R[1, 2], R[2, 2]), y, np.arctan2(-R[0, 1], R[0, 0])])
-
-
 def mass_properties(segment: str, surfaces: Sequence[Surface]) -> tuple[float, NDArray, NDArray]:
     """Mass [kg], centre of mass (3,) [m] and inertia (3, 3) [kg m²] about it, of elliptical rods along the surfaces."""
     rods = [_rod(surface) for surface in surfaces] or [(np.array([0.0, 0.025, 0.0]), _EYE, 0.05, np.full(2, 0.02))]
@@ -189,9 +181,6 @@ def mass_properties(segment: str, surfaces: Sequence[Surface]) -> tuple[float, N
     return mass, centre, inertia
 
 
-def _text(parent: ET.Element, tag: str, text: str) -> None:
-    ET.SubElement(parent, tag).text = text
+def _text(parent: ET.Element, tag: str, text: str | ArrayLike) -> None:
+    ET.SubElement(parent, tag).text = text if isinstance(text, str) else numbers(text, ".10g")
 
-
-def _numbers(values: ArrayLike) -> str:
-    return " ".join(f"{float(v) + 0.0:.10g}" for v in np.atleast_1d(np.asarray(values, float)))

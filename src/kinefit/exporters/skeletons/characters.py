@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes, write_lines
-from kinefit.exporters.skeletons.common import euler_zxy
+from kinefit.exporters.skeletons.bvh import bvh_motion
+from kinefit.exporters.skeletons.common import euler
 from kinefit.exporters.skeletons.glb import GltfFile
 from kinefit.exporters.skeletons.retarget import Retargeted, retargeted
 from kinefit.geometry import se3
@@ -115,19 +116,10 @@ def _bvh(motion: Motion, found: Retargeted) -> Iterator[str]:
         if len(set(axes)) not in (0, 3):
             problem = f"joint '{character.names[node]}' turns about {len(set(axes))} axes, not three"
             raise ExportError(problem, file=character.path, remedy="Export the character again, for animation.")
-        angles = iter(_euler(found.rotations[:, node], axes).T if axes else ())
+        angles = iter(euler(found.rotations[:, node], axes).T if axes else ())
         columns += [
             np.degrees(next(angles)) if name.endswith("rotation") else place[:, "xyz".index(name[0])] for name in names
         ]  # fmt: skip
     yield from head.rstrip().splitlines()
-    yield from ("MOTION", f"Frames: {len(motion)}", f"Frame Time: {1.0 / motion.rate:.9f}")
-    table = np.stack(columns, axis=1) + 0.0
-    row = " ".join(["%.8f"] * table.shape[1])
-    yield from (row % tuple(values) for values in table.tolist())
+    yield from bvh_motion(motion, [np.stack(columns, axis=1)])
 
-
-def _euler(rotations: NDArray, axes: str) -> NDArray:
-    """(F, 3) [rad] angles about three different axes in this order, without jumps, of rotations (F, 3, 3)."""
-    i, j, k = ("xyz".index(axis) for axis in axes)
-    as_zxy = rotations[:, [[j], [k], [i]], [j, k, i]]  # axes renamed; where that mirrors, turns go the other way
-    return euler_zxy(as_zxy) * (1.0 if (j - i) % 3 == 1 else -1.0)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes
-from kinefit.exporters.skeletons.common import bone_names, plain_names, slides
+from kinefit.exporters.skeletons.common import bone_names, moving_segments, plain_names
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
 from kinefit.motion import Motion
 from kinefit.rendering.tubes import TubeMesh, body_mesh
@@ -138,10 +138,10 @@ def _add_skin(file: GltfFile, mesh: TubeMesh, pose: Rest) -> None:
 
 
 def _courses(motion: Motion, pose: Rest) -> Iterator[tuple[int, str, NDArray]]:
-    tree, moving = motion.body.tree, slides(motion.body)
+    tree, moving = motion.body.tree, moving_segments(motion.body)
     turns, places = pose.local_moves(motion, "y")
     turning = np.zeros(len(tree.segments), bool)
-    turning[tree.owners[~tree.prismatic]] = turning[0] = moving[0] = True
+    turning[tree.owners[~tree.prismatic]] = turning[0] = True
     for s in range(len(tree.segments)):
         if turning[s]:
             yield s, "rotation", turns[:, s]
