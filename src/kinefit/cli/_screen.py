@@ -9,7 +9,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
@@ -122,6 +122,20 @@ def print_json(result: Mapping[str, Any]) -> None:
     import json
 
     click.echo(json.dumps(result, indent=2, ensure_ascii=False))
+
+
+def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], *, title: str = "") -> None:
+    """Print rows of cells below their heads; with a title in a frame, numbers at the right."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    framed = {"title": escape(title), "title_justify": "left"}
+    table = Table(**(framed if title else {"box": None, "pad_edge": False}))  # type: ignore[arg-type]
+    for k, head in enumerate(heads):
+        table.add_column(escape(head), justify="right" if title and k else "left", no_wrap=bool(title and not k))
+    for row in rows:
+        table.add_row(*map(escape, row))
+    console().print(table)
 
 
 def say(text: str = "", *, style: str = "", stderr: bool = False) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kinefit.batch.results import DESCRIPTIONS
-from kinefit.cli._screen import console, say
+from kinefit.cli._screen import print_table, say
 from kinefit.findings import frame_ranges
 
 if TYPE_CHECKING:
@@ -22,18 +22,17 @@ MOMENTS = 5  # doubtful moments that are listed, the worst first
 
 def print_summary(motion: Motion, *, points: bool = False) -> None:
     """Print it; with `points`, the residual of every point in every camera too."""
-    from rich.table import Table
-
     from kinefit.exporters.report.fit import sensor_fits, told
     from kinefit.exporters.report.moments import doubt_sentence, doubtful_moments, throughout_sentence, when
 
     seconds = len(motion) / motion.rate
     say(f"\n{motion.name}: {len(motion)} frames at {motion.rate:g} Hz ({seconds:.2f} s), body {motion.body.name}")
-    table = Table("sensor", "median residual", "rejected points", "left/right swaps", box=None, pad_edge=False)
-    for f in sensor_fits(motion):
-        table.add_row(f.name, told(f.median, f.unit), f"{100 * f.left_out:.1f} %", f"{f.swapped} frames")
     if motion.residuals:
-        console().print(table)
+        rows = [
+            (f.name, told(f.median, f.unit), f"{100 * f.left_out:.1f} %", f"{f.swapped} frames")
+            for f in sensor_fits(motion)
+        ]
+        print_table(("sensor", "median residual", "rejected points", "left/right swaps"), rows)
     worst = int(np.argmin(motion.quality))
     say(f"quality: {motion.quality.mean():.2f} of 1 on average, lowest {motion.quality[worst]:.2f} in frame {worst}")
     moments = doubtful_moments(motion)
@@ -138,15 +137,14 @@ def _median_of(r: Residuals) -> float | None:
 
 
 def _print_points(motion: Motion) -> None:
-    from rich.table import Table
-
     from kinefit.exporters.report.fit import point_medians
     from kinefit.motion import SHOWN_UNITS
 
     names = list(dict.fromkeys(name for r in motion.residuals.values() for name in r.names))
-    table = Table("median residual of", *motion.residuals, box=None, pad_edge=False)
     medians = [(point_medians(r), SHOWN_UNITS[r.unit][1]) for r in motion.residuals.values()]
-    for name in names:
-        table.add_row(name, *(f"{of[name]:.1f} {unit}" if of.get(name, np.nan) >= 0 else "-" for of, unit in medians))
+    rows = [
+        (name, *(f"{of[name]:.1f} {unit}" if of.get(name, np.nan) >= 0 else "-" for of, unit in medians))
+        for name in names
+    ]
     say()
-    console().print(table)
+    print_table(("median residual of", *motion.residuals), rows)

@@ -191,12 +191,17 @@ def looked_at(cameras: Sequence[Camera]) -> NDArray:
 
 def angle_line(motion: Motion, coordinate: str, frame: int) -> str:
     """Words for one coordinate in one frame, with twice its standard deviation: "knee_angle_r 34.2° ± 3.1°"."""
+    values, spreads, unit = angle_course(motion, coordinate)
+    digits = 1 if unit == "°" else 0
+    spread = f"± {spreads[frame]:.{digits}f}{unit}" if np.isfinite(spreads[frame]) else "(not observed)"
+    return f"{coordinate} {values[frame]:.{digits}f}{unit} {spread}"
+
+
+def angle_course(motion: Motion, coordinate: str) -> tuple[NDArray, NDArray, str]:
+    """(F,) values and twice their standard deviations of a coordinate in "°", of a sliding one in " mm"."""
     d = motion.body.tree.coordinates.index(coordinate)
-    turn = not motion.body.tree.prismatic[d]
-    value, std = motion.angles[frame, d], motion.dof_std[frame, 6 + d]
-    scale, unit, digits = (180 / np.pi, "°", 1) if turn else (1000.0, " mm", 0)
-    spread = f"± {2 * scale * std:.{digits}f}{unit}" if np.isfinite(std) else "(not observed)"
-    return f"{coordinate} {scale * value:.{digits}f}{unit} {spread}"
+    scale, unit = (1000.0, " mm") if motion.body.tree.prismatic[d] else (180 / np.pi, "°")
+    return scale * motion.angles[:, d], 2 * scale * motion.dof_std[:, 6 + d], unit
 
 
 def as_markdown(name: str) -> str:

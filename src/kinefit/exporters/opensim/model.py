@@ -158,9 +158,7 @@ def _rod(surface: Surface) -> tuple[NDArray, NDArray, float, NDArray]:
         a, b, axis = surface.axes
         middle = 0.5 * np.add(surface.start, surface.end)
         return middle, np.stack([a, axis, -b], axis=1), surface.length, np.mean(surface.radii, axis=0)
-    middle = surface.vertices.mean(axis=0)
-    _, _, axes = np.linalg.svd(surface.vertices - middle, full_matrices=False)
-    size = np.ptp((surface.vertices - middle) @ axes.T, axis=0)
+    middle, axes, size = surface.box()
     R = np.stack([axes[1], axes[0], np.cross(axes[1], axes[0])], axis=1)
     return middle, R, float(size[0]), 0.5 * size[1:]
 

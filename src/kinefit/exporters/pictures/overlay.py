@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kinefit._threads import ahead
 from kinefit.errors import ExportError
-from kinefit.exporters.atomic import write_bytes, writing
+from kinefit.exporters.atomic import write_image, writing
 from kinefit.exporters.pictures.drawing import WHITE, draw_body, draw_residuals, draw_skin, write_lines
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
@@ -171,11 +171,7 @@ def write_montage(
     for image in images.values():
         size = (max(1, round(image.shape[1] * height / image.shape[0])), height)
         row += [np.full((height, gap, 3), 255, np.uint8), cv2.resize(image, size, interpolation=cv2.INTER_AREA)]
-    suffix = ".jpg" if str(path).lower().endswith((".jpg", ".jpeg")) else ".png"
-    written, data = cv2.imencode(suffix, cv2.cvtColor(np.concatenate(row[1:], axis=1), cv2.COLOR_RGB2BGR))
-    if not written:
-        raise ExportError("the image cannot be encoded", file=path, remedy="Give a name that ends in .png.")
-    write_bytes(path, data.tobytes())
+    write_image(path, np.concatenate(row[1:], axis=1)[..., ::-1])
 
 
 def _told(residuals: Residuals, frame: int) -> str:
