@@ -71,6 +71,6 @@ def write_detections(detections: Detections, path: str | PathLike[str], *, key: 
 def _write(path: str | PathLike[str], kind: str, form: Any, arrays: Mapping[str, Any]) -> None:
     if Path(path).suffix != ".npz":
         raise ExportError(f"{kind} ends in .npz", file=path, remedy=f"Call it {Path(path).stem}.npz.")
-    head = {"format": form.FORMAT, "version": form.VERSION}
+    whole = {"format": form.FORMAT, "version": form.VERSION, **arrays}
     with writing(path) as temporary:
-        np.savez_compressed(temporary, **{key: np.asarray(value) for key, value in (head | arrays).items()})
+        np.savez_compressed(temporary, **{key: np.asarray(value) for key, value in whole.items()})  # type: ignore[arg-type]

@@ -1,9 +1,9 @@
-"""A recording as a moving 3D scene: motions, cameras with their pictures, rays, markers, frame by frame."""
+"""A recording as a moving 3D scene, frame by frame in a server, or as one page that needs none."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from kinefit.motion import Motion, known_median, nearest_frame
 from kinefit.observations import Markers
 from kinefit.viewers import figure, scene, stage
 from kinefit.viewers.pictures import CameraImages
+from kinefit.viewers.stage import POLICY, open_server, quiet
 
 if TYPE_CHECKING:
     import viser
@@ -296,3 +297,44 @@ def _without_strays(x: NDArray) -> NDArray:
         return x
     distance = np.linalg.norm(x - np.median(x, axis=0), axis=1)
     return x[distance <= 5.0 * np.median(distance) + 1e-9]
+
+
+MOST_FRAMES, MOST_PICTURES = 600, 240
+"""Frames and camera pictures that a page holds at most, so that it stays below 10 MB and loads at once."""
+
+
+def page(recording: ViewerContent, *, choice: Choice = Choice()) -> tuple[str, int]:
+    """The scene with its animation as one self-contained HTML text, and the number of frames in it.
+
+    Longer recordings are thinned out evenly to `MOST_FRAMES`; the cameras' pictures change as often as `MOST_PICTURES`
+    allow.
+
+    Raises
+    ------
+    ExportError
+        viser is missing.
+    """
+    frames = chosen_frames(len(recording.times), MOST_FRAMES)
+    with_pictures = chosen_frames(len(frames), max(1, MOST_PICTURES // max(len(recording.rig or ()), 1)))
+    server = open_server(0)
+    try:
+        show = Show(server, recording)
+        choice = replace(choice, follow=choice.follow or show.stage.goes_far)
+        show.frame(0, choice)
+        for fig in show.figures:
+            fig.blank()
+        serializer = server.get_scene_serializer()
+        for k, i in enumerate(frames):
+            show.frame(int(i), choice, pictures=k in with_pictures)
+            step = frames[k + 1] - i if k + 1 < len(frames) else 1
+            serializer.insert_sleep(float(step) / recording.rate)
+        policy = f'<head><meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+        return serializer.as_html().replace("<head>", policy, 1), len(frames)
+    finally:
+        with quiet():
+            server.stop()
+
+
+def chosen_frames(count: int, most: int) -> NDArray:
+    """At most `most` of `count` frames, evenly: every first, second, third ... one."""
+    return np.arange(0, count, max(1, -(-count // most)))

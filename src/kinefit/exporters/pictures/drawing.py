@@ -72,7 +72,7 @@ def draw_bones(image: NDArray, motion: Motion, frame: int, camera: Camera, image
         draw_line(image, uv[b], DARK, width + 2 * edge, dash)
         draw_line(image, uv[b], LOST_COLOUR if lost else colours[b], width, dash)
     for b in np.flatnonzero(~motion.lost[frame, list(owners)]):
-        _dot(image, uv[b, 0], 0.36 * thick[b], WHITE, -1)
+        draw_dot(image, uv[b, 0], 0.36 * thick[b], WHITE, -1)
 
 
 @lru_cache(maxsize=8)
@@ -162,8 +162,8 @@ def draw_residuals(image: NDArray, residuals: Residuals, frame: int, image_frame
                 draw_line(image, np.stack([measured[k] - step, measured[k] + step]), DARK, thin + 2)
                 draw_line(image, np.stack([measured[k] - step, measured[k] + step]), OUTLIER, thin)
         else:
-            _dot(image, measured[k], size, DARK, thin + 2)
-            _dot(image, measured[k], size, MEASURED, thin)
+            draw_dot(image, measured[k], size, DARK, thin + 2)
+            draw_dot(image, measured[k], size, MEASURED, thin)
 
 
 def write_lines(image: NDArray, lines: Sequence[tuple[str, tuple[int, int, int]]]) -> None:
@@ -197,7 +197,8 @@ def _dashes(uv: NDArray, length: float) -> list[NDArray]:
     return [samples[k : k + 3] for k in range(0, len(samples) - 1, 4)]
 
 
-def _dot(image: NDArray, uv: NDArray, radius: float, colour: tuple[int, int, int], thickness: int) -> None:
+def draw_dot(image: NDArray, uv: NDArray, radius: float, colour: tuple[int, int, int], thickness: int) -> None:
+    """Draw a circle about a pixel (2,), filled with a thickness of -1; none where it is not finite."""
     if np.isfinite(uv).all() and (np.abs(uv) < _MAX_DRAWN_PX).all():
         x, y, r = (round(float(v) * (1 << _SUBPIXEL_BITS)) for v in (uv[0], uv[1], radius))
         cv2.circle(image, (x, y), r, colour, thickness, cv2.LINE_AA, _SUBPIXEL_BITS)

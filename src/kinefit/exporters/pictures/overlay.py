@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from fractions import Fraction
+from itertools import count
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import av
@@ -97,7 +100,7 @@ def write_pictures(
     ExportError
         The file cannot be written.
     """
-    with writing(path) as temporary, _encoder(path, temporary, rate, *size) as encode:
+    with writing(path) as temporary, _encoder(path, temporary, rate, size) as encode:
         for done, image in enumerate(ahead(pictures), start=1):
             encode(image, None if times is None else float(times[done - 1] - times[0]))
             if progress:
@@ -196,44 +199,35 @@ def _notes(motion: Motion, residuals: Residuals | None, frame: int) -> list[str]
     return notes
 
 
-class _encoder:
-    """Context that gives a function to encode one picture (H, W, 3) after the other, each with its time [s] or None."""
+@contextmanager
+def _encoder(
+    path: str | PathLike[str], temporary: Path, rate: float, size: tuple[int, int]
+) -> Iterator[Callable[[NDArray, float | None], None]]:
+    """Give a function that encodes one picture (H, W, 3) after the other, each with its time [s] or None."""
+    codec = next((name for name in _CODECS if name in av.codecs_available), None)
+    if codec is None:
+        raise ExportError(f"FFmpeg has none of the codecs {', '.join(_CODECS)}", file=path)
+    exact, numbers = Fraction(rate).limit_denominator(10000), count()
+    container = _told_by_system(av.open, str(temporary), "w")
+    stream = container.add_stream(codec, rate=exact, options=_CODECS[codec])
+    (stream.width, stream.height), stream.pix_fmt, stream.codec_context.time_base = size, "yuv420p", _TICK
 
-    def __init__(self, path: Any, temporary: Any, rate: float, width: int, height: int) -> None:
-        self.path, self.temporary = path, temporary
-        self.codec = next((name for name in _CODECS if name in av.codecs_available), None)
-        self.rate, self.size = Fraction(rate).limit_denominator(10000), (width, height)
-        self.container: Any = None
-        self.done = 0
-
-    def __enter__(self) -> Callable[[NDArray, float | None], None]:
-        if self.codec is None:
-            raise ExportError(f"FFmpeg has none of the codecs {', '.join(_CODECS)}", file=self.path)
-        self.container = _told_by_system(av.open, str(self.temporary), "w")
-        self.stream = self.container.add_stream(self.codec, rate=self.rate, options=_CODECS[self.codec])
-        self.stream.width, self.stream.height = self.size
-        self.stream.pix_fmt = "yuv420p"
-        self.stream.codec_context.time_base = _TICK
-        return self._encode
-
-    def _encode(self, image: NDArray, time: float | None) -> None:
+    def encode(image: NDArray, time: float | None) -> None:
         planes = cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420)  # four times as fast as FFmpeg's
-        frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
-        frame.time_base, frame.pts = _TICK, round((self.done / self.rate if time is None else time) / _TICK)
-        self.done += 1
-        for packet in self.stream.encode(frame):
-            _told_by_system(self.container.mux, packet)
+        frame, number = av.VideoFrame.from_ndarray(planes, format="yuv420p"), next(numbers)
+        frame.time_base, frame.pts = _TICK, round((number / exact if time is None else time) / _TICK)
+        for packet in stream.encode(frame):
+            _told_by_system(container.mux, packet)
 
-    def __exit__(self, kind: Any, error: Any, at: Any) -> None:
-        if kind is not None:
-            try:
-                self.container.close()
-            except (av.FFmpegError, OSError, ValueError):
-                pass  # the first error is the one to tell
-            return
-        for packet in self.stream.encode():
-            _told_by_system(self.container.mux, packet)
-        _told_by_system(self.container.close)
+    try:
+        yield encode
+    except BaseException:
+        with suppress(av.FFmpegError, OSError, ValueError):  # the first error is the one to tell
+            container.close()
+        raise
+    for packet in stream.encode():
+        _told_by_system(container.mux, packet)
+    _told_by_system(container.close)
 
 
 def _told_by_system(call: Callable, *args: Any) -> Any:

@@ -68,8 +68,8 @@ def cycle_plots(motion: Motion, cycles: Cycles, norms: Norms | None = None) -> d
             if not usable:
                 continue
             wanted = dict.fromkeys((*(c.name for c in usable), stem))
-            for name in wanted if norms else ():
-                traces += band(*norms[name].T, "norm", _GREY, len(shown)) if name in norms else []
+            for percent, mean, sd in (norms[name].T for name in wanted if norms and name in norms):
+                traces += band(percent, mean, sd, "norm", _GREY, len(shown))
             for curve in usable:
                 side = curve.side if curve.side in spans else other
                 values = normalised(curve.values, spans[side])
