@@ -195,7 +195,7 @@ def _caliscope(folder: Path) -> Seed:
 
 
 def _detections(folder: Path) -> Seed:
-    from kinefit.exporters.pictures.detections import write_detections
+    from kinefit.exporters.motion_file import write_detections
     from kinefit.observations import Detections
     from kinefit.readers.detections import detections_key, read_detections
 

@@ -173,7 +173,7 @@ def _bar(folder: Path) -> Seed:
 
 
 def _norms(folder: Path) -> Seed:
-    from kinefit.exporters.report.norms import read_norms
+    from kinefit.exporters.report.cycles import read_norms
 
     _norms_table(folder / "norms.csv")
     return Seed((folder / "norms.csv",), lambda: read_norms(folder / "norms.csv"))

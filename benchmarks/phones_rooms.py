@@ -26,7 +26,7 @@ from kinefit import Keypoints, Motion, find_cameras, track_take
 from kinefit.calibration.people.of_take import cameras_file
 from kinefit.errors import KinefitError
 from kinefit.evaluation import angle_errors
-from kinefit.exporters.pictures.detections import write_detections
+from kinefit.exporters.motion_file import write_detections
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import Detections

@@ -32,6 +32,12 @@ _FRAMES_PER_BLOCK = 2000  # frames of which all segments' poses are made at once
 ARRAYS = "times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality"
 """Of a motion, one entry a frame each."""
 
+SHOWN_UNITS = {"px": (1.0, "px"), "m": (1000.0, "mm")}
+"""Unit of residuals -> the factor and the unit in which they are shown."""
+
+OUTLIER_WEIGHT = 0.05
+"""Robust weight below which a measurement had no say."""
+
 
 
 def rotation_between_up(source: str, target: str) -> NDArray:
@@ -89,11 +95,30 @@ class Residuals:
         """(F, K) length of each residual, NaN where unseen."""
         return np.linalg.norm(self.values, axis=-1)
 
+    @property
+    def rejected(self) -> NDArray:
+        """(F, K) bool: points that were seen, but are outliers."""
+        return np.isfinite(self.norms) & (np.asarray(self.weights) < OUTLIER_WEIGHT)
 
-def _middle(r: Residuals) -> str:
-    seen = r.norms[np.isfinite(r.norms)]
-    factor, unit = (1000.0, "mm") if r.unit == "m" else (1.0, "px")
-    return f"{factor * np.median(seen):.1f} {unit}" if len(seen) else "nothing seen"
+    def median_text(self, norms: NDArray | None = None) -> str:
+        """The median of lengths (N,), by default all, in words: "2.1 px", "no data"."""
+        factor, unit = SHOWN_UNITS[self.unit]
+        median = factor * known_median(self.norms if norms is None else norms)
+        return f"{median:.1f} {unit}" if np.isfinite(median) else "no data"
+
+
+def known_median(values: NDArray) -> float:
+    """Median of what is finite, NaN where nothing is."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else np.nan
+
+
+def nearest_frame(times: NDArray, time: float, rate: float) -> int | None:
+    """Frame nearest to a time [s], of frames at `times` (F,) [s]; None where there is none within one frame."""
+    if not len(times):
+        return None
+    frame = int(np.argmin(np.abs(times - time)))
+    return frame if abs(times[frame] - time) < 1.0 / rate else None
 
 
 def _turned_std(std: NDArray, R: NDArray, rays: NDArray | None = None) -> NDArray:
@@ -187,7 +212,7 @@ class Motion:
         """Five lines that tell what it is."""
         tree, worst = self.body.tree, int(np.argmin(self.quality)) if len(self) else 0
         stature = f", {self.body.stature:.2f} m tall" if self.body.stature else ""
-        parts = [f"{name} ({_middle(r)})" for name, r in self.residuals.items()]
+        parts = [f"{name} ({r.median_text()})" for name, r in self.residuals.items()]
         sensors = ", ".join(parts[:6]) + (f" and {len(parts) - 6} more" if len(parts) > 6 else "")
         quality = f"{self.quality.mean():.2f} of 1 on average, lowest {self.quality[worst]:.2f} in frame {worst}"
         return [
@@ -203,6 +228,10 @@ class Motion:
         for start in range(0, max(len(self), 1), frames):
             arrays = {name: getattr(self, name)[start : start + frames] for name in ARRAYS}
             yield replace(self, residuals={}, **arrays)
+
+    def frame_at(self, time: float) -> int | None:
+        """Frame nearest to a time [s], None where there is none within one frame."""
+        return nearest_frame(self.times, time, self.rate)
 
     def state(self, frame: int) -> BodyState:
         """State of the body in one frame."""

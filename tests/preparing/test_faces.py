@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from kinefit.cli import main
-from kinefit.exporters.pictures.privacy import hide_all
+from kinefit.exporters.pictures.drawing import hide_all
 from kinefit.geometry.camera import ImageFrame
 from kinefit.observations import Keypoints
 from kinefit.preparing import faces

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import TakeError
-from kinefit.exporters.pictures.detections import write_detections
+from kinefit.exporters.motion_file import write_detections
 from kinefit.observations import Detections
 from kinefit.preparing import detecting, faces
 from kinefit.preparing.ingest import FOLDER, hide_in_copies

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ExportError, FileError, ObservationError
-from kinefit.exporters.pictures.detections import write_detections
+from kinefit.exporters.motion_file import write_detections
 from kinefit.observations import Detections
 from kinefit.readers.detections import detections_file, detections_key, read_detections
 

@@ -6,8 +6,9 @@ from tests.exporters.synthetic import a_camera, smooth_motion
 
 from kinefit.bodies import load_body
 from kinefit.geometry import se3
+from kinefit.motion import OUTLIER_WEIGHT, nearest_frame
 from kinefit.rendering import colours
-from kinefit.viewers import player, scene, show
+from kinefit.viewers import player, scene
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +90,7 @@ def test_rays_pass_through_what_was_measured_and_end_at_what_was_fitted(motion):
     assert np.allclose(camera.project(ways[:, 1]), residuals.measured[f, seen], atol=1e-6)
     assert np.allclose(rests[:, 0], ways[:, 1]) and np.allclose(rests[:, 1], x[seen])
     assert np.allclose(np.sum((rests[:, 1] - rests[:, 0]) * (ways[:, 1] - ways[:, 0]), axis=1), 0, atol=1e-9)
-    left_out = weights[seen] < scene.OUTLIER_WEIGHT
+    left_out = weights[seen] < OUTLIER_WEIGHT
     red = np.all(rays.colours[: len(seen), 0] == scene.OUTLIER, axis=-1)
     assert left_out.any() and np.array_equal(red, left_out)
 
@@ -167,8 +168,8 @@ def test_the_clock_runs_in_a_loop():
 
 def test_the_nearest_frame_is_within_one():
     times = np.arange(5) / 10 + 2
-    assert [show.nearest(times, t, 10.0) for t in (1.95, 2.04, 2.06, 2.45, 2.6, 0.0)] == [0, 0, 1, 4, None, None]
-    assert show.nearest(np.zeros(0), 0.0, 10.0) is None
+    assert [nearest_frame(times, t, 10.0) for t in (1.95, 2.04, 2.06, 2.45, 2.6, 0.0)] == [0, 0, 1, 4, None, None]
+    assert nearest_frame(np.zeros(0), 0.0, 10.0) is None
 
 
 def test_names_are_text_in_markdown():

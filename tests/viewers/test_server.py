@@ -26,8 +26,7 @@ from kinefit.rendering.colours import LEFT_COLOUR, LOST_COLOUR, RIGHT_COLOUR
 from kinefit.serving.access import Access
 from kinefit.simulation import cut
 from kinefit.viewers import CameraImages, Choice, Player, View, ViewerContent, page
-from kinefit.viewers.page import MOST_FRAMES, chosen_frames
-from kinefit.viewers.show import ALL_CAMERAS, CYLINDERS, Show
+from kinefit.viewers.show import ALL_CAMERAS, CYLINDERS, MOST_FRAMES, Show, chosen_frames
 from kinefit.viewers.stage import free_port, open_server, quiet
 
 ACCESS = Access()

@@ -34,7 +34,7 @@ def write_track_report(
     notes : sentences for the user
     """
     from kinefit.batch.results import DESCRIPTIONS
-    from kinefit.exporters.report.norms import read_norms
+    from kinefit.exporters.report.cycles import read_norms
     from kinefit.exporters.report.report import write_report
 
     norms = read_norms(take.session.norms) if take.session.norms else None
@@ -56,7 +56,7 @@ def take_pictures(
     Frames outside a camera's video are omitted.
     """
     from kinefit.batch.results import _residuals
-    from kinefit.exporters.report.pictures import close_up, report_frames
+    from kinefit.exporters.report.flagged import close_up, report_frames
     from kinefit.preparing.faces import shown_video
 
     out: dict[str, dict[int, NDArray[np.uint8]]] = {}

@@ -92,7 +92,7 @@ def write_overlays(
     import numpy as np
 
     from kinefit.exporters import depth_picture, draw_overlay, write_depth_overlay, write_montage, write_overlay
-    from kinefit.exporters.pictures.overlay import frames_of, nearest_frame
+    from kinefit.exporters.pictures.overlay import frames_of
     from kinefit.preparing.faces import shown_video
 
     if not (seen.videos or seen.depth) or seen.rig is None:
@@ -103,7 +103,7 @@ def write_overlays(
         given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name), "skin": skin}
         with shown_video(take, seen, name) as colour:
             shown = colour.frame_at(float(np.clip(middle - offset, 0.0, colour.times[-1]))) or 0
-            at = nearest_frame(motion, colour.times[shown] + offset)
+            at = motion.frame_at(colour.times[shown] + offset)
             pictures[name] = draw_overlay(colour.read(shown), motion, at, seen.rig[name], **given)
             bar, count = f"overlay {name}", len(frames_of(motion, colour.times + offset))
             step(bar, 0, count)
@@ -114,7 +114,7 @@ def write_overlays(
         files["overlays"] = folder / "overlays"
     for video in seen.depth:
         camera, shown = seen.rig[video.sensor], video.nearest(float(middle))
-        at = nearest_frame(motion, float(video.times[shown]))
+        at = motion.frame_at(float(video.times[shown]))
         pictures[video.sensor] = depth_picture(video.frame(shown).depth, motion, at, camera, label=video.sensor)
         bar, count = f"overlay {video.sensor}", len(frames_of(motion, video.times))
         step(bar, 0, count)

@@ -71,7 +71,7 @@ def summary_page(rows: Sequence[Row], folder: Path) -> str:
 
 def fault_boxes(rows: Iterable[Row]) -> list[Html]:
     """A callout for each fault of the inputs, with its take and person."""
-    from kinefit.exporters.report.findings import finding_callout
+    from kinefit.exporters.report.page import finding_callout
 
     return [
         finding_callout(found, f"{row.take}{f', person {row.person}' if row.person else ''}")
@@ -115,8 +115,8 @@ def outcome(row: Row) -> tuple[str, ...]:
 
 def by_joint(rows: Sequence[Row]) -> Html:
     """A menu of coordinates, each with tables of ranges by take, and by subject and session."""
+    from kinefit.exporters.curves import spoken
     from kinefit.exporters.report import page as p
-    from kinefit.exporters.report.names import spoken
 
     names = list(dict.fromkeys(r.coordinate for row in rows for r in row.ranges))
     pages = {}

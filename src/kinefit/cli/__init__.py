@@ -18,7 +18,7 @@ import click
 from kinefit import __version__
 from kinefit._processes import environment
 from kinefit.cli import _screen
-from kinefit.cli._group import CommandGroup
+from kinefit.cli._screen import CommandGroup
 from kinefit.errors import KinefitError
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: its threads only wait for each other here

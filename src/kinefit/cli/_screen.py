@@ -9,8 +9,9 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -121,6 +122,20 @@ def print_json(result: Mapping[str, Any]) -> None:
     import json
 
     click.echo(json.dumps(result, indent=2, ensure_ascii=False))
+
+
+def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]], *, title: str = "") -> None:
+    """Print rows of cells below their heads; with a title in a frame, numbers at the right."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    framed = {"title": escape(title), "title_justify": "left"}
+    table = Table(**(framed if title else {"box": None, "pad_edge": False}))  # type: ignore[arg-type]
+    for k, head in enumerate(heads):
+        table.add_column(escape(head), justify="right" if title and k else "left", no_wrap=bool(title and not k))
+    for row in rows:
+        table.add_row(*map(escape, row))
+    console().print(table)
 
 
 def say(text: str = "", *, style: str = "", stderr: bool = False) -> None:
@@ -243,3 +258,18 @@ def _step_events() -> Step:
             _emit("step", what=what, done=done, total=total)
 
     return step
+
+
+class CommandGroup(click.Group):
+    """A group whose commands are named where none is of the name given."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command of a name; an error suggests the nearest one where there is none."""
+        names = self.list_commands(ctx)
+        if args and args[0] not in names and not args[0].startswith("-"):
+            near = get_close_matches(args[0].lower(), names, n=1, cutoff=0.5)
+            hint = f" Did you mean '{near[0]}'?" if near else f" There are: {', '.join(names)}."
+            raise click.UsageError(f"No such command '{args[0]}'.{hint}", ctx)
+        return super().resolve_command(ctx, args)

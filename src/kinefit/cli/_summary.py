@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kinefit.batch.results import DESCRIPTIONS
-from kinefit.cli._screen import console, say
+from kinefit.cli._screen import print_table, say
 from kinefit.findings import frame_ranges
 
 if TYPE_CHECKING:
@@ -18,22 +18,21 @@ if TYPE_CHECKING:
     from kinefit.motion import Motion, Residuals
 
 MOMENTS = 5  # doubtful moments that are listed, the worst first
-_UNITS = {"px": (1.0, "px"), "m": (1000.0, "mm")}
 
 
 def print_summary(motion: Motion, *, points: bool = False) -> None:
     """Print it; with `points`, the residual of every point in every camera too."""
-    from rich.table import Table
-
+    from kinefit.exporters.report.fit import sensor_fits, told
     from kinefit.exporters.report.moments import doubt_sentence, doubtful_moments, throughout_sentence, when
 
     seconds = len(motion) / motion.rate
     say(f"\n{motion.name}: {len(motion)} frames at {motion.rate:g} Hz ({seconds:.2f} s), body {motion.body.name}")
-    table = Table("sensor", "median residual", "rejected points", "left/right swaps", box=None, pad_edge=False)
-    for name, r in motion.residuals.items():
-        table.add_row(name, _median(r), f"{100 * _left_out(r):.1f} %", f"{int(r.swapped.sum())} frames")
     if motion.residuals:
-        console().print(table)
+        rows = [
+            (f.name, told(f.median, f.unit), f"{100 * f.left_out:.1f} %", f"{f.swapped} frames")
+            for f in sensor_fits(motion)
+        ]
+        print_table(("sensor", "median residual", "rejected points", "left/right swaps"), rows)
     worst = int(np.argmin(motion.quality))
     say(f"quality: {motion.quality.mean():.2f} of 1 on average, lowest {motion.quality[worst]:.2f} in frame {worst}")
     moments = doubtful_moments(motion)
@@ -123,46 +122,29 @@ def without_markers(motion: Motion) -> dict[str, NDArray]:
 
 def bone_lengths(motion: Motion) -> dict[str, str]:
     """Distances [cm] from joint to joint, one for left and right where they are alike."""
-    body = motion.body
-    found: dict[str, dict[str, None]] = {}
-    for child, parent in enumerate(body.tree.parents):
-        length = float(np.linalg.norm(body.tree.offsets[child]))
-        if parent >= 0 and length > 1e-6:
-            ends = (body.joints[parent].removeprefix("ground_"), body.joints[child])
-            name = " to ".join(e[:-2] if e.endswith(("_l", "_r")) else e for e in ends)
-            found.setdefault(name, {})[f"{100 * length:.1f}"] = None
-    return {name: "/".join(values) for name, values in found.items()}
+    from kinefit.exporters.report.methods import joint_distances
 
-
-def _median(r: Residuals) -> str:
-    (factor, unit), median = _UNITS[r.unit], _median_of(r)
-    return "no points" if median is None else f"{factor * median:.1f} {unit}"
+    found = joint_distances(motion.body)
+    return {name: "/".join(dict.fromkeys(f"{cm:.1f}" for cm, _ in of.values())) for name, of in found.items()}
 
 
 def _median_of(r: Residuals) -> float | None:
     """Median length of the residuals, in their unit; None where no point was seen."""
-    seen = np.isfinite(r.norms)
-    return float(np.median(r.norms[seen])) if seen.any() else None
+    from kinefit.motion import known_median
 
-
-def _left_out(r: Residuals) -> float:
-    from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT
-
-    seen = np.isfinite(r.norms)
-    return float(np.mean(np.asarray(r.weights)[seen] < OUTLIER_WEIGHT)) if seen.any() else 0.0
+    median = known_median(r.norms)
+    return median if np.isfinite(median) else None
 
 
 def _print_points(motion: Motion) -> None:
-    from rich.table import Table
+    from kinefit.exporters.report.fit import point_medians
+    from kinefit.motion import SHOWN_UNITS
 
     names = list(dict.fromkeys(name for r in motion.residuals.values() for name in r.names))
-    table = Table("median residual of", *motion.residuals, box=None, pad_edge=False)
-    for name in names:
-        cells = []
-        for r in motion.residuals.values():
-            norms = r.norms[:, r.names.index(name)] if name in r.names else np.zeros(0)
-            seen = norms[np.isfinite(norms)]
-            cells.append(f"{_UNITS[r.unit][0] * np.median(seen):.1f} {_UNITS[r.unit][1]}" if len(seen) else "-")
-        table.add_row(name, *cells)
+    medians = [(point_medians(r), SHOWN_UNITS[r.unit][1]) for r in motion.residuals.values()]
+    rows = [
+        (name, *(f"{of[name]:.1f} {unit}" if of.get(name, np.nan) >= 0 else "-" for of, unit in medians))
+        for name in names
+    ]
     say()
-    console().print(table)
+    print_table(("median residual of", *motion.residuals), rows)

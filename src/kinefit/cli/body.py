@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from kinefit.cli import _screen
-from kinefit.cli._group import CommandGroup
+from kinefit.cli._screen import CommandGroup
 
 _FILE = click.Path(path_type=Path)
 
@@ -92,17 +92,14 @@ def check(file: str, planar: bool) -> None:
 @click.option("--azimuth", type=float, default=40.0, show_default=True, help="[deg] Camera angle, 0 in front.")
 def picture(file: str, out: Path, azimuth: float) -> None:
     """Render a body in the pose nearest to its reference pose that satisfies its closures."""
-    import cv2
-
     from kinefit.bodies import load_body
     from kinefit.cli._results import check_file
     from kinefit.errors import FileError
+    from kinefit.exporters.atomic import write_image
     from kinefit.simulation.figures import portrait
 
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise FileError("images are written only as .png or .jpg", file=out, remedy=f"Write to {out.stem}.png.")
     check_file(out)
-    written, data = cv2.imencode(out.suffix, portrait(load_body(file), azimuth))
-    assert written
-    out.write_bytes(data.tobytes())
+    write_image(out, portrait(load_body(file), azimuth))
     _screen.say(str(out))

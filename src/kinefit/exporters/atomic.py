@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import errno
 import os
 from collections.abc import Iterable, Iterator
@@ -9,6 +10,8 @@ from contextlib import contextmanager, suppress
 from glob import escape
 from os import PathLike
 from pathlib import Path
+
+from numpy.typing import NDArray
 
 from kinefit.errors import ExportError, printable
 
@@ -79,3 +82,17 @@ def write_bytes(path: str | PathLike[str], data: bytes) -> None:
     """Write a whole binary file or nothing."""
     with writing(path) as temporary:
         temporary.write_bytes(data)
+
+
+def write_rows(path: str | PathLike[str], rows: Iterable[Iterable[object]]) -> None:
+    """Write a whole CSV file, row by row, or nothing."""
+    with writing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
+
+
+def write_image(path: str | PathLike[str], image: NDArray) -> None:
+    """Write an image (H, W, 3) uint8 BGR as JPEG, or as PNG by any other ending, whole or not at all."""
+    import cv2
+
+    kind = ".jpg" if Path(path).suffix.lower() in (".jpg", ".jpeg") else ".png"
+    write_bytes(path, cv2.imencode(kind, image)[1].tobytes())

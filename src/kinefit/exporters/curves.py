@@ -52,9 +52,8 @@ def curves(motion: Motion) -> list[Curve]:
         values, std, speed = motion.angles[:, d], motion.dof_std[:, 6 + d], float(speeds[6 + d])
         if not slides:
             values, std, speed = np.degrees(np.unwrap(values)), np.degrees(std), float(np.degrees(speed))
-        side, joint = _side(name), motion.body.joints[tree.owners[d]]
-        whole = joint[:-2] if _side(joint) else joint
-        out.append(Curve(name, whole, side, "m" if slides else "deg", values, std, speed))
+        joint, _ = split_side(motion.body.joints[tree.owners[d]])
+        out.append(Curve(name, joint, split_side(name)[1], "m" if slides else "deg", values, std, speed))
     return out
 
 
@@ -66,8 +65,10 @@ def _speeds(motion: Motion) -> NDArray:
     return np.array([float(speed_std.get(name, np.nan)) for name in motion.body.dof_names])
 
 
-def _side(name: str) -> str:
-    return {"_l": "left", "_r": "right"}.get(name[-2:], "")
+def split_side(name: str) -> tuple[str, str]:
+    """A name without its side, and "left", "right" or "": hand_l becomes ("hand", "left")."""
+    side = {"_l": "left", "_r": "right"}.get(name[-2:], "")
+    return (name[:-2] if side else name), side
 
 
 def _root_turns(y_up: Motion) -> tuple[NDArray, NDArray]:
@@ -87,3 +88,35 @@ def _root_turns(y_up: Motion) -> tuple[NDArray, NDArray]:
     std = np.full((len(angles), 3), np.inf)
     std[known] = np.sqrt((np.linalg.inv(J[known]) ** 2 @ y_up.dof_std[known, 3:6, None] ** 2)[..., 0])
     return np.degrees(np.unwrap(angles, axis=0)), np.degrees(std)
+
+
+DIGITS = {"thumb": "Thumb"} | {digit: f"{digit.capitalize()} finger" for digit in ("index", "middle", "ring", "little")}
+"""Digits of a hand, as coordinates and segments begin, in words."""
+
+FINGER_JOINTS = ("cmc", "mcp", "pip", "dip", "ip")
+_FINGER_MOVES = {"flex": "flexion", "abd": "abduction", "dev": "ulnar deviation"}
+
+NAMES = {
+    "hip_flexion": "Hip flexion", "hip_adduction": "Hip adduction", "hip_rotation": "Hip inward rotation",
+    "knee_angle": "Knee flexion", "ankle_angle": "Ankle dorsiflexion", "subtalar_angle": "Subtalar inversion",
+    "mtp_angle": "Toe extension", "clav_prot": "Shoulder girdle protraction", "clav_elev": "Shoulder girdle elevation",
+    "arm_flex": "Shoulder flexion", "arm_add": "Shoulder adduction", "arm_rot": "Shoulder inward rotation",
+    "elbow_flex": "Elbow flexion", "pro_sup": "Forearm pronation", "wrist_flex": "Wrist flexion",
+    "wrist_dev": "Wrist ulnar deviation", "pelvis_tilt": "Pelvic tilt (backward)",
+    "pelvis_list": "Pelvic obliquity (right down)", "pelvis_rotation": "Pelvic rotation (to the left)",
+    "lumbar_extension": "Lumbar extension", "lumbar_bending": "Lumbar bending (to the right)",
+    "lumbar_rotation": "Lumbar rotation (to the left)", "thorax_extension": "Thoracic extension",
+    "thorax_bending": "Thoracic bending (to the right)", "thorax_rotation": "Thoracic rotation (to the left)",
+    "neck_extension": "Neck extension", "neck_bending": "Neck bending (to the right)",
+    "neck_rotation": "Neck rotation (to the left)",
+    **{f"{digit}_{joint}_{move}": f"{digit.capitalize()} {joint.upper()} {of}"
+       for digit in DIGITS for joint in FINGER_JOINTS for move, of in _FINGER_MOVES.items()},
+}  # fmt: skip
+"""Clinical names of OpenSim's coordinates, in the direction that counts as positive."""
+
+
+def spoken(coordinate: str) -> str:
+    """Clinical name of a coordinate, with its side in words: hip_flexion_l becomes "left hip flexion"."""
+    stem, side = split_side(coordinate)
+    name = NAMES.get(stem, stem.replace("_", " "))
+    return f"{side} {name[0].lower()}{name[1:]}".strip()

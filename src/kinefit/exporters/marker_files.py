@@ -12,6 +12,7 @@ from kinefit._arguments import checked
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes, write_text
 from kinefit.exporters.c3d_file import MAX_FRAMES, Value, c3d_bytes, label_groups, screens
+from kinefit.exporters.opensim.files import trc_head
 from kinefit.exporters.skeletons.common import length_factor
 from kinefit.observations import Markers
 from kinefit.readers.c3d_file import C3d, read_c3d
@@ -130,14 +131,9 @@ def _events(markers: Markers) -> dict[str, Value]:
 
 def _trc(markers: Markers, path: Path, unit: str, factor: float) -> str:
     names = [n.replace("\t", " ").replace("\n", " ") for n in markers.names]
-    count, rate, first = len(markers), f"{markers.rate:.10g}", markers.first_frame
-    axes = "".join(f"\tX{k}\tY{k}\tZ{k}" for k in range(1, len(names) + 1))
-    lines = [
-        f"PathFileType\t4\t(X/Y/Z)\t{path.name}",
-        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
-        f"{rate}\t{rate}\t{count}\t{len(names)}\t{unit}\t{rate}\t{first}\t{count}",
-        "Frame#\tTime\t" + "\t\t\t".join(names) + "\t\t", "\t" + axes, "",
-    ]  # fmt: skip
+    first = markers.first_frame
+    lines = trc_head(path, names, f"{markers.rate:.10g}", len(markers), unit, first)
+    lines[3] += "\t\t"  # as Vicon's programs write it
     seen = np.isfinite(markers.positions).all(axis=2)
     for f, (t, x) in enumerate(zip(markers.times.tolist(), (markers.positions * factor).tolist(), strict=True)):
         cells = [f"{p[0]:.7g}\t{p[1]:.7g}\t{p[2]:.7g}" if ok else "\t\t" for p, ok in zip(x, seen[f], strict=True)]

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from os import PathLike
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from kinefit.errors import ExportError, extra
 from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import bone_names, turned
-from kinefit.geometry import se3
+from kinefit.exporters.skeletons.rest import rest_pose
 from kinefit.motion import Motion
-from kinefit.motion_columns import continuous_quaternions
 
 WORLD = "world"
 """Frame that the root's transforms are given in."""
@@ -70,44 +64,21 @@ def write_mcap(motion: Motion, path: str | PathLike[str], *, up: str = "z", name
     with writing(path) as temporary, temporary.open("wb") as file, Writer(file) as out:
         state = out.register_msgdef("sensor_msgs/msg/JointState", _STATE)
         move = out.register_msgdef("tf2_msgs/msg/TFMessage", _MOVE)
-        for time, transforms, angles, std in _frames(world, bones):
-            header = {"stamp": _stamp(time), "frame_id": ""}
+        rest = rest_pose(world.body, "body", "kinefit", path)
+        above = [bones[p] if p >= 0 else WORLD for p in world.body.tree.parents]
+        turns, places = (values.tolist() for values in rest.local_moves(world, up))
+        for f, seconds in enumerate(world.times):
+            time = round(float(seconds) * 1e9)
+            stamp = {"sec": time // 10**9, "nanosec": time % 10**9}
             log = {"log_time": time, "publish_time": time}
+            transforms = [
+                {"header": {"stamp": stamp, "frame_id": frame}, "child_frame_id": bone,
+                 "transform": {"translation": dict(zip("xyz", place)), "rotation": dict(zip("wxyz", turn))}}
+                for frame, bone, place, turn in zip(above, bones, places[f], turns[f])
+            ]  # fmt: skip
+            header = {"stamp": stamp, "frame_id": ""}
             out.write_message("/tf", move, {"transforms": transforms}, **log)
-            for topic, values in (("/joint_states", angles), ("/joint_std", std)):
-                message = {"header": header, "name": list(motion.body.tree.coordinates), "position": values.tolist(),
+            for topic, values in (("/joint_states", world.angles[f]), ("/joint_std", world.dof_std[f, 6:])):
+                message = {"header": header, "name": list(world.body.tree.coordinates), "position": values.tolist(),
                            "velocity": [], "effort": []}  # fmt: skip
                 out.write_message(topic, state, message, **log)
-
-
-def _frames(motion: Motion, bones: list[str]) -> Iterator[tuple[int, list[dict[str, Any]], NDArray, NDArray]]:
-    """Time [ns], transforms, coordinates and their standard deviations of every frame."""
-    parents = motion.body.tree.parents
-    above = [bones[p] if p >= 0 else WORLD for p in parents]
-    before = None
-    for part in motion.parts():
-        Ts_world = np.array(part.segment_poses())
-        Ts = se3.inverse(Ts_world[:, np.maximum(parents, 0)]) @ Ts_world
-        Ts[:, parents < 0] = Ts_world[:, parents < 0]
-        turns = continuous_quaternions(Ts[..., :3, :3], before)
-        before = turns[-1] if len(turns) else before
-        for f, seconds in enumerate(part.times):
-            time = round(float(seconds) * 1e9)
-            yield time, [
-                _transform(time, above[s], bone, Ts[f, s, :3, 3].tolist(), turns[f, s].tolist())
-                for s, bone in enumerate(bones)
-            ], part.angles[f], part.dof_std[f, 6:]
-
-
-def _transform(time: int, parent: str, child: str, place: list[float], turn: list[float]) -> dict[str, Any]:
-    w, x, y, z = turn
-    return {
-        "header": {"stamp": _stamp(time), "frame_id": parent}, "child_frame_id": child,
-        "transform": {
-            "translation": dict(zip("xyz", place)), "rotation": {"x": x, "y": y, "z": z, "w": w},
-        },
-    }  # fmt: skip
-
-
-def _stamp(time: int) -> dict[str, int]:
-    return {"sec": time // 10**9, "nanosec": time % 10**9}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import math
 import warnings
 from collections.abc import Mapping
 from os import PathLike
@@ -67,15 +66,13 @@ def write_nwb(motion: Motion, path: str | PathLike[str], *, up: str | None = Non
 def confidence(std: NDArray) -> NDArray:
     """(...) probability that a point with standard deviations (..., 3) [m] lies within `CONFIDENCE_RADIUS_M`.
 
-    Of a normal distribution equal in all directions, with the mean variance: erf(r/√2) − √(2/π) r exp(−r²/2), where r
-    is `CONFIDENCE_RADIUS_M` by the standard deviation (Maxwell's distribution).
+    Of a normal distribution equal in all directions, with the mean variance (Maxwell's distribution).
     """
-    sigma = np.sqrt(np.mean(np.square(std), axis=-1))
-    known = np.isfinite(sigma) & (sigma > 0)
-    r = np.divide(CONFIDENCE_RADIUS_M, sigma, out=np.zeros_like(sigma), where=known)
-    erf = np.reshape([math.erf(value) for value in np.ravel(r / math.sqrt(2.0)).tolist()], r.shape)
-    out = erf - math.sqrt(2.0 / math.pi) * r * np.exp(-0.5 * r**2)
-    return np.where(sigma == 0.0, 1.0, np.where(known, np.clip(out, 0.0, 1.0), 0.0))
+    from scipy.special import gammainc
+
+    sigma = np.nan_to_num(np.sqrt(np.mean(np.square(std), axis=-1)), nan=np.inf, posinf=np.inf)
+    with np.errstate(divide="ignore"):
+        return np.asarray(gammainc(1.5, 0.5 * np.square(CONFIDENCE_RADIUS_M / sigma)))
 
 
 def _file(pynwb: Any, motion: Motion) -> Any:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from os import PathLike
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ExportError
-from kinefit.exporters.atomic import write_bytes, write_text
+from kinefit.exporters.atomic import write_bytes, write_image, write_rows
 from kinefit.photogrammetry.returning import PointReturn
 from kinefit.photogrammetry.states import displacement_std
 from kinefit.photogrammetry.strain import Strain
@@ -57,10 +56,8 @@ def write_points_csv(surface: MeasuredSurface, path: str | PathLike[str], column
     row, column = np.divmod(index, surface.grid.columns)
     more = [value[index] for value in columns.values()]
     table = np.column_stack([surface.uv[index, 0], surface.x_world[index], *more])
-    lines = [",".join(["row", "column", "u_px", "v_px", "x_m", "y_m", "z_m", *columns])]
-    for r, c, values in zip(row, column, table):
-        lines.append(f"{r},{c}," + ",".join("" if not np.isfinite(v) else f"{v:.9g}" for v in values))
-    write_text(path, "\n".join(lines) + "\n")
+    head = ["row", "column", "u_px", "v_px", "x_m", "y_m", "z_m", *columns]
+    write_rows(path, [head, *([r, c, *_cells(values, ".9g")] for r, c, values in zip(row, column, table))])
 
 
 def write_surface_vtk(surface: MeasuredSurface, path: str | PathLike[str], columns: Mapping[str, NDArray]) -> None:
@@ -117,30 +114,26 @@ def write_field_picture(
             colour = tuple(int(c) for c in codes[triangle].mean(axis=0))
             cv2.fillConvexPoly(painted, np.rint(uv[triangle] * 8).astype(np.int32), colour, shift=3)
     picture = cv2.addWeighted(painted, 0.75, picture, 0.25, 0)
-    data = cv2.imencode(".png", np.hstack([picture, _scale(picture.shape[0], bottom, top, title, unit)]))[1]
-    write_bytes(Path(path), data.tobytes())
+    write_image(path, np.hstack([picture, _scale(picture.shape[0], bottom, top, title, unit)]))
 
 
 def write_paths_csv(paths: Trajectories, path: str | PathLike[str]) -> None:
     """Write a row for each point and time: metres, seconds, m/s and m/s². Errors as of `write_points_csv`."""
     velocity, acceleration = paths.velocity, paths.acceleration
     names = [*"xyz", *(f"std_{a}" for a in "xyz"), *(f"v{a}" for a in "xyz"), *(f"a{a}" for a in "xyz")]
-    lines = [",".join(["time_s", "point", *names])]
+    rows: list[list[object]] = [["time_s", "point", *names]]
     for k, time in enumerate(paths.times):
         index = np.flatnonzero(paths.live[k])
         table = np.hstack([paths.x_world[k, index], paths.std[k, index], velocity[k, index], acceleration[k, index]])
-        for p, row in zip(index, table):
-            lines.append(f"{time:.6f},{p}," + ",".join(f"{v:.6g}" if np.isfinite(v) else "" for v in row))
-    write_text(path, "\n".join(lines) + "\n")
+        rows += [[f"{time:.6f}", p, *_cells(values, ".6g")] for p, values in zip(index, table)]
+    write_rows(path, rows)
 
 
 def write_returns_csv(returns: Sequence[PointReturn], rate: float, path: str | PathLike[str]) -> None:
     """Write a row for each point that vanished: when it was lost, is expected and was found [s]; empty for never."""
-    lines = ["point,lost_s,expected_s,found_s"]
-    for of in returns:
-        times = ["" if frame is None else f"{frame / rate:.6f}" for frame in (of.lost, of.expected, of.found)]
-        lines.append(",".join([str(of.point), *times]))
-    write_text(path, "\n".join(lines) + "\n")
+    frames = np.array([[of.lost, of.expected, of.found] for of in returns], float).reshape(-1, 3)  # NaN for None
+    rows = [[of.point, *_cells(times, ".6f")] for of, times in zip(returns, frames / rate)]
+    write_rows(path, [["point", "lost_s", "expected_s", "found_s"], *rows])
 
 
 def write_point_picture(uv: NDArray, image: NDArray, path: str | PathLike[str]) -> None:
@@ -148,7 +141,12 @@ def write_point_picture(uv: NDArray, image: NDArray, path: str | PathLike[str]) 
     picture = cv2.cvtColor(np.clip(image, 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
     for place in np.rint(uv * 8).astype(int):
         cv2.circle(picture, (int(place[0]), int(place[1])), 12, (0, 200, 255), -1, cv2.LINE_AA, 3)
-    write_bytes(path, cv2.imencode(".png", picture)[1].tobytes())
+    write_image(path, picture)
+
+
+def _cells(values: NDArray, form: str) -> list[str]:
+    """Numbers as CSV has them, nothing for what is not finite."""
+    return [f"{v:{form}}" if np.isfinite(v) else "" for v in values.tolist()]
 
 
 def _scale(height: int, bottom: float, top: float, title: str, unit: str) -> NDArray:

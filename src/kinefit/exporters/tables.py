@@ -14,6 +14,7 @@ deviation "inf" means that nothing observed it.
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from os import PathLike
@@ -203,9 +204,10 @@ def _write(
 
 def _to_csv(pieces: Iterator[Table], file: Path) -> None:
     with open(file, "w", encoding="utf-8", newline="\n") as out:
+        rows = csv.writer(out, lineterminator="\n")
         for number, table in enumerate(pieces):
-            head = [] if number else [",".join(_quoted(name) for name in table)]
-            out.writelines(f"{line}\n" for line in (*head, *map(",".join, zip(*map(_cells, table.values())))))
+            rows.writerows([] if number else [table])
+            rows.writerows(zip(*map(_cells, table.values())))
 
 
 def _cells(column: NDArray) -> list[str]:
@@ -213,8 +215,5 @@ def _cells(column: NDArray) -> list[str]:
         return ["" if v != v else f"{v:.9g}" for v in column.tolist()]
     if column.dtype.kind == "b":
         return ["true" if v else "false" for v in column.tolist()]
-    return [_quoted(str(v)) for v in column.tolist()]
+    return list(map(str, column.tolist()))
 
-
-def _quoted(text: str) -> str:
-    return '"' + text.replace('"', '""') + '"' if any(c in text for c in ',"\n\r') else text

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kinefit._files import regular
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_text
-from kinefit.exporters.pictures.detections import write_detections
+from kinefit.exporters.motion_file import write_detections
 from kinefit.geometry.camera import Rig
 from kinefit.observations import MEDIAPIPE_33, Detections, KeypointFrame, LiftedFrame, by_record
 from kinefit.readers.calibration.read import write_calibration

@@ -205,7 +205,7 @@ def seconds_of(job: DetectionJob, video: Video) -> tuple[int, int]:
 def _look_through(
     job: DetectionJob, files: Networks, settings: DetectionSettings, key: str, tell: Step, threads: int
 ) -> None:
-    from kinefit.exporters.pictures.detections import write_detections
+    from kinefit.exporters.motion_file import write_detections
     from kinefit.images.detectors.detection import detect_people
     from kinefit.images.detectors.faces import FaceFinder, FaceModels
     from kinefit.images.detectors.hands import HandFollower, HandModels

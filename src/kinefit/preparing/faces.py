@@ -94,7 +94,7 @@ class HiddenVideo(Video):
 
     def read(self, i: int) -> NDArray[np.uint8]:
         """Frame `i` as (H, W, 3) uint8 RGB, upright, with all faces hidden; all of it where it was not searched."""
-        from kinefit.exporters.pictures.privacy import hide_all, hide_circles
+        from kinefit.exporters.pictures.drawing import hide_all, hide_circles
 
         image, circles = super().read(i), self._heads.at(i)
         return hide_all(image) if circles is None else hide_circles(image, np.concatenate([circles, self._more(i)]))

@@ -198,13 +198,10 @@ def summary(motion: Motion, frame: int) -> str:
     if lost:
         lines.append("lost: " + ", ".join(map(scene.as_markdown, lost)))
     for name, residuals in motion.residuals.items():
-        norms = residuals.norms[frame]
-        seen = np.isfinite(norms)
-        scale, unit = (1.0, "px") if residuals.unit == "px" else (1000.0, "mm")
-        middle = f"{scale * np.median(norms[seen]):.1f} {unit}" if seen.any() else "no data"
-        out = int((seen & (residuals.weights[frame] < scene.OUTLIER_WEIGHT)).sum())
+        out = int(residuals.rejected[frame].sum())
         extra = f", {out} rejected" if out else ""
         extra += ", left/right swap corrected" if residuals.swapped[frame] else ""
+        middle = residuals.median_text(residuals.norms[frame])
         lines.append(f"{scene.as_markdown(name)}: {middle}{extra}")
     return "\n\n".join(lines)
 
@@ -253,7 +250,7 @@ def course(motion: Motion, coordinate: str, frame: int) -> tuple[NDArray, ...]:
 
     Where a coordinate is not observed, 2σ is a million: the band fills the plot.
     """
-    value, spread = _value_and_spread(motion, coordinate)
+    value, spread, _ = scene.angle_course(motion, coordinate)
     spread = np.where(np.isfinite(spread), spread, 1e6)
     now = np.full(len(value), np.nan)
     now[frame] = value[frame]
@@ -262,19 +259,9 @@ def course(motion: Motion, coordinate: str, frame: int) -> tuple[NDArray, ...]:
 
 def course_range(motion: Motion, coordinate: str) -> tuple[float, float]:
     """Lowest and highest of what a plot of a coordinate shows: all values, and 2σ about them where it is below 45°."""
-    value, spread = _value_and_spread(motion, coordinate)
-    known = np.where(spread < (45.0 if not _prismatic(motion, coordinate) else 100.0), spread, 0.0)
+    value, spread, unit = scene.angle_course(motion, coordinate)
+    known = np.where(spread < (45.0 if unit == "°" else 100.0), spread, 0.0)
     low, high = float((value - known).min()), float((value + known).max())
     margin = max(0.05 * (high - low), 0.5)
     return low - margin, high + margin
 
-
-def _prismatic(motion: Motion, coordinate: str) -> bool:
-    return bool(motion.body.tree.prismatic[motion.body.tree.coordinates.index(coordinate)])
-
-
-def _value_and_spread(motion: Motion, coordinate: str) -> tuple[NDArray, NDArray]:
-    """(F,) values and 2σ; [deg], prismatic [mm]."""
-    d = motion.body.tree.coordinates.index(coordinate)
-    scale = 1000.0 if _prismatic(motion, coordinate) else 180 / np.pi
-    return scale * motion.angles[:, d], 2 * scale * motion.dof_std[:, 6 + d]

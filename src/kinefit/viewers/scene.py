@@ -12,14 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, PointSet, TaperedCylinder
 from kinefit.geometry.camera import Camera
-from kinefit.motion import UP_AXES, Motion, Residuals
+from kinefit.motion import OUTLIER_WEIGHT, UP_AXES, Motion, Residuals
 from kinefit.rendering.colours import RGB, quality_ramp
 from kinefit.rendering.looks import Mesh
 
 OTHERS: tuple[RGB, ...] = ((204, 121, 167), (86, 180, 233), (230, 159, 0), (120, 90, 60))
 """Colours of the second, third ... motion, which have one colour for both sides."""
 
-OUTLIER_WEIGHT = 0.05  # robust weight below which a measurement had no say
 OUTLIER = (255, 30, 30)
 LARGEST_ELLIPSOID = 0.5  # [m] half axis beyond which "somewhere there" says nothing more, and hides the rest
 _PIECES = 5  # of a bone: dashes and gaps of a lost one in turn
@@ -162,13 +161,6 @@ def camera_rays(
     return Rays(points, np.repeat(np.tile(colours, (2, 1))[:, None], 2, axis=1))
 
 
-def middling_residual(motion: Motion) -> float:
-    """[px] median of all keypoints that the cameras saw; 1 where there are none."""
-    norms = [r.norms.ravel() for r in motion.residuals.values() if r.unit == "px"]
-    known = np.concatenate(norms)[np.isfinite(np.concatenate(norms))] if norms else np.zeros(0)
-    return float(np.median(known)) if known.size else 1.0
-
-
 def root_path(motion: Motion) -> NDArray:
     """(F - 1, 2, 3) [m] way of the root."""
     x = motion.Ts_world_root[:, :3, 3]
@@ -199,12 +191,17 @@ def looked_at(cameras: Sequence[Camera]) -> NDArray:
 
 def angle_line(motion: Motion, coordinate: str, frame: int) -> str:
     """Words for one coordinate in one frame, with twice its standard deviation: "knee_angle_r 34.2° ± 3.1°"."""
+    values, spreads, unit = angle_course(motion, coordinate)
+    digits = 1 if unit == "°" else 0
+    spread = f"± {spreads[frame]:.{digits}f}{unit}" if np.isfinite(spreads[frame]) else "(not observed)"
+    return f"{coordinate} {values[frame]:.{digits}f}{unit} {spread}"
+
+
+def angle_course(motion: Motion, coordinate: str) -> tuple[NDArray, NDArray, str]:
+    """(F,) values and twice their standard deviations of a coordinate in "°", of a sliding one in " mm"."""
     d = motion.body.tree.coordinates.index(coordinate)
-    turn = not motion.body.tree.prismatic[d]
-    value, std = motion.angles[frame, d], motion.dof_std[frame, 6 + d]
-    scale, unit, digits = (180 / np.pi, "°", 1) if turn else (1000.0, " mm", 0)
-    spread = f"± {2 * scale * std:.{digits}f}{unit}" if np.isfinite(std) else "(not observed)"
-    return f"{coordinate} {scale * value:.{digits}f}{unit} {spread}"
+    scale, unit = (1000.0, " mm") if motion.body.tree.prismatic[d] else (180 / np.pi, "°")
+    return scale * motion.angles[:, d], 2 * scale * motion.dof_std[:, 6 + d], unit
 
 
 def as_markdown(name: str) -> str:

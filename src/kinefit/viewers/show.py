@@ -1,9 +1,9 @@
-"""A recording as a moving 3D scene: motions, cameras with their pictures, rays, markers, frame by frame."""
+"""A recording as a moving 3D scene, frame by frame in a server, or as one page that needs none."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
-from kinefit.motion import Motion
+from kinefit.motion import Motion, known_median, nearest_frame
 from kinefit.observations import Markers
 from kinefit.viewers import figure, scene, stage
 from kinefit.viewers.pictures import CameraImages
+from kinefit.viewers.stage import POLICY, open_server, quiet
 
 if TYPE_CHECKING:
     import viser
@@ -180,7 +181,9 @@ class Show:
         self._fitted = [
             {name: scene.fitted_points(m.body, r) for name, r in m.residuals.items()} for m in recording.motions[:1]
         ]
-        self._middling = scene.middling_residual(recording.motions[0]) if recording.motions else 1.0
+        norms = [r.norms.ravel() for m in recording.motions[:1] for r in m.residuals.values() if r.unit == "px"]
+        middling = known_median(np.concatenate([*norms, np.zeros(0)]))
+        self._middling = middling if np.isfinite(middling) else 1.0  # [px]
         self._clouds = list(self._make_clouds())
         self._rays: Any = None
         self._last = Choice(frozenset(LAYERS))  # as the nodes were made
@@ -191,7 +194,7 @@ class Show:
             self._show_layers(choice)
             time = float(self.recording.times[i])
             for n, (fig, motion) in enumerate(zip(self.figures, self.recording.motions)):
-                f = nearest(motion.times, time, motion.rate)
+                f = motion.frame_at(time)
                 fig.show_all(f is not None)
                 if f is not None:
                     fig.pose(
@@ -224,7 +227,7 @@ class Show:
     def _show_points(self, time: float, choice: Choice) -> None:
         """Triangulated keypoints and markers, which no segment carries."""
         for cloud, layer, values, times, rate in self._clouds:
-            f = nearest(times, time, rate)
+            f = nearest_frame(times, time, rate)
             cloud.show(values[f] if f is not None and layer in choice.layers else None)
 
     def _make_clouds(self) -> Iterator[tuple[figure.ScenePoints, str, NDArray, NDArray, float]]:
@@ -287,14 +290,6 @@ class Show:
             node.look(behind)
 
 
-def nearest(times: NDArray, time: float, rate: float) -> int | None:
-    """Frame nearest to a time [s], None where there is none within one frame."""
-    if not len(times):
-        return None
-    i = int(np.argmin(np.abs(times - time)))
-    return i if abs(times[i] - time) < 1.0 / rate else None
-
-
 def _without_strays(x: NDArray) -> NDArray:
     """Points (N, 3) without those far from the rest: single wrong meetings of rays should not size the scene."""
     x = x[np.isfinite(x).all(-1)]
@@ -302,3 +297,44 @@ def _without_strays(x: NDArray) -> NDArray:
         return x
     distance = np.linalg.norm(x - np.median(x, axis=0), axis=1)
     return x[distance <= 5.0 * np.median(distance) + 1e-9]
+
+
+MOST_FRAMES, MOST_PICTURES = 600, 240
+"""Frames and camera pictures that a page holds at most, so that it stays below 10 MB and loads at once."""
+
+
+def page(recording: ViewerContent, *, choice: Choice = Choice()) -> tuple[str, int]:
+    """The scene with its animation as one self-contained HTML text, and the number of frames in it.
+
+    Longer recordings are thinned out evenly to `MOST_FRAMES`; the cameras' pictures change as often as `MOST_PICTURES`
+    allow.
+
+    Raises
+    ------
+    ExportError
+        viser is missing.
+    """
+    frames = chosen_frames(len(recording.times), MOST_FRAMES)
+    with_pictures = chosen_frames(len(frames), max(1, MOST_PICTURES // max(len(recording.rig or ()), 1)))
+    server = open_server(0)
+    try:
+        show = Show(server, recording)
+        choice = replace(choice, follow=choice.follow or show.stage.goes_far)
+        show.frame(0, choice)
+        for fig in show.figures:
+            fig.blank()
+        serializer = server.get_scene_serializer()
+        for k, i in enumerate(frames):
+            show.frame(int(i), choice, pictures=k in with_pictures)
+            step = frames[k + 1] - i if k + 1 < len(frames) else 1
+            serializer.insert_sleep(float(step) / recording.rate)
+        policy = f'<head><meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+        return serializer.as_html().replace("<head>", policy, 1), len(frames)
+    finally:
+        with quiet():
+            server.stop()
+
+
+def chosen_frames(count: int, most: int) -> NDArray:
+    """At most `most` of `count` frames, evenly: every first, second, third ... one."""
+    return np.arange(0, count, max(1, -(-count // most)))

@@ -11,7 +11,7 @@ from tests.calibration.people_data import BODY, room
 from kinefit import read_take
 from kinefit.calibration.people.altered import refuse_videos
 from kinefit.errors import CalibrationError, ObservationError
-from kinefit.exporters.pictures.detections import write_detections
+from kinefit.exporters.motion_file import write_detections
 from kinefit.observations import Detections
 from kinefit.observations.recordings import mirror_name
 from kinefit.readers.take.load import load_observations

@@ -11,7 +11,7 @@ from kinefit import read_take, track_take
 from kinefit.calibration.people import of_take
 from kinefit.calibration.people.of_take import _holds_for, cameras_file, find_cameras, last_found
 from kinefit.errors import TakeError
-from kinefit.exporters.pictures.detections import write_detections
+from kinefit.exporters.motion_file import write_detections
 from kinefit.observations import Detections
 from kinefit.readers.calibration.found import read_found
 from kinefit.readers.take.load import load_observations

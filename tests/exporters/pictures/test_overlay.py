@@ -13,7 +13,7 @@ from kinefit.bodies.limbs import finger_groups
 from kinefit.errors import ExportError
 from kinefit.exporters import draw_overlay, write_montage, write_overlay
 from kinefit.exporters.pictures.drawing import bones
-from kinefit.exporters.pictures.overlay import frames_of, nearest_frame
+from kinefit.exporters.pictures.overlay import frames_of
 from kinefit.geometry.camera import ImageFrame
 from kinefit.readers.video import Video
 from kinefit.rendering.colours import CENTRE_COLOUR, LEFT_COLOUR, LOST_COLOUR, RIGHT_COLOUR
@@ -221,9 +221,9 @@ def test_only_the_motion_s_pictures_are_drawn(tmp_path, motion):
 
 
 def test_frames_are_matched_by_time(motion):
-    assert nearest_frame(motion, 2.0) == 0 and nearest_frame(motion, 2.0 + 3.4 / 60) == 3
-    assert nearest_frame(motion, 1.9) is None and nearest_frame(motion, 3.0) is None
-    assert nearest_frame(smooth_motion(0), 0.0) is None
+    assert motion.frame_at(2.0) == 0 and motion.frame_at(2.0 + 3.4 / 60) == 3
+    assert motion.frame_at(1.9) is None and motion.frame_at(3.0) is None
+    assert smooth_motion(0).frame_at(0.0) is None
 
 
 def test_montage_puts_pictures_side_by_side(tmp_path):

@@ -5,7 +5,7 @@ from tests.exporters.report.test_cycles import walk
 from tests.exporters.report.test_page import plots
 
 from kinefit.errors import ExportError, FileError
-from kinefit.exporters.report.norms import read_norms
+from kinefit.exporters.report.cycles import read_norms
 from kinefit.exporters.report.report import write_report
 
 HEAD = "coordinate,percent,mean,sd\n"

@@ -7,8 +7,7 @@ import pytest
 from tests.exporters.report.test_page import own
 from tests.exporters.synthetic import smooth_motion
 
-from kinefit.exporters.curves import Curve, curves
-from kinefit.exporters.report.names import NAMES
+from kinefit.exporters.curves import NAMES, Curve, curves
 from kinefit.exporters.report.ranges import MAX_STD_DEG, extremes, ranges_of, ranges_table
 
 RATE = 50.0

@@ -13,18 +13,17 @@ from tests.exporters.synthetic import a_camera, smooth_motion
 from kinefit.bodies import load_body
 from kinefit.errors import ExportError
 from kinefit.exporters.curves import _root_turns, curves
-from kinefit.exporters.report.angles import _band, thinned
 from kinefit.exporters.report.fit import overall_median, sensor_fits
+from kinefit.exporters.report.flagged import close_up, report_frames
 from kinefit.exporters.report.methods import lengths_table, methods_sentences
 from kinefit.exporters.report.moments import (
     doubtful_moments,
-    frame_residuals,
     listed,
     never_observed,
     shared_by_prior,
     throughout_sentence,
 )
-from kinefit.exporters.report.pictures import close_up, report_frames
+from kinefit.exporters.report.plots import band, thinned
 from kinefit.exporters.report.report import trust_sentence, write_report
 from kinefit.findings import runs_of
 from kinefit.geometry import se3
@@ -206,7 +205,7 @@ def test_numbers_of_a_sensor_are_those_of_its_residuals():
     assert fit.median == pytest.approx(np.median(norms)) and fit.most == pytest.approx(np.percentile(norms, 95))
     assert fit.seen == pytest.approx(0.9) and fit.left_out == pytest.approx(8 / 72) and fit.count == norms.size
     assert overall_median(motion) == pytest.approx(np.nanmedian([r.norms for r in motion.residuals.values()]))
-    assert np.isnan(frame_residuals(motion.residuals["cam0"])[:8]).all()
+    assert motion.residuals["cam0"].median_text(norms[:0]) == "no data"
 
 
 def test_a_constant_shift_points_to_the_calibration(tmp_path):
@@ -261,10 +260,11 @@ def test_thinning_keeps_the_extremes():
 
 
 def test_a_band_leaves_out_what_nothing_observes():
-    x, y = _band(np.arange(6.0), np.zeros(6), np.array([1, 1, np.nan, np.nan, 2, 2.0]))
+    [trace] = band(np.arange(6.0), np.zeros(6), np.array([1, 1, np.nan, np.nan, 2, 2.0]), "left", "#0072b2")
+    x, y = trace["x"], trace["y"]
     assert x.tolist()[:4] == [0, 1, 1, 0] and np.isnan(x[4]) and x.tolist()[5:] == [4, 5, 5, 4]
     assert y.tolist()[:4] == [1, 1, -1, -1] and y.tolist()[5:] == [2, 2, -2, -2]
-    assert len(_band(np.arange(2.0), np.zeros(2), np.full(2, np.nan))[0]) == 0
+    assert band(np.arange(2.0), np.zeros(2), np.full(2, np.nan), "left", "#0072b2") == []
 
 
 # The page

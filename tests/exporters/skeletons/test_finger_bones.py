@@ -10,7 +10,7 @@ from tests.exporters.skeletons.test_characters import chunks, play, run, unit
 from kinefit.bodies import load_body
 from kinefit.bodies.joint_names import DIGITS
 from kinefit.exporters import write_bvh, write_character, write_motion
-from kinefit.exporters.skeletons.finger_bones import in_words
+from kinefit.exporters.skeletons.retarget import in_words
 from kinefit.geometry import se3
 from kinefit.readers.skeletons.bvh import read_bvh
 from kinefit.simulation import squat_and_wave

@@ -353,7 +353,7 @@ def test_matlab_structs_of_cameras(tmp_path, old):
     assert_projects(read_calibration(tmp_path / "all"), {name: f"cam{name}" for name in K})
 
 
-def test_matlab_files_that_are_refused(tmp_path, monkeypatch):
+def test_matlab_files_that_are_refused(tmp_path):
     path = tmp_path / "a.mat"
     path.write_bytes(b"MATLAB 5.0 MAT-file, cut")
     with pytest.raises(FileError, match="not a readable MATLAB file"):

@@ -9,8 +9,7 @@ import pytest
 from kinefit.batch.corrections import add_click
 from kinefit.bodies import load_body
 from kinefit.errors import TakeError, TrackingError
-from kinefit.exporters.motion_file import write_motion
-from kinefit.exporters.pictures.detections import write_detections
+from kinefit.exporters.motion_file import write_detections, write_motion
 from kinefit.geometry import se3
 from kinefit.observations import MEDIAPIPE_33, Detections
 from kinefit.readers.detections import read_detections

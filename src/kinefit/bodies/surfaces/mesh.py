@@ -61,6 +61,12 @@ class MeshSurface:
         object.__setattr__(self, "faces", faces)
         _check(vertices, self._welded, self._open_edges)
 
+    def box(self) -> tuple[NDArray, NDArray, NDArray]:
+        """Mean of the vertices (3,), their principal directions (3, 3) in rows, the longest first, and extents (3,)."""
+        middle = self.vertices.mean(axis=0)
+        axes = np.linalg.svd(self.vertices - middle, full_matrices=False)[2]
+        return middle, axes, np.ptp((self.vertices - middle) @ axes.T, axis=0)
+
     @cached_property
     def grid(self) -> DistanceGrid:
         """Grid of signed distances around the mesh, computed at first use."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -125,17 +124,16 @@ def _distance(text: str | None) -> tuple[str, str, float] | None:
 
 def _write_table(result: BarCalibration, file: Path) -> None:
     """A row a parameter: camera, name, value, standard deviation, what it rests on."""
-    from kinefit.exporters.atomic import writing
+    from kinefit.exporters.atomic import write_rows
 
-    with writing(file) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
-        table = csv.writer(stream)
-        table.writerow(("camera", "parameter", "unit", "value", "std", "from"))
-        for name, report in result.cameras.items():
-            for parameter, value, std in zip(report.names, report.values, report.std):
-                unit = "px" if parameter in ("fx", "fy", "cx", "cy") else "m" if parameter in "xyz" else ""
-                unit = "rad" if parameter in ("rx", "ry", "rz") else unit
-                origin = "given" if not std else "assumption" if parameter in report.assumed else "recording"
-                table.writerow((name, parameter, unit, f"{value:.9g}", f"{std:.4g}", origin))
+    rows: list[tuple[str, ...]] = [("camera", "parameter", "unit", "value", "std", "from")]
+    for name, report in result.cameras.items():
+        for parameter, value, std in zip(report.names, report.values, report.std):
+            unit = "px" if parameter in ("fx", "fy", "cx", "cy") else "m" if parameter in "xyz" else ""
+            unit = "rad" if parameter in ("rx", "ry", "rz") else unit
+            origin = "given" if not std else "assumption" if parameter in report.assumed else "recording"
+            rows.append((name, parameter, unit, f"{value:.9g}", f"{std:.4g}", origin))
+    write_rows(file, rows)
 
 
 def _write_picture(result: BarCalibration, file: Path) -> None:
@@ -143,7 +141,7 @@ def _write_picture(result: BarCalibration, file: Path) -> None:
     import cv2
     import numpy as np
 
-    from kinefit.exporters.atomic import writing
+    from kinefit.exporters.atomic import write_image
 
     panels = []
     for c, camera in enumerate(result.rig):
@@ -162,8 +160,7 @@ def _write_picture(result: BarCalibration, file: Path) -> None:
     columns = min(len(panels), 2 if len(panels) < 5 else 3)
     panels += [np.zeros_like(panels[0])] * (-len(panels) % columns)
     picture = np.vstack([np.hstack(panels[k : k + columns]) for k in range(0, len(panels), columns)])
-    with writing(file) as temporary:
-        temporary.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+    write_image(file, picture)
 
 
 def _titled(panel: NDArray, text: str) -> NDArray:
@@ -180,23 +177,19 @@ def _at(uv: NDArray) -> tuple[int, int]:
 
 
 def _tell(result: BarCalibration, checked: bool) -> None:
-    from rich.table import Table
-
-    table = Table(title=f"bar of {result.length:g} m", title_justify="left")
-    for column in ("camera", "focal px", "± px", "centre ± px", "bars", "image covered", "rms px", "position ± mm"):
-        left = column == "camera"
-        table.add_column(column, justify="left" if left else "right", no_wrap=left)
+    rows = []
     for camera in result.rig:
         report = result.cameras[camera.name]
         lens = report.std_of("fx") > 0
         place = 1e3 * sum(report.std_of(axis) ** 2 for axis in "xyz") ** 0.5
-        table.add_row(
+        rows.append((
             camera.name, f"{camera.matrix[0, 0]:.1f}", f"{report.std_of('fx'):.2f}" if lens else "given",
             f"{max(report.std_of('cx'), report.std_of('cy')):.2f}" if lens else "given",
             f"{report.used} of {report.places}",
             f"{100 * report.coverage:.0f} %", f"{report.rms_px:.3f}", f"{place:.1f}",
-        )  # fmt: skip
-    _screen.console().print(table)
+        ))  # fmt: skip
+    heads = ("camera", "focal px", "± px", "centre ± px", "bars", "image covered", "rms px", "position ± mm")
+    _screen.print_table(heads, rows, title=f"bar of {result.length:g} m")
     _screen.say(
         f"Target detection: sigma {result.sigma_px:.3f} px. Bar length: scatter {1e3 * result.scatter:.2f} mm over "
         f"{len(result.frames)} frames. Rejected: {result.left_out} outliers, {result.ambiguous} in which the two "

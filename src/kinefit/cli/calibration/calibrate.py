@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from kinefit.cli import _screen
-from kinefit.cli._group import CommandGroup
+from kinefit.cli._screen import CommandGroup
 
 if TYPE_CHECKING:
     from kinefit.calibration.board.calibrate import BoardCalibration
@@ -117,21 +117,16 @@ def _frame(floor: str | None, sources: dict) -> int | None:
 
 
 def _tell(result: BoardCalibration) -> None:
-    from rich.table import Table
-
-    table = Table(title=f"{result.board}", title_justify="left")
-    for column in ("camera", "focal px", "± px", "views", "image covered", "rms px", "lens alone px", "position ± mm"):
-        left = column == "camera"
-        table.add_column(column, justify="left" if left else "right", no_wrap=left)
+    rows = []
     for camera in result.rig:
         report = result.cameras[camera.name]
-        cells = (
-            f"{camera.matrix[0, 0]:.1f}", f"{report.focal_std_px:.1f}" if report.focal_std_px else "given",
+        rows.append((
+            camera.name, f"{camera.matrix[0, 0]:.1f}", f"{report.focal_std_px:.1f}" if report.focal_std_px else "given",
             f"{report.used} of {report.views}", f"{100 * report.coverage:.0f} %", f"{report.rms_px:.2f}",
             f"{report.own_rms_px:.2f}", f"{1e3 * report.position_std:.1f}" if report.position_std < 1e3 else "-",
-        )  # fmt: skip
-        table.add_row(camera.name, *cells)
-    _screen.console().print(table)
+        ))  # fmt: skip
+    heads = ("camera", "focal px", "± px", "views", "image covered", "rms px", "lens alone px", "position ± mm")
+    _screen.print_table(heads, rows, title=f"{result.board}")
     for (a, b), distance in result.rig.distances.items() if result.shared else ():
         _screen.say(f"{a} to {b}: {distance:.3f} m, {result.shared.get((a, b), 0)} frames agree")
     if result.jitter[0] > 5e-4:

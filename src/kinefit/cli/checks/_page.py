@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,7 +10,8 @@ import numpy as np
 from kinefit.cli.checks._pictures import pair, picture_section
 from kinefit.diagnostics.keypoints import Check
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.findings import finding_callout
+from kinefit.exporters.report.page import finding_callout
+from kinefit.exporters.report.plots import line
 from kinefit.geometry.camera import Camera
 from kinefit.motion import UP_AXES
 
@@ -116,10 +118,7 @@ def _plan(check: Check, up: str) -> p.Section:
             outline = np.stack([corners[0], camera.centre_world, corners[1]])
             bad = any(found.severity == "fault" for found in check.of(camera.name))
             colour = p.RIGHT_COLOUR if bad else p.LEFT_COLOUR
-            traces.append({
-                "x": outline @ a, "y": outline @ b, "mode": "lines", "type": "scatter", "showlegend": False,
-                "line": {"color": colour, "width": 1}, "hoverinfo": "skip",
-            })  # fmt: skip
+            traces.append(line(outline @ a, outline @ b, camera.name, colour, 1))
             traces.append({
                 "x": [float(camera.centre_world @ a)], "y": [float(camera.centre_world @ b)], "mode": "markers+text",
                 "type": "scatter", "text": [camera.name], "textposition": "top center", "showlegend": False,
@@ -145,10 +144,9 @@ def _sides(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
 def _times(check: Check) -> p.Section:
     assert check.times is not None
     traces = [
-        {"x": shifts, "y": cost, "mode": "lines", "type": "scatter", "name": f"{a} - {b}",
-         "line": {"color": p.SERIES[i % len(p.SERIES)], "width": 1.6}}
-        for i, ((a, b), (shifts, cost)) in enumerate(check.times.curves.items())
-    ]  # fmt: skip
+        line(shifts, cost, f"{a} - {b}", colour, 1.6, hover=f"{a} - {b} %{{y:.1f}} px", legend=True)
+        for ((a, b), (shifts, cost)), colour in zip(check.times.curves.items(), cycle(p.SERIES))
+    ]
     layout = {
         "xaxis": {"title": "shift of the second camera [frames]"},
         "yaxis": {"title": "distance of the rays [px]", "rangemode": "tozero"},

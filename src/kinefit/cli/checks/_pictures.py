@@ -10,6 +10,7 @@ from kinefit.diagnostics.bias import CameraBias
 from kinefit.diagnostics.keypoints import Check
 from kinefit.diagnostics.views import from_others
 from kinefit.errors import KinefitError
+from kinefit.exporters.pictures.drawing import draw_dot, draw_line
 from kinefit.exporters.report import page as p
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.preparing.faces import shown_video
@@ -84,16 +85,14 @@ def _ground(check: Check, camera: Camera, frame: int) -> tuple[NDArray, ImageFra
 def _points(ground: NDArray, image: ImageFrame, seen: NDArray, others: NDArray, b: CameraBias) -> NDArray:
     scale = max(ground.shape) / _LINE_REFERENCE_PX
     out = (ground * 0.75).astype(np.uint8)
-    for uv, expected in zip(image.from_calibration(seen), image.from_calibration(others), strict=True):
-        if np.isfinite(uv).all() and np.isfinite(expected).all():
-            cv2.line(out, _at(uv), _at(expected), _EXPECTED_RGB, max(1, round(1.5 * scale)), cv2.LINE_AA)
-    for uv, expected in zip(image.from_calibration(seen), image.from_calibration(others), strict=True):
-        if np.isfinite(expected).all():
-            cv2.circle(out, _at(expected), round(4.5 * scale), _CONTOUR_RGB, -1, cv2.LINE_AA)
-            cv2.circle(out, _at(expected), round(3.5 * scale), _EXPECTED_RGB, -1, cv2.LINE_AA)
-        if np.isfinite(uv).all():
-            cv2.circle(out, _at(uv), round(6 * scale), _CONTOUR_RGB, round(4 * scale), cv2.LINE_AA)
-            cv2.circle(out, _at(uv), round(6 * scale), _DETECTED_RGB, round(2 * scale), cv2.LINE_AA)
+    pairs = list(zip(image.from_calibration(seen), image.from_calibration(others), strict=True))
+    for both in pairs:
+        draw_line(out, np.stack(both), _EXPECTED_RGB, max(1, round(1.5 * scale)))
+    for uv, expected in pairs:
+        draw_dot(out, expected, 4.5 * scale, _CONTOUR_RGB, -1)
+        draw_dot(out, expected, 3.5 * scale, _EXPECTED_RGB, -1)
+        draw_dot(out, uv, 6 * scale, _CONTOUR_RGB, max(2, round(4 * scale)))
+        draw_dot(out, uv, 6 * scale, _DETECTED_RGB, max(1, round(2 * scale)))
     bias = b.alone if np.isfinite(b.alone).all() else b.bias
     person = image.from_calibration(seen)[np.isfinite(seen).all(-1)]
     start = np.median(person, axis=0) if len(person) else np.array(out.shape[1::-1]) / 2
@@ -124,7 +123,7 @@ def _map(check: Check, c: int, ground: NDArray, image: ImageFrame) -> NDArray:
             here = (cell == (i, j)).all(axis=1)
             if here.sum() >= _MIN_CELL_POINTS:
                 start = image.from_calibration(np.median(uv[here], axis=0))
-                cv2.circle(out, _at(start), round(3 * scale), _EXPECTED_RGB, -1, cv2.LINE_AA)
+                draw_dot(out, start, 3 * scale, _EXPECTED_RGB, -1)
                 _arrow(out, start, start + _ARROW_SCALE * np.median(error[here], axis=0), 2 * scale)
     return out
 
@@ -138,12 +137,5 @@ def _arrow(out: NDArray, start: NDArray, end: NDArray, width: float) -> None:
     length = float(np.linalg.norm(end - start))
     if length > 1:
         for colour, thick in ((_CONTOUR_RGB, width + 3), (_BIAS_RGB, width)):
-            cv2.arrowedLine(
-                out,
-                _at(start),
-                _at(end),
-                colour,
-                max(1, round(thick)),
-                cv2.LINE_AA,
-                tipLength=min(0.5, 12 * width / 3 / length + 0.1),
-            )
+            tip = min(0.5, 12 * width / 3 / length + 0.1)
+            cv2.arrowedLine(out, _at(start), _at(end), colour, max(1, round(thick)), cv2.LINE_AA, tipLength=tip)

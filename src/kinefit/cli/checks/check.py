@@ -103,9 +103,6 @@ def check(
 
 
 def _print(found: Check) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
     from kinefit.cli.checks._page import camera_rows, verdict
 
     _screen.say(f"\n{found.name}: {verdict(found)}")
@@ -119,8 +116,5 @@ def _print(found: Check) -> None:
     columns, rows = camera_rows(found)
     if rows:
         shown = [at for at, name in enumerate(columns) if name in _PRINTED]
-        table = Table(*(escape(columns[at]) for at in shown), box=None, pad_edge=False)
-        for row in rows:
-            table.add_row(*(row[at] for at in shown))
         _screen.say()
-        _screen.console().print(table)
+        _screen.print_table([columns[at] for at in shown], ([row[at] for at in shown] for row in rows))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from os import PathLike
@@ -128,7 +128,7 @@ def identify_file(
         A file cannot be read or written, or no subject is found.
     """
     from kinefit.exporters import write_markers
-    from kinefit.exporters.atomic import write_text
+    from kinefit.exporters.atomic import write_rows
 
     source = Path(path)
     target = Path(out) if out is not None else source.with_name(f"{source.stem}-named{source.suffix}")
@@ -142,7 +142,7 @@ def identify_file(
     write_markers(labelled, target, like=source if both_c3d else None)
     doubts = target.with_name(f"{target.stem}-doubts.csv")
     named = {m.name: f for m, f in zip(models, found, strict=True)}
-    write_text(doubts, _doubts(named, markers, len(models) > 1))
+    write_rows(doubts, _doubts(named, markers, len(models) > 1))
     return labelled, named, {"markers": target, "doubts": doubts}
 
 
@@ -174,17 +174,15 @@ def _prefixed(name: str, label: str) -> str:
     return f"{name}:{bare(label)}"
 
 
-def _doubts(found: dict[str, TakeIdentification], markers: Markers, many: bool) -> str:
-    """Doubtful frames as CSV, worst first; frames as the file counts them."""
+def _doubts(found: dict[str, TakeIdentification], markers: Markers, many: bool) -> Iterator[Sequence[object]]:
+    """Rows of doubtful frames, worst first; frames as the file counts them."""
     rows = sorted((d.confidence, d.first, name, d) for name, f in found.items() for d in f.doubts)
-    lines, times = ["first_frame,last_frame,first_time,last_time,label,kind,confidence"], markers.times
+    yield "first_frame", "last_frame", "first_time", "last_time", "label", "kind", "confidence"
     for _, _, name, d in rows:
         label = _prefixed(name, d.label) if many else d.label
-        lines.append(
-            f"{d.first + markers.first_frame},{d.last + markers.first_frame},{times[d.first]:.3f},"
-            f"{times[d.last]:.3f},{label},{d.kind},{d.confidence:.3f}"
-        )
-    return "\n".join(lines) + "\n"
+        ends = (d.first, d.last)
+        times = (f"{markers.times[frame]:.3f}" for frame in ends)
+        yield *(frame + markers.first_frame for frame in ends), *times, label, d.kind, f"{d.confidence:.3f}"
 
 
 def check_labels(markers: Markers, marker_set: str | None) -> list[Finding]:

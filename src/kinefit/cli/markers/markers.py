@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from kinefit.cli import _results, _screen
-from kinefit.cli._group import CommandGroup
+from kinefit.cli._screen import CommandGroup
 
 if TYPE_CHECKING:
     from kinefit.findings import Finding

@@ -151,7 +151,7 @@ def _retarget(motion: Path, character: Path, table: Path | None, out: Path | Non
     if others:
         raise click.UsageError(f"--{others[0]} does not apply with --retarget: the character's file determines it.")
     from kinefit.exporters import write_character
-    from kinefit.exporters.skeletons.finger_bones import in_words
+    from kinefit.exporters.skeletons.retarget import in_words
     from kinefit.readers.motion import find_motion, read_motion
     from kinefit.readers.skeletons.characters import KINDS, read_names
 

@@ -33,21 +33,16 @@ def retarget(
 ) -> None:
     """Retarget a recorded motion to the humanoid, by the directions of its bones."""
     from kinefit.cli._results import check_file
+    from kinefit.cli.motions.simulate import check_recording, read_skeleton
     from kinefit.exporters import write_motion
     from kinefit.findings import of_provenance
-    from kinefit.readers.skeletons.amc import read_amc
-    from kinefit.readers.skeletons.bvh import read_bvh
     from kinefit.readers.skeletons.characters import read_names
     from kinefit.simulation import retarget as retarget_motion
 
-    suffix = recording.suffix.lower()
-    if suffix not in (".bvh", ".amc"):
-        raise click.BadParameter(f"'{recording.name}' is not a .bvh or .amc file.", param_hint="RECORDING")
-    if (asf is not None) != (suffix == ".amc"):
-        raise click.UsageError("An .amc file needs its skeleton: give --asf FILE. With a .bvh file, leave out --asf.")
+    check_recording(recording, asf, (".bvh", ".amc"), "RECORDING")
     out = out or recording.with_suffix(".npz")
     check_file(out)
-    skeleton = read_amc(asf, recording, unit=unit, up=up) if asf else read_bvh(recording, unit=unit, up=up)
+    skeleton = read_skeleton(recording, asf, unit=unit, up=up)
     with _screen.bars() as step:
         step("retargeting", 0, 0)
         motion = retarget_motion(skeleton, rate=rate, names=read_names(table) if table else None)

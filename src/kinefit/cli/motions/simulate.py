@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -11,6 +12,7 @@ from kinefit.cli import _results, _screen
 
 if TYPE_CHECKING:
     from kinefit.motion import Motion
+    from kinefit.observations.recordings import SkeletonMotion
 
 _SENSORS = ("tof", "kinect", "stereo", "colour", "keypoints")
 _EXAMPLES = """\b
@@ -86,24 +88,35 @@ def _known(path: Path, body: str | None, asf: Path | None, rate: float | None, s
     """The motion on the body and at the rate asked for."""
     from kinefit.bodies import load_body
     from kinefit.readers.motion import read_motion
-    from kinefit.readers.skeletons.amc import read_amc
-    from kinefit.readers.skeletons.bvh import read_bvh
     from kinefit.simulation import on_body, resampled, retarget
 
-    suffix = path.suffix.lower()
-    if suffix not in (".npz", ".bvh", ".amc"):
-        raise click.BadParameter(f"'{path.name}' is not a .npz, .bvh or .amc file.", param_hint="MOTION")
-    if (asf is not None) != (suffix == ".amc"):
-        raise click.UsageError("An .amc file needs its skeleton: give --asf FILE. With other files, leave out --asf.")
+    check_recording(path, asf, (".npz", ".bvh", ".amc"), "MOTION")
     chosen = load_body(body) if body else None
-    if suffix == ".npz":
+    if path.suffix.lower() == ".npz":
         known = read_motion(path)
         known = resampled(known, rate or 30.0) if rate or known.rate > 30.0 else known
     else:
-        skeleton = read_amc(asf, path) if asf else read_bvh(path)
+        skeleton = read_skeleton(path, asf)
         step("retargeting", 0, 0)
         known = retarget(skeleton, rate=rate or min(skeleton.rate, 30.0))
         step("retargeting", len(known), len(known))
     if chosen is not None and chosen.name != known.body.name:
         known = on_body(known, chosen)
     return known
+
+
+def check_recording(path: Path, asf: Path | None, endings: Sequence[str], name: str) -> None:
+    """Raise click's errors for a recorded motion of another ending, or an .amc without its skeleton."""
+    if path.suffix.lower() not in endings:
+        known = f"{', '.join(endings[:-1])} or {endings[-1]}"
+        raise click.BadParameter(f"'{path.name}' is not a {known} file.", param_hint=name)
+    if (asf is not None) != (path.suffix.lower() == ".amc"):
+        raise click.UsageError("An .amc file needs its skeleton: give --asf FILE. With other files, leave out --asf.")
+
+
+def read_skeleton(path: Path, asf: Path | None, **options: Any) -> SkeletonMotion:
+    """The skeleton and motion of a .bvh file, or of an .amc file with its .asf."""
+    from kinefit.readers.skeletons.amc import read_amc
+    from kinefit.readers.skeletons.bvh import read_bvh
+
+    return read_amc(asf, path, **options) if asf else read_bvh(path, **options)

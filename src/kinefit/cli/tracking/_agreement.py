@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kinefit.cli._screen import console, say
+from kinefit.cli._screen import print_table, say
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,19 +21,17 @@ _FRAMES = 50
 
 def print_agreement(take: Take) -> None:
     """Print, for every two cameras, how far the points that both saw miss each other."""
-    from rich.table import Table
-
     from kinefit.readers.take.load import load_observations
 
     seen = load_observations(take)
-    table = Table("cameras", "shared points", "median reprojection error", box=None, pad_edge=False)
+    rows = []
     for a, b in combinations(seen.keypoints, 2):
         if seen.rig is not None and a.camera != b.camera and a.names == b.names:
             errors = pair_errors(seen.rig, a, b)
             median = f"{np.median(errors):.1f} px" if len(errors) else "-"
-            table.add_row(f"{a.camera} - {b.camera}", str(len(errors)), median)
+            rows.append((f"{a.camera} - {b.camera}", str(len(errors)), median))
     say("\nA pair with a far larger error has a wrong calibration, differing clocks, or keypoints of another person.")
-    console().print(table)
+    print_table(("cameras", "shared points", "median reprojection error"), rows)
 
 
 def pair_errors(rig: Rig, a: Keypoints, b: Keypoints) -> NDArray:

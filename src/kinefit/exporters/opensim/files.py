@@ -7,7 +7,7 @@ ground_pelvis joint: the way of its origin, then turns about its own z (tilt), x
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain, count
 from os import PathLike
 from pathlib import Path
@@ -48,15 +48,7 @@ def write_trc(
     names = plain_names(points.names)
     check_up(up, path)
     first = round(float(motion.times[0]) * motion.rate) + 1 if len(motion) else 1  # frame 1 is at 0 s, as in C3D
-    axes = "".join(f"\tX{k}\tY{k}\tZ{k}" for k in range(1, len(names) + 1))
-    lines = [
-        f"PathFileType\t4\t(X/Y/Z)\t{Path(path).name}",
-        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
-        f"{motion.rate:g}\t{motion.rate:g}\t{len(motion)}\t{len(names)}\t{unit}\t{motion.rate:g}\t{first}\t{len(motion)}",
-        "Frame#\tTime\t" + "\t\t\t".join(names),
-        "\t" + axes,
-        "",
-    ]
+    lines = trc_head(path, names, f"{motion.rate:g}", len(motion), unit, first)
     row = "\t".join(["%d", "%.9f"] + ["%.8f"] * (3 * len(names)))
 
     def rows() -> Iterator[str]:
@@ -66,6 +58,19 @@ def write_trc(
             yield from (row % (next(number), t, *v) for t, v in zip(part.times.tolist(), values.tolist()))
 
     write_lines(path, chain(lines, rows()))
+
+
+def trc_head(
+    path: str | PathLike[str], names: Sequence[str], rate: str, count: int, unit: str, first: int = 1
+) -> list[str]:
+    """First lines of a TRC file of `count` frames, of which the first has the number `first`."""
+    axes = "".join(f"\tX{k}\tY{k}\tZ{k}" for k in range(1, len(names) + 1))
+    return [
+        f"PathFileType\t4\t(X/Y/Z)\t{Path(path).name}",
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
+        f"{rate}\t{rate}\t{count}\t{len(names)}\t{unit}\t{rate}\t{first}\t{count}",
+        "Frame#\tTime\t" + "\t\t\t".join(names), "\t" + axes, "",
+    ]  # fmt: skip
 
 
 @checked

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, TaperedCylinder
 from kinefit.bodies.surfaces import Surface
 from kinefit.errors import ExportError
-from kinefit.exporters.skeletons.common import plain_names
+from kinefit.exporters.skeletons.common import euler, numbers, plain_names
 
 PERSON = 75.0  # [kg]
 SHARES = {
@@ -35,9 +35,7 @@ def model(body: Body, root_coordinates: list[str], path: str | PathLike[str]) ->
     names = plain_names(body.alias("opensim", s) for s in tree.segments)
     coordinates = plain_names(tree.coordinates)
     out = ET.Element("Model", name=plain_names([body.name])[0])
-    _text(out, "length_units", "meters")
-    _text(out, "force_units", "N")
-    _text(out, "gravity", "0 -9.80665 0")
+    _texts(out, length_units="meters", force_units="N", gravity="0 -9.80665 0")
     bodies = ET.SubElement(ET.SubElement(out, "BodySet"), "objects")
     joints = ET.SubElement(ET.SubElement(out, "JointSet"), "objects")
     markers = ET.SubElement(ET.SubElement(out, "MarkerSet"), "objects")
@@ -58,9 +56,7 @@ def model(body: Body, root_coordinates: list[str], path: str | PathLike[str]) ->
     points = body.landmarks
     for label, s, at in zip(plain_names(points.names), points.segments, points.points):
         marker = ET.SubElement(markers, "Marker", name=label)
-        _text(marker, "socket_parent_frame", f"/bodyset/{names[s]}")
-        _text(marker, "location", _numbers(at))
-        _text(marker, "fixed", "true")
+        _texts(marker, socket_parent_frame=f"/bodyset/{names[s]}", location=at, fixed="true")
     return out
 
 
@@ -68,22 +64,16 @@ def _joint(
     name: str, parent: str, child: str, at: NDArray, turns: list, ways: list, path: str | PathLike[str]
 ) -> ET.Element:
     joint = ET.Element("CustomJoint" if turns or ways else "WeldJoint", name=name)
-    _text(joint, "socket_parent_frame", f"{name}_parent")
-    _text(joint, "socket_child_frame", f"{name}_child")
+    _texts(joint, socket_parent_frame=f"{name}_parent", socket_child_frame=f"{name}_child")
     if turns or ways:
         coordinates = ET.SubElement(joint, "coordinates")
         for coordinate, _, (low, high) in turns + ways:
             entry = ET.SubElement(coordinates, "Coordinate", name=coordinate)
-            _text(entry, "default_value", _numbers([np.clip(0.0, low, high)]))
-            _text(entry, "range", _numbers([low, high]))
-            _text(entry, "clamped", "false")
-            _text(entry, "locked", "false")
+            _texts(entry, default_value=np.clip(0.0, low, high), range=[low, high], clamped="false", locked="false")
     frames = ET.SubElement(joint, "frames")
     for frame, socket, offset in ((f"{name}_parent", parent, at), (f"{name}_child", f"/bodyset/{child}", np.zeros(3))):
         entry = ET.SubElement(frames, "PhysicalOffsetFrame", name=frame)
-        _text(entry, "socket_parent", socket)
-        _text(entry, "translation", _numbers(offset))
-        _text(entry, "orientation", _ZERO)
+        _texts(entry, socket_parent=socket, translation=offset, orientation=_ZERO)
     if turns or ways:
         transform = ET.SubElement(joint, "SpatialTransform")
         for kind, moves in (("rotation", turns), ("translation", ways)):
@@ -114,12 +104,11 @@ def _three_axes(axes: Sequence[NDArray]) -> NDArray:
 
 def _transform_axis(transform: ET.Element, name: str, axis: NDArray, coordinate: str | None) -> None:
     entry = ET.SubElement(transform, "TransformAxis", name=name)
-    _text(entry, "coordinates", coordinate or "")
-    _text(entry, "axis", _numbers(axis))
+    _texts(entry, coordinates=coordinate or "", axis=axis)
     if coordinate:
-        _text(ET.SubElement(entry, "LinearFunction", name="function"), "coefficients", "1 0")
+        _texts(ET.SubElement(entry, "LinearFunction", name="function"), coefficients="1 0")
     else:
-        _text(ET.SubElement(entry, "Constant", name="function"), "value", "0")
+        _texts(ET.SubElement(entry, "Constant", name="function"), value="0")
 
 
 def _limits(low: float, high: float) -> tuple[float, float]:
@@ -129,9 +118,10 @@ def _limits(low: float, high: float) -> tuple[float, float]:
 def _body(name: str, segment: str, surfaces: Sequence[Surface]) -> ET.Element:
     mass, centre, inertia = mass_properties(segment, surfaces)
     out = ET.Element("Body", name=name)
-    _text(out, "mass", _numbers([mass]))
-    _text(out, "mass_center", _numbers(centre))
-    _text(out, "inertia", _numbers([inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]))
+    _texts(
+        out, mass=mass, mass_center=centre,
+        inertia=[inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))],
+    )  # fmt: skip
     components = ET.SubElement(out, "components") if surfaces else out
     for k, surface in enumerate(surfaces):
         middle, R_body_cylinder, length, radii = _rod(surface)
@@ -139,13 +129,10 @@ def _body(name: str, segment: str, surfaces: Sequence[Surface]) -> ET.Element:
         frame = ET.SubElement(components, "PhysicalOffsetFrame", name=f"{label}_axis")
         geometry = ET.SubElement(ET.SubElement(frame, "attached_geometry"), "Cylinder", name=f"{label}_surface")
         radius = float(np.mean(radii))
-        _text(geometry, "radius", _numbers([radius]))
-        _text(geometry, "half_height", _numbers([0.5 * length]))
+        _texts(geometry, radius=radius, half_height=0.5 * length)
         if abs(radii[0] - radii[1]) > 1e-9:
-            _text(geometry, "scale_factors", _numbers([radii[0] / radius, 1.0, radii[1] / radius]))
-        _text(frame, "socket_parent", "..")
-        _text(frame, "translation", _numbers(middle))
-        _text(frame, "orientation", _numbers(_turns(R_body_cylinder)))
+            _texts(geometry, scale_factors=[radii[0] / radius, 1.0, radii[1] / radius])
+        _texts(frame, socket_parent="..", translation=middle, orientation=euler(R_body_cylinder[None], "xyz"))
     return out
 
 
@@ -158,19 +145,9 @@ def _rod(surface: Surface) -> tuple[NDArray, NDArray, float, NDArray]:
         a, b, axis = surface.axes
         middle = 0.5 * np.add(surface.start, surface.end)
         return middle, np.stack([a, axis, -b], axis=1), surface.length, np.mean(surface.radii, axis=0)
-    middle = surface.vertices.mean(axis=0)
-    _, _, axes = np.linalg.svd(surface.vertices - middle, full_matrices=False)
-    size = np.ptp((surface.vertices - middle) @ axes.T, axis=0)
+    middle, axes, size = surface.box()
     R = np.stack([axes[1], axes[0], np.cross(axes[1], axes[0])], axis=1)
     return middle, R, float(size[0]), 0.5 * size[1:]
-
-
-def _turns(R: NDArray) -> NDArray:
-    """(3,) [rad] turns about x, y, z, each carried along, as OpenSim writes orientations: R = Rx Ry Rz."""
-    y = np.arcsin(np.clip(R[0, 2], -1.0, 1.0))
-    if abs(R[0, 2]) > 1 - 1e-12:
-        return np.array([np.arctan2(R[1, 0], R[1, 1]), y, 0.0])
-    return np.array([np.arctan2(-R[1, 2], R[2, 2]), y, np.arctan2(-R[0, 1], R[0, 0])])
 
 
 def mass_properties(segment: str, surfaces: Sequence[Surface]) -> tuple[float, NDArray, NDArray]:
@@ -189,9 +166,8 @@ def mass_properties(segment: str, surfaces: Sequence[Surface]) -> tuple[float, N
     return mass, centre, inertia
 
 
-def _text(parent: ET.Element, tag: str, text: str) -> None:
-    ET.SubElement(parent, tag).text = text
+def _texts(parent: ET.Element, **texts: str | ArrayLike) -> None:
+    """Elements with a text or numbers, in this order."""
+    for tag, text in texts.items():
+        ET.SubElement(parent, tag).text = text if isinstance(text, str) else numbers(text, ".10g")
 
-
-def _numbers(values: ArrayLike) -> str:
-    return " ".join(f"{float(v) + 0.0:.10g}" for v in np.atleast_1d(np.asarray(values, float)))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.exporters.pictures.drawing import WHITE, draw_line, segment_contours, write_lines
-from kinefit.exporters.pictures.overlay import frames_of, nearest_frame, write_pictures
+from kinefit.exporters.pictures.overlay import frames_of, write_pictures
 from kinefit.geometry.camera import Camera
 from kinefit.motion import Motion
 from kinefit.observations import DepthVideo
@@ -78,7 +78,7 @@ def write_depth_overlay(
 
     def drawn() -> Iterator[NDArray[np.uint8]]:
         for i in frames_of(motion, depth.times):
-            at = nearest_frame(motion, float(depth.times[i]))
+            at = motion.frame_at(float(depth.times[i]))
             label = f"{camera.name}   frame {i}" + ("" if at is not None else "   no motion here")
             yield depth_picture(depth.frame(i).depth, motion, at, camera, label=label)[:height, :width]
 

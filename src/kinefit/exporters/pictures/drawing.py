@@ -14,7 +14,7 @@ from kinefit.bodies.limbs import finger_groups
 from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.geometry.camera import Camera, ImageFrame
-from kinefit.motion import Motion, Residuals
+from kinefit.motion import OUTLIER_WEIGHT, Motion, Residuals
 from kinefit.rendering import Canvas
 from kinefit.rendering.colours import LOST_COLOUR, side_colour
 from kinefit.rendering.looks import segment_looks, side_colours, triangle_segments, uncertain_segments
@@ -22,10 +22,11 @@ from kinefit.rendering.tubes import TubeMesh, body_mesh
 
 DARK, WHITE = (15, 15, 15), (255, 255, 255)
 MEASURED, OUTLIER, WAY = (255, 240, 60), (255, 40, 40), (255, 90, 220)
-OUTLIER_WEIGHT = 0.05
 _SAMPLES = np.linspace(0.0, 1.0, 6)[:, None]  # along a bone, which a lens may bend
 _LIMB_WIDTH, _FINGER_WIDTH = 0.022, 0.007  # [m] of a bone as drawn
 _SUBPIXEL_BITS, _MAX_DRAWN_PX = 4, 20000.0  # OpenCV's sub-pixel bits; [px] beyond which nothing is drawn
+_BLOCKS = 4  # over the head: a face is known down to about ten
+_ALL_BLOCKS = 12  # over the longer side of a picture that shows faces one knows not where
 _SKIN_OPACITY = 0.75
 _TO_LIGHT = np.array([-0.36, -0.48, -0.8])  # in the camera's frame
 _DASH_WIDTHS = 3.0  # length of a dash, and of a gap, over the width of its line: its ends are round
@@ -71,7 +72,7 @@ def draw_bones(image: NDArray, motion: Motion, frame: int, camera: Camera, image
         draw_line(image, uv[b], DARK, width + 2 * edge, dash)
         draw_line(image, uv[b], LOST_COLOUR if lost else colours[b], width, dash)
     for b in np.flatnonzero(~motion.lost[frame, list(owners)]):
-        _dot(image, uv[b, 0], 0.36 * thick[b], WHITE, -1)
+        draw_dot(image, uv[b, 0], 0.36 * thick[b], WHITE, -1)
 
 
 @lru_cache(maxsize=8)
@@ -161,8 +162,8 @@ def draw_residuals(image: NDArray, residuals: Residuals, frame: int, image_frame
                 draw_line(image, np.stack([measured[k] - step, measured[k] + step]), DARK, thin + 2)
                 draw_line(image, np.stack([measured[k] - step, measured[k] + step]), OUTLIER, thin)
         else:
-            _dot(image, measured[k], size, DARK, thin + 2)
-            _dot(image, measured[k], size, MEASURED, thin)
+            draw_dot(image, measured[k], size, DARK, thin + 2)
+            draw_dot(image, measured[k], size, MEASURED, thin)
 
 
 def write_lines(image: NDArray, lines: Sequence[tuple[str, tuple[int, int, int]]]) -> None:
@@ -196,7 +197,36 @@ def _dashes(uv: NDArray, length: float) -> list[NDArray]:
     return [samples[k : k + 3] for k in range(0, len(samples) - 1, 4)]
 
 
-def _dot(image: NDArray, uv: NDArray, radius: float, colour: tuple[int, int, int], thickness: int) -> None:
+def draw_dot(image: NDArray, uv: NDArray, radius: float, colour: tuple[int, int, int], thickness: int) -> None:
+    """Draw a circle about a pixel (2,), filled with a thickness of -1; none where it is not finite."""
     if np.isfinite(uv).all() and (np.abs(uv) < _MAX_DRAWN_PX).all():
         x, y, r = (round(float(v) * (1 << _SUBPIXEL_BITS)) for v in (uv[0], uv[1], radius))
         cv2.circle(image, (x, y), r, colour, thickness, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def hide_circles(image: NDArray[np.uint8], circles: NDArray) -> NDArray[np.uint8]:
+    """A copy of a picture (H, W, 3) uint8 in which nothing can be made out within circles (N, 3) [px] u, v, radius."""
+    out = np.array(image, order="C")
+    classes = np.ceil(np.log2(np.maximum(circles[:, 2], 1.0)))
+    for size in np.unique(classes):  # circles of nearly one radius at once, large ones last
+        mask = np.zeros(image.shape[:2], np.uint8)
+        for u, v, radius in circles[classes == size]:
+            cv2.circle(mask, (round(u), round(v)), max(1, round(radius)), 1, -1)
+        left, top, width, height = cv2.boundingRect(mask)
+        if width and height:
+            part, inside = (a[top : top + height, left : left + width] for a in (out, mask))
+            cv2.copyTo(_coarse(part, 2 * 2**size / _BLOCKS), inside, part)
+    return out
+
+
+def hide_all(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A copy of a picture in which nobody can be recognised."""
+    return _coarse(image, max(image.shape[:2]) / _ALL_BLOCKS)
+
+
+def _coarse(image: NDArray[np.uint8], block: float) -> NDArray[np.uint8]:
+    """The picture in blocks of so many pixels, blended."""
+    height, width = image.shape[:2]
+    few = (max(1, round(width / block)), max(1, round(height / block)))
+    small = cv2.resize(image, few, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)

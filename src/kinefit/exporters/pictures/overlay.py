@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from fractions import Fraction
+from itertools import count
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import av
@@ -15,8 +18,8 @@ from numpy.typing import NDArray
 
 from kinefit._threads import ahead
 from kinefit.errors import ExportError
-from kinefit.exporters.atomic import write_bytes, writing
-from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT, WHITE, draw_body, draw_residuals, draw_skin, write_lines
+from kinefit.exporters.atomic import write_image, writing
+from kinefit.exporters.pictures.drawing import WHITE, draw_body, draw_residuals, draw_skin, write_lines
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
 from kinefit.readers.video import Video
@@ -71,7 +74,7 @@ def write_overlay(
 
     def drawn() -> Iterator[NDArray[np.uint8]]:
         for i, image in zip(span, video.frames(span.start, span.stop)):
-            frame = nearest_frame(motion, video.times[i] + time_offset)
+            frame = motion.frame_at(video.times[i] + time_offset)
             label = f"frame {i}"
             yield draw_overlay(
                 image, motion, frame, camera, image_frame=image_frame, residuals=residuals, label=label, skin=skin
@@ -97,7 +100,7 @@ def write_pictures(
     ExportError
         The file cannot be written.
     """
-    with writing(path) as temporary, _encoder(path, temporary, rate, *size) as encode:
+    with writing(path) as temporary, _encoder(path, temporary, rate, size) as encode:
         for done, image in enumerate(ahead(pictures), start=1):
             encode(image, None if times is None else float(times[done - 1] - times[0]))
             if progress:
@@ -109,14 +112,6 @@ def frames_of(motion: Motion, times: NDArray) -> range:
     margin = 0.5 / motion.rate
     inside = np.flatnonzero((times > motion.times[0] - margin) & (times < motion.times[-1] + margin))
     return range(inside[0], inside[-1] + 1) if len(inside) else range(len(times))
-
-
-def nearest_frame(motion: Motion, time: float) -> int | None:
-    """Frame of a motion nearest to a time [s], None where there is none within one frame."""
-    if not len(motion):
-        return None
-    i = int(np.argmin(np.abs(motion.times - time)))
-    return i if abs(motion.times[i] - time) < 1.0 / motion.rate else None
 
 
 def draw_overlay(
@@ -179,17 +174,13 @@ def write_montage(
     for image in images.values():
         size = (max(1, round(image.shape[1] * height / image.shape[0])), height)
         row += [np.full((height, gap, 3), 255, np.uint8), cv2.resize(image, size, interpolation=cv2.INTER_AREA)]
-    suffix = ".jpg" if str(path).lower().endswith((".jpg", ".jpeg")) else ".png"
-    written, data = cv2.imencode(suffix, cv2.cvtColor(np.concatenate(row[1:], axis=1), cv2.COLOR_RGB2BGR))
-    if not written:
-        raise ExportError("the image cannot be encoded", file=path, remedy="Give a name that ends in .png.")
-    write_bytes(path, data.tobytes())
+    write_image(path, np.concatenate(row[1:], axis=1)[..., ::-1])
 
 
 def _told(residuals: Residuals, frame: int) -> str:
     norms = residuals.norms[frame]
     seen = np.isfinite(norms)
-    used = seen & (residuals.weights[frame] >= OUTLIER_WEIGHT)
+    used = seen & ~residuals.rejected[frame]
     if not seen.any():
         return "no keypoints"
     text = f"residual: median {np.median(norms[seen]):.1f}, mean {np.mean(norms[seen]):.1f} px, {used.sum()} points"
@@ -208,44 +199,35 @@ def _notes(motion: Motion, residuals: Residuals | None, frame: int) -> list[str]
     return notes
 
 
-class _encoder:
-    """Context that gives a function to encode one picture (H, W, 3) after the other, each with its time [s] or None."""
+@contextmanager
+def _encoder(
+    path: str | PathLike[str], temporary: Path, rate: float, size: tuple[int, int]
+) -> Iterator[Callable[[NDArray, float | None], None]]:
+    """Give a function that encodes one picture (H, W, 3) after the other, each with its time [s] or None."""
+    codec = next((name for name in _CODECS if name in av.codecs_available), None)
+    if codec is None:
+        raise ExportError(f"FFmpeg has none of the codecs {', '.join(_CODECS)}", file=path)
+    exact, numbers = Fraction(rate).limit_denominator(10000), count()
+    container = _told_by_system(av.open, str(temporary), "w")
+    stream = container.add_stream(codec, rate=exact, options=_CODECS[codec])
+    (stream.width, stream.height), stream.pix_fmt, stream.codec_context.time_base = size, "yuv420p", _TICK
 
-    def __init__(self, path: Any, temporary: Any, rate: float, width: int, height: int) -> None:
-        self.path, self.temporary = path, temporary
-        self.codec = next((name for name in _CODECS if name in av.codecs_available), None)
-        self.rate, self.size = Fraction(rate).limit_denominator(10000), (width, height)
-        self.container: Any = None
-        self.done = 0
-
-    def __enter__(self) -> Callable[[NDArray, float | None], None]:
-        if self.codec is None:
-            raise ExportError(f"FFmpeg has none of the codecs {', '.join(_CODECS)}", file=self.path)
-        self.container = _told_by_system(av.open, str(self.temporary), "w")
-        self.stream = self.container.add_stream(self.codec, rate=self.rate, options=_CODECS[self.codec])
-        self.stream.width, self.stream.height = self.size
-        self.stream.pix_fmt = "yuv420p"
-        self.stream.codec_context.time_base = _TICK
-        return self._encode
-
-    def _encode(self, image: NDArray, time: float | None) -> None:
+    def encode(image: NDArray, time: float | None) -> None:
         planes = cv2.cvtColor(image, cv2.COLOR_RGB2YUV_I420)  # four times as fast as FFmpeg's
-        frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
-        frame.time_base, frame.pts = _TICK, round((self.done / self.rate if time is None else time) / _TICK)
-        self.done += 1
-        for packet in self.stream.encode(frame):
-            _told_by_system(self.container.mux, packet)
+        frame, number = av.VideoFrame.from_ndarray(planes, format="yuv420p"), next(numbers)
+        frame.time_base, frame.pts = _TICK, round((number / exact if time is None else time) / _TICK)
+        for packet in stream.encode(frame):
+            _told_by_system(container.mux, packet)
 
-    def __exit__(self, kind: Any, error: Any, at: Any) -> None:
-        if kind is not None:
-            try:
-                self.container.close()
-            except (av.FFmpegError, OSError, ValueError):
-                pass  # the first error is the one to tell
-            return
-        for packet in self.stream.encode():
-            _told_by_system(self.container.mux, packet)
-        _told_by_system(self.container.close)
+    try:
+        yield encode
+    except BaseException:
+        with suppress(av.FFmpegError, OSError, ValueError):  # the first error is the one to tell
+            container.close()
+        raise
+    for packet in stream.encode():
+        _told_by_system(container.mux, packet)
+    _told_by_system(container.close)
 
 
 def _told_by_system(call: Callable, *args: Any) -> Any:

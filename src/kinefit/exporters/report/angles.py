@@ -7,16 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.exporters.curves import Curve, curves
-from kinefit.exporters.report.cycles import PERCENT, Cycles, normalised
-from kinefit.exporters.report.names import DIGITS, FINGER_JOINTS, NAMES
-from kinefit.exporters.report.norms import Norms
-from kinefit.exporters.report.page import CENTRE_COLOUR, LEFT_COLOUR, RIGHT_COLOUR, Html, plot
+from kinefit.exporters.curves import DIGITS, FINGER_JOINTS, NAMES, Curve, curves
+from kinefit.exporters.report.cycles import PERCENT, Cycles, Norms, normalised
+from kinefit.exporters.report.page import CENTRE_COLOUR, LEFT_COLOUR, RIGHT_COLOUR, Html
+from kinefit.exporters.report.plots import band, line, mark, stacked, thinned
 from kinefit.motion import Motion
 
-MAX_CURVE_POINTS = 1000  # points of a curve; the page is about as many pixels wide
 _COLOURS = {"left": LEFT_COLOUR, "right": RIGHT_COLOUR, "": CENTRE_COLOUR}
-_ROW, _GREY = 190, "#8a949e"  # [px] height of one plot
+_GREY = "#8a949e"
 
 # In the humanoid's order of interest; a joint that is not here keeps its own name and comes last.
 _JOINTS = {
@@ -51,7 +49,7 @@ def joint_plots(motion: Motion) -> dict[str, Html]:
             for curve in sides:
                 traces += _over_time(curve, motion.times, row, sides[0].side in ("left", "right"))
             ranges.append(_range(sides))
-        out[joint] = _stacked(traces, list(rows.values()), "time [s]", ranges, seeks=True)
+        out[joint] = _stacked(traces, list(rows.values()), ranges, "time [s]", seeks=True)
     return out
 
 
@@ -70,7 +68,8 @@ def cycle_plots(motion: Motion, cycles: Cycles, norms: Norms | None = None) -> d
             if not usable:
                 continue
             wanted = dict.fromkeys((*(c.name for c in usable), stem))
-            traces += [_norm(norms[name], len(shown)) for name in wanted if norms and name in norms]
+            for percent, mean, sd in (norms[name].T for name in wanted if norms and name in norms):
+                traces += band(percent, mean, sd, "norm", _GREY, len(shown))
             for curve in usable:
                 side = curve.side if curve.side in spans else other
                 values = normalised(curve.values, spans[side])
@@ -78,18 +77,9 @@ def cycle_plots(motion: Motion, cycles: Cycles, norms: Norms | None = None) -> d
             shown[stem] = usable
         if shown:
             of = {c.side or other for sides in shown.values() for c in sides}
-            lines = [_mark(at, _COLOURS[side]) for side, at in marks.items() if side in of]
-            out[joint] = _stacked(traces, list(shown.values()), "cycle [%]", [None] * len(shown), shapes=lines)
+            lines = [mark("x", at, _COLOURS[side], 1.2, "dash") for side, at in marks.items() if side in of]
+            out[joint] = _stacked(traces, list(shown.values()), [None] * len(shown), "cycle [%]", marks=lines)
     return out
-
-
-def thinned(values: NDArray, most: int = MAX_CURVE_POINTS) -> NDArray:
-    """Frames that keep the shape of a curve (F,): the lowest and highest value of each of `most` / 2 equal parts."""
-    if len(values) <= most:
-        return np.arange(len(values))
-    parts = np.array_split(np.arange(len(values)), most // 2)
-    ends = [p[k] for p in parts for k in (np.argmin(values[p]), np.argmax(values[p]))]
-    return np.unique([0, *ends, len(values) - 1])
 
 
 def by_joint(found: list[Curve]) -> dict[str, dict[str, list[Curve]]]:
@@ -107,77 +97,34 @@ def _over_time(curve: Curve, times: NDArray, row: int, legend: bool) -> list[dic
     std = np.array([curve.std[a:b].max() for a, b in zip(at, ends)]) if len(at) < len(curve.std) else curve.std
     t, values, known = times[at], curve.values[at], np.isfinite(std)
     name, colour = curve.side or "middle", _COLOURS[curve.side]
-    axes = _axes(row)
-    band_t, band = _band(t, values, np.where(known, 2 * std, np.nan))
-    out: list[dict] = []
-    if len(band_t):
-        out.append(_filled(band_t, band, colour, name, axes))
-    half_width = np.where(known, 2 * std, 0)
-    line = {"x": t, "mode": "lines" if len(t) > 2 else "markers", "name": name, "legendgroup": name, **axes}
+    out = band(t, values, np.where(known, 2 * std, np.nan), name, colour, row)
     if known.any():
-        out.append(line | {
-            "y": np.where(known, values, np.nan), "line": {"color": colour, "width": 1.8}, "customdata": half_width,
-            "hovertemplate": f"{name} %{{y:.4~g}} ± %{{customdata:.2~g}} {curve.unit}<extra></extra>",
-            "showlegend": legend and row == 0,
-        })  # fmt: skip
+        out.append(line(
+            t, np.where(known, values, np.nan), name, colour, 1.8, row=row, legend=legend and row == 0,
+            hover=f"{name} %{{y:.4~g}} ± %{{customdata:.2~g}} {curve.unit}", customdata=np.where(known, 2 * std, 0),
+        ))  # fmt: skip
     if not known.all():
         near = ~known
         near[:-1] |= ~known[1:]
         near[1:] |= ~known[:-1]
-        dash = {"left": "dot", "right": "dash"}.get(curve.side, "dot")
-        out.append(line | {
-            "y": np.where(near, values, np.nan), "line": {"color": _GREY, "width": 1.4, "dash": dash},
-            "hovertemplate": f"{name} %{{y:.4~g}} {curve.unit}, not observed<extra></extra>", "showlegend": False,
-        })  # fmt: skip
+        out.append(line(
+            t, np.where(near, values, np.nan), name, _GREY, 1.4, dash="dash" if curve.side == "right" else "dot",
+            row=row, hover=f"{name} %{{y:.4~g}} {curve.unit}, not observed",
+        ))  # fmt: skip
     return out
-
-
-def _norm(values: NDArray, row: int) -> dict:
-    return _filled(*_band(*values.T), _GREY, "norm", _axes(row))
 
 
 def _over_cycle(curve: Curve, values: NDArray, row: int, of: str) -> list[dict]:
-    name, colour, axes = curve.side or "middle", _COLOURS[curve.side], _axes(row)
-    mean, out = values.mean(axis=0), []
-    if len(values) >= 3:
-        sd = values.std(axis=0, ddof=1)
-        out.append(_filled(*_band(PERCENT, mean, sd), colour, name, axes))
+    name, colour, mean = curve.side or "middle", _COLOURS[curve.side], values.mean(axis=0)
+    out = band(PERCENT, mean, values.std(axis=0, ddof=1), name, colour, row) if len(values) >= 3 else []
     if len(values) <= 8:
-        for cycle in values:
-            out.append({
-                "x": PERCENT, "y": cycle, "mode": "lines", "line": {"color": colour, "width": 0.8}, "opacity": 0.45,
-                "hoverinfo": "skip", "showlegend": False, "legendgroup": name, **axes,
-            })  # fmt: skip
+        out += [line(PERCENT, cycle, name, colour, 0.8, row=row, opacity=0.45) for cycle in values]
     unseen = not np.isfinite(curve.std).mean() > 0.5
-    line = {"color": _GREY if unseen else colour, "width": 2.2, **({"dash": "dot"} if unseen else {})}
     label = f"{name}, {len(values)} {'' if of.strip() == curve.side else of}cycles"
-    out.append({
-        "x": PERCENT, "y": mean, "mode": "lines", "name": label, "line": line,
-        "hovertemplate": f"{name} %{{y:.4~g}} {curve.unit}<extra></extra>", "legendgroup": name,
-        "showlegend": row == 0, **axes,
-    })  # fmt: skip
-    return out
-
-
-def _band(x: NDArray, middle: NDArray, half: NDArray) -> tuple[NDArray, NDArray]:
-    """Outline of a band as closed polygons, one for each run of finite halves, with NaN between them."""
-    known = np.flatnonzero(np.isfinite(half))
-    xs: list[Any] = []
-    ys: list[Any] = []
-    for part in np.split(known, np.flatnonzero(np.diff(known) > 1) + 1):
-        if len(part):
-            there, back = part, part[::-1]
-            xs += [x[there], x[back], [np.nan]]
-            ys += [middle[there] + half[there], middle[back] - half[back], [np.nan]]
-    return (np.concatenate(xs)[:-1], np.concatenate(ys)[:-1]) if xs else (np.zeros(0), np.zeros(0))
-
-
-def _filled(x: NDArray, y: NDArray, colour: str, name: str, axes: dict) -> dict:
-    red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
-    return {
-        "x": x, "y": y, "mode": "none", "fill": "toself", "fillcolor": f"rgba({red},{green},{blue},0.17)",
-        "hoverinfo": "skip", "showlegend": False, "legendgroup": name, **axes,
-    }  # fmt: skip
+    return [*out, line(
+        PERCENT, mean, label, _GREY if unseen else colour, 2.2, dash="dot" if unseen else "", row=row, legend=row == 0,
+        hover=f"{name} %{{y:.4~g}} {curve.unit}", legendgroup=name,
+    )]  # fmt: skip
 
 
 def _range(sides: list[Curve]) -> list[float]:
@@ -191,44 +138,14 @@ def _range(sides: list[Curve]) -> list[float]:
     return [low - pad, high + pad]
 
 
-def _axes(row: int) -> dict[str, str]:
-    return {"xaxis": "x", "yaxis": f"y{row + 1}" if row else "y"}
-
-
-def _mark(at: float, colour: str) -> dict:
-    return {
-        "type": "line", "xref": "x", "yref": "paper", "x0": at, "x1": at, "y0": 0, "y1": 1,
-        "line": {"color": colour, "width": 1.2, "dash": "dash"},
-    }  # fmt: skip
-
-
-def _stacked(
-    traces: list[dict], rows: list[list[Curve]], x: str, ranges: list[Any], *, seeks: bool = False, shapes: Any = ()
-) -> Html:
-    """Plots one below the other on one x axis, each with its name above it."""
-    n, notes = len(rows), []
-    height = _ROW * n + 78
-    gap = 34 / (_ROW * n)
-    tall = (1 - gap * (n - 1)) / n
-    layout: dict[str, Any] = {"margin": {"l": 52, "r": 12, "t": 62, "b": 42}, "shapes": list(shapes)}
-    for row, sides in enumerate(rows):
-        top = 1 - row * (tall + gap)
-        layout[f"yaxis{row + 1}" if row else "yaxis"] = {
-            "domain": [max(0.0, top - tall), top], "anchor": "x", "title": sides[0].unit,
-            **({"range": ranges[row]} if ranges[row] else {}),
-        }  # fmt: skip
+def _stacked(traces: list[dict], rows: list[list[Curve]], ranges: list[Any], x: str, **more: Any) -> Html:
+    names = []
+    for sides in rows:
         unseen = [c.side or "all of it" for c in sides if not np.isfinite(c.std).any()]
         stem = sides[0].stem
         text = NAMES.get(stem, stem) + (f"  {stem}" if stem in NAMES else "")
-        text += f"  + {_POSITIVE[sides[0].stem]}" if sides[0].stem in _POSITIVE else ""
-        text += f"  (not observed: {' and '.join(unseen)})" if unseen else ""
-        notes.append({
-            "text": text, "x": 0, "xref": "paper", "xanchor": "left", "y": top, "yref": "paper", "yanchor": "bottom",
-            "showarrow": False, "font": {"size": 12.5, "weight": 600},  # a part in bold would be a style of its element
-        })  # fmt: skip
-    layout["xaxis"] = {"title": x, "anchor": f"y{n}" if n > 1 else "y"}
-    layout |= {"annotations": notes, "legend": {"orientation": "h", "x": 0, "xanchor": "left", "y": 1 + 32 / height,
-               "yanchor": "bottom"}}  # fmt: skip
-    label = ", ".join(sides[0].stem for sides in rows)
-    traces = sorted(traces, key=lambda trace: "fill" not in trace)  # bands below all lines
-    return plot(traces, layout, height=height, label=f"{label} over {x.split()[0]}", seeks=seeks)
+        text += f"  + {_POSITIVE[stem]}" if stem in _POSITIVE else ""
+        names.append(text + (f"  (not observed: {' and '.join(unseen)})" if unseen else ""))
+    axes = [{"title": sides[0].unit, **({"range": of} if of else {})} for sides, of in zip(rows, ranges)]
+    label = f"{', '.join(sides[0].stem for sides in rows)} over {x.split()[0]}"
+    return stacked(traces, axes, x, label, names=names, **more)

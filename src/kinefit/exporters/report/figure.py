@@ -117,9 +117,8 @@ def _limbs(c: Surface, body: Body) -> list[tuple[int, NDArray, NDArray]]:
     surface; a mesh is as long as its longest direction and as thick as the rest of it.
     """
     if isinstance(c, MeshSurface):
-        middle = c.vertices.mean(axis=0)
-        _, _, axes = np.linalg.svd(c.vertices - middle, full_matrices=False)
-        half = 0.5 * np.ptp((c.vertices - middle) @ axes.T, axis=0)
+        middle, axes, size = c.box()
+        half = 0.5 * size
         radius = float(np.sqrt(half[1] * half[2]))
         return [(c.segment, middle + np.outer([-1, 1], max(half[0] - radius, 1e-3) * axes[0]), np.full(2, radius))]
     start, end, radii = np.array(c.start), np.array(c.end), np.array(c.radii)

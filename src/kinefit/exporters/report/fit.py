@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT
-from kinefit.exporters.report.angles import thinned
-from kinefit.exporters.report.moments import POORLY_SUPPORTED, Moment, frame_residuals
-from kinefit.exporters.report.page import SERIES, Html, joined, moment, plot, shaded, table
+from kinefit.exporters.report.moments import POORLY_SUPPORTED, Moment
+from kinefit.exporters.report.page import SERIES, Html, joined, moment, shaded, table
+from kinefit.exporters.report.plots import MAX_CURVE_POINTS, line, mark, stacked, thinned
 from kinefit.findings import runs_of
-from kinefit.motion import Motion, Residuals
+from kinefit.motion import SHOWN_UNITS, Motion, Residuals, known_median
 
-UNITS = {"px": (1.0, "px"), "m": (1000.0, "mm")}
 _SHIFTED = 0.5  # of the median residual: a constant shift above makes up most of what a camera is off by
 
 
@@ -52,9 +50,7 @@ def overall_median(motion: Motion, unit: str = "px") -> float:
     """Median residual of all points, or else surfaces, of a unit ("px", or "m", shown in mm); NaN without any."""
     own = [r for r in motion.residuals.values() if r.unit == unit]
     chosen = [r for r in own if r.of_points] or own
-    norms = [r.norms[np.isfinite(r.norms)] for r in chosen]
-    values = np.concatenate(norms) if norms else np.zeros(0)
-    return UNITS[unit][0] * float(np.median(values)) if len(values) else np.nan
+    return SHOWN_UNITS[unit][0] * known_median(np.concatenate([*(r.norms.ravel() for r in chosen), np.zeros(0)]))
 
 
 def sensor_table(motion: Motion, fits: Sequence[SensorFit]) -> Html:
@@ -70,7 +66,7 @@ def sensor_table(motion: Motion, fits: Sequence[SensorFit]) -> Html:
         more = " …" if len(swaps) > 6 else ""
         swapped = joined(f"{f.swapped} frames: ", Html(", ".join(links)), more) if swaps else "–"
         rows.append(
-            [f.name, _told(f.median, f.unit), _told(f.most, f.unit), *(shift[:2] if flat else shift),
+            [f.name, told(f.median, f.unit), told(f.most, f.unit), *(shift[:2] if flat else shift),
              f"{100 * f.seen:.0f} %", f"{100 * f.left_out:.1f} %", swapped]
         )  # fmt: skip
     if flat:
@@ -83,11 +79,14 @@ def point_table(motion: Motion) -> Html:
     """Median residual of every point in every sensor, the darker the larger; the share left out where it is much."""
     sensors = dict(motion.residuals)
     names = list(dict.fromkeys(name for r in sensors.values() for name in r.names))
-    medians = {sensor: dict(zip(r.names, _point_medians(r))) for sensor, r in sensors.items()}
-    left_out = {sensor: dict(zip(r.names, _point_left_out(r))) for sensor, r in sensors.items()}
+    medians = {sensor: point_medians(r) for sensor, r in sensors.items()}
+    left_out = {
+        sensor: dict(zip(r.names, r.rejected.sum(axis=0) / np.maximum(np.isfinite(r.norms).sum(axis=0), 1)))
+        for sensor, r in sensors.items()
+    }
     largest = {
         unit: max((v for s, r in sensors.items() if r.unit == unit for v in medians[s].values() if v > 0), default=1.0)
-        for unit in UNITS
+        for unit in SHOWN_UNITS
     }
     rows = []
     for name in names:
@@ -97,86 +96,54 @@ def point_table(motion: Motion) -> Html:
             text = f"{value:.1f}" if np.isfinite(value) else "–"
             cells.append(shaded(text + (f" ({100 * share:.0f} %)" if share >= 0.05 else ""), value / largest[r.unit]))
         rows.append(cells)
-    heads = [f"{s} [{UNITS[r.unit][1]}]" for s, r in sensors.items()]
+    heads = [f"{s} [{SHOWN_UNITS[r.unit][1]}]" for s, r in sensors.items()]
     caption = "Median residual of every point; in brackets the share rejected as outliers, if it is 5 % or more."
     return table(["point", *heads], rows, caption=caption)
 
 
 def quality_plot(motion: Motion, moments: Sequence[Moment]) -> Html:
     """Quality and every sensor's residual over time, doubtful moments shaded; a click moves the 3D figure."""
-    times, at = motion.times, thinned(motion.quality)
-    mode = "lines" if len(motion) > 2 else "markers"
-    traces: list[dict] = [{
-        "x": times[at], "y": motion.quality[at], "mode": mode, "name": "quality",
-        "line": {"color": "#4d4d4d", "width": 1.8}, "hovertemplate": "quality %{y:.2f}<extra></extra>",
-        "showlegend": False,
-    }]  # fmt: skip
+    times, at, half = motion.times, thinned(motion.quality), 0.5 / motion.rate
+    hover = "quality %{y:.2f}"
+    traces = [line(times[at], motion.quality[at], "quality", "#4d4d4d", 1.8, hover=hover)]
     units = list(dict.fromkeys(r.unit for r in motion.residuals.values()))
     for k, (name, r) in enumerate(motion.residuals.items()):
-        factor, unit = UNITS[r.unit]
-        level = factor * frame_residuals(r)
+        factor, unit = SHOWN_UNITS[r.unit]
+        level = factor * np.array([known_median(norms) for norms in r.norms])
         known = np.flatnonzero(np.isfinite(level))
-        chosen = np.arange(len(level)) if len(level) <= 1000 or not len(known) else known[thinned(level[known])]
-        traces.append({
-            "x": times[chosen], "y": level[chosen], "mode": mode, "name": name,
-            "line": {"color": SERIES[k % len(SERIES)], "width": 1.4}, "yaxis": f"y{2 + units.index(r.unit)}",
-            "hovertemplate": f"{name} %{{y:.1f}} {unit}<extra></extra>",
-        })  # fmt: skip
-    n = 1 + len(units)
-    height = 170 * n + 80
-    gap = 26 / (170 * n)
-    tall = (1 - gap * (n - 1)) / n
-    layout: dict[str, Any] = {
-        "yaxis": {"title": "quality", "range": [0, 1.03], "domain": [1 - tall, 1.0]},
-        "xaxis": {"title": "time [s]", "anchor": f"y{n}" if n > 1 else "y"},
-        "legend": {"orientation": "h", "x": 0, "y": 1 + 8 / height, "yanchor": "bottom"},
-        "margin": {"l": 56, "r": 12, "t": 46, "b": 42},
-        "shapes": [_shade(m, motion) for m in moments[:100]] + [_level(POORLY_SUPPORTED)],
-    }  # fmt: skip
-    for k, unit in enumerate(units, 1):
-        top = 1 - k * (tall + gap)
-        title = f"residual [{UNITS[unit][1]}]"
-        layout[f"yaxis{k + 1}"] = {"title": title, "rangemode": "tozero", "domain": [max(0.0, top - tall), top]}
-    return plot(traces, layout, height=height, label="quality and residuals over time", seeks=True)
+        at = np.arange(len(level)) if len(level) <= MAX_CURVE_POINTS or not len(known) else known[thinned(level[known])]
+        hover, row = f"{name} %{{y:.1f}} {unit}", 1 + units.index(r.unit)
+        traces.append(
+            line(times[at], level[at], name, SERIES[k % len(SERIES)], 1.4, hover=hover, row=row, legend=True)
+        )
+    axes: list[dict[str, Any]] = [{"title": "quality", "range": [0, 1.03]}]
+    axes += [{"title": f"residual [{SHOWN_UNITS[unit][1]}]", "rangemode": "tozero"} for unit in units]
+    marks: list[dict[str, Any]] = [
+        {"type": "rect", "xref": "x", "yref": "paper", "y0": 0, "y1": 1, "x0": times[m.start] - half,
+         "x1": times[m.stop - 1] + half, "fillcolor": "rgba(224,161,0,0.25)", "line": {"width": 0}, "layer": "below"}
+        for m in moments[:100]
+    ]  # fmt: skip
+    marks.append(mark("y", POORLY_SUPPORTED, "#a87600", 1, "dot"))
+    return stacked(traces, axes, "time [s]", "quality and residuals over time", marks=marks, seeks=True)
 
 
 def _fit(name: str, r: Residuals) -> SensorFit:
-    factor, unit = UNITS[r.unit]
-    norms, weights = r.norms, np.asarray(r.weights)
-    seen = np.isfinite(norms)
-    found = factor * norms[seen]
-    used = seen & (weights >= OUTLIER_WEIGHT)
+    factor, unit = SHOWN_UNITS[r.unit]
+    seen, rejected = np.isfinite(r.norms), r.rejected
+    found, used = factor * r.norms[seen], seen & ~rejected
     shift = factor * np.median(r.values[used], axis=0) if used.any() else np.full(r.values.shape[-1], np.nan)
     return SensorFit(
-        name, unit, int(seen.sum()), float(np.median(found)) if len(found) else np.nan,
-        float(np.percentile(found, 95)) if len(found) else np.nan, float(seen.mean()) if seen.size else 0.0,
-        float(np.mean(weights[seen] < OUTLIER_WEIGHT)) if len(found) else 0.0, shift, int(np.sum(r.swapped)),
-    )  # fmt: skip
+        name, unit, len(found), known_median(found), float(np.percentile(found, 95)) if len(found) else np.nan,
+        float(seen.mean()) if seen.size else 0.0, float(rejected.sum() / max(len(found), 1)), shift,
+        int(np.sum(r.swapped)),
+    )
 
 
-def _point_medians(r: Residuals) -> NDArray:
-    norms = UNITS[r.unit][0] * r.norms
-    return np.array([np.median(v[np.isfinite(v)]) if np.isfinite(v).any() else np.nan for v in norms.T])
+def point_medians(r: Residuals) -> dict[str, float]:
+    """Point -> median residual as shown [px, mm], NaN where it was not seen."""
+    return {name: SHOWN_UNITS[r.unit][0] * known_median(norms) for name, norms in zip(r.names, r.norms.T)}
 
 
-def _point_left_out(r: Residuals) -> NDArray:
-    seen = np.isfinite(r.norms)
-    return np.sum(seen & (np.asarray(r.weights) < OUTLIER_WEIGHT), axis=0) / np.maximum(seen.sum(axis=0), 1)
-
-
-def _told(value: float, unit: str) -> str:
+def told(value: float, unit: str) -> str:
+    """A residual in words."""
     return f"{value:.1f} {unit}" if np.isfinite(value) else "no data"
-
-
-def _shade(m: Moment, motion: Motion) -> dict:
-    half = 0.5 / motion.rate
-    return {
-        "type": "rect", "xref": "x", "yref": "paper", "y0": 0, "y1": 1, "x0": motion.times[m.start] - half,
-        "x1": motion.times[m.stop - 1] + half, "fillcolor": "rgba(224,161,0,0.25)",
-        "line": {"width": 0}, "layer": "below",
-    }  # fmt: skip
-
-
-def _level(value: float) -> dict:
-    line = {"color": "#a87600", "width": 1, "dash": "dot"}
-    return {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "yref": "y", "y0": value, "y1": value, "line": line}

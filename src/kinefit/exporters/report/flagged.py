@@ -1,4 +1,4 @@
-"""The doubtful moments on the page: a time line of all, then each with its cause and, folded, its pictures."""
+"""The doubtful moments on the page, each with its cause and pictures; which frames a report shows, and how."""
 
 from __future__ import annotations
 
@@ -7,13 +7,17 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.exporters.pictures.drawing import draw_body, draw_residuals, drawn_points
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.moments import Moment, listed, place, span, spoken_segments
-from kinefit.exporters.report.pictures import MOMENTS
-from kinefit.motion import Motion
+from kinefit.exporters.report.moments import Moment, doubtful_moments, listed, place, span, spoken_segments
+from kinefit.exporters.report.plots import line
+from kinefit.geometry.camera import Camera, ImageFrame
+from kinefit.motion import Motion, Residuals
 
 Pictures = Mapping[str, Mapping[int, NDArray[np.uint8]]]
 
+MOMENTS = 6  # doubtful moments that have pictures
+_MARGIN = 0.25  # of the person's box that is kept around it
 _MAX_TIMELINE_ROWS = 12
 _TIMELINE_ROW_PX = 24
 _MAX_TABLE_MOMENTS = 200
@@ -59,10 +63,7 @@ def time_line(motion: Motion, moments: Sequence[Moment]) -> p.Html:
                     half = 0.5 / motion.rate
                     x += [motion.times[m.start] - half, motion.times[m.stop - 1] + half, np.nan]
             if x:
-                traces.append({
-                    "x": x, "y": [name] * len(x), "mode": "lines", "line": {"color": colour, "width": 12},
-                    "hovertemplate": f"{name} %{{x:.2f}} s<extra></extra>", "showlegend": False,
-                })  # fmt: skip
+                traces.append(line(x, [name] * len(x), name, colour, 12, hover=f"{name} %{{x:.2f}} s"))
     layout = {
         "margin": {"l": 10, "r": 12, "t": 30, "b": 40}, "yaxis": {"type": "category", "automargin": True},
         "xaxis": {"title": "time [s]", "range": [float(motion.times[0]), float(motion.times[-1])]},
@@ -73,3 +74,40 @@ def time_line(motion: Motion, moments: Sequence[Moment]) -> p.Html:
 
 def _when(motion: Motion, m: Moment) -> p.Html:
     return p.joined(p.moment(motion.times[m.worst], span(motion, m)), f" {place(motion, m)}")
+
+
+def report_frames(motion: Motion) -> dict[int, str]:
+    """{frame: what it is}: first, middle, last, the one of lowest quality, and those of the worst doubtful moments."""
+    if not len(motion):
+        return {}
+    out: dict[int, str] = {0: "first", len(motion) // 2: "middle", len(motion) - 1: "last"}
+    out.setdefault(int(np.argmin(motion.quality)), "lowest quality")
+    for m in doubtful_moments(motion)[:MOMENTS]:
+        out.setdefault(m.worst, "doubtful")
+    return out
+
+
+def close_up(
+    image: NDArray[np.uint8],
+    motion: Motion,
+    frame: int,
+    camera: Camera,
+    *,
+    image_frame: ImageFrame | None = None,
+    residuals: Residuals | None = None,
+) -> NDArray[np.uint8]:
+    """The part of a picture (H, W, 3) uint8 RGB that shows the person, with the fit and the keypoints drawn on it."""
+    image_frame = image_frame or ImageFrame.identity()
+    out = np.array(image, order="C")
+    draw_body(out, motion, frame, camera, image_frame)
+    if residuals is not None and residuals.unit == "px":
+        draw_residuals(out, residuals, frame, image_frame)
+    uv = image_frame.from_calibration(camera.project(drawn_points(motion, frame)))
+    uv = uv[np.isfinite(uv).all(axis=1)]
+    size = np.array([out.shape[1], out.shape[0]], float)
+    if not len(uv) or np.any(uv.max(axis=0) < 0) or np.any(uv.min(axis=0) > size):
+        return out
+    low, high = np.clip(uv.min(axis=0), 0, size), np.clip(uv.max(axis=0), 0, size)
+    pad = _MARGIN * max(high - low)
+    (left, top), (right, bottom) = np.clip(low - pad, 0, size).astype(int), np.clip(high + pad, 0, size).astype(int)
+    return out[top:bottom, left:right] if right - left > 16 and bottom - top > 16 else out

@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from kinefit.bodies import Body
+from kinefit.exporters.curves import split_side
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.fit import UNITS, overall_median, sensor_fits
+from kinefit.exporters.report.fit import overall_median, sensor_fits
 from kinefit.exporters.report.moments import listed
-from kinefit.motion import Motion
+from kinefit.motion import SHOWN_UNITS, Motion
 
 _DETECTORS = {
     "openpose": "OpenPose (Cao et al. 2021, IEEE TPAMI 43:172)",
@@ -58,11 +60,11 @@ def methods_sentences(motion: Motion, doubtful: int) -> list[str]:
     for unit in ("px", "m"):
         median = overall_median(motion, unit)
         if np.isfinite(median):
-            fits = [f for f in sensor_fits(motion) if f.unit == UNITS[unit][1]]
+            fits = [f for f in sensor_fits(motion) if f.unit == SHOWN_UNITS[unit][1]]
             count = sum(f.count for f in fits)
             left = sum(f.count * f.left_out for f in fits) / max(count, 1)
             out.append(
-                f"The median residual is {median:.1f} {UNITS[unit][1]} over {count} measured points, of which "
+                f"The median residual is {median:.1f} {SHOWN_UNITS[unit][1]} over {count} measured points, of which "
                 f"{100 * left:.1f} % were rejected as outliers."
             )
     flagged = {0: "No moment was", 1: "One moment was"}.get(doubtful, f"{doubtful} moments were")
@@ -88,21 +90,28 @@ def summary(motion: Motion, date: str) -> dict[str, Any]:
 
 def lengths_table(motion: Motion) -> p.Html:
     """Distances from joint to joint; left and right in one row, with deviations where the provenance has them."""
-    body = motion.body
     stds = motion.provenance.get("length_std_m", {})
-    rows: dict[str, dict[str, str]] = {}
-    for child, parent in enumerate(body.tree.parents):
-        length = float(np.linalg.norm(body.tree.offsets[child]))
-        if parent < 0 or length < 1e-6:
-            continue
-        ends = (body.joints[parent].removeprefix("ground_"), body.joints[child])
-        side = {"_l": "left", "_r": "right"}.get(ends[1][-2:], "middle")
-        name = " to ".join(e[:-2] if e.endswith(("_l", "_r")) else e for e in ends)
-        std = stds.get(f"{body.tree.segments[parent]}-{body.tree.segments[child]}")
-        text = f"{100 * length:.1f}" + (f" ± {100 * std:.1f}" if isinstance(std, float) and np.isfinite(std) else "")
-        rows.setdefault(name, {})[side] = text
-    cells = [(name, *(found.get(side, "") for side in ("left", "middle", "right"))) for name, found in rows.items()]
+    cells = []
+    for name, found in joint_distances(motion.body).items():
+        row = dict.fromkeys(("left", "", "right"), "")
+        for side, (length, ends) in found.items():
+            std = stds.get(ends)
+            row[side] = f"{length:.1f}"
+            row[side] += f" ± {100 * std:.1f}" if isinstance(std, float) and np.isfinite(std) else ""
+        cells.append((name, *row.values()))
     return p.table(["joint to joint [cm]", "left", "middle", "right"], cells)
+
+
+def joint_distances(body: Body) -> dict[str, dict[str, tuple[float, str]]]:
+    """Name of two joints, without the side -> side -> their distance [cm] and "segment-segment"."""
+    tree, out = body.tree, dict[str, dict[str, tuple[float, str]]]()
+    for child, parent in enumerate(tree.parents):
+        length = float(np.linalg.norm(tree.offsets[child]))
+        if parent >= 0 and length > 1e-6:
+            ends = [split_side(joint) for joint in (body.joints[parent].removeprefix("ground_"), body.joints[child])]
+            found = 100 * length, f"{tree.segments[parent]}-{tree.segments[child]}"
+            out.setdefault(" to ".join(stem for stem, _ in ends), {})[ends[1][1]] = found
+    return out
 
 
 def _cameras(provenance: Mapping[str, Any], names: list[str]) -> str:

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body
 from kinefit.bodies.limbs import finger_groups
-from kinefit.exporters.pictures.drawing import OUTLIER_WEIGHT
+from kinefit.exporters.curves import DIGITS, split_side
 from kinefit.exporters.report.doubt import contradicted, doubtful, end_sigmas, uncertain_throughout
-from kinefit.exporters.report.names import DIGITS
 from kinefit.findings import runs_of
 from kinefit.motion import Motion, Residuals
 
@@ -133,10 +132,10 @@ def shared_by_prior(motion: Motion) -> dict[str, float]:
 
 def plain(segment: str) -> str:
     """A segment's name in words: hand_l becomes "left hand", index_distal_l "left index finger (distal)"."""
-    side = {"_l": "left ", "_r": "right "}.get(segment[-2:], "")
-    name = (segment[:-2] if side else segment).replace("_", " ").replace("upperarm", "upper arm")
+    stem, side = split_side(segment)
+    name = stem.replace("_", " ").replace("upperarm", "upper arm")
     digit, _, bone = name.partition(" ")
-    return side + (f"{DIGITS[digit].lower()} ({bone})" if bone and digit in DIGITS else name)
+    return f"{side} {f'{DIGITS[digit].lower()} ({bone})' if bone and digit in DIGITS else name}".strip()
 
 
 def spoken_segments(body: Body, segments: Sequence[str]) -> list[str]:
@@ -156,15 +155,6 @@ def listed(names: Sequence[str], most: int = 4) -> str:
     if len(names) > most + 1:
         names = [*names[:most], f"{len(names) - most} more"]
     return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
-
-
-def frame_residuals(residuals: Residuals) -> NDArray:
-    """(F,) median length of a sensor's residuals in each frame, NaN where it saw nothing."""
-    norms = residuals.norms
-    out = np.full(len(norms), np.nan)
-    seen = np.isfinite(norms).any(axis=1)
-    out[seen] = np.nanmedian(norms[seen], axis=1)
-    return out
 
 
 def _runs(motion: Motion, flags: NDArray) -> list[tuple[int, int]]:
@@ -244,7 +234,7 @@ def causes(motion: Motion, moment: Moment) -> tuple[str, ...]:
         points = _points_of(motion, r, moment.segments)
         seen = np.isfinite(r.values[frames][:, points]).all(axis=-1)
         share_seen[name] = float(seen.any(axis=1).mean()) if points.any() else 0.0
-        left_out[name] = int((seen & (np.asarray(r.weights)[frames][:, points] < OUTLIER_WEIGHT)).sum())
+        left_out[name] = int(r.rejected[frames][:, points].sum())
         seen_points += int(seen.sum())
     seeing = [name for name, share in share_seen.items() if share >= 0.5]
     if pixels and len(seeing) < len(pixels) and len(seeing) <= 2:

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import AssetError, ExportError
+from kinefit.findings import Finding
 from kinefit.rendering import colours
 from kinefit.serving.policy import inline_policy
 
@@ -39,6 +40,9 @@ LEFT_COLOUR, RIGHT_COLOUR = colours.to_hex(colours.LEFT_COLOUR), colours.to_hex(
 CENTRE_COLOUR = colours.to_hex(colours.CENTRE_COLOUR)
 SERIES = (LEFT_COLOUR, RIGHT_COLOUR, CENTRE_COLOUR, "#cc79a7", "#7a5195", "#56b4e9", "#b8860b", "#4d4d4d")
 SEVERITIES = {"good": "✓", "note": "i", "warning": "!", "bad": "✕"}
+_FINDINGS = {
+    "fault": ("bad", "Fault"), "doubt": ("warning", "Doubt"), "note": ("note", "Note"), "good": ("good", "In order"),
+}  # fmt: skip
 
 _PLOTS_REMEDY = "Run kinefit warmup once where the package index can be reached, then write this page again."
 _SHADES = 20  # steps of the ground of a table's cell, from white to the right side's orange; text stays dark on all
@@ -334,3 +338,22 @@ def _plotly() -> tuple[str, str]:
     except AssetError as error:
         return str(error), ""
     return script.decode("utf-8"), base64.b64encode(gzip.compress(script, 9, mtime=0)).decode("ascii")
+
+
+def finding_callout(found: Finding, where: str = "") -> Html:
+    """One finding; `where` says of what, on a page about several takes."""
+    look, title = _FINDINGS[found.severity]
+    parts = [paragraph(found.confidence, small=True)] if found.confidence else []
+    if found.remedy:
+        parts.append(paragraph(strong("What to do: "), found.remedy))
+    head = joined(strong(f"{where}{': ' if where else ''}{title}. "), found.text)
+    return callout(look, head, *parts)
+
+
+def fault_sections(faults: Iterable[Finding]) -> list[Section]:
+    """The first section of a report on a motion whose inputs have faults; none where they have none."""
+    boxes = [finding_callout(found) for found in faults]
+    if not boxes:
+        return []
+    text = "The results below follow from inputs with these faults. Correct them and track again."
+    return [section("Faults of the inputs", paragraph(text), *boxes)]

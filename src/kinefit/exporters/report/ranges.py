@@ -10,10 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.exporters.curves import Curve, curves
+from kinefit.exporters.curves import Curve, curves, spoken
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.angles import by_joint
-from kinefit.exporters.report.names import spoken
 from kinefit.motion import Motion
 
 MAX_STD_DEG = 45.0

@@ -19,14 +19,13 @@ import numpy as np
 from kinefit._arguments import checked
 from kinefit.errors import ExportError, choices
 from kinefit.exporters.atomic import write_text
-from kinefit.exporters.curves import curves
+from kinefit.exporters.curves import curves, spoken
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.angles import cycle_plots, joint_plots
-from kinefit.exporters.report.cycles import Cycles, find_cycles, gait_numbers
+from kinefit.exporters.report.cycles import Cycles, Norms, find_cycles, gait_numbers
 from kinefit.exporters.report.figure import figure
-from kinefit.exporters.report.findings import fault_sections
 from kinefit.exporters.report.fit import overall_median, point_table, quality_plot, sensor_fits, sensor_table
-from kinefit.exporters.report.flagged import Pictures, flagged
+from kinefit.exporters.report.flagged import Pictures, flagged, report_frames
 from kinefit.exporters.report.methods import lengths_table, methods
 from kinefit.exporters.report.moments import (
     POORLY_SUPPORTED,
@@ -38,9 +37,7 @@ from kinefit.exporters.report.moments import (
     shared_by_prior,
     throughout_sentence,
 )
-from kinefit.exporters.report.names import spoken
-from kinefit.exporters.report.norms import Norms
-from kinefit.exporters.report.pictures import report_frames
+from kinefit.exporters.report.page import fault_sections
 from kinefit.exporters.report.ranges import ranges_table
 from kinefit.findings import of_provenance
 from kinefit.geometry.camera import Rig

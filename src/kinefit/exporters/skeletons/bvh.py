@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import chain
 from os import PathLike
 
 import numpy as np
@@ -11,7 +12,15 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.bodies import Body
 from kinefit.exporters.atomic import write_lines
-from kinefit.exporters.skeletons.common import UNITS, bone_names, check_up, euler_zxy, length_factor, slides
+from kinefit.exporters.skeletons.common import (
+    UNITS,
+    bone_names,
+    check_up,
+    euler_zxy,
+    length_factor,
+    moving_segments,
+    numbers,
+)
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
 from kinefit.motion import Motion
 
@@ -50,14 +59,11 @@ def write_bvh(
     body, scale, joints = motion.body, length_factor(unit, UNITS, path), bone_names(motion.body, names, path)
     pose = rest_pose(body, rest, names, path)
     check_up(up, path)
-    with_position = slides(body)
-    with_position[0] = True
+    with_position = moving_segments(body)
     order: list[int] = []
     head = ["HIERARCHY", *_hierarchy(body, pose, joints, with_position, scale, order)]
-    head += ["MOTION", f"Frames: {len(motion)}", f"Frame Time: {1.0 / motion.rate:.9f}"]
 
-    def lines() -> Iterator[str]:
-        yield from head
+    def tables() -> Iterator[NDArray]:
         before = None
         for part in motion.parts():
             Ts = pose.local_poses(part.turned(up))
@@ -66,11 +72,17 @@ def write_bvh(
             columns: list[NDArray] = []
             for s in order:
                 columns += [scale * Ts[:, s, :3, 3]] * bool(with_position[s]) + [np.degrees(turns[:, s])]
-            table = np.concatenate(columns, axis=1) + 0.0
-            row = " ".join(["%.8f"] * table.shape[1])
-            yield from (row % tuple(values) for values in table.tolist())
+            yield np.concatenate(columns, axis=1)
 
-    write_lines(path, lines())
+    write_lines(path, chain(head, bvh_motion(motion, tables())))
+
+
+def bvh_motion(motion: Motion, tables: Iterable[NDArray]) -> Iterator[str]:
+    """Lines of the motion, from the values of its channels (F, C) in pieces."""
+    yield from ("MOTION", f"Frames: {len(motion)}", f"Frame Time: {1.0 / motion.rate:.9f}")
+    for table in tables:
+        row = " ".join(["%.8f"] * table.shape[1])  # twice as fast as number by number
+        yield from (row % tuple(values) for values in (table + 0.0).tolist())
 
 
 def _hierarchy(
@@ -85,17 +97,14 @@ def _hierarchy(
         indent, inner = "\t" * depth, "\t" * (depth + 1)
         channels = f"6 {_POSITIONS} {_ROTATIONS}" if with_position[s] else f"3 {_ROTATIONS}"
         lines = [f"{indent}{'JOINT' if depth else 'ROOT'} {names[s]}", f"{indent}{{"]
-        lines += [f"{inner}OFFSET {_numbers(scale * pose.offsets[s])}", f"{inner}CHANNELS {channels}"]
+        lines += [f"{inner}OFFSET {numbers(scale * pose.offsets[s], '.8f')}", f"{inner}CHANNELS {channels}"]
         children = np.flatnonzero(tree.parents == s)
         for child in children:
             lines += joint(int(child), depth + 1)
         if not len(children):
-            end = _numbers(ends.get(s, np.zeros(3)))
+            end = numbers(ends.get(s, np.zeros(3)), ".8f")
             lines += [f"{inner}End Site", f"{inner}{{", f"{inner}\tOFFSET {end}", f"{inner}}}"]
         return [*lines, f"{indent}}}"]
 
     return joint(0, 0)
 
-
-def _numbers(values: NDArray) -> str:
-    return " ".join(f"{v + 0.0:.8f}" for v in values)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import struct
 from collections.abc import Iterator, Mapping
 from os import PathLike
 from pathlib import Path
@@ -16,7 +15,9 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes, write_lines
-from kinefit.exporters.skeletons.common import euler_zxy
+from kinefit.exporters.skeletons.bvh import bvh_motion
+from kinefit.exporters.skeletons.common import euler
+from kinefit.exporters.skeletons.glb import GltfFile
 from kinefit.exporters.skeletons.retarget import Retargeted, retargeted
 from kinefit.geometry import se3
 from kinefit.motion import Motion
@@ -71,42 +72,18 @@ def write_character(
 
 def _glb(motion: Motion, found: Retargeted) -> bytes:
     assert found.character.gltf is not None
-    gltf: dict[str, Any] = json.loads(json.dumps(found.character.gltf.json))
-    data = bytearray(found.character.gltf.binary)
+    gltf, nodes = found.character.gltf, map(int, np.flatnonzero(found.moving))
+    file = GltfFile(json.loads(json.dumps(gltf.json)), gltf.binary)
 
-    def add(array: NDArray, kind: str, **more: Any) -> int:
-        data.extend(bytes(-len(data) % 4))
-        content = np.ascontiguousarray(array, "<f4").tobytes()
-        views, accessors = gltf.setdefault("bufferViews", []), gltf.setdefault("accessors", [])
-        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": len(content)})
-        data.extend(content)
-        accessors.append({
-            "bufferView": len(views) - 1, "componentType": 5126, "count": len(array), "type": kind, **more,
-        })  # fmt: skip
-        return len(accessors) - 1
+    def courses() -> Iterator[tuple[int, str, NDArray]]:
+        for node in nodes:
+            _as_parts(file.json["nodes"][node], gltf.local(node))
+            yield node, "rotation", continuous_quaternions(found.rotations[:, node])
+            if node == found.mover:
+                yield node, "translation", found.places
 
-    times = (motion.times - motion.times[0]).astype(np.float32)
-    clock = add(times, "SCALAR", min=[float(times.min())], max=[float(times.max())])
-    samplers: list[dict[str, Any]] = []
-    channels: list[dict[str, Any]] = []
-
-    def channel(node: int, path: str, values: NDArray, kind: str) -> None:
-        samplers.append({"input": clock, "output": add(values, kind), "interpolation": "LINEAR"})
-        channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": path}})
-
-    for node in map(int, np.flatnonzero(found.moving)):
-        _as_parts(gltf["nodes"][node], found.character.gltf.local(node))
-        channel(node, "rotation", np.roll(continuous_quaternions(found.rotations[:, node]), -1, axis=-1), "VEC4")
-        if node == found.mover:
-            channel(node, "translation", found.places, "VEC3")
-    animation = {"name": motion.name, "samplers": samplers, "channels": channels}
-    gltf["animations"] = [animation, *gltf.get("animations", [])]
-    data.extend(bytes(-len(data) % 4))
-    gltf["buffers"] = [{**gltf["buffers"][0], "byteLength": len(data)}]
-    text = json.dumps(gltf, separators=(",", ":"), ensure_ascii=False).encode()
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(data), len(text), 0x4E4F534A)
-    return head + text + struct.pack("<I4s", len(data), b"BIN\0") + bytes(data)
+    file.animate(motion.name, motion.times, courses())
+    return file.packed()
 
 
 def _as_parts(node: dict[str, Any], M: NDArray) -> None:
@@ -139,19 +116,10 @@ def _bvh(motion: Motion, found: Retargeted) -> Iterator[str]:
         if len(set(axes)) not in (0, 3):
             problem = f"joint '{character.names[node]}' turns about {len(set(axes))} axes, not three"
             raise ExportError(problem, file=character.path, remedy="Export the character again, for animation.")
-        angles = iter(_euler(found.rotations[:, node], axes).T if axes else ())
+        angles = iter(euler(found.rotations[:, node], axes).T if axes else ())
         columns += [
             np.degrees(next(angles)) if name.endswith("rotation") else place[:, "xyz".index(name[0])] for name in names
         ]  # fmt: skip
     yield from head.rstrip().splitlines()
-    yield from ("MOTION", f"Frames: {len(motion)}", f"Frame Time: {1.0 / motion.rate:.9f}")
-    table = np.stack(columns, axis=1) + 0.0
-    row = " ".join(["%.8f"] * table.shape[1])
-    yield from (row % tuple(values) for values in table.tolist())
+    yield from bvh_motion(motion, [np.stack(columns, axis=1)])
 
-
-def _euler(rotations: NDArray, axes: str) -> NDArray:
-    """(F, 3) [rad] angles about three different axes in this order, without jumps, of rotations (F, 3, 3)."""
-    i, j, k = ("xyz".index(axis) for axis in axes)
-    as_zxy = rotations[:, [[j], [k], [i]], [j, k, i]]  # axes renamed; where that mirrors, turns go the other way
-    return euler_zxy(as_zxy) * (1.0 if (j - i) % 3 == 1 else -1.0)

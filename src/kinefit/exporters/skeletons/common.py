@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from os import PathLike
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body
 from kinefit.errors import ExportError, check_choice, spelled
@@ -22,11 +22,16 @@ UNITS = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 _LOCKED = 1e-7  # cosine of the middle angle below which the outer two turn about one axis
 
 
-def slides(body: Body) -> NDArray:
-    """(S,) bool: segments whose joint can slide, so that their offset changes."""
+def moving_segments(body: Body) -> NDArray:
+    """(S,) bool: the root, and segments whose joint can slide, so that their offset changes."""
     out = np.zeros(len(body.tree.segments), bool)
-    out[body.tree.owners[body.tree.prismatic]] = True
+    out[body.tree.owners[body.tree.prismatic]] = out[0] = True
     return out
+
+
+def numbers(values: ArrayLike, form: str) -> str:
+    """Numbers in a row as text, each in a form such as ".9g"; no minus before zero."""
+    return " ".join(f"{value + 0.0:{form}}" for value in np.ravel(values).tolist())
 
 
 def euler_zxy(rotations: NDArray, before: NDArray | None = None) -> NDArray:
@@ -42,6 +47,13 @@ def euler_zxy(rotations: NDArray, before: NDArray | None = None) -> NDArray:
     for frame in range(len(R)):
         out[frame] = before = _nearest_zxy(R[frame], before)
     return out
+
+
+def euler(rotations: NDArray, axes: str) -> NDArray:
+    """(F, 3) [rad] angles about three different body-fixed axes in this order, without jumps, of (F, 3, 3)."""
+    i, j, k = ("xyz".index(axis) for axis in axes)
+    as_zxy = rotations[:, [[j], [k], [i]], [j, k, i]]  # axes renamed; where that mirrors, turns go the other way
+    return euler_zxy(as_zxy) * (1.0 if (j - i) % 3 == 1 else -1.0)
 
 
 def _nearest_zxy(R: NDArray, before: NDArray) -> NDArray:

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import json
+import struct
+from collections.abc import Iterable, Iterator
 from os import PathLike
 from typing import Any
 
 import numpy as np
-import pygltflib as gl
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes
-from kinefit.exporters.skeletons.common import bone_names, plain_names, slides
+from kinefit.exporters.skeletons.common import bone_names, moving_segments, plain_names
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
 from kinefit.motion import Motion
 from kinefit.rendering.tubes import TubeMesh, body_mesh
 
 _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
-_COMPONENTS = {"float32": gl.FLOAT, "uint32": gl.UNSIGNED_INT, "uint16": gl.UNSIGNED_SHORT, "uint8": gl.UNSIGNED_BYTE}
+_COMPONENTS = {"float32": 5126, "uint32": 5125, "uint16": 5123, "uint8": 5121}
+_VERTICES, _INDICES = {"target": 34962}, {"target": 34963}  # what a buffer is for
 
 
 @checked
@@ -50,90 +53,97 @@ def write_glb(
     if not len(motion):
         raise ExportError("a motion without frames cannot be animated", file=path)
     body, tree = motion.body, motion.body.tree
-    gltf, buffer = gl.GLTF2(asset=gl.Asset(version="2.0", generator="kinefit")), _Buffer()
     joints, pose = bone_names(body, names, path), rest_pose(body, rest, names, path)
-    gltf.nodes = [
-        gl.Node(
-            name=name,
-            translation=[float(v) for v in pose.offsets[s]],
-            children=[int(c) for c in np.flatnonzero(tree.parents == s)],
-        )
-        for s, name in enumerate(joints)
-    ]
-    roots = [0]
+    nodes: list[dict[str, Any]] = []
+    for s, name in enumerate(joints):
+        nodes.append({"name": name, "translation": pose.offsets[s].tolist()})
+        if children := np.flatnonzero(tree.parents == s).tolist():
+            nodes[s]["children"] = children
+    scene = {"name": motion.name, "nodes": [0]}
+    file = GltfFile({
+        "asset": {"version": "2.0", "generator": "kinefit"}, "nodes": nodes, "scenes": [scene], "scene": 0,
+    })  # fmt: skip
     if body.surfaces or body.skin is not None:
-        mesh = pose.posed(body_mesh(body, cylinders=cylinders), body)
-        gltf.meshes, gltf.materials = [_mesh(mesh, buffer)], [_material()]
-        inverse_bind = np.tile(np.eye(4), (len(joints), 1, 1))
-        inverse_bind[:, :3, 3] = -pose.positions
-        matrices = buffer.add(inverse_bind.transpose(0, 2, 1))  # column after column
-        gltf.skins = [gl.Skin(inverseBindMatrices=matrices, joints=list(range(len(joints))), skeleton=0)]
-        gltf.nodes.append(gl.Node(name=plain_names([body.name])[0], mesh=0, skin=0))
-        roots.append(len(joints))
-    gltf.scenes, gltf.scene = [gl.Scene(name=motion.name, nodes=roots)], 0
-    gltf.animations = [_animation(motion, pose, buffer)]
-    gltf.accessors, gltf.bufferViews = buffer.accessors, buffer.views
-    gltf.buffers = [gl.Buffer(byteLength=len(buffer.data))]
-    gltf.set_binary_blob(bytes(buffer.data))
-    write_bytes(path, b"".join(gltf.save_to_bytes()))
+        _add_skin(file, pose.posed(body_mesh(body, cylinders=cylinders), body), pose)
+        nodes.append({"name": plain_names([body.name])[0], "mesh": 0, "skin": 0})
+        scene["nodes"] = [0, len(joints)]
+    file.animate(plain_names([motion.name])[0], motion.times, _courses(motion, pose))
+    write_bytes(path, file.packed())
 
 
-class _Buffer:
-    """The binary part of the file, and how it is cut up."""
+class GltfFile:
+    """A glTF file to be written as GLB: its JSON and its binary buffer, to which arrays are added."""
 
-    def __init__(self) -> None:
-        self.data, self.views, self.accessors = bytearray(), [], []  # type: ignore[var-annotated]
+    def __init__(self, content: dict[str, Any], binary: bytes = b"") -> None:
+        self.json, self.data = content, bytearray(binary)
 
-    def add(self, array: NDArray, *, target: int | None = None, bounds: bool = False, **more: Any) -> int:
-        """Append an array of (N, ...) and return the number of its accessor; floats are stored as float32."""
+    def add(self, array: NDArray, *, bounds: bool = False, view: Any = (), **more: Any) -> int:
+        """Add an array (N, ...), floats as float32, and return the number of its accessor.
+
+        `bounds`: with its lowest and highest values; `view` and `more`: entries of the view and of the accessor.
+        """
         array = np.ascontiguousarray(array, np.float32 if array.dtype.kind == "f" else array.dtype)
-        self.views.append(gl.BufferView(buffer=0, byteOffset=len(self.data), byteLength=array.nbytes, target=target))
-        self.data += array.tobytes() + bytes(-array.nbytes % 4)
+        self.data += bytes(-len(self.data) % 4)
+        views, accessors = (self.json.setdefault(key, []) for key in ("bufferViews", "accessors"))
+        views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes, **dict(view)})
+        self.data += array.tobytes()
         flat = array.reshape(len(array), -1)
         limits = {"min": flat.min(0).tolist(), "max": flat.max(0).tolist()} if bounds else {}
         kind = {"componentType": _COMPONENTS[array.dtype.name], "type": _TYPES[array.shape[1:]]}
-        self.accessors.append(gl.Accessor(bufferView=len(self.views) - 1, count=len(array), **kind, **limits, **more))
-        return len(self.accessors) - 1
+        accessors.append({"bufferView": len(views) - 1, "count": len(array), **kind, **limits, **more})
+        return len(accessors) - 1
+
+    def animate(self, name: str, times: NDArray, courses: Iterable[tuple[int, str, NDArray]]) -> None:
+        """Add an animation before the others: of nodes, "rotation" (F, 4) w, x, y, z or "translation" (F, 3)."""
+        clock = self.add(times - times[0], bounds=True)
+        samplers, channels = list[dict[str, Any]](), list[dict[str, Any]]()
+        for node, path, values in courses:
+            values = np.roll(values, -1, axis=-1) if path == "rotation" else values  # glTF: x, y, z, w
+            channels.append({"sampler": len(samplers), "target": {"node": node, "path": path}})
+            samplers.append({"input": clock, "output": self.add(values), "interpolation": "LINEAR"})
+        animation = {"name": name, "samplers": samplers, "channels": channels}
+        self.json["animations"] = [animation, *self.json.get("animations", [])]
+
+    def packed(self) -> bytes:
+        """The whole file."""
+        self.data += bytes(-len(self.data) % 4)
+        self.json["buffers"] = [{**self.json.get("buffers", [{}])[0], "byteLength": len(self.data)}]
+        text = json.dumps(self.json, separators=(",", ":"), ensure_ascii=False).encode()
+        text += b" " * (-len(text) % 4)
+        head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(self.data), len(text), 0x4E4F534A)
+        return head + text + struct.pack("<I4s", len(self.data), b"BIN\0") + bytes(self.data)
 
 
-def _mesh(mesh: TubeMesh, buffer: _Buffer) -> gl.Mesh:
+def _add_skin(file: GltfFile, mesh: TubeMesh, pose: Rest) -> None:
     weights = mesh.weights.astype(np.float32)
     segments = np.where(weights > 0, mesh.segments, 0).astype(np.uint16)
     colours = np.pad(mesh.colours, ((0, 0), (0, 1)), constant_values=255)
-    attributes = gl.Attributes(
-        POSITION=buffer.add(mesh.vertices, target=gl.ARRAY_BUFFER, bounds=True),
-        NORMAL=buffer.add(mesh.normals, target=gl.ARRAY_BUFFER),
-        COLOR_0=buffer.add(colours, target=gl.ARRAY_BUFFER, normalized=True),
-        JOINTS_0=buffer.add(segments, target=gl.ARRAY_BUFFER),
-        WEIGHTS_0=buffer.add(weights, target=gl.ARRAY_BUFFER),
-    )
-    indices = buffer.add(mesh.triangles.astype(np.uint32).ravel(), target=gl.ELEMENT_ARRAY_BUFFER)
-    return gl.Mesh(name="surface", primitives=[gl.Primitive(attributes=attributes, indices=indices, material=0)])
+    attributes = {
+        "POSITION": file.add(mesh.vertices, view=_VERTICES, bounds=True),
+        "NORMAL": file.add(mesh.normals, view=_VERTICES),
+        "COLOR_0": file.add(colours, view=_VERTICES, normalized=True),
+        "JOINTS_0": file.add(segments, view=_VERTICES), "WEIGHTS_0": file.add(weights, view=_VERTICES),
+    }  # fmt: skip
+    indices = file.add(mesh.triangles.astype(np.uint32).ravel(), view=_INDICES)
+    primitive = {"attributes": attributes, "indices": indices, "material": 0}
+    look = {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.75}
+    inverse_bind = np.tile(np.eye(4), (len(pose.positions), 1, 1))
+    inverse_bind[:, :3, 3] = -pose.positions
+    matrices = file.add(inverse_bind.transpose(0, 2, 1))  # column after column
+    file.json |= {
+        "meshes": [{"name": "surface", "primitives": [primitive]}],
+        "materials": [{"name": "skin", "pbrMetallicRoughness": look, "alphaMode": "OPAQUE"}],
+        "skins": [{"inverseBindMatrices": matrices, "joints": list(range(len(inverse_bind))), "skeleton": 0}],
+    }
 
 
-def _material() -> gl.Material:
-    look = gl.PbrMetallicRoughness(baseColorFactor=[1.0, 1.0, 1.0, 1.0], metallicFactor=0.0, roughnessFactor=0.75)
-    return gl.Material(name="skin", pbrMetallicRoughness=look, alphaMode="OPAQUE", alphaCutoff=None)
-
-
-def _animation(motion: Motion, pose: Rest, buffer: _Buffer) -> gl.Animation:
-    tree = motion.body.tree
+def _courses(motion: Motion, pose: Rest) -> Iterator[tuple[int, str, NDArray]]:
+    tree, moving = motion.body.tree, moving_segments(motion.body)
     turns, places = pose.local_moves(motion, "y")
     turning = np.zeros(len(tree.segments), bool)
     turning[tree.owners[~tree.prismatic]] = turning[0] = True
-    moving = slides(motion.body)
-    moving[0] = True
-    times = buffer.add(motion.times - motion.times[0], bounds=True)
-    out = gl.Animation(name=plain_names([motion.name])[0], samplers=[], channels=[])
-
-    def channel(segment: int, what: str, values: NDArray) -> None:
-        out.samplers.append(gl.AnimationSampler(input=times, output=buffer.add(values), interpolation="LINEAR"))
-        target = gl.AnimationChannelTarget(node=segment, path=what)
-        out.channels.append(gl.AnimationChannel(sampler=len(out.samplers) - 1, target=target))
-
     for s in range(len(tree.segments)):
         if turning[s]:
-            channel(s, "rotation", np.roll(turns[:, s], -1, axis=-1))  # glTF: x, y, z, w
+            yield s, "rotation", turns[:, s]
         if moving[s]:
-            channel(s, "translation", places[:, s])
-    return out
+            yield s, "translation", places[:, s]

@@ -130,10 +130,7 @@ def _rest_poses(body: Body, pose: Rest, up: str, factor: float) -> tuple[NDArray
     local = np.tile(np.eye(4), (len(body.tree.segments), 1, 1))
     local[:, :3, 3] = factor * pose.offsets
     local[0] = upright @ local[0]
-    bind = np.tile(np.eye(4), (len(local), 1, 1))
-    for s, parent in enumerate(body.tree.parents):
-        bind[s] = bind[parent] @ local[s] if parent >= 0 else local[s]
-    return local, bind
+    return local, upright @ se3.transform(np.eye(3), factor * pose.positions)
 
 
 def _animation(stage: Any, motion: Motion, pose: Rest, joints: list[str], factor: float) -> Any:

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_lines
-from kinefit.exporters.skeletons.common import bone_names, plain_names, slides
+from kinefit.exporters.skeletons.common import bone_names, moving_segments, numbers, plain_names
 from kinefit.exporters.skeletons.rest import Rest, rest_pose, standing
 from kinefit.motion import Motion
 
+_FORM = ".9g"  # of numbers
 _HEAD = """<?xml version="1.0" encoding="UTF-8"?>
 <!DOCTYPE X3D PUBLIC "ISO//Web3D//DTD X3D 4.0//EN" "https://www.web3d.org/specifications/x3d-4.0.dtd">
 <X3D profile="Immersive" version="4.0" xmlns:xsd="http://www.w3.org/2001/XMLSchema-instance" \
@@ -53,9 +54,8 @@ def write_x3d(motion: Motion, path: str | PathLike[str], *, names: str | None = 
     plain = rest_pose(body, rest, names, path)
     pose = standing(body) if np.array_equal(plain.turns, np.broadcast_to(np.eye(3), plain.turns.shape)) else plain
     turns, places = pose.local_moves(motion, "y")
-    moves = slides(body)
-    moves[0] = True
-    keys = _numbers(np.arange(len(motion)) / (len(motion) - 1))
+    moves = moving_segments(body)
+    keys = numbers(np.arange(len(motion)) / (len(motion) - 1), _FORM)
 
     def lines() -> Iterator[str]:
         seconds = (len(motion) - 1) / motion.rate
@@ -99,7 +99,7 @@ def _joints(
 
     def joint(s: int) -> Iterator[str]:
         field = ' containerField="skeleton"' if tree.parents[s] < 0 else ""
-        centre = _numbers(pose.positions[s])
+        centre = numbers(pose.positions[s], _FORM)
         yield f'<HAnimJoint{field} DEF="{ids[s][0]}" name={quoteattr(names[s])} center="{centre}">'
         children = [int(child) for child in np.flatnonzero(tree.parents == s)]
         to = [pose.positions[child] for child in children]
@@ -107,7 +107,7 @@ def _joints(
             to = [pose.positions[s] + pose.turns[s] @ ends[s]]
         yield f'<HAnimSegment DEF="{ids[s][1]}" name={quoteattr(plain[s])}>'
         if to:
-            points = _numbers(np.array([[pose.positions[s], end] for end in to]))
+            points = numbers([[pose.positions[s], end] for end in to], _FORM)
             yield '<Shape><Appearance><Material emissiveColor="0.1 0.4 0.7"/></Appearance>'
             yield f'<LineSet vertexCount="{" ".join(["2"] * len(to))}"><Coordinate point="{points}"/></LineSet></Shape>'
         yield "</HAnimSegment>"
@@ -122,7 +122,7 @@ def _joints(
 def _moved(kind: str, field: str, joint: str, keys: str, values: NDArray) -> Iterator[str]:
     """An interpolator, and its routes from the clock and to the joint."""
     name = f"{field}_{joint}"
-    yield f'<{kind}Interpolator DEF="{name}" key="{keys}" keyValue="{_numbers(values)}"/>'
+    yield f'<{kind}Interpolator DEF="{name}" key="{keys}" keyValue="{numbers(values, _FORM)}"/>'
     yield f'<ROUTE fromNode="clock" fromField="fraction_changed" toNode="{name}" toField="set_fraction"/>'
     yield f'<ROUTE fromNode="{name}" fromField="value_changed" toNode="{joint}" toField="set_{field}"/>'
 
@@ -134,6 +134,3 @@ def _axis_angles(quaternions: NDArray) -> NDArray:
     axes = np.where(turned[:, None], quaternions[:, 1:] / np.where(turned, sines, 1.0)[:, None], [0.0, 0.0, 1.0])
     return np.column_stack([axes, 2.0 * np.arctan2(sines, quaternions[:, 0])])
 
-
-def _numbers(values: NDArray) -> str:
-    return " ".join(f"{value + 0.0:.9g}" for value in np.ravel(values).tolist())
