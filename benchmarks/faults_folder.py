@@ -22,9 +22,9 @@ from benchmarks.figures import LEFT_OUT, amount, figure, quick
 from benchmarks.long import command, same_results, tracked, write_long_take
 from kinefit.errors import KinefitError
 from kinefit.readers.take.file import Take, read_take
+from kinefit.takes.track import track_take
 from kinefit.tracking.checkpoints.checkpoint import Checkpoint, key_of
 from kinefit.tracking.checkpoints.frame_file import FORMAT, KINDS
-from kinefit.tracking.takes.take import track_take
 
 LONG, KILLS = 20_000, 20
 _FRAMES, _BYTES = amount(700, 160), 10_000  # frames of the take that is killed; of a frame, about

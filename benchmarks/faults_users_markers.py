@@ -21,7 +21,7 @@ from kinefit.exporters import write_markers
 from kinefit.exporters.c3d_file import c3d_bytes
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 
 LABELS = ("LASI", "RASI", "LPSI", "RPSI", "C7")
 _START = 12.5  # [s]

@@ -16,10 +16,10 @@ from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.multiview.followed import follow
 from kinefit.observations import MEDIAPIPE_33
-from kinefit.preparing.take import prepared
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
+from kinefit.takes.missing import prepared
 
 _CAMERA = '[[camera]]\nname = "{0}"\nsize = [{1}, {2}]\n'
 _KEYPOINTS = '[[keypoints]]\ncamera = "{0}"\nfile = "{0}.npy"\nformat = "mediapipe"\nframe = "calibration"\n'

@@ -23,11 +23,11 @@ from kinefit import Keypoints, Recording, Rig, load_body, track
 from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.observations import MEDIAPIPE_33, MEDIAPIPE_75
-from kinefit.preparing.take import prepared
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.keypoints import read_caliscope_csv
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
+from kinefit.takes.missing import prepared
 
 _NAME, _VIDEOS = "mv4_landmarks_caliscope", "mv4_upperbody_caliscope"
 _GESTURES = 60  # first images of the videos; then a board is held before the hands

@@ -31,11 +31,11 @@ from kinefit import (
 from kinefit.errors import AssetError, ObservationError
 from kinefit.observations import MEDIAPIPE_33
 from kinefit.preparing import detecting
-from kinefit.preparing.take import prepared
 from kinefit.readers.keypoints import read_caliscope_csv
 from kinefit.sensors.points.view_bias import ViewBias
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.view_bias import SeenFrames, learn_view_bias
+from kinefit.takes.missing import prepared
 from kinefit.tracking.sizing import channels_of
 
 _OWN, _TABLE = "x that without, bias found in the take", "x that without, bias of the other two recordings"

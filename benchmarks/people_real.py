@@ -14,13 +14,13 @@ from benchmarks.figures import data, figure, quick
 from kinefit import load_body
 from kinefit.errors import AssetError, ObservationError
 from kinefit.preparing import detecting
-from kinefit.preparing.take import prepared
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.readers.video import Video
+from kinefit.takes.in_view import people_in_view
+from kinefit.takes.missing import prepared
+from kinefit.takes.track import track_take
 from kinefit.tracking.recording import Recording
-from kinefit.tracking.takes.in_view import people_in_view
-from kinefit.tracking.takes.take import track_take
 from kinefit.tracking.video import track
 
 _GOALS = {

@@ -22,12 +22,12 @@ from kinefit.multiview.likeness import ImageSource, joints_of
 from kinefit.multiview.people import PersonTrack, people_of
 from kinefit.observations import Keypoints
 from kinefit.preparing import detecting
-from kinefit.preparing.take import prepared
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.readers.take.pictures import TakePictures
 from kinefit.simulation import simulate_keypoints, studio_rig
 from kinefit.simulation.movements import movement
+from kinefit.takes.missing import prepared
 
 SEEDS = amount(tuple(range(200, 220)), (200,))  # the odds were settled on 100 to 114
 _BEFORE, _AFTER = 2.0, 2.0  # [s] in view before and after

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, figure
 from benchmarks.motions import library
 from kinefit import Keypoints, Motion, find_cameras, track_take
-from kinefit.calibration.people.of_take import cameras_file
 from kinefit.errors import KinefitError
 from kinefit.evaluation import angle_errors
 from kinefit.exporters.motion_file import write_detections
@@ -35,6 +34,7 @@ from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.keypoint_sets import MEDIAPIPE_33
 from kinefit.simulation import cut, known_motion, resampled, simulate_keypoints
 from kinefit.simulation.keypoints import drift
+from kinefit.takes.missing import cameras_file
 
 FIRST, ROOMS = amount(40, 44), amount(30, 1)
 FINE = 120.0  # [Hz] at which the truth is known

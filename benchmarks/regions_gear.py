@@ -27,7 +27,7 @@ from kinefit.geometry.camera import Camera
 from kinefit.images.silhouette_background import BackgroundPlate
 from kinefit.motion import Motion
 from kinefit.rendering import Canvas, render_body
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 
 SEEDS = (11, 12)
 TRACKED = 50.0  # [mm] mean joint error of a frame up to which it counts as tracked

@@ -28,7 +28,7 @@ from kinefit.readers.video import Video
 from kinefit.rendering import Canvas, scaled
 from kinefit.subject.parameters import SegmentScales
 from kinefit.subject.surfaces import AnnyShape
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 from kinefit.tracking.tracker import Tracker
 
 STEPS, POSES = amount(100, 10), amount(6, 1)

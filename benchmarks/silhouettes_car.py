@@ -22,7 +22,7 @@ from kinefit.observations import SilhouetteFrame
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 
 BODY = """
 [body]

@@ -18,7 +18,7 @@ from benchmarks.regions_scene import away
 from kinefit.bodies.surfaces import body_mesh
 from kinefit.motion import Motion
 from kinefit.rendering import render_body
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 
 COLOUR = 'format = "threshold"\nchannels = "hsv"\nlow = [14, 115, 50]\nhigh = [34, 255, 255]\nsigma = 2.0\n'
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "silhouettes_cat.jpg"

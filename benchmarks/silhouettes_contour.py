@@ -24,7 +24,7 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.images.silhouette import outline
 from kinefit.readers.calibration.read import read_calibration, write_calibration
 from kinefit.recipes.contours import By, pose_of_contour
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 
 GRID, EDGE = (9, 6), 0.025  # corners; [m] of a square
 OFF = amount((5.0, 15.0, 30.0, 45.0), (5.0, 30.0))  # [deg] about an axis in the plane of the image, 2 mm of shift each

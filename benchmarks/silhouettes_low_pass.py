@@ -21,7 +21,7 @@ from benchmarks.silhouettes_contour import off_by
 from benchmarks.silhouettes_track import FRAMES, take_text, tracked
 from kinefit.bodies.serial import save_body
 from kinefit.motion import Motion
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 
 TOY_OFF, PERSON_OFF = amount((20.0, 35.0, 50.0), (35.0,)), amount((20.0, 30.0), (20.0,))  # [deg]
 TOY_STEPS, PERSON_STEPS = amount(range(1, 31, 2), range(1, 2)), amount(range(4, 100, 8), range(4, 5))

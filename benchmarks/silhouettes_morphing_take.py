@@ -20,7 +20,7 @@ from kinefit.bodies.morphs.morphing import Morphing
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.rendering import Canvas
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 
 SEEN = amount(FRAMES, 4)
 

@@ -28,7 +28,7 @@ from kinefit.observations import SilhouetteVideo
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.rendering import Canvas, scaled
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 
 SCALE = 0.5  # at which the body and masks are compared
 AROUND = 0.2  # [m] of a shoulder joint

@@ -33,7 +33,7 @@ from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.rendering import Canvas, lens_of, render_body
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 from kinefit.tracking.tracker import Tracker
 
 FRAMES, WARM, ROUNDS = amount(45, 15), 5, amount(6, 1)

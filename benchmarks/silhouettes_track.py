@@ -19,7 +19,7 @@ from kinefit.observations import SilhouetteVideo
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.rendering import render_body, scaled
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 FRAMES = amount(100, 6)

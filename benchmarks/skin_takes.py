@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, data, figure
 from benchmarks.held_out import persons, sides_right
 from kinefit import Keypoints, Motion, Rig, TrackSettings, track_take
-from kinefit.preparing.take import prepared
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
+from kinefit.takes.missing import prepared
 
 CAMERAS = tuple(range(4))
 SKIN = (1, 2, 3)  # camera 0 is so near that a hand hides the face

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from drawing import results
 from kinefit import read_motion
 from kinefit.bodies.surfaces import body_mesh
-from kinefit.calibration.people.of_take import find_cameras
 from kinefit.exporters import draw_overlay, write_motion
 from kinefit.exporters.pictures.drawing import draw_body
 from kinefit.exporters.report.cycles import PERCENT, find_cycles, normalised
@@ -26,6 +25,7 @@ from kinefit.readers.video import Video
 from kinefit.rendering import render_body
 from kinefit.rendering.colours import LEFT, RIGHT, to_hex
 from kinefit.simulation import cut, movement, retarget, squat_and_wave, write_synthetic_take
+from kinefit.takes.missing import find_cameras
 
 _TO_CALIBRATION = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
 

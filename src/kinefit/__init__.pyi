@@ -22,7 +22,7 @@ from kinefit.sensors.scene import Scene as Scene
 
 # From a recording to a motion
 from kinefit.batch.many import track_takes as track_takes
-from kinefit.calibration.people.of_take import find_cameras as find_cameras
+from kinefit.takes.missing import find_cameras as find_cameras
 from kinefit.frame.results import FrameResult as FrameResult
 from kinefit.motion import Motion as Motion
 from kinefit.readers.take.file import read_take as read_take
@@ -33,7 +33,7 @@ from kinefit.smoothing.online.known_noise import KnownNoise as KnownNoise
 from kinefit.subject.fit import fit_subject as fit_subject
 from kinefit.subject.sensor_parameters import OwnUnknowns as OwnUnknowns
 from kinefit.tracking.recording import Recording as Recording
-from kinefit.tracking.takes.take import track_take as track_take
+from kinefit.takes.track import track_take as track_take
 from kinefit.tracking.tracker import Tracker as Tracker
 from kinefit.tracking.video import track as track
 

@@ -26,7 +26,7 @@ from kinefit.observations import ClickFrame
 from kinefit.observations.recordings import mirror_name
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 from kinefit.tracking.takes.take_recording import recording_of
 
 

@@ -9,7 +9,7 @@ import pytest
 from kinefit.batch.report import provenance, take_pictures, write_track_report
 from kinefit.exporters.report.flagged import report_frames
 from kinefit.readers.take.file import read_take
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 
 
 @pytest.fixture(scope="module")

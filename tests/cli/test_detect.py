@@ -23,7 +23,7 @@ from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 

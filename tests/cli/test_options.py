@@ -25,8 +25,8 @@ from kinefit.simulation.movements import movement, people
 from kinefit.simulation.recordings import write_recording
 from kinefit.smoothing.online.known_noise import KnownNoise
 from kinefit.subject.subject import Subject
+from kinefit.takes.track import track_take
 from kinefit.tracking.recording import Recording
-from kinefit.tracking.takes.take import track_take
 from kinefit.tracking.takes.take_recording import recording_of
 from kinefit.tracking.tracker import Tracker
 from kinefit.tracking.video import track

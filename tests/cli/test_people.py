@@ -50,8 +50,8 @@ def test_a_point_that_no_camera_ever_sees(tmp_path):
 
 def test_what_the_cameras_saw_is_read_once_for_all(take, tmp_path, monkeypatch):
     from kinefit.multiview import followed
-    from kinefit.tracking.takes import in_view
-    from kinefit.tracking.takes import take as module
+    from kinefit.takes import in_view
+    from kinefit.takes import track as module
 
     calls = []
     for of, name in ((module, "load_uncovered"), (in_view, "load_uncovered"), (followed, "people_of")):
@@ -88,7 +88,7 @@ def test_a_number_too_many_is_told(take, tmp_path):
 
 def test_of_one_who_cannot_be_tracked_the_others_still_are(take, tmp_path, monkeypatch):
     from kinefit.errors import TrackingError
-    from kinefit.tracking.takes import take as module
+    from kinefit.takes import track as module
 
     original = module.track_take
 

@@ -17,7 +17,7 @@ from kinefit.solvers.bundle.shape import mirror_points
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.parameters import World
 from kinefit.subject.sensor_parameters import CameraExtrinsics
-from kinefit.tracking.takes.take import track_take, trial_of
+from kinefit.takes.track import track_take, trial_of
 
 BODY = load_body("humanoid")
 SCALES = np.linspace(0.92, 1.08, len(BODY.scale_groups))

@@ -11,7 +11,7 @@ from kinefit.geometry import se3
 from kinefit.readers.body_trackers import read_body_trackers
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 
 HEADER = "time_s,tracker,x,y,z,qw,qx,qy,qz\n"
 COUNT = 20

@@ -8,8 +8,8 @@ from kinefit.bodies.surfaces import sample
 from kinefit.errors import FileError, KinefitError, ObservationError
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.surface_points import read_surface_points
+from kinefit.takes.track import track_take
 from kinefit.tracking.checkpoints.checkpoint import Checkpoint, key_of
-from kinefit.tracking.takes.take import track_take
 
 HEADER = "time_s,point,x,y,z,std_x,std_y,std_z,vx\n"
 

@@ -14,9 +14,9 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import cut, resampled, simulate_keypoints, squat_and_wave, studio_rig
+from kinefit.takes.track import track_take
 from kinefit.tracking.agreement import sentences
 from kinefit.tracking.cameras import sentences as moved_cameras
-from kinefit.tracking.takes.take import track_take
 
 
 @pytest.fixture(scope="module")

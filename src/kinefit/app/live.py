@@ -9,13 +9,13 @@ from pathlib import Path
 
 from kinefit.app.folders import takes_below
 from kinefit.app.jobs import Job, JobQueue
-from kinefit.calibration.people.of_take import cameras_file
 from kinefit.errors import KinefitError
 from kinefit.readers.take.cameras import is_uncalibrated
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.streams import streams_of
 from kinefit.serving import TOKEN_VARIABLE
 from kinefit.serving.access import Access
+from kinefit.takes.missing import cameras_file, last_found
 
 _HOST, _CONNECT_TIMEOUT_S = "127.0.0.1", 0.2
 
@@ -29,7 +29,7 @@ def followable(root: Path) -> dict[Path, bool]:
     for take in takes_below(root):
         try:
             read = read_take(take.file)
-            if not is_uncalibrated(read):
+            if not is_uncalibrated(last_found(read)):
                 found[take.file] = bool(streams_of(read))
         except KinefitError:
             continue

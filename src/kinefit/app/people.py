@@ -13,17 +13,16 @@ from numpy.typing import NDArray
 
 from kinefit.app.images import ShownVideos
 from kinefit.batch.results import silent
-from kinefit.calibration.people.of_take import cameras_file, find_cameras
 from kinefit.errors import KinefitError, TrackingError
 from kinefit.multiview.people import PersonTrack
 from kinefit.preparing.detecting import detection_key, jobs_of_take
-from kinefit.preparing.take import prepared
 from kinefit.readers.detections import detections_key
 from kinefit.readers.take.cameras import is_uncalibrated
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import Observations
 from kinefit.readers.video import Video
-from kinefit.tracking.takes.in_view import people_in_view
+from kinefit.takes.in_view import people_in_view
+from kinefit.takes.missing import cameras_file, last_found, prepared
 
 _MARGIN = 0.15  # of a person's height around the keypoints: head and feet reach beyond them
 _MIN_CONFIDENCE = 0.5  # of a keypoint that counts
@@ -82,9 +81,9 @@ def people_pictures(take_file: Path, *, hide_faces: bool) -> tuple[PersonPicture
     """
     try:
         take = replace(read_take(take_file), person=None, hide_faces=False)
-        if not _is_detected(take) or (is_uncalibrated(take) and not cameras_file(take.path).exists()):
+        if not _is_detected(take) or is_uncalibrated(last_found(take)):
             return ()
-        take = prepared(find_cameras(take, _refuse, silent), _refuse, silent)
+        take = prepared(take, _refuse, silent)
         view = people_in_view(take)
         if view is None or len(view.people) < 2 or not view.seen.keypoints:
             return ()

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from kinefit.app.images import ShownVideos
 from kinefit.app.scene import ScenePage
 from kinefit.batch.viewed import content_of, has_same_cameras
-from kinefit.calibration.people.of_take import last_found
 from kinefit.errors import ObservationError
 from kinefit.exporters.pictures.overlay import draw_overlay
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
+from kinefit.takes.missing import last_found
 
 
 class Review:

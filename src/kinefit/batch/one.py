@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from kinefit.motion import Motion
     from kinefit.preparing.each_video import Tell
     from kinefit.readers.take.file import Take
-    from kinefit.tracking.takes.in_view import InView
+    from kinefit.takes.in_view import InView
 
 
 @dataclass(frozen=True)
@@ -112,13 +112,12 @@ def check_drawable(take: Take, *, skin: bool = False) -> None:
 def people_of(take: Take, out: Path, step: Step, tell: Tell) -> tuple[InView | None, list[tuple[Take, Path]]]:
     """Find the people to track: the people in view (None if the take names one), and a take and a folder for each.
 
-    If the take needs it, keypoints are detected, cameras calibrated and bodies downloaded first.
+    What the take lacks is found first, as by `prepared`.
     """
-    from kinefit.calibration.people.of_take import find_cameras
-    from kinefit.preparing.take import prepared
-    from kinefit.tracking.takes.in_view import people_in_view
+    from kinefit.takes.in_view import people_in_view
+    from kinefit.takes.missing import prepared
 
-    take = prepared(find_cameras(take, step, tell), step, tell)
+    take = prepared(take, step, tell)
     view = people_in_view(take) if take.person is None else None
     people = len(view.people) if view else 0
     if people < 2:
@@ -144,11 +143,11 @@ def track_person(
     from kinefit.batch.viewed import OUTDATED, inputs_entry, is_outdated
     from kinefit.findings import CLOCKS, LABELS, STATURE
     from kinefit.multiview import followed
+    from kinefit.takes.track import settings_of, track_take
     from kinefit.tracking import cameras
     from kinefit.tracking.agreement import sentences
     from kinefit.tracking.checkpoints.checkpoint import Checkpoint, key_of
     from kinefit.tracking.takes.floor_level import floor_sentences
-    from kinefit.tracking.takes.take import settings_of, track_take
     from kinefit.tracking.video import TrackingInterrupted
 
     notes: list[str] = []

@@ -44,10 +44,10 @@ def gather(
     KinefitError
         A file is missing or invalid, or two takes are given.
     """
-    from kinefit.calibration.people.of_take import find_cameras
     from kinefit.readers.motion import read_motion
     from kinefit.readers.take.find import takes_in
     from kinefit.readers.take.load import load_observations
+    from kinefit.takes.missing import find_cameras
     from kinefit.viewers.show import ViewerContent
 
     motions: list[Motion] = []
@@ -66,7 +66,7 @@ def gather(
             beside = beside or there
         motions.append(read_motion(source))
     if take_file is not None:
-        take = find_cameras(take_file, tell=tell)
+        take = find_cameras(take_file, step, tell)
         seen = load_observations(take)
     elif found := _fitting(beside, motions[0].name, tell):
         take, seen = found
@@ -143,8 +143,8 @@ def is_outdated(provenance: Mapping[str, Any], take: Path) -> bool:
 
 def _fitting(file: Path | None, name: str, tell: Tell) -> tuple[Take, Observations] | None:
     """The take beside a folder of results and what its sensors saw, where it can be read and is the motion's."""
-    from kinefit.calibration.people.of_take import find_cameras
     from kinefit.readers.take.load import load_observations
+    from kinefit.takes.missing import find_cameras
 
     if file is None:
         return None

@@ -56,6 +56,8 @@ def work(job: TakeJob) -> tuple[Row, ...]:
 
     Faults of the take are in its rows. Other errors are raised, since they may not occur again.
     """
+    from kinefit.readers.take.cameras import is_uncalibrated
+    from kinefit.takes.missing import last_found
     from kinefit.tracking.checkpoints.checkpoint import key_of
 
     start, said = Row(take=job.label), list[str]()
@@ -64,13 +66,14 @@ def work(job: TakeJob) -> tuple[Row, ...]:
             take = asked_take(job.take, job.choices)
         start = _of_session(start, take)
         key = key_of(take, **asdict(replace(job.choices, restart=False)))
+        complete = not is_uncalibrated(last_found(take))  # whoever deletes found cameras wants others
     except KinefitError as error:
         return (failed(start, str(error)),)
     known = None if job.choices.restart else _read(job.out / RECORD)
     if known is not None and known.take != printable(job.take):
         problem = f"{job.folder} has the results of another take ({known.take})"
         return (failed(start, f"{problem}. Give another folder with --out, or overwrite them with --restart."),)
-    if known is not None and known.key == key and all((job.out / name).exists() for name in known.files):
+    if known is not None and known.key == key and complete and all((job.out / name).exists() for name in known.files):
         return known.rows
     rows, made = _tracked(job, take, start, said)
     if all(row.status == DONE for row in rows):

@@ -38,8 +38,9 @@ def start_from_clicks(out: Path, points: Path | None, step: int | None, body: st
     from kinefit.readers.clicks import read_clicks
     from kinefit.readers.take.file import read_take
     from kinefit.readers.take.load import load_observations
+    from kinefit.takes.missing import last_found
 
-    take = read_take(out)
+    take = last_found(read_take(out))
     seen, generic = load_observations(take), load_body(body)
     if seen.rig is None or (not seen.videos and points is None):
         remedy = "Add [calibration] and videos, or leave out --click."

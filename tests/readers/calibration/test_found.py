@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kinefit.errors import FileError
+from kinefit.errors import FileError, KinefitError
 from kinefit.readers.calibration.found import FoundCameras, read_found, write_found
 from kinefit.readers.calibration.read import read_calibration, write_calibration
 from kinefit.simulation import studio_rig
@@ -12,22 +12,35 @@ from kinefit.simulation import studio_rig
 @pytest.fixture
 def found():
     rig = studio_rig(cameras=3)
-    return FoundCameras(rig, (0.0, -0.25, 1.5), 0.08, 0.7, ('a "note"', "another"), "abc")
+    made_from = {name: f"of {name}" for name in rig.names}
+    return FoundCameras(rig, (0.0, -0.25, 1.5), 0.08, 0.7, ('a "note"', "another"), made_from, 1.7)
 
 
 def test_what_is_written_is_read(found, tmp_path):
     write_found(found, tmp_path / "cameras.toml")
     back = read_found(tmp_path / "cameras.toml")
-    assert back.time_offsets == found.time_offsets and back.notes == found.notes and back.made_from == "abc"
+    assert back.time_offsets == found.time_offsets and back.notes == found.notes
+    assert back.made_from == found.made_from and back.height == 1.7
     assert (back.position_sigma, back.rotation_sigma) == (0.08, 0.7)
     for a, b in zip(read_calibration(tmp_path / "cameras.toml"), found.rig, strict=True):
         np.testing.assert_allclose(a.T_camera_world, b.T_camera_world, atol=1e-9)
 
 
-def test_other_calibrations_are_none(found, tmp_path):
+def test_other_calibrations_are_told(found, tmp_path):
     write_calibration(found.rig, tmp_path / "rig.toml")
-    assert read_found(tmp_path / "rig.toml") is None
+    with pytest.raises(FileError, match="no whole file of cameras.*another name"):
+        read_found(tmp_path / "rig.toml")
     assert read_found(tmp_path / "nothing.toml") is None and read_found(tmp_path) is None
+
+
+@pytest.mark.parametrize("part", [0.2, 0.5, 0.9, 0.97])
+def test_half_a_file_is_told(found, tmp_path, part):
+    file = tmp_path / "cameras.toml"
+    write_found(found, file)
+    text = file.read_text()
+    file.write_text(text[: int(part * len(text))])
+    with pytest.raises(KinefitError, match="cameras.toml"):
+        read_found(file)
 
 
 def test_one_that_was_changed_is_told(found, tmp_path):

@@ -10,7 +10,7 @@ from kinefit.errors import TakeError
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 from kinefit.tracking.takes.take_recording import recording_of
 
 

@@ -9,7 +9,7 @@ from kinefit.geometry.camera import ImageFrame
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.readers.take.silhouettes import read_silhouettes
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 
 
 def write_masks(folder, size=(64, 48), count=3, value=255):

@@ -18,7 +18,7 @@ from kinefit.observations import KeypointFrame, SilhouetteFrame
 from kinefit.rendering import render_body
 from kinefit.sensors.regions.silhouette import averaged
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 from kinefit.tracking.tracker import Tracker
 
 

@@ -18,8 +18,8 @@ from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation import squat_and_wave
 from kinefit.smoothing.foot_contacts import soles
-from kinefit.tracking.takes.in_view import people_in_view
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.in_view import people_in_view
+from kinefit.takes.track import track_take
 from kinefit.tracking.takes.take_recording import recording_of
 
 SIZE, RATE = (720, 1280), 30.0

@@ -20,7 +20,7 @@ from kinefit.geometry import se3
 from kinefit.observations import SilhouetteFrame
 from kinefit.readers.take.file import read_take
 from kinefit.rendering import render_body
-from kinefit.tracking.takes.take import track_take
+from kinefit.takes.track import track_take
 from kinefit.tracking.takes.take_recording import recording_of
 
 FRAMES, TURN = 8, np.radians(5.0)

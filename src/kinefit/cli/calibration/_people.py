@@ -40,7 +40,7 @@ def people(
     from kinefit.readers.calibration.read import write_calibration
     from kinefit.readers.take.file import read_take
     from kinefit.readers.take.find import find_take
-    from kinefit.tracking.takes.take import load_keypoints
+    from kinefit.takes.track import load_keypoints
 
     take = find_take(take, wanted=("calibrate", "people"))
     out = out or take.with_name(f"{take.stem}-people.toml")

@@ -52,7 +52,6 @@ def check(
     if points is not None and not points.is_file():
         raise click.BadParameter(f"no such file: {points}", param_hint="--points")
     from kinefit.calibration.check.check import check_take
-    from kinefit.calibration.people.of_take import find_cameras
     from kinefit.cli._results import check_file
     from kinefit.cli.checks._page import check_page
     from kinefit.cli.checks._refine import refined_of, write_refined
@@ -63,6 +62,7 @@ def check(
     from kinefit.preparing.take import with_detections
     from kinefit.readers.take.file import read_take
     from kinefit.readers.take.find import find_take
+    from kinefit.takes.missing import find_cameras
 
     take = find_take(take, wanted=("check",))
     out = out or take.with_name(f"{take.stem}-check.html")

@@ -15,7 +15,7 @@ from kinefit.cli import _results, _screen
 if TYPE_CHECKING:
     from kinefit.batch.one import Choices, TrackedPerson
     from kinefit.readers.take.file import Take
-    from kinefit.tracking.takes.in_view import InView
+    from kinefit.takes.in_view import InView
 
 
 def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:

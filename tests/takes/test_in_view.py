@@ -12,7 +12,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame
 from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.takes.in_view import people_in_depth
+from kinefit.takes.in_view import people_in_depth
 
 RATE, COUNT = 15.0, 12
 
