@@ -52,14 +52,10 @@ def _commands() -> Iterator[str]:
 
 
 def _take_keys() -> Iterator[str]:
-    import msgspec
+    from kinefit.readers.take.entries import TABLES, keys_of
 
-    from kinefit.readers.take.file import _TakeFile
-
-    for table in msgspec.structs.fields(_TakeFile):
-        kind = getattr(table.type, "__args__", (table.type,))[0]
-        for key in msgspec.structs.fields(kind) if isinstance(kind, msgspec.StructMeta) else ():
-            yield f"take [{table.encode_name}] {key.encode_name}"
+    for table in TABLES:
+        yield from (f"take [{table}] {key}" for key in keys_of(table))
 
 
 def _formats() -> Iterator[str]:

@@ -16,7 +16,8 @@ from kinefit.cli.tracking.track import track as command
 from kinefit.errors import KinefitError
 from kinefit.exporters import write_markers, write_motion
 from kinefit.observations import Markers
-from kinefit.readers.take.file import TABLES, read_take
+from kinefit.readers.take.entries import keys_of
+from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
@@ -212,11 +213,11 @@ def test_a_key_of_a_sensor_acts_or_is_refused(kind, key, take, usual):
 
 
 def test_every_key_is_tried():
-    assert set(HEAD) | {"hide_faces"} == set(TABLES["take"].__struct_fields__)  # tests/preparing/test_faces.py
+    assert set(HEAD) | {"hide_faces"} == set(keys_of("take"))  # tests/preparing/test_faces.py
     elsewhere = {"low_pass", "clicks", "click_sigma"}  # takes/test_starts.py, test_init.py, batch/test_corrections.py
-    assert set(START) | elsewhere == set(TABLES["start"].__struct_fields__)
+    assert set(START) | elsewhere == set(keys_of("start"))
     for kind, table in TABLE.items():
-        assert set(OWN[kind]) | NAMING | {"name"} >= set(TABLES[table].__struct_fields__) - {"camera", "name"}
+        assert set(OWN[kind]) | NAMING | {"name"} >= set(keys_of(table)) - {"camera", "name"}
 
 
 @pytest.mark.parametrize("table", ["keypoints", "markers", "depth", "silhouettes"])

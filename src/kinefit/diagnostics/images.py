@@ -17,7 +17,7 @@ from kinefit.geometry.camera import ImageFrame
 from kinefit.observations import DepthVideo
 from kinefit.readers.guess.draft import Value
 from kinefit.readers.guess.views import black_bars, picture
-from kinefit.readers.take.file import CameraEntry, Take
+from kinefit.readers.take.entries import CameraEntry, Take
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.readers.take.pictures import TakePictures
 from kinefit.readers.video import Video

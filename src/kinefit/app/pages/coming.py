@@ -9,7 +9,7 @@ from nicegui import ui
 
 from kinefit.app.jobs import RUNNING, Job
 from kinefit.app.pages.shell import link
-from kinefit.readers.take.file import CameraEntry, Take
+from kinefit.readers.take.entries import CameraEntry, Take
 
 STEP = "frames"
 """Name of the work that goes through the frames of a take."""

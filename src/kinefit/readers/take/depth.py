@@ -12,7 +12,7 @@ from kinefit.errors import CalibrationError, TakeError, located
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.readers.depth.recordings import is_unordered, read_clouds, read_depth
-from kinefit.readers.take.file import DepthEntry, Take
+from kinefit.readers.take.entries import DepthEntry, Take
 
 _MAX_RATE_DIFFERENCE = 0.01  # rates that differ by less are one
 

@@ -1,22 +1,76 @@
-"""The tables of a take file as typed records; every default stands here and nowhere else."""
+"""The tables of a take file as records: every key, default and bound stands here and nowhere else.
+
+What an entry alone can have wrong is refused where it is made: numbers by the bounds of their types, whose descriptions
+say what to write; keys that need each other by `__post_init__`.
+"""
 
 from __future__ import annotations
 
 import datetime
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
+from kinefit.errors import TakeError, choices
 from kinefit.geometry import se3
 from kinefit.observations import KEYPOINT_SIGMA
+from kinefit.readers.keypoint_sets import FACE_SET, KEYPOINT_SETS, MEDIAPIPE_SETS
+from kinefit.readers.units import LENGTHS, worth
+
+_Pixels = Annotated[float, Meta(gt=0, lt=1e4, description="Give a positive number of pixels.")]
+_Rate = Annotated[float, Meta(gt=0, lt=1e6, description="Give frames per second, a positive number, or remove it.")]
+_Metres = Annotated[float, Meta(gt=0, lt=1, description="Give metres, above 0 and below 1.")]
+_Seconds = Annotated[float, Meta(gt=-1e6, lt=1e6, description="Give seconds.")]
+_Scale = Annotated[float, Meta(gt=0, lt=1e6, description="Give a positive number: unit in metres a count, times in s.")]
+_Number = Annotated[float, Meta(ge=-1e6, le=1e6, description="Give metres, directions and degrees.")]
+_Side = Annotated[int, Meta(ge=1, lt=100_000, description="Give [width, height] in pixels.")]
+_Shift = Annotated[float, Meta(gt=-1e4, lt=1e4, description="Give metres.")]
+_Turn = Annotated[float, Meta(ge=-360, le=360, description="Give degrees, at most 360.")]
+_Level = Annotated[int, Meta(ge=0, le=255, description="Give [r, g, b], 0 to 255 each.")]
+_Focal = Annotated[float, Meta(gt=0, description="Give [fx, fy, cx, cy] in pixels.")]
+_Length = Annotated[float, Meta(gt=0, description="Give [left, top, width, height] in pixels of the video.")]
+_Reach = Annotated[float, Meta(ge=0, description="Give [near, far] in metres.")]
+_Place = Annotated[float, Meta(ge=0, lt=1, description="Give metres below 1: one farther off needs calibration.")]
+_Angle = Annotated[float, Meta(ge=0, lt=30, description="Give degrees below 30: one farther off needs calibration.")]
+_View = Annotated[float, Meta(ge=5, le=150, description="Give degrees from 5 to 150.")]
+_Stature = Annotated[float, Meta(gt=0.3, lt=3, description="Give the stature in metres, or remove it.")]
+_Disparity = Annotated[float, Meta(gt=0, lt=100, description="Give a positive number of pixels.")]
+_Step = Annotated[int, Meta(gt=-(10**9), lt=10**9, description="Give [first, one after the last].")]
+_Counted = Annotated[
+    int, Meta(ge=0, lt=10**9, description="Give [first, one after the last], counted from 0, for every range.")
+]
+
+
+class WrongEntryError(TakeError, ValueError):
+    """Keys of an entry that do not agree."""
+
+
+def _refuse(wrong: object, problem: str, remedy: str) -> None:
+    if wrong:
+        raise WrongEntryError(problem, remedy=remedy)
 
 
 class _Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A table of the take file; paths are absolute once it is read."""
+
+    def _uses(self, given: str, only: Mapping[str, Sequence[str]]) -> None:
+        """Refuse keys that mean nothing with the entry's format; `only`: {key: formats}."""
+        for key, formats in only.items():
+            odd = getattr(self, key) not in (None, ()) and given not in formats
+            _refuse(odd, f"'{key}' has no use with format = \"{given}\"", f"Remove it; it is for {', '.join(formats)}.")
+
+    def _ordered(self, *keys: str) -> None:
+        """Refuse ranges (first, last) that are none."""
+        for key in keys:
+            value = getattr(self, key) or ()
+            for one in value if value and isinstance(value[0], tuple) else (value,):
+                _refuse(one and not one[0] < one[1], f"{key} has {list(one)}", "Give the lesser number first.")
 
 
 SKIN_SETS = ("HANDS", "WRISTS")
@@ -31,14 +85,14 @@ RENAMED: dict[str, dict[str, str]] = {
 class StartEntry(_Entry, frozen=True, kw_only=True):
     """`[start]`: where the body is at one step, for sensors that alone cannot find it."""
 
-    at: tuple[float, float, float] | None = None  # [m] of the root's origin in the world; of clicks alone: none
-    forward: tuple[float, float, float] | None = None  # direction in the world in which the root's x looks
-    upward: tuple[float, float, float] | None = None  # and its y; default: the take's `up`
-    angles: dict[str, float] = {}  # [deg] or, of joints that slide, [m]; others are the body's usual ones
+    at: tuple[_Number, _Number, _Number] | None = None  # [m] of the root's origin in the world; of clicks alone: none
+    forward: tuple[_Number, _Number, _Number] | None = None  # direction in the world in which the root's x looks
+    upward: tuple[_Number, _Number, _Number] | None = None  # and its y; default: the take's `up`
+    angles: dict[str, _Number] = {}  # [deg] or, of joints that slide, [m]; others are the body's usual ones
     step: int | None = None  # of the common time; default: the first
     low_pass: bool = True  # whether silhouettes are also fitted with low-pass approximations of the surface first
     clicks: Path | None = None  # joints clicked at any steps, which are measurements of their steps
-    click_sigma: float = 3.0  # [px] standard deviation of a click along each axis, in the calibration's image
+    click_sigma: _Pixels = 3.0  # [px] standard deviation of a click along each axis, in the calibration's image
 
     @property
     def is_clicks_alone(self) -> bool:
@@ -69,8 +123,14 @@ class CalibrationEntry(_Entry, frozen=True, kw_only=True):
 
     file: Path
     unit: str | float = "auto"  # of its translations, where the format does not state it; or [m] of one
-    position_sigma: float | None = None  # [m] of each camera's position; with rotation_sigma, or neither
-    rotation_sigma: float | None = None  # [deg] of each camera's direction; both 0 for an exact calibration
+    position_sigma: _Place | None = None  # [m] of each camera's position; with rotation_sigma, or neither
+    rotation_sigma: _Angle | None = None  # [deg] of each camera's direction; both 0 for an exact calibration
+
+    def __post_init__(self) -> None:
+        both = self.position_sigma, self.rotation_sigma
+        problem = "position_sigma {}, rotation_sigma {}".format(*both)
+        remedy = "Give metres and degrees above 0, or 0 and 0 for an exact calibration, or neither."
+        _refuse(both not in ((None, None), (0, 0)) and not all(both), problem, remedy)
 
 
 class CameraEntry(_Entry, frozen=True, kw_only=True):
@@ -80,11 +140,14 @@ class CameraEntry(_Entry, frozen=True, kw_only=True):
     video: Path | None = None
     topic: str | None = None  # of a video that is an MCAP recording of ROS 2: "/front/color/image_raw"
     stream: str | None = None  # of `kinefit live`: a webcam's number, an address, or a folder that fills up
-    size: tuple[int, int] | None = None  # [px] (width, height) of the image; default: the video's
+    size: tuple[_Side, _Side] | None = None  # [px] (width, height) of the image; default: the video's
     image: Literal["as calibrated", "scaled", "letterboxed"] = "as calibrated"  # what became of the image
     rotation: Literal[0, 90, 180, 270] = 0  # [deg] the image is the calibration's, turned clockwise
-    time_offset: float = 0.0  # [s] added to frame / rate
-    field_of_view: float | None = None  # [deg] across the longer side, of a camera of a take without calibration
+    time_offset: _Seconds = 0.0  # [s] added to frame / rate
+    field_of_view: _View | None = None  # [deg] across the longer side, of a camera of a take without calibration
+
+    def __post_init__(self) -> None:
+        _refuse(self.stream is not None and self.video is not None, "a stream and a video", "Remove one of the two.")
 
 
 class KeypointsEntry(_Entry, frozen=True, kw_only=True):
@@ -96,12 +159,31 @@ class KeypointsEntry(_Entry, frozen=True, kw_only=True):
     format: Literal["openpose", "mediapipe", "caliscope", "detect", "skin"] = "openpose"
     set: str | None = None  # default: BODY_25B of openpose, MEDIAPIPE_33 of mediapipe, HANDS of skin
     frame: Literal["calibration", "video"] | None = None  # image frame of the coordinates; needed where the two differ
-    rate: float | None = None  # [Hz]; default: the camera's video, or the take
-    sigma: float = KEYPOINT_SIGMA  # [px] standard deviation, in the calibration's image
-    frames: tuple[int, int] | None = None  # steps (start, stop) at which they count; default: all
-    excluded: tuple[tuple[int, int], ...] = ()  # ranges (start, stop) of steps at which they do not count
-    swapped: tuple[tuple[int, int], ...] = ()  # ranges (start, stop) of steps at which left is right
-    face: tuple[float, float, float, float] | None = None  # [px] of "skin": left, top, width, height in the video
+    rate: _Rate | None = None  # [Hz]; default: the camera's video, or the take
+    sigma: _Pixels = KEYPOINT_SIGMA  # [px] standard deviation, in the calibration's image
+    frames: tuple[_Step, _Step] | None = None  # steps (start, stop) at which they count; default: all
+    excluded: tuple[tuple[_Counted, _Counted], ...] = ()  # ranges (start, stop) of steps at which they do not count
+    swapped: tuple[tuple[_Counted, _Counted], ...] = ()  # ranges (start, stop) of steps at which left is right
+    face: tuple[float, float, _Length, _Length] | None = None  # [px] of "skin": left, top, width, height in the video
+
+    def __post_init__(self) -> None:
+        files = ("openpose", "mediapipe", "caliscope")
+        self._uses(self.format, {
+            "file": (*files, "detect"), "frame": files, "rate": files, "face": ("skin",), "stream": ("openpose",),
+            "excluded": (*files, "detect"), "swapped": (*files, "detect"),
+        })  # fmt: skip
+        sets = {"openpose": tuple(KEYPOINT_SETS), "skin": SKIN_SETS, "detect": (*MEDIAPIPE_SETS, FACE_SET)}
+        known = sets.get(self.format, MEDIAPIPE_SETS)
+        kind = "keypoint set" if self.format == "openpose" else f"keypoint set of {self.format}"
+        odd = self.set is not None and self.set not in known
+        _refuse(odd, choices(kind, str(self.set), known), f'Use set = "{known[0]}", or remove it.')
+        none = self.file is None and self.stream is None and self.format not in ("detect", "skin")
+        _refuse(none, f"no file of {self.format} keypoints", 'Write file = "...", or format = "detect".')
+        self._ordered("frames", "excluded", "swapped")
+        if self.stream is not None:
+            _refuse(self.file is not None, "a stream and a file", "Remove one of the two.")
+            for key in ("excluded", "swapped"):
+                _refuse(getattr(self, key), f"'{key}' has no use with a stream", "Leave it out.")
 
 
 class SilhouetteEntry(_Entry, frozen=True, kw_only=True):
@@ -111,19 +193,32 @@ class SilhouetteEntry(_Entry, frozen=True, kw_only=True):
     file: Path | None = None  # of "masks": folder or pattern; of "background": image of the empty scene
     format: Literal["masks", "background", "threshold", "detect"] = "masks"
     frame: Literal["calibration", "video"] | None = None  # image frame of the masks; needed where the two differ
-    rate: float | None = None  # [Hz] of the masks; default: the camera's video, or the take
-    sigma: float = 4.0  # [px] standard deviation of an outline, in the calibration's image
-    low: tuple[int, int, int] | None = None  # of "threshold": least value of each channel that is the body's
-    high: tuple[int, int, int] | None = None  # and the largest
+    rate: _Rate | None = None  # [Hz] of the masks; default: the camera's video, or the take
+    sigma: _Pixels = 4.0  # [px] standard deviation of an outline, in the calibration's image
+    low: tuple[_Level, _Level, _Level] | None = None  # of "threshold": least value of each channel that is the body's
+    high: tuple[_Level, _Level, _Level] | None = None  # and the largest
     channels: Literal["rgb", "hsv", "lab", "ycrcb"] | None = None  # of low and high, 8 bits each; default: rgb
-    smooth: float | None = None  # [px] of the Gaussian before the Laplace operator; default: 1
+    smooth: _Pixels | None = None  # [px] of the Gaussian before the Laplace operator; default: 1
+
+    def __post_init__(self) -> None:
+        self._uses(self.format, {
+            "file": ("masks", "background", "detect"), "frame": ("masks",), "rate": ("masks",),
+            **dict.fromkeys(("low", "high", "channels", "smooth"), ("threshold",)),
+        })  # fmt: skip
+        none = self.file is None and self.format == "masks"
+        _refuse(none, "no file of masks", 'Write file = "..." (a folder), or another format.')
+        if self.format == "threshold":
+            remedy = "Write low = [r, g, b] and high = [r, g, b], 0 to 255 each."
+            _refuse(self.low is None or self.high is None, "no colour of the body", remedy)
+            odd = any(a > b for a, b in zip(self.low or (), self.high or ()))
+            _refuse(odd, f"low = {self.low}, high = {self.high}", "Give 0 to 255, the lower ones first.")
 
 
 class RegionEntry(_Entry, frozen=True, kw_only=True):
     """`[[region]]`: a camera in whose video the body is followed by the colours inside and outside of its contour."""
 
     camera: str
-    sigma: float | None = None  # [px] standard deviation of the contour, shape included; default: as the body is made
+    sigma: _Pixels | None = None  # [px] standard deviation of the contour, shape included; default: as the body is made
 
 
 class LinesEntry(_Entry, frozen=True, kw_only=True):
@@ -133,26 +228,33 @@ class LinesEntry(_Entry, frozen=True, kw_only=True):
     file: Path  # table of frame, line, u1, v1, u2, v2 [px]
     landmarks: dict[str, tuple[str, ...]]  # of each line: two ends of an edge of the body, or one point
     frame: Literal["calibration", "video"] | None = None  # image frame of the lines; needed where the two differ
-    rate: float | None = None  # [Hz]; default: the camera's video, or the take
-    sigma: float = 2.0  # [px] standard deviation, in the calibration's image
+    rate: _Rate | None = None  # [Hz]; default: the camera's video, or the take
+    sigma: _Pixels = 2.0  # [px] standard deviation, in the calibration's image
+
+    def __post_init__(self) -> None:
+        example = 'Write landmarks = { edge = ["r_asis", "l_asis"] }, one entry for each line.'
+        _refuse(not self.landmarks, "no landmarks", example)
+        for name, own in self.landmarks.items():
+            odd = not 1 <= len(set(own)) == len(own) <= 2
+            _refuse(odd, f"line '{name}' has {len(own)} landmarks", "Give the two ends of an edge, or one point.")
 
 
 class SurfacePointsEntry(_Entry, frozen=True, kw_only=True):
     """`[[surface_points]]`: a surface that was tracked, such as by `kinefit surface`."""
 
     file: Path  # table of time_s, point, x, y, z, std_x, std_y, std_z [s, m]
-    time_offset: float = 0.0  # [s]
-    sigma: float = 0.01  # [m] standard deviation by which the surface slides on the bone, and the body's shape is off
+    time_offset: _Seconds = 0.0  # [s]
+    sigma: _Metres = 0.01  # [m] standard deviation by which the surface slides on the bone, and the body's shape is off
 
 
 class _PlacedEntry(_Entry, frozen=True, kw_only=True):
     """A file of places in a world of its own."""
 
     file: Path
-    time_offset: float = 0.0  # [s]
-    sigma: float = 0.005  # [m] standard deviation
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [m] of the file's origin, in the world
-    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [deg] rotation vector, from the file's axes to the world's
+    time_offset: _Seconds = 0.0  # [s]
+    sigma: _Metres = 0.005  # [m] standard deviation
+    shift: tuple[_Shift, _Shift, _Shift] = (0.0, 0.0, 0.0)  # [m] of the file's origin, in the world
+    turn: tuple[_Turn, _Turn, _Turn] = (0.0, 0.0, 0.0)  # [deg] rotation vector, from the file's axes to the world's
 
     @property
     def T_world_file(self) -> NDArray:
@@ -167,6 +269,10 @@ class MarkersEntry(_PlacedEntry, frozen=True, kw_only=True):
     set: str | None = None  # the body's marker set that its labels belong to; default: the one that fits
     sides: Literal["labelled", "exchanged", "mirrored-x", "mirrored-y", "mirrored-z"] | None = None  # None: checked
     model: Path | None = None  # of the subject, for markers without names; default: they have names
+
+    def __post_init__(self) -> None:
+        odd = self.unit is not None and worth(self.unit, LENGTHS) is None
+        _refuse(odd, choices("unit", str(self.unit), LENGTHS), "Use one of these.")
 
 
 class TrackerEntry(_PlacedEntry, frozen=True, kw_only=True):
@@ -186,18 +292,32 @@ class DepthEntry(_Entry, frozen=True, kw_only=True):
     file: Path | None = None  # or folder, or pattern (frames/depth_*.png)
     stream: Path | None = None  # of `kinefit live`, in place of a file: a folder that depth images come into
     topic: str | None = None  # of a file that is an MCAP recording of ROS 2: "/front/depth/image_raw"
-    unit: float | None = None  # [m] of one count; default: what the file states, else millimetres
-    size: tuple[int, int] | None = None  # [px] (width, height), of raw files
-    range: tuple[float, float] | None = None  # [m] (near, far): what is measured outside of it is dropped
-    intrinsics: tuple[float, float, float, float] | None = None  # [px] fx, fy, cx, cy, in a take without calibration
+    unit: _Scale | None = None  # [m] of one count; default: what the file states, else millimetres
+    size: tuple[_Side, _Side] | None = None  # [px] (width, height), of raw files
+    range: tuple[_Reach, _Reach] | None = None  # [m] (near, far): what is measured outside of it is dropped
+    intrinsics: tuple[_Focal, _Focal, float, float] | None = None  # [px] fx, fy, cx, cy, in a take without calibration
     distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]] beside the intrinsics
-    rate: float | None = None  # [Hz]; default: what the file states, the take's, the videos'
-    time_unit: float | None = None  # [s] of the last number in every file's name, where that is the time
-    time_offset: float = 0.0  # [s] time of the first frame
-    sigma: float = 0.01  # [m] standard deviation of a depth
+    rate: _Rate | None = None  # [Hz]; default: what the file states, the take's, the videos'
+    time_unit: _Scale | None = None  # [s] of the last number in every file's name, where that is the time
+    time_offset: _Seconds = 0.0  # [s] time of the first frame
+    sigma: _Metres = 0.01  # [m] standard deviation of a depth
     background: Path | None = None  # the same sensor before the empty scene
     on_body: bool = False  # everything but the body was taken out already
     segment: str | None = None  # of clouds of points: the one segment of the body that they are on
+
+    def __post_init__(self) -> None:
+        problem = "neither a file nor a stream" if self.file is None else "a stream and a file"
+        remedy = 'Write file = "...", or, for `kinefit live`, stream = "FOLDER".'
+        _refuse((self.stream is None) == (self.file is None), problem, remedy)
+        if self.stream is not None:
+            for key in ("time_unit", "segment"):
+                _refuse(getattr(self, key) is not None, f"'{key}' has no use with a stream", "Remove it.")
+            unsized = self.intrinsics is not None and self.size is None
+            remedy = "Write size = [width, height] of its images."
+            _refuse(unsized, "a stream with intrinsics, and no size", remedy)
+        bare = self.distortion and self.intrinsics is None
+        _refuse(bare, "distortion without intrinsics", "Write intrinsics = [fx, fy, cx, cy] too.")
+        self._ordered("range")
 
 
 class StereoEntry(_Entry, frozen=True, kw_only=True):
@@ -205,8 +325,12 @@ class StereoEntry(_Entry, frozen=True, kw_only=True):
 
     left: str
     right: str
-    range: tuple[float, float] = (0.5, 6.0)  # [m] along the left camera's axis
-    sigma: float = 0.5  # [px] standard deviation of a disparity
+    range: tuple[_Scale, _Scale] = (0.5, 6.0)  # [m] along the left camera's axis
+    sigma: _Disparity = 0.5  # [px] standard deviation of a disparity
+
+    def __post_init__(self) -> None:
+        self._ordered("range")
+        _refuse(self.left == self.right, "left and right are one camera", "Name two cameras.")
 
     @property
     def name(self) -> str:
@@ -214,27 +338,148 @@ class StereoEntry(_Entry, frozen=True, kw_only=True):
         return f"{self.left}-{self.right}"
 
 
-class _Head(_Entry, frozen=True, kw_only=True):
-    name: str | None = None
-    rate: float | None = None
+@dataclass(frozen=True, kw_only=True)
+class TakeHead:
+    """`[take]`: what holds for the whole take.
+
+    Parameters
+    ----------
+    name : str
+        Default: the take file's own name.
+    rate : float [Hz] or None
+        None: the videos' or markers'.
+    up : "x", "y", "z", "-x", "-y" or "-z"
+        Vertical axis of the calibration's (or markers') world.
+    body : str
+        Name in the catalogue, or absolute path of a body file.
+    height : float [m] or None
+        Stature of the person, as a first guess.
+    person : int, str or None
+        The target person if several are in view, see `PersonChoice`; None: the one with most visible points.
+    subject : Path or None
+        Take of the same person (a T-pose trial) that bone lengths come from; None: from this take itself.
+    start : Path or None
+        Motion file (`motion.npz`) that gives body and pose of the first step; None: they are sought.
+    size : bool or None
+        Whether the body is fitted to the person's size and shape; None: unless `start` tells it.
+    frames : (start, stop) or None
+        Steps of the common time, t = step / rate.
+    hide_faces : bool
+        Whether images and videos that are made from the take's show no faces.
+    """
+
+    name: str = ""
+    rate: _Rate | None = None
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
     body: str = "humanoid"
-    height: float | None = None
+    height: _Stature | None = None
     person: int | str | None = None
     subject: Path | None = None
     start: Path | None = None
     size: bool | None = None
-    frames: tuple[int, int] | None = None
-    hide_faces: bool = False  # in all images and videos that show what the cameras saw
+    frames: tuple[_Step, _Step] | None = None
+    hide_faces: bool = False
 
 
-TABLES: dict[str, type[msgspec.Struct]] = {
-    "take": _Head, "session": SessionEntry, "start": StartEntry, "calibration": CalibrationEntry, "camera": CameraEntry,
-    "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry, "stereo": StereoEntry,
-    "silhouette": SilhouetteEntry, "region": RegionEntry, "lines": LinesEntry,
+@dataclass(frozen=True, kw_only=True)
+class Take(TakeHead):
+    """A take file, checked: all names in it agree and all files it names exist.
+
+    Parameters
+    ----------
+    path : Path
+        Of the take file.
+    session : SessionEntry, subject and movement of the recording
+    placed : StartEntry or None, `[start]`
+    calibration : CalibrationEntry or None
+    cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines, surface_points, trackers : tuples
+        Of entries; `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
+    digest : str
+        SHA-256 of the file's tables as they are written, without comments and spacing; "" for a take of no file.
+    """
+
+    path: Path
+    digest: str = ""
+    session: SessionEntry = field(default_factory=SessionEntry)
+    placed: StartEntry | None = None
+    calibration: CalibrationEntry | None = None
+    cameras: tuple[CameraEntry, ...] = ()
+    keypoints: tuple[KeypointsEntry, ...] = ()
+    markers: tuple[MarkersEntry, ...] = ()
+    depth: tuple[DepthEntry, ...] = ()
+    stereo: tuple[StereoEntry, ...] = ()
+    silhouettes: tuple[SilhouetteEntry, ...] = ()
+    regions: tuple[RegionEntry, ...] = ()
+    skin: tuple[KeypointsEntry, ...] = ()
+    lines: tuple[LinesEntry, ...] = ()
+    surface_points: tuple[SurfacePointsEntry, ...] = ()
+    trackers: tuple[TrackerEntry, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Keypoints by colour apart from others."""
+        if skin := tuple(entry for entry in self.keypoints if entry.format == "skin"):
+            object.__setattr__(self, "skin", (*self.skin, *skin))
+            object.__setattr__(self, "keypoints", tuple(entry for entry in self.keypoints if entry.format != "skin"))
+
+    @property
+    def pose(self) -> StartEntry | None:
+        """Where the body is at one step."""
+        return None if self.placed is None or self.placed.is_clicks_alone else self.placed
+
+    @property
+    def clicks(self) -> Path | None:
+        """Joints that were clicked in images, see `read_clicks`."""
+        return None if self.placed is None else self.placed.clicks
+
+    @property
+    def click_sigma(self) -> float:
+        """Standard deviation [px] of a click along each axis."""
+        return (self.placed or StartEntry()).click_sigma
+
+    @property
+    def other_sensors(self) -> tuple[object, ...]:
+        """Entries of all sensors but cameras and the keypoints of a detector."""
+        return (
+            *self.depth, *self.stereo, *self.markers, *self.skin, *self.silhouettes, *self.regions, *self.lines,
+            *self.surface_points, *self.trackers,
+        )  # fmt: skip
+
+    @property
+    def entries(self) -> Iterator[tuple[str, str, Any]]:
+        """Every entry of every table: table, the entry's name in messages, entry."""
+        for table in TABLES:
+            found = self if table == "take" else getattr(self, ATTRIBUTES.get(table, table))
+            of_table = found if isinstance(found, tuple) else () if found is None else (found,)
+            for entry in (*of_table, *(self.skin if table == "keypoints" else ())):
+                yield table, _name_of(table, entry), entry
+
+
+TABLES: dict[str, type[Any]] = {
+    "take": TakeHead, "session": SessionEntry, "start": StartEntry, "calibration": CalibrationEntry,
+    "camera": CameraEntry, "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry,
+    "stereo": StereoEntry, "silhouette": SilhouetteEntry, "region": RegionEntry, "lines": LinesEntry,
     "surface_points": SurfacePointsEntry, "tracker": TrackerEntry,
 }  # fmt: skip
 """Every table of a take file, and its keys as the fields of a record."""
+ATTRIBUTES = {
+    "start": "placed", "camera": "cameras", "silhouette": "silhouettes", "region": "regions", "tracker": "trackers",
+}  # fmt: skip
+"""{table: attribute of a `Take`} where they differ; the keys of [take] are attributes themselves."""
+SINGLE_TABLES = ("take", "session", "start", "calibration")
+
+
+def keys_of(table: str) -> tuple[str, ...]:
+    """All keys of a table."""
+    record = TABLES[table]
+    return tuple(getattr(record, "__struct_fields__", None) or record.__dataclass_fields__)
+
+
+def _name_of(table: str, entry: Any) -> str:
+    if table in SINGLE_TABLES:
+        return f"[{table}]"
+    if table not in ("camera", "depth", "stereo"):
+        return f"{table} of camera {entry.camera}" if hasattr(entry, "camera") else f"{table} {entry.file.name}"
+    return f"{table} {entry.name}"
 
 
 def sensor_name(kind: str, entries: Sequence[object], k: int) -> str:

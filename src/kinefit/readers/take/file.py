@@ -6,7 +6,6 @@ import hashlib
 import json
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -19,136 +18,18 @@ from kinefit.errors import FileError, TakeError, check_choice, choices, printabl
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.checks import check_take
 from kinefit.readers.take.entries import (
+    ATTRIBUTES,
     RENAMED,
+    SINGLE_TABLES,
     TABLES,
-    CalibrationEntry,
-    CameraEntry,
-    DepthEntry,
-    KeypointsEntry,
-    LinesEntry,
-    MarkersEntry,
-    RegionEntry,
-    SessionEntry,
-    SilhouetteEntry,
-    StartEntry,
-    StereoEntry,
-    SurfacePointsEntry,
-    TrackerEntry,
-    _Entry,
-    _Head,
+    Take,
+    keys_of,
 )
 from kinefit.readers.take.find import find_take
 from kinefit.readers.take.values import wrong_value
 from kinefit.readers.units import LENGTHS, TIMES, worth
 
-__all__ = [
-    "CalibrationEntry", "CameraEntry", "DepthEntry", "KeypointsEntry", "LinesEntry", "MarkersEntry", "RegionEntry",
-    "SessionEntry", "SilhouetteEntry", "StartEntry", "StereoEntry", "SurfacePointsEntry", "Take", "TrackerEntry",
-    "read_take",
-]
-
-
-class _TakeFile(_Entry, frozen=True, kw_only=True):
-    take: _Head = _Head()
-    session: SessionEntry = SessionEntry()
-    start: StartEntry | None = None
-    calibration: CalibrationEntry | None = None
-    camera: tuple[CameraEntry, ...] = ()
-    keypoints: tuple[KeypointsEntry, ...] = ()
-    markers: tuple[MarkersEntry, ...] = ()
-    depth: tuple[DepthEntry, ...] = ()
-    stereo: tuple[StereoEntry, ...] = ()
-    silhouette: tuple[SilhouetteEntry, ...] = ()
-    region: tuple[RegionEntry, ...] = ()
-    lines: tuple[LinesEntry, ...] = ()
-    surface_points: tuple[SurfacePointsEntry, ...] = ()
-    tracker: tuple[TrackerEntry, ...] = ()
-
-
-_SINGLE_TABLES = ("take", "session", "start", "calibration")
-
-
-@dataclass(frozen=True)
-class Take:
-    """A take file, checked: all names in it agree and all files it names exist.
-
-    Parameters
-    ----------
-    path : Path
-        Of the take file.
-    name : str
-        Default: the take file's own name.
-    rate : float [Hz] or None
-        None: the videos' or markers'.
-    up : "x", "y", "z", "-x", "-y" or "-z"
-        Vertical axis of the calibration's (or markers') world.
-    body : str
-        Name in the catalogue, or absolute path of a body file.
-    height : float [m] or None
-        Stature of the person, as a first guess.
-    person : int, str or None
-        The target person if several are in view, see `PersonChoice`; None: the one with most visible points.
-    subject : Path or None
-        Take of the same person (a T-pose trial) that bone lengths come from; None: from this take itself.
-    start : Path or None
-        Motion file (`motion.npz`) that gives body and pose of the first step; None: they are sought.
-    pose : StartEntry or None
-        Where the body is at one step.
-    clicks : Path or None
-        Joints that were clicked in images, see `read_clicks`.
-    click_sigma : float [px]
-        Standard deviation of a click along each axis.
-    size : bool or None
-        Whether the body is fitted to the person's size and shape; None: unless `start` tells it.
-    frames : (start, stop) or None
-        Steps of the common time, t = step / rate.
-    calibration : CalibrationEntry or None
-    session : SessionEntry, subject and movement of the recording
-    hide_faces : bool
-        Whether images and videos that are made from the take's show no faces.
-    cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines, surface_points, trackers : tuples
-        Of entries; `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
-    digest : str
-        SHA-256 of the file's tables as they are written, without comments and spacing; "" for a take of no file.
-    """
-
-    path: Path
-    name: str
-    rate: float | None
-    up: str
-    body: str
-    height: float | None
-    subject: Path | None
-    frames: tuple[int, int] | None
-    calibration: CalibrationEntry | None
-    cameras: tuple[CameraEntry, ...]
-    keypoints: tuple[KeypointsEntry, ...]
-    markers: tuple[MarkersEntry, ...]
-    depth: tuple[DepthEntry, ...] = ()
-    stereo: tuple[StereoEntry, ...] = ()
-    silhouettes: tuple[SilhouetteEntry, ...] = ()
-    regions: tuple[RegionEntry, ...] = ()
-    start: Path | None = None
-    pose: StartEntry | None = None
-    clicks: Path | None = None
-    click_sigma: float = StartEntry().click_sigma
-    size: bool | None = None
-    person: int | str | None = None
-    skin: tuple[KeypointsEntry, ...] = ()
-    lines: tuple[LinesEntry, ...] = ()
-    surface_points: tuple[SurfacePointsEntry, ...] = ()
-    trackers: tuple[TrackerEntry, ...] = ()
-    session: SessionEntry = field(default_factory=SessionEntry)
-    hide_faces: bool = False
-    digest: str = ""
-
-    @property
-    def other_sensors(self) -> tuple[object, ...]:
-        """Entries of all sensors but cameras and the keypoints of a detector."""
-        return (
-            *self.depth, *self.stereo, *self.markers, *self.skin, *self.silhouettes, *self.regions, *self.lines,
-            *self.surface_points, *self.trackers,
-        )  # fmt: skip
+__all__ = ["Take", "read_take"]
 
 
 @checked
@@ -177,25 +58,15 @@ def read_take(path: str | PathLike[str]) -> Take:
             if (value := worth(row.get(key), units)) is not None:
                 row[key] = value
     _name_topics(raw, path)
-    folder = path.parent
+    head = raw.pop("take", {}) | {"path": path, "digest": digest}
+    head["name"] = head.get("name") or printable(path.stem)
+    if isinstance(body := head.get("body"), str) and body.endswith((".toml", ".npz")):
+        head["body"] = str(path.parent / body)
+    content = head | {ATTRIBUTES.get(table, table): rows for table, rows in raw.items()}
     try:
-        content = msgspec.convert(raw, _TakeFile, dec_hook=_path_in(folder))
+        take = msgspec.convert(content, Take, dec_hook=_path_in(path.parent))
     except msgspec.ValidationError as error:
-        raise wrong_value(error, TABLES, path) from error
-    head, start = content.take, content.start or StartEntry()
-    body = str(folder / head.body) if head.body.endswith((".toml", ".npz")) else head.body
-    take = Take(
-        path=path, name=head.name or printable(path.stem), rate=head.rate, up=head.up, body=body, height=head.height,
-        subject=head.subject, frames=head.frames, calibration=content.calibration, cameras=content.camera,
-        keypoints=tuple(k for k in content.keypoints if k.format != "skin"), markers=content.markers,
-        depth=content.depth, stereo=content.stereo,
-        silhouettes=content.silhouette, regions=content.region,
-        skin=tuple(k for k in content.keypoints if k.format == "skin"), lines=content.lines, start=head.start,
-        pose=None if start.is_clicks_alone else content.start, clicks=start.clicks, click_sigma=start.click_sigma,
-        size=head.size, person=head.person, session=content.session,
-        surface_points=content.surface_points, trackers=content.tracker, hide_faces=head.hide_faces,
-        digest=digest,
-    )  # fmt: skip
+        raise wrong_value(error, content, path) from error
     check_take(take)
     return take
 
@@ -207,6 +78,8 @@ def _path_in(folder: Path) -> Callable[[type, Any], Path]:
     """Maker of absolute paths from the texts of a take file."""
 
     def make(_: type, value: Any) -> Path:
+        if isinstance(value, Path):
+            return value
         if not isinstance(value, str) or not value:
             raise ValueError("a file or folder must be a text in quotes")
         if len(value.encode()) > _MAX_PATH_BYTES or any(len(part.encode()) > 255 for part in Path(value).parts):
@@ -236,15 +109,11 @@ def _name_topics(raw: dict[str, Any], path: Path) -> None:
             row[key] = f"{file}/{topic.strip('/')}"
 
 
-def _fields(entry: type[msgspec.Struct]) -> tuple[str, ...]:
-    return entry.__struct_fields__
-
-
 def _check_keys(raw: dict[str, Any], path: Path) -> None:
     """Name an unknown table or key, and what exists."""
     for table, content in raw.items():
         check_choice("sensor or table", table, TABLES, TakeError, file=path, place=f"[{table}]")
-        many = table not in _SINGLE_TABLES
+        many = table not in SINGLE_TABLES
         if many != isinstance(content, list):
             wanted = f"[[{table}]]" if many else f"[{table}]"
             raise TakeError(f"'{table}' is not a table {wanted}", file=path, place=table, remedy=f"Write {wanted}.")
@@ -253,15 +122,15 @@ def _check_keys(raw: dict[str, Any], path: Path) -> None:
             if not isinstance(row, dict):
                 raise TakeError("not a table", file=path, place=place, remedy=f"Write [[{table}]] and its keys below.")
             for key in row:
-                if key not in _fields(TABLES[table]) and key not in RENAMED.get(table, {}):
-                    problem = choices("key", key, _fields(TABLES[table]))
+                if key not in keys_of(table) and key not in RENAMED.get(table, {}):
+                    problem = choices("key", key, keys_of(table))
                     raise TakeError(problem, file=path, place=place, remedy=_belongs(key))
 
 
 def _belongs(key: str) -> str | None:
     """Which tables have a key."""
-    holding = [name for name in TABLES if key in _fields(TABLES[name])]
-    tables = [f"[{name}]" if name in _SINGLE_TABLES else f"[[{name}]]" for name in holding]
+    holding = [name for name in TABLES if key in keys_of(name)]
+    tables = [f"[{name}]" if name in SINGLE_TABLES else f"[[{name}]]" for name in holding]
     return f"'{key}' belongs to {', '.join(tables)}." if tables else None
 
 

@@ -45,8 +45,7 @@ from kinefit.readers.take.cameras import (
     what_is_assumed,
 )
 from kinefit.readers.take.depth import load_depth
-from kinefit.readers.take.entries import MarkersEntry, sensor_name
-from kinefit.readers.take.file import KeypointsEntry, Take
+from kinefit.readers.take.entries import KeypointsEntry, MarkersEntry, Take, sensor_name
 from kinefit.readers.take.lines import load_clicks, load_lines
 from kinefit.readers.take.silhouettes import load_regions, load_silhouettes
 from kinefit.readers.take.skin import load_skin

@@ -19,7 +19,7 @@ from kinefit.observations import ColourVideo, Detections, SilhouetteVideo
 from kinefit.observations.clocks import frame_times
 from kinefit.readers.depth.images import listed
 from kinefit.readers.detections import detections_file, read_detections
-from kinefit.readers.take.file import CameraEntry, SilhouetteEntry, Take
+from kinefit.readers.take.entries import CameraEntry, SilhouetteEntry, Take
 from kinefit.readers.video import Video
 
 _SIDE = 1000  # [px] of an image that its background is taken from: larger ones are made smaller by a whole number

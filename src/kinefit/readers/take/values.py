@@ -5,54 +5,53 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
 
 from kinefit.errors import TakeError
+from kinefit.readers.take.entries import ATTRIBUTES, SINGLE_TABLES, TABLES, WrongEntryError
 
-if TYPE_CHECKING:
-    from kinefit.readers.take.file import Take
-
-_MAX_STEPS = 10**9  # steps of a take
 _WORDS = {
     "float": "a number", "int": "a whole number", "str": "a text", "bool": "true or false", "array": "a list",
     "object": "a table", "null": "nothing", "date": "a date",
 }  # fmt: skip
 
 
-def wrong_value(error: msgspec.ValidationError, tables: Mapping[str, type[msgspec.Struct]], path: Path) -> TakeError:
-    """The error of a value that a table of a take file cannot have; `tables` are the records of all of them."""
+def wrong_value(error: msgspec.ValidationError, content: Mapping[str, Any], path: Path) -> TakeError:
+    """The error of a value that a table of a take file cannot have; `content` is what could not become a `Take`."""
     message, _, at = str(error).partition(" - at `$.")
-    at = at.rstrip("`")
-    table, _, key = at.partition(".")
-    name, _, number = table.rstrip("]").partition("[")
-    place = f"[[{name}]] {int(number) + 1}, {key}" if number.isdigit() else f"[{name}] {key}"
-    listed = ", ".join(map(repr, _options(tables, name, key)))
+    attribute, *inner = re.findall(r"\w+", at) or [""]
+    table = {ATTRIBUTES.get(name, name): name for name in TABLES if name != "take"}.get(attribute, "take")
+    if table in SINGLE_TABLES:
+        row, keys = (content, [attribute]) if table == "take" else (content[attribute], inner)
+        key, where = next(iter(keys), ""), f"[{table}]"
+        place = f"{where} {key}".strip()
+    else:
+        number, key = int(inner[0]), next(iter(inner[1:]), "")
+        row = content[attribute][number]
+        whose = f"camera {row['camera']}" if "camera" in row and table != "depth" else row.get("name")
+        where = ", ".join([f"[[{table}]] {number + 1}", *([str(whose)] if whose else [])])
+        place = f"{where}, {key}" if key else where
+    if isinstance(cause := error.__cause__, WrongEntryError):
+        return TakeError(cause.problem, file=path, place=where, remedy=cause.remedy)
+    hints = list(_parts(get_type_hints(TABLES[table], include_extras=True).get(key)))
+    listed = next((", ".join(map(repr, get_args(hint))) for hint in hints if get_origin(hint) is Literal), "")
+    if re.match(r"Expected `\w+` [<>]", message):
+        remedy = next(m.description for hint in hints for m in getattr(hint, "__metadata__", ()))
+        if key == "height" and 30.0 < row[key] < 300.0:
+            remedy = f"Give the stature in metres: height = {row[key] / 100:g}."
+        return TakeError(f"{key} = {row[key]}", file=path, place=where, remedy=remedy)
     known = listed and ("enum" in message or "Invalid" in message)
     remedy = f"There are: {listed}." if known else _form(message, key)
-    return TakeError(_plain(message), file=path, place=place.rstrip(", ") if at else None, remedy=remedy)
+    return TakeError(_plain(message), file=path, place=place if at else None, remedy=remedy)
 
 
-def wrong_ranges(take: Take) -> Iterator[tuple[str, str, str]]:
-    """Ranges of steps that cannot be: problem, place, remedy."""
-    form = "Give [first, one after the last]"
-    if take.frames is not None and not _is_range(take.frames):
-        yield f"frames {list(take.frames)}", "[take] frames", f"{form}."
-    for source in (*take.keypoints, *take.skin):
-        place = f"keypoints of camera {source.camera}"
-        if source.frames is not None and not _is_range(source.frames):
-            yield f"frames {list(source.frames)}", place, f"{form}."
-        for key in ("excluded", "swapped"):
-            if source.stream is not None and getattr(source, key):
-                yield f"'{key}' has no use with a stream", place, "Leave it out."
-            for steps in getattr(source, key):
-                if steps[0] < 0 or not _is_range(steps):
-                    yield f"{key} has {list(steps)}", place, f"{form}, counted from 0, for every range."
-
-
-def _is_range(steps: tuple[int, int]) -> bool:
-    return -_MAX_STEPS < steps[0] < steps[1] < _MAX_STEPS
+def _parts(hint: Any) -> Iterator[Any]:
+    """A type, and all types that it is made of."""
+    yield hint
+    for part in () if get_origin(hint) is Literal else get_args(hint):
+        yield from _parts(part)
 
 
 def _plain(message: str) -> str:
@@ -67,15 +66,6 @@ def _plain(message: str) -> str:
     if length:
         return f"a list of {length[1]} is expected, not of {given}"
     return f"{' or '.join(kinds)} is expected, not {_WORDS.get(given.strip('`'), given)}"
-
-
-def _options(tables: Mapping[str, type[msgspec.Struct]], name: str, key: str) -> tuple[Any, ...]:
-    """What may be written for a key, where it is one of a few."""
-    entry = tables.get(name)
-    if entry is None or key not in entry.__struct_fields__:
-        return ()
-    hint = get_type_hints(entry)[key]
-    return next((get_args(literal) for literal in (hint, *get_args(hint)) if get_origin(literal) is Literal), ())
 
 
 def _form(message: str, key: str) -> str | None:
