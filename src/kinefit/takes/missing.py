@@ -123,11 +123,11 @@ def _kept(take: Take, tell: Tell) -> FoundCameras | None:
     if found is None:
         return None
     made_from = _made_from(take)
-    if not found.made_from and set(made_from) <= set(found.rig.names):
+    if isinstance(found.made_from, str) and set(made_from) <= set(found.rig.names):
         tell(f"{file.name}, of an earlier version, does not state its recording: used as it is. Delete it to find the "
              "cameras anew.")  # fmt: skip
         return found
-    changed = [name for name, key in made_from.items() if found.made_from.get(name) != key]
+    changed = [name for name, key in made_from.items() if (name, key) not in zip(found.rig.names, found.made_from)]
     if changed:
         tell(f"Cameras are found anew: {file.name} is of other keypoints, lenses or clocks of {', '.join(changed)}.")
         return None
@@ -147,7 +147,7 @@ def _resized(found: FoundCameras, height: float) -> FoundCameras:
     factor = height / found.height
     notes = [note for note in found.notes if note != _NO_HEIGHT and not note.startswith(_SCALED)]
     note = f"{_SCALED} of {height:g} m, {factor:.4g} times as large as before; errors of places grow with it."
-    return replace(
+    return msgspec.structs.replace(
         found, rig=resized(found.rig, factor), position_sigma=factor * found.position_sigma, height=height,
         notes=(*notes, note),
     )  # fmt: skip
@@ -199,10 +199,11 @@ def _find(take: Take, progress: Step | None) -> FoundCameras:
     if take.height is None:
         notes.append(_NO_HEIGHT)
     return FoundCameras(
-        found.rig, tuple(heard.get(name, 0.0) + found.time_offsets[name] for name in found.rig.names),
-        float(median(c.shift_std for c in changes)) / np.sqrt(3.0),
-        float(np.degrees(median(c.turn_std for c in changes))) / np.sqrt(3.0),
-        tuple(notes), made_from, take.height or found.motion.body.stature,
+        rig=found.rig, notes=tuple(notes), made_from=tuple(made_from[name] for name in found.rig.names),
+        time_offsets=tuple(heard.get(name, 0.0) + found.time_offsets[name] for name in found.rig.names),
+        position_sigma=float(median(c.shift_std for c in changes) / np.sqrt(3.0)),
+        rotation_sigma=float(np.degrees(median(c.turn_std for c in changes)) / np.sqrt(3.0)),
+        height=take.height or found.motion.body.stature,
     )  # fmt: skip
 
 

@@ -67,11 +67,10 @@ def track_take(
     sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin, take.trackers)
     alone = take.start or take.pose or any(sensors)
     if (take.silhouettes or take.regions or take.surface_points) and not alone:
-        kind, table = ("silhouettes", "silhouette") if take.silhouettes else ("colours", "region")
-        if take.surface_points:
-            kind, table = "surface points", "surface_points"
+        kinds = {"surface_points": "surface points", "silhouette": "silhouettes", "region": "colours"}
+        table = next(kind for kind in kinds if any(kind == table for table, *_ in take.entries))
         raise TakeError(
-            f"{kind} alone do not determine the first pose", file=take.path, place=f"[[{table}]]",
+            f"{kinds[table]} alone do not determine the first pose", file=take.path, place=f"[[{table}]]",
             remedy='Add [start], or [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
         )  # fmt: skip
     if not alone:

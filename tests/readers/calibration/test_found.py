@@ -12,8 +12,10 @@ from kinefit.simulation import studio_rig
 @pytest.fixture
 def found():
     rig = studio_rig(cameras=3)
-    made_from = {name: f"of {name}" for name in rig.names}
-    return FoundCameras(rig, (0.0, -0.25, 1.5), 0.08, 0.7, ('a "note"', "another"), made_from, 1.7)
+    return FoundCameras(
+        rig=rig, time_offsets=(0.0, -0.25, 1.5), position_sigma=0.08, rotation_sigma=0.7,
+        notes=('a "note"', "another"), made_from=("a", "b", "c"), height=1.7,
+    )  # fmt: skip
 
 
 def test_what_is_written_is_read(found, tmp_path):
@@ -46,6 +48,9 @@ def test_half_a_file_is_told(found, tmp_path, part):
 def test_one_that_was_changed_is_told(found, tmp_path):
     file = tmp_path / "cameras.toml"
     write_found(found, file)
-    file.write_text(file.read_text().replace("position_sigma", "place_sigma"))
-    with pytest.raises(FileError, match="position_sigma.*made again"):
-        read_found(file)
+    text = file.read_text()
+    wrong = {"position_sigma": "place_sigma", '"a", ': "", "0.08": "-0.08", "1.5]": "1.5, 2.0]", "1.7": '"tall"'}
+    for old, new in wrong.items():
+        file.write_text(text.replace(old, new))
+        with pytest.raises(FileError, match="is not whole.*made again"):
+            read_found(file)

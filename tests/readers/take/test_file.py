@@ -222,7 +222,7 @@ WRONG = {
     "unknown sensor": (take_text(more='[[lidar]]\nfile = "x"'), r"no sensor or table 'lidar'; there are: take, s"),
     "unknown key": (take_text(a='vidoe = "x.mp4"'), r"\[\[camera\]\] 1: no key 'vidoe'; there are: name, video"),
     "unknown key of take": (take_text(head="fps = 50"), r"\[take\]: no key 'fps'; there are: name, rate, up"),
-    "unknown option": (take_text(a='image = "cropped"'), r"\[\[camera\]\] 1, a, image: Invalid value 'cropped'.*'scaled'"),
+    "unknown option": (take_text(a='image = "cropped"'), r"\[\[camera\]\] 1, a, image: .*'cropped'.*'scaled'"),
     "unknown up": (take_text(head='up = "up"'), r"\[take\] up: Invalid value 'up'.*'-z'"),
     "wrong type": (take_text(head='rate = "fast"'), r"\[take\] rate: a number is expected, not a text"),
     "file of wrong type": (take_text(a="video = 3"), r"\[\[camera\]\] 1, a, video: a file or folder must be a text"),

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from kinefit._files import parse_toml, read_bytes
 from kinefit.errors import FileError
@@ -17,9 +17,8 @@ from kinefit.readers.take.entries import CalibrationEntry
 _KEY = "kinefit_found_from"
 
 
-@dataclass(frozen=True, eq=False)
-class FoundCameras:
-    """A rig that was estimated from people.
+class FoundCameras(msgspec.Struct, frozen=True, kw_only=True, eq=False):
+    """A rig that was estimated from people; what is not the rig stands in [metadata] of its file.
 
     Parameters
     ----------
@@ -27,30 +26,29 @@ class FoundCameras:
     time_offsets : (C,) [s] to add to each camera's times, in the rig's order.
     position_sigma, rotation_sigma : float [m], [deg] standard deviations of a camera's pose.
     notes : sentences on the result and its uncertainty.
-    made_from : {camera: text that identifies its keypoints and settings}: another text, another result; empty where
-        the file is of a version that did not state it.
+    made_from : (C,) texts that identify each camera's keypoints and settings: another text, another result; one text
+        where the file is of a version that did not state them.
     height : float [m] of the person, which sets the scale; 0: unknown.
     """
 
     rig: Rig
     time_offsets: tuple[float, ...]
-    position_sigma: float
-    rotation_sigma: float
+    position_sigma: Annotated[float, msgspec.Meta(ge=0.0)]
+    rotation_sigma: Annotated[float, msgspec.Meta(ge=0.0)]
     notes: tuple[str, ...]
-    made_from: Mapping[str, str]
-    height: float = 0.0
+    made_from: tuple[str, ...] | str = msgspec.field(name=_KEY)
+    height: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
+
+    def __post_init__(self) -> None:
+        of_each = self.time_offsets, self.time_offsets if isinstance(self.made_from, str) else self.made_from
+        if any(len(one) != len(self.rig) for one in of_each):
+            raise ValueError(f"it is not of {len(self.rig)} cameras")
 
 
 def write_found(found: FoundCameras, path: str | PathLike[str]) -> None:
     """Write a rig that was estimated from people; raises as `write_calibration`."""
-    write_calibration(
-        found.rig, path,
-        metadata={
-            "time_offsets": list(found.time_offsets), "position_sigma": found.position_sigma,
-            "rotation_sigma": found.rotation_sigma, "notes": list(found.notes), "height": found.height,
-            _KEY: [found.made_from[name] for name in found.rig.names],
-        },
-    )  # fmt: skip
+    metadata = msgspec.structs.asdict(found)
+    write_calibration(metadata.pop("rig"), path, metadata=metadata | {_KEY: metadata.pop("made_from")})
 
 
 def read_found(path: str | PathLike[str]) -> FoundCameras | None:
@@ -68,14 +66,8 @@ def read_found(path: str | PathLike[str]) -> FoundCameras | None:
     if (metadata := _metadata(path)) is None:
         raise FileError("no whole file of cameras that were found from people", file=path, remedy=remedy)
     try:
-        rig, keys = read_calibration(path), metadata[_KEY]
-        made_from = {} if isinstance(keys, str) else dict(zip(rig.names, map(str, keys), strict=True))
-        offsets = tuple(float(t) for _, t in zip(rig, metadata["time_offsets"], strict=True))
-        return FoundCameras(
-            rig, offsets, float(metadata["position_sigma"]), float(metadata["rotation_sigma"]),
-            tuple(map(str, metadata["notes"])), made_from, float(metadata.get("height", 0.0)),
-        )  # fmt: skip
-    except (KeyError, TypeError, ValueError) as error:
+        return msgspec.convert({**metadata, "rig": read_calibration(path)}, FoundCameras)
+    except msgspec.ValidationError as error:
         raise FileError(f"its [metadata] is not whole: {error}", file=path, remedy=remedy) from error
 
 

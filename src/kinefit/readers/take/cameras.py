@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -11,8 +12,7 @@ from kinefit.geometry.camera import Camera, ImageFrame, Rig
 from kinefit.motion import UP_AXES
 from kinefit.readers.calibration.found import found_notes
 from kinefit.readers.calibration.read import read_calibration
-from kinefit.readers.take.entries import CameraEntry
-from kinefit.readers.take.file import Take
+from kinefit.readers.take.entries import CameraEntry, Take
 from kinefit.readers.video import Video
 
 DEFAULT_FIELD_OF_VIEW = 64.0
@@ -110,6 +110,26 @@ def calibrated_size(take: Take, name: str) -> tuple[int, int] | None:
         with Video(entry.video, rate=take.rate or 1.0) as video:
             size = video.size
     return size[::-1] if size and entry.rotation % 180 else size
+
+
+def stated_frame(image: ImageFrame, frame: str | None, kind: str) -> ImageFrame | None:
+    """From the calibration's image to that in which a `kind` of points is, by its entry's `frame`; None: they are one.
+
+    Raises TakeError where it matters and is not stated.
+    """
+    if np.allclose(image.T_image_calibration, np.eye(3), atol=1e-9):
+        return None
+    if frame is None:
+        problem = f"the video's image is not the calibration's, and it is not stated which the {kind} use"
+        raise TakeError(problem, remedy='Write frame = "calibration" or frame = "video".')
+    return image if frame == "video" else None
+
+
+def stated_rate(rate: float | None, file: Path | None = None) -> float:
+    """A rate [Hz]; TakeError where there is none."""
+    if rate is None:
+        raise TakeError("the rate is not stated", file=file, remedy="Write rate = ... into [take].")
+    return rate
 
 
 def image_frame(entry: CameraEntry, rig: Rig | None, video_size: tuple[int, int] | None, take: Take) -> ImageFrame:

@@ -156,13 +156,12 @@ def _names(take: Take) -> _Odd:
 
 def _files_of_two(take: Take) -> _Odd:
     """One file for two entries."""
-    inputs: list[tuple[object, ...]] = [
-        (f"keypoints of camera {k.camera}", k.file, k.format, k.frames, k.set == FACE_SET)
-        for k in (*take.keypoints, *take.skin)
-    ]
-    inputs += [(f"markers {m.file.name}", m.file, m.set) for m in take.markers]
-    inputs += [(f"surface_points {p.file.name}", p.file) for p in take.surface_points]
-    inputs += [(f"tracker {p.file.name}", p.file, sorted(p.points)) for p in take.trackers]
+    inputs = [
+        (name, entry.file, sorted(getattr(entry, "points", ())),
+         *(getattr(entry, key, None) for key in (("set",) if table == "markers" else ("format", "frames"))),
+         getattr(entry, "set", None) == FACE_SET)
+        for table, name, entry in take.entries if table in ("keypoints", "markers", "surface_points", "tracker")
+    ]  # fmt: skip
     for one in inputs:
         if inputs.count(one) > 1:
             yield "the same file twice", str(one[0]), "Remove one: a file named twice would count twice."

@@ -62,8 +62,8 @@ def load_depth(take: Take, rig: Rig | None, rates: Mapping[str, float]) -> Depth
         As `read_depth`, with the sensor's name.
     """
     depth, clouds, cameras = [], [], []
+    usual = take.rate or next(iter(rates.values()), None)
     for entry in take.depth:
-        usual = take.rate or next(iter(rates.values()), None)
         assert entry.file is not None
         with located(take.path, f"depth {entry.name}"):
             if is_unordered(entry.file):

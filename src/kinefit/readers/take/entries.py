@@ -7,22 +7,23 @@ say what to write; keys that need each other by `__post_init__`.
 from __future__ import annotations
 
 import datetime
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from kinefit.errors import TakeError, choices
+from kinefit.errors import TakeError, choices, located
 from kinefit.geometry import se3
 from kinefit.observations import KEYPOINT_SIGMA
 from kinefit.readers.keypoint_sets import FACE_SET, KEYPOINT_SETS, MEDIAPIPE_SETS
 from kinefit.readers.units import LENGTHS, worth
 
+_Read = TypeVar("_Read")
 _Pixels = Annotated[float, Meta(gt=0, lt=1e4, description="Give a positive number of pixels.")]
 _Rate = Annotated[float, Meta(gt=0, lt=1e6, description="Give frames per second, a positive number, or remove it.")]
 _Metres = Annotated[float, Meta(gt=0, lt=1, description="Give metres, above 0 and below 1.")]
@@ -439,10 +440,8 @@ class Take(TakeHead):
     @property
     def other_sensors(self) -> tuple[object, ...]:
         """Entries of all sensors but cameras and the keypoints of a detector."""
-        return (
-            *self.depth, *self.stereo, *self.markers, *self.skin, *self.silhouettes, *self.regions, *self.lines,
-            *self.surface_points, *self.trackers,
-        )  # fmt: skip
+        own = (entry for table, _, entry in self.entries if table not in (*SINGLE_TABLES, "camera", "keypoints"))
+        return (*own, *self.skin)
 
     @property
     def entries(self) -> Iterator[tuple[str, str, Any]]:
@@ -480,6 +479,15 @@ def _name_of(table: str, entry: Any) -> str:
     if table not in ("camera", "depth", "stereo"):
         return f"{table} of camera {entry.camera}" if hasattr(entry, "camera") else f"{table} {entry.file.name}"
     return f"{table} {entry.name}"
+
+
+def read_each(take: Take, entries: Iterable[Any], read: Callable[[Any], _Read]) -> tuple[_Read, ...]:
+    """What is read of each of some entries of a take; errors get the entry's name."""
+    out, names = [], {id(entry): name for _, name, entry in take.entries}
+    for entry in entries:
+        with located(take.path, names[id(entry)]):
+            out.append(read(entry))
+    return tuple(out)
 
 
 def sensor_name(kind: str, entries: Sequence[object], k: int) -> str:

@@ -14,7 +14,7 @@ import msgspec
 
 from kinefit._arguments import checked
 from kinefit._files import BACKSLASHES, parse_toml, regular
-from kinefit.errors import FileError, TakeError, check_choice, choices, printable, shortened
+from kinefit.errors import FileError, TakeError, check_choice, choices, located, printable, shortened
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.checks import check_take
 from kinefit.readers.take.entries import (
@@ -51,13 +51,7 @@ def read_take(path: str | PathLike[str]) -> Take:
     except (OSError, UnicodeDecodeError) as error:
         raise FileError(f"cannot be read ({error})", file=path, remedy="Give a text file in UTF-8.") from error
     digest = hashlib.sha256(json.dumps(raw, sort_keys=True, default=str).encode()).hexdigest()
-    _check_keys(raw, path)
-    _rename(raw, path)
-    for row in raw.get("depth", []):
-        for key, units in (("unit", LENGTHS), ("time_unit", TIMES)):
-            if (value := worth(row.get(key), units)) is not None:
-                row[key] = value
-    _name_topics(raw, path)
+    _tidy(raw, path)
     head = raw.pop("take", {}) | {"path": path, "digest": digest}
     head["name"] = head.get("name") or printable(path.stem)
     if isinstance(body := head.get("body"), str) and body.endswith((".toml", ".npz")):
@@ -91,61 +85,49 @@ def _path_in(folder: Path) -> Callable[[type, Any], Path]:
     return make
 
 
-def _name_topics(raw: dict[str, Any], path: Path) -> None:
-    """Make `topic` a part of its file's path, as recordings of ROS 2 are read."""
-    for table, key in (("camera", "video"), ("depth", "file")):
-        for number, row in enumerate(raw.get(table, [])):
-            topic, file = row.get("topic"), row.get(key)
-            if topic is None or not isinstance(topic, str):
-                continue
-            place = f"[[{table}]] {number + 1}"
-            if not isinstance(file, str) or not topic.strip("/"):
-                remedy = f'Write {key} = "recording.mcap" and topic = "/front/image_raw".'
-                raise TakeError(f"a topic without {key}, or without a name", file=path, place=place, remedy=remedy)
-            recording = path.parent / file
-            if recording.exists() and inside(recording) is None:
-                problem = f"'topic' has no use with {file}"
-                raise TakeError(problem, file=path, place=place, remedy="It is for MCAP recordings of ROS 2.")
-            row[key] = f"{file}/{topic.strip('/')}"
-
-
-def _check_keys(raw: dict[str, Any], path: Path) -> None:
-    """Name an unknown table or key, and what exists."""
+def _tidy(raw: dict[str, Any], path: Path) -> None:
+    """Name an unknown table or key, and what exists; put new names of keys, metres and topics in place."""
     for table, content in raw.items():
         check_choice("sensor or table", table, TABLES, TakeError, file=path, place=f"[{table}]")
         many = table not in SINGLE_TABLES
         if many != isinstance(content, list):
             wanted = f"[[{table}]]" if many else f"[{table}]"
             raise TakeError(f"'{table}' is not a table {wanted}", file=path, place=table, remedy=f"Write {wanted}.")
-        for number, row in enumerate(content if many else [content]):
-            place = f"[[{table}]] {number + 1}" if many else f"[{table}]"
-            if not isinstance(row, dict):
-                raise TakeError("not a table", file=path, place=place, remedy=f"Write [[{table}]] and its keys below.")
-            for key in row:
-                if key not in keys_of(table) and key not in RENAMED.get(table, {}):
-                    problem = choices("key", key, keys_of(table))
-                    raise TakeError(problem, file=path, place=place, remedy=_belongs(key))
+        for number, row in enumerate(content if many else [content], 1):
+            with located(path, f"[[{table}]] {number}" if many else f"[{table}]"):
+                if not isinstance(row, dict):
+                    raise TakeError("not a table", remedy=f"Write [[{table}]] and its keys below.")
+                _rename(table, row, path, f"[[{table}]] {number}" if many else f"[{table}]")
+                for key, units in (("unit", LENGTHS), ("time_unit", TIMES)) if table == "depth" else ():
+                    if (value := worth(row.get(key), units)) is not None:
+                        row[key] = value
+                if isinstance(topic := row.get("topic"), str):
+                    _name_topic(topic, row, "video" if table == "camera" else "file", path)
 
 
-def _belongs(key: str) -> str | None:
-    """Which tables have a key."""
-    holding = [name for name in TABLES if key in keys_of(name)]
-    tables = [f"[{name}]" if name in SINGLE_TABLES else f"[[{name}]]" for name in holding]
-    return f"'{key}' belongs to {', '.join(tables)}." if tables else None
+def _rename(table: str, row: dict[str, Any], path: Path, place: str) -> None:
+    """Put the new name of a key in place of its old one, and say so; refuse one that there is not."""
+    known, old_names = keys_of(table), RENAMED.get(table, {})
+    for old in [key for key in row if key not in known]:
+        if old not in old_names:
+            tables = [name for name in TABLES if old in keys_of(name)]
+            holding = ", ".join(f"[{name}]" if name in SINGLE_TABLES else f"[[{name}]]" for name in tables)
+            raise TakeError(choices("key", old, known), remedy=f"'{old}' belongs to {holding}." if holding else None)
+        new = old_names[old]
+        if new in row:
+            raise TakeError(f"'{old}' and '{new}' are one key", remedy=f"Keep '{new}'.")
+        row[new] = row.pop(old)
+        text = f"{path}, {place}: '{old}' is now called '{new}'; the next version does not read '{old}'"
+        warnings.warn(text, FutureWarning, stacklevel=4)
 
 
-def _rename(raw: dict[str, Any], path: Path) -> None:
-    """Put the new name of a key in place of its old one, and say so."""
-    for table, names in RENAMED.items():
-        content = raw.get(table, [])
-        for number, row in enumerate(content if isinstance(content, list) else [content]):
-            place = f"[[{table}]] {number + 1}" if isinstance(content, list) else f"[{table}]"
-            for old in [key for key in row if key in names]:
-                new = names[old]
-                if new in row:
-                    raise TakeError(f"'{old}' and '{new}' are one key", file=path, place=place, remedy=f"Keep '{new}'.")
-                row[new] = row.pop(old)
-                warnings.warn(
-                    f"{path}, {place}: '{old}' is now called '{new}'; the next version does not read '{old}'",
-                    FutureWarning, stacklevel=3,
-                )  # fmt: skip
+def _name_topic(topic: str, row: dict[str, Any], key: str, path: Path) -> None:
+    """Make a topic a part of its file's path, as recordings of ROS 2 are read."""
+    file = row.get(key)
+    if not isinstance(file, str) or not topic.strip("/"):
+        remedy = f'Write {key} = "recording.mcap" and topic = "/front/image_raw".'
+        raise TakeError(f"a topic without {key}, or without a name", remedy=remedy)
+    recording = path.parent / file
+    if recording.exists() and inside(recording) is None:
+        raise TakeError(f"'topic' has no use with {file}", remedy="It is for MCAP recordings of ROS 2.")
+    row[key] = f"{file}/{topic.strip('/')}"

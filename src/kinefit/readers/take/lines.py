@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import regular
-from kinefit.errors import FileError, ObservationError, TakeError, choices, located
+from kinefit.errors import FileError, ObservationError, TakeError, choices
 from kinefit.geometry.camera import ImageFrame
 from kinefit.observations import ClickVideo, LineVideo
 from kinefit.readers.clicks import read_clicks
-from kinefit.readers.take.entries import LinesEntry
-from kinefit.readers.take.file import Take
+from kinefit.readers.take.cameras import stated_frame, stated_rate
+from kinefit.readers.take.entries import LinesEntry, Take
 
 _COLUMNS = ("frame", "line", "u1", "v1", "u2", "v2")
 _REMEDY = f"Give a table with the columns {', '.join(_COLUMNS)} (.csv), or a list of objects with these keys (.json)."
@@ -74,25 +74,6 @@ def _rows(path: Path) -> Iterable[tuple[str, Mapping[str, Any]]]:
         raise FileError(f"cannot read the lines ({error})", file=path, remedy=_REMEDY) from error
 
 
-def load_lines(
-    take: Take, images: Mapping[str, ImageFrame], rate: float | None, clocks: Mapping[str, NDArray]
-) -> tuple[LineVideo, ...]:
-    """All `[[lines]]` of a take; `rate` [Hz] of its steps, `clocks` (N,) [s] of its videos.
-
-    Raises
-    ------
-    TakeError
-        Nothing states the rate, or the image in which the lines are.
-    KinefitError
-        As `read_lines`, with the camera's name.
-    """
-    out = []
-    for entry in take.lines:
-        with located(take.path, f"lines of camera {entry.camera}"):
-            out.append(_lines(entry, take, images[entry.camera], rate, clocks.get(entry.camera)))
-    return tuple(out)
-
-
 def load_clicks(take: Take, images: Mapping[str, ImageFrame], rate: float | None) -> tuple[ClickVideo, ...]:
     """Joints that were clicked: each is two image lines that cross in it, along u and v, with its landmark on both.
 
@@ -112,8 +93,7 @@ def load_clicks(take: Take, images: Mapping[str, ImageFrame], rate: float | None
         if camera not in images:
             problem = choices("camera", camera, images)
             raise TakeError(problem, file=take.clicks, place="[start] clicks", remedy="Remove its clicks.")
-        if rate is None:
-            raise TakeError("the rate is not stated", file=take.path, remedy="Write rate = ... into [take].")
+        rate = stated_rate(rate, take.path)
         mine = [of for of in steps if of.points.get(camera)]
         names = tuple(dict.fromkeys(name for of in mine for name in of.points[camera]))
         uv = np.array([[of.points[camera].get(name, (np.nan, np.nan)) for name in names] for of in mine])
@@ -127,20 +107,24 @@ def load_clicks(take: Take, images: Mapping[str, ImageFrame], rate: float | None
     return tuple(out)
 
 
-def _lines(
+def load_lines(
     entry: LinesEntry, take: Take, image: ImageFrame, rate: float | None, clock: NDArray | None
 ) -> LineVideo:
-    same = np.allclose(image.T_image_calibration, np.eye(3), atol=1e-9)
-    if entry.frame is None and not same:
-        problem = "the video's image is not the calibration's, and it is not stated which the lines use"
-        raise TakeError(problem, remedy='Write frame = "calibration" or frame = "video".')
-    rate = entry.rate or rate
-    if rate is None:
-        raise TakeError("the rate is not stated", remedy="Write rate = ... into [take].")
+    """A `[[lines]]` of a take; `rate` [Hz] of its steps, `clock` (N,) [s] of the camera's video.
+
+    Raises
+    ------
+    TakeError
+        Nothing states the rate, or the image in which the lines are.
+    KinefitError
+        As `read_lines`.
+    """
+    frame = stated_frame(image, entry.frame, "lines")
+    rate = stated_rate(entry.rate or rate)
     names = tuple(entry.landmarks)
     frames, ends = read_lines(entry.file, names)
-    if entry.frame == "video" and not same:
-        ends = image.to_calibration(ends)
+    if frame is not None:
+        ends = frame.to_calibration(ends)
     offset = next(camera.time_offset for camera in take.cameras if camera.name == entry.camera)
     of_video = entry.rate is None and clock is not None and frames[-1] < len(clock)
     times = clock[frames] if of_video and clock is not None else frames / rate

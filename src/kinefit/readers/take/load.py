@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import read_sides
-from kinefit.errors import ObservationError, TakeError, command
+from kinefit.errors import ObservationError, TakeError, command, located
 from kinefit.geometry import se3
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.observations import (
@@ -42,15 +42,17 @@ from kinefit.readers.take.cameras import (
     is_alone,
     is_uncalibrated,
     read_rig,
+    stated_frame,
+    stated_rate,
     what_is_assumed,
 )
 from kinefit.readers.take.depth import load_depth
-from kinefit.readers.take.entries import KeypointsEntry, MarkersEntry, Take, sensor_name
+from kinefit.readers.take.entries import KeypointsEntry, MarkersEntry, Take, read_each, sensor_name
 from kinefit.readers.take.lines import load_clicks, load_lines
-from kinefit.readers.take.silhouettes import load_regions, load_silhouettes
+from kinefit.readers.take.silhouettes import load_region, load_silhouettes
 from kinefit.readers.take.skin import load_skin
 from kinefit.readers.take.streams import refuse_streams
-from kinefit.readers.take.surface_points import load_surface_points
+from kinefit.readers.take.surface_points import read_surface_points
 from kinefit.readers.video import Video, common_frames
 
 _Timed = DepthVideo | CloudVideo | LineVideo | SurfacePointVideo | BodyTrackerVideo
@@ -189,14 +191,23 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         streams[stream] = times + offsets[source.camera]
         keypoints.append((read, streams[stream]))
     sensors = load_depth(take, rig, rates)
-    silhouettes = load_silhouettes(take, rig, images, rates, clocks)
+    silhouettes = read_each(
+        take, take.silhouettes, lambda e: load_silhouettes(e, take, rig, images[e.camera], rates, clocks.get(e.camera))
+    )
     for outlines in silhouettes:
         rates[f"silhouettes {outlines.sensor}"] = outlines.rate
         streams[f"silhouettes {outlines.sensor}"] = outlines.times
     fastest = take.rate or max(rates.values(), default=None)
-    skin = load_skin(take, images, {e.name: e.video for e in take.cameras if e.video is not None}, fastest)
-    lines, clicks = load_lines(take, images, fastest, clocks), load_clicks(take, images, fastest)
-    surfaces = load_surface_points(take)
+    videos = {e.name: e.video for e in take.cameras if e.video is not None}
+    skin = read_each(take, take.skin, lambda e: load_skin(e, take, images[e.camera], videos[e.camera], fastest))
+    lines = read_each(
+        take, take.lines, lambda e: load_lines(e, take, images[e.camera], fastest, clocks.get(e.camera))
+    )
+    clicks = load_clicks(take, images, fastest)
+    surfaces = tuple(
+        read_surface_points(e.file, sensor_name("surface_points", take.surface_points, k), time_offset=e.time_offset)
+        for k, e in enumerate(take.surface_points)
+    )
     trackers = tuple(
         read_body_trackers(e.file, e.points, sensor_name("trackers", take.trackers, k), time_offset=e.time_offset,
                            T_world_file=e.T_world_file)
@@ -243,9 +254,10 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         rate=rate, frames=frames, rig=Rig(cameras) if cameras else None,
         markers=markers,
         keypoints=tuple(_cut(*k, rate, frames, entry) for k, entry in zip(keypoints, take.keypoints)),
-        videos={entry.name: entry.video for entry in take.cameras if entry.video is not None}, images=images,
+        videos=videos, images=images,
         depth=sensors.depth, clouds=sensors.clouds, silhouettes=silhouettes,
-        regions=load_regions(take, rig, images), skin=skin, lines=lines,
+        regions=read_each(take, take.regions, lambda e: load_region(e, take, rig, images[e.camera])),
+        skin=skin, lines=lines,
         clicks=tuple(c for c in clicks if _within(np.rint(c.times * rate), [frames]).any()),
         surface_points=surfaces, trackers=trackers,
         notes=(*notes, *(n for m in markers for n in m.notes), *sensors.notes(rate), *found, *what_is_assumed(take)),
@@ -280,29 +292,22 @@ def _read_keypoints(
 ) -> tuple[Keypoints, NDArray]:
     """Keypoints of a camera, and the times (F,) [s] of their frames from the first on."""
     place = f"[[keypoints]] {number + 1}, camera {source.camera}"
-    same = np.allclose(image.T_image_calibration, np.eye(3), atol=1e-9)
-    if source.frame is None and not same and source.format != "detect":
-        raise TakeError(
-            "the video's image is not the calibration's, and it is not stated which the keypoints use",
-            file=take.path, place=place, remedy='Write frame = "calibration" or frame = "video".',
-        )
     offset = next(entry.time_offset for entry in take.cameras if entry.name == source.camera)
     clock = clocks.get(source.camera)
     if source.format == "detect":
         file = source.file or detections_file(take.path, source.camera)
         found = read_detections(file)
-        frame, face = None if same else image, source.set == FACE_SET
+        frame, face = stated_frame(image, "video", "keypoints"), source.set == FACE_SET
         seen = found.keypoints(source.camera, image_frame=frame, time_offset=offset, face=face)
         return seen, frame_times(len(found), found.rate, clock if found.times is None else found.times)
-    rate = source.rate or rates.get(f"video {source.camera}") or take.rate
-    if rate is None:
-        raise TakeError("the rate is not stated", file=take.path, place=place, remedy="Write rate = ... into [take].")
+    with located(take.path, place):
+        frame = stated_frame(image, source.frame, "keypoints")
+        rate = stated_rate(source.rate or rates.get(f"video {source.camera}") or take.rate)
     assert source.file is not None
     options: dict[str, Any] = {"keypoint_set": source.set} if source.format == "openpose" and source.set else {}
     record = read_keypoints(
-        source.file, format=source.format, camera=source.camera, rate=rate,
-        image_frame=image if source.frame == "video" and not same else None,
-        time_offset=offset, **options,
+        source.file, format=source.format, camera=source.camera, rate=rate, image_frame=frame, time_offset=offset,
+        **options,
     )
     times = frame_times(len(record), rate, clock)
     if times is clock and source.rate and not is_even(times, source.rate):

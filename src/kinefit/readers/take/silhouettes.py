@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._pictures import read_picture
-from kinefit.errors import FileError, ObservationError, TakeError, located
+from kinefit.errors import FileError, ObservationError, TakeError
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.images.silhouette import colour_mask
 from kinefit.images.silhouette_background import BackgroundPlate
@@ -19,7 +19,8 @@ from kinefit.observations import ColourVideo, Detections, SilhouetteVideo
 from kinefit.observations.clocks import frame_times
 from kinefit.readers.depth.images import listed
 from kinefit.readers.detections import detections_file, read_detections
-from kinefit.readers.take.entries import CameraEntry, SilhouetteEntry, Take
+from kinefit.readers.take.cameras import stated_frame, stated_rate
+from kinefit.readers.take.entries import CameraEntry, RegionEntry, SilhouetteEntry, Take
 from kinefit.readers.video import Video
 
 _SIDE = 1000  # [px] of an image that its background is taken from: larger ones are made smaller by a whole number
@@ -67,44 +68,27 @@ def read_silhouettes(
 
 
 def load_silhouettes(
-    take: Take, rig: Rig | None, images: Mapping[str, ImageFrame], rates: Mapping[str, float],
-    clocks: Mapping[str, NDArray],
-) -> tuple[SilhouetteVideo, ...]:
-    """All `[[silhouette]]` of a take, in its order; `rates` [Hz] of its other streams, `clocks` [s] of its videos.
+    entry: SilhouetteEntry, take: Take, rig: Rig | None, frame: ImageFrame, rates: Mapping[str, float],
+    clock: NDArray | None,
+) -> SilhouetteVideo:
+    """A `[[silhouette]]` of a take; `rates` [Hz] of its other streams, `clock` [s] of the camera's video.
 
     Raises
     ------
     TakeError
         Nothing states the rate, or the image in which masks are.
     KinefitError
-        As `read_silhouettes`, with the camera's name.
+        As `read_silhouettes`.
     """
-    out = []
-    for entry in take.silhouettes:
-        with located(take.path, f"silhouette of camera {entry.camera}"):
-            out.append(_silhouettes(entry, take, rig, images[entry.camera], rates, clocks.get(entry.camera)))
-    return tuple(out)
-
-
-def _silhouettes(
-    entry: SilhouetteEntry, take: Take, rig: Rig | None, frame: ImageFrame, rates: Mapping[str, float],
-    clock: NDArray | None,
-) -> SilhouetteVideo:
     assert rig is not None
     camera = next(c for c in take.cameras if c.name == entry.camera)
-    same = np.allclose(frame.T_image_calibration, np.eye(3), atol=1e-9)
     size, offset = rig[entry.camera].size, camera.time_offset
     rate = entry.rate or rates.get(f"video {entry.camera}") or take.rate
     if entry.format == "masks":
-        if rate is None:
-            raise TakeError("the rate is not stated", remedy="Write rate = ... into [take].")
-        if entry.frame is None and not same:
-            problem = "the video's image is not the calibration's, and it is not stated which the masks use"
-            raise TakeError(problem, remedy='Write frame = "calibration" or frame = "video".')
         assert entry.file is not None
         return read_silhouettes(
-            entry.file, camera=entry.camera, rate=rate, size=size,
-            image_frame=frame if entry.frame == "video" and not same else None, time_offset=offset,
+            entry.file, camera=entry.camera, rate=stated_rate(rate), size=size,
+            image_frame=stated_frame(frame, entry.frame, "masks"), time_offset=offset,
             clock=None if entry.rate else clock,
         )  # fmt: skip
     if entry.format == "threshold":
@@ -211,21 +195,11 @@ def in_calibration(mask: NDArray, size: tuple[int, int], frame: ImageFrame | Non
     return np.asarray(cv2.warpAffine(mask, T, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))
 
 
-def load_regions(take: Take, rig: Rig | None, images: Mapping[str, ImageFrame]) -> tuple[ColourVideo, ...]:
-    """The videos of all `[[region]]` of a take, in its order, in the calibration's image frame.
-
-    Raises
-    ------
-    KinefitError
-        What reading a video raises.
-    """
-    out = []
-    for entry in take.regions:
-        assert rig is not None
-        camera = next(c for c in take.cameras if c.name == entry.camera)
-        assert camera.video is not None
-        video, size, frame = Video(camera.video, rate=take.rate), rig[entry.camera].size, images[entry.camera]
-        times = camera.time_offset + video.times
-        image = lambda i, video=video, size=size, frame=frame: in_calibration(video.read(i), size, frame)
-        out.append(ColourVideo(entry.camera, video.rate, times, size, image, str(camera.video)))
-    return tuple(out)
+def load_region(entry: RegionEntry, take: Take, rig: Rig | None, frame: ImageFrame) -> ColourVideo:
+    """The video of a `[[region]]` of a take, in the calibration's image frame; raises what reading a video raises."""
+    assert rig is not None
+    camera = next(c for c in take.cameras if c.name == entry.camera)
+    assert camera.video is not None
+    video, size = Video(camera.video, rate=take.rate), rig[entry.camera].size
+    image = lambda i: in_calibration(video.read(i), size, frame)
+    return ColourVideo(entry.camera, video.rate, camera.time_offset + video.times, size, image, str(camera.video))

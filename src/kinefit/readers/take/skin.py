@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import TakeError, located
+from kinefit.errors import TakeError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.images.detectors.skin import LANDMARKS, WRISTS, SkinTracker, face_box
 from kinefit.observations import KeypointVideo
 from kinefit.readers.detections import detections_file, read_detections
-from kinefit.readers.take.entries import KeypointsEntry
-from kinefit.readers.take.file import Take
+from kinefit.readers.take.entries import KeypointsEntry, Take
 from kinefit.readers.video import Video
 
 _NAMES = {"HANDS": LANDMARKS, "WRISTS": WRISTS}
 
 
-def load_skin(
-    take: Take, images: Mapping[str, ImageFrame], videos: Mapping[str, Path], rate: float | None
-) -> tuple[KeypointVideo, ...]:
-    """All `[[keypoints]]` of a take with format = "skin"; images are read when their frames are asked for.
+def load_skin(entry: KeypointsEntry, take: Take, image: ImageFrame, file: Path, rate: float | None) -> KeypointVideo:
+    """A `[[keypoints]]` of a take with format = "skin"; images are read when their frames are asked for.
 
     `rate` [Hz] is that of the take's steps.
 
@@ -32,16 +28,8 @@ def load_skin(
     TakeError
         Nothing states where the face is.
     KinefitError
-        What reading the video, and the tracker at a face that is not in it, raise; with the camera's name.
+        What reading the video, and the tracker at a face that is not in it, raise.
     """
-    out = []
-    for entry in take.skin:
-        with located(take.path, f"keypoints of camera {entry.camera}"):
-            out.append(_skin(entry, take, images[entry.camera], videos[entry.camera], rate))
-    return tuple(out)
-
-
-def _skin(entry: KeypointsEntry, take: Take, image: ImageFrame, file: Path, rate: float | None) -> KeypointVideo:
     video = Video(file, rate=take.rate)
     offset = next(camera.time_offset for camera in take.cameras if camera.name == entry.camera)
     used = entry.frames or take.frames

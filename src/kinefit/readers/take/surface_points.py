@@ -9,8 +9,6 @@ import numpy as np
 from kinefit._files import rate_of, read_table
 from kinefit.errors import FileError
 from kinefit.observations import SurfacePointVideo
-from kinefit.readers.take.entries import sensor_name
-from kinefit.readers.take.file import Take
 
 _COLUMNS = ("time_s", "point", "x", "y", "z", "std_x", "std_y", "std_z")
 _REMEDY = f"Give trajectories.csv of `kinefit surface`, or a table with the columns {', '.join(_COLUMNS)}."
@@ -39,11 +37,3 @@ def read_surface_points(path: Path, sensor: str = "surface_points", *, time_offs
         sensor, rate, times + time_offset, first, values[:, 1].astype(np.int64), values[:, 2:5], values[:, 5:],
         source=str(path),
     )  # fmt: skip
-
-
-def load_surface_points(take: Take) -> tuple[SurfacePointVideo, ...]:
-    """All `[[surface_points]]` of a take, in its order; errors as of `read_surface_points`."""
-    return tuple(
-        read_surface_points(e.file, sensor_name("surface_points", take.surface_points, k), time_offset=e.time_offset)
-        for k, e in enumerate(take.surface_points)
-    )
