@@ -62,7 +62,7 @@ def test_the_same_as_json_and_in_the_videos_picture(tmp_path):
         (LINES.replace('"cam"', '"cam9"'), "no camera 'cam9'"),
         (LINES.replace('["cervicale"]', '["a", "b", "c"]'), "line 'back' has 3 landmarks"),
         (LINES.replace(LANDMARKS, "{}"), "no landmarks"),
-        (LINES + "sigma = 0\n", "sigma 0.0 px"),
+        (LINES + "sigma = 0\n", "sigma = 0. Give a positive"),
         (LINES + "accuracy = 1\n", "no key 'accuracy'"),
     ],
 )

@@ -53,7 +53,7 @@ def check_take(take: Take) -> None:
     FileError
         A file that it names is missing.
     """
-    for odd in (_head, _pose, _cameras, odd_streams, _names, _files_of_two):
+    for odd in (_head, _pose, _names, _cameras, odd_streams, _files_of_two):
         for problem, place, remedy in odd(take):
             raise TakeError(problem, file=take.path, place=place, remedy=remedy)
     for place, file in _files(take):

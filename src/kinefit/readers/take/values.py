@@ -31,6 +31,7 @@ def wrong_value(error: msgspec.ValidationError, content: Mapping[str, Any], path
         number, key = int(inner[0]), next(iter(inner[1:]), "")
         row = content[attribute][number]
         whose = f"camera {row['camera']}" if "camera" in row and table != "depth" else row.get("name")
+        whose = f"{row.get('left')}-{row.get('right')}" if table == "stereo" else whose
         where = ", ".join([f"[[{table}]] {number + 1}", *([str(whose)] if whose else [])])
         place = f"{where}, {key}" if key else where
     if isinstance(cause := error.__cause__, WrongEntryError):
