@@ -14,7 +14,8 @@ from benchmarks.figures import data, figure
 from benchmarks.motions import library
 from benchmarks.tracking import DETECTORS, NOISE, TRIAL, take_text
 from kinefit import Keypoints, Motion, Rig
-from kinefit.calibration.check.check import Check, check_keypoints, check_take
+from kinefit.calibration.check.check import check_take
+from kinefit.diagnostics.checks import Checked, check_keypoints
 from kinefit.diagnostics.timing import time_offsets
 from kinefit.diagnostics.views import make_views, with_sides_right
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
@@ -86,7 +87,7 @@ def offsets() -> None:
     figure("check_time_offset_worst", float(np.max(errors)), "frame", "<= 0.1")
 
 
-def faults(rig: Rig, seen: list[Keypoints], up: str) -> Check:
+def faults(rig: Rig, seen: list[Keypoints], up: str) -> Checked:
     """A check of simulated keypoints."""
     return check_keypoints(rig, seen, up=up)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 Severity = Literal["fault", "doubt", "note", "good"]
 SEVERITIES: tuple[Severity, ...] = ("fault", "doubt", "note", "good")
 """Worst first: a fault spoils results; a doubt may; a note is worth knowing; good was looked at and is in order."""
+
+_GUESSES = ("Guess", "A guess", "Uncertain")  # how the confidence of a guess begins
 
 FINDINGS = "findings"
 """Key of `Motion.provenance`: the faults that `track` found in its inputs, as mappings of a `Finding`'s parts."""
@@ -28,6 +30,42 @@ STATURE = "stature"
 
 INVERTED = "upside down"
 """Key of `Motion.provenance`: the depth camera in which people are explained better upside down."""
+
+
+@dataclass(frozen=True)
+class Edit:
+    """One line of a take file: a key of one of its tables.
+
+    Parameters
+    ----------
+    table, key : str
+        "take" and "up", "camera" and "time_offset" ...
+    value : str or None
+        As TOML has it; None takes the key away.
+    entry : str or int
+        Which `[[table]]`: the name of its camera or sensor, or its number from 0. "" for a single `[table]`.
+    """
+
+    table: str
+    key: str
+    value: str | None
+    entry: str | int = ""
+
+    @property
+    def place(self) -> str:
+        """The table in words: [take], [[camera]] cam02, [[markers]] 2."""
+        if self.entry == "":
+            return f"[{self.table}]"
+        return f"[[{self.table}]] {self.entry + 1 if isinstance(self.entry, int) else self.entry}"
+
+    def __str__(self) -> str:
+        return f"no {self.key}" if self.value is None else f"{self.key} = {self.value}"
+
+
+def in_words(edits: Sequence[Edit], into: str = " into ") -> str:
+    """Edits as "a = 1 and b = 2 into [[camera]] cam02; c = 3 into [take]"."""
+    places = {edit.place: [str(e) for e in edits if e.place == edit.place] for edit in edits}
+    return "; ".join(f"{' and '.join(lines)}{into}{place}" for place, lines in places.items())
 
 
 @dataclass(frozen=True)
@@ -47,8 +85,10 @@ class Finding:
         How sure that is, and why; empty where the text is a plain fact.
     remedy : str
         What would fix it: the line to write, the command to run; empty where nothing need be done.
-    keys : tuple of (key, value)
-        What to write into the `[[camera]]` of the one camera that it is about: keys with their values as TOML has them.
+    edits : tuple of Edit
+        The lines of the take that mend it; without a remedy in words, they are the remedy.
+    alike : str
+        What else would look the same.
     """
 
     severity: Severity
@@ -57,7 +97,12 @@ class Finding:
     cameras: tuple[str, ...] = ()
     confidence: str = ""
     remedy: str = ""
-    keys: tuple[tuple[str, str], ...] = ()
+    edits: tuple[Edit, ...] = ()
+    alike: str = ""
+
+    def __post_init__(self) -> None:
+        if self.edits and not self.remedy:
+            object.__setattr__(self, "remedy", f"Write {in_words(self.edits)}.")
 
     def __str__(self) -> str:
         return " ".join(part for part in (self.text, self.confidence, self.remedy) if part)
@@ -66,6 +111,14 @@ class Finding:
 def faults_of(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Those that spoil results, each said once."""
     return tuple(dict.fromkeys(found for found in findings if found.severity == "fault"))
+
+
+def fixes(findings: Iterable[Finding], written: Iterable[Edit] = ()) -> tuple[Edit, ...]:
+    """What `kinefit check --fix` writes: the edits of faults that are no guess, of keys not written before."""
+    known = {(edit.table, edit.entry, edit.key) for edit in written}
+    sure = [f for f in findings if f.severity == "fault" and not f.confidence.startswith(_GUESSES)]
+    edits = dict.fromkeys(edit for found in sure for edit in found.edits)
+    return tuple(edit for edit in edits if (edit.table, edit.entry, edit.key) not in known)
 
 
 def ranked(findings: Iterable[Finding]) -> tuple[Finding, ...]:
@@ -94,10 +147,10 @@ def listed(names: Iterable[str]) -> str:
 
 def runs_of(flags: NDArray, gap: int = 1) -> list[tuple[int, int]]:
     """(start, stop) of the runs of true flags (F,); runs with fewer than `gap` frames between them are one."""
-    return _joined(np.flatnonzero(flags), gap)
+    return joined(np.flatnonzero(flags), gap)
 
 
-def _joined(at: NDArray, gap: int = 1) -> list[tuple[int, int]]:
+def joined(at: NDArray, gap: int = 1) -> list[tuple[int, int]]:
     """(start, stop) of the runs of ascending numbers."""
     parts = np.split(at, np.flatnonzero(np.diff(at) > max(gap, 1)) + 1) if len(at) else []
     return [(int(part[0]), int(part[-1]) + 1) for part in parts]
@@ -105,5 +158,5 @@ def _joined(at: NDArray, gap: int = 1) -> list[tuple[int, int]]:
 
 def frame_ranges(frames: Iterable[int], most: int = 12) -> str:
     """Frames in ascending order as "3, 7-9"; at most so many stretches."""
-    texts = [f"{a}" if a + 1 == b else f"{a}-{b - 1}" for a, b in _joined(np.array(list(frames), int))]
+    texts = [f"{a}" if a + 1 == b else f"{a}-{b - 1}" for a, b in joined(np.array(list(frames), int))]
     return ", ".join(texts[:most]) + (f" and {len(texts) - most} more stretches" if len(texts) > most else "")

@@ -14,13 +14,14 @@ from kinefit.batch.corrections import (
     corrections_of,
     exchange_sides,
     exclude_view,
-    set_camera_keys,
     set_height,
     trim,
     undo,
+    write_edits,
 )
 from kinefit.bodies import load_body
-from kinefit.errors import FileError, KinefitError, TakeError
+from kinefit.errors import ExportError, FileError, KinefitError, TakeError
+from kinefit.findings import Edit
 from kinefit.multiview.people import PersonTrack
 from kinefit.observations import ClickFrame
 from kinefit.observations.recordings import mirror_name
@@ -277,10 +278,11 @@ def test_a_click_is_of_the_person_with_the_nearest_keypoint(take):
 
 def test_a_finding_is_written_into_its_camera(take):
     before = read_take(take).cameras
-    set_camera_keys(take, "cam02", {"time_offset": "0.0109"})
+    late = Edit("camera", "time_offset", "0.0109", "cam02")
+    write_edits(take, [late, late])
     assert [entry.time_offset for entry in read_take(take).cameras] == [0.0, 0.0109, 0.0, 0.0]
     with pytest.raises(TakeError, match="cam9"):
-        set_camera_keys(take, "cam9", {"time_offset": "0.1"})
+        write_edits(take, [Edit("camera", "time_offset", "0.1", "cam9")])
     assert undo(take) and read_take(take).cameras == before
 
 
@@ -305,3 +307,66 @@ def test_a_kept_text_that_is_no_take_is_not_put_back(copy_take, tmp_path, conten
     with pytest.raises(KinefitError, match="take-before.*0004.txt"):
         undo(take)
     assert take.read_bytes() == original
+
+
+WRITES = {
+    "a step and its cut": [Edit("camera", "time_offset", "0.1", "cam01"), Edit("take", "frames", "[0, 30]")],
+    "names of two cameras": [
+        Edit(table, key, f'"{new}"', old)
+        for old, new in (("cam01", "cam03"), ("cam03", "cam01"))
+        for table, key in (("camera", "name"), ("keypoints", "camera"))
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("edits", WRITES)
+@pytest.mark.parametrize("ends", ["\n", "\r\n"])
+def test_edits_are_written_together_and_undone_byte_for_byte(edits, ends, take):
+    take.write_bytes(b"\xef\xbb\xbf" * (ends == "\r\n") + take.read_text().replace("\n", ends).encode())
+    before, videos = take.read_bytes(), {c.video.stem: c.name for c in read_take(take).cameras if c.video}
+    assert write_edits(take, WRITES[edits]).read_bytes() == before
+    now = read_take(take)
+    if "names" in edits:
+        assert {c.video.stem: c.name for c in now.cameras if c.video} == {**videos, "cam01": "cam03", "cam03": "cam01"}
+        assert next((k.camera, k.file.stem) for k in now.keypoints) == ("cam03", "mediapipe_cam01")
+    else:
+        assert now.frames == (0, 30) and now.cameras[0].time_offset == 0.1
+    assert undo(take) and take.read_bytes() == before
+
+
+REFUSED = {
+    "contradicting": ([Edit("take", "up", '"y"'), Edit("take", "up", '"x"')], TakeError, 'up = "y" and up = "x"'),
+    "contradicting, of a camera": (
+        [Edit("camera", "image", '"scaled"', "cam02"), Edit("camera", "image", None, "cam02")], TakeError,
+        r'\[\[camera\]\] cam02: two edits contradict each other: image = "scaled" and no image',
+    ),
+    "by name and by number": (
+        [Edit("camera", "rotation", "90", 1), Edit("camera", "rotation", "180", "cam02")], TakeError, "contradict",
+    ),
+    "invalid": ([Edit("camera", "rotation", "45", "cam02")], TakeError, "rotation"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_edits_that_cannot_be_leave_everything_as_it_was(case, take):
+    edits, error, words = REFUSED[case]
+    files = files_in(take.parent)
+    with pytest.raises(error, match=words) as caught:
+        write_edits(take, edits)
+    assert caught.value.file == take and files_in(take.parent) == files
+    assert not take.with_name("take-before").exists()
+
+
+def test_a_take_that_is_read_only_or_was_changed_in_the_meantime_is_left_alone(take):
+    before, edit = take.read_bytes(), Edit("take", "up", '"y"')
+    set_height(take, 1.7)  # as in the window, while a check runs
+    files = files_in(take.parent)
+    with pytest.raises(TakeError, match="changed by another program"):
+        write_edits(take, [edit], over=before)
+    take.chmod(0o444)
+    with pytest.raises(ExportError, match="read-only"):
+        write_edits(take, [edit])
+    assert files_in(take.parent) == files
+    take.chmod(0o644)
+    write_edits(take, [edit], over=take.read_bytes())
+    assert read_take(take).up == "y" and read_take(take).height == 1.7

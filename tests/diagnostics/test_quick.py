@@ -7,11 +7,10 @@ import pytest
 
 import kinefit
 from kinefit import Recording, load_body, track
-from kinefit.diagnostics.arrangement import sample
-from kinefit.diagnostics.groups import group_findings
-from kinefit.diagnostics.keypoints import check_keypoints
+from kinefit.diagnostics.checks import check_keypoints
 from kinefit.diagnostics.quick import input_findings, motion_findings, with_cause, with_findings
-from kinefit.diagnostics.views import make_views
+from kinefit.diagnostics.timing import group_findings
+from kinefit.diagnostics.views import make_views, sample
 from kinefit.errors import TrackingError
 from kinefit.findings import CLOCKS, FINDINGS, INVERTED, STATURE, Finding, faults_of, of_provenance
 from kinefit.geometry import se3

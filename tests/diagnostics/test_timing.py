@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinefit.diagnostics.keypoints import check_keypoints
+from kinefit.diagnostics.checks import check_keypoints
 from kinefit.diagnostics.timing import _jackknife, _speed, fast_pixels, shifted, time_offsets
 from kinefit.diagnostics.views import make_views
+from kinefit.findings import Edit
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 
 FINE = 10  # frames of the fine motion are one of the recording
@@ -61,7 +62,7 @@ def test_the_line_to_write_stands_in_the_finding(late, severity):
     found = [f for f in check.findings if f.kind == "time"]
     assert [(f.severity, f.cameras) for f in found] == [(severity, ("cam02",))]
     value = float(found[0].remedy.partition("time_offset = ")[2].split()[0])
-    assert found[0].keys == (("time_offset", f"{value:.4f}"),)
+    assert found[0].edits == (Edit("camera", "time_offset", f"{value:.4f}", "cam02"),)
     assert value == pytest.approx(late / 30.0, abs=0.1 / 30.0)
     assert not [f for f in check.findings if f.kind != "time" and f.severity in ("fault", "doubt")]
 

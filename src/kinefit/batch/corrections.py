@@ -6,17 +6,24 @@ take file that would not be valid is not written.
 
 from __future__ import annotations
 
+import json
+import os
+import stat
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from kinefit._files import read_bytes, regular
 from kinefit.bodies import load_body
-from kinefit.errors import KinefitError, TakeError, check_choice, choices
+from kinefit.errors import ExportError, KinefitError, TakeError, choices, located
 from kinefit.exporters.atomic import write_bytes, write_text, writing
-from kinefit.exporters.take_text import quoted, with_keys
+from kinefit.exporters.take_text import edited, quoted
+from kinefit.findings import Edit, joined
 from kinefit.preparing.take import has_face, uses_detector
 from kinefit.readers.clicks import Clicks, clicks_of, clicks_text, read_clicks
 from kinefit.readers.detections import detections_file, read_detections
@@ -32,17 +39,29 @@ CLICKS = "clicks.json"
 _CLICK_SIGMA = "1.0"  # [px] well below the noise of any detector, so that the joint goes where it was placed
 
 
-def trim(take: TakePath, first: int, stop: int) -> None:
-    """Use only the steps from `first` up to, not including, `stop` of the take's common time.
+def write_edits(take: TakePath, edits: Iterable[Edit], *, over: bytes | None = None) -> Path:
+    """Write edits into a take file, all or none; returns the file that keeps its content before.
+
+    Parameters
+    ----------
+    edits : such as those of findings
+    over : content of the file for which the edits were made; default: what it holds now
 
     Raises
     ------
     TakeError, FileError
-        Of this and all other edits: what the changed take file would have wrong. Nothing is written then.
+        Of this and all other edits: what the changed take file would have wrong; two edits that contradict each other;
+        a file that was changed since `over`. Nothing is written then.
     ExportError
-        Of all edits: the disk refuses.
+        Of all edits: the take is read-only, or the disk refuses.
     """
-    _set(take, "take", {"frames": _listed([first, stop])})
+    read, now = _opened(take)
+    return _write(read, over or now, edits)
+
+
+def trim(take: TakePath, first: int, stop: int) -> None:
+    """Use only the steps from `first` up to, not including, `stop` of the take's common time."""
+    write_edits(take, [Edit("take", "frames", str([int(first), int(stop)]))])
 
 
 def exclude_view(take: TakePath, camera: str, first: int, stop: int) -> None:
@@ -58,25 +77,17 @@ def exchange_sides(take: TakePath, camera: str, first: int, stop: int) -> None:
 def choose_person(take: TakePath, person: int | str | None) -> None:
     """Track this person alone: a number from 1 as `kinefit track` lists them, or words such as "moving"; None: all."""
     value = quoted(person) if isinstance(person, str) else None if person is None else str(int(person))
-    _set(take, "take", {"person": value})
+    write_edits(take, [Edit("take", "person", value)])
+
+
+def set_height(take: TakePath, height: float | None) -> None:
+    """State the person's height [m]; None: it is not stated."""
+    write_edits(take, [Edit("take", "height", None if height is None else f"{float(height)!r}")])
 
 
 def can_undo(take: TakePath) -> bool:
     """Whether there is an edit to take back."""
     return bool(_kept(find_take(take).absolute()))
-
-
-def set_height(take: TakePath, height: float | None) -> None:
-    """State the person's height [m]; None: it is not stated."""
-    _set(take, "take", {"height": None if height is None else f"{float(height)!r}"})
-
-
-def set_camera_keys(take: TakePath, camera: str, keys: Mapping[str, str]) -> None:
-    """Set keys of a `[[camera]]`, with values as TOML has them, such as those of a `Finding`."""
-    read, text = _opened(take)
-    names = [entry.name for entry in read.cameras]
-    check_choice("camera", camera, names, TakeError, file=read.path)
-    _write(read.path, with_keys(text, "camera", names.index(camera), keys))
 
 
 def add_click(take: TakePath, step: int, camera: str, landmark: str, uv: Sequence[float]) -> None:
@@ -96,7 +107,7 @@ def add_click(take: TakePath, step: int, camera: str, landmark: str, uv: Sequenc
     FileError
         A step or a pixel that cannot be; a file of clicks that cannot be read.
     """
-    read, text = _opened(take)
+    read, before = _opened(take)
     body = load_body(read.body) if read.start is None else read_motion(read.start).body
     names = {"camera": (camera, [c.name for c in read.cameras]), "landmark": (landmark, body.landmarks.names)}
     for kind, (name, known) in names.items():
@@ -107,11 +118,11 @@ def add_click(take: TakePath, step: int, camera: str, landmark: str, uv: Sequenc
     points = {c: dict(of) for c, of in steps[new.step].points.items()} if new.step in steps else {}
     points[camera] = {**points.get(camera, {}), **new.points[camera]}
     steps[new.step] = Clicks(new.step, points)
-    file = read.clicks or read.path.with_name(CLICKS)
+    file, edits = read.clicks or read.path.with_name(CLICKS), list[Edit]()
     if read.clicks is None:
         file = file.with_name(f"{read.path.stem}-{CLICKS}") if file.exists() else file
-        text = with_keys(text, "start", None, {"clicks": quoted(file.name), "click_sigma": _CLICK_SIGMA})
-    _write(read.path, text, (file, clicks_text([steps[k] for k in sorted(steps)])))
+        edits = [Edit("start", "clicks", quoted(file.name)), Edit("start", "click_sigma", _CLICK_SIGMA)]
+    _write(read, before, edits, (file, clicks_text([steps[k] for k in sorted(steps)])))
 
 
 def corrections_of(take: TakePath) -> tuple[str, ...]:
@@ -172,14 +183,19 @@ def _put(file: Path, content: bytes) -> None:
         file.unlink(missing_ok=True)
 
 
-def _opened(take: TakePath) -> tuple[Take, str]:
-    """A take, and the text of its file, line ends as they are."""
+def _opened(take: TakePath) -> tuple[Take, bytes]:
+    """A take, and the content of its file."""
     read = read_take(take)
-    return read, regular(read.path).read_bytes().decode("utf-8").removeprefix("\ufeff")
+    return read, regular(read.path).read_bytes()
 
 
-def _write(path: Path, text: str, clicks: tuple[Path, str] | None = None) -> None:
-    """Write the text of a take, and its clicks, if it is valid; keep what was there before."""
+def _write(read: Take, before: bytes, edits: Iterable[Edit], clicks: tuple[Path, str] | None = None) -> Path:
+    """Write edits over the content of a take, and its clicks, if it is valid then; keep what was there before."""
+    path = read.path
+    if not os.access(path, os.W_OK) or not path.stat().st_mode & stat.S_IWUSR:
+        raise ExportError("the take file is read-only", file=path, remedy="Make it writable, or edit a copy.")
+    with located(path):
+        text = edited(before.decode("utf-8-sig"), edits)
     kept = _kept(path)
     copy = _before(path) / f"{int(kept[-1].stem) + 1 if kept else 1:04}.txt"
     former = clicks[0].read_bytes() if clicks and clicks[0].exists() else b""
@@ -191,77 +207,57 @@ def _write(path: Path, text: str, clicks: tuple[Path, str] | None = None) -> Non
             read_take(temporary)
             if clicks:
                 write_bytes(copy.with_suffix(".json"), former)
-            write_bytes(copy, regular(path).read_bytes())
+            write_bytes(copy, before)
+            if regular(path).read_bytes() != before:
+                remedy = "Look at the take, then do it again."
+                raise TakeError("the take file was changed by another program in the meantime", remedy=remedy)
     except BaseException as error:
+        for part in (copy, copy.with_suffix(".json")):
+            part.unlink(missing_ok=True)
+        with suppress(OSError):  # no such folder, or former edits in it
+            copy.parent.rmdir()
         if clicks:
             _put(clicks[0], former)
         if not isinstance(error, KinefitError):
             raise
         raise type(error)(error.problem, file=path, place=error.place, remedy=error.remedy) from error
-
-
-def _set(take: TakePath, table: str, keys: dict[str, str | None]) -> None:
-    """Set keys of a single table."""
-    read, text = _opened(take)
-    _write(read.path, with_keys(text, table, None, keys))
+    return copy
 
 
 def _set_ranges(take: TakePath, camera: str, key: str, steps: Range) -> None:
     """Add steps to those of all keypoints of a camera; of "swapped" take those away that are there."""
-    read, text = _opened(take)
+    read, before = _opened(take)
     if not 0 <= steps[0] < steps[1]:
         problem, remedy = f"{key} has {list(steps)}", "Give the first step and the one after the last, from 0."
         raise TakeError(problem, file=read.path, place=f"keypoints of camera {camera}", remedy=remedy)
-    if uses_detector(read) and not read.keypoints:
-        text = _with_detector(read, text)
-    tables: list[dict[str, Any]] = tomllib.loads(text).get("keypoints", [])
+    edits = _of_detector(read) if uses_detector(read) and not read.keypoints else []
+    tables: list[dict[str, Any]] = tomllib.loads(before.decode("utf-8-sig")).get("keypoints", [])
+    tables += [{"camera": json.loads(edit.value or "")} for edit in edits if edit.key == "camera"]
     own = [n for n, k in enumerate(tables) if k["camera"] == camera and k.get("format") != "skin"]
     if not own:
         seeing = dict.fromkeys(k["camera"] for k in tables)
         raise TakeError(choices("camera with keypoints", camera, seeing), file=read.path)
     for n in own:
-        former = _united(tables[n].get(key, []))
-        both = _united([*former, steps]) if key == "excluded" else _either(former, steps)
-        text = with_keys(text, "keypoints", n, {key: _listed(both) if both else None})
-    _write(read.path, text)
+        former, new = {step for a, b in tables[n].get(key, ()) for step in range(a, b)}, {*range(*steps)}
+        both = joined(np.array(sorted(former | new if key == "excluded" else former ^ new)))
+        edits.append(Edit("keypoints", key, str([list(run) for run in both]) if both else None, n))
+    _write(read, before, edits)
 
 
-def _with_detector(read: Take, text: str) -> str:
-    """The text with a table for all keypoints that the built-in detector gives a take without any."""
-    number = 0
+def _of_detector(read: Take) -> list[Edit]:
+    """Tables for all keypoints that the built-in detector gives a take without any."""
+    cameras: list[tuple[str, str | None]] = []
     for camera in read.cameras:
         file = detections_file(read.path, camera.name)
         found = read_detections(file) if file.exists() else None
-        if camera.video is None or (found is not None and not found.seen.any()):
-            continue
-        sets = [None, *([FACE_SET] if found is not None and found.has_faces and has_face(read.body) else [])]
-        for points in sets:
-            keys = {"camera": quoted(camera.name), "format": '"detect"', "set": quoted(points) if points else None}
-            text, number = with_keys(text, "keypoints", number, keys), number + 1
-    return text
-
-
-def _united(ranges: Sequence[Any]) -> list[Range]:
-    """Ranges of steps in order, those that touch as one."""
-    out: list[Range] = []
-    for first, stop in sorted((int(a), int(b)) for a, b in ranges):
-        if out and first <= out[-1][1]:
-            out[-1] = out[-1][0], max(out[-1][1], stop)
-        else:
-            out.append((first, stop))
-    return out
-
-
-def _either(ranges: Sequence[Range], steps: Range) -> list[Range]:
-    """Steps of one but not of both: of united ranges, or of `steps`."""
-    ends = sorted([*(end for one in ranges for end in one), int(steps[0]), int(steps[1])])
-    single = [end for end in ends if ends.count(end) == 1]
-    return list(zip(single[::2], single[1::2]))
-
-
-def _listed(values: Sequence[Any]) -> str:
-    """Numbers, or pairs of them, as a TOML list."""
-    return str([list(map(int, v)) if isinstance(v, tuple) else int(v) for v in values])
+        if camera.video is not None and (found is None or found.seen.any()):
+            has_faces = found is not None and found.has_faces and has_face(read.body)
+            cameras += [(camera.name, None), *([(camera.name, FACE_SET)] if has_faces else [])]
+    return [
+        Edit("keypoints", key, quoted(value), n)
+        for n, (name, points) in enumerate(cameras)
+        for key, value in (("camera", name), ("format", "detect"), ("set", points)) if value
+    ]  # fmt: skip
 
 
 def _steps(steps: Range) -> str:

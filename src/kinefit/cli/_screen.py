@@ -187,7 +187,8 @@ def tell_finding(found: Finding) -> None:
     console().print(
         Text.assemble("\n", (f"{found.severity}: ", _STYLES[found.severity]), found.text), soft_wrap=True
     )
-    for what, text in (("confidence", found.confidence), ("try", found.remedy)):
+    alike = found.alike if is_verbose() else ""
+    for what, text in (("confidence", found.confidence), ("alike", alike), ("try", found.remedy)):
         if text:
             say(f"   {what}: {text}")
 

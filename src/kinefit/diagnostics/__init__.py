@@ -1,4 +1,4 @@
 """Check the inputs of a take: calibration, keypoints, clocks, scale and vertical of the world.
 
-`keypoints.check_keypoints` runs all checks, `quick.input_findings` those that `track` always runs.
+`checks.check_keypoints` runs all checks, `quick.input_findings` those that `track` always runs.
 """

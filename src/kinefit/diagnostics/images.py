@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
 
@@ -11,8 +12,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.diagnostics.views import MIN_CONFIDENCE
 from kinefit.errors import KinefitError
-from kinefit.findings import Finding, Severity, listed, runs_of
+from kinefit.findings import Edit, Finding, Severity, listed, runs_of
 from kinefit.geometry.camera import ImageFrame
 from kinefit.observations import DepthVideo
 from kinefit.readers.guess.draft import Value
@@ -33,7 +35,6 @@ _MAX_COVERED_SHARE = 0.1  # of the pixels that the camera measures in most image
 _MIN_MEASURED_SHARE = 0.4  # of the pixels: cameras that measure the person alone see nothing in an empty room, either
 _COVER_DISTANCE = 0.3  # [m] of objects that cover the lens
 _COVER_DISTANCE_RATIO = 1.2  # the same, to the sensor's stated minimal range
-_MIN_CONFIDENCE = 0.3  # of points of a detected person
 _MIN_PERSON_POINTS = 5
 _MIN_UNSEEN_S = 0.25  # of intervals without a person in which a video's images are tested
 _MAX_INTERVALS = 8  # of them, the longest
@@ -44,7 +45,6 @@ _MIN_TRIPLES = 3
 _NO_STATIC_PIXELS = np.zeros(0), np.zeros((0, 2))  # times and noise of a camera without static pixels
 _NOISE_GROWTH = 1.4e-3  # [1/m] noise by squared depth that a sensor may have beyond its sigma (Khoshelham 2012)
 _OUTLIER_SIGMAS = 6.0
-_NO_KEYS: Mapping[str, str] = {}
 _MAX_NOISE_RATIO = 1.5  # to the stated sigma
 _MAX_UNSTABLE_SHARE = 0.1  # of static pixels that are missing in one image; single Kinects: 0.01 to 0.04
 
@@ -77,15 +77,13 @@ def fit_image(
         return msgspec.structs.replace(entry, video=None, size=None), [finding_of(error, (entry.name,))]
     findings = []
 
-    def add(
-        severity: Severity, kind: str, text: str, remedy: str = "", sure: str = "", keys: Mapping[str, str] = _NO_KEYS
-    ) -> None:
-        found = Finding(severity, kind, f"{entry.name} {text}.", (entry.name,), sure, remedy, tuple(keys.items()))
-        findings.append(found)
+    def add(severity: Severity, kind: str, text: str, remedy: str = "", sure: str = "", **keys: str | None) -> None:
+        edits = tuple(Edit("camera", key, value, entry.name) for key, value in keys.items())
+        findings.append(Finding(severity, kind, f"{entry.name} {text}.", (entry.name,), sure, remedy, edits))
 
     if entry.size and entry.size != size:
         problem = f"has a video of {size[0]}x{size[1]} px, but size = {list(entry.size)}"
-        add("fault", "picture", problem, f"Leave size out of [[camera]] {entry.name}.")
+        add("fault", "picture", problem, f"Leave size out of [[camera]] {entry.name}.", size=None)
         entry = msgspec.structs.replace(entry, size=None)
     expected = _bars(turned, size)
     tolerance = max(_MIN_BAR_ERROR_PX, _MIN_BAR_ERROR * max(expected))
@@ -100,15 +98,15 @@ def fit_image(
     elif entry.image == "letterboxed" and boxed:
         add("note", "letterboxed", f"is letterboxed against the calibration, as the take says: {with_bars}")
     elif entry.image == "letterboxed":
-        shows = bars < max(expected) - tolerance  # dark scenes only widen them
-        verb, where = ("Write", "into") if shows else ("Try", "in")
-        remedy = f'{verb} image = "scaled" {where} [[camera]] {entry.name}.'
         text = f"is letterboxed by the take ({with_bars}), but its black bars have {bars} px"
-        add("fault" if shows else "doubt", "picture", text, remedy, keys={"image": '"scaled"'})
+        if bars < max(expected) - tolerance:
+            add("fault", "picture", text, image='"scaled"')
+        else:
+            remedy, sure = f'Try image = "scaled" in [[camera]] {entry.name}.', "A guess: a dark scene widens the bars."
+            add("doubt", "picture", text, remedy, sure, image='"scaled"')
     elif entry.image == "scaled" and boxed and max(expected) >= _MIN_BAR_ERROR_PX:
-        remedy = f'Write image = "letterboxed" into [[camera]] {entry.name}.'
         problem = f"is scaled by the take, but its video is letterboxed: {with_bars}"
-        add("fault", "letterboxed", problem, remedy, keys={"image": '"letterboxed"'})
+        add("fault", "letterboxed", problem, image='"letterboxed"')
         return msgspec.structs.replace(entry, image="letterboxed"), findings
     elif entry.image == "scaled":
         add("note", "picture", f"is scaled against the calibration, as the take says: {sizes}")
@@ -117,9 +115,8 @@ def fit_image(
         keys = {k: f'"{v.value}"' if isinstance(v.value, str) else str(v.value) for k, v in guessed.items()}
         what = f"is letterboxed against the calibration: {with_bars}" if is_boxed else f"has another size: {sizes}"
         sure = "; ".join(f"{v.sure.capitalize()}: {v.why}" for v in guessed.values()) + "."
-        remedy = f"Write {' and '.join(f'{k} = {v}' for k, v in keys.items())} into [[camera]] {entry.name}."
         kind = "letterboxed" if is_boxed else "picture"
-        add("fault", kind, f"{what}; the take does not say so", remedy, sure, keys)
+        add("fault", kind, f"{what}; the take does not say so", "", sure, **keys)
         return msgspec.structs.replace(entry, **{key: v.value for key, v in guessed.items()}), findings
     return entry, findings
 
@@ -128,7 +125,9 @@ def finding_of(error: KinefitError, cameras: tuple[str, ...] = ()) -> Finding:
     """Fault for an input that cannot be read."""
     where = ", ".join(str(part) for part in (error.file, error.place) if part)
     text = f"{where}: {error.problem}." if where else f"{error.problem}."
-    return Finding("fault", "load", text, cameras, remedy=error.remedy or "")
+    cut = re.search(r"frames = (\[\d+, \d+\])", error.remedy or "")
+    edits = (Edit("take", "frames", cut[1]),) if cut and str(error.file).endswith(".toml") else ()
+    return Finding("fault", "load", text, cameras, remedy=error.remedy or "", edits=edits)
 
 
 def _bars(calibrated: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
@@ -164,7 +163,7 @@ def without_covered(take: Take, seen: Observations) -> tuple[Observations, list[
     with TakePictures(take, seen) as pictures:
         for camera in dict.fromkeys(k.camera for k in seen.keypoints if k.camera in seen.videos):
             own = [k for k in seen.keypoints if k.camera == camera]
-            points = np.max([(k.confidence > _MIN_CONFIDENCE).sum(axis=-1).max(axis=1, initial=0) for k in own], axis=0)
+            points = np.max([(k.confidence > MIN_CONFIDENCE).sum(axis=-1).max(axis=1, initial=0) for k in own], axis=0)
             for a, b in _flat_runs(points >= _MIN_PERSON_POINTS, seen.rate, partial(pictures, camera)):
                 findings.append(_covered(camera, own[0].times[a], own[0].times[b - 1], "its image is flat"))
     return replace(seen, depth=tuple(depth)), findings

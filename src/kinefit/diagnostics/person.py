@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.bodies.limbs import rigid_pairs
 from kinefit.diagnostics.views import KeypointViews
-from kinefit.findings import Finding, listed
+from kinefit.findings import Edit, Finding, Severity, in_words, listed
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
 from kinefit.readers.guess.views import nearest_axis, up_of_cameras, up_of_person
@@ -45,10 +45,10 @@ def upright_findings(rig: Rig, x: NDArray, names: Sequence[str], up: str) -> lis
         right, off = nearest_axis(person)
         how = "the floor would be the ceiling" if min(angles.values()) > 180 - _MAX_UP_ANGLE else "the person would lie"
         evidence = " and ".join(f"{why} ({angle:.0f} degrees off)" for why, angle in angles.items())
-        remedy = f'Write up = "{right}" into [take].'
-        if off > _MAX_LEAN:
-            remedy += f" The person leans from this axis by {off:.0f} degrees."
-        out = [Finding("fault", "up", f'up = "{up}" is wrong: {how}.', (), f"Certain, by {evidence}.", remedy)]
+        edits = (Edit("take", "up", f'"{right}"'),)
+        leans = f" The person leans from this axis by {off:.0f} degrees." if off > _MAX_LEAN else ""
+        text, remedy = f'up = "{up}" is wrong: {how}.', f"Write {in_words(edits)}.{leans}"
+        out = [Finding("fault", "up", text, (), f"Certain, by {evidence}.", remedy, edits)]
         axis = np.array(UP_AXES[right])
     elif wrong:
         evidence = " and ".join(f"{why} show {nearest_axis(ways[why])[0]}" for why in wrong)
@@ -64,7 +64,7 @@ def upright_findings(rig: Rig, x: NDArray, names: Sequence[str], up: str) -> lis
 
 def _floor_findings(x: NDArray, names: Sequence[str], up: NDArray) -> list[Finding]:
     feet = [k for k, name in enumerate(names) if any(part in name for part in _FEET)]
-    heights = (x[:, feet] @ up).ravel()
+    heights = x[:, feet] @ up
     heights = heights[np.isfinite(heights)]
     if len(heights) < 10:
         return []
@@ -81,42 +81,32 @@ def _hand_findings(x: NDArray, names: Sequence[str]) -> list[Finding]:
 
     Forward is the nose relative to the ears, the toes relative to the heels, and the bent knees.
     """
-    sides = ("left", "right")
-    at = {joint: [_index(names, side, joint) for side in sides] for joint in ("ear", "hip", "shoulder")}
-    nose = next((k for k, name in enumerate(names) if name.lower() == "nose"), None)
-    if None in at["hip"] or None in at["shoulder"]:
-        return []
-    (hip_l, hip_r), (shoulder_l, shoulder_r) = ([x[:, k] for k in at[joint]] for joint in ("hip", "shoulder"))
-    side = hip_l - hip_r + shoulder_l - shoulder_r
-    height = 0.5 * (shoulder_l + shoulder_r - hip_l - hip_r)
-    ahead = [x[:, nose] - 0.5 * sum(x[:, k] for k in at["ear"])] if nose is not None and None not in at["ear"] else []
-    for s in sides:
-        heel, toe, hip, knee, ankle = (_index(names, s, j) for j in ("heel", "foot_index", "hip", "knee", "ankle"))
-        ahead += [x[:, toe] - x[:, heel]] if None not in (toe, heel) else []
-        ahead += [_ahead_of_knee(x[:, hip], x[:, knee], x[:, ankle])] if None not in (knee, ankle) else []
-    votes = (
-        np.concatenate([np.sign(np.sum(side * np.cross(height, a), axis=-1)) for a in ahead]) if ahead else np.zeros(0)
-    )
+    point = lambda k: np.full_like(x[:, 0], np.nan) if k is None else x[:, k]
+    nose = point(next((k for k, name in enumerate(names) if name.lower() == "nose"), None))
+    joints = "ear", "shoulder", "hip", "knee", "ankle", "heel", "foot_index"
+    left, right = ({joint: point(_index(names, side, joint)) for joint in joints} for side in ("left", "right"))
+    side = left["hip"] - right["hip"] + left["shoulder"] - right["shoulder"]
+    height = 0.5 * (left["shoulder"] + right["shoulder"] - left["hip"] - right["hip"])
+    ahead = [nose - 0.5 * (left["ear"] + right["ear"])]
+    for at in (left, right):
+        ahead += [at["foot_index"] - at["heel"], _ahead_of_knee(at["hip"], at["knee"], at["ankle"])]
+    votes = np.concatenate([np.sign(np.sum(side * np.cross(height, a), axis=-1)) for a in ahead])
     votes = votes[np.isfinite(votes)]
     if len(votes) < 10 or votes.mean() > -0.5:
         return []
     text = "Left and right are swapped: the person's face, toes and knees point backwards."
     confidence = f"Certain: in {100 * np.mean(votes < 0):.0f} % of the frames, while the cameras agree."
-    remedy = (
-        "Check format and set in [[keypoints]], or swap the names of left and right there. If images and calibration "
-        "were mirrored together, mirror the videos back, then calibrate and detect again."
-    )
+    remedy = "Check format and set in [[keypoints]], or swap the names of left and right there. If images and "
+    remedy += "calibration were mirrored together, mirror the videos back, then calibrate and detect again."
     return [Finding("fault", "mirrored", text, (), confidence, remedy)]
 
 
 def _ahead_of_knee(hip: NDArray, knee: NDArray, ankle: NDArray) -> NDArray:
     """Vector (F, 3) [m] from the middle of hip and ankle to the knee; NaN where the knee is nearly straight."""
     thigh, shank = knee - hip, ankle - knee
-    cosine = np.sum(thigh * shank, axis=-1) / np.maximum(
-        np.linalg.norm(thigh, axis=-1) * np.linalg.norm(shank, axis=-1), 1e-12
-    )
-    ahead = np.asarray(knee - 0.5 * (hip + ankle))
-    return np.where((cosine < np.cos(_MIN_KNEE_BEND))[:, None], ahead, np.nan)
+    lengths = np.linalg.norm(thigh, axis=-1) * np.linalg.norm(shank, axis=-1)
+    bent = np.sum(thigh * shank, axis=-1) < np.cos(_MIN_KNEE_BEND) * lengths
+    return np.where(bent[:, None], knee - 0.5 * (hip + ankle), np.nan)
 
 
 def _index(names: Sequence[str], side: str, joint: str) -> int | None:
@@ -149,10 +139,8 @@ def order_findings(ratios: NDArray, keypoint_sets: Sequence[str]) -> list[Findin
     """Find keypoints that are in the order of another set: the `bone_ratios` contradict each other."""
     if not len(ratios) or np.std(np.log(ratios)) < _MIN_ORDER_SPREAD:
         return []
-    text = (
-        f"The keypoints are not those of {listed(keypoint_sets)}, or are in another order: bones are "
-        f"{ratios.min():.2g} to {ratios.max():.2g} times as long as a person's."
-    )
+    text = f"The keypoints are not those of {listed(keypoint_sets)}, or are in another order: bones are "
+    text += f"{ratios.min():.2g} to {ratios.max():.2g} times as long as a person's."
     remedy = "Check format and set in [[keypoints]], and the order in which the points are written."
     return [Finding("fault", "set", text, (), "Certain: no scale of the calibration explains it.", remedy)]
 
@@ -171,33 +159,32 @@ def size_findings(height: float | None, stated: float | None) -> list[Finding]:
     if ratio > _MAX_STATURE_ERROR:
         text = f"The person is {height:.3g} m tall by the long bones, but height = {stated:.2f} m in the take."
         confidence = "Likely: the error of detected joints is a few per cent at most."
-        remedy = f"Check height in [take], and the scale of the calibration{_unit_remedy(height / (stated or 1.0))}."
-        return [Finding("fault" if ratio > _MIN_SCALE_FAULT else "doubt", "scale", text, (), confidence, remedy)]
+        way, edits = _unit_remedy(height / (stated or 1.0))
+        remedy = f"Check height in [take], and the scale of the calibration{way}."
+        severity: Severity = "fault" if ratio > _MIN_SCALE_FAULT else "doubt"
+        return [Finding(severity, "scale", text, (), confidence, remedy, edits)]
     if stated is None and not _MIN_STATURE <= height <= _MAX_STATURE:
-        text = (
-            f"The person would be {height:.3g} m tall: the calibration's unit or scale is wrong. People are "
-            f"{_MIN_STATURE} to {_MAX_STATURE} m tall."
-        )
-        remedy = (
-            "Check the unit of the calibration, and the size of the board's squares"
-            f"{_unit_remedy(height / 1.75)}. For a child, write height = ... into [take]."
-        )
-        return [Finding("fault", "scale", text, (), "Certain, unless it is a child, a doll or an animal.", remedy)]
+        text = f"The person would be {height:.3g} m tall: the calibration's unit or scale is wrong. "
+        text += f"People are {_MIN_STATURE} to {_MAX_STATURE} m tall."
+        way, edits = _unit_remedy(height / 1.75)
+        remedy = f"Check the unit of the calibration, and the size of the board's squares{way}. "
+        remedy += "For a child, write height = ... into [take]."
+        confidence = "Certain, unless it is a child, a doll or an animal."
+        return [Finding("fault", "scale", text, (), confidence, remedy, edits)]
     if stated is None and not _MIN_ADULT_STATURE <= height <= _MAX_ADULT_STATURE:
         limits = f"below {_MIN_ADULT_STATURE} m or above {_MAX_ADULT_STATURE} m"
         text = f"The person would be {height:.2f} m tall. Few adults are {limits}."
-        remedy = (
-            "Either the scale is wrong (check the size of the board's squares; without a calibration the scale is "
-            "unknown), or a child is in view. Write height = ... into [take]."
-        )
+        remedy = "Either the scale is wrong (check the size of the board's squares; without a calibration the scale is "
+        remedy += "unknown), or a child is in view. Write height = ... into [take]."
         return [Finding("doubt", "scale", text, (), "", remedy)]
     return [Finding("good", "scale", f"The person is about {height:.2f} m tall by the long bones: the unit is right.")]
 
 
-def _unit_remedy(ratio: float) -> str:
+def _unit_remedy(ratio: float) -> tuple[str, tuple[Edit, ...]]:
     """The line of the take that corrects lengths by this ratio, or the ratio if no unit explains it."""
     unit = min(_UNITS, key=lambda u: abs(abs(np.log(ratio)) - np.log(_UNITS[u])))
     if abs(abs(np.log(ratio)) - np.log(_UNITS[unit])) < _UNIT_TOLERANCE:
-        right = f'unit = "{unit}"' if ratio > 1.0 else f'unit = "m", not "{unit}",'
-        return f": write {right} into [calibration]"
-    return f" (lengths are about {ratio:.2g} times what they should be)"
+        edits = (Edit("calibration", "unit", f'"{unit if ratio > 1.0 else "m"}"'),)
+        into = " into " if ratio > 1.0 else f', not "{unit}", into '
+        return f": write {in_words(edits, into)}", edits
+    return f" (lengths are about {ratio:.2g} times what they should be)", ()

@@ -9,11 +9,21 @@ from typing import Any
 import numpy as np
 
 from kinefit.bodies import Body
-from kinefit.diagnostics.images import fit_image
-from kinefit.diagnostics.keypoints import Check, check_keypoints
+from kinefit.diagnostics.checks import CHECKS, Checked, run
 from kinefit.diagnostics.person import size_findings
 from kinefit.errors import KinefitError
-from kinefit.findings import CLOCKS, FINDINGS, INVERTED, LABELS, STATURE, Finding, as_records, faults_of
+from kinefit.findings import (
+    CLOCKS,
+    FINDINGS,
+    INVERTED,
+    LABELS,
+    STATURE,
+    Edit,
+    Finding,
+    as_records,
+    faults_of,
+    in_words,
+)
 from kinefit.motion import UP_AXES, Motion
 from kinefit.observations import Keypoints
 from kinefit.readers.guess.views import nearest_axis
@@ -27,7 +37,6 @@ _MIN_LYING_ANGLE = 60.0  # [deg] the same; a median, as bending is brief
 _MIN_LYING_TRAVEL = 0.5  # [m] across the trunk: a lying person does not move so far
 _MIN_LATE_S = 0.05  # of a camera's clock: a hand that gestures at 0.5 m/s is 2.5 cm off by that
 _MIN_LATE_SIGMAS = 8.0  # standard errors of the same
-_STATED_IMAGES = ("scaled", "letterboxed")  # statements of the take that one image of the video can contradict
 
 
 def input_findings(take: Take, seen: Observations, keypoints: Sequence[Keypoints], body: Body) -> tuple[Finding, ...]:
@@ -42,26 +51,22 @@ def input_findings(take: Take, seen: Observations, keypoints: Sequence[Keypoints
     keypoints : of the tracked person.
     body : of the person, generic.
     """
-    rig, findings, late = seen.rig, list[Finding](), list[Finding]()
+    rig = seen.rig
     if rig is None or take.calibration is None:
         return ()
-    for entry in take.cameras:
-        if entry.image in _STATED_IMAGES:
-            findings += fit_image(entry, rig[entry.name].size, take.rate, frames=1)[1]
     everybody, here = _cameras_with_people(seen.keypoints), _cameras_with_people(keypoints)
     shown = [k for k in keypoints if k.camera in here or k.camera not in everybody]  # a camera may see others only
     cameras = tuple(name for name in rig.names if any(k.camera == name for k in shown))
-    if len(cameras) > 1:
-        begun = Check(take.name, take=take, observations=seen)
-        check = check_keypoints(
-            rig.select(cameras), shown, body=body, up=take.up, height=take.height, begun=begun, quick=True
-        )
-        findings += check.findings
-        if (t := check.times) is not None:
-            clear = np.abs(t.offsets) >= np.maximum(_MIN_LATE_S, _MIN_LATE_SIGMAS * t.std)
-            names = {name for name, is_late in zip(t.cameras, clear) if is_late}
-            late = [f for f in check.findings if f.kind == "time" and f.severity == "doubt" and names & {*f.cameras}]
-    return *faults_of(findings), *late
+    checked = Checked(
+        take.name, take=take, observations=seen, rig=rig.select(cameras), keypoints=shown if len(cameras) > 1 else (),
+        body=body, up=take.up, height=take.height, quick=True,
+    )  # fmt: skip
+    found, late = run(checked, CHECKS).findings, list[Finding]()
+    if (t := checked.times) is not None:
+        clear = np.abs(t.offsets) >= np.maximum(_MIN_LATE_S, _MIN_LATE_SIGMAS * t.std)
+        names = {name for name, is_late in zip(t.cameras, clear) if is_late}
+        late = [f for f in found if f.kind == "time" and f.severity == "doubt" and names & {*f.cameras}]
+    return *faults_of(found), *late
 
 
 def _cameras_with_people(keypoints: Sequence[Keypoints]) -> set[str]:
@@ -95,8 +100,9 @@ def motion_findings(motion: Motion, height: float | None) -> tuple[Finding, ...]
     if lean > _MIN_INVERTED_ANGLE or (lean > _MIN_LYING_ANGLE and way > _MIN_LYING_TRAVEL):
         how = "hangs head down" if lean > _MIN_INVERTED_ANGLE else f"moves {way:.1f} m lying"
         text = f'up = "{motion.up}" is wrong: the person {how}, with the trunk {lean:.0f} degrees off it.'
-        remedy = f'Write up = "{nearest_axis(middle)[0]}" into [take].'
-        findings.append(Finding("fault", "up", text, (), "Certain, unless the person really does so.", remedy))
+        edit = Edit("take", "up", f'"{nearest_axis(middle)[0]}"')
+        sure = "Certain, unless the person really does so."
+        findings.append(Finding("fault", "up", text, (), sure, edits=(edit,)))
     return faults_of(findings)
 
 
@@ -132,8 +138,9 @@ def inverted_findings(provenance: Mapping[str, Any], up: str) -> list[Finding]:
         return []
     name, other = provenance[INVERTED], nearest_axis(-np.array(UP_AXES[up]))[0]
     text = f'up = "{up}" is wrong, or {name} is upside down: an inverted vertical fits the people better.'
-    remedy = f'Write up = "{other}" into [take], or turn the images by 180 degrees.'
-    return [Finding("fault", "up", text, (name,), "Likely, unless the person does a handstand.", remedy)]
+    edits = (Edit("take", "up", f'"{other}"'),)
+    remedy = f"Write {in_words(edits)}, or turn the images by 180 degrees."
+    return [Finding("fault", "up", text, (name,), "Likely, unless the person does a handstand.", remedy, edits)]
 
 
 def with_cause(error: KinefitError, findings: Sequence[Finding]) -> KinefitError:

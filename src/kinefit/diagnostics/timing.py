@@ -1,30 +1,70 @@
-"""Estimate time offsets between cameras from the body's motion, to a fraction of a frame.
+"""Cameras out of step: time offsets to a fraction of a frame, and groups of cameras that show different motions.
 
 First the whole-frame shift of every pair of cameras minimises the distance between the rays of each point (epipolar
 distance, Hartley and Zisserman 9.2), and the shifts of all pairs are combined. Then a joint least-squares solution
-gives
-fractions: the error of a late view is its pixel velocity times the delay. The constant error of a point in a camera (of
-calibration or detector) is subtracted before.
+gives fractions: the error of a late view is its pixel velocity times the delay. The constant error of a point in a
+camera (of calibration or detector) is subtracted before.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations, product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.diagnostics.bias import without_points
-from kinefit.diagnostics.views import KeypointViews, meet
-from kinefit.diagnostics.whole_frames import MIN_DEPTH, MIN_FRAMES, best_shift, depth, from_pairs, pair_curves
+from kinefit.diagnostics.cameras import MIN_SIGMAS, without_points
+from kinefit.diagnostics.views import (
+    KeypointViews,
+    disagreement_share,
+    make_views,
+    meet,
+    sample,
+    with_sides_right,
+)
+from kinefit.errors import TrackingError
+from kinefit.findings import Edit, Finding, Severity, in_words, listed
+from kinefit.geometry.camera import Rig
+from kinefit.multiview.medians import medians
+from kinefit.observations import Keypoints
 
+Curve = tuple[NDArray, NDArray]
+"""Shifts (S,) [frames] and their costs (S,) [px]."""
+
+_MAX_OFFSET = 2.0  # [s] that is searched; cameras started by hand differ by less, or by much more
+_MAX_POINTS = 12  # of the body, those with most motion
+_MAX_PAIR_FRAMES = 400  # of the first camera, for the cost of a shift
+_MAX_COST_RATIO = 0.9  # of a shift to no shift: one that fits no better counts as none
+_MAX_WEIGHT = 2.0  # of a pair's shift: one pair with a periodic motion must not outvote the others
+_MIN_DEPTH = 1.4
+"""Ratio of the median cost to the smallest one: noise alone gives 1.1, a waving hand 1.8."""
+_MIN_SINE = 0.15  # of the angle between ray and baseline: below, the ray is not informative
+_MIN_FRAMES = 12
+"""Smallest number of frames from which a shift is estimated."""
 _MAX_FRAMES = 1500  # for the fractional offsets
 _TIME_BLOCKS = 10  # for the standard error: errors within a block are correlated
 _SPEED_WINDOW = 0.1  # [s] before and after, for a speed: longer than a detector's jitter, shorter than a swing
 _NOISE_VARIANCES = 4.0  # of a speed, subtracted from its square
 _MAX_ITERATIONS = 12
 _MIN_SIGMA = 0.02  # [frames] added to the standard error: the excess error found in recorded motions
+_MIN_OFFSET_NOTE = 0.1  # [frames]
+_MIN_OFFSET_DOUBT = 0.2  # [frames]
+_MIN_OFFSET_FAULT = 2.0  # [frames] free-running webcams differ by up to 1.6 from the median in a real recording
+_MIN_OFFSET_FAULT_OF_TWO = 4.0  # [frames] the same of two cameras, without a third to compare: 3.4
+_MIN_SHARE_OF_LARGEST = 0.7  # of the largest offset: smaller ones may come from an error of the median camera
+_MAX_OFFSET_SIGMA = 0.5  # [frames] standard error beyond which an offset is undetermined
+_MIN_PART_FRAMES = 30  # of a part: 12 of both cameras must remain after shifts of up to 0.4 of it
+_MAX_PART_FRAMES = 90  # of a part that are compared, consecutive
+# The advantage of a pair is the median cost over time shifts divided by the cost without a shift. Between groups that
+# show different motions its median over pairs is 0.6 to 1.15, and single pairs reach 1.43. Between groups that show the
+# same motion it is 1.2 and more, except without motion, which the last three limits exclude.
+_MAX_MEDIAN_ADVANTAGE = 1.2
+_MAX_PAIR_ADVANTAGE = 1.45
+_MIN_WITHIN_ADVANTAGE = 1.3  # of a pair within a group: there is motion
+_MIN_ADVANTAGE_FALL = 1.4  # factor, of the median from the part where the groups agree to the other
+_MIN_COST_RISE = 1.5  # factor, of the cost itself
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,24 +107,22 @@ def time_offsets(views: KeypointViews) -> TimeOffsets:
     cameras = len(views.rig)
     stated = (views.begins - np.median(views.begins)) * views.rate  # [frames] fractions that the take states
     unknown = TimeOffsets(views.rig.names, np.full(cameras, np.nan), np.full(cameras, np.inf), views.rate, {})
-    if len(views) < MIN_FRAMES or cameras < 2:
+    if len(views) < _MIN_FRAMES or cameras < 2:
         return unknown
-    all_curves = pair_curves(views)
-    named = {(views.rig.names[a], views.rig.names[b]): curve for (a, b), curve in all_curves.items()}
-    curves = {pair: curve for pair, curve in all_curves.items() if depth(curve[1]) >= MIN_DEPTH}
-    moving = sorted({c for pair in curves for c in pair})
+    all_curves, names = pair_curves(views), views.rig.names
+    unknown = replace(unknown, curves={(names[a], names[b]): curve for (a, b), curve in all_curves.items()})
+    curves = {pair: curve for pair, curve in all_curves.items() if _depth(curve[1]) >= _MIN_DEPTH}
     if not curves:
-        return replace(unknown, curves=named)
-    whole = from_pairs(cameras, {pair: best_shift(*curve) for pair, curve in curves.items()})
+        return unknown
+    whole = _from_pairs(cameras, {pair: _best_shift(*curve) for pair, curve in curves.items()})
     delays, std = _fractions(_most_motion(views), whole)
     delays = delays - stated
-    still = np.setdiff1d(np.arange(cameras), moving)
+    still = np.setdiff1d(np.arange(cameras), list(curves))
     delays[still], std[still] = np.nan, np.inf
     known = np.isfinite(delays)
     if known.any():
         delays -= np.median(delays[known]) if known.sum() > 2 else delays[known][0]
-    std = np.hypot(std, _MIN_SIGMA)
-    return TimeOffsets(views.rig.names, delays / views.rate, std / views.rate, views.rate, named)
+    return replace(unknown, offsets=delays / views.rate, std=np.hypot(std, _MIN_SIGMA) / views.rate)
 
 
 def _most_motion(views: KeypointViews) -> KeypointViews:
@@ -165,12 +203,12 @@ def _delay_equations(views: KeypointViews) -> list[tuple[NDArray, NDArray]]:
 
     Empty where too few points are known.
     """
-    cameras, (frames, points) = len(views.rig), views.uv.shape[:2]
+    frames, points, cameras, _ = views.uv.shape
     x, agree = meet(views)
     speed = _speed(x, max(2, round(_SPEED_WINDOW * views.rate)))  # in space: robust to outliers of one camera
     agree &= np.isfinite(speed).all(-1)[..., None]
     use = agree.sum(axis=2) >= 2
-    if use.sum() < MIN_FRAMES:
+    if use.sum() < _MIN_FRAMES:
         return []
     residual, velocity = np.full(views.uv.shape, np.nan), np.full(views.uv.shape, np.nan)
     jacobian = np.zeros((frames, points, cameras, 2, 3))
@@ -178,23 +216,17 @@ def _delay_equations(views: KeypointViews) -> list[tuple[NDArray, NDArray]]:
         predicted, jacobian[:, :, c] = camera.project_with_jacobian(x)
         residual[:, :, c] = np.where(agree[:, :, c, None], views.uv[:, :, c] - predicted, np.nan)
         velocity[:, :, c] = np.einsum("fkij,fkj->fki", jacobian[:, :, c], speed)
-    residual -= _nanmedian(residual)
+    residual -= _constant(residual)
     off = np.linalg.norm(residual, axis=-1)
-    spread = np.nanmedian(off)
-    weight = np.where(
-        np.isfinite(off) & agree, 1.0 / (1.0 + np.square(off / (2.0 * spread + 1e-9))), 0.0
-    )  # √ of robust
-    velocity = velocity - _nanmedian(np.where(agree[..., None], velocity, np.nan))
-    design = np.zeros((frames, points, cameras, 2, cameras))
-    for c in range(cameras):
-        design[:, :, c, :, c] = np.nan_to_num(velocity[:, :, c])
-    rows = weight[..., None]
-    n = int(use.sum())
+    robust = 1.0 / (1.0 + np.square(off / (2.0 * np.nanmedian(off) + 1e-9)))  # square root of a weight
+    weight = np.where(np.isfinite(off) & agree, robust, 0.0)
+    velocity -= _constant(np.where(agree[..., None], velocity, np.nan))
+    design = np.nan_to_num(velocity)[..., None] * np.eye(cameras)[:, None]
+    n, rows = int(use.sum()), weight[..., None]
     matrix, right = without_points(
         np.nan_to_num(jacobian * rows[..., None])[use].reshape(n, -1, 3),
-        (design * rows[..., None])[use].reshape(n, -1, cameras),
-        np.nan_to_num(residual * rows)[use].reshape(n, -1),
-    )
+        (design * rows[..., None])[use].reshape(n, -1, cameras), np.nan_to_num(residual * rows)[use].reshape(n, -1),
+    )  # fmt: skip
     frame, point = np.nonzero(use)
     out = []
     for block, count in (((frame * _TIME_BLOCKS) // frames, _TIME_BLOCKS), (point, points)):
@@ -230,7 +262,236 @@ def _speed(x: NDArray, reach: int) -> NDArray:
     return np.where(known.sum(axis=1) > reach, slope, np.nan)
 
 
-def _nanmedian(values: NDArray) -> NDArray:
-    """Median over time, 0 where all values are NaN."""
-    known = np.isfinite(values).any(axis=0)
-    return np.where(known, np.nanmedian(np.where(known, values, 0.0), axis=0), 0.0)
+
+def pair_curves(views: KeypointViews) -> dict[tuple[int, int], Curve]:
+    """Cost curves {(a, b): (shifts [frames], cost [px])}: distance of rays of b, at each shift, from those of a."""
+    reach = int(min(_MAX_OFFSET * views.rate, 0.4 * len(views)))
+    shifts = np.arange(-reach, reach + 1)
+    steps = np.diff(views.uv, axis=0)
+    motion = np.median(np.nan_to_num(np.abs(steps)).sum(-1), axis=0).sum(-1)
+    points = np.argsort(-motion)[:_MAX_POINTS]
+    rays = np.stack([camera.ray(views.uv[:, points, c]) for c, camera in enumerate(views.rig)], axis=2)
+    frames = np.unique(np.linspace(0, len(views) - 1, _MAX_PAIR_FRAMES).astype(int))
+    out = {}
+    for a, b in combinations(range(len(views.rig)), 2):
+        base = views.rig.cameras[b].centre_world - views.rig.cameras[a].centre_world
+        if np.linalg.norm(base) < 1e-6:
+            continue
+        focal = np.sqrt(views.rig.cameras[a].matrix[0, 0] * views.rig.cameras[b].matrix[0, 0])
+        cost = np.array([_epipolar_error(rays[:, :, a], rays[:, :, b], base, frames, int(s)) for s in shifts])
+        if np.isfinite(cost).sum() >= 3:
+            out[a, b] = shifts, focal * cost
+    return out
+
+
+def _epipolar_error(rays_a: NDArray, rays_b: NDArray, base: NDArray, frames: NDArray, shift: int) -> float:
+    """Mean angle [rad] between rays of b at frame + shift and the epipolar planes of a's rays, without constant parts.
+
+    NaN with too few rays.
+    """
+    frames = frames[(frames + shift >= 0) & (frames + shift < len(rays_b))]
+    if len(frames) < _MIN_FRAMES:
+        return np.nan
+    a, b = rays_a[frames], rays_b[frames + shift]
+    normal = np.cross(base / np.linalg.norm(base), a)
+    sine = np.linalg.norm(normal, axis=-1, keepdims=True)
+    angle = np.sum(np.where(sine > _MIN_SINE, normal / np.maximum(sine, _MIN_SINE), np.nan) * b, axis=-1)
+    enough = np.isfinite(angle).sum(axis=0) >= _MIN_FRAMES
+    if not enough.any():
+        return np.nan
+    angle = angle[:, enough]
+    apart = np.abs(angle - medians(angle.T))
+    return float(np.nanmean(np.minimum(apart, 3.0 * np.nanmedian(apart))))
+
+
+def _best_shift(shifts: NDArray, cost: NDArray) -> tuple[float, float]:
+    """Shift [frames] of smallest cost, and its weight, from a curve (S,), (S,); 0 if no other fits clearly better."""
+    cost = np.where(np.isfinite(cost), cost, np.inf)
+    at, zero = int(np.argmin(cost)), int(np.flatnonzero(shifts == 0)[0])
+    if cost[at] > _MAX_COST_RATIO * cost[zero]:  # a periodic motion fits as well a step later: the nearest wins
+        at = zero
+    return float(shifts[at]), min(_depth(cost) - 1.0, _MAX_WEIGHT)
+
+
+def _depth(cost: NDArray) -> float:
+    """Ratio of the median to the smallest cost (S,); a number, 1 without motion."""
+    cost = cost[np.isfinite(cost)]
+    return float(np.median(cost) / max(cost.min(), 1e-12)) if len(cost) else 1.0
+
+
+def _from_pairs(cameras: int, pairs: dict[tuple[int, int], tuple[float, float]]) -> NDArray:
+    """Delays (C,) [frames] whose differences fit the pairs' shifts with the least weighted absolute error."""
+    delays = np.zeros(cameras)
+    weight = {pair: w for pair, (_, w) in pairs.items()}
+    for _ in range(30):  # iteratively reweighted least squares
+        matrix, right = np.full((cameras, cameras), 1e-9), np.zeros(cameras)
+        for (a, b), (shift, _) in pairs.items():  # b shows later what a shows: b began earlier
+            row = np.zeros(cameras)
+            row[a], row[b] = 1.0, -1.0
+            matrix += weight[a, b] * np.outer(row, row)
+            right += weight[a, b] * shift * row
+        delays = np.linalg.lstsq(matrix, right, rcond=None)[0]
+        weight = {(a, b): w / max(abs(delays[a] - delays[b] - shift), 0.05) for (a, b), (shift, w) in pairs.items()}
+    return np.round(delays - np.median(delays))
+
+
+
+def synchronised(views: KeypointViews) -> tuple[TimeOffsets, KeypointViews, dict[str, int]]:
+    """Time offsets, and the views with left and right corrected and, where offsets are significant, synchronised.
+
+    Sides can only be corrected in synchronised cameras, offsets only estimated from correct sides: two rounds do both.
+    """
+    right = with_sides_right(views)
+    times = time_offsets(right)
+    late = np.where(np.isfinite(times.frames) & (times.std * times.rate < 0.25), times.frames, 0.0)
+    late = np.where(np.abs(late) > 0.75, late, 0.0)
+    if not late.any():
+        return times, right, {}
+    delays = np.round(late + (views.begins - np.median(views.begins)) * views.rate)
+    moved = with_sides_right(shifted(views, delays))
+    if disagreement_share(moved.rig, sample(moved)) > disagreement_share(right.rig, sample(right)):
+        return times, right, {}
+    again = time_offsets(_unshifted(views, moved, delays) if moved.swapped.any() else right)
+    return again, moved, dict(zip(views.rig.names, delays.astype(int).tolist(), strict=True))
+
+
+def _unshifted(views: KeypointViews, moved: KeypointViews, delays: NDArray) -> KeypointViews:
+    """The original views, with the sides swapped that were found swapped after synchronisation."""
+    uv, swapped = views.uv.copy(), views.swapped.copy()
+    for c, delay in enumerate(delays.astype(int)):
+        frames = np.flatnonzero(moved.swapped[:, c]) - delay
+        frames = frames[(frames >= 0) & (frames < len(views))]
+        uv[frames, :, c] = uv[frames[:, None], views.partner, c]
+        swapped[frames, c] = True
+    return replace(views, uv=uv, swapped=swapped)
+
+
+
+def time_findings(
+    times: TimeOffsets, take_offsets: Mapping[str, float], whole: Mapping[str, float], *, confirmed: bool
+) -> list[Finding]:
+    """Findings on cameras that are out of sync.
+
+    Parameters
+    ----------
+    times : TimeOffsets
+    take_offsets : {camera: [s]} `time_offset` as the take states it.
+    whole : {camera: [px]} motion of the fast points per frame, see `fast_pixels`.
+    confirmed : bool, whether the shifts improve the agreement of the cameras; of a periodic motion, several would fit.
+    """
+    out: list[Finding] = []
+    known = np.isfinite(times.offsets) & (times.std * times.rate < _MAX_OFFSET_SIGMA)
+    if not known.any():
+        text = "Too little motion is visible in several cameras to check their clocks."
+        return [Finding("note", "time", text, remedy="Clap, jump or swing the arms once at the start of a recording.")]
+    undetermined = [name for name, fine in zip(times.cameras, known, strict=True) if not fine]
+    if undetermined:
+        text = f"Too little motion to check the clock of {listed(undetermined)}."
+        out.append(Finding("note", "time", text, tuple(undetermined)))
+    largest = float(np.max(np.abs(times.frames[known])))
+    least = _MIN_OFFSET_FAULT if known.sum() > 2 else _MIN_OFFSET_FAULT_OF_TWO
+    for c in np.flatnonzero(known):
+        name, late, std = times.cameras[c], times.frames[c], times.std[c] * times.rate
+        if abs(late) < max(_MIN_OFFSET_NOTE, MIN_SIGMAS * std):
+            continue
+        value = take_offsets.get(name, 0.0) + times.offsets[c]
+        way = "later" if late > 0 else "earlier"
+        amount = f"{abs(late):.2f} ± {std:.2f} frames ({1e3 * abs(times.offsets[c]):.0f} ms)"
+        text = f"{name} is {amount} {way} than the take states, which moves a fast point by "
+        text += f"{abs(late) * whole.get(name, np.nan):.0f} px."
+        is_fault = confirmed and abs(late) >= max(least + 3.0 * std, _MIN_SHARE_OF_LARGEST * largest)
+        severity: Severity = "fault" if is_fault else "doubt" if abs(late) >= _MIN_OFFSET_DOUBT else "note"
+        confidence = "Certain" if abs(late) >= 2 * max(_MIN_OFFSET_NOTE, MIN_SIGMAS * std) else "Likely"
+        if abs(late) < 1.0:
+            confidence += "; but temporal smoothing in a detector, or a rolling shutter, also delays by part of a frame"
+        edit = Edit("camera", "time_offset", f"{value:.4f}", name)
+        out.append(Finding(severity, "time", text, (name,), f"{confidence}.", edits=(edit,)))
+    if not out:
+        within = max(largest, float(np.max(times.std[known])) * times.rate)
+        out.append(Finding("good", "time", f"The cameras are synchronised to {within:.2f} frames."))
+    return out
+
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Consecutive frames, and of every pair of cameras (C, C) the advantage of no time shift, and its cost [px]."""
+
+    start: int
+    stop: int
+    advantage: NDArray
+    cost: NDArray
+
+
+def group_findings(rig: Rig, keypoints: Sequence[Keypoints], first: int = 0) -> list[Finding]:
+    """Find two groups of at least two cameras that show different motions in the first or the last third.
+
+    Two cameras that show the same motion fit best without a time shift. If they show different motions, no shift fits
+    better than any other. Cameras that are out of sync all the time never fit without a shift, and form no group.
+
+    Parameters
+    ----------
+    rig : Rig
+    keypoints : records of the same number of frames and the same rate.
+    first : number of the records' first frame, for remedies.
+    """
+    length = min(len(k) for k in keypoints)
+    if len(rig) < 4 or length < 3 * _MIN_PART_FRAMES:
+        return []
+    edges = np.linspace(0, length, 4).astype(int).tolist()
+    parts = [_part(rig, keypoints, edges[k], edges[k + 1]) for k in (0, 2)]
+    sizes = range(2, len(rig) // 2 + 1)
+    groups = [group for size in sizes for group in combinations(range(len(rig)), size)
+              if 2 * size < len(rig) or group[0] == 0]  # fmt: skip
+    every = product((parts, parts[::-1]), groups)
+    found = [(good, bad, group) for (good, bad), group in every if _differs(good, bad, group)]
+    if not found:
+        return []
+    good, bad, group = found[0]
+    names = [rig.names[c] for c in group]
+    others = [rig.names[c] for c in range(len(rig)) if c not in group]
+    part = lambda run: f"frames {first + run.start} to {first + run.stop - 1}"
+    text = f"{listed(names)} show another motion than {listed(others)} in {part(bad)}; "
+    text += f"in {part(good)} all cameras show the same motion."
+    confidence = "Certain: no time shift makes the two groups agree there, while the cameras within a group agree."
+    edits = (Edit("take", "frames", f"[{first + good.start}, {first + good.stop}]"),)
+    remedy = "Check whether videos are cut, have dropped frames or continue with another take. Until it is corrected, "
+    remedy = f"{remedy}write {in_words(edits)}."
+    return [Finding("fault", "groups", text, (*names, *others), confidence, remedy, edits)]
+
+
+def _part(rig: Rig, keypoints: Sequence[Keypoints], start: int, stop: int) -> _Part:
+    count = min(stop - start, _MAX_PART_FRAMES)
+    begin = (start + stop - count) // 2
+    advantage, cost = np.full((2, len(rig), len(rig)), np.nan)
+    try:
+        records = [k.rows(slice(begin, begin + count), k.time_offset) for k in keypoints]
+        curves = pair_curves(with_sides_right(make_views(rig, records, filled=True)))
+    except TrackingError:  # no person detected
+        curves = {}
+    for pair, (shifts, costs) in curves.items():
+        near = costs[np.abs(shifts) <= 1]  # cameras may be out of sync by part of a frame
+        if np.isfinite(near).any():
+            cost[pair] = max(np.nanmin(near), 1e-9)
+            advantage[pair] = np.nanmedian(costs) / cost[pair]
+    return _Part(start, stop, advantage, cost)
+
+
+def _differs(good: _Part, bad: _Part, group: tuple[int, ...]) -> bool:
+    """Whether a group shows the other cameras' motion in the good part, and another one in the bad part."""
+    known, member = np.isfinite(good.cost + bad.cost), np.isin(np.arange(len(bad.cost)), group)
+    across = known & (member[:, None] != member)
+    within = bad.advantage[known & ~across]
+    if across.sum() < 2 or not len(within):
+        return False
+    median = float(np.median(bad.advantage[across]))
+    fall = float(np.median(good.advantage[across])) / max(median, 1e-9)
+    rise = float(np.median(bad.cost[across] / good.cost[across]))
+    fits_nowhere = median <= _MAX_MEDIAN_ADVANTAGE and bad.advantage[across].max() <= _MAX_PAIR_ADVANTAGE
+    moves = within.max() >= _MIN_WITHIN_ADVANTAGE
+    return bool(fits_nowhere and moves and fall >= _MIN_ADVANTAGE_FALL and rise >= _MIN_COST_RISE)
+
+
+def _constant(values: NDArray) -> NDArray:
+    """Medians over time (first axis), 0 where all values are NaN."""
+    return np.nan_to_num(medians(np.moveaxis(values, 0, -1)))

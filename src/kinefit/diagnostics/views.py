@@ -1,15 +1,17 @@
-"""Keypoints of one person in all cameras, with left and right corrected: the input of the calibration checks."""
+"""Keypoints of one person in all cameras, with left and right corrected, and how well the cameras agree on them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.geometry.camera import Rig
-from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.findings import Finding, frame_ranges, listed
+from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.triangulation import triangulate, triangulate_robust
 from kinefit.multiview.association import choose_people
 from kinefit.observations import Keypoints
 from kinefit.observations.recordings import mirror_name
@@ -17,6 +19,8 @@ from kinefit.observations.recordings import mirror_name
 MAX_ERROR_SHARE = 0.03  # of the image's diagonal: cameras that differ by more did not detect the same point
 MIN_CONFIDENCE = 0.3  # of a point; detectors give occluded points less
 _MIN_PAIRS = 3  # left-right pairs needed to decide the sides
+_SAMPLE_FRAMES = 16
+_SAMPLE_POINTS = 14  # of a frame, spread over the set
 _MAX_SWAPPED_ERROR = 0.6  # of swapped pairs, as a share of their error before; else the detector is believed
 
 
@@ -61,7 +65,7 @@ class KeypointViews:
 
     def spread(self, count: int) -> KeypointViews:
         """At most `count` frames, spread over the recording."""
-        return self.at(np.unique(np.linspace(0, len(self) - 1, min(count, len(self))).astype(int)))
+        return self.at(spread(len(self), count))
 
     def select(self, cameras: Sequence[str]) -> KeypointViews:
         """The views of some cameras."""
@@ -74,6 +78,15 @@ class KeypointViews:
     def pixels(self) -> NDArray:
         """All points (F · K, C, 2) [px], frame after frame."""
         return self.uv.reshape(-1, len(self.rig), 2)
+
+    def without(self, c: int) -> KeypointViews:
+        """The views of all cameras but the one of index c."""
+        return self.select([name for k, name in enumerate(self.rig.names) if k != c])
+
+
+def spread(length: int, count: int) -> NDArray:
+    """At most `count` indices of `length` ones, evenly spread."""
+    return np.unique(np.linspace(0, length - 1, min(count, length)).astype(int))
 
 
 def make_views(rig: Rig, keypoints: Sequence[Keypoints], *, filled: bool = False) -> KeypointViews:
@@ -186,3 +199,93 @@ def _gain(views: KeypointViews, c: int, paired: NDArray) -> NDArray:
     count = both.sum(axis=1)
     before, after = (np.where(both, e, 0.0).sum(axis=1) / np.maximum(count, 1) for e in (error, swapped_error))
     return np.where((count >= 2 * _MIN_PAIRS) & (after < _MAX_SWAPPED_ERROR * before), before - after, 0.0)
+
+
+def sample(views: KeypointViews) -> NDArray:
+    """Sample (N, C, 2) [px] of the points of some frames."""
+    at = np.ix_(spread(len(views), _SAMPLE_FRAMES), spread(len(views.names), _SAMPLE_POINTS))
+    uv = views.uv[at]
+    return uv.reshape(uv.shape[0] * uv.shape[1], len(views.rig), 2)
+
+
+def disagreement_share(rig: Rig, uv: NDArray) -> float:
+    """Mean reprojection error of views (N, C, 2) [px] of points in two or more cameras, as a share 0..1 of the limit.
+
+    Errors are clipped at the limit. 1 where no point is visible in two cameras.
+    """
+    limit = MAX_ERROR_SHARE * max(float(np.hypot(*camera.size)) for camera in rig)
+    detected = np.isfinite(uv).all(-1)
+    detected &= (detected.sum(axis=1) >= 2)[:, None]
+    if not detected.any():
+        return 1.0
+    _, agree, residual = triangulate_robust(rig, uv, max_residual_px=limit)
+    error = np.where(agree, np.nan_to_num(residual, nan=limit, posinf=limit), limit)
+    return float(np.minimum(error, limit)[detected].mean() / limit)
+
+
+
+def points_of_others(views: KeypointViews, c: int) -> NDArray:
+    """Triangulate the points of `sample` without camera c: (N, 3) [m]; NaN where no two cameras agree."""
+    others = views.without(c)
+    return triangulate_robust(others.rig, sample(others), max_residual_px=views.limit)[0]
+
+
+def share_against(x_world: NDArray, camera: Camera, uv: NDArray, limit: float) -> float:
+    """Median error of a camera's views (N, 2) [px] of points (N, 3) [m], clipped at the limit [px], as its share 0..1.
+
+    0 where too few points are known.
+    """
+    both = np.isfinite(x_world).all(axis=1) & np.isfinite(uv).all(axis=1)
+    if both.sum() < _SAMPLE_POINTS:
+        return 0.0
+    error = np.linalg.norm(camera.project(x_world[both]) - uv[both], axis=1)
+    return float(np.median(np.minimum(np.nan_to_num(error, nan=limit), limit)) / limit)
+
+
+def share_against_others(views: KeypointViews, c: int) -> float:
+    """Median error, as a share 0..1 of the limit, of camera c against points triangulated by the other cameras."""
+    return share_against(points_of_others(views, c), views.rig.cameras[c], sample(views)[:, c], views.limit)
+
+
+
+def errors_of(rig: Rig, uv: NDArray) -> NDArray:
+    """Reprojection errors (N, C) [px] of views (N, C, 2) [px] of triangulated points; infinite where there is none."""
+    x = triangulate(rig, uv)
+    error = np.stack([np.linalg.norm(camera.project(x) - uv[:, c], axis=-1) for c, camera in enumerate(rig)], axis=1)
+    return np.nan_to_num(error, nan=np.inf, posinf=np.inf)
+
+
+def median_error(rig: Rig, uv: NDArray) -> float:
+    """Median reprojection error [px] of views (N, C, 2) [px] of triangulated points; infinite where there are none."""
+    uv = uv[np.isfinite(uv).all(-1).sum(axis=1) >= max(2, len(rig) - 1)]
+    return float(np.median(errors_of(rig, uv)[np.isfinite(uv).all(-1)])) if len(uv) else np.inf
+
+
+def pair_misses(views: KeypointViews) -> NDArray:
+    """Median reprojection error (C, C) [px] of each pair of cameras alone; NaN where they share fewer than 4 points."""
+    uv, names = sample(views), views.rig.names
+    out = np.full((len(names), len(names)), np.nan)
+    for a, b in combinations(range(len(names)), 2):
+        both = uv[:, [a, b]][np.isfinite(uv[:, [a, b]]).all(axis=(1, 2))]
+        if len(both) >= 4:
+            error = errors_of(views.rig.select((names[a], names[b])), both)
+            out[a, b] = out[b, a] = float(np.median(error.max(axis=1)))
+    return out
+
+
+def side_findings(views: KeypointViews) -> list[Finding]:
+    """Findings on frames in which the detector swapped left and right."""
+    if len(views.rig) < 3:
+        return [Finding("note", "sides", "Left/right swaps cannot be assigned to a camera: only two cameras.")]
+    found = {name: np.flatnonzero(views.swapped[:, c]) for c, name in enumerate(views.rig.names)}
+    found = {name: frames for name, frames in found.items() if len(frames)}
+    if not found:
+        return [Finding("good", "sides", "No left/right swaps in any camera.")]
+    exchanges = [f"{len(f)} of {len(views)} frames of {name} ({frame_ranges(f, 6)})" for name, f in found.items()]
+    most = max(found, key=lambda name: len(found[name]))
+    mostly = len(found[most]) > 0.5 * len(views)
+    remedy = f"Check whether the image of {most} is mirrored." if mostly else "Nothing: tracking corrects it."
+    text = f"The detector swapped left and right in {listed(exchanges)}."
+    confidence = "Certain: after correction they fit the other cameras."
+    return [Finding("doubt" if mostly else "note", "sides", text, tuple(found), confidence, remedy)]
+

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import accumulate
 from typing import Any
+
+from kinefit.errors import TakeError, check_choice
+from kinefit.findings import Edit
 
 _DOUBLED = str.maketrans({"\\": "\\\\", '"': '\\"'})
 
@@ -13,6 +16,42 @@ _DOUBLED = str.maketrans({"\\": "\\\\", '"': '\\"'})
 def quoted(text: str) -> str:
     """A text without line breaks as a TOML string in double quotes."""
     return f'"{text.translate(_DOUBLED)}"'
+
+
+def edited(text: str, edits: Iterable[Edit]) -> str:
+    """The text of a take file with edits.
+
+    Those of [[keypoints]] of a camera which has none are left out: the built-in detector's are as their camera is.
+
+    Raises
+    ------
+    TakeError
+        Two edits contradict each other; a camera or sensor that is not in the take.
+    """
+    made: dict[tuple[str, int | None, str], Edit] = {}
+    tables = tomllib.loads(text)
+    for edit in edits:
+        for number in _numbers(tables, edit):
+            other = made.setdefault((edit.table, number, edit.key), edit)
+            if other.value != edit.value:
+                problem = f"two edits contradict each other: {other} and {edit}"
+                raise TakeError(problem, place=edit.place, remedy="Write the right one yourself.")
+    for (table, number, key), edit in made.items():
+        text = with_keys(text, table, number, {key: edit.value})
+    return text
+
+
+def _numbers(tables: Mapping[str, Any], edit: Edit) -> Sequence[int | None]:
+    """Which of its tables an edit is about, from 0; (None,) for a single table."""
+    if isinstance(edit.entry, int):
+        return (edit.entry,)
+    if not edit.entry:
+        return (None,)
+    key = "name" if edit.table in ("camera", "depth", "stereo") else "camera"
+    names = [entry.get(key) for entry in tables.get(edit.table, ())]
+    if edit.table != "keypoints":
+        check_choice("camera" if edit.table == "camera" else f"[[{edit.table}]]", edit.entry, names, TakeError)
+    return [n for n, name in enumerate(names) if name == edit.entry]
 
 
 def with_keys(text: str, table: str, number: int | None, keys: Mapping[str, str | None]) -> str:

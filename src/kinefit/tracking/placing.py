@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
-from kinefit.diagnostics.sensor_fit import MISFIT_SIGMAS, POSE_SIGMAS
+from kinefit.diagnostics.sensors import MISFIT_SIGMAS, POSE_SIGMAS
 from kinefit.frame.routing import Sensors
 from kinefit.geometry import se3
 from kinefit.observations import DepthFrame

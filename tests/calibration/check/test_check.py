@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from kinefit.calibration.check.check import check_take
-from kinefit.diagnostics.arrangement import frame_findings
-from kinefit.diagnostics.bias import camera_biases, disagreement, without_points
-from kinefit.diagnostics.keypoints import check_keypoints
-from kinefit.diagnostics.scene import lens_findings, placement_findings
+from kinefit.diagnostics.cameras import camera_biases, disagreement, frame_findings, without_points
+from kinefit.diagnostics.checks import check_keypoints
+from kinefit.diagnostics.rig import lens_findings, placement_findings
 from kinefit.diagnostics.views import make_views, with_sides_right
 from kinefit.findings import Finding, listed, ranked
 from kinefit.geometry import se3

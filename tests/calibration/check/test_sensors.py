@@ -7,15 +7,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from kinefit.calibration.check.sensor_verdicts import (
+from kinefit.cli.checks._refine import Refined
+from kinefit.diagnostics.sensors import (
+    SensorAlignment,
     alignment_line,
-    marker_lines,
+    doubts_of,
+    marker_edits,
     misfits,
     moved_cameras,
     sensor_findings,
 )
-from kinefit.cli.checks._refine import Refined
-from kinefit.diagnostics.sensor_fit import SensorAlignment, doubts_of
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.readers.take.entries import DepthEntry, MarkersEntry
@@ -104,8 +105,9 @@ def test_a_doubtful_sensor_is_named_and_not_refined():
 
 def test_lines_of_markers_go_on_from_those_that_are_there():
     one = fit("markers", "markers", x=0.03, rz=0.05)
-    shift, turn = (np.fromstring(line.split("[")[1].strip("]"), sep=",") for line in marker_lines(one, MARKERS))
+    shift, turn = (np.fromstring(edit.value.strip("[]"), sep=",") for edit in marker_edits(one, MARKERS))
     new = MarkersEntry(file="m", shift=tuple(shift), turn=tuple(turn)).T_world_file
     np.testing.assert_allclose(new, one.T @ MARKERS.markers[0].T_world_file, atol=2e-5)
-    assert "[[markers]] of take.toml" in sensor_findings([one], MARKERS)[0].remedy
+    (found,) = sensor_findings([one], MARKERS)
+    assert found.edits == marker_edits(one, MARKERS) and found.remedy.endswith("into [[markers]] 1.")
     assert alignment_line(one).startswith("markers: turned 2.86 ± ")

@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from kinefit.batch.corrections import undo
 from kinefit.bodies import load_body
+from kinefit.calibration.check import check as checking
 from kinefit.cli.checks._refine import free_name
 from kinefit.cli.checks.check import check
-from kinefit.errors import KinefitError
+from kinefit.diagnostics.checks import Checked
+from kinefit.errors import ExportError, KinefitError, TakeError
 from kinefit.exporters.marker_files import write_markers
+from kinefit.findings import Edit, Finding
 from kinefit.geometry import se3
 from kinefit.observations import Markers
 from kinefit.readers.calibration.read import read_calibration, write_calibration
@@ -184,3 +188,51 @@ def test_a_marker_system_that_does_not_fit_the_videos_is_named_and_moved(tmp_pat
     assert np.degrees(np.linalg.norm(se3.log_so3(left[:3, :3]))) < 0.2
     middle = markers.positions.mean(axis=(0, 1))
     assert np.linalg.norm(se3.apply(left, middle) - middle) < 0.005
+
+
+FIXED = {
+    "five frames": ("time_offset = 0.1", lambda t: read_take(t).cameras[1].time_offset > 0.15),
+    "upside down": ('up = "z" in [take]', lambda t: read_take(t).up == "z"),
+    "lengths": ("frames = [0, 53] in [take]", lambda t: read_take(t).frames == (0, 53)),
+    "late, with stated frames": ("frames = [5, 60] in [take]", lambda t: read_take(t).frames == (5, 60)),
+    "exchanged": ('name = "cam03"', lambda t: [c.name for c in read_take(t).cameras][::2] == ["cam03", "cam01"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", FIXED)
+def test_fix_writes_the_lines_of_the_findings_and_checks_again(case, take):
+    BAD["five frames" if "late" in case else case][0](take)
+    if "late" in case:  # which leaves no camera what it saw before the late one began
+        swap(take, r"^\[take\]", "[take]\nframes = [0, 60]")
+    before = take.read_bytes()
+    told = run(take, "--fix", "--strict")
+    assert told.exit_code == 0, told.output
+    words, is_right = FIXED[case]
+    assert re.search(f"Written into .*{re.escape(words)}", told.stdout) and is_right(take)
+    assert "No fault" in told.stdout and "page" in take.with_name("take-check.html").read_text("utf-8")
+    kept = take.with_name("take-before") / "0001.txt"
+    assert str(kept) in told.stdout and kept.read_bytes() == before
+    while undo(take):
+        pass
+    assert take.read_bytes() == before
+
+
+def test_fix_writes_nothing_where_nothing_is_certain_or_the_take_is_read_only(take):
+    before = take.read_bytes()
+    assert "Nothing is written" in run(take, "--fix").stdout and take.read_bytes() == before
+    BAD["upside down"][0](take)
+    before = take.read_bytes()
+    take.chmod(0o444)
+    told = run(take, "--fix")
+    assert isinstance(told.exception, ExportError) and "read-only" in str(told.exception)
+    assert take.read_bytes() == before and not take.with_name("take-before").exists()
+    assert "the floor would be the ceiling" in told.stdout and take.with_name("take-check.html").exists()
+
+
+def test_fix_refuses_findings_that_contradict_each_other(take, monkeypatch):
+    twice = tuple(Finding("fault", "up", "", edits=(Edit("take", "up", f'"{axis}"'),)) for axis in "xy")
+    monkeypatch.setattr(checking, "check_take", lambda take, progress: Checked(take.name, twice, take))
+    before = take.read_bytes()
+    told = run(take, "--fix")
+    assert isinstance(told.exception, TakeError) and 'up = "x" and up = "y"' in str(told.exception)
+    assert take.read_bytes() == before

@@ -18,6 +18,7 @@ from kinefit.app.texts import Texts
 from kinefit.batch import corrections
 from kinefit.errors import KinefitError
 from kinefit.exporters.atomic import write_text
+from kinefit.findings import Edit, in_words
 from kinefit.readers.guess.draft import Note
 from kinefit.readers.guess.folder import Guess, guess_take
 from kinefit.readers.take.file import Take, read_take
@@ -141,10 +142,10 @@ class _TakePage:
             self._edit(lambda: corrections.choose_person(self._folder.file, who or None), self._t("take.who_saved"))
 
     def _write(self, found: dict[str, Any]) -> None:
-        """Write the keys of a finding into its camera, and check again."""
-        (camera,), keys = found["cameras"], dict(found["keys"])
-        said = self._t("take.written", keys=", ".join(f"{k} = {v}" for k, v in keys.items()), camera=camera)
-        self._edit(lambda: corrections.set_camera_keys(self._folder.file, camera, keys), said)
+        """Write the edits of a finding into the take, and check again."""
+        edits = [Edit(**edit) for edit in found["edits"]]
+        said = self._t("take.written", edits=in_words(edits, " in "))
+        self._edit(lambda: corrections.write_edits(self._folder.file, edits), said)
         self._check()
 
     def _edit(self, edit: Callable[[], object], said: str) -> None:
@@ -283,7 +284,7 @@ class _TakePage:
                         with ui.row():
                             for remedy in _REMEDIES.get(found["kind"], ()) if found["severity"] != "note" else ():
                                 ui.button(t(f"take.{remedy}"), on_click=lambda r=remedy: self._check(*_REFINE[r]))
-                            if found["keys"]:
+                            if found["edits"]:
                                 ui.button(t("take.write"), on_click=lambda f=found: self._write(f)).props("outline")
             if job.result["refined"]:
                 with ui.row().classes("items-center"):

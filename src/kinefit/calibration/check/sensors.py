@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.surfaces import TaperedCylinder
-from kinefit.diagnostics.sensor_fit import MISFIT_SIGMAS, POSE_SIGMAS, SensorAlignment, doubts_of
+from kinefit.diagnostics.sensors import MISFIT_SIGMAS, POSE_SIGMAS, SensorAlignment, doubts_of
 from kinefit.errors import ObservationError
 from kinefit.frame.routing import Sensors
 from kinefit.geometry import se3

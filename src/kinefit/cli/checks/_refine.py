@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
-from kinefit.calibration.check.sensor_verdicts import alignment_line, marker_lines, misfits, moved_cameras
+from kinefit.batch.results import Step
+from kinefit.bodies import load_body
 from kinefit.calibration.check.sensors import fit_sensors
+from kinefit.calibration.refine.refine import refine
+from kinefit.calibration.refine.result import Refinement
 from kinefit.cli import _screen
-from kinefit.diagnostics.keypoints import Check
-from kinefit.diagnostics.sensor_fit import SensorAlignment, marker_index
-from kinefit.errors import FileError, TakeError, command
+from kinefit.diagnostics.checks import Checked
+from kinefit.diagnostics.sensors import SensorAlignment, alignment_line, marker_edits, misfits, moved_cameras
+from kinefit.errors import CalibrationError, FileError, TakeError, command
+from kinefit.exporters.atomic import write_text
+from kinefit.exporters.take_text import edited, quoted
+from kinefit.findings import Edit, in_words
 from kinefit.geometry.camera import Rig
-
-if TYPE_CHECKING:
-    from kinefit.calibration.refine.result import Refinement
+from kinefit.readers.calibration.write import write_calibration_like
+from kinefit.readers.static_points import read_static_points
+from kinefit.readers.take.file import read_take
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,100 +51,68 @@ class Refined:
         return [*lines, *(alignment_line(fit) for fit in self.sensors)]
 
 
-def refined_of(
-    found: Check, step: _screen.Step, points: Path | None, *, focal: bool, distortion: bool, time_offsets: bool
-) -> Refined:
+def refined_of(found: Checked, step: Step, points: Path | None, **lenses_and_clocks: Any) -> Refined:
     """The cameras with keypoints refined, and other sensors against them.
 
     Where other sensors do not fit and the cameras have no fault, the cameras stay: a person's few steps place a sensor
-    better than all cameras anew.
+    better than all cameras anew. `lenses_and_clocks`: whether to refine "focal", "distortion" and "time_offsets" too.
 
     Raises
     ------
     CalibrationError
         Faults that must be fixed first; what `refine` raises.
     """
-    wrong, asked = misfits(found.sensors), focal or distortion or time_offsets or points is not None
-    if wrong and not asked:
+    wrong = misfits(found.sensors)
+    if wrong and points is None and not any(lenses_and_clocks.values()):
         return Refined(None, wrong)
-    cameras = _refine(found, step, points, focal=focal, distortion=distortion, time_offsets=time_offsets)
-    assert found.take is not None and found.observations is not None
-    return Refined(cameras, misfits(fit_sensors(found.take, found.observations, cameras.rig, progress=step)))
-
-
-def _refine(
-    found: Check, step: _screen.Step, points: Path | None, *, focal: bool, distortion: bool, time_offsets: bool
-) -> Refinement:
-    from kinefit.bodies import load_body
-    from kinefit.calibration.refine.refine import refine
-    from kinefit.errors import CalibrationError
-    from kinefit.readers.static_points import read_static_points
-
-    seen, take = found.observations, found.take
-    if found.views is None or not found.biases or seen is None or take is None:
+    if not found.biases:
         raise CalibrationError(
-            "--refine needs a recording without faults",
-            remedy="Correct the faults listed above first.",
+            "--refine needs a recording without faults", remedy="Correct the faults listed above first."
         )
-    static = read_static_points(points, found.views.rig.names) if points else None
-    sigma = min(entry.sigma for entry in take.keypoints)
-    return refine(
-        found.views.rig, [k for k in seen.keypoints if k.camera in found.views.rig], load_body(take.body), focal=focal,
-        distortion=distortion, time_offsets=time_offsets, static_points=static, height=take.height, up=take.up,
-        sigma=sigma,
-        progress=step,
+    rig, seen, take = found.views.rig, found.observations, found.take
+    cameras = refine(
+        rig, [k for k in seen.keypoints if k.camera in rig], load_body(take.body), height=take.height, up=take.up,
+        static_points=read_static_points(points, rig.names) if points else None,
+        sigma=min(entry.sigma for entry in take.keypoints), progress=step, **lenses_and_clocks,
     )  # fmt: skip
+    return Refined(cameras, misfits(fit_sensors(take, seen, cameras.rig, progress=step)))
 
 
-def write_refined(found: Check, refined: Refined, path: Path) -> Path | None:
+def write_refined(found: Checked, refined: Refined, path: Path) -> Path | None:
     """Write the refined calibration beside the old one, and a copy of the take at `path` that uses it.
 
     Returns the copy; None where nothing changes.
 
     Raises TakeError where the form of [calibration] cannot be changed.
     """
-    from kinefit.exporters.atomic import write_text
-    from kinefit.exporters.take_text import quoted, with_keys
-    from kinefit.readers.calibration.write import write_calibration_like
-    from kinefit.readers.take.file import read_take
-
-    assert found.take is not None and found.take.calibration is not None and found.observations is not None
-    take, old, text = found.take, found.take.calibration, path.read_text("utf-8")
-    markers = {marker_index(fit.sensor): marker_lines(fit, take) for fit in refined.moved if fit.kind == "markers"}
+    take, old, edits = found.take, found.take.calibration, list[Edit]()
+    assert old is not None
     moved = moved_cameras(refined.moved, take, found.observations.rig or Rig(()))
     rig = Rig((*(refined.cameras.rig if refined.cameras is not None else ()), *moved))
-    new = free_name(old.file)
     if len(rig):
+        new = free_name(old.file)
         write_calibration_like(rig, old.file, new, unit=old.unit)
         _screen.say(f"Written: {new}\n")
+        edits.append(Edit("calibration", "file", quoted(_relative(new, path.absolute().parent))))
+    edits += [edit for fit in refined.moved if fit.kind == "markers" for edit in marker_edits(fit, take)]
     for line in refined.summary_lines():
         _screen.say(line)
-    if not len(rig) and not markers:
+    if not edits:
         _screen.say(f"Next:\n  {command('track', path)}")
         return None
-    changed: list[str] = []
-    if len(rig):
-        file = _relative(new, path.absolute().parent)
-        changed.append(f'file = "{file}" in [calibration]')
-        text = with_keys(text, "calibration", None, {"file": quoted(file)})
-    for number, lines in markers.items():
-        changed.append(f"{' and '.join(lines)} in [[markers]] {number + 1}")
-        text = with_keys(text, "markers", number, dict(line.split(" = ") for line in lines))
     late = refined.cameras.time_offsets if refined.cameras is not None else {}
-    for number, entry in enumerate(take.cameras):
+    for entry in take.cameras:
         if abs(late.get(entry.name, 0.0)) > 1e-5:
-            value = f"{entry.time_offset + late[entry.name]:.6f}"
-            changed.append(f"time_offset = {value} in [[camera]] {entry.name}")
-            text = with_keys(text, "camera", number, {"time_offset": value})
+            edits.append(Edit("camera", "time_offset", f"{entry.time_offset + late[entry.name]:.6f}", entry.name))
     beside = free_name(path)
-    write_text(beside, text)
+    write_text(beside, edited(path.read_text("utf-8"), edits))
     try:
         read_take(beside)
     except FileError as error:  # [calibration] twice: the take has it in another form
         beside.unlink()
-        remedy = f"Write it yourself: {'; '.join(changed)}."
+        remedy = f"Write it yourself: {in_words(edits, ' in ')}."
         raise TakeError("the refined file cannot be written into [calibration]", file=path, remedy=remedy) from error
-    _screen.say(f"\nWritten: {beside}, a copy of {path.name} with {', '.join(changed)}.")
+    _screen.say(f"\nWritten: {beside}, a copy of {path.name} with {in_words(edits, ' in ')}.")
     _screen.say(f"Next:\n  {command('track', beside)}")
     return beside
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,12 +11,15 @@ import click
 from kinefit.cli import _screen
 
 if TYPE_CHECKING:
+    from kinefit.batch.results import Step
     from kinefit.cli.checks._refine import Refined
-    from kinefit.diagnostics.keypoints import Check
+    from kinefit.diagnostics.checks import Checked
+    from kinefit.findings import Edit
 
 _EXAMPLES = """\b
 Examples:
   kinefit check take.toml                    findings, and a page with images
+  kinefit check take.toml --fix              writes the lines that correct it into the take, checks again
   kinefit check take.toml --refine           also a refined calibration, and a take file that uses it
 """
 _PRINTED = ("camera", "bias u, v [px]", "±", "spread", "late [frames]", "left/right swapped")
@@ -33,13 +36,14 @@ _PRINTED = ("camera", "bias u, v [px]", "±", "spread", "late [frames]", "left/r
     "--points", type=click.Path(path_type=Path),
     help="With --refine: TOML file of static points: [NAME], then CAMERA = [u, v] px in the calibration's image.",
 )
+@click.option("--fix", is_flag=True, help="Write what corrects faults into the take, then check again.")
 @_screen.hide_faces_option
 @click.option("--strict", is_flag=True, help="End with exit code 2 if there is a fault.")
 @_screen.quiet_options
 @_screen.verbose_option
 def check(
     take: Path, out: Path | None, refine: bool, focal: bool, distortion: bool, time_offsets: bool,
-    points: Path | None, strict: bool, hide_faces: bool, as_json: bool,
+    points: Path | None, fix: bool, strict: bool, hide_faces: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Find faults of a recording, with their confidence and how to correct them.
 
@@ -51,50 +55,50 @@ def check(
         raise click.UsageError("--focal, --distortion, --time-offsets and --points need --refine.")
     if points is not None and not points.is_file():
         raise click.BadParameter(f"no such file: {points}", param_hint="--points")
-    from kinefit.calibration.check.check import check_take
+    from kinefit.batch.corrections import write_edits
     from kinefit.cli._results import check_file
     from kinefit.cli.checks._page import check_page
     from kinefit.cli.checks._refine import refined_of, write_refined
     from kinefit.errors import KinefitError
     from kinefit.exporters.atomic import write_text
-    from kinefit.findings import as_records, ranked
-    from kinefit.preparing.faces import ensure_faces
-    from kinefit.preparing.take import with_detections
-    from kinefit.readers.take.file import read_take
+    from kinefit.findings import as_records, fixes, in_words, ranked
     from kinefit.readers.take.find import find_take
-    from kinefit.takes.missing import find_cameras
 
     take = find_take(take, wanted=("check",))
     out = out or take.with_name(f"{take.stem}-check.html")
     check_file(out)
-    entry = read_take(take)
-    entry = replace(entry, hide_faces=entry.hide_faces or hide_faces)
     refined: Refined | None = None
     failed: KinefitError | None = None
+    fixed: list[Edit] = []
+    kept: list[Path] = []
     with _screen.bars() as step:
-        try:
-            entry = with_detections(entry, step, _screen.note)
-        except KinefitError as error:  # the rest can be checked without
-            _screen.note(f"note: checked without keypoints: {error}")
-        entry = find_cameras(entry, step, _screen.note)
-        if entry.hide_faces and any(camera.video for camera in entry.cameras):
-            ensure_faces(entry, step, _screen.note)
-        found = check_take(entry, progress=step)
-        if refine:
+        found, content = _checked(take, hide_faces, step)
+        while fix and failed is None and (wanted := fixes(found.findings, fixed)):
             try:
-                refined = refined_of(
-                    found, step, points, focal=focal, distortion=distortion, time_offsets=time_offsets
-                )
+                kept.append(write_edits(take, wanted, over=content))
             except KinefitError as error:
                 failed = error
+            else:
+                fixed += wanted
+                found, content = _checked(take, hide_faces, step)
+        if refine and failed is None:
+            try:
+                refined = refined_of(found, step, points, focal=focal, distortion=distortion, time_offsets=time_offsets)
+            except KinefitError as error:
+                failed = error
+    if fixed:
+        _screen.say(f"Written into {take}: {in_words(fixed, ' in ')}.")
+        _screen.say(f"The file as it was is {kept[0]}.")
+    elif fix and failed is None:
+        _screen.say("Nothing is written: no fault has a certain correction that is a line of the take.")
     _print(found)
-    write_text(out, check_page(found, refinement=refined, up=entry.up))
+    write_text(out, check_page(found, refined))
     _screen.say(f"\nWritten: {out}")
     used = write_refined(found, refined, take) if refined is not None else None
     if as_json:
         _screen.print_json({
             "take": str(take), "faults": len(found.faults), "findings": as_records(ranked(found.findings)),
-            "page": str(out), "refined": str(used) if used else None,
+            "page": str(out), "refined": str(used) if used else None, "fixed": [asdict(edit) for edit in fixed],
         })  # fmt: skip
     if failed is not None:
         raise failed
@@ -102,17 +106,37 @@ def check(
         click.get_current_context().exit(2)
 
 
-def _print(found: Check) -> None:
+def _checked(take: Path, hide_faces: bool, step: Step) -> tuple[Checked, bytes]:
+    """The check of a take, after keypoints, cameras and faces are found where it needs that; and the take's content."""
+    from kinefit.calibration.check.check import check_take
+    from kinefit.errors import KinefitError
+    from kinefit.preparing.faces import ensure_faces
+    from kinefit.preparing.take import with_detections
+    from kinefit.readers.take.file import read_take
+    from kinefit.takes.missing import find_cameras
+
+    entry, content = read_take(take), take.read_bytes()
+    entry = replace(entry, hide_faces=entry.hide_faces or hide_faces)
+    try:
+        entry = with_detections(entry, step, _screen.note)
+    except KinefitError as error:  # the rest can be checked without
+        _screen.note(f"note: checked without keypoints: {error}")
+    entry = find_cameras(entry, step, _screen.note)
+    if entry.hide_faces and any(camera.video for camera in entry.cameras):
+        ensure_faces(entry, step, _screen.note)
+    return check_take(entry, progress=step), content
+
+
+def _print(found: Checked) -> None:
     from kinefit.cli.checks._page import camera_rows, verdict
 
     _screen.say(f"\n{found.name}: {verdict(found)}")
+    good = {one.kind: None for one in found.findings if one.severity == "good" and not _screen.is_verbose()}
     for one in found.findings:
-        if one.severity == "good" and not _screen.is_verbose():
-            continue
-        _screen.tell_finding(one)
-    good = [one for one in found.findings if one.severity == "good"]
-    if good and not _screen.is_verbose():
-        _screen.say(f"\nin order: {', '.join(dict.fromkeys(one.kind for one in good))} (-v lists them)")
+        if one.severity != "good" or not good:
+            _screen.tell_finding(one)
+    if good:
+        _screen.say(f"\nin order: {', '.join(good)} (-v lists them)")
     columns, rows = camera_rows(found)
     if rows:
         shown = [at for at, name in enumerate(columns) if name in _PRINTED]

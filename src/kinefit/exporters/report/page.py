@@ -343,7 +343,7 @@ def _plotly() -> tuple[str, str]:
 def finding_callout(found: Finding, where: str = "") -> Html:
     """One finding; `where` says of what, on a page about several takes."""
     look, title = _FINDINGS[found.severity]
-    parts = [paragraph(found.confidence, small=True)] if found.confidence else []
+    parts = [paragraph(text, small=True) for text in (found.confidence, found.alike) if text]
     if found.remedy:
         parts.append(paragraph(strong("What to do: "), found.remedy))
     head = joined(strong(f"{where}{': ' if where else ''}{title}. "), found.text)

@@ -50,10 +50,8 @@ class CameraCoverage:
 
 def lens_findings(rig: Rig) -> list[Finding]:
     """Check that focal lengths, principal points and distortions are those of real lenses."""
-    out = []
-    for camera in rig:
-        for problem, remedy in _lens_problems(camera):
-            out.append(Finding("doubt", "lens", f"{camera.name}: {problem}.", (camera.name,), remedy=remedy))
+    out = [Finding("doubt", "lens", f"{camera.name}: {problem}.", (camera.name,), remedy=remedy)
+           for camera in rig for problem, remedy in _lens_problems(camera)]  # fmt: skip
     sizes = {camera.size for camera in rig}
     focal = np.array([camera.matrix[0, 0] for camera in rig])
     if len(sizes) == 1 and len(rig) > 2:
@@ -73,38 +71,32 @@ def lens_findings(rig: Rig) -> list[Finding]:
 def _view(camera: Camera) -> float:
     """Field of view [deg] along the longer side."""
     axis = int(np.argmax(camera.size))
-    if camera.model == "fisheye":
-        return float(np.degrees(camera.size[axis] / camera.matrix[axis, axis]))
-    return float(np.degrees(2 * np.arctan(0.5 * camera.size[axis] / camera.matrix[axis, axis])))
+    half = 0.5 * camera.size[axis] / camera.matrix[axis, axis]
+    return float(np.degrees(2 * (half if camera.model == "fisheye" else np.arctan(half))))
 
 
 def _lens_problems(camera: Camera) -> list[tuple[str, str]]:
     fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
     size, centre, view = np.array(camera.size), camera.matrix[:2, 2], _view(camera)
-    again, out = "Calibrate its lens again, or check the image size in the calibration.", []
-    if not _FIELD_OF_VIEW_RANGE[0] <= view <= (_FIELD_OF_VIEW_RANGE[1] if camera.model != "fisheye" else 220.0):
-        out.append((f"a field of view of {view:.0f} degrees (focal length {fx:.0f} px) is implausible", again))
-    if abs(np.log(fx / fy)) > _MAX_ASPECT_ERROR:
-        out.append(
-            (f"its pixels are not square (fx {fx:.0f}, fy {fy:.0f} px)", "Is its image stretched? " + again)
-        )
-    off = np.abs(centre - 0.5 * (size - 1)) / size
-    if np.any(off > _MAX_CENTRE_OFFSET):
-        where = f"({centre[0]:.0f}, {centre[1]:.0f}) of {size[0]}x{size[1]} px"
-        out.append(
-            (f"its principal point {where} is far from the middle", "Is its image cropped or rotated? " + again)
-        )
+    again = "Calibrate its lens again, or check the image size in the calibration."
+    widest = _FIELD_OF_VIEW_RANGE[1] if camera.model != "fisheye" else 220.0
+    where = f"({centre[0]:.0f}, {centre[1]:.0f}) of {size[0]}x{size[1]} px"
     edge = np.linspace(0.0, 1.0, 9)
     border = np.array([(a, b) for a in edge for b in edge if a in (0, 1) or b in (0, 1)]) * (size - 1)
     with np.errstate(invalid="ignore"):
-        rays = camera.ray(border)
-    lost = ~np.isfinite(rays).all(-1)
-    if lost.any():
-        share = f"{100 * lost.mean():.0f} % of the image's border"
-        out.append(
-            (f"its distortion model is not invertible at {share}", "Calibrate it with boards up to the corners.")
-        )
-    return out
+        lost = ~np.isfinite(camera.ray(border)).all(-1)
+    share = f"{100 * lost.mean():.0f} % of the image's border"
+    problems = (
+        (not _FIELD_OF_VIEW_RANGE[0] <= view <= widest,
+         f"a field of view of {view:.0f} degrees (focal length {fx:.0f} px) is implausible", again),
+        (abs(np.log(fx / fy)) > _MAX_ASPECT_ERROR,
+         f"its pixels are not square (fx {fx:.0f}, fy {fy:.0f} px)", f"Is its image stretched? {again}"),
+        (np.any(np.abs(centre - 0.5 * (size - 1)) / size > _MAX_CENTRE_OFFSET),
+         f"its principal point {where} is far from the middle", f"Is its image cropped or rotated? {again}"),
+        (lost.any(), f"its distortion model is not invertible at {share}",
+         "Calibrate it with boards up to the corners."),
+    )  # fmt: skip
+    return [(problem, remedy) for is_wrong, problem, remedy in problems if is_wrong]
 
 
 def placement_findings(rig: Rig, x: NDArray) -> list[Finding]:
@@ -114,15 +106,15 @@ def placement_findings(rig: Rig, x: NDArray) -> list[Finding]:
     ways = middle - centres
     distance = np.linalg.norm(ways, axis=1)
     ways = ways / np.maximum(distance, 1e-9)[:, None]
-    pairs = list(combinations(range(len(rig)), 2))
+    pairs = combinations(range(len(rig)), 2)
     angles = {(a, b): float(np.degrees(np.arccos(np.clip(ways[a] @ ways[b], -1, 1)))) for a, b in pairs}
     across = [v for v in angles.values() if _MIN_ANGLE <= v <= _MAX_ANGLE]
     anisotropy = _anisotropy(ways)
     enough = bool(across) and anisotropy <= _MAX_ANISOTROPY
     for (a, b), angle in angles.items():
-        names = (rig.names[a], rig.names[b])
         if _MIN_ANGLE <= angle <= _MAX_ANGLE:
             continue
+        names = (rig.names[a], rig.names[b])
         how = "are side by side" if angle < _MIN_ANGLE else "face each other"
         gap = f"{angle:.0f} degrees and {np.linalg.norm(centres[a] - centres[b]):.2f} m apart"
         text = f"{listed(names)} {how} ({gap}): these two alone do not determine depth"
@@ -152,16 +144,15 @@ def coverage(views: KeypointViews, x: NDArray) -> tuple[CameraCoverage, ...]:
     """Coverage of the person's volume of motion by every camera, from points x (F, K, 3) [m]."""
     known = x[np.isfinite(x).all(-1)]
     low, high = np.percentile(known, [1, 99], axis=0)
+    detected = np.isfinite(views.uv).all(-1).any(axis=(0, 2))
     grid = np.stack(np.meshgrid(*np.linspace(low, high, _GRID_CELLS).T, indexing="ij"), -1).reshape(-1, 3)
     out = []
     for c, camera in enumerate(views.rig):
         uv = camera.project(grid)
         inside = np.all((uv >= -0.5) & (uv < np.array(camera.size) - 0.5), axis=-1)
         seen = np.isfinite(views.uv[:, :, c]).all(-1)
-        some = seen.sum(axis=1) >= 5
-        v = views.uv[some, :, c, 1]
-        tall = float(np.median(np.nanmax(v, axis=1) - np.nanmin(v, axis=1))) if some.any() else np.nan
-        detected = np.isfinite(views.uv).all(-1).any(axis=(0, 2))
+        v = views.uv[seen.sum(axis=1) >= 5, :, c, 1]
+        tall = float(np.median(np.nanmax(v, axis=1) - np.nanmin(v, axis=1))) if len(v) else np.nan
         distance = float(np.linalg.norm(camera.centre_world - 0.5 * (low + high)))
         out.append(CameraCoverage(camera.name, float(inside.mean()), float(seen[:, detected].mean()), tall, distance))
     return tuple(out)
@@ -180,12 +171,7 @@ def coverage_findings(seen: Sequence[CameraCoverage]) -> list[Finding]:
             remedy = "Move the camera nearer, or record at a higher resolution."
             out.append(Finding("note", "coverage", text, (c.camera,), remedy=remedy))
     if not out and seen:
-        least = 100 * min(c.volume for c in seen)
-        out.append(
-            Finding(
-                "good",
-                "coverage",
-                f"Every camera sees at least {least:.0f} % of the volume in which the person moves.",
-            )
-        )
+        least = f"{100 * min(c.volume for c in seen):.0f} %"
+        text = f"Every camera sees at least {least} of the volume in which the person moves."
+        out.append(Finding("good", "coverage", text))
     return out

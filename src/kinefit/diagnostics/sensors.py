@@ -1,14 +1,19 @@
-"""Alignment of a sensor's frame with the world of the videos, and whether its correction is reliable."""
+"""Sensors against the videos: how far a frame is off, whether its correction is reliable, what corrects it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.errors import command
+from kinefit.findings import Edit, Finding
 from kinefit.geometry import se3
+from kinefit.geometry.camera import Rig
+from kinefit.readers.take.file import Take
 from kinefit.sensors.displaced import AXES, displacement
 
 MISFIT_SIGMAS = 3.0
@@ -25,6 +30,8 @@ POSE_SIGMAS = 0.1, float(np.radians(5.0))
 
 _COVERAGE = 0.95  # share of errors within the error bars
 _MONTE_CARLO_DRAWS = 4000  # for the error bars
+_MIN_INVERTED_TURN = np.radians(150.0)  # of an upside-down camera
+_MIN_CLOCK_ERROR = 0.01  # [s] that is reported: a person walks 1 cm
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,3 +139,89 @@ def marker_index(sensor: str) -> int:
     """Index of a sensor among the take's [[markers]]."""
     number = sensor.removeprefix("markers").strip()
     return int(number) - 1 if number else 0
+
+
+def misfits(fits: Iterable[SensorAlignment]) -> tuple[SensorAlignment, ...]:
+    """The alignments that significantly do not fit."""
+    return tuple(f for f in fits if f.misfit)
+
+
+def sensor_findings(fits: Sequence[SensorAlignment], take: Take) -> list[Finding]:
+    """A fault for each sensor that does not fit, a doubt for each clock offset, "good" for all others."""
+    out = []
+    for fit in fits:
+        own, refine = (fit.sensor,), command("check", take.path, "--refine")
+        shift = " and ".join(_amounts(fit))
+        evidence = f"{fit.deviations:.0f} standard deviations; ± holds 95 % of errors, including the surface's own."
+        if fit.kind == "depth" and fit.turn > _MIN_INVERTED_TURN:
+            turn = f"{np.degrees(fit.turn):.0f} degrees"
+            text = f"{fit.sensor} hangs upside down, or its pose is wrong: it fits the person turned by {turn}."
+            remedy = "Correct its pose in the calibration, or turn its images by 180 degrees; `track` excludes it."
+            found = Finding("fault", "sensor", text, own, remedy=remedy)
+        elif fit.misfit and fit.doubts:
+            may = "does not fit the videos" if fit.falls else "may not fit the videos"
+            text = f"{fit.sensor} {may}: it seems off by {shift} at the person."
+            unsure = f"Its correct pose is uncertain, because {'; '.join(fit.doubts)}."
+            remedy = "Calibrate it together with the videos, or record a person who walks and turns nearer to it."
+            found = Finding("fault" if fit.falls else "doubt", "sensor", text, own, unsure, remedy)
+        elif fit.misfit and fit.kind == "depth":
+            text = f"{fit.sensor} does not fit the videos: its pose in the calibration is off by {shift} at the person."
+            remedy = f"To move it run {refine} (or calibrate it together with the videos)."
+            found = Finding("fault", "sensor", text, own, evidence, remedy)
+        elif fit.misfit:
+            text = f"{fit.sensor} does not fit the videos: its frame is off by {shift} at the person."
+            found = Finding("fault", "sensor", text, own, evidence, edits=marker_edits(fit, take))
+        else:
+            shift = f"{np.degrees(fit.turn):.2f}° and {1e3 * fit.shift:.0f} mm at the person"
+            found = Finding("good", "sensor", f"{fit.sensor} fits the videos to {shift}.")
+        out.append(found)
+        late, std = fit.twist[6], float(np.sqrt(fit.covariance[6, 6]))
+        if abs(late) > max(MISFIT_SIGMAS * std, _MIN_CLOCK_ERROR):
+            text = f"The clock of {fit.sensor} is off by {1e3 * late:+.0f} ± {1e3 * std:.0f} ms against the videos."
+            entries = [e for e in take.depth if e.name == fit.sensor] or take.markers[marker_index(fit.sensor) :]
+            place = fit.sensor if fit.kind == "depth" else marker_index(fit.sensor)
+            edit = Edit(fit.kind, "time_offset", f"{entries[0].time_offset + late:.4f}", place)
+            out.append(Finding("doubt", "sensor", text, own, edits=(edit,)))
+    return out
+
+
+def _amounts(fit: SensorAlignment) -> tuple[str, str]:
+    """Texts of the rotation [deg] and of the shift [mm] with their error bars."""
+    shift, turn = fit.bars
+    return f"{np.degrees(fit.turn):.2f} ± {np.degrees(turn):.2f}°", f"{1e3 * fit.shift:.1f} ± {1e3 * shift:.1f} mm"
+
+
+def alignment_line(fit: SensorAlignment) -> str:
+    """Line of text on a sensor's correction, or on the reasons against one."""
+    if fit.doubts:
+        return f"{fit.sensor}: not refined, because {'; '.join(fit.doubts)}."
+    turn, shift = _amounts(fit)
+    return f"{fit.sensor}: turned {turn}, moved {shift} at the person (95 %)"
+
+
+def moved_cameras(fits: Iterable[SensorAlignment], take: Take, rig: Rig) -> Rig:
+    """The depth cameras at their corrected poses, named as in the calibration.
+
+    Parameters
+    ----------
+    rig : Rig with the depth cameras under their sensors' names
+    """
+    out, of = [], {entry.name: entry.camera or entry.name for entry in take.depth}
+    for fit in fits:
+        if fit.kind == "depth":
+            camera = rig[fit.sensor]
+            placed = camera.with_pose(camera.T_camera_world @ se3.inverse(fit.T))
+            out.append(replace(placed, name=of[fit.sensor]))
+    return Rig(tuple(out))
+
+
+def marker_edits(fit: SensorAlignment, take: Take) -> tuple[Edit, Edit]:
+    """The two lines of [[markers]] that correct a marker system's pose."""
+    number = marker_index(fit.sensor)
+    T = fit.T @ take.markers[number].T_world_file
+    values = {"shift": (T[:3, 3], 5), "turn": (np.degrees(se3.log_so3(T[:3, :3])), 4)}
+    shift, turn = (
+        Edit("markers", key, f"[{', '.join(f'{v:.{digits}f}' for v in part)}]", number)
+        for key, (part, digits) in values.items()
+    )
+    return shift, turn
