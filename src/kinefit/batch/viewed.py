@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -136,7 +137,9 @@ def is_outdated(provenance: Mapping[str, Any], take: Path) -> bool:
     if _INPUTS not in provenance or provenance.get("take") != take.name:
         return False
     try:
-        return inputs_entry(read_take(take))[_INPUTS] != provenance[_INPUTS]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # old keys were said when the take was tracked
+            return inputs_entry(read_take(take))[_INPUTS] != provenance[_INPUTS]
     except (KinefitError, OSError):
         return False
 
