@@ -30,6 +30,19 @@ def pytest_configure(config):
         subprocess.run([sys.executable, "-m", "kinefit", "warmup"], check=True, capture_output=True)
 
 
+@pytest.fixture(autouse=True)
+def environment_of_each_test():
+    """Take back what the command line sets in the environment of its process: here that is the tests' own."""
+    names = ("PATH", "PYTHONPATH", "PYTHONSAFEPATH", "NoDefaultCurrentDirectoryInExePath")
+    before = {name: os.environ.get(name) for name in names}
+    yield
+    for name, value in before.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Callable[[str], Path]:
     """Find a folder of real recordings by name; skip the test where it is absent, fail with KINEFIT_REQUIRE_DATA."""
