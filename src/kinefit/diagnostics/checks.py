@@ -51,15 +51,18 @@ class Check:
     test : from what is known so far to findings. It leaves what is known as it would be with its findings corrected,
         for the checks after it.
     needs : attributes of `Checked` that must be there (true, or not empty)
-    cost : [s] of one core, for 100 frames of four cameras. `kinefit track` runs checks of at most `QUICK_S`.
+    cost : [s] of one core for 100 frames of four cameras (of depth cameras: for their images), as measured. `kinefit
+        track` runs checks of at most `QUICK_S`.
     alike : what else would look the same, in one sentence; added to faults and doubts
+    reads : whether it reads files, which `kinefit track` does by itself
     """
 
     name: str
     test: Callable[[Checked], Iterable[Finding]]
     needs: tuple[str, ...]
-    cost: float
+    cost: float = 0.02
     alike: str = ""
+    reads: bool = False
 
 
 @dataclass(eq=False)
@@ -137,7 +140,7 @@ class Checked:
 
 def run(checked: Checked, checks: Sequence[Check]) -> Checked:
     """Run checks one after the other, as far as they are cheap enough and what they need is there."""
-    some = [check for check in checks if check.cost <= QUICK_S or not checked.quick]
+    some = [check for check in checks if not checked.quick or (check.cost <= QUICK_S and not check.reads)]
     for done, check in enumerate(some):
         checked.progress("checking", done, len(some))
         if all(getattr(checked, need) for need in check.needs):
@@ -326,10 +329,10 @@ def _coverage(c: Checked) -> list[Finding]:
 
 _VIEWS = ("sound", "views")
 CHECKS = (
-    Check("calibration", _calibration, ("take",), 1.0),
-    Check("images", _pictures, ("take", "rig"), 0.2, "A dark scene looks like wider black bars."),
-    Check("stated image of the keypoints", _image_frames, ("take", "rig"), 1.0),
-    Check("files", _files, ("take", "sound"), 10.0),
+    Check("calibration", _calibration, ("take",), reads=True),
+    Check("images", _pictures, ("take", "rig"), 0.3, "A dark scene looks like wider black bars."),
+    Check("stated image of the keypoints", _image_frames, ("take", "rig"), reads=True),
+    Check("files", _files, ("take", "sound"), 0.1, reads=True),
     Check(
         "covered lens", _covered, ("take", "observations"), 2.0,
         "Darkness, or an object that fills the image, looks like a covered lens.",
@@ -339,51 +342,51 @@ CHECKS = (
         ("take", "observations"), 2.0,
         "Sunlight, a second depth camera and a worn sensor look the same.",
     ),
-    Check("marker files", _notes, ("take", "observations"), 1.0),
-    Check("person", _person, ("take", "observations"), 2.0),
+    Check("marker files", _notes, ("take", "observations"), reads=True),
+    Check("person", _person, ("take", "observations"), reads=True),
     Check(
-        "lens", lambda c: rig.lens_findings(c.rig), ("rig",), 0.01,
-        "A cropped image looks like a lens with another field of view or principal point.",
+        "lens", lambda c: rig.lens_findings(c.rig), ("rig",),
+        alike="A cropped image looks like a lens with another field of view or principal point.",
     ),
-    Check("keypoints", _nobody, ("rig", "keypoints"), 0.3),
+    Check("keypoints", _nobody, ("rig", "keypoints")),
     Check(
-        "image of the keypoints", _other_frame, ("sound", "views", "take", "observations"), 0.02,
-        "Lenses calibrated at another image size look the same.",
+        "image of the keypoints", _other_frame, ("sound", "views", "take", "observations"),
+        alike="Lenses calibrated at another image size look the same.",
     ),
     Check(
         "gross mistakes", _mistakes, _VIEWS, 0.1,
         "A camera that was moved far may look like a wrong sign or focal length, and a mirrored world like its images.",
     ),
-    Check("person in each camera", _unseen, _VIEWS, 0.01, "A detector that fails on a whole video looks the same."),
-    Check("groups", _groups, _VIEWS, 0.2, "Cameras that follow different people in one part look the same."),
+    Check("person in each camera", _unseen, _VIEWS, alike="A detector that fails on a whole video looks the same."),
+    Check("groups", _groups, _VIEWS, 0.1, "Cameras that follow different people in one part look the same."),
     Check(
-        "other cameras", _strangers, _VIEWS, 0.3,
+        "other cameras", _strangers, _VIEWS, 0.4,
         "The calibration or the video of another camera, and keypoints of another person look the same.",
     ),
-    Check("scale", _scale, _VIEWS, 0.1, "All focal lengths too long or too short, and a child look the same."),
+    Check("scale", _scale, _VIEWS, alike="All focal lengths too long or too short, and a child look the same."),
     Check(
         "vertical, floor, sides of the body",
-        lambda c: person.upright_findings(c.views.rig, c.x, c.views.names, c.up), _VIEWS, 0.02,
-        "A person who lies or stands on the hands, and a world mirrored together with its images look the same.",
+        lambda c: person.upright_findings(c.views.rig, c.x, c.views.names, c.up), _VIEWS,
+        alike="A person who lies or stands on the hands, and a world mirrored together with its images look the same.",
     ),
     Check(
-        "distortion", lambda c: cameras.distortion_findings(c.sampled), _VIEWS, 0.05,
-        "Several cameras that have moved a little look the same.",
+        "distortion", lambda c: cameras.distortion_findings(c.sampled), _VIEWS,
+        alike="Several cameras that have moved a little look the same.",
     ),
     Check(
-        "clocks", _clocks, _VIEWS, 0.02,
-        "A detector that smooths over time, a rolling shutter and dropped frames look the same.",
+        "clocks", _clocks, _VIEWS,
+        alike="A detector that smooths over time, a rolling shutter and dropped frames look the same.",
     ),
     Check(
         "bias and moved cameras", _biases, _VIEWS, 0.1,
         "Systematic errors of a detector look like biases of a few pixels; a wrong focal length like a moved camera.",
     ),
-    Check("left and right", lambda c: views.side_findings(c.views), _VIEWS, 0.01, "A mirrored image looks the same."),
+    Check("left and right", lambda c: views.side_findings(c.views), _VIEWS, alike="A mirrored image looks the same."),
     Check(
-        "placement", lambda c: rig.placement_findings(c.views.rig, c.x[np.isfinite(c.x).all(-1)]), _VIEWS, 0.01,
-        "Wrong poses in the calibration look the same.",
+        "placement", lambda c: rig.placement_findings(c.views.rig, c.x[np.isfinite(c.x).all(-1)]), _VIEWS,
+        alike="Wrong poses in the calibration look the same.",
     ),
-    Check("coverage", _coverage, _VIEWS, 0.02, "A detector that misses the person looks the same."),
+    Check("coverage", _coverage, _VIEWS, alike="A detector that misses the person looks the same."),
 )
 """All checks of which the evidence is the files and keypoints of a take, in the order in which they run."""
 
