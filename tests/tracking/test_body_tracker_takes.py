@@ -89,7 +89,7 @@ def test_tables_that_are_none(tmp_path, text, error, said):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("sigma = 0.003\n", "sigma = 3.0\n", "sigma 3.0 m"),
+        ("sigma = 0.003\n", "sigma = 3.0\n", "sigma = 3.0. Give metres"),
         ("rotation_sigma = 0.6", "rotation_sigma = 0.0", r"\[\[tracker\]\] 1.*0.0 rad"),
         ("rotation_sigma = 0.6", "mount_sigma = -1.0", "mount_sigma -0.01"),
         ("mounts = {", "mounts = { elbow = [0, 0, 1],", "no tracker 'elbow'"),

@@ -155,7 +155,7 @@ def test_a_camera_without_calibration_is_level_and_of_a_usual_lens(folder):
 
 
 BAD = {
-    "too wide": (CAMERA + "field_of_view = 200.0\n" + DETECTED, TakeError, "field_of_view 200"),
+    "too wide": (CAMERA + "field_of_view = 200.0\n" + DETECTED, TakeError, "field_of_view = 200"),
     "other keypoints": (CAMERA + DETECTED.replace('"detect"', '"openpose"'), TakeError, "do not give a person"),
     "not lifted": (CAMERA + DETECTED, TrackingError, "kinefit detect --force"),
 }  # fmt: skip

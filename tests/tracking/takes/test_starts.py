@@ -201,7 +201,7 @@ WRONG = {
     "no such angle": ("angles = { knee = 3 }", "no angle of body 'pebble' 'knee'"),
     "no such step": ("step = 8", "step = 8 is outside the take's steps 0 to 7"),
     "one line": ("upward = [2, 0, 0.1]", "along one line"),
-    "no numbers": ("upward = [nan, 0, 0.1]", "not a position, direction or angle"),
+    "no numbers": ("upward = [nan, 0, 0.1]", r"upward = \[nan, 0, 0.1\]. Give metres, directions"),
     "a key": ("turn = [2, 0, 0.1]", "no key 'turn'"),
     "no place": ("at = [2, 0]", "at"),
 }
