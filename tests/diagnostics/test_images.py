@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -137,7 +138,7 @@ def rough(depth, random, generator):
 
 
 def test_a_depth_camera_with_light_of_its_kind_in_view_is_named_and_no_quiet_one(depth):
-    take = SimpleNamespace(depth=tuple(DepthEntry(name=n) for n in ("depth", "other")))
+    take = SimpleNamespace(depth=tuple(DepthEntry(name=n, file=Path(n)) for n in ("depth", "other")))
     late = replace(depth.without(np.arange(15)), sensor="other")
     assert noise_findings(take, [depth, late]) == []
     (found,) = noise_findings(take, [changed(depth, range(15, 30), stripes), late])

@@ -74,7 +74,7 @@ def test_tables_that_are_none(tmp_path, text, error, said):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("sigma = 0.003", "sigma = 3.0", "sigma 3.0 m"),
+        ("sigma = 0.003", "sigma = 3.0", "sigma = 3.0. Give metres"),
         ("sigma = 0.003", "slide = 0.003", "no key 'slide'"),
         ("sigma = 0.003", "time_offset = 50.0", "points"),
         ("points.csv", "nothing.csv", "no such file"),

@@ -51,8 +51,8 @@ class Check:
     test : from what is known so far to findings. It leaves what is known as it would be with its findings corrected,
         for the checks after it.
     needs : attributes of `Checked` that must be there (true, or not empty)
-    cost : [s] of one core for 100 frames of four cameras (of depth cameras: for their images), as measured. `kinefit
-        track` runs checks of at most `QUICK_S`.
+    cost : [s] of one core for 100 frames of four cameras (of depth cameras: for their images), as measured. Tracking
+        runs checks of at most `QUICK_S`.
     alike : what else would look the same, in one sentence; added to faults and doubts
     reads : whether it reads files, which `kinefit track` does by itself
     """
