@@ -23,7 +23,7 @@ from kinefit.readers.take.load import load_observations
 from kinefit.readers.take.pictures import TakePictures
 from kinefit.readers.video import Video
 from kinefit.rendering import render_body
-from kinefit.rendering.colours import LEFT, RIGHT, to_hex
+from kinefit.rendering.colours import LEFT_COLOUR, RIGHT_COLOUR, to_hex
 from kinefit.simulation import cut, movement, retarget, squat_and_wave, write_synthetic_take
 from kinefit.takes.missing import find_cameras
 
@@ -220,5 +220,5 @@ def gait() -> None:
             foot = next(side for side in cycles.sides if side.name == name)
             lines += [(PERCENT, curve, line, dashes) for curve in normalised(knee, foot.spans)]
         panels.append((f"{name} knee", lines))
-    legend = {"left, tracked": to_hex(LEFT), "right, tracked": to_hex(RIGHT), "known": "#222 4 3"}
+    legend = {"left, tracked": to_hex(LEFT_COLOUR), "right, tracked": to_hex(RIGHT_COLOUR), "known": "#222 4 3"}
     curves(results.IMAGES / "gait.svg", panels, x="gait cycle [%]", y="knee flexion [deg]", legend=legend)
