@@ -210,7 +210,7 @@ def gait() -> None:
     take = write_synthetic_take(out / "take", walk)
     results.command("track", take, "--out", out / "results", "--no-overlays", "--no-report", "-q")
     panels = []
-    for name, colour in (("left", LEFT), ("right", RIGHT)):
+    for name, colour in (("left", LEFT_COLOUR), ("right", RIGHT_COLOUR)):
         lines: list[tuple[NDArray, NDArray, str, str]] = []
         tracked = read_motion(out / "results" / "motion.npz")
         for motion, line, dashes in ((tracked, to_hex(colour), ""), (walk, "#222", "4 3")):
