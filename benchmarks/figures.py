@@ -114,6 +114,8 @@ def run_parts(parts: Mapping[str, str]) -> None:
         sys.exit(f"no part {', '.join(unknown)}; there are: {', '.join(parts)}, and {', '.join(OPTIONS)}")
     if "--quick" in options:
         os.environ[QUICK] = "1"
+    paths = [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]  # processes that parts start find this
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))  # package, after a command ran in theirs, too
     if _command():
         from benchmarks.ledger import commit
 
