@@ -22,14 +22,14 @@ MOMENTS = 5  # doubtful moments that are listed, the worst first
 
 def print_summary(motion: Motion, *, points: bool = False) -> None:
     """Print it; with `points`, the residual of every point in every camera too."""
-    from kinefit.exporters.report.fit import sensor_fits, told
+    from kinefit.exporters.report.fit import sensor_fits, value_text
     from kinefit.exporters.report.moments import doubt_sentence, doubtful_moments, throughout_sentence, when
 
     seconds = len(motion) / motion.rate
     say(f"\n{motion.name}: {len(motion)} frames at {motion.rate:g} Hz ({seconds:.2f} s), body {motion.body.name}")
     if motion.residuals:
         rows = [
-            (f.name, told(f.median, f.unit), f"{100 * f.left_out:.1f} %", f"{f.swapped} frames")
+            (f.name, value_text(f.median, f.unit), f"{100 * f.left_out:.1f} %", f"{f.swapped} frames")
             for f in sensor_fits(motion)
         ]
         print_table(("sensor", "median residual", "rejected points", "left/right swaps"), rows)

@@ -16,8 +16,8 @@ from kinefit.motion import rotation_between_up
 from kinefit.observations import SkeletonMotion
 
 _MIN_BONE_LENGTH = 0.005  # [m]: a shorter bone has no direction
-_FAR = {"thigh": "shank", "shank": "foot", "foot": "toes", "upperarm": "forearm", "forearm": "hand"}
-_CHAINS = tuple((f"{bone}_{s}", f"{far}_{s}") for bone, far in _FAR.items() for s in SIDES)
+_NEXT_BONE = {"thigh": "shank", "shank": "foot", "foot": "toes", "upperarm": "forearm", "forearm": "hand"}
+_CHAINS = tuple((f"{bone}_{s}", f"{far}_{s}") for bone, far in _NEXT_BONE.items() for s in SIDES)
 _MAX_REST_DEG = 10.0  # of thighs and shanks in an upright rest pose, forward or backward of the vertical
 _MAX_TRUNK_DEG = 25.0  # likewise of the line from hips to neck, which leans backward by 14 degrees in CMU's skeletons
 _MAX_OFF_AXIS_DEG = 4.0  # nearer to one of the axes, a rest pose stands along that axis
@@ -134,7 +134,7 @@ def bone_directions(skeleton: SkeletonMotion, names: Mapping[str, str] | None = 
     else:
         bones["head"], across["head"] = end("head_top", "head") - neck, turned("head", "right")
     for s in SIDES:
-        bones |= {f"{bone}_{s}": joint[f"{far}_{s}"] - joint[f"{bone}_{s}"] for bone, far in _FAR.items()}
+        bones |= {f"{bone}_{s}": joint[f"{far}_{s}"] - joint[f"{bone}_{s}"] for bone, far in _NEXT_BONE.items()}
         bones[f"toes_{s}"] = end(f"toe_end_{s}", f"toes_{s}") - joint[f"toes_{s}"]
         bones[f"clavicle_{s}"] = joint[f"upperarm_{s}"] - neck
         bones[f"hand_{s}"] = end(f"knuckle_{s}", f"hand_{s}") - joint[f"hand_{s}"]

@@ -117,7 +117,7 @@ def last_found(take: Take) -> Take:
 
 
 def _kept(take: Take, tell: Tell) -> FoundCameras | None:
-    """The cameras that were found for a take before, of its height; None, which is told, where they are of others."""
+    """The cameras that were found for a take before, of its height; None, which is said, where they are of others."""
     file = cameras_file(take.path)
     found = read_found(file)
     if found is None:

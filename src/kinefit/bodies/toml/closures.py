@@ -15,7 +15,7 @@ from kinefit.errors import BodyError, check_choice, located
 
 ESTIMATE = "estimate"
 _MAX_DIMENSION = 1e4  # [m] or [deg]
-_NONE = (0.0, 0.0, 0.0)
+_ZERO_VECTOR = (0.0, 0.0, 0.0)
 
 
 def closed(
@@ -60,7 +60,7 @@ def _closure(body: Body, r: ClosureRecord) -> Closure:
     one = (r.to is None) != (r.at is None)
     _check(one, "`to` and `at`: one of them is needed", "Give `to` a landmark, or `at` a place in the world.")
     unknown = r.at == ESTIMATE
-    at = r.mean if unknown else (r.at or _NONE)
+    at = r.mean if unknown else (r.at or _ZERO_VECTOR)
     if isinstance(at, str):
         raise BodyError(f"at = {at!r}", remedy='Give three numbers in metres, or "estimate".')
     wanted = (r.kind in ("line", "plane")) == (r.axis is not None)
@@ -79,7 +79,7 @@ def _closure(body: Body, r: ClosureRecord) -> Closure:
         remedy = 'Use "x", "y", "z", or three numbers that are not all zero.'
         raise BodyError(f"axis {r.axis!r} is no direction", remedy=remedy)
     _check(bool(np.isfinite([*at, *(r.turn or ())]).all()), "numbers that are not finite", "Give metres and degrees.")
-    turn, turn_sigma, turn_std = np.radians(r.turn or _NONE), np.radians(sigmas[1]), np.radians(r.turn_std)
+    turn, turn_sigma, turn_std = np.radians(r.turn or _ZERO_VECTOR), np.radians(sigmas[1]), np.radians(r.turn_std)
     return Closure(
         r.name, r.kind, r.point, r.to or "", at, _vector(axis), _vector(turn), sigma, float(turn_sigma),
         r.mode == "hard", r.std if unknown else 0.0, float(turn_std) if unknown and r.kind == "rigid" else 0.0,
@@ -121,4 +121,4 @@ def _dimension(body: Body, r: DimensionRecord) -> tuple[Dimension, float]:
         raise BodyError("`about` is no direction", remedy="Give three numbers that are not all zero.")
     unit = 1.0 if r.about is None else np.pi / 180.0
     std = std * unit if estimated else 0.0
-    return Dimension(r.name, r.drawn * unit, r.along or _NONE, _vector(axis), tuple(r.moves), std), value * unit
+    return Dimension(r.name, r.drawn * unit, r.along or _ZERO_VECTOR, _vector(axis), tuple(r.moves), std), value * unit

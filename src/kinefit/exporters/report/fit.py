@@ -66,7 +66,7 @@ def sensor_table(motion: Motion, fits: Sequence[SensorFit]) -> Html:
         more = " …" if len(swaps) > 6 else ""
         swapped = joined(f"{f.swapped} frames: ", Html(", ".join(links)), more) if swaps else "–"
         rows.append(
-            [f.name, told(f.median, f.unit), told(f.most, f.unit), *(shift[:2] if flat else shift),
+            [f.name, value_text(f.median, f.unit), value_text(f.most, f.unit), *(shift[:2] if flat else shift),
              f"{100 * f.seen:.0f} %", f"{100 * f.left_out:.1f} %", swapped]
         )  # fmt: skip
     if flat:
@@ -144,6 +144,6 @@ def point_medians(r: Residuals) -> dict[str, float]:
     return {name: SHOWN_UNITS[r.unit][0] * known_median(norms) for name, norms in zip(r.names, r.norms.T)}
 
 
-def told(value: float, unit: str) -> str:
+def value_text(value: float, unit: str) -> str:
     """A residual in words."""
     return f"{value:.1f} {unit}" if np.isfinite(value) else "no data"
