@@ -19,6 +19,7 @@ from kinefit._jit import cache_directory
 
 _BASE = ("numpy==2.4.6", "scipy==1.17.1")
 _ROOT = Path(__file__).parents[2]
+_OWN_PATHS = "PYTHONPATH", "PYTHONHOME", "PYTHONSAFEPATH"  # of this process, not of the peer
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -102,7 +103,7 @@ def run_peer(peer: str, folder: Path, timeout: float = 900.0) -> dict[str, Any]:
     if python is None:
         return {"peer": peer, "reason": reason}
     record = PEERS[peer]
-    variables = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTHONHOME")}
+    variables = {name: value for name, value in os.environ.items() if name not in _OWN_PATHS}
     command = [str(python), "-m", f"benchmarks.peers.{record.runner}", str(folder.resolve()), *record.arguments]
     taskset = shutil.which("taskset")
     if taskset and hasattr(os, "sched_getaffinity"):
