@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -61,16 +62,21 @@ class TakeFolder:
             return UNFINISHED
         if not (people := self.people):
             return NEW
-        return OUTDATED if any(is_outdated(_provenance(folder), self.file) for folder in people) else COMPLETE
+        return OUTDATED if any(is_outdated(_made_from(folder), self.file) for folder in people) else COMPLETE
 
 
-def _provenance(folder: Path) -> Mapping[str, Any]:
+def _made_from(folder: Path) -> Mapping[str, Any]:
     """What the motion in a folder of results was computed from; empty where it cannot be read."""
+    motion = folder / "motion.npz"
     try:
-        arrays = read_npz(folder / "motion.npz", "provenance", remedy="")
-        return dict(json.loads(str(arrays["provenance"])))
-    except (KinefitError, KeyError, ValueError):
+        return _provenance(motion, motion.stat().st_mtime_ns)
+    except (KinefitError, OSError, KeyError, ValueError):
         return {}
+
+
+@lru_cache(4096)
+def _provenance(motion: Path, changed: int) -> Mapping[str, Any]:
+    return dict(json.loads(str(read_npz(motion, "provenance", remedy="")["provenance"])))
 
 
 def subfolders(folder: Path) -> list[Path]:

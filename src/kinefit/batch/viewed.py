@@ -6,6 +6,7 @@ import hashlib
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -137,11 +138,17 @@ def is_outdated(provenance: Mapping[str, Any], take: Path) -> bool:
     if _INPUTS not in provenance or provenance.get("take") != take.name:
         return False
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)  # old keys were said when the take was tracked
-            return inputs_entry(read_take(take))[_INPUTS] != provenance[_INPUTS]
+        return inputs_entry(_read(take, take.stat().st_mtime_ns))[_INPUTS] != provenance[_INPUTS]
     except (KinefitError, OSError):
         return False
+
+
+@lru_cache(1024)
+def _read(take: Path, changed: int) -> Take:
+    """The take file of this change [ns]: the window's lists ask for the same ones every two seconds."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # old keys were said when the take was tracked
+        return read_take(take)
 
 
 def _fitting(file: Path | None, name: str, tell: Tell) -> tuple[Take, Observations] | None:
