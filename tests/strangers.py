@@ -32,7 +32,7 @@ from kinefit.batch.processes import run_here
 assert dict(run_here(len, ["four"], workers=1, retries=0)) == {0: 4}
 """,
     "a process of a live session": """
-from kinefit._processes import Pool
+from kinefit._threads import Pool
 with Pool(1) as pool:
     assert pool.submit(len, "four").result() == 4
 """,

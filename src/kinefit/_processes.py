@@ -6,12 +6,9 @@ import os
 import shutil
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 _START_LOCK = threading.RLock()  # environment and search path belong to all threads
 
@@ -53,16 +50,3 @@ def starting(**more: str) -> Iterator[None]:
             sys.path = path
             for name, text in before.items():
                 os.environ.pop(name) if text is None else os.environ.update({name: text})
-
-
-class Pool(ProcessPoolExecutor):
-    """A `ProcessPoolExecutor` of new processes, each started in the context `starting()`."""
-
-    def __init__(self, workers: int, initializer: Callable[[], object] | None = None) -> None:
-        with starting():
-            super().__init__(workers, get_context("spawn"), initializer)
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **more: Any) -> Future[Any]:
-        """Run a function of a module in one of the processes."""
-        with starting():  # the executor starts its processes here
-            return super().submit(fn, *args, **more)

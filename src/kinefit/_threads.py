@@ -5,8 +5,11 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
+from typing import Any, TypeVar
+
+from kinefit._processes import starting
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -59,3 +62,16 @@ def _next(source: Iterator[T]) -> tuple[T] | tuple[()]:
     for thing in source:
         return (thing,)
     return ()
+
+
+class Pool(ProcessPoolExecutor):
+    """A `ProcessPoolExecutor` of new processes, each started in the context `starting()`."""
+
+    def __init__(self, workers: int, initializer: Callable[[], object] | None = None) -> None:
+        with starting():
+            super().__init__(workers, get_context("spawn"), initializer)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **more: Any) -> Future[Any]:
+        """Run a function of a module in one of the processes."""
+        with starting():  # the executor starts its processes here
+            return super().submit(fn, *args, **more)

@@ -31,7 +31,7 @@ def warmup() -> None:
     """
     from kinefit import assets
     from kinefit._jit import kernel_folder
-    from kinefit._processes import Pool
+    from kinefit._threads import Pool
     from kinefit.errors import AssetError
 
     begin = perf_counter()

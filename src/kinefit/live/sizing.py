@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from kinefit._processes import Pool
+from kinefit._threads import Pool
 from kinefit.bodies import Body
 from kinefit.errors import KinefitError
 from kinefit.frame.results import FrameResult
