@@ -1,4 +1,4 @@
-"""Work on several cores at once: threads, as compiled kernels, the networks and FFmpeg let others run meanwhile."""
+"""Work on several cores at once: processes; threads, as compiled kernels, networks and FFmpeg let others run."""
 
 from __future__ import annotations
 
