@@ -30,17 +30,24 @@ def pytest_configure(config):
         subprocess.run([sys.executable, "-m", "kinefit", "warmup"], check=True, capture_output=True)
 
 
-@pytest.fixture(autouse=True)
-def environment_of_each_test():
-    """Take back what the command line sets in the environment of its process: here that is the tests' own."""
-    names = ("PATH", "PYTHONPATH", "PYTHONSAFEPATH", "NoDefaultCurrentDirectoryInExePath")
-    before = {name: os.environ.get(name) for name in names}
-    yield
-    for name, value in before.items():
+_SEARCH_PATHS = "PATH", "PYTHONPATH", "PYTHONSAFEPATH", "NoDefaultCurrentDirectoryInExePath"
+_PATHS = {name: os.environ.get(name) for name in _SEARCH_PATHS}  # before any test
+
+
+def _restore_paths():
+    for name, value in _PATHS.items():
         if value is None:
             os.environ.pop(name, None)
         else:
             os.environ[name] = value
+
+
+@pytest.fixture(autouse=True)
+def environment_of_each_test():
+    """Take back what the command line sets in its process, here the tests' own: by a test or by fixtures before it."""
+    _restore_paths()
+    yield
+    _restore_paths()
 
 
 @pytest.fixture(scope="session")
