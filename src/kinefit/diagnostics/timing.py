@@ -27,7 +27,7 @@ from kinefit.diagnostics.views import (
 from kinefit.errors import TrackingError
 from kinefit.findings import Edit, Finding, Severity, in_words, listed
 from kinefit.geometry.camera import Rig
-from kinefit.multiview.medians import medians
+from kinefit.multiview.association import medians
 from kinefit.observations import Keypoints
 
 Curve = tuple[NDArray, NDArray]

@@ -13,8 +13,7 @@ from kinefit.bodies import Body, PointSet
 from kinefit.bodies.limbs import rigid_pairs
 from kinefit.calibration.people.first_rig import first_rig
 from kinefit.calibration.people.floor import centre_of_mass, settled
-from kinefit.calibration.people.skeletons import first_cameras, in_step
-from kinefit.calibration.people.steady import steady_person
+from kinefit.calibration.people.skeletons import first_cameras, in_step, steady_person
 from kinefit.calibration.refine.gauge import resized
 from kinefit.calibration.refine.refine import Length, check_input, length_of, prior_sigma, refine_from
 from kinefit.calibration.refine.result import Refinement
