@@ -61,13 +61,34 @@ def accumulate(data, segment, factor, count, cx, cy, cz, blocks):
             h44 += w4 * a4
             h45 += w4 * a5
             h55 += w * a5 * a5
-        b, k = blocks[s], 0
-        for v in (
-            h00, h01, h02, h03, h04, h05, h11, h12, h13, h14, h15, h22, h23, h24, h25, h33, h34, h35, h44, h45, h55,
-            g0, g1, g2, g3, g4, g5,
-        ):  # fmt: skip
-            b[k] += v
-            k += 1
+        b = blocks[s]
+        b[0] += h00
+        b[1] += h01
+        b[2] += h02
+        b[3] += h03
+        b[4] += h04
+        b[5] += h05
+        b[6] += h11
+        b[7] += h12
+        b[8] += h13
+        b[9] += h14
+        b[10] += h15
+        b[11] += h22
+        b[12] += h23
+        b[13] += h24
+        b[14] += h25
+        b[15] += h33
+        b[16] += h34
+        b[17] += h35
+        b[18] += h44
+        b[19] += h45
+        b[20] += h55
+        b[21] += g0
+        b[22] += g1
+        b[23] += g2
+        b[24] += g3
+        b[25] += g4
+        b[26] += g5
         i = j
 
 
