@@ -17,12 +17,11 @@ from kinefit.errors import BodyError, ObservationError
 from kinefit.losses import SQUARED, Loss, huber
 from kinefit.solvers.equations import inverse
 from kinefit.solvers.least_squares import MAX_DAMPING, descend
-from kinefit.subject.parameters import World
+from kinefit.subject.parameters import Parameters, World
 
 RADIUS_STD = 0.2
 """Standard deviation of a radius' logarithm between people, as of cylinders' half axes."""
 _WEIGHT_STD = 0.3  # standard deviation of a weight's logarithm
-_STEP = 1e-3  # of finite differences
 _HUBER_SIGMAS = 2.0
 _MAX_ITERATIONS = 30
 _TOLERANCE = 1e-10  # share of the cost that a step must be predicted to lower it by
@@ -36,7 +35,7 @@ minimum, as in two of four arms."""
 
 
 @dataclass(frozen=True, eq=False)
-class MetaballShape:
+class MetaballShape(Parameters):
     """Logarithms of the radii of a body's metaballs, and optionally of their weights, limb by limb.
 
     Parameters
@@ -54,6 +53,7 @@ class MetaballShape:
     body: Body
     weights: bool = False
     girth: float = RADIUS_STD
+    difference = 1e-3
 
     def __post_init__(self) -> None:
         if not self._limbs:
@@ -82,20 +82,10 @@ class MetaballShape:
         return tuple(frozenset((segment,)) for segment, count in each for _ in range(count))
 
     @property
-    def mean(self) -> NDArray:
-        """(p,) zero."""
-        return np.zeros(len(self.names))
-
-    @property
     def information(self) -> NDArray:
         """(p, p) prior information."""
         std = [_WEIGHT_STD if name.endswith("weight") else self.girth for name in self.names]
         return np.diag(np.array(std) ** -2.0)
-
-    @property
-    def step(self) -> NDArray:
-        """(p,) steps of finite differences."""
-        return np.full(len(self.names), _STEP)
 
     def apply(self, world: World, values: NDArray) -> World:
         """The body with these logarithms (p,) of factors on radii and weights."""
