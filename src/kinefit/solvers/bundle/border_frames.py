@@ -16,8 +16,7 @@ from kinefit.losses import SQUARED, Loss
 from kinefit.rows import AnyRows, Rows
 from kinefit.solvers import _kernels_border, _kernels_linear
 from kinefit.solvers.bundle.arrow import MIN_DIAGONAL_RATIO
-from kinefit.solvers.bundle.whitened import PoseScrews, columns, residuals, softening
-from kinefit.solvers.equations import dense_pattern, lock, normal_equations
+from kinefit.solvers.equations import columns, dense_pattern, lock, normal_equations, residuals, softening
 from kinefit.solvers.least_squares import bounds_of, descend
 from kinefit.solvers.pixels import fit_pixels
 
@@ -108,8 +107,8 @@ class FrameEquations:
     @cached_property
     def J(self) -> NDArray:
         """(N, n) derivatives by the pose, whitened and softened."""
-        pose = PoseScrews.of(self.body, self.state)
-        blocks = [np.empty((0, len(self.g))), *(columns(rows, pose) for _, rows in self.parts)]
+        own = (columns(rows, self.body, self.state) for _, rows in self.parts)
+        blocks = [np.empty((0, len(self.g))), *own]
         return np.asarray(self.factor[:, None] * np.concatenate(blocks))
 
     @property
