@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from kinefit.bodies import Body
+from kinefit.diagnostics.cameras import MIN_SIGMAS
 from kinefit.diagnostics.checks import CHECKS, Checked, run
 from kinefit.diagnostics.person import size_findings
 from kinefit.errors import KinefitError
@@ -36,7 +37,6 @@ _MIN_INVERTED_ANGLE = 135.0  # [deg] median angle between trunk and vertical
 _MIN_LYING_ANGLE = 60.0  # [deg] the same; a median, as bending is brief
 _MIN_LYING_TRAVEL = 0.5  # [m] across the trunk: a lying person does not move so far
 _MIN_LATE_S = 0.05  # of a camera's clock: a hand that gestures at 0.5 m/s is 2.5 cm off by that
-_MIN_LATE_SIGMAS = 8.0  # standard errors of the same
 
 
 def input_findings(take: Take, seen: Observations, keypoints: Sequence[Keypoints], body: Body) -> tuple[Finding, ...]:
@@ -63,7 +63,7 @@ def input_findings(take: Take, seen: Observations, keypoints: Sequence[Keypoints
     )  # fmt: skip
     found, late = run(checked, CHECKS).findings, list[Finding]()
     if (t := checked.times) is not None:
-        clear = np.abs(t.offsets) >= np.maximum(_MIN_LATE_S, _MIN_LATE_SIGMAS * t.std)
+        clear = np.abs(t.offsets) >= np.maximum(_MIN_LATE_S, 2 * MIN_SIGMAS * t.std)
         names = {name for name, is_late in zip(t.cameras, clear) if is_late}
         late = [f for f in found if f.kind == "time" and f.severity == "doubt" and names & {*f.cameras}]
     return *faults_of(found), *late

@@ -31,8 +31,7 @@ from kinefit.takes.missing import prepared
 from kinefit.tracking.cameras import as_found
 from kinefit.tracking.checkpoints.checkpoint import Checkpoint
 from kinefit.tracking.checkpoints.interrupted import TrackingInterrupted
-from kinefit.tracking.takes.floor_level import on_floor, rig_on_floor
-from kinefit.tracking.takes.take_recording import from_afar, label_findings_of, recording_of
+from kinefit.tracking.take_recording import from_afar, label_findings_of, on_floor, recording_of, rig_on_floor
 from kinefit.tracking.video import Progress, track
 
 _DEFAULT_BODY = "humanoid"  # body of a take that names none
@@ -74,10 +73,7 @@ def track_take(
             remedy='Add [start], or [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
         )  # fmt: skip
     if not alone:
-        raise TakeError(
-            "the take has no [[keypoints]] and no other sensor", file=take.path,
-            remedy=f"Add keypoints of two or more cameras; {command('detect', take.path)} detects them in videos.",
-        )  # fmt: skip
+        raise _without_keypoints(take, " and no other sensor")
     named = body if take.start is None or take.body == _DEFAULT_BODY else load_body(take.body)
     if named.tree.segments != body.tree.segments:
         raise TakeError(
@@ -126,12 +122,13 @@ def load_keypoints(take: Take, *, exteriors: bool = True) -> Observations:
     """
     observations = load_observations(take, exteriors=exteriors)
     if not observations.keypoints or observations.rig is None:
-        raise TakeError(
-            "the take has no [[keypoints]]",
-            file=take.path,
-            remedy=f"Add keypoints of two or more cameras; {command('detect', take.path)} detects them in videos.",
-        )
+        raise _without_keypoints(take)
     return observations
+
+
+def _without_keypoints(take: Take, more: str = "") -> TakeError:
+    remedy = f"Add keypoints of two or more cameras; {command('detect', take.path)} detects them in videos."
+    return TakeError(f"the take has no [[keypoints]]{more}", file=take.path, remedy=remedy)
 
 
 def trial_of(take: Take, *, frames: int = 50) -> Subject | None:

@@ -23,7 +23,7 @@ from kinefit.exporters.report.moments import (
     shared_by_prior,
     throughout_sentence,
 )
-from kinefit.exporters.report.plots import band, thinned
+from kinefit.exporters.report.page import band, thinned
 from kinefit.exporters.report.report import trust_sentence, write_report
 from kinefit.findings import runs_of
 from kinefit.geometry import se3
