@@ -152,7 +152,6 @@ def track_person(
     from kinefit.multiview import followed
     from kinefit.takes.track import settings_of, track_take
     from kinefit.tracking import cameras
-    from kinefit.tracking.agreement import sentences
     from kinefit.tracking.checkpoints.checkpoint import Checkpoint, key_of
     from kinefit.tracking.take_recording import floor_sentences
     from kinefit.tracking.video import TrackingInterrupted
@@ -174,7 +173,7 @@ def track_person(
             motion, seen = track_take(
                 take, **how, checkpoint=unfinished, view=view, progress=read
             )
-            notes += [*seen.notes, *sentences(motion.provenance["contradictions"])]
+            notes += [*seen.notes, *cameras.contradiction_sentences(motion.provenance["contradictions"])]
             notes += followed.sentences(motion.provenance, asked=take.person is not None)
             notes += cameras.sentences(motion.provenance, settings_of(take).camera_errors)
             notes += [*motion.provenance.get(CLOCKS, ()), *motion.provenance.get(LABELS, ())]
@@ -234,7 +233,8 @@ def work(job: TakeJob) -> tuple[Row, ...]:
     try:
         with _warnings_in(said):
             take = asked_take(job.take, job.choices)
-        start = _of_session(start, take)
+        keys = ("subject", "visit", "date", "movement")
+        start = msgspec.structs.replace(start, **{key: take.session.stated.get(key, "") for key in keys})
         key = key_of(take, **asdict(replace(job.choices, restart=False)))
         complete = not is_uncalibrated(last_found(take))  # whoever deletes found cameras wants others
     except KinefitError as error:
@@ -290,24 +290,14 @@ def _tracked(job: TakeJob, take: Take, start: Row, said: list[str]) -> tuple[tup
     return tuple(rows), made
 
 
-def _of_session(row: Row, take: Take) -> Row:
-    entries = take.session.stated
-    keys = ("subject", "visit", "date", "movement")
-    return msgspec.structs.replace(row, **{key: entries.get(key, "") for key in keys})
-
-
 def of_motion(row: Row, motion: Motion, notes: tuple[str, ...]) -> Row:
     """The row with a motion's length, quality, ranges of motion and findings."""
     from kinefit.exporters.report.angles import ranges_of
 
-    ranges = []
-    for coordinate, sides in ranges_of(motion).items():
-        for side, found in sides.items():
-            if found is None:
-                ranges.append(Range(coordinate, side))
-                continue
-            ends = found.lowest[0], found.highest[0]
-            ranges.append(Range(coordinate, side, *ends, *found.span, found.share))
+    ranges = [
+        Range(coordinate, side, *((r.lowest[0], r.highest[0], *r.span, r.share) if r else ()))
+        for coordinate, sides in ranges_of(motion).items() for side, r in sides.items()
+    ]  # fmt: skip
     return msgspec.structs.replace(
         row, frames=len(motion), seconds=len(motion) / motion.rate, quality=float(motion.quality.mean()),
         lost=float(motion.lost.mean()), notes=notes, findings=of_provenance(motion.provenance), ranges=tuple(ranges),
