@@ -139,9 +139,11 @@ def of_provenance(provenance: Mapping[str, Any]) -> tuple[Finding, ...]:
         return ()
 
 
-def listed(names: Iterable[str]) -> str:
-    """Names as "a", "a and b" or "a, b and c"."""
+def listed(names: Iterable[str], most: int = 99) -> str:
+    """Names as "a", "a and b" or "a, b and c"; those beyond `most` are counted."""
     names = list(names)
+    if len(names) > most + 1:
+        names = [*names[:most], f"{len(names) - most} more"]
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1] if names else "none"
 
 

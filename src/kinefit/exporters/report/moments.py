@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.bodies.limbs import finger_groups
 from kinefit.exporters.curves import DIGITS, split_side
-from kinefit.findings import runs_of
+from kinefit.findings import listed, runs_of
 from kinefit.motion import Motion, Residuals
 
 DOUBT_DISTANCE_M = 0.08  # [m] from the truth: about as thick as a limb, which then lies beside itself
@@ -182,7 +182,8 @@ def throughout_sentence(motion: Motion) -> str:
     widest: dict[str, float] = {}
     for name, words in _spoken(motion.body, list(sigmas)).items():
         widest[words] = max(sigmas[name], widest.get(words, 0.0))
-    return listed([f"{name} (±{200 * sigma:.0f}\u00a0cm)" for name, sigma in widest.items()], 20)
+    each = [f"{name} (±{200 * sigma:.0f}\u00a0cm)" for name, sigma in widest.items()]
+    return listed(each, 20) if each else ""
 
 
 def when(motion: Motion, m: Moment) -> str:
@@ -199,7 +200,7 @@ def span(motion: Motion, m: Moment) -> str:
 def place(motion: Motion, m: Moment) -> str:
     """Frames and segments of a moment: "(frames 36–43): head"."""
     frames = f"frame {m.start}" if m.stop - m.start == 1 else f"frames {m.start}–{m.stop - 1}"
-    return f"({frames}): {listed(spoken_segments(motion.body, m.segments)) or 'whole body'}"
+    return f"({frames}): {listed(spoken_segments(motion.body, m.segments) or ['whole body'], 4)}"
 
 
 def never_observed(motion: Motion) -> tuple[str, ...]:
@@ -243,14 +244,6 @@ def _spoken(body: Body, segments: Sequence[str]) -> dict[str, str]:
     groups = finger_groups(body)
     hand = {s: name for name, own in groups.items() if len(set(own) & set(segments)) > 1 for s in own}
     return {s: f"fingers of the {plain(hand[s])}" if s in hand else plain(s) for s in segments}
-
-
-def listed(names: Sequence[str], most: int = 4) -> str:
-    """Names as "a, b and c"; those beyond `most` are counted."""
-    names = list(names)
-    if len(names) > most + 1:
-        names = [*names[:most], f"{len(names) - most} more"]
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def _runs(motion: Motion, flags: NDArray) -> list[tuple[int, int]]:
@@ -310,7 +303,7 @@ def _sentences(body: Body, group: Sequence[_Doubt]) -> Iterable[str]:
     """What a moment's findings say; what is the same of several segments is said once, of all."""
     for kind in dict.fromkeys(g.kind for g in group):
         same = [g for g in group if g.kind == kind]
-        names = listed(spoken_segments(body, [g.segment for g in same]))
+        names = listed(spoken_segments(body, [g.segment for g in same]), 4)
         most = max(g.amount for g in same)
         if kind == "nobody":
             yield "The person was not observed; the body keeps its last pose."
@@ -334,7 +327,7 @@ def causes(motion: Motion, moment: Moment) -> tuple[str, ...]:
         seen_points += int(seen.sum())
     seeing = [name for name, share in share_seen.items() if share >= 0.5]
     if pixels and len(seeing) < len(pixels) and len(seeing) <= 2:
-        out.append(f"Only {listed(seeing)} saw it." if seeing else "No camera saw it for most of this time.")
+        out.append(f"Only {listed(seeing, 4)} saw it." if seeing else "No camera saw it for most of this time.")
     if seen_points and sum(left_out.values()) >= _MIN_OUTLIER_SHARE * seen_points:
         most = max(left_out, key=lambda name: left_out[name])
         share = 100 * sum(left_out.values()) / seen_points
@@ -344,10 +337,10 @@ def causes(motion: Motion, moment: Moment) -> tuple[str, ...]:
     for text, of in (("No measurement supports {}", quality <= 0), (more, quality > 0)):
         gone = 2 * (of & motion.lost[frames]).sum(axis=0) > len(quality)
         if names := [n for n in moment.segments if gone[motion.body.tree.segments.index(n)]]:
-            out.append(text.format(listed(spoken_segments(motion.body, names))) + ".")
+            out.append(text.format(listed(spoken_segments(motion.body, names), 4)) + ".")
     swapped = [name for name, r in pixels.items() if np.any(np.asarray(r.swapped)[frames])]
     if swapped:
-        out.append(f"The detector swapped left and right in {listed(swapped)} (corrected).")
+        out.append(f"The detector swapped left and right in {listed(swapped, 4)} (corrected).")
     return tuple(out)
 
 

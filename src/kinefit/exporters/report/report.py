@@ -32,12 +32,11 @@ from kinefit.exporters.report.moments import (
     Moment,
     doubt_sentence,
     doubtful_moments,
-    listed,
     never_observed,
     shared_by_prior,
     throughout_sentence,
 )
-from kinefit.findings import of_provenance
+from kinefit.findings import listed, of_provenance
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 
