@@ -14,14 +14,11 @@ from kinefit.diagnostics.quick import input_findings, with_cause, with_findings
 from kinefit.errors import KinefitError, TakeError, command
 from kinefit.identification.take.takes import with_names
 from kinefit.motion import Motion
-from kinefit.multiview.association import choose_people, person_records
-from kinefit.multiview.followed import follow
 from kinefit.readers.calibration.found import found_notes
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.checks import check_enough
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import Observations, load_observations
-from kinefit.sensors.channels import make_channels
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.online.known_noise import KnownNoise
 from kinefit.subject.keypoints import fit_subject
@@ -31,6 +28,8 @@ from kinefit.takes.missing import prepared
 from kinefit.tracking.cameras import as_found
 from kinefit.tracking.checkpoints.checkpoint import Checkpoint
 from kinefit.tracking.checkpoints.interrupted import TrackingInterrupted
+from kinefit.tracking.recording import Recording
+from kinefit.tracking.sizing import channels_of
 from kinefit.tracking.take_recording import from_afar, label_findings_of, on_floor, recording_of, rig_on_floor
 from kinefit.tracking.video import Progress, track
 
@@ -144,6 +143,6 @@ def trial_of(take: Take, *, frames: int = 50) -> Subject | None:
     seen, body = load_keypoints(trial), load_body(take.body)
     assert seen.rig is not None
     sigma, cameras = [entry.sigma for entry in trial.keypoints], settings_of(trial).camera_errors
-    keypoints = follow(seen.rig, seen.keypoints, trial.person).keypoints
-    channels = make_channels(body, seen.rig, person_records(keypoints, choose_people(seen.rig, keypoints)), sigma)
+    of_person = Recording.of_keypoints(seen.rig, seen.keypoints, sigma=sigma, person=trial.person)
+    channels = channels_of(of_person, body, TrackSettings())
     return fit_subject(body, channels, frames=frames, height=trial.height or take.height, cameras=cameras)
