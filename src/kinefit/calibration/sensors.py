@@ -218,12 +218,12 @@ class _PlacementProblem:
         return out
 
     def fit(
-        self, looks: Sequence[Look], twists: dict[str, NDArray], parameters: Sequence[Parameters], start: NDArray,
+        self, some: Sequence[Look], twists: dict[str, NDArray], parameters: Sequence[Parameters], start: NDArray,
         **options: Any,
     ) -> SubjectFit:  # fmt: skip
         """Fit parameters to some frames from a start (P,), at which the sensors have twists (7,)."""
-        measured, scenes = [], [scene for _, scene in looks]
-        for look in looks:
+        measured, scenes = [], [scene for _, scene in some]
+        for look in some:
             at = round((look[1].time - self.recording.times[0]) * self.recording.rate)
             pixels = self.sensors.measurements(self.recording.keypoints_at(at), look[1])
             measured.append([*measurements_at(look, self.sensors, self.centre, twists), *pixels])
