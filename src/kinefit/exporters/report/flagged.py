@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from kinefit.exporters.pictures.drawing import draw_body, draw_residuals, drawn_points
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.moments import Moment, doubtful_moments, place, span, spoken_segments
-from kinefit.findings import listed
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
 
@@ -52,7 +51,7 @@ def time_line(motion: Motion, moments: Sequence[Moment]) -> p.Html:
     """When what is doubtful: one row for each part of the body, the worst first; a click moves the 3D figure there."""
     rows: dict[str, list[Moment]] = {}
     for m in moments:
-        rows.setdefault(listed(spoken_segments(motion.body, m.segments) or ["whole body"], 4), []).append(m)
+        rows.setdefault(spoken_segments(motion.body, m.segments), []).append(m)
     shown = list(rows)[:_MAX_TIMELINE_ROWS]
     traces = []
     for name in reversed(shown):  # plots grow upwards

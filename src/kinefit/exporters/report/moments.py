@@ -200,7 +200,7 @@ def span(motion: Motion, m: Moment) -> str:
 def place(motion: Motion, m: Moment) -> str:
     """Frames and segments of a moment: "(frames 36–43): head"."""
     frames = f"frame {m.start}" if m.stop - m.start == 1 else f"frames {m.start}–{m.stop - 1}"
-    return f"({frames}): {listed(spoken_segments(motion.body, m.segments) or ['whole body'], 4)}"
+    return f"({frames}): {spoken_segments(motion.body, m.segments)}"
 
 
 def never_observed(motion: Motion) -> tuple[str, ...]:
@@ -235,9 +235,9 @@ def plain(segment: str) -> str:
     return f"{side} {f'{DIGITS[digit].lower()} ({bone})' if bone and digit in DIGITS else name}".strip()
 
 
-def spoken_segments(body: Body, segments: Sequence[str]) -> list[str]:
+def spoken_segments(body: Body, segments: Sequence[str]) -> str:
     """Segments in words, each once; several fingers of a hand together: "fingers of the left hand"."""
-    return list(dict.fromkeys(_spoken(body, segments).values()))
+    return listed(dict.fromkeys(_spoken(body, segments).values()) or ["whole body"], 4)
 
 
 def _spoken(body: Body, segments: Sequence[str]) -> dict[str, str]:
@@ -303,7 +303,7 @@ def _sentences(body: Body, group: Sequence[_Doubt]) -> Iterable[str]:
     """What a moment's findings say; what is the same of several segments is said once, of all."""
     for kind in dict.fromkeys(g.kind for g in group):
         same = [g for g in group if g.kind == kind]
-        names = listed(spoken_segments(body, [g.segment for g in same]), 4)
+        names = spoken_segments(body, [g.segment for g in same])
         most = max(g.amount for g in same)
         if kind == "nobody":
             yield "The person was not observed; the body keeps its last pose."
@@ -327,7 +327,7 @@ def causes(motion: Motion, moment: Moment) -> tuple[str, ...]:
         seen_points += int(seen.sum())
     seeing = [name for name, share in share_seen.items() if share >= 0.5]
     if pixels and len(seeing) < len(pixels) and len(seeing) <= 2:
-        out.append(f"Only {listed(seeing, 4)} saw it." if seeing else "No camera saw it for most of this time.")
+        out.append(f"Only {listed(seeing)} saw it." if seeing else "No camera saw it for most of this time.")
     if seen_points and sum(left_out.values()) >= _MIN_OUTLIER_SHARE * seen_points:
         most = max(left_out, key=lambda name: left_out[name])
         share = 100 * sum(left_out.values()) / seen_points
@@ -337,10 +337,10 @@ def causes(motion: Motion, moment: Moment) -> tuple[str, ...]:
     for text, of in (("No measurement supports {}", quality <= 0), (more, quality > 0)):
         gone = 2 * (of & motion.lost[frames]).sum(axis=0) > len(quality)
         if names := [n for n in moment.segments if gone[motion.body.tree.segments.index(n)]]:
-            out.append(text.format(listed(spoken_segments(motion.body, names), 4)) + ".")
+            out.append(text.format(spoken_segments(motion.body, names)) + ".")
     swapped = [name for name, r in pixels.items() if np.any(np.asarray(r.swapped)[frames])]
     if swapped:
-        out.append(f"The detector swapped left and right in {listed(swapped, 4)} (corrected).")
+        out.append(f"The detector swapped left and right in {listed(swapped)} (corrected).")
     return tuple(out)
 
 
