@@ -124,20 +124,20 @@ class _PlacementProblem:
     def fits(self, most: int) -> tuple[SensorAlignment, ...]:
         """Alignments of the sensors; those that do not fit also from each half of the frames.
 
-        From at most `most` frames with a tracked person and a frame of a sensor.
+        From at most `most` frames with a tracked person and a frame of a sensor; `FRAMES` show where cameras belong.
         """
-        good = np.flatnonzero(self.motion.quality > _MIN_QUALITY)
-        some = np.array([f for f in good[spread(len(good), 4 * most)] if self.seen(int(f))], int)
-        chosen = some[spread(len(some), most)]
+        good, wanted = np.flatnonzero(self.motion.quality > _MIN_QUALITY), max(most, FRAMES)
+        some = np.array([f for f in good[spread(len(good), 4 * wanted)] if self.seen(int(f))], int)
+        chosen = some[spread(len(some), wanted)]
         if len(chosen) < _MIN_FRAMES:
             return ()
-        looks = [self.look(int(f)) for f in chosen]
+        every = [self.look(int(f)) for f in chosen]
         self.centre = np.mean([self.motion.positions()[f].mean(axis=0) for f in chosen], axis=0)
-        names = tuple(dict.fromkeys(f.sensor for frames, _ in looks for f in frames))
+        names = tuple(dict.fromkeys(f.sensor for frames, _ in every for f in frames))
         away, found = list[SensorAlignment](), dict[str, Ends | None]()
         for name in (name for name in names if name in self.depth):
             T_camera_world = self.recording.rig[name].T_camera_world
-            fit, found[name] = placed_camera(name, looks, self.wide, T_camera_world, self.centre, thorough=True)
+            fit, found[name] = placed_camera(name, every, self.wide, T_camera_world, self.centre, thorough=True)
             if not (fit.usable or fit.is_near):
                 doubt = f"it would turn by {np.degrees(fit.turn):.0f}°: more than "
                 doubt += f"{np.degrees(MISFIT_SIGMAS * POSE_SIGMAS[1]):.0f}°"
@@ -146,7 +146,8 @@ class _PlacementProblem:
         self.names = tuple(name for name in names if name not in gone)
         if not self.names:
             return tuple(away)
-        looks = [([f for f in frames if f.sensor not in gone], scene) for frames, scene in looks]
+        few = [every[k] for k in spread(len(every), most)]
+        looks = [([f for f in frames if f.sensor not in gone], scene) for frames, scene in few]
         arms = {name: self.origins[name] - self.centre for name in self.names}
         self.place = SensorFrames(self.names, POSE_SIGMAS, arms)
         near, ends = self.coarse(looks, found)
@@ -229,7 +230,7 @@ class _PlacementProblem:
             measured.append([*measurements_at(look, self.sensors, self.centre, twists), *pixels])
         return fit_subject(
             self.body, self.recording.rig, measured, [scene.state for scene in scenes], parameters, start=start,
-            times=[scene.time for scene in scenes], velocities=[scene.velocity for scene in scenes],
+            times=[scene.time for scene in scenes], velocities=[scene.velocity for scene in scenes if scene.velocity is not None],
             loss=TrackSettings().loss, **options,
         )  # fmt: skip
 
