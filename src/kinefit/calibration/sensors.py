@@ -230,8 +230,8 @@ class _PlacementProblem:
             measured.append([*measurements_at(look, self.sensors, self.centre, twists), *pixels])
         return fit_subject(
             self.body, self.recording.rig, measured, [scene.state for scene in scenes], parameters, start=start,
-            times=[scene.time for scene in scenes], velocities=[scene.velocity for scene in scenes if scene.velocity is not None],
-            loss=TrackSettings().loss, **options,
+            times=[scene.time for scene in scenes], loss=TrackSettings().loss,
+            velocities=[scene.velocity for scene in scenes if scene.velocity is not None], **options,
         )  # fmt: skip
 
     def parameters(self, frames: Sequence[Sequence[Any]]) -> list[Parameters]:
