@@ -21,7 +21,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from html import escape
-from itertools import chain
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote as urlquote
@@ -176,8 +175,8 @@ def chooser(label: str, choices: Mapping[str, str]) -> Html:
     """A menu of parts {name: part} of which one is shown; all are printed."""
     options = "".join(f"<option>{escape(name)}</option>" for name in choices)
     parts = "".join(
-        f'<div class="choice"{"" if first else " hidden"}><p class="name">{escape(name)}</p>{_block(part)}</div>'
-        for first, (name, part) in zip(chain([True], iter(lambda: False, True)), choices.items())
+        f'<div class="choice"{" hidden" if k else ""}><p class="name">{escape(name)}</p>{_block(part)}</div>'
+        for k, (name, part) in enumerate(choices.items())
     )
     return Html(f'<div class="chooser"><label>{inline(label)} <select>{options}</select></label>{parts}</div>')
 
