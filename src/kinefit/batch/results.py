@@ -21,11 +21,6 @@ if TYPE_CHECKING:
 Step = Callable[[str, int, int], None]
 """Called with the name of the work, the number of steps done, and the number of all steps (0: unknown)."""
 
-
-def silent(*_: object) -> None:
-    """Report nothing: in place of a `Step` or a function for sentences."""
-
-
 NAMES = {
     "motion": "motion.npz", "csv": "tables", "bvh": "motion.bvh", "glb": "motion.glb", "trc": "motion.trc",
     "mot": "motion.mot", "osim": "body.osim", "parquet": "tables", "c3d": "motion.c3d", "usd": "motion.usdc",
@@ -57,6 +52,12 @@ DESCRIPTIONS = {
     "report": "results with error bars and findings, as a page for the browser",
 }
 """Use of each kind of result."""
+
+_PACKAGES = ("kinefit", "numpy", "numba", "opencv-python-headless", "av")
+
+
+def silent(*_: object) -> None:
+    """Report nothing: in place of a `Step` or a function for sentences."""
 
 
 def write_format(motion: Motion, format: str, path: Path, **options: Any) -> None:
@@ -146,9 +147,6 @@ def _residuals(motion: Motion, camera: str) -> Residuals | None:
     """Residuals of a camera's first detector; None if it has none."""
     labels = [label for label in motion.residuals if label == camera or label.startswith(f"{camera} ")]
     return motion.residuals[labels[0]] if labels else None
-
-
-_PACKAGES = ("kinefit", "numpy", "numba", "opencv-python-headless", "av")
 
 
 def write_track_report(

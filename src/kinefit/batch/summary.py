@@ -23,6 +23,20 @@ RECORD = "batch.json"
 
 DONE, FAILED = "done", "failed"
 
+_ID_COLUMNS = ("take", "person", "subject", "visit", "date", "movement")
+_TAKE_COLUMNS = (*_ID_COLUMNS, "frames", "seconds", "quality", "lost share", "status", "error", "faults", "folder")
+_RANGE_COLUMNS = (
+    *_ID_COLUMNS, "coordinate", "side", "lowest [deg]", "highest [deg]", "range [deg]", "range 2 std [deg]",
+    "observed share",
+)  # fmt: skip
+_RANGES_NOTE = (
+    "In degrees, as in the report of each take: highest minus lowest angle, ± two standard deviations. Subjects and "
+    "sessions: mean over takes, and the standard deviation between takes (not of the measurement) if there are two or "
+    "more. * marks takes in which the angle was unobserved in some frames."
+)
+_GROUPED = "Subjects and sessions"
+OUTCOME = "status", "frames", "seconds", "quality", "lost"
+
 
 class Range(msgspec.Struct, frozen=True):
     """Range of motion of one angle [deg], as in the report.
@@ -86,14 +100,6 @@ def failed(row: Row, error: str) -> Row:
     return msgspec.structs.replace(row, status=FAILED, error=error)
 
 
-_ID_COLUMNS = ("take", "person", "subject", "visit", "date", "movement")
-_TAKE_COLUMNS = (*_ID_COLUMNS, "frames", "seconds", "quality", "lost share", "status", "error", "faults", "folder")
-_RANGE_COLUMNS = (
-    *_ID_COLUMNS, "coordinate", "side", "lowest [deg]", "highest [deg]", "range [deg]", "range 2 std [deg]",
-    "observed share",
-)  # fmt: skip
-
-
 def write_summary(rows: Sequence[Row], folder: Path) -> None:
     """Write summary.csv (a row for each take and person), ranges.csv (for each angle of them) and summary.html.
 
@@ -148,16 +154,6 @@ def fault_boxes(rows: Iterable[Row]) -> list[Html]:
     ]  # fmt: skip
 
 
-_RANGES_NOTE = (
-    "In degrees, as in the report of each take: highest minus lowest angle, ± two standard deviations. Subjects and "
-    "sessions: mean over takes, and the standard deviation between takes (not of the measurement) if there are two or "
-    "more. * marks takes in which the angle was unobserved in some frames."
-)
-
-
-_GROUPED = "Subjects and sessions"
-
-
 def _takes(rows: Sequence[Row], folder: Path) -> Html:
     from kinefit.exporters.report import page as p
 
@@ -166,9 +162,6 @@ def _takes(rows: Sequence[Row], folder: Path) -> Html:
          row.error) for row in rows
     ]  # fmt: skip
     return p.table(("take", "person", *_ID_COLUMNS[2:], *OUTCOME, "error"), cells, first_left=7)
-
-
-OUTCOME = "status", "frames", "seconds", "quality", "lost"
 
 
 def outcome(row: Row) -> tuple[str, ...]:

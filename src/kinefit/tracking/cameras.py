@@ -27,6 +27,10 @@ LEFT_OUT = "cameras left out"
 
 _MIN_MOTION = 1e-9  # [m, rad] below which a camera stayed where it was
 
+LOOKS = 12  # frames that are looked at, spread over the take
+_RAYLEIGH = 1.177  # median length of a vector whose two parts have a standard deviation of 1
+_MIN_MEASURED_SHARE = 1e-6  # share of a direction that nothing measures
+
 
 def as_record(found: Sequence[SubjectFit]) -> dict[str, Any]:
     """How far the last of several fits that sought cameras moved them, for `Motion.provenance`."""
@@ -86,11 +90,6 @@ def sentences(provenance: Mapping[str, Any], errors: CameraErrors | None) -> lis
 def as_found(rig: Rig, provenance: Mapping[str, Any]) -> Rig:
     """The cameras of a calibration where a motion's fit found them; as they are where it did not seek them."""
     return moved_rig(rig, {name: one["moved"] for name, one in provenance.get(CAMERAS, {}).items()})
-
-
-LOOKS = 12  # frames that are looked at, spread over the take
-_RAYLEIGH = 1.177  # median length of a vector whose two parts have a standard deviation of 1
-_MIN_MEASURED_SHARE = 1e-6  # share of a direction that nothing measures
 
 
 def contradictions(scenes: Sequence[Scene], matched: Sequence[Sequence[Matched]]) -> dict[str, dict[str, Any]]:

@@ -48,6 +48,10 @@ FLOOR = "floor"
 
 _MAX_LOST = 0.5  # share of frames in which the feet may be lost, to tell a floor
 
+_EMPTY = 30  # images of an empty scene that are looked at: more add nothing
+_SIZING_IMAGES = 4  # depth images from which a person's size is found ...
+_SIZING_S = 5.0  # ... spread over the beginning
+
 
 def on_floor(motion: Motion, recording: Recording, floors: list[FloorPlane]) -> Motion:
     """A motion in a world whose floor is level and at zero; as it is where the vertical was measured, or no foot rests.
@@ -89,11 +93,6 @@ def floor_sentences(provenance: Mapping[str, Any]) -> list[str]:
         "the floor was estimated from resting feet and is at height zero; standard deviations "
         f"{1e3 * entries['height_std_m']:.0f} mm and {entries['tilt_std_deg']:.1f} degrees. Resting soles stay still"
     ]
-
-
-_EMPTY = 30  # images of an empty scene that are looked at: more add nothing
-_SIZING_IMAGES = 4  # depth images from which a person's size is found ...
-_SIZING_S = 5.0  # ... spread over the beginning
 
 
 def recording_of(

@@ -38,6 +38,11 @@ _POSITIVE = {
     **{f"thumb_{joint}_abd": "away from the palm" for joint in FINGER_JOINTS},
 }  # fmt: skip
 
+MAX_STD_DEG = 45.0
+"""[deg] standard deviation beyond which an angle counts as not observed: ±2 of it are half a turn."""
+
+_HEAD = ("lowest", "highest", "range", "fastest")
+
 
 def joint_plots(motion: Motion) -> dict[str, p.Html]:
     """{joint: plot} of all coordinates over time with bands of ±2 standard deviations."""
@@ -150,11 +155,6 @@ def _stacked(traces: list[dict], rows: list[list[Curve]], ranges: list[Any], x: 
     label = f"{', '.join(sides[0].stem for sides in rows)} over {x.split()[0]}"
     return p.stacked(traces, axes, x, label, names=names, **more)
 
-
-MAX_STD_DEG = 45.0
-"""[deg] standard deviation beyond which an angle counts as not observed: ±2 of it are half a turn."""
-
-_HEAD = ("lowest", "highest", "range", "fastest")
 
 @dataclass(frozen=True)
 class Extremes:

@@ -21,6 +21,10 @@ _FLAT_ROOT_SIGMA = 1.0  # [m, rad] of a root that nothing holds
 _MAX_STD = 1e3  # [rad, m] of a coordinate without a prior
 _WINDOW = 0.05  # [s] to either side, in which most views must contradict: an outlier is alone
 
+POORLY_SUPPORTED = 0.5  # quality below which the measurements support less than half of the body
+_GAP = 0.1  # [s] stretches nearer than this are one to somebody who looks at the video
+_MIN_OUTLIER_SHARE = 0.25  # reported as a cause; fits of good keypoints reject less than a tenth
+
 
 def doubtful(sigmas: NDArray, against: NDArray) -> NDArray:
     """(F, S) bool: segments of which an end is rather more than 8 cm off than not, or is so in most views.
@@ -109,11 +113,6 @@ def _square_moves(motion: Motion, frame: int) -> NDArray:
     for s, last in enumerate(tree.last_dof):
         moved[s, tree.chain[last, : tree.depth[last] + 1]] = True
     return np.where(moved, out, 0.0)
-
-
-POORLY_SUPPORTED = 0.5  # quality below which the measurements support less than half of the body
-_GAP = 0.1  # [s] stretches nearer than this are one to somebody who looks at the video
-_MIN_OUTLIER_SHARE = 0.25  # reported as a cause; fits of good keypoints reject less than a tenth
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,9 @@ _FINDINGS = {
 _PLOTS_REMEDY = "Run kinefit warmup once where the package index can be reached, then write this page again."
 _SHADES = 20  # steps of the ground of a table's cell, from white to the right side's orange; text stays dark on all
 
+MAX_CURVE_POINTS = 1000  # points of a curve; the page is about as many pixels wide
+_ROW_PX, _GAP_PX, _HEAD_PX = 190, 34, 62  # height of one row, of the gap to the next, of legend and names above
+
 
 class Html(str):
     """Text that is HTML already and not escaped again."""
@@ -356,10 +359,6 @@ def fault_sections(faults: Iterable[Finding]) -> list[Section]:
         return []
     text = "The results below follow from inputs with these faults. Correct them and track again."
     return [section("Faults of the inputs", paragraph(text), *boxes)]
-
-
-MAX_CURVE_POINTS = 1000  # points of a curve; the page is about as many pixels wide
-_ROW_PX, _GAP_PX, _HEAD_PX = 190, 34, 62  # height of one row, of the gap to the next, of legend and names above
 
 
 def line(

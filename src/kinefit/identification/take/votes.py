@@ -22,6 +22,15 @@ MAX_RELATIVE_SPEED = 3.0
 MAX_SPEED = 15.0
 """[m/s] of a marker without known motion: feet of a sprinter."""
 
+MAX_VOTE_WEIGHT = 4.0
+"""Largest weight of a vote, -log of its odds to be wrong: errors of consecutive frames are correlated."""
+
+NONE_WEIGHT = 1.0
+"""Weight of a vote for no label: it is weaker evidence, as true labels may be missed."""
+
+MIN_CHANGE_WEIGHT = 6.0
+"""Least gain of a change of label within a piece, as weight: more than one vote can have."""
+
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
@@ -68,16 +77,6 @@ def find_pieces(positions: NDArray, rate: float) -> Pieces:
     first, second = tolerance + MAX_SPEED / rate, tolerance + MAX_RELATIVE_SPEED / rate
     count = link_points(points, starts, column.astype(np.int64), first, second, tolerance, piece)
     return Pieces(points, frame, column, piece, starts, int(count))
-
-
-MAX_VOTE_WEIGHT = 4.0
-"""Largest weight of a vote, -log of its odds to be wrong: errors of consecutive frames are correlated."""
-
-NONE_WEIGHT = 1.0
-"""Weight of a vote for no label: it is weaker evidence, as true labels may be missed."""
-
-MIN_CHANGE_WEIGHT = 6.0
-"""Least gain of a change of label within a piece, as weight: more than one vote can have."""
 
 
 @dataclass(eq=False)
