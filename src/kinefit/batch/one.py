@@ -148,7 +148,7 @@ def track_person(
     """
     from kinefit.batch.results import provenance, write_track_report
     from kinefit.batch.viewed import OUTDATED, inputs_entry, is_outdated
-    from kinefit.findings import CLOCKS, LABELS, STATURE
+    from kinefit.findings import NOTES
     from kinefit.multiview import followed
     from kinefit.takes.track import settings_of, track_take
     from kinefit.tracking import cameras
@@ -176,8 +176,7 @@ def track_person(
             notes += [*seen.notes, *cameras.contradiction_sentences(motion.provenance["contradictions"])]
             notes += followed.sentences(motion.provenance, asked=take.person is not None)
             notes += cameras.sentences(motion.provenance, settings_of(take).camera_errors)
-            notes += [*motion.provenance.get(CLOCKS, ()), *motion.provenance.get(LABELS, ())]
-            notes += [*motion.provenance.get(STATURE, ()), *floor_sentences(motion.provenance)]
+            notes += [*motion.provenance.get(NOTES, ()), *floor_sentences(motion.provenance)]
         except TrackingInterrupted as stopped:
             motion, total = stopped.motion, stopped.total
         motion = replace(motion, provenance=provenance(take, **inputs, **motion.provenance))
