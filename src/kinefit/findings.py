@@ -20,7 +20,7 @@ FINDINGS = "findings"
 """Key of `Motion.provenance`: the faults that `track` found in its inputs, as mappings of a `Finding`'s parts."""
 
 NOTES = "notes"
-"""Key of `Motion.provenance`: sentences with what to do about clocks that are off, marker labels that were ignored or do
+"""Key of `Motion.provenance`: sentences on what to do about clocks that are off, marker labels that are ignored or do
 not decide left and right, and a person who is as tall as few adults are."""
 
 INVERTED = "upside down"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -108,7 +106,7 @@ def write_summary(rows: Sequence[Row], folder: Path) -> None:
     ExportError
         There are no rows, or they cannot be written.
     """
-    from kinefit.exporters.atomic import write_text
+    from kinefit.exporters.atomic import write_rows, write_text
 
     if not rows:
         raise ExportError("there are no takes to summarise", file=folder, remedy="Give a pattern that matches takes.")
@@ -118,8 +116,8 @@ def write_summary(rows: Sequence[Row], folder: Path) -> None:
         (*_ids(row), r.coordinate, r.side, *map(_number, (r.lowest, r.highest, r.span, r.twice, r.share)))
         for row in rows for r in row.ranges
     ]  # fmt: skip
-    write_text(folder / "summary.csv", _csv(_TAKE_COLUMNS, table))
-    write_text(folder / "ranges.csv", _csv(_RANGE_COLUMNS, ranges))
+    write_rows(folder / "summary.csv", [_TAKE_COLUMNS, *table])
+    write_rows(folder / "ranges.csv", [_RANGE_COLUMNS, *ranges])
     write_text(folder / "summary.html", summary_page(rows, folder))
 
 
@@ -247,14 +245,6 @@ def _person(row: Row) -> str:
 
 def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.6g}"
-
-
-def _csv(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(head)
-    writer.writerows(rows)
-    return out.getvalue()
 
 
 def write_people_report(rows: Sequence[Row], folder: Path, *, pictures: bool) -> Path:
