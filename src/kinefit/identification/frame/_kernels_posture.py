@@ -81,9 +81,10 @@ def turn_costs(labels, points, starts, markers, x, sigma, parent, here, there, s
                 cross, other = (w * xs[:n].T) @ ys[:n], R0.copy()
                 square = (w @ (xs[:n] ** 2 + ys[:n] ** 2)).sum()
                 cost = fit_rotation(C, cross, square, R0, G, R)
-                other_cost = fit_rotation(C, cross, square, R0, G, other)
-                if other_cost < cost:
-                    cost, R[:] = other_cost, other
+                if np.trace(R @ R0.T) < 2.0:  # a turn of more than a radian: there may be a nearer minimum
+                    other_cost = fit_rotation(C, cross, square, R0, G, other)
+                    if other_cost < cost:
+                        cost, R[:] = other_cost, other
                 if count > 0:
                     total += min(0.5 * (cost - free_cost), most)
             Rs[s], ts[s], variance[s] = R, b - R @ a, 1 / weight
