@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from kinefit import Keypoints, Motion, Recording, Rig
 from kinefit.sensors.channels import Channels, make_channels
 from kinefit.sensors.layout import Layout, projected
-from kinefit.sensors.points.left_right import find_swaps, limb_groups
-from kinefit.sensors.points.view_bias import ViewBias
+from kinefit.sensors.points.views import ViewBias, find_swaps, limb_groups
 from kinefit.sensors.scene import Scene
 
 _SURE = 0.3  # confidence of keypoints that are held against the fit

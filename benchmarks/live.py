@@ -18,8 +18,7 @@ import numpy as np
 
 from benchmarks.figures import amount, data, figure
 from kinefit.live.inbox import Arrived
-from kinefit.live.receivers.lines import JsonLines
-from kinefit.live.receivers.vmc import Vmc
+from kinefit.live.receivers.programs import JsonLines, Vmc
 from kinefit.live.receivers.websocket import WebSockets
 from kinefit.live.record import MotionRecord
 from kinefit.live.session import LiveSession

@@ -32,7 +32,7 @@ from kinefit.errors import AssetError, ObservationError
 from kinefit.observations import MEDIAPIPE_33
 from kinefit.preparing import detecting
 from kinefit.readers.keypoints import read_caliscope_csv
-from kinefit.sensors.points.view_bias import ViewBias
+from kinefit.sensors.points.views import ViewBias
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.view_bias import SeenFrames, learn_view_bias
 from kinefit.takes.missing import prepared

@@ -24,7 +24,7 @@ from benchmarks.figures import LEFT_OUT, amount, figure, quick
 from benchmarks.gear_takes import GearTake, rendered_cyclist, rendered_snowboarder
 from kinefit.bodies.surfaces import body_mesh
 from kinefit.geometry.camera import Camera
-from kinefit.images.silhouette_background import BackgroundPlate
+from kinefit.images.silhouette import BackgroundPlate
 from kinefit.motion import Motion
 from kinefit.rendering import Canvas, render_body
 from kinefit.takes.track import track_take

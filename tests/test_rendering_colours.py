@@ -9,8 +9,8 @@ import pytest
 from kinefit.bodies import load_body
 from kinefit.exporters.report.figure import live_figure
 from kinefit.exporters.report.page import CENTRE_COLOUR, LEFT_COLOUR, RIGHT_COLOUR
-from kinefit.rendering import colours, looks
-from kinefit.rendering.tubes import body_mesh
+from kinefit.rendering import looks
+from kinefit.rendering.looks import body_mesh
 
 # Machado, Oliveira and Fernandes, IEEE TVCG 15 (2009), severity 1: of linear RGB.
 DEFICIENCIES = {
@@ -29,7 +29,7 @@ def lab(rgb, deficiency):
 
 @pytest.mark.parametrize("deficiency", DEFICIENCIES)
 def test_sides_and_lost_differ_for_everybody(deficiency):
-    named = (colours.LEFT_COLOUR, colours.RIGHT_COLOUR, colours.CENTRE_COLOUR, colours.LOST_COLOUR)
+    named = (looks.LEFT_COLOUR, looks.RIGHT_COLOUR, looks.CENTRE_COLOUR, looks.LOST_COLOUR)
     gaps = [np.linalg.norm(lab(a, deficiency) - lab(b, deficiency)) for a, b in combinations(named, 2)]
     print(deficiency, np.round(gaps, 1))
     assert min(gaps) > 12.0
@@ -37,18 +37,18 @@ def test_sides_and_lost_differ_for_everybody(deficiency):
 
 @pytest.mark.parametrize("deficiency", DEFICIENCIES)
 def test_good_and_bad_quality_differ_for_everybody(deficiency):
-    good, middling, bad = (lab(c, deficiency) for c in colours.quality_ramp([0.0, 0.5, 1.0]))
+    good, middling, bad = (lab(c, deficiency) for c in looks.quality_ramp([0.0, 0.5, 1.0]))
     assert min(np.linalg.norm(a - b) for a, b in combinations((good, middling, bad), 2)) > 25.0
 
 
 def test_every_place_uses_the_same_colours():
     body = load_body("humanoid")
-    sides = {"_l": colours.LEFT_COLOUR, "_r": colours.RIGHT_COLOUR}
-    expected = [sides.get(name[-2:], colours.CENTRE_COLOUR) for name in body.tree.segments]
+    sides = {"_l": looks.LEFT_COLOUR, "_r": looks.RIGHT_COLOUR}
+    expected = [sides.get(name[-2:], looks.CENTRE_COLOUR) for name in body.tree.segments]
     assert [tuple(c) for c in looks.side_colours(body)] == expected
     assert {tuple(c) for c in body_mesh(body).colours} == set(expected)
     sides = LEFT_COLOUR, RIGHT_COLOUR, CENTRE_COLOUR
-    assert sides == tuple(map(colours.to_hex, (colours.LEFT_COLOUR, colours.RIGHT_COLOUR, colours.CENTRE_COLOUR)))
+    assert sides == tuple(map(looks.to_hex, (looks.LEFT_COLOUR, looks.RIGHT_COLOUR, looks.CENTRE_COLOUR)))
     page = str(live_figure(body))
-    lost = colours.to_hex(colours.LOST_COLOUR)
+    lost = looks.to_hex(looks.LOST_COLOUR)
     assert all(colour in page for colour in (LEFT_COLOUR, RIGHT_COLOUR, CENTRE_COLOUR, lost))

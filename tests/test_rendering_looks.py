@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body
-from kinefit.rendering import colours, looks
-from kinefit.rendering.tubes import body_mesh
+from kinefit.rendering import looks
+from kinefit.rendering.looks import body_mesh
 
 
 def volume(mesh):
@@ -50,6 +50,6 @@ def test_a_lost_segment_is_grey_whatever_the_colours_mean():
     usual = np.array([[1, 2, 3]] * 3, np.uint8)
     for by_quality in (False, True):
         shades, opacities = looks.segment_looks(np.array([1.0, 0.6, 0.4]), usual, by_quality=by_quality)
-        assert tuple(shades[2]) == colours.LOST_COLOUR and opacities[2] < 0.5
+        assert tuple(shades[2]) == looks.LOST_COLOUR and opacities[2] < 0.5
         assert list(opacities[:2]) == [1, 1]
     assert tuple(looks.segment_looks(np.ones(3), usual, by_quality=False)[0][0]) == (1, 2, 3)

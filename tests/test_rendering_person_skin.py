@@ -8,8 +8,7 @@ from benchmarks.person_skin import skin
 
 from kinefit.bodies import load_body
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
-from kinefit.rendering.person_skin import FILE, person_skin
-from kinefit.rendering.tubes import body_mesh
+from kinefit.rendering.looks import FILE, body_mesh, person_skin
 
 BODY = load_body("humanoid")
 

@@ -19,8 +19,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 from kinefit.readers.video import Video
 from kinefit.rendering import Canvas
-from kinefit.rendering.colours import side_colour
-from kinefit.rendering.tubes import body_mesh
+from kinefit.rendering.looks import body_mesh, side_colour
 
 PAPER = (247, 249, 251)
 _HEIGHT, _STEP, _SPEED = 360, 4, 80  # [px], every which frame, [ms] each is shown

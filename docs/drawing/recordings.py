@@ -23,7 +23,7 @@ from kinefit.readers.take.load import load_observations
 from kinefit.readers.take.pictures import TakePictures
 from kinefit.readers.video import Video
 from kinefit.rendering import render_body
-from kinefit.rendering.colours import LEFT_COLOUR, RIGHT_COLOUR, to_hex
+from kinefit.rendering.looks import LEFT_COLOUR, RIGHT_COLOUR, to_hex
 from kinefit.simulation import cut, movement, retarget, squat_and_wave, write_synthetic_take
 from kinefit.takes.missing import find_cameras
 

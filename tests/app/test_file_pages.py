@@ -5,7 +5,7 @@ import urllib.request
 
 import pytest
 
-from kinefit.app.file_pages import FilePages
+from kinefit.app.served import FilePages
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from kinefit.cli import main
 from kinefit.cli.detect import detect
 from kinefit.errors import AssetError, FileError, KinefitError, ObservationError, TakeError
 from kinefit.exporters.motion_file import write_detections
-from kinefit.images.detectors.person_detector import DetectedPerson
+from kinefit.images.detectors.box_detector import DetectedPerson
 from kinefit.images.detectors.pose_model import SIZE, PersonLandmarks
 from kinefit.observations import Detections
 from kinefit.preparing import detecting, each_video

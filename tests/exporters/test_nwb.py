@@ -11,7 +11,7 @@ from tests.exporters.synthetic import smooth_motion
 
 from kinefit.errors import ExportError
 from kinefit.exporters import write_nwb
-from kinefit.exporters.nwb import CONFIDENCE_RADIUS_M, confidence
+from kinefit.exporters.interchange import CONFIDENCE_RADIUS_M, confidence
 
 
 def quiet(do):

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from kinefit.images.detectors.person_detector import DetectedPerson
+from kinefit.images.detectors.box_detector import DetectedPerson
 from kinefit.images.detectors.pose_model import SIZE, PersonLandmarks
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
-from kinefit.images.depth_noise import denoised, noise_of, without_speckles
+from kinefit.images.depth import denoised, noise_of, without_speckles
 
 CAMERA = Camera("tof", (160, 124), [[181.0, 0, 79.5], [0, 181.0, 61.5], [0, 0, 1]])
 

@@ -6,8 +6,7 @@ import pytest
 from kinefit.bodies import load_body
 from kinefit.errors import ObservationError, TrackingError
 from kinefit.geometry.camera import Camera
-from kinefit.images.depth import clean, to_points
-from kinefit.images.depth_noise import denoised
+from kinefit.images.depth import clean, denoised, to_points
 from kinefit.images.depth_scene import background_model, clusters, find_floor, foreground, people
 from kinefit.initialization.from_depth import start_from_points
 from kinefit.readers.depth.recordings import read_depth

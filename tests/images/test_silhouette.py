@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ObservationError
-from kinefit.images.silhouette import choose_person, colour_silhouette, outline
-from kinefit.images.silhouette_background import BackgroundPlate, cleaned
+from kinefit.images.silhouette import BackgroundPlate, choose_person, cleaned, colour_silhouette, outline
 
 
 def disc(centre, radius, size=(90, 120), finer=8):

@@ -13,7 +13,7 @@ from kinefit.geometry import se3
 from kinefit.initialization.from_points import aligned_root, first_scales, pose_from_points
 from kinefit.observations import Keypoints
 from kinefit.sensors.channels import make_channels
-from kinefit.sensors.points.triangulation import triangulated, triangulated_frame
+from kinefit.sensors.points.views import triangulated, triangulated_frame
 
 BODY = load_body("humanoid")
 SET = "BODY_25B"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kinefit.geometry import se3
-from kinefit.live.replay import Replay
+from kinefit.live.folders import Replay
 from kinefit.motion import UP_AXES
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.tracking.recording import Recording

@@ -12,10 +12,10 @@ from tests.live.refused import REFUSED
 from kinefit.errors import BodyError, ObservationError
 from kinefit.frame.routing import MAX_SIGMA, MIN_SIGMA
 from kinefit.live.cameras import CameraSource, SessionClock
+from kinefit.live.folders import Replay
 from kinefit.live.inbox import Arrived
 from kinefit.live.people import LivePerson
 from kinefit.live.record import MotionRecord
-from kinefit.live.replay import Replay
 from kinefit.live.session import LiveSession
 from kinefit.motion import UP_AXES
 from kinefit.observations import MarkerFrame

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from kinefit.serving.peers import is_of_this_user
+from kinefit.serving.access import is_of_this_user
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux says whose a connection is")

@@ -11,8 +11,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketExce
 from websockets.sync.client import connect
 
 from kinefit.errors import ExportError
-from kinefit.serving.access import Access
-from kinefit.serving.policy import inline_policy
+from kinefit.serving.access import Access, inline_policy
 from kinefit.serving.server import MAX_FRAMES_AT_ONCE, MAX_MESSAGE_BYTES, Allowance, Page, PageServer
 
 PAGES = {"/": Page(b"hello", policy=inline_policy(["x"], [])), "/a.js": Page(b"1", "text/javascript")}

@@ -15,7 +15,7 @@ from kinefit.bodies import PointSet
 from kinefit.bodies.tree import twin
 from kinefit.evaluation import angle_errors, joint_errors
 from kinefit.geometry import se3
-from kinefit.sensors.observability import levers, moves_points, near
+from kinefit.sensors.evidence import levers, moves_points, near
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.smoothing.foot_contacts import find_contacts, soles

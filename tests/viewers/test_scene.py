@@ -7,7 +7,7 @@ from tests.exporters.synthetic import a_camera, smooth_motion
 from kinefit.bodies import load_body
 from kinefit.geometry import se3
 from kinefit.motion import OUTLIER_WEIGHT, nearest_frame
-from kinefit.rendering import colours
+from kinefit.rendering import looks
 from kinefit.viewers import player, scene
 
 
@@ -56,10 +56,10 @@ def test_every_surface_is_there():
 
 
 def test_the_colours_of_quality_go_from_blue_to_vermillion():
-    ramp = colours.quality_ramp(np.array([-1, 0.0, 0.5, 1.0, 9.0])).astype(int)
+    ramp = looks.quality_ramp(np.array([-1, 0.0, 0.5, 1.0, 9.0])).astype(int)
     assert np.array_equal(ramp[0], ramp[1]) and np.array_equal(ramp[3], ramp[4])
     assert ramp[1, 2] > ramp[1, 0] and ramp[3, 0] > ramp[3, 2]
-    assert np.all(np.diff(colours.quality_ramp(np.linspace(0, 1, 9))[:, 2].astype(int)[:5]) <= 0)
+    assert np.all(np.diff(looks.quality_ramp(np.linspace(0, 1, 9))[:, 2].astype(int)[:5]) <= 0)
 
 
 def test_ellipsoids_are_two_sigmas_and_end_somewhere():

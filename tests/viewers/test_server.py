@@ -22,7 +22,7 @@ from kinefit.errors import BodyError, CalibrationError, ExportError, Observation
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.observations import Markers
-from kinefit.rendering.colours import LEFT_COLOUR, LOST_COLOUR, RIGHT_COLOUR
+from kinefit.rendering.looks import LEFT_COLOUR, LOST_COLOUR, RIGHT_COLOUR
 from kinefit.serving.access import Access
 from kinefit.simulation import cut
 from kinefit.viewers import CameraImages, Choice, Player, View, ViewerContent, page

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from kinefit.app.scene import ScenePage
+from kinefit.app.served import ScenePage
 from kinefit.batch.viewed import gather
 from kinefit.exporters.curves import curves, spoken
 from kinefit.exporters.report.angles import Extremes, ranges_of, with_error

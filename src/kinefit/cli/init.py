@@ -49,7 +49,7 @@ def init(
         raise click.UsageError("--step needs --click; a file of --points has its own step.")
     if body is not None and not (clicked or points):
         raise click.UsageError("--body needs --click or --points; without them, write body into the take file.")
-    from kinefit.cli._results import check_file
+    from kinefit.cli._screen import check_file
     from kinefit.errors import TakeError, command
     from kinefit.exporters.atomic import write_text
     from kinefit.readers.guess.folder import guess_take

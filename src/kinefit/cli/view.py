@@ -44,7 +44,7 @@ def view(
     shown in the same scene. Ctrl-C ends the command.
     """
     from kinefit.batch.viewed import gather
-    from kinefit.cli._results import check_file
+    from kinefit.cli._screen import check_file
     from kinefit.serving.access import Access
 
     if html is not None:

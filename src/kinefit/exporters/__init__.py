@@ -1,16 +1,19 @@
 """Results as files: each written whole or not at all."""
 
-from kinefit.exporters.c3d import write_c3d
+from kinefit.exporters.c3d_file import write_c3d
+from kinefit.exporters.interchange import write_mcap, write_nwb, write_rrd
 from kinefit.exporters.marker_files import write_markers
-from kinefit.exporters.mcap import write_mcap
 from kinefit.exporters.motion_file import write_motion
-from kinefit.exporters.nwb import write_nwb
 from kinefit.exporters.opensim.files import write_mot, write_osim, write_trc
-from kinefit.exporters.pictures.depth import depth_picture, write_depth_overlay
-from kinefit.exporters.pictures.overlay import draw_overlay, write_montage, write_overlay
+from kinefit.exporters.pictures.overlay import (
+    depth_picture,
+    draw_overlay,
+    write_depth_overlay,
+    write_montage,
+    write_overlay,
+)
 from kinefit.exporters.pose_lines import write_jsonl
 from kinefit.exporters.report.report import write_report
-from kinefit.exporters.rrd import write_rrd
 from kinefit.exporters.skeletons.bvh import write_bvh
 from kinefit.exporters.skeletons.characters import write_character
 from kinefit.exporters.skeletons.glb import write_glb

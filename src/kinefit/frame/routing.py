@@ -33,7 +33,7 @@ from kinefit.sensors.points.image_lines import ImageLineSensor
 from kinefit.sensors.points.keypoints import KeypointSensor
 from kinefit.sensors.points.lifted import LiftedSensor
 from kinefit.sensors.points.markers import MarkerSensor
-from kinefit.sensors.points.view_bias import ViewBias
+from kinefit.sensors.points.views import ViewBias
 from kinefit.sensors.regions.regions import RegionSensor
 from kinefit.sensors.regions.silhouette import SilhouetteSensor
 from kinefit.sensors.scene import Scene

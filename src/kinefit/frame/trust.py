@@ -13,8 +13,7 @@ from kinefit.bodies.tree import KinematicTree
 from kinefit.frame.results import ROOT_PRIOR_STD, UNOBSERVED_STD_RATIO
 from kinefit.rows import AnyRows, PairRows, ParameterRows, Rows
 from kinefit.sensors.base import Matched
-from kinefit.sensors.evidence import AGREEMENT_SIGMAS, Evidence
-from kinefit.sensors.observability import moves_points, near
+from kinefit.sensors.evidence import AGREEMENT_SIGMAS, Evidence, moves_points, near
 from kinefit.sensors.points.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.equations import variances

@@ -26,7 +26,7 @@ from kinefit.sensors.base import Measurement
 from kinefit.sensors.channels import joined
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.surfaces.depth_view import camera_at
-from kinefit.sensors.visibility.parting import without_others
+from kinefit.sensors.visibility.occlusion import without_others
 from kinefit.solvers.least_squares import levenberg_marquardt
 
 MIN_GAIN = 0.01  # of the score (share of the person's pixels) by which another pose must be better

@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import BodyError, ObservationError, TrackingError
 from kinefit.geometry.camera import Camera
-from kinefit.images.depth import to_points
-from kinefit.images.depth_noise import denoised, noise_of, without_speckles
+from kinefit.images.depth import denoised, noise_of, to_points, without_speckles
 from kinefit.images.depth_scene import DepthBlob, find_floor, foreground, people
 from kinefit.initialization.depth_search import PostureSearch
 from kinefit.sensors.surfaces.depth_view import DepthView, splat, view_of

@@ -17,14 +17,13 @@ from kinefit.bodies import Body, catalogue, load_body
 from kinefit.errors import BodyError, KinefitError, ObservationError, check_choice, choices
 from kinefit.exporters.pose_lines import hello
 from kinefit.frame.results import FrameResult
-from kinefit.live.detecting import LiveDetector
+from kinefit.live.cameras import LiveDetector
+from kinefit.live.folders import REPLAY
 from kinefit.live.inbox import Arrived, Inbox
-from kinefit.live.packets import PosePacket
+from kinefit.live.packets import Answer, PosePacket, Wish, read_wish
 from kinefit.live.people import LivePerson
-from kinefit.live.replay import REPLAY
 from kinefit.live.seen import SeenRecord
 from kinefit.live.sizing import LiveSize
-from kinefit.live.wishes import Answer, Wish, read_wish
 from kinefit.observations import Keypoints
 from kinefit.tracking.session import axis_of
 from kinefit.tracking.tracker import Tracker

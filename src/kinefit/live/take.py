@@ -15,11 +15,9 @@ from kinefit.geometry.camera import Camera, ImageFrame, Rig
 from kinefit.identification.take.takes import with_names
 from kinefit.images.depth_scene import background_model
 from kinefit.images.detectors.models import Models
-from kinefit.live.cameras import CameraStream, SessionClock, VideoReplay
-from kinefit.live.detecting import LiveDetector
-from kinefit.live.folders import DepthFolderStream, ImageFolderStream, KeypointFolderStream
+from kinefit.live.cameras import CameraStream, LiveDetector, SessionClock, VideoReplay
+from kinefit.live.folders import DepthFolderStream, ImageFolderStream, KeypointFolderStream, Replay
 from kinefit.live.people import LivePerson
-from kinefit.live.replay import Replay
 from kinefit.live.seen import SeenRecord
 from kinefit.live.session import LiveSession, Receiver, Source
 from kinefit.live.sizing import LiveSize

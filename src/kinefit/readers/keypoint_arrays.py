@@ -13,7 +13,7 @@ from kinefit._mapped import kept
 from kinefit.errors import ObservationError
 from kinefit.observations import Keypoints
 from kinefit.observations.arrays import sealed
-from kinefit.observations.keypoint_values import check_pixels, confidence_of
+from kinefit.observations.recordings import check_pixels, confidence_of
 from kinefit.readers.keypoint_sets import KEYPOINT_SETS, keypoint_names
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import Any
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError
 from kinefit.rows import AnyRows, DofRows, PairRows, ParameterRows, Rows
-from kinefit.sensors import _kernels_checks
+from kinefit.sensors import _kernels
 
 
 def of_kind(value: object, kind: type, what: str, remedy: str, *, each: type | None = None) -> None:
@@ -52,7 +52,7 @@ def check_rows(rows: Any, sensor: str, body: Body) -> list[AnyRows]:
         if isinstance(p, Rows) and not p.segment.shape == p.group.shape == p.data.shape[1:] == (p.data.size // 8,):
             shapes = p.data.shape, p.segment.shape, p.group.shape
             raise ObservationError(f"sensor '{sensor}' has rows of shapes {shapes}", remedy="Create them with Rows.of.")
-        if isinstance(p, Rows) and _kernels_checks.sound(p.data, p.segment, count):
+        if isinstance(p, Rows) and _kernels.sound(p.data, p.segment, count):
             continue
         if isinstance(p, Rows) and not math.isfinite(p.data.sum()):
             remedy = "Leave out rows that were not measured."

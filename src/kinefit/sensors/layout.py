@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.points.hand_views import HandViews
-from kinefit.sensors.points.left_right import limb_groups
-from kinefit.sensors.points.view_bias import beside, trunks
+from kinefit.sensors.points.views import HandViews, beside, limb_groups, trunks
 from kinefit.sensors.scene import Scene
 
 Stream = tuple[str, str, tuple[str, ...]]

@@ -1,20 +1,60 @@
-"""Decide who may connect to a server that kinefit opens; docs/live.md, "Who may connect", says it to users."""
+"""Decide who may connect to a server that kinefit opens, and what its pages may do; docs/live.md tells users."""
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import hmac
 import ipaddress
+import os
 import re
 import secrets
 import socket
+from collections.abc import Iterable
+from contextlib import suppress
 from http import HTTPStatus
+from pathlib import Path
 from typing import NamedTuple
 
 from websockets.datastructures import Headers
 
 from kinefit.errors import ExportError
 from kinefit.serving import TOKEN_VARIABLE
-from kinefit.serving.peers import is_of_this_user
+
+APP_PAGES = "http://localhost:* http://127.0.0.1:*"
+"""Pages of `kinefit app`, whose port is not known, as the policies `frame-src` and `frame-ancestors` have them."""
+
+
+def inline_policy(scripts: Iterable[str], styles: Iterable[str], more: str = "") -> str:
+    """A policy under which a page runs exactly these inline scripts and styles, by their hashes, and fetches nothing.
+
+    Parameters
+    ----------
+    scripts, styles : texts of the elements, to the letter
+    more : further directives, such as "img-src data:"
+    """
+    hashes = [" ".join(_hash(text) for text in texts) or "'none'" for texts in (scripts, styles)]
+    rules = ["default-src 'none'", f"script-src {hashes[0]}", f"style-src {hashes[1]}"]
+    return "; ".join([*rules, *([more] if more else []), "base-uri 'none'", "form-action 'none'"])
+
+
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def is_of_this_user(peer_port: int, port: int) -> bool:
+    """Whether a connection between two ports of this computer was opened by this user.
+
+    Only Linux says who opened it. Where it is not known, the answer is yes.
+    """
+    for table in ("/proc/net/tcp", "/proc/net/tcp6"):
+        with suppress(OSError):
+            for line in Path(table).read_text().splitlines()[1:]:
+                _, local, remote, _, _, _, _, user, *_ = line.split()
+                if [int(end.rpartition(":")[2], 16) for end in (local, remote)] == [peer_port, port]:
+                    return int(user) == os.getuid()
+    return True
+
 
 _TOKEN_BYTES = 18  # 144 random bits: 24 characters of the address
 _TOKEN = re.compile(r"[A-Za-z0-9_-]{16,128}")  # stands in an address as it is; a shorter one can be tried out

@@ -11,7 +11,7 @@ from kinefit.bodies.surfaces import Surface
 from kinefit.errors import BodyError
 from kinefit.geometry.camera import Camera
 from kinefit.motion import Motion
-from kinefit.rendering.colours import side_colour
+from kinefit.rendering.looks import side_colour
 from kinefit.simulation.placing import look_at
 from kinefit.solvers.mobility import closed_poses
 

@@ -15,9 +15,9 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import Motion
 from kinefit.observations import Keypoints
 from kinefit.readers.calibration.read import write_calibration
-from kinefit.simulation.exercise import squat_and_wave
 from kinefit.simulation.figures import draw_figure
 from kinefit.simulation.keypoints import simulate_keypoints, studio_rig
+from kinefit.simulation.movements import squat_and_wave
 
 _IMAGE_SIZE = (544, 960)  # [px]
 _KEYPOINT_SIGMA = 2.0  # [px] in the take file

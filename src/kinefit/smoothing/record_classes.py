@@ -17,10 +17,9 @@ from kinefit.sensors.points.keypoints import KeypointMatched, KeypointMeasuremen
 from kinefit.sensors.points.lifted import LiftedMatched, LiftedMeasurement
 from kinefit.sensors.points.markers import MarkerMatched, MarkerMeasurement
 from kinefit.sensors.regions.region_image import Coloured, Kept
-from kinefit.sensors.regions.region_matched import RegionMatched
 from kinefit.sensors.regions.region_parts import Lines
 from kinefit.sensors.regions.region_seams import Seams
-from kinefit.sensors.regions.regions import RegionMeasurement
+from kinefit.sensors.regions.regions import RegionMatched, RegionMeasurement
 from kinefit.sensors.regions.silhouette import SilhouetteMatched, SilhouetteMeasurement
 from kinefit.sensors.surfaces.depth_image import DepthImageMatched, DepthImageMeasurement
 from kinefit.sensors.surfaces.point_cloud import PointCloudMatched, PointCloudMeasurement

@@ -17,8 +17,8 @@ from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult, frame_resul
 from kinefit.frame.trust import unknown_joints
 from kinefit.sensors.base import Matched, pixels_of
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.observability import moves_points, near
-from kinefit.sensors.points.left_right import find_swaps, limb_groups
+from kinefit.sensors.evidence import moves_points, near
+from kinefit.sensors.points.views import find_swaps, limb_groups
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.foot_contacts import find_contacts
 from kinefit.smoothing.linearised import OtherSensors

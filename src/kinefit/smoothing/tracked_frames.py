@@ -13,7 +13,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.frame.results import FrameResult
 from kinefit.sensors.base import Leftover, Measurement, pixels_of
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.points.view_bias import beside, trunks
+from kinefit.sensors.points.views import beside, trunks
 from kinefit.smoothing.linearised import ApartRows, SceneOf
 from kinefit.smoothing.spool import STRETCH, stretches
 

@@ -16,9 +16,7 @@ from kinefit.observations import KEYPOINTS
 from kinefit.sensors.channels import Channels, fitted_pixels
 from kinefit.sensors.layout import Layout
 from kinefit.sensors.points.keypoints import KeypointMeasurement, KeypointSensor
-from kinefit.sensors.points.left_right import find_swaps, limb_groups
-from kinefit.sensors.points.triangulation import triangulated
-from kinefit.sensors.points.view_bias import ViewBias
+from kinefit.sensors.points.views import ViewBias, find_swaps, limb_groups, triangulated
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import CameraErrors
 from kinefit.solvers.equations import inverse

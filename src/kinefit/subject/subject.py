@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
-from kinefit.sensors.points.view_bias import ViewBias
+from kinefit.sensors.points.views import ViewBias
 from kinefit.solvers.bundle.border import Prior
 from kinefit.solvers.equations import inverse
 from kinefit.subject.parameters import Parameters, World

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.observations.recordings import mirror_name
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.points.view_bias import MIRRORED, TERMS, ViewBias, directions, trunks
+from kinefit.sensors.points.views import MIRRORED, TERMS, ViewBias, directions, trunks
 
 _COEFFICIENT_PRIOR_STD = 0.01  # [m]: of 1, 1.4 and 2 cm the best on three recordings of the built-in network
 # (`benchmarks.people_bias`); 2 cm gains more on two of them, and loses 7 % on the third

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.diagnostics.images import load_uncovered
 from kinefit.errors import KinefitError, TrackingError
-from kinefit.images.depth import to_points
-from kinefit.images.depth_noise import denoised, without_speckles
+from kinefit.images.depth import denoised, to_points, without_speckles
 from kinefit.images.depth_scene import DepthBlob, find_floor, foreground, people
 from kinefit.initialization.from_depth import StartSearch, start_from_points
 from kinefit.motion import ARRAYS, Motion

@@ -16,7 +16,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.errors import FileError, TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
-from kinefit.sensors.points.view_bias import ViewBias
+from kinefit.sensors.points.views import ViewBias
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.spool import Spool

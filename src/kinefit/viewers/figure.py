@@ -11,7 +11,7 @@ from kinefit.bodies import Body
 from kinefit.geometry import se3
 from kinefit.motion import BELIEVED
 from kinefit.rendering import looks
-from kinefit.rendering.tubes import body_mesh
+from kinefit.rendering.looks import body_mesh
 from kinefit.viewers import scene as content
 
 PARTS = ("skin", "bones", "joints", "surface", "landmarks", "uncertainty")

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, PointSet, TaperedCylinder
 from kinefit.geometry.camera import Camera
 from kinefit.motion import OUTLIER_WEIGHT, UP_AXES, Motion, Residuals
-from kinefit.rendering.colours import RGB, quality_ramp
-from kinefit.rendering.looks import Mesh
+from kinefit.rendering.looks import RGB, Mesh, quality_ramp
 
 OTHERS: tuple[RGB, ...] = ((204, 121, 167), (86, 180, 233), (230, 159, 0), (120, 90, 60))
 """Colours of the second, third ... motion, which have one colour for both sides."""

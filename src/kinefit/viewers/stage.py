@@ -17,8 +17,7 @@ from kinefit.errors import ExportError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import UP_AXES
-from kinefit.serving.access import Access
-from kinefit.serving.policy import APP_PAGES
+from kinefit.serving.access import APP_PAGES, Access
 from kinefit.viewers.pictures import PinholeView, flat_view
 
 if TYPE_CHECKING:

@@ -199,7 +199,7 @@ def test_the_exported_limbs_are_closed(tmp_path):
     from benchmarks.surface_body import moving_arm
 
     from kinefit.exporters import write_glb
-    from kinefit.rendering.tubes import body_mesh
+    from kinefit.rendering.looks import body_mesh
 
     motion = replace(moving_arm(0, 3), body=BODY)
     write_glb(motion, tmp_path / "arm.glb")

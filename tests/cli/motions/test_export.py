@@ -14,7 +14,7 @@ from kinefit.bodies import load_body
 from kinefit.cli import main
 from kinefit.exporters import write_bvh, write_motion
 from kinefit.readers.skeletons.bvh import read_bvh
-from kinefit.rendering.person_skin import person_skin
+from kinefit.rendering.looks import person_skin
 from kinefit.simulation import cut, squat_and_wave
 
 

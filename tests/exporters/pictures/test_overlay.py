@@ -16,7 +16,7 @@ from kinefit.exporters.pictures.drawing import bones
 from kinefit.exporters.pictures.overlay import frames_of
 from kinefit.geometry.camera import ImageFrame
 from kinefit.readers.video import Video
-from kinefit.rendering.colours import CENTRE_COLOUR, LEFT_COLOUR, LOST_COLOUR, RIGHT_COLOUR
+from kinefit.rendering.looks import CENTRE_COLOUR, LEFT_COLOUR, LOST_COLOUR, RIGHT_COLOUR
 from kinefit.simulation import cut
 
 CAMERA = a_camera("cam 0", 0.3)

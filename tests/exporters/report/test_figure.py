@@ -13,8 +13,7 @@ from kinefit.bodies import load_body
 from kinefit.exporters.report.figure import MAX_FIGURE_FRAMES, figure, live_figure
 from kinefit.geometry import se3
 from kinefit.motion import rotation_between_up
-from kinefit.rendering.colours import side_colour, to_hex
-from kinefit.rendering.tubes import body_mesh
+from kinefit.rendering.looks import body_mesh, side_colour, to_hex
 
 
 @pytest.fixture(scope="module")

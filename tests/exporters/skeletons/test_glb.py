@@ -11,7 +11,7 @@ from tests.exporters.synthetic import smooth_motion
 from kinefit.bodies import load_body
 from kinefit.errors import ExportError
 from kinefit.exporters import write_glb
-from kinefit.rendering.tubes import body_mesh
+from kinefit.rendering.looks import body_mesh
 
 
 class Glb:

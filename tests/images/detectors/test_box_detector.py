@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from kinefit.images.detectors.box_detector import BoxDetector, anchors, decode
-from kinefit.images.detectors.person_detector import CELLS, PersonDetector
+from kinefit.images.detectors.box_detector import CELLS, BoxDetector, PersonDetector, anchors, decode
 
 ANCHORS = anchors(224, CELLS)
 

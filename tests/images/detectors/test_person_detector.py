@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from kinefit.images.detectors.box_detector import DetectedPerson
 from kinefit.images.detectors.models import squares
-from kinefit.images.detectors.person_detector import DetectedPerson
 
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])

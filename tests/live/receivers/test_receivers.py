@@ -14,8 +14,7 @@ from websockets.sync.client import connect
 
 from kinefit.errors import ExportError
 from kinefit.geometry import se3
-from kinefit.live.receivers.lines import JsonLines
-from kinefit.live.receivers.vmc import BONES, Vmc
+from kinefit.live.receivers.programs import BONES, JsonLines, Vmc
 from kinefit.live.receivers.websocket import WebSockets
 from kinefit.live.record import MotionRecord
 from kinefit.live.session import LiveSession
@@ -212,7 +211,7 @@ def test_jaw_and_eyes_are_those_of_the_avatar():
 def test_an_avatar_at_rest_stands_as_a_t():
     """A body in T pose that faces z has no turn in any bone: Unity's humanoid at rest."""
     from kinefit.bodies import load_body
-    from kinefit.exporters.skeletons.rest import rest_pose
+    from kinefit.exporters.skeletons.common import rest_pose
 
     body = load_body("humanoid")
     vmc = Vmc("127.0.0.1", 39539, up="y")
@@ -247,7 +246,7 @@ def test_an_unknown_host_is_told():
 
 def test_laboratories_get_angles_and_joints(scene, played):
     pylsl = pytest.importorskip("pylsl")
-    from kinefit.live.receivers.lsl import Lsl
+    from kinefit.live.receivers.programs import Lsl
 
     outlet = Lsl("kinefit-test", rate=30.0)
     outlet.hello(scene.motion.body, b"")

@@ -7,7 +7,7 @@ from tests.oracle import posture, rig_around
 from kinefit.bodies import load_body
 from kinefit.observations import Keypoints
 from kinefit.sensors.channels import fitted_pixels, make_channels
-from kinefit.sensors.points.left_right import find_swaps, limb_groups
+from kinefit.sensors.points.views import find_swaps, limb_groups
 
 BODY = load_body("humanoid")
 SET = "BODY_25B"

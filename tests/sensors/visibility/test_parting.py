@@ -13,7 +13,7 @@ from kinefit.sensors.regions.silhouette import SilhouetteSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surfaces.depth_image import DepthImageSensor
-from kinefit.sensors.visibility.parting import without_others
+from kinefit.sensors.visibility.occlusion import without_others
 
 SETTINGS = TrackSettings()
 

@@ -10,7 +10,7 @@ from kinefit.app.compare import Comparison
 from kinefit.app.desk import Desk
 from kinefit.app.pages.shell import card, link, loaded, page_frame, shell, short, texts
 from kinefit.app.texts import Texts
-from kinefit.rendering import colours
+from kinefit.rendering import looks
 
 _MAX_POINTS = 2000  # of a curve
 
@@ -45,7 +45,7 @@ def _angles(t: Texts, both: Comparison, names: tuple[str, str]) -> None:
     def draw() -> None:
         series = [
             {"type": "line", "name": names[k], "showSymbol": False, "data": both.points(choice.value, k, _MAX_POINTS),
-             "itemStyle": {"color": colours.to_hex((colours.LEFT_COLOUR, colours.RIGHT_COLOUR)[k])},
+             "itemStyle": {"color": looks.to_hex((looks.LEFT_COLOUR, looks.RIGHT_COLOUR)[k])},
              "lineStyle": {"type": ("solid", "dashed")[k]}} for k in (0, 1)
         ]  # fmt: skip
         chart.options.update({

@@ -20,7 +20,7 @@ from kinefit.batch.results import DESCRIPTIONS, NAMES, write_format
 from kinefit.batch.viewed import is_outdated
 from kinefit.errors import KinefitError
 from kinefit.exporters.report.moments import Moment, doubtful_moments
-from kinefit.rendering.colours import to_hex
+from kinefit.rendering.looks import to_hex
 
 _REFRESH_S = 0.1  # between two looks at the clock of the 3D figure
 _IMAGE_PX = 720  # longer side of a camera's image

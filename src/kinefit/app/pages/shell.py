@@ -14,12 +14,12 @@ from nicegui import ui
 from kinefit.app.desk import Desk
 from kinefit.app.texts import Texts, preferred_language
 from kinefit.errors import KinefitError, printable
-from kinefit.rendering import colours
+from kinefit.rendering import looks
 
 Value = TypeVar("Value")
 
 COLOURS = {
-    "fault": colours.RIGHT_COLOUR, "doubt": (176, 132, 0), "note": colours.LEFT_COLOUR, "good": colours.CENTRE_COLOUR,
+    "fault": looks.RIGHT_COLOUR, "doubt": (176, 132, 0), "note": looks.LEFT_COLOUR, "good": looks.CENTRE_COLOUR,
 }  # fmt: skip
 """RGB of the severities of findings: safe for the colour-blind, and dark enough for text."""
 
@@ -39,7 +39,7 @@ def link(page: str, **parameters: object) -> str:
 @contextmanager
 def shell(desk: Desk, t: Texts, title: str) -> Iterator[None]:
     """The frame of a page: a header with the way home and the choice of faces, and a column for the content."""
-    ui.colors(primary=colours.to_hex(colours.LEFT_COLOUR))
+    ui.colors(primary=looks.to_hex(looks.LEFT_COLOUR))
     ui.page_title(f"{title} - kinefit")
     with ui.header().classes("items-center justify-between q-py-xs"):
         ui.link("kinefit", "/").classes("text-white text-lg no-underline font-bold")
@@ -84,9 +84,9 @@ def show_error(t: Texts, error: KinefitError | dict[str, str]) -> None:
     if isinstance(error, KinefitError):
         where = ", ".join(str(part) for part in (error.file, error.place) if part)
         error = {"problem": error.problem, "at": where, "try": error.remedy or ""}
-    with ui.card().classes("w-full").style(f"border-left: 6px solid {colours.to_hex(COLOURS['fault'])}"):
+    with ui.card().classes("w-full").style(f"border-left: 6px solid {looks.to_hex(COLOURS['fault'])}"):
         with ui.row().classes("items-center no-wrap"):
-            ui.icon("error", size="sm").style(f"color: {colours.to_hex(COLOURS['fault'])}")
+            ui.icon("error", size="sm").style(f"color: {looks.to_hex(COLOURS['fault'])}")
             ui.label(error["problem"]).props('role="alert"')
         if error.get("at"):
             ui.label(t("shell.where", at=error["at"])).classes("text-sm text-grey-8 break-all")

@@ -1,7 +1,8 @@
-"""One take: what was found, the person, the check with its remedies, and the computation with its progress."""
+"""One take: what was found, the person, the check with its remedies, the computation with images as it goes on."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,6 @@ from nicegui import ui
 from kinefit.app.desk import Desk
 from kinefit.app.folders import NEW, OUTDATED, UNFINISHED, TakeFolder, video_files
 from kinefit.app.jobs import DONE, FAILED, PAUSED, RUNNING, WAITING, Job
-from kinefit.app.pages.coming import coming_images
 from kinefit.app.pages.people import people_cards
 from kinefit.app.pages.shell import COLOURS, card, link, loaded, page_frame, shell, short, show_error, texts
 from kinefit.app.texts import Texts
@@ -21,9 +21,49 @@ from kinefit.exporters.atomic import write_text
 from kinefit.findings import Edit, in_words
 from kinefit.readers.guess.draft import Note
 from kinefit.readers.guess.folder import Guess, guess_take
+from kinefit.readers.take.entries import CameraEntry
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.find import find_take, takes_in
-from kinefit.rendering.colours import to_hex
+from kinefit.rendering.looks import to_hex
+
+STEP = "frames"
+"""Name of the work that goes through the frames of a take."""
+
+_INTERVAL_S = 2.0  # between two images, of one camera after the other: each costs a tenth of a second at most
+_MAX_CAMERAS = 4  # of which images are shown
+
+
+def coming_images(take: Take, job: Job) -> Callable[[], None]:
+    """A row of images, empty until frames are computed; what is returned brings them up to date."""
+    videos = [camera for camera in take.cameras if camera.video is not None and camera.video.is_file()][:_MAX_CAMERAS]
+    row, images, last = ui.row().classes("w-full"), dict[str, ui.image](), [0.0, 0]
+
+    def update() -> None:
+        progress, now = job.steps.get(STEP), time.monotonic()
+        if job.state != RUNNING or not videos or progress is None or now - last[0] < _INTERVAL_S:
+            return
+        if progress.share >= 1.0 and len(images) == len(videos):
+            return
+        camera = videos[int(last[1]) % len(videos)]
+        last[:] = now, last[1] + 1
+        source = link("/image/raw", path=camera.video, share=f"{progress.share:.4f}", **_span(take, camera))
+        if camera.name in images:
+            images[camera.name].set_source(source)
+            return
+        with row:
+            image = images[camera.name] = ui.image(source).classes("w-40 min-h-[6rem]").props("no-spinner")
+            image.props["alt"] = camera.name
+
+    return update
+
+
+def _span(take: Take, camera: CameraEntry) -> dict[str, float]:
+    """Begin and end [s] of a camera's video that the take uses; nothing for all of it."""
+    if take.frames is None or not take.rate:
+        return {}
+    start, stop = (step / take.rate - camera.time_offset for step in take.frames)
+    return {"start": round(start, 3), "stop": round(stop, 3)}
+
 
 _REFRESH_S = 0.5  # between two looks at the job
 _MAX_NOTES = 8  # of a job that are shown

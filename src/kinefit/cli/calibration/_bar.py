@@ -51,7 +51,7 @@ def bar(
     frame numbers mean equal times. Or give a CSV file of centroids: camera,frame,u,v, with two rows for each image.
     """
     from kinefit.calibration.bar.calibrate import LENGTH_SIGMA, calibrate_bar, check_bar
-    from kinefit.cli._results import check_new
+    from kinefit.cli._screen import check_new
     from kinefit.readers.calibration.read import read_calibration, write_calibration
 
     sigma = LENGTH_SIGMA if length_sigma is None else length_sigma

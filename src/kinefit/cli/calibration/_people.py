@@ -35,7 +35,7 @@ def people(
 
     from kinefit.bodies import load_body
     from kinefit.calibration.people.calibrate import calibrate_people
-    from kinefit.cli._results import check_new
+    from kinefit.cli._screen import check_new
     from kinefit.preparing.take import with_detections
     from kinefit.readers.calibration.read import write_calibration
     from kinefit.readers.take.file import read_take

@@ -75,7 +75,7 @@ def board(
     from kinefit.calibration.board.calibrate import calibrate_board
     from kinefit.calibration.board.detection import Board
     from kinefit.calibration.board.sources import camera_sources, find_boards
-    from kinefit.cli._results import check_new
+    from kinefit.cli._screen import check_new
     from kinefit.readers.calibration.read import read_calibration, write_calibration
 
     described = Board.parse(spec)

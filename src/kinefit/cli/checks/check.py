@@ -56,7 +56,7 @@ def check(
     if points is not None and not points.is_file():
         raise click.BadParameter(f"no such file: {points}", param_hint="--points")
     from kinefit.batch.corrections import write_edits
-    from kinefit.cli._results import check_file
+    from kinefit.cli._screen import check_file
     from kinefit.cli.checks._page import check_page
     from kinefit.cli.checks._refine import refined_of, write_refined
     from kinefit.errors import KinefitError

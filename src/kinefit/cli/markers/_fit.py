@@ -11,7 +11,7 @@ import numpy as np
 from kinefit.batch import results
 from kinefit.bodies import Body, PointSet, load_body
 from kinefit.bodies.marker_sets import matched, read_sides
-from kinefit.cli import _results
+from kinefit.cli import _screen
 from kinefit.cli._screen import Step
 from kinefit.cli.markers._name import read_file
 from kinefit.errors import ExportError, located
@@ -88,8 +88,8 @@ def fit_file(
     folder = out if out is not None else path.with_name(f"{path.stem}-kinefit")
     unknown = [name for name in formats if name not in (*results.NAMES, "markers")]
     if unknown:
-        raise ExportError(_results.no_format(unknown[0], (*results.NAMES, "markers")), remedy="Correct --formats.")
-    _results.check_folder(folder)
+        raise ExportError(_screen.no_format(unknown[0], (*results.NAMES, "markers")), remedy="Correct --formats.")
+    _screen.check_folder(folder)
     generic = load_body(options.body)
     people = read_people(path, unit, options.sides)
     trials = read_people(options.static, unit, options.sides) if options.static else {}

@@ -13,8 +13,7 @@ import numpy as np
 
 from kinefit.bodies import load_body
 from kinefit.bodies.marker_sets import bare, find_marker_set, load_marker_set
-from kinefit.cli._results import check_file
-from kinefit.cli._screen import Step, note
+from kinefit.cli._screen import Step, check_file, note
 from kinefit.errors import KinefitError, ObservationError
 from kinefit.findings import Finding
 from kinefit.identification.model.from_frame import model_from_frame

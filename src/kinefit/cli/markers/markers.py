@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from kinefit.cli import _results, _screen
+from kinefit.cli import _screen
 from kinefit.cli._screen import CommandGroup
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def learn(
     frame: int | None, unit: str | None,
 ) -> None:  # fmt: skip
     """Learn a subject's markers from labelled takes, best from a take in which every joint moves."""
-    from kinefit.cli._results import check_file
+    from kinefit.cli._screen import check_file
     from kinefit.cli.markers._name import learn_files
     from kinefit.identification.model.model import save_model
 
@@ -98,7 +98,7 @@ def write_set(takes: tuple[Path, ...], out: Path | None, name: str | None, unit:
     with known words on the humanoid's landmarks, and assigns every marker to the segment that it moves with. Check the
     file before you learn with it.
     """
-    from kinefit.cli._results import check_file
+    from kinefit.cli._screen import check_file
     from kinefit.cli.markers._name import write_first_set
 
     out = out or Path(f"{takes[0].stem}.toml")
@@ -201,7 +201,7 @@ def fit(
 
     out = out or take.with_name(f"{take.stem}-kinefit")
     chosen = FORMATS if formats is None else tuple(part.strip().lower() for part in formats.split(",") if part.strip())
-    _results.check_folder(out)
+    _screen.check_folder(out)
     with _screen.bars() as step:
         source = take
         if subjects:

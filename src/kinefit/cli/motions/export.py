@@ -9,7 +9,7 @@ from typing import NamedTuple
 import click
 
 from kinefit.batch import results
-from kinefit.cli import _results, _screen
+from kinefit.cli import _screen
 from kinefit.errors import spelled
 from kinefit.readers.units import LENGTHS, worth
 
@@ -81,7 +81,7 @@ def _format(ctx: click.Context, parameter: click.Parameter, value: str | None) -
         return None
     format = spelled(value, FREEDOM)
     if format not in FREEDOM:
-        raise click.BadParameter(_results.no_format(value, FREEDOM))
+        raise click.BadParameter(_screen.no_format(value, FREEDOM))
     return format
 
 
@@ -130,7 +130,7 @@ def export(
 
     motion = find_motion(motion)
     out = out or motion.with_name(f"{motion.stem}{_ENDINGS.get(format, '.' + format)}")
-    (_results.check_folder if format in ("csv", "parquet") else _results.check_file)(out)
+    (_screen.check_folder if format in ("csv", "parquet") else _screen.check_file)(out)
     recorded = read_motion(motion)
     more = {"cylinders": True} if cylinders else {}
     results.write_format(recorded, format, out, **options, **more)
@@ -158,7 +158,7 @@ def _retarget(motion: Path, character: Path, table: Path | None, out: Path | Non
     motion = find_motion(motion)
     ending = KINDS.get(character.suffix.lower(), character.suffix)
     out = out or motion.with_name(f"{motion.stem}-{character.stem}.{ending}")
-    _results.check_file(out)
+    _screen.check_file(out)
     recorded = read_motion(motion)
     found = write_character(recorded, character, out, names=read_names(table) if table else None)
     _screen.say(f"{out}: {len(recorded)} frames on {len(found.segments)} joints of {character.name}")

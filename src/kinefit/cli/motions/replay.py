@@ -28,7 +28,7 @@ def replay(
     source: Path, out: Path, slope: float, heading: float, speed: float, gain: float, azimuth: float
 ) -> None:
     """Place a motion on a slope, move it downhill, and write it as a video or a motion."""
-    from kinefit.cli._results import check_file
+    from kinefit.cli._screen import check_file
     from kinefit.exporters.motion_file import write_motion
     from kinefit.readers.motion import read_motion
     from kinefit.simulation.replay import film, replayed

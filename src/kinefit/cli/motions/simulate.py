@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kinefit.cli import _results, _screen
+from kinefit.cli import _screen
 
 if TYPE_CHECKING:
     from kinefit.motion import Motion
@@ -66,7 +66,7 @@ def simulate(
     from kinefit.exporters import write_csv, write_motion
     from kinefit.simulation import cut, write_recording
 
-    _results.check_folder(out)
+    _screen.check_folder(out)
     with _screen.bars() as step:
         known = _known(motion, body, asf, rate, step)
         known = cut(known, *frames) if frames else known

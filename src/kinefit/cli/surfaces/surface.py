@@ -65,7 +65,7 @@ def surface(
 
     With --flat there is no calibration: all arguments are photographs, before and after.
     """
-    from kinefit.cli._results import check_folder
+    from kinefit.cli._screen import check_folder
     from kinefit.cli.surfaces._files import read_views
     from kinefit.cli.surfaces._measure import Wanted, measure_one_camera, measure_photographs, measure_videos
     from kinefit.errors import ObservationError

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from kinefit.cli import _results, _screen
+from kinefit.cli import _screen
 from kinefit.cli.tracking.track import choices_options
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def batch(
     if cluster is not None and workers is not None:
         raise click.UsageError("--workers (processes on this machine) and --cluster exclude each other: give one.")
     found = find_takes(patterns)
-    _results.check_folder(out)
+    _screen.check_folder(out)
     if found.left_out:
         _screen.note(f"{len(found.left_out)} matching TOML files are no takes, and skipped: {_listed(found.left_out)}")
     try:

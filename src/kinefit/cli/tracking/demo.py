@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from kinefit.cli import _results, _screen
+from kinefit.cli import _screen
 
 _EXAMPLES = """\b
 Examples:
@@ -32,7 +32,7 @@ def demo(ctx: click.Context, out: Path, synthetic: bool) -> None:
     from kinefit.cli.tracking.track import run
     from kinefit.errors import command
 
-    _results.check_folder(out)
+    _screen.check_folder(out)
     take = synthetic_take(out / "take") if synthetic else sample_take(out / "take")
     code = run(take, out, Choices())
     if code == 0:

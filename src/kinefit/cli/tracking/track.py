@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from kinefit.batch import results
-from kinefit.cli import _results, _screen
+from kinefit.cli import _screen
 
 if TYPE_CHECKING:
     from kinefit.batch.one import Choices, TrackedPerson
@@ -23,7 +23,7 @@ def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -
     formats = tuple(dict.fromkeys(value.lower().replace(",", " ").split()))
     for name in formats:
         if name not in results.NAMES:
-            raise click.BadParameter(_results.no_format(name, results.NAMES))
+            raise click.BadParameter(_screen.no_format(name, results.NAMES))
     return formats
 
 
@@ -169,7 +169,7 @@ def run(
     take = asked_take(path, choices)
     if wanted:
         check_drawable(take, skin=choices.overlay_skin)
-    _results.check_folder(out)
+    _screen.check_folder(out)
     with _screen.bars() as step:
         view, people = people_of(take, out, step, _screen.note)
     if len(people) == 1:

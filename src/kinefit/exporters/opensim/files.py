@@ -6,6 +6,7 @@ ground_pelvis joint: the way of its origin, then turns about its own z (tilt), x
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from itertools import chain, count
@@ -13,13 +14,171 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
-from kinefit.bodies import Body, PointSet
+from kinefit.bodies import Body, PointSet, TaperedCylinder
+from kinefit.bodies.surfaces import Surface
+from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_lines, write_text
-from kinefit.exporters.opensim.model import model
-from kinefit.exporters.skeletons.common import UNITS, check_up, euler_zxy, length_factor, plain_names
+from kinefit.exporters.skeletons.common import UNITS, check_up, euler, euler_zxy, length_factor, numbers, plain_names
 from kinefit.motion import Motion
+
+PERSON = 75.0  # [kg]
+SHARES = {
+    "head": 0.0694, "thorax": 0.1396, "clavicle": 0.01, "abdomen": 0.1633, "pelvis": 0.1117, "upperarm": 0.0271,
+    "forearm": 0.0162, "hand": 0.0061, "thigh": 0.1416, "shank": 0.0433, "foot": 0.0117, "toes": 0.002,
+}  # fmt: skip
+"""Share of a segment in a person's mass (de Leva 1996; collar bones and toes are taken out of trunk and foot)."""
+
+_DENSITY_KG_M3, _MIN_MASS_KG = 1000.0, 0.01  # [kg/m³], [kg]
+_EYE, _ZERO = np.eye(3), "0 0 0"
+
+
+def model(body: Body, root_coordinates: list[str], path: str | PathLike[str]) -> ET.Element:
+    """The element <Model>; `root_coordinates`: names of the turns z, x, y and the three ways; `path` for messages.
+
+    Raises ExportError for a joint of more than three turns or three ways.
+    """
+    tree = body.tree
+    names = plain_names(body.alias("opensim", s) for s in tree.segments)
+    coordinates = plain_names(tree.coordinates)
+    out = ET.Element("Model", name=plain_names([body.name])[0])
+    _texts(out, length_units="meters", force_units="N", gravity="0 -9.80665 0")
+    bodies = ET.SubElement(ET.SubElement(out, "BodySet"), "objects")
+    joints = ET.SubElement(ET.SubElement(out, "JointSet"), "objects")
+    markers = ET.SubElement(ET.SubElement(out, "MarkerSet"), "objects")
+    for s, name in enumerate(names):
+        bodies.append(_body(name, tree.segments[s], [c for c in body.surfaces if c.segment == s]))
+        parent = "/ground" if tree.parents[s] < 0 else f"/bodyset/{names[tree.parents[s]]}"
+        dofs = range(tree.dof_start[s], tree.dof_start[s + 1])
+        moves = {d: (coordinates[d], tree.axes[d], _limits(tree.lower[d], tree.upper[d])) for d in dofs}
+        turns = [move for d, move in moves.items() if not tree.prismatic[d]]
+        ways = [move for d, move in moves.items() if tree.prismatic[d]]
+        if tree.parents[s] < 0:
+            turns = [(c, _EYE[k], (-2 * np.pi, 2 * np.pi)) for c, k in zip(root_coordinates[:3], (2, 0, 1))] + turns
+            ways = [(c, _EYE[k], (-100.0, 100.0)) for c, k in zip(root_coordinates[3:], (0, 1, 2))] + ways
+        if len(turns) > 3 or len(ways) > 3:
+            place = f"joint {body.joints[s]}"
+            raise ExportError("OpenSim has no joint of more than three turns or three ways", file=path, place=place)
+        joints.append(_joint(plain_names([body.joints[s]])[0], parent, name, tree.offsets[s], turns, ways, path))
+    points = body.landmarks
+    for label, s, at in zip(plain_names(points.names), points.segments, points.points):
+        marker = ET.SubElement(markers, "Marker", name=label)
+        _texts(marker, socket_parent_frame=f"/bodyset/{names[s]}", location=at, fixed="true")
+    return out
+
+
+def _joint(
+    name: str, parent: str, child: str, at: NDArray, turns: list, ways: list, path: str | PathLike[str]
+) -> ET.Element:
+    joint = ET.Element("CustomJoint" if turns or ways else "WeldJoint", name=name)
+    _texts(joint, socket_parent_frame=f"{name}_parent", socket_child_frame=f"{name}_child")
+    if turns or ways:
+        coordinates = ET.SubElement(joint, "coordinates")
+        for coordinate, _, (low, high) in turns + ways:
+            entry = ET.SubElement(coordinates, "Coordinate", name=coordinate)
+            _texts(entry, default_value=np.clip(0.0, low, high), range=[low, high], clamped="false", locked="false")
+    frames = ET.SubElement(joint, "frames")
+    for frame, socket, offset in ((f"{name}_parent", parent, at), (f"{name}_child", f"/bodyset/{child}", np.zeros(3))):
+        entry = ET.SubElement(frames, "PhysicalOffsetFrame", name=frame)
+        _texts(entry, socket_parent=socket, translation=offset, orientation=_ZERO)
+    if turns or ways:
+        transform = ET.SubElement(joint, "SpatialTransform")
+        for kind, moves in (("rotation", turns), ("translation", ways)):
+            axes = _three_axes([axis for _, axis, _ in moves])
+            if abs(np.linalg.det(axes)) < 1e-3:
+                raise ExportError(
+                    "OpenSim needs axes that do not lie in one plane",
+                    file=path, place=f"joint {name}", remedy="Turn one of the axes, or remove one.",
+                )  # fmt: skip
+            for k in range(3):
+                _transform_axis(transform, f"{kind}{k + 1}", axes[k], moves[k][0] if k < len(moves) else None)
+    return joint
+
+
+def _three_axes(axes: Sequence[NDArray]) -> NDArray:
+    """(3, 3) the axes, made up to three by directions at right angles to them."""
+    out = [np.asarray(axis, float) for axis in axes]
+    while len(out) < 3:
+        if len(out) == 2:
+            normal = np.cross(out[0], out[1])
+            out.append(normal / max(float(np.linalg.norm(normal)), 1e-12))
+        else:
+            rest = _EYE[np.argmin(np.abs(out[0]))] if out else _EYE[0]
+            out.append(rest - (rest @ out[0]) * out[0] if out else rest)
+            out[-1] /= np.linalg.norm(out[-1])
+    return np.array(out)
+
+
+def _transform_axis(transform: ET.Element, name: str, axis: NDArray, coordinate: str | None) -> None:
+    entry = ET.SubElement(transform, "TransformAxis", name=name)
+    _texts(entry, coordinates=coordinate or "", axis=axis)
+    if coordinate:
+        _texts(ET.SubElement(entry, "LinearFunction", name="function"), coefficients="1 0")
+    else:
+        _texts(ET.SubElement(entry, "Constant", name="function"), value="0")
+
+
+def _limits(low: float, high: float) -> tuple[float, float]:
+    return max(float(low), -99999.9), min(float(high), 99999.9)
+
+
+def _body(name: str, segment: str, surfaces: Sequence[Surface]) -> ET.Element:
+    mass, centre, inertia = mass_properties(segment, surfaces)
+    out = ET.Element("Body", name=name)
+    _texts(
+        out, mass=mass, mass_center=centre,
+        inertia=[inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))],
+    )  # fmt: skip
+    components = ET.SubElement(out, "components") if surfaces else out
+    for k, surface in enumerate(surfaces):
+        middle, R_body_cylinder, length, radii = _rod(surface)
+        label = f"{name}_{k + 1}" if k else name
+        frame = ET.SubElement(components, "PhysicalOffsetFrame", name=f"{label}_axis")
+        geometry = ET.SubElement(ET.SubElement(frame, "attached_geometry"), "Cylinder", name=f"{label}_surface")
+        radius = float(np.mean(radii))
+        _texts(geometry, radius=radius, half_height=0.5 * length)
+        if abs(radii[0] - radii[1]) > 1e-9:
+            _texts(geometry, scale_factors=[radii[0] / radius, 1.0, radii[1] / radius])
+        _texts(frame, socket_parent="..", translation=middle, orientation=euler(R_body_cylinder[None], "xyz"))
+    return out
+
+
+def _rod(surface: Surface) -> tuple[NDArray, NDArray, float, NDArray]:
+    """Middle (3,) [m], rotation (3, 3) from an upright cylinder, length [m] and half axes (2,) [m] along its x and z.
+
+    Of a mesh: the elliptical cylinder in the box along its principal directions.
+    """
+    if isinstance(surface, TaperedCylinder):
+        a, b, axis = surface.axes
+        middle = 0.5 * np.add(surface.start, surface.end)
+        return middle, np.stack([a, axis, -b], axis=1), surface.length, np.mean(surface.radii, axis=0)
+    middle, axes, size = surface.box()
+    R = np.stack([axes[1], axes[0], np.cross(axes[1], axes[0])], axis=1)
+    return middle, R, float(size[0]), 0.5 * size[1:]
+
+
+def mass_properties(segment: str, surfaces: Sequence[Surface]) -> tuple[float, NDArray, NDArray]:
+    """Mass [kg], centre of mass (3,) [m] and inertia (3, 3) [kg m²] about it, of elliptical rods along the surfaces."""
+    rods = [_rod(surface) for surface in surfaces] or [(np.array([0.0, 0.025, 0.0]), _EYE, 0.05, np.full(2, 0.02))]
+    volumes = np.array([np.pi * length * radii[0] * radii[1] for _, _, length, radii in rods])
+    share = SHARES.get(re.sub("_[lr]$", "", segment))
+    mass = max(_MIN_MASS_KG, share * PERSON if share else _DENSITY_KG_M3 * float(volumes.sum()))
+    masses = mass * volumes / volumes.sum()
+    centre = sum(m * middle for m, (middle, _, _, _) in zip(masses, rods)) / mass
+    inertia = np.zeros((3, 3))
+    for m, (middle, R, length, (a, b)) in zip(masses, rods):
+        own = m * np.diag([b**2 / 4 + length**2 / 12, (a**2 + b**2) / 4, a**2 / 4 + length**2 / 12])
+        away = middle - centre
+        inertia += R @ own @ R.T + m * ((away @ away) * _EYE - np.outer(away, away))
+    return mass, centre, inertia
+
+
+def _texts(parent: ET.Element, **texts: str | ArrayLike) -> None:
+    """Elements with a text or numbers, in this order."""
+    for tag, text in texts.items():
+        ET.SubElement(parent, tag).text = text if isinstance(text, str) else numbers(text, ".10g")
 
 
 @checked

@@ -16,9 +16,16 @@ from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import OUTLIER_WEIGHT, Motion, Residuals
 from kinefit.rendering import Canvas
-from kinefit.rendering.colours import LOST_COLOUR, side_colour
-from kinefit.rendering.looks import segment_looks, side_colours, triangle_segments, uncertain_segments
-from kinefit.rendering.tubes import TubeMesh, body_mesh
+from kinefit.rendering.looks import (
+    LOST_COLOUR,
+    TubeMesh,
+    body_mesh,
+    segment_looks,
+    side_colour,
+    side_colours,
+    triangle_segments,
+    uncertain_segments,
+)
 
 DARK, WHITE = (15, 15, 15), (255, 255, 255)
 MEASURED, OUTLIER, WAY = (255, 240, 60), (255, 40, 40), (255, 90, 220)

@@ -15,9 +15,17 @@ from kinefit.exporters.report.page import Html, to_json
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion, rotation_between_up
-from kinefit.rendering.colours import LOST_COLOUR, side_colour, to_hex
-from kinefit.rendering.looks import LOST_OPACITY, UNCERTAIN_OPACITY, triangle_segments, uncertain_segments
-from kinefit.rendering.tubes import body_mesh, is_last
+from kinefit.rendering.looks import (
+    LOST_COLOUR,
+    LOST_OPACITY,
+    UNCERTAIN_OPACITY,
+    body_mesh,
+    is_last,
+    side_colour,
+    to_hex,
+    triangle_segments,
+    uncertain_segments,
+)
 
 RATE = 15.0  # [Hz] of the figure: enough for the eye to follow, the player goes smoothly between
 MAX_FIGURE_FRAMES = 3000  # frames: longer takes are shown at a lower rate

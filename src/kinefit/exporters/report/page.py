@@ -31,12 +31,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import AssetError, ExportError
 from kinefit.findings import Finding
-from kinefit.rendering import colours
-from kinefit.serving.policy import inline_policy
+from kinefit.rendering import looks
+from kinefit.serving.access import inline_policy
 
 # Left and right as in overlays.
-LEFT_COLOUR, RIGHT_COLOUR = colours.to_hex(colours.LEFT_COLOUR), colours.to_hex(colours.RIGHT_COLOUR)
-CENTRE_COLOUR = colours.to_hex(colours.CENTRE_COLOUR)
+LEFT_COLOUR, RIGHT_COLOUR = looks.to_hex(looks.LEFT_COLOUR), looks.to_hex(looks.RIGHT_COLOUR)
+CENTRE_COLOUR = looks.to_hex(looks.CENTRE_COLOUR)
 SERIES = (LEFT_COLOUR, RIGHT_COLOUR, CENTRE_COLOUR, "#cc79a7", "#7a5195", "#56b4e9", "#b8860b", "#4d4d4d")
 SEVERITIES = {"good": "✓", "note": "i", "warning": "!", "bad": "✕"}
 _FINDINGS = {
@@ -325,7 +325,7 @@ def _shades() -> str:
     """Rules of `shaded` cells: a page's policy allows no style of a single element."""
     rules = []
     for k in range(_SHADES + 1):
-        red, green, blue = (round(255 + (end - 255) * 0.75 * k / _SHADES) for end in colours.RIGHT_COLOUR)
+        red, green, blue = (round(255 + (end - 255) * 0.75 * k / _SHADES) for end in looks.RIGHT_COLOUR)
         rules.append(f".shade-{k} {{ background: rgb({red},{green},{blue}); }}\n")
     return "".join(rules)
 

@@ -14,14 +14,15 @@ from kinefit.bodies import Body
 from kinefit.exporters.atomic import write_lines
 from kinefit.exporters.skeletons.common import (
     UNITS,
+    Rest,
     bone_names,
     check_up,
     euler_zxy,
     length_factor,
     moving_segments,
     numbers,
+    rest_pose,
 )
-from kinefit.exporters.skeletons.rest import Rest, rest_pose
 from kinefit.motion import Motion
 
 _ROTATIONS = "Zrotation Xrotation Yrotation"

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes
-from kinefit.exporters.skeletons.common import bone_names, moving_segments, plain_names
-from kinefit.exporters.skeletons.rest import Rest, rest_pose
+from kinefit.exporters.skeletons.common import Rest, bone_names, moving_segments, plain_names, rest_pose
 from kinefit.motion import Motion
-from kinefit.rendering.tubes import TubeMesh, body_mesh
+from kinefit.rendering.looks import TubeMesh, body_mesh
 
 _TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 _COMPONENTS = {"float32": 5126, "uint32": 5125, "uint16": 5123, "uint8": 5121}

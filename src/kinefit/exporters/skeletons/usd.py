@@ -14,11 +14,10 @@ from kinefit.bodies import Body, MeshSurface
 from kinefit.bodies.surfaces import Surface
 from kinefit.errors import ExportError, extra
 from kinefit.exporters.atomic import writing
-from kinefit.exporters.skeletons.common import UNITS, bone_names, length_factor, turned
-from kinefit.exporters.skeletons.rest import Rest, rest_pose
+from kinefit.exporters.skeletons.common import UNITS, Rest, bone_names, length_factor, rest_pose, turned
 from kinefit.geometry import se3
 from kinefit.motion import Motion, rotation_between_up
-from kinefit.rendering.tubes import TubeMesh, body_mesh
+from kinefit.rendering.looks import TubeMesh, body_mesh
 
 ENDINGS = (".usd", ".usda", ".usdc")
 _UPS = ("y", "z")

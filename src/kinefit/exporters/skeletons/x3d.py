@@ -13,8 +13,15 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_lines
-from kinefit.exporters.skeletons.common import bone_names, moving_segments, numbers, plain_names
-from kinefit.exporters.skeletons.rest import Rest, rest_pose, standing
+from kinefit.exporters.skeletons.common import (
+    Rest,
+    bone_names,
+    moving_segments,
+    numbers,
+    plain_names,
+    rest_pose,
+    standing,
+)
 from kinefit.motion import Motion
 
 _FORM = ".9g"  # of numbers

@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.images.detectors.box_detector import BoxDetector
+from kinefit.images.detectors.box_detector import BoxDetector, DetectedPerson
 from kinefit.images.detectors.models import Models, interpreter
-from kinefit.images.detectors.person_detector import DetectedPerson
 from kinefit.images.detectors.pose_model import SIZE
 
 FACES_NEAR, FACES_FAR = "face_detection_short_range.tflite", "face_detection_full_range_sparse.tflite"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kinefit._jit import cache_directory
 from kinefit.errors import FileError, ObservationError
-from kinefit.images.detectors.person_detector import DetectedPerson, PersonDetector
+from kinefit.images.detectors.box_detector import DetectedPerson, PersonDetector
 from kinefit.images.detectors.pose_model import MASK, PersonLandmarks, PoseModel, mean_with_mirrored
 
 DETECTOR, LANDMARKS = "pose_detection.tflite", "pose_landmark_full.tflite"

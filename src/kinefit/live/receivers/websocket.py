@@ -16,10 +16,8 @@ from websockets.exceptions import ConnectionClosed
 
 from kinefit.bodies import Body
 from kinefit.exporters.report.figure import live_figure
-from kinefit.live.packets import PosePacket
-from kinefit.live.wishes import Answer
-from kinefit.serving.access import Access
-from kinefit.serving.policy import APP_PAGES, inline_policy
+from kinefit.live.packets import Answer, PosePacket
+from kinefit.serving.access import APP_PAGES, Access, inline_policy
 from kinefit.serving.server import Connection, Page, PageServer
 
 _MAX_WAITING_ANSWERS = 100  # a client that leaves more unread is disconnected

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from kinefit._pictures import read_picture
 from kinefit.errors import FileError, ObservationError, TakeError
 from kinefit.geometry.camera import ImageFrame, Rig
-from kinefit.images.silhouette import colour_mask
-from kinefit.images.silhouette_background import BackgroundPlate
+from kinefit.images.silhouette import BackgroundPlate, colour_mask
 from kinefit.observations import ColourVideo, Detections, SilhouetteVideo
 from kinefit.observations.clocks import frame_times
 from kinefit.readers.depth.images import listed

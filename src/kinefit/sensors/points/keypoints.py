@@ -20,10 +20,7 @@ from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor
 from kinefit.sensors.channels import Channels, known_points, make_channels
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence
 from kinefit.sensors.layout import Layout, Stream, projected
-from kinefit.sensors.points.hand_views import join_fingers
-from kinefit.sensors.points.left_right import find_swaps
-from kinefit.sensors.points.triangulation import rays, triangulated_frame
-from kinefit.sensors.points.view_bias import ViewBias
+from kinefit.sensors.points.views import ViewBias, find_swaps, join_fingers, rays, triangulated_frame
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.visibility.occlusion import MIN_VISIBLE_CONFIDENCE, Hidden, hidden_points
 from kinefit.solvers.pixels import PixelPoints

@@ -25,7 +25,7 @@ from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segm
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, Evidence
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.visibility.parting import drawn_together, outside_others
+from kinefit.sensors.visibility.occlusion import drawn_together, outside_others
 
 _MAX_RENDER_SHIFT_PX = 0.5  # of a body since its rendering: half of the offset at which pixels at the contour are read
 _FOREARM_RADIUS = 0.04  # [m]: a contour farther off is another part's, however poor the masks are

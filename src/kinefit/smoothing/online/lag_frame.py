@@ -15,7 +15,7 @@ from kinefit.frame.fit import rows_of, rows_of_points
 from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched, Measurement, matched_by, pixels_of
-from kinefit.sensors.observability import moves_points
+from kinefit.sensors.evidence import moves_points
 from kinefit.sensors.points.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings

@@ -1,4 +1,4 @@
-"""Virtual Motion Capture protocol: poses over OSC to avatars in Unity, Unreal, Blender and VRM programs.
+"""Receivers of poses in other programs: avatars (VMC), laboratories (Lab Streaming Layer), JSON lines.
 
 Bones are those of Unity's humanoid, resting as a T that faces z; the world is Unity's: left-handed, x right, y up, z
 forward. From kinefit's right-handed world with y up it comes by x -> -x, hence a quaternion (w, x, y, z) becomes
@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import socket
 import struct
+import sys
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +23,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.bodies.joint_names import SIDES, VRM0_FINGERS
 from kinefit.errors import BodyError, ExportError
-from kinefit.exporters.skeletons.rest import Rest, rest_pose
+from kinefit.exporters.skeletons.common import Rest, rest_pose
 from kinefit.geometry import se3
 from kinefit.live.packets import PosePacket
 from kinefit.motion import rotation_between_up
@@ -157,3 +159,99 @@ def _parts(messages: list[bytes]) -> list[bytes]:
         part.append(message)
         size += len(message) + 4
     return [*out, osc_bundle(part)]
+
+
+class JsonLines:
+    """Writes every packet as one line; "-" is the standard output.
+
+    Raises
+    ------
+    ExportError
+        The file cannot be written.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        try:
+            self._file: BinaryIO = sys.stdout.buffer if str(path) == "-" else open(self.path, "wb")
+        except OSError as error:
+            problem = f"cannot be written ({error.strerror})"
+            raise ExportError(problem, file=self.path, remedy="Give another file with --json.") from error
+
+    def hello(self, body: Body, packet: bytes) -> None:
+        """Write the packet of a new body as one line."""
+        self._write(packet)
+
+    def pose(self, posed: PosePacket, packet: bytes) -> None:
+        """Write the packet of a pose as one line."""
+        self._write(packet)
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not sys.stdout.buffer:
+            self._file.close()
+
+    def _write(self, packet: bytes) -> None:
+        try:
+            self._file.write(packet + b"\n")
+            self._file.flush()
+        except OSError as error:
+            problem = f"cannot be written ({error.strerror})"
+            raise ExportError(problem, file=self.path, remedy="Free some space, or give another --json.") from error
+
+
+class Lsl:
+    """Two outlets: NAME-angles [deg, of sliding coordinates m] and NAME-joints [m], each with standard deviations.
+
+    Unobserved coordinates have the standard deviation inf; while the person is not found, nothing is sent.
+
+    Raises
+    ------
+    ExportError
+        The package `pylsl`, or its library, is missing.
+    """
+
+    def __init__(self, name: str, *, rate: float) -> None:
+        try:
+            import pylsl
+        except (ImportError, RuntimeError) as error:
+            remedy = "Install it: pip install 'kinefit[lsl]'."
+            raise ExportError(f"LSL needs the package pylsl ({error})", place="--lsl", remedy=remedy) from error
+        self._lsl, self.name, self.rate = pylsl, name, rate
+        self._outlets: list[Any] = []
+        self._factor = np.ones(0)
+
+    def hello(self, body: Body, packet: bytes) -> None:
+        """Open streams for a new body; those of the previous one end."""
+        tree = body.tree
+        self._factor = np.where(tree.prismatic, 1.0, np.degrees(1.0))
+        angles = [(name, "m" if slides else "deg") for name, slides in zip(tree.coordinates, tree.prismatic)]
+        angles += [(f"{name} std", unit) for name, unit in angles]
+        joints = [(f"{name} {axis}", "m") for name in tree.segments for axis in "xyz"]
+        joints += [(f"{name} std", unit) for name, unit in joints]
+        self._outlets = [self._outlet(kind, columns) for kind, columns in (("angles", angles), ("joints", joints))]
+
+    def pose(self, posed: PosePacket, packet: bytes) -> None:
+        """Send one sample of each stream."""
+        r = posed.result
+        if r is None:
+            return
+        f = self._factor
+        angles = np.concatenate([f * r.state.angles, f * r.dof_std[6:]])
+        joints = np.concatenate([posed.Ts_world_segment[:, :3, 3].ravel(), r.joint_std.ravel()])
+        for outlet, sample in zip(self._outlets, (angles, joints)):
+            outlet.push_sample(sample.tolist())
+
+    def close(self) -> None:
+        """End the streams."""
+        self._outlets = []
+
+    def _outlet(self, kind: str, columns: list[tuple[str, str]]) -> Any:
+        name = f"{self.name}-{kind}"
+        info = self._lsl.StreamInfo(name, "MoCap", len(columns), self.rate, "double64", f"kinefit-{name}")
+        channels = info.desc().append_child("channels")
+        for label, unit in columns:
+            channel = channels.append_child("channel")
+            channel.append_child_value("label", label)
+            channel.append_child_value("unit", unit)
+        return self._lsl.StreamOutlet(info)

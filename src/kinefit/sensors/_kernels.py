@@ -1,4 +1,4 @@
-"""Levers of the degrees of freedom of a tree on observed points."""
+"""Checks of rows, and levers of observed points, each in one pass."""
 
 from __future__ import annotations
 
@@ -6,6 +6,19 @@ import math
 
 from kinefit._jit import jit
 from kinefit.geometry._kernels_frames import moved
+
+
+@jit
+def sound(data, segment, count):
+    """Whether data (8, N) are finite, weights at least 0 and segments (N,) below `count`."""
+    total, good = 0.0, True
+    for q in range(8):
+        line = data[q]
+        for i in range(line.size):
+            total += line[i]
+    for i in range(segment.size):
+        good = good and data[7, i] >= 0.0 and 0 <= segment[i] < count
+    return good and abs(total) < math.inf
 
 
 @jit
