@@ -4,7 +4,7 @@ import pytest
 from tests.app.test_live import STUDIO
 from tests.viewers.recordings import write_video
 
-from kinefit.app.pages import coming
+from kinefit.app.pages.take import _span
 from kinefit.errors import FileError
 from kinefit.readers.take.file import read_take
 from kinefit.readers.video_files import image_at
@@ -31,7 +31,7 @@ def test_only_the_part_of_a_video_that_the_take_uses_is_shown(tmp_path):
     text = STUDIO + '[[camera]]\nname = "a"\nvideo = "a.mp4"\ntime_offset = 0.5\n'
     (tmp_path / "take.toml").write_text(text)
     take = read_take(tmp_path / "take.toml")
-    assert coming._span(take, take.cameras[0]) == {}
+    assert _span(take, take.cameras[0]) == {}
     (tmp_path / "take.toml").write_text(text.replace("[take]\n", "[take]\nframes = [30, 90]\n"))
     take = read_take(tmp_path / "take.toml")
-    assert coming._span(take, take.cameras[0]) == {"start": 0.5, "stop": 2.5}
+    assert _span(take, take.cameras[0]) == {"start": 0.5, "stop": 2.5}

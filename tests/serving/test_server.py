@@ -12,20 +12,23 @@ from websockets.sync.client import connect
 
 from kinefit.errors import ExportError
 from kinefit.serving.access import Access, inline_policy
-from kinefit.serving.server import MAX_FRAMES_AT_ONCE, MAX_MESSAGE_BYTES, Allowance, Page, PageServer
+from kinefit.serving.server import MAX_FRAMES_AT_ONCE, MAX_MESSAGE_BYTES, Allowance, Page, PageServer, listen
 
 PAGES = {"/": Page(b"hello", policy=inline_policy(["x"], [])), "/a.js": Page(b"1", "text/javascript")}
 LIMIT = 5000  # messages that a flooder of a test sends at most
 
 
-async def echo(connection):
-    async for message in connection:
-        await connection.send(f"{message} {connection.has_token}")
+class Echo(PageServer):
+    page = staticmethod(PAGES.get)
+
+    async def talk(self, connection):
+        async for message in connection:
+            await connection.send(f"{message} {connection.has_token}")
 
 
 @pytest.fixture
 def server():
-    server = PageServer(Access(readers=True), 0, page=PAGES.get, talk=echo)
+    server = Echo(Access(readers=True))
     yield server
     server.close()
 
@@ -76,7 +79,7 @@ def test_the_token_is_told_to_who_talks(server):
 
 
 def test_a_server_for_all_networks_needs_the_token():
-    server = PageServer(Access("0.0.0.0", readers=True), 0, page=PAGES.get, talk=echo)
+    server = Echo(Access("0.0.0.0", readers=True))
     try:
         with pytest.raises(InvalidStatus, match="403"):
             connect(ws(server, False))
@@ -155,7 +158,7 @@ def test_probes_print_nothing(server, capfd, caplog):
 @pytest.mark.parametrize("host", ["no.such.host.invalid", "a" * 70 + ".invalid", "203.0.113.7"])
 def test_a_host_that_is_none_is_told(host):
     with pytest.raises(ExportError, match="server cannot start at"):
-        PageServer(Access(host), 0, page=PAGES.get, talk=echo)
+        Echo(Access(host))
 
 
 def test_a_server_that_is_closed_does_nothing(server):
@@ -171,3 +174,12 @@ def test_a_one_time_address_goes_on_to_the_page(server):
         assert answer.headers["Cache-Control"] == "no-store"
     with pytest.raises(urllib.error.HTTPError, match="403"):
         urllib.request.urlopen(address, timeout=10)
+
+
+def test_a_port_in_use_gives_the_next():
+    with listen("127.0.0.1", 0) as taken:
+        port = taken.getsockname()[1]
+        with listen("127.0.0.1", port, search=True) as found:
+            assert found.getsockname()[1] != port
+        with pytest.raises(ExportError, match=f"127.0.0.1:{port} .*in use"):
+            listen("127.0.0.1", port)

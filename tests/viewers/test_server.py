@@ -2,7 +2,6 @@
 
 import base64
 import re
-import socket
 import sys
 import types
 import urllib.error
@@ -27,7 +26,7 @@ from kinefit.serving.access import Access
 from kinefit.simulation import cut
 from kinefit.viewers import CameraImages, Choice, Player, View, ViewerContent, page
 from kinefit.viewers.show import ALL_CAMERAS, CYLINDERS, MOST_FRAMES, Show, chosen_frames
-from kinefit.viewers.stage import free_port, open_server, quiet
+from kinefit.viewers.stage import open_server, quiet
 
 ACCESS = Access()
 
@@ -324,15 +323,6 @@ def test_the_player_plays_steps_and_obeys_its_boxes(server, motion, rig):
 def test_nothing_to_show_is_told():
     with pytest.raises(ObservationError, match="no frame"):
         ViewerContent()
-
-
-def test_a_port_in_use_gives_the_next():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        found = free_port("127.0.0.1", port)
-        assert found != port
-        with socket.create_server(("127.0.0.1", found)):
-            pass
 
 
 def test_a_host_that_is_none_is_told():

@@ -8,7 +8,7 @@ import threading
 from pathlib import Path
 
 from kinefit.serving.access import APP_PAGES, Access
-from kinefit.serving.server import Connection, Page, PageServer
+from kinefit.serving.server import Page, PageServer
 from kinefit.viewers.player import Player
 from kinefit.viewers.show import ViewerContent
 from kinefit.viewers.stage import open_server, quiet
@@ -21,7 +21,7 @@ _POLICY = (
 """A page with its own scripts and images and without connections, of an origin that no other page has."""
 
 
-class FilePages:
+class FilePages(PageServer):
     """A server of pages that lie among recordings.
 
     Parameters
@@ -36,7 +36,7 @@ class FilePages:
     def __init__(self, root: Path) -> None:
         self.folders = {root}
         self._keys: dict[Path, str] = {}
-        self._server = PageServer(Access(), 0, page=self._page, talk=_hang_up)
+        super().__init__(Access())
 
     def address(self, file: Path) -> str | None:
         """Address of a page; None where the file, after all links, is no page, or lies outside of all folders."""
@@ -44,21 +44,14 @@ class FilePages:
         within = any(found.is_relative_to(os.path.realpath(folder)) for folder in self.folders)
         if not within or found.suffix.lower() != ".html" or not found.is_file():
             return None
-        return f"{self._server.url}{self._keys.setdefault(found, secrets.token_urlsafe(_KEY_BYTES))}"
+        return f"{self.url}{self._keys.setdefault(found, secrets.token_urlsafe(_KEY_BYTES))}"
 
-    def close(self) -> None:
-        """Serve them no more."""
-        self._server.close()
-
-    def _page(self, path: str) -> Page | None:
+    def page(self, path: str) -> Page | None:
+        """The file of an address."""
         file = next((file for file, key in self._keys.items() if path == f"/{key}"), None)
         if file is None or not (self.address(file) or "").endswith(path):  # a link by now
             return None
         return Page(file.read_bytes(), policy=_POLICY, framed_by=APP_PAGES)
-
-
-async def _hang_up(connection: Connection) -> None:
-    """Say nothing: pages of files open no WebSockets."""
 
 
 _END_TIMEOUT_S = 5.0  # of the frame that is shown

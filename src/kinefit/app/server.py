@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import secrets
-import socket
 import warnings
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from http import HTTPStatus
@@ -14,8 +13,7 @@ from websockets.datastructures import Headers
 
 from kinefit.errors import ExportError
 from kinefit.serving.access import APP_PAGES, Access, Refusal
-from kinefit.serving.server import HEADERS
-from kinefit.viewers.stage import free_port
+from kinefit.serving.server import HEADERS, listen
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Scope]]
@@ -119,7 +117,7 @@ def serve(root: Path, port: int, access: Access, opened: Callable[[int], None]) 
     from kinefit.app.desk import Desk
     from kinefit.app.pages.routes import add_pages
 
-    listener = socket.create_server((access.host, free_port(access.host, port)))
+    listener = listen(access.host, port, search=True)
     desk = Desk(root, prefix=f"/{access.token}")
     add_pages(desk)
     outer = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)

@@ -4,26 +4,37 @@ Readers make them, correspondences use them. Nothing here opens a file or depend
 time, `recordings` of a whole take of one sensor.
 """
 
-from kinefit.observations.body_trackers import BodyTrackerFrame, BodyTrackerVideo
-from kinefit.observations.colours import ColourVideo
-from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.observations.detections import MEDIAPIPE_33, MEDIAPIPE_75, MEDIAPIPE_478, MEDIAPIPE_HAND_21, Detections
-from kinefit.observations.features import ClickVideo, KeypointVideo, LineVideo, NamedMarkers
-from kinefit.observations.frame_kinds import KEYPOINTS, Frame, by_record, sensor_of
 from kinefit.observations.frames import (
+    KEYPOINTS,
+    BodyTrackerFrame,
     ClickFrame,
     ColourFrame,
     DepthFrame,
+    Frame,
     KeypointFrame,
     LiftedFrame,
     LineFrame,
     MarkerFrame,
     PointCloud,
     SilhouetteFrame,
+    SurfacePointFrame,
+    by_record,
+    sensor_of,
 )
 from kinefit.observations.recordings import KEYPOINT_SIGMA, Keypoints, MarkerEvent, Markers, SkeletonMotion
-from kinefit.observations.silhouettes import SilhouetteVideo
-from kinefit.observations.surface_points import SurfacePointFrame, SurfacePointVideo
+from kinefit.observations.videos import (
+    BodyTrackerVideo,
+    ClickVideo,
+    CloudVideo,
+    ColourVideo,
+    DepthVideo,
+    KeypointVideo,
+    LineVideo,
+    NamedMarkers,
+    SilhouetteVideo,
+    SurfacePointVideo,
+)
 
 __all__ = [
     "KEYPOINTS", "KEYPOINT_SIGMA", "MEDIAPIPE_33", "MEDIAPIPE_75", "MEDIAPIPE_478", "MEDIAPIPE_HAND_21",

@@ -13,8 +13,8 @@ from kinefit._image_headers import MAX_IMAGE_PIXELS
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.observations.arrays import freeze, frozen
-from kinefit.observations.depth import checked_times
 from kinefit.observations.recordings import Keypoints
+from kinefit.observations.videos import checked_times
 
 _FACE = "nose left_eye_inner left_eye left_eye_outer right_eye_inner right_eye right_eye_outer left_ear right_ear"
 _PAIRS = "shoulder elbow wrist pinky index thumb hip knee ankle heel foot_index"

@@ -1,9 +1,11 @@
-"""Frames: the data of one sensor at one time, from a live source or a recording."""
+"""Frames: the data of one sensor at one time, from a live source or a recording; their kinds and sensors' names."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +18,44 @@ from kinefit.observations.recordings import Keypoints
 _MAX_DEPTH = 100.0  # [m] of any depth camera; a larger number is in millimetres
 
 
+KEYPOINTS = "keypoints"
+"""Name of the one sensor of the keypoint detectors of all cameras."""
+
+
 @dataclass(frozen=True, eq=False)
-class DepthFrame:
+class _SensorFrame:
+    """What all frames have: the name of what saw it, and its time [s].
+
+    A kind states its arrays that have a row for each of its `names`, {array: (what it is, shape of a row)}; the form of
+    its sensor's name, whose prefix distinguishes kinds that share a camera; and the array that is an image.
+    """
+
+    sensor: str
+    time: float
+    _rows: ClassVar[Mapping[str, tuple[str, tuple[int, ...]]]] = {}
+    _sensor_form: ClassVar[str] = "{}"
+    _pixels: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        names = getattr(self, "names", ())
+        check_seen(self.sensor, self.time, names)
+        for name, (what, row) in self._rows.items():
+            if (values := getattr(self, name)) is not None:
+                freeze(self, **{name: frozen(values, float, f"{what} of {self.sensor}", (len(names), *row))})
+
+
+class _ImageLike(_SensorFrame):
+    """A frame of one value or colour for each pixel."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) [px]."""
+        height, width = getattr(self, self._pixels).shape[:2]
+        return width, height
+
+
+@dataclass(frozen=True, eq=False)
+class DepthFrame(_ImageLike):
     """One depth image.
 
     Parameters
@@ -34,12 +72,11 @@ class DepthFrame:
         The array is no image, or its values are too large for metres.
     """
 
-    sensor: str
-    time: float
     depth: NDArray
+    _pixels = "depth"
 
     def __post_init__(self) -> None:
-        check_seen(self.sensor, self.time)
+        super().__post_init__()
         depth = numbers(self.depth, np.float32, f"a depth image of {self.sensor}")
         if depth.ndim != 2 or not depth.size:
             raise ObservationError(
@@ -54,14 +91,9 @@ class DepthFrame:
         depth.flags.writeable = False
         object.__setattr__(self, "depth", depth)
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) [px]."""
-        return self.depth.shape[1], self.depth.shape[0]
-
 
 @dataclass(frozen=True, eq=False)
-class PointCloud:
+class PointCloud(_SensorFrame):
     """3D points on a surface (P2 2.3): of anything, of the body, or of one segment.
 
     Parameters
@@ -82,15 +114,13 @@ class PointCloud:
         Arrays of other shapes; a viewpoint that is not finite.
     """
 
-    sensor: str
-    time: float
     points: NDArray
     viewpoint: NDArray | None = None
     on_body: bool = False
     segment: str | None = None
 
     def __post_init__(self) -> None:
-        check_seen(self.sensor, self.time)
+        super().__post_init__()
         points = frozen(self.points, float, f"a cloud of {self.sensor}", ("points", 3))
         object.__setattr__(self, "points", frozen(points[np.isfinite(points).all(axis=1)]))
         if self.viewpoint is not None:
@@ -103,7 +133,7 @@ class PointCloud:
 
 
 @dataclass(frozen=True, eq=False)
-class KeypointFrame:
+class KeypointFrame(_SensorFrame):
     """2D keypoints of one person in one camera.
 
     Parameters
@@ -125,13 +155,13 @@ class KeypointFrame:
         Arrays of other shapes.
     """
 
-    sensor: str
-    time: float
     names: tuple[str, ...]
     uv: NDArray
     confidence: NDArray
     keypoint_set: str = ""
     sides_known: bool = False
+    _rows: ClassVar = {"confidence": ("the confidence of keypoints", ()), "uv": ("keypoints", (2,))}
+    _sensor_form = KEYPOINTS
 
     @classmethod
     def of_record(cls, record: Keypoints, frame: int, time: float) -> KeypointFrame:
@@ -145,15 +175,10 @@ class KeypointFrame:
         )  # fmt: skip
         return out
 
-    def __post_init__(self) -> None:
-        check_seen(self.sensor, self.time, self.names)
-        what, count = f"keypoints of {self.sensor}", len(self.names)
-        confidence = frozen(self.confidence, float, f"the confidence of {what}", (count,))
-        freeze(self, uv=frozen(self.uv, float, what, (count, 2)), confidence=confidence)
 
 
 @dataclass(frozen=True, eq=False)
-class MarkerFrame:
+class MarkerFrame(_SensorFrame):
     """3D positions of labelled markers.
 
     Parameters
@@ -166,19 +191,14 @@ class MarkerFrame:
         The body's marker set that has the names; "" for names of the body's landmarks.
     """
 
-    sensor: str
-    time: float
     names: tuple[str, ...]
     positions: NDArray
     marker_set: str = ""
-
-    def __post_init__(self) -> None:
-        check_seen(self.sensor, self.time, self.names)
-        freeze(self, positions=frozen(self.positions, float, f"markers of {self.sensor}", (len(self.names), 3)))
+    _rows: ClassVar = {"positions": ("markers", (3,))}
 
 
 @dataclass(frozen=True, eq=False)
-class SilhouetteFrame:
+class SilhouetteFrame(_ImageLike):
     """A mask of the body in one image.
 
     Parameters
@@ -196,12 +216,11 @@ class SilhouetteFrame:
         The array is no image, or not of 8 bits.
     """
 
-    sensor: str
-    time: float
     mask: NDArray
+    _pixels, _sensor_form = "mask", "silhouette {}"
 
     def __post_init__(self) -> None:
-        check_seen(self.sensor, self.time)
+        super().__post_init__()
         mask = numbers(self.mask, None, f"a mask of {self.sensor}")
         mask = 255 * mask.astype(np.uint8) if mask.dtype == bool else mask
         if mask.ndim != 2 or not mask.size or mask.dtype != np.uint8:
@@ -209,14 +228,9 @@ class SilhouetteFrame:
             raise ObservationError(problem, remedy="Give (height, width), of bool, or of uint8 from 0 to 255.")
         object.__setattr__(self, "mask", frozen(mask, np.uint8))
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) [px]."""
-        return self.mask.shape[1], self.mask.shape[0]
-
 
 @dataclass(frozen=True, eq=False)
-class LineFrame:
+class LineFrame(_SensorFrame):
     """Lines in one image through points or edges of the body (P1 2.3).
 
     Parameters
@@ -236,14 +250,13 @@ class LineFrame:
         Shapes do not agree; the two points of a line are less than a pixel apart; a line has not one or two landmarks.
     """
 
-    sensor: str
-    time: float
     names: tuple[str, ...]
     landmarks: tuple[tuple[str, ...], ...]
     ends: NDArray
+    _sensor_form = "lines {}"
 
     def __post_init__(self) -> None:
-        check_seen(self.sensor, self.time, self.names)
+        super().__post_init__()
         for own in self.landmarks if isinstance(self.landmarks, Sequence) else [None]:
             check_seen(self.sensor, self.time, own)
         ends = frozen(self.ends, float, f"a record of lines of {self.sensor}")
@@ -263,9 +276,11 @@ class LineFrame:
 class ClickFrame(LineFrame):
     """Points of the body that a person clicked in one image, each as two lines that cross in it."""
 
+    _sensor_form = "clicks {}"
+
 
 @dataclass(frozen=True, eq=False)
-class ColourFrame:
+class ColourFrame(_ImageLike):
     """One colour image.
 
     Parameters
@@ -282,22 +297,16 @@ class ColourFrame:
         The array is no image of three channels of 8 bits.
     """
 
-    sensor: str
-    time: float
     image: NDArray
+    _pixels, _sensor_form = "image", "region {}"
 
     def __post_init__(self) -> None:
-        check_seen(self.sensor, self.time)
+        super().__post_init__()
         freeze(self, image=np.ascontiguousarray(rgb_image(self.image, f"an image of {self.sensor}")))
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """(width, height) [px]."""
-        return self.image.shape[1], self.image.shape[0]
 
 
 @dataclass(frozen=True, eq=False)
-class LiftedFrame:
+class LiftedFrame(_SensorFrame):
     """3D landmarks of one person that a network estimated from one camera's image.
 
     Parameters
@@ -314,15 +323,88 @@ class LiftedFrame:
         The body's keypoint set that has the names.
     """
 
-    sensor: str
-    time: float
     names: tuple[str, ...]
     x: NDArray
     uv: NDArray
     keypoint_set: str
+    _rows: ClassVar = {"uv": ("pixels of lifted landmarks", (2,)), "x": ("lifted landmarks", (3,))}
+    _sensor_form = "lifted {}"
+
+
+@dataclass(frozen=True, eq=False)
+class BodyTrackerFrame(_SensorFrame):
+    """Poses, or places alone, of trackers that are fixed on the body.
+
+    Parameters
+    ----------
+    sensor, time : name of the system, and [s]
+    names : (K,) of the trackers
+    x_world : (K, 3) [m] place of each; NaN if missing
+    Rs_world_tracker : (K, 3, 3) rotations, whose columns are the tracker's axes in the world; NaN if missing; default:
+        all missing
+
+    Raises
+    ------
+    ObservationError
+        Arrays of other shapes.
+    """
+
+    names: tuple[str, ...]
+    x_world: NDArray
+    Rs_world_tracker: NDArray | None = None
+    _rows: ClassVar = {"x_world": ("trackers", (3,)), "Rs_world_tracker": ("rotations of trackers", (3, 3))}
 
     def __post_init__(self) -> None:
-        check_seen(self.sensor, self.time, self.names)
-        what, count = f"lifted landmarks of {self.sensor}", len(self.names)
-        uv = frozen(self.uv, float, f"pixels of {what}", (count, 2))
-        freeze(self, x=frozen(self.x, float, what, (count, 3)), uv=uv)
+        super().__post_init__()
+        if self.Rs_world_tracker is None:
+            freeze(self, Rs_world_tracker=sealed(np.full((len(self.names), 3, 3), np.nan)))
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePointFrame(_SensorFrame):
+    """Tracked points of a surface at one time, from `photogrammetry.surface_tracking.SurfaceTracker.update`.
+
+    Parameters
+    ----------
+    sensor, time : name of the sensor, and [s]
+    ids : (N,) int, the same for the same point at all times
+    x_world : (N, 3) [m]; NaN for missing points, which are dropped
+    covariance : (N, 3, 3) [m²]
+
+    Raises
+    ------
+    ObservationError
+        Arrays of other shapes, or a point twice.
+    """
+
+    ids: NDArray
+    x_world: NDArray
+    covariance: NDArray
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        ids, x, c = numbers(self.ids, None), numbers(self.x_world), numbers(self.covariance)
+        if ids.ndim != 1 or x.shape != (len(ids), 3) or c.shape != (len(ids), 3, 3) or ids.dtype.kind not in "iu":
+            problem = f"{ids.dtype} ids {ids.shape}, points {x.shape}, covariances {c.shape} of {self.sensor}"
+            raise ObservationError(problem, remedy="Give whole numbers (N,), (N, 3) and (N, 3, 3).")
+        if len(np.unique(ids)) < len(ids):
+            raise ObservationError(f"a point of {self.sensor} twice", remedy="Give every point its own number.")
+        known = np.isfinite(x).all(axis=1) & np.isfinite(c).all(axis=(1, 2))
+        freeze(self, ids=ids[known], x_world=x[known], covariance=c[known])
+
+
+Frame = DepthFrame | PointCloud | KeypointFrame | MarkerFrame | SilhouetteFrame | LineFrame | ColourFrame | LiftedFrame
+"""What a sensor of a known kind sees at one time; a `ClickFrame` is a `LineFrame`."""
+
+
+def sensor_of(frame: object) -> str:
+    """Name of a frame's sensor: its `sensor`, with a prefix for kinds that may share a camera."""
+    return getattr(frame, "_sensor_form", "{}").format(getattr(frame, "sensor", ""))
+
+
+def by_record(frames: Iterable[Any]) -> Mapping[type, list[Any]]:
+    """Frames of one time by class: `by_record(frames)[DepthFrame]`; an empty list for a class without frames."""
+    out = defaultdict[type, list[Any]](list)
+    for frame in frames:
+        out[type(frame)].append(frame)
+    return out

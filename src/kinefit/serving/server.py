@@ -9,7 +9,7 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any, NamedTuple
 
@@ -38,6 +38,7 @@ _MAX_CONNECTIONS_AT_ONCE = 64.0  # of all clients: a page with 50 images opens o
 _MAX_CONNECTIONS_PER_SECOND = 16.0  # on average; each costs 1 ms, and 2 ms where it floods
 _MAX_WAITING_CONNECTIONS = 32  # in the system's queue: two seconds' worth
 _PROBLEM_CONNECTIONS = "too many connections are opened"
+_PORTS, _MAX_PORTS_TRIED = 65536, 100
 _OPEN_TIMEOUT_S = 5.0  # of a handshake
 _CLOSE_TIMEOUT_S = 1.0
 
@@ -176,15 +177,41 @@ def _is_of_handler(record: logging.LogRecord) -> bool:
     return record.msg != "opening handshake failed"
 
 
+def listen(host: str, port: int, *, search: bool = False) -> socket.socket:
+    """A socket that listens at a port of a host, 0 for any.
+
+    Parameters
+    ----------
+    search : whether the next port that is free is taken where this one is in use
+
+    Raises
+    ------
+    ExportError
+        The port is in use, or the host none of this computer.
+    """
+    for candidate in [*range(port, min(port + _MAX_PORTS_TRIED, _PORTS)), 0] if search else [port]:
+        try:
+            found = socket.getaddrinfo(host or None, candidate, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+            return socket.create_server(found[0][4], family=found[0][0])
+        except (OSError, UnicodeError) as error:  # a host that is no name at all is the second
+            is_used = getattr(error, "errno", 0) in (errno.EADDRINUSE, errno.EACCES)
+            if search and is_used and candidate:
+                continue
+            reason = getattr(error, "strerror", None) or error
+            remedy = "Give another port with --port, or stop the program that uses it."
+            remedy = remedy if is_used else "Use 127.0.0.1, or 0.0.0.0 for all networks."
+            problem = f"the server cannot start at {host}:{candidate} ({reason})"
+            raise ExportError(problem, place="--port", remedy=remedy) from error
+    raise AssertionError
+
+
 class PageServer:
-    """A page and WebSockets at one port.
+    """A page and WebSockets at one port: a class of its own says what is there, by `page` and `talk`.
 
     Parameters
     ----------
     access : who may connect
     port : 0 for any; the next free one is not taken, since clients are given one port
-    page : what a browser gets at a path behind the token, such as "/"; None where there is nothing
-    talk : what is said with a WebSocket client, until it returns or the connection ends
 
     Raises
     ------
@@ -192,20 +219,8 @@ class PageServer:
         The port is in use, or the host none of this computer.
     """
 
-    def __init__(
-        self, access: Access, port: int, *, page: Callable[[str], Page | None],
-        talk: Callable[[Connection], Awaitable[None]],
-    ) -> None:  # fmt: skip
-        self.access, self._page, self._talk = access, page, talk
-        try:
-            found = socket.getaddrinfo(access.host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-            listener = socket.create_server(found[0][4], family=found[0][0])
-        except (OSError, UnicodeError) as error:  # a host that is no name at all is the second
-            reason = getattr(error, "strerror", None) or error
-            remedy = "Give another port with --port, or stop the program that uses it."
-            raise ExportError(
-                f"the server cannot start at {access.host}:{port} ({reason})", place="--port", remedy=remedy
-            ) from error
+    def __init__(self, access: Access, port: int = 0) -> None:
+        self.access, listener = access, listen(access.host, port)
         self.port: int = listener.getsockname()[1]
         self._loop = asyncio.SelectorEventLoop()  # which asks the listener, on every system
         self._loop.set_exception_handler(_report)
@@ -217,6 +232,17 @@ class PageServer:
     def url(self) -> str:
         """Address of the page, with the token."""
         return self.access.url(self.port)
+
+    def opening(self) -> str:
+        """Address that leads to the page once."""
+        return self.access.opening(self.port)
+
+    def page(self, path: str) -> Page | None:
+        """What a browser gets at a path behind the token, such as "/"; None where there is nothing."""
+        raise NotImplementedError
+
+    async def talk(self, connection: Connection) -> None:
+        """Talk with a WebSocket client, until this returns or the connection ends; nothing by default."""
 
     def call(self, act: Callable[..., object], *arguments: Any) -> None:
         """Have something done in the server's thread, from any other; nothing where the server is closed."""
@@ -247,7 +273,7 @@ class PageServer:
         """The page to browsers that ask for it; WebSockets go on."""
         if request.headers.get("Upgrade", "").lower() == "websocket":
             return None
-        page = self._page(request.path)
+        page = self.page(request.path)
         if page is None:
             return connection.respond(HTTPStatus.NOT_FOUND, "There is no such page.\n")
         headers = Headers([
@@ -259,4 +285,4 @@ class PageServer:
     async def _client(self, connection: ServerConnection) -> None:
         assert isinstance(connection, Connection)
         with contextlib.suppress(ConnectionClosed):
-            await self._talk(connection)
+            await self.talk(connection)

@@ -32,7 +32,7 @@ class _ClicksMessage(msgspec.Struct, forbid_unknown_fields=True):
     points: dict[str, dict[str, list[float]]]
 
 
-class ClickPage:
+class ClickPage(PageServer):
     """Images of one time in the browser, in which joints are clicked; served from the start until `close`.
 
     Parameters
@@ -52,22 +52,10 @@ class ClickPage:
         self.done = Event()
         self._asked = msgspec.json.encode({"cameras": list(pictures), "joints": list(joints), "step": step}).decode()
         self._taking = asyncio.Lock()
-        self._server = PageServer(Access(), 0, page=self._page, talk=self._talk)
+        super().__init__(Access())
 
-    @property
-    def url(self) -> str:
-        """Of the page."""
-        return self._server.url
-
-    def opening(self) -> str:
-        """Address that leads to the page once."""
-        return self._server.access.opening(self._server.port)
-
-    def close(self) -> None:
-        """Serve it no more."""
-        self._server.close()
-
-    def _page(self, path: str) -> Page | None:
+    def page(self, path: str) -> Page | None:
+        """The page, its style and script, and the images."""
         if path in _FILES:
             name, kind = _FILES[path]
             return Page((resources.files("kinefit.viewers") / name).read_bytes(), kind, _POLICY)
@@ -76,7 +64,7 @@ class ClickPage:
             return None
         return Page(picture, "image/png" if picture.startswith(b"\x89PNG") else "image/jpeg")
 
-    async def _talk(self, connection: Connection) -> None:
+    async def talk(self, connection: Connection) -> None:
         """Say what is asked for, and answer clicks."""
         await connection.send(self._asked)
         while True:

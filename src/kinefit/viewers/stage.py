@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import io
-import socket
 import threading
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
@@ -57,8 +55,11 @@ def open_server(port: int, access: Access | None = None, *, label: str = "kinefi
     except ImportError as error:
         remedy = "Install it: pip install viser."
         raise ExportError("the 3D viewer needs the package viser", remedy=remedy) from error
+    from kinefit.serving.server import listen
+
     access = access or Access()
-    port = free_port(access.host, port)
+    with listen(access.host, port, search=True) as free:
+        port = free.getsockname()[1]
     with quiet(), _guarded(access) as used:
         server = viser.ViserServer(host=access.host, port=port, label=label, verbose=False)
         if not used:
@@ -100,19 +101,6 @@ def _guarded(access: Access) -> Iterator[list[int]]:
             yield used
         finally:
             server.serve = plain  # type: ignore[misc]
-
-
-def free_port(host: str, port: int) -> int:
-    """The first free port of a host from `port` on; 0 stands for any. Raises ExportError without one."""
-    for candidate in [*range(port, min(port + 100, 65536)), 0]:
-        try:
-            with socket.create_server((host, candidate)):
-                return candidate
-        except OSError as error:
-            if error.errno not in (errno.EADDRINUSE, errno.EACCES):
-                problem = f"nothing can be served as '{host}' ({error.strerror or error})"
-                raise ExportError(problem, remedy="Use 127.0.0.1, or 0.0.0.0 for all networks.") from error
-    raise ExportError("no port is free", place=f"ports from {port} on", remedy="Choose another one with --port.")
 
 
 @contextlib.contextmanager

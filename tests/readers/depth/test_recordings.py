@@ -13,7 +13,7 @@ import pytest
 
 from kinefit.errors import CalibrationError, FileError, KinefitError, ObservationError
 from kinefit.observations import DepthVideo
-from kinefit.observations.depth import CloudVideo
+from kinefit.observations.videos import CloudVideo
 from kinefit.readers.depth.recordings import is_unordered, read_clouds, read_depth
 
 SIZE = (64, 48)
@@ -281,7 +281,7 @@ def test_one_damaged_or_odd_frame_is_named_when_it_is_asked_for(tmp_path):
     cv2.imwrite(str(folder / "03.png"), COUNTS[0][:20])
     with pytest.raises(FileError, match=r"01\.png"):
         video.frame(1)
-    with pytest.raises(ObservationError, match=r"frame 3 of a: the image has shape \(20, 64\)"):
+    with pytest.raises(ObservationError, match=r"frame 3 of a: the image has \(64, 20\) px, its camera \(64, 48\)"):
         video.frame(3)
     np.testing.assert_allclose(video.frame(2).depth, METRES[2], rtol=1e-6)
 

@@ -42,7 +42,7 @@ class _Client:
         return out
 
 
-class WebSockets:
+class WebSockets(PageServer):
     """Server of poses and their page at one port, by default to this computer alone.
 
     Parameters
@@ -67,20 +67,11 @@ class WebSockets:
         self._clients: set[_Client] = set()
         self._hello: bytes | None = None
         self._page = live_page(title, None, "z")
-        self.access = Access(host, token, readers=True)
-        self._server = PageServer(
-            self.access, port, page=lambda path: self._page if path == "/" else None, talk=self._talk
-        )
+        super().__init__(Access(host, token, readers=True), port)
 
-    @property
-    def port(self) -> int:
-        """Port of poses and page."""
-        return self._server.port
-
-    @property
-    def url(self) -> str:
-        """Address of the page, with the token; the socket's address has ws instead of http."""
-        return self._server.url
+    def page(self, path: str) -> Page | None:
+        """The page of the body; its socket's address has ws instead of http."""
+        return self._page if path == "/" else None
 
     @property
     def receivers(self) -> int:
@@ -91,16 +82,12 @@ class WebSockets:
         """Send a new body to all present and future receivers."""
         self._page = live_page(self._title, body, msgspec.json.decode(packet)["up"])
         self._hello = packet
-        self._server.call(self._spread, packet, True)
+        self.call(self._spread, packet, True)
 
     def pose(self, posed: PosePacket, packet: bytes) -> None:
         """Put a pose into every receiver's slot."""
         if self._clients:
-            self._server.call(self._spread, packet, False)
-
-    def close(self) -> None:
-        """Close all connections."""
-        self._server.close()
+            self.call(self._spread, packet, False)
 
     def _spread(self, packet: bytes, hello: bool) -> None:
         for client in self._clients:
@@ -110,7 +97,7 @@ class WebSockets:
                 client.pose = packet
             client.news.set()
 
-    async def _talk(self, connection: Connection) -> None:
+    async def talk(self, connection: Connection) -> None:
         """Send packets and receive wishes until the client disconnects."""
         client = _Client()
         if self._hello is not None:
@@ -128,7 +115,7 @@ class WebSockets:
         """Pass a client's wishes on; reject those that are not allowed."""
 
         def answer(content: Mapping[str, Any]) -> None:  # from any thread
-            self._server.call(back, msgspec.json.encode(content))
+            self.call(back, msgspec.json.encode(content))
 
         def back(packet: bytes) -> None:
             if len(client.answers) >= _MAX_WAITING_ANSWERS:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
 from kinefit.errors import FileError, ObservationError
-from kinefit.observations.depth import CloudVideo, DepthVideo
+from kinefit.observations.videos import CloudVideo, DepthVideo
 from kinefit.readers.depth import clouds
 from kinefit.readers.depth.images import PICTURES, DepthSource, array_source, listed, picture_source, raw_source
 from kinefit.readers.depth.streams import bag_source, track_source

@@ -10,7 +10,7 @@ import numpy as np
 
 from kinefit.errors import CalibrationError, TakeError, located
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.observations.depth import CloudVideo, DepthVideo
+from kinefit.observations.videos import CloudVideo, DepthVideo
 from kinefit.readers.depth.recordings import is_unordered, read_clouds, read_depth
 from kinefit.readers.take.entries import DepthEntry, Take
 

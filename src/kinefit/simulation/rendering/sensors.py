@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.motion import Motion
-from kinefit.observations.depth import DepthVideo
+from kinefit.observations.videos import DepthVideo
 from kinefit.rendering import scaled
 from kinefit.simulation.rendering.scenes import RenderedView, SimulatedScene, centred_camera
 
