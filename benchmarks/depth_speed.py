@@ -94,8 +94,8 @@ class Stage:
 
     def __init__(self, movement: str, *, finer: int = 1) -> None:
         from kinefit.geometry.camera import Rig
+        from kinefit.simulation.figures import in_front
         from kinefit.simulation.movements import movement as moving
-        from kinefit.simulation.placing import in_front
         from kinefit.simulation.rendering.sensors import KINECT
 
         w, h = KINECT.size

@@ -127,8 +127,8 @@ def _movements(sensor: str) -> None:
 
 def moving(sensor: str, count: int) -> Iterator[tuple[Any, Any, Any, NDArray]]:
     """Body, state, camera and depth image of people of all sizes in movements, every fourth at its beginning."""
+    from kinefit.simulation.figures import in_front
     from kinefit.simulation.movements import MOVEMENTS, movement, people
-    from kinefit.simulation.placing import in_front
     from kinefit.simulation.rendering.scenes import SimulatedScene
     from kinefit.simulation.rendering.sensors import DEPTH_SENSORS, measured_depth
 

@@ -95,8 +95,7 @@ def _head() -> None:
         figure("stereo head, depth of the body", None, "px", "<= 0.25", "no recording")
         return
     from kinefit.readers.skeletons.bvh import read_bvh
-    from kinefit.simulation.rendering.pictures import STEREO, picture
-    from kinefit.simulation.rendering.scenes import SimulatedScene
+    from kinefit.simulation.rendering.scenes import STEREO, SimulatedScene, picture
     from kinefit.simulation.retarget import retarget
 
     motion = retarget(read_bvh(sorted(folder.glob("*.bvh"))[0]), rate=2)

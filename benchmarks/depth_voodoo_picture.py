@@ -21,8 +21,7 @@ from kinefit.evaluation.voodoo import voodoo_method
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import render_body
 from kinefit.simulation.movements import people
-from kinefit.simulation.rendering.pictures import ColourSensor, picture
-from kinefit.simulation.rendering.scenes import SimulatedScene
+from kinefit.simulation.rendering.scenes import ColourSensor, SimulatedScene, picture
 
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "voodoo.jpg"
 SHOWN = {"wave": (0.46, 0.5), "bow": (0.45, 0.6), "arms_at_sensor": (0.4, 0.5)}  # movement: shares of its time

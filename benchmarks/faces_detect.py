@@ -16,8 +16,7 @@ from benchmarks.figures import amount, data, figure
 from kinefit import load_body
 from kinefit.errors import AssetError, ObservationError
 from kinefit.images.detectors.detection import detect_people
-from kinefit.images.detectors.face_detector import HEAD
-from kinefit.images.detectors.faces import FaceFinder, FaceModels
+from kinefit.images.detectors.faces import HEAD, FaceFinder, FaceModels
 from kinefit.images.detectors.models import Models
 from kinefit.observations import MEDIAPIPE_478, Detections
 from kinefit.preparing import detecting

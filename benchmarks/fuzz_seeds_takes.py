@@ -185,7 +185,7 @@ def _norms_table(path: Path) -> None:
 
 
 def _seeds(folder: Path) -> Seed:
-    from kinefit.cli.surfaces._files import read_seeds
+    from kinefit.cli.surfaces._measure import read_seeds
 
     rows = [f"{10 + i}.5,{20 - i}.25,{12 + i}.5,{20 - i}.75" for i in range(6)]
     (folder / "seeds.csv").write_text("u1,v1,u2,v2\n" + "\n".join(rows) + "\n")

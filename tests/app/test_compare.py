@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinefit.app.compare import Comparison
+from kinefit.app.review import Comparison
 from kinefit.errors import FileError
 from kinefit.exporters import write_motion
 from kinefit.simulation import squat_and_wave

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from kinefit.app.images import jpeg, scaled, unrecognisable
+from kinefit.app.people import jpeg, scaled, unrecognisable
 
 
 def test_the_longer_side_is_bounded_and_nothing_is_enlarged():

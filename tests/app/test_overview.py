@@ -5,8 +5,8 @@ import os
 import pytest
 from tests.viewers.recordings import RATE, write_take
 
-from kinefit.app import overview
-from kinefit.app.overview import measures, recordings
+from kinefit.app import folders
+from kinefit.app.folders import measures, recordings
 from kinefit.exporters import write_motion
 
 SESSION = '[session]\nsubject = "P01"\ndate = 2026-03-02\nmovement = "squat"\n'
@@ -44,7 +44,7 @@ def test_each_person_is_a_row(root):
 def test_a_file_is_read_again_only_when_it_changed(root, monkeypatch):
     file = root / "a" / "take-kinefit" / "motion.npz"
     before = measures(file)
-    monkeypatch.setattr(overview, "read_npz", lambda *_, **__: pytest.fail("read again"))
+    monkeypatch.setattr(folders, "read_npz", lambda *_, **__: pytest.fail("read again"))
     assert measures(file) == before
     monkeypatch.undo()
     from kinefit.readers.motion import read_motion

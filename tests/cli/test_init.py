@@ -272,7 +272,7 @@ def test_joints_are_clicked_in_the_browser(folder, monkeypatch):
 
 
 def test_joints_are_clicked_in_images_of_one_time_alone(folder):
-    from kinefit.cli._clicks import _pictures
+    from kinefit.cli.init import _pictures
 
     assert run("init", folder).exit_code == 0
     take = read_take(folder / "take.toml")

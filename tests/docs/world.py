@@ -22,7 +22,7 @@ from kinefit.simulation import (
     squat_and_wave,
     studio_rig,
 )
-from kinefit.simulation.rendering.pictures import COLOUR
+from kinefit.simulation.rendering.scenes import COLOUR
 
 
 class World:

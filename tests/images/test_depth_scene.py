@@ -10,8 +10,8 @@ from kinefit.images.depth import clean, denoised, to_points
 from kinefit.images.depth_scene import background_model, clusters, find_floor, foreground, people
 from kinefit.initialization.from_depth import start_from_points
 from kinefit.readers.depth.recordings import read_depth
+from kinefit.simulation.figures import in_front
 from kinefit.simulation.movements import movement
-from kinefit.simulation.placing import in_front
 from kinefit.simulation.rendering.scenes import SimulatedScene
 from kinefit.simulation.rendering.sensors import KINECT, TOF, measured_depth
 

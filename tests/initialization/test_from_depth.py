@@ -10,8 +10,8 @@ from kinefit.errors import BodyError, ObservationError, TrackingError
 from kinefit.images.depth import to_points
 from kinefit.initialization.from_depth import StartSearch, start_from_points
 from kinefit.rendering import render_body
+from kinefit.simulation.figures import in_front
 from kinefit.simulation.movements import movement
-from kinefit.simulation.placing import in_front
 from kinefit.simulation.rendering.scenes import SimulatedScene
 from kinefit.simulation.rendering.sensors import TOF, measured_depth
 

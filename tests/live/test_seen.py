@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ExportError
-from kinefit.live.seen import SeenRecord, on_grid
+from kinefit.live.record import SeenRecord, on_grid
 from kinefit.observations import MEDIAPIPE_33, KeypointFrame
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations

@@ -8,7 +8,7 @@ from multiprocessing import get_context
 import pytest
 
 from kinefit.frame.results import FrameResult
-from kinefit.live.sizing import LiveSize
+from kinefit.live.people import LiveSize
 from kinefit.motion import UP_AXES
 from kinefit.observations import KeypointFrame
 from kinefit.sensors.settings import TrackSettings

@@ -21,7 +21,7 @@ from benchmarks.fuzz_worker import LONGEST
 from kinefit._files import parse_toml
 from kinefit.bodies import load_body
 from kinefit.bodies.surfaces import Metaballs
-from kinefit.cli.surfaces._files import read_seeds
+from kinefit.cli.surfaces._measure import read_seeds
 from kinefit.errors import BodyError, CalibrationError, FileError, KinefitError, ObservationError
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.depth.clouds import FileCloud, camera_of, read_cloud

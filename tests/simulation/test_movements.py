@@ -5,8 +5,7 @@ import pytest
 
 from kinefit.bodies import load_body
 from kinefit.errors import ObservationError
-from kinefit.simulation._postures import MOVEMENTS
-from kinefit.simulation.movements import movement, people
+from kinefit.simulation.movements import MOVEMENTS, movement, people
 
 BODIES = {name: load_body(name) for name in ("humanoid10", "humanoid")}
 

@@ -9,7 +9,7 @@ from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.readers.video import Video
 from kinefit.simulation import SENSORS, TOF, cut, simulate_depth, squat_and_wave, write_recording
-from kinefit.simulation.rendering.pictures import depth_picture
+from kinefit.simulation.rendering.scenes import depth_picture
 
 
 @pytest.fixture(scope="module")

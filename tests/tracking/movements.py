@@ -10,8 +10,8 @@ from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, KeypointFrame, MarkerFrame, PointCloud
 from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
+from kinefit.simulation.figures import in_front
 from kinefit.simulation.movements import movement
-from kinefit.simulation.placing import in_front
 from kinefit.simulation.rendering.scenes import SimulatedScene
 from kinefit.simulation.rendering.sensors import KINECT, measured_depth
 from kinefit.tracking.tracker import Tracker

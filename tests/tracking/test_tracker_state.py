@@ -20,7 +20,7 @@ from kinefit.observations import KeypointFrame
 from kinefit.sensors.base import Matched, Measurement, Sensor
 from kinefit.sensors.regions.regions import RegionSensor
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surfaces.background import Background
+from kinefit.sensors.surfaces.depth_view import Background
 from kinefit.sensors.surfaces.surface_points import SurfacePointSensor
 from kinefit.smoothing.record_classes import CODEC
 from kinefit.tracking import run as running

@@ -13,8 +13,7 @@ from kinefit.geometry.triangulation import triangulate_robust
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.keypoints import read_keypoints
 from kinefit.readers.video import Video
-from kinefit.viewers.pictures import CameraImages, flat_view, flatten, undistortion
-from kinefit.viewers.stage import first_look, fitting_fov
+from kinefit.viewers.stage import CameraImages, first_look, fitting_fov, flat_view, flatten, undistortion
 
 SIZE = (320, 480)
 
@@ -111,7 +110,7 @@ def test_pictures_are_the_videos_at_their_time_and_are_kept(tmp_path, monkeypatc
         assert pictures.read("a", 0.5 + 7 / video.rate, 128) is found
         assert pictures.read("a", 0.4, 128) is None and pictures.read("a", 1e3, 128) is None
         assert pictures.read("b", 0.5, 128) is None
-        monkeypatch.setattr("kinefit.viewers.pictures._MAX_CACHE_BYTES", 2 * found.nbytes)
+        monkeypatch.setattr("kinefit.viewers.stage._MAX_CACHE_BYTES", 2 * found.nbytes)
         for i in range(4):
             pictures.read("a", 0.5 + i / video.rate, 128)
         assert len(pictures._kept) == 2

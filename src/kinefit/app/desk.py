@@ -6,10 +6,9 @@ import threading
 from contextlib import suppress
 from pathlib import Path
 
-from kinefit.app.compare import Comparison
 from kinefit.app.jobs import Job, JobQueue
 from kinefit.app.people import PeoplePictures
-from kinefit.app.review import Review
+from kinefit.app.review import Comparison, Review
 from kinefit.app.served import FilePages
 from kinefit.app.webcams import Recorder
 from kinefit.errors import KinefitError

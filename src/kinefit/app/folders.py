@@ -1,4 +1,4 @@
-"""What lies in the folders of a session: takes, their results, and how far each is."""
+"""What lies in the folders of a session: takes, results, and all numbers of the session at a glance."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from kinefit.batch.viewed import is_outdated
 from kinefit.errors import FileError, KinefitError, printable
 from kinefit.readers.depth.images import natural
 from kinefit.readers.guess.files import VIDEOS
+from kinefit.readers.take.file import read_take
 from kinefit.readers.take.find import takes_in
 
 NEW = "new"
@@ -126,3 +127,64 @@ def takes_below(root: Path, *, addressable: bool = True) -> list[TakeFolder]:
             continue
     found = [take for take in found if (printable(take.file) == str(take.file)) is addressable]
     return sorted(found, key=lambda take: take.file)
+
+
+@dataclass(frozen=True)
+class SessionRow:
+    """One person of one take; a take without results has one, too.
+
+    Parameters
+    ----------
+    take : TakeFolder
+    person : int, number of the person; 0 if the take has one
+    folder : Path of the person's results; None if there are none
+    session : {"subject": ..., "date": ..., "movement": ...}, what the take's `[session]` states
+    problem : what is wrong with the take file; "" if nothing is
+    state : of the take, as `TakeFolder.state` has it
+    seconds, agreement : float [s], and mean quality, 0 to 1; None without results
+    """
+
+    take: TakeFolder
+    person: int
+    folder: Path | None
+    session: Mapping[str, str]
+    problem: str
+    state: str
+    seconds: float | None = None
+    agreement: float | None = None
+
+
+def recordings(root: Path) -> list[SessionRow]:
+    """Everybody in all takes below a folder, by path."""
+    found = []
+    for take in takes_below(root):
+        try:
+            session, problem = _session(take.file, take.file.stat().st_mtime_ns), ""
+        except (KinefitError, OSError) as error:
+            session, problem = {}, str(error)
+        people, state = take.people, take.state
+        for k, folder in enumerate(people, start=1):
+            number = k if len(people) > 1 else 0
+            found.append(SessionRow(take, number, folder, session, problem, state, *measures(folder / "motion.npz")))
+        if not people:
+            found.append(SessionRow(take, 0, None, session, problem, state))
+    return found
+
+
+def measures(motion: Path) -> tuple[float | None, float | None]:
+    """Length [s] and mean quality of a motion file; (None, None) if it cannot be read."""
+    try:
+        return _measures(motion, motion.stat().st_mtime_ns)
+    except (KinefitError, OSError, KeyError):
+        return None, None
+
+
+@lru_cache(4096)
+def _session(take: Path, changed: int) -> dict[str, str]:
+    return read_take(take).session.stated
+
+
+@lru_cache(4096)
+def _measures(motion: Path, changed: int) -> tuple[float, float]:
+    arrays = read_npz(motion, "rate", "quality", remedy="")
+    return len(arrays["quality"]) / float(arrays["rate"]), float(arrays["quality"].mean())

@@ -88,8 +88,8 @@ def content_of(
     import numpy as np
 
     from kinefit.preparing.faces import ensure_faces, shown_video
-    from kinefit.viewers.pictures import CameraImages
     from kinefit.viewers.show import ViewerContent
+    from kinefit.viewers.stage import CameraImages
 
     cameras = {camera.name: camera for camera in seen.rig or ()}
     offsets = {entry.name: entry.time_offset for entry in take.cameras}

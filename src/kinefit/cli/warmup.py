@@ -51,7 +51,7 @@ def warmup() -> None:
 
 def _compile(part: str) -> None:
     """Use the kernels of one kind of take once."""
-    from kinefit.simulation.warm import warm_depth, warm_keypoints
+    from kinefit.simulation.takes import warm_depth, warm_keypoints
 
     {"surfaces": _surfaces, "keypoints": warm_keypoints, "depth": warm_depth}[part]()
 

@@ -1,6 +1,6 @@
 """Errors of results against ground truth."""
 
-from kinefit.evaluation.accuracy import (
+from kinefit.evaluation.sequences import (
     ErrorBarCoverage,
     angle_errors,
     coverage,

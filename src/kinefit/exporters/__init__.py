@@ -1,8 +1,7 @@
 """Results as files: each written whole or not at all."""
 
-from kinefit.exporters.c3d_file import write_c3d
+from kinefit.exporters.c3d_file import write_c3d, write_markers
 from kinefit.exporters.interchange import write_mcap, write_nwb, write_rrd
-from kinefit.exporters.marker_files import write_markers
 from kinefit.exporters.motion_file import write_motion
 from kinefit.exporters.opensim.files import write_mot, write_osim, write_trc
 from kinefit.exporters.pictures.overlay import (
@@ -14,11 +13,9 @@ from kinefit.exporters.pictures.overlay import (
 )
 from kinefit.exporters.pose_lines import write_jsonl
 from kinefit.exporters.report.report import write_report
-from kinefit.exporters.skeletons.bvh import write_bvh
+from kinefit.exporters.skeletons.bvh import write_bvh, write_x3d
 from kinefit.exporters.skeletons.characters import write_character
-from kinefit.exporters.skeletons.glb import write_glb
-from kinefit.exporters.skeletons.usd import write_usd
-from kinefit.exporters.skeletons.x3d import write_x3d
+from kinefit.exporters.skeletons.glb import write_glb, write_usd
 from kinefit.exporters.tables import tables, write_csv, write_parquet
 
 __all__ = [

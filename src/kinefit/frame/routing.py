@@ -26,9 +26,8 @@ from kinefit.observations import (
     sensor_of,
 )
 from kinefit.observations.arrays import is_number
-from kinefit.sensors.base import Matched, Measurement, Sensor, named, rows_at
+from kinefit.sensors.base import Matched, Measurement, Sensor, named, of_kind, rows_at
 from kinefit.sensors.channel_names import ChannelNames
-from kinefit.sensors.checks import of_kind
 from kinefit.sensors.points.image_lines import ImageLineSensor
 from kinefit.sensors.points.keypoints import KeypointSensor
 from kinefit.sensors.points.lifted import LiftedSensor
@@ -38,8 +37,8 @@ from kinefit.sensors.regions.regions import RegionSensor
 from kinefit.sensors.regions.silhouette import SilhouetteSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surfaces.background import Background
 from kinefit.sensors.surfaces.depth_image import DepthImageSensor
+from kinefit.sensors.surfaces.depth_view import Background
 from kinefit.sensors.surfaces.point_cloud import PointCloudSensor
 
 MIN_SIGMA = 1e-5

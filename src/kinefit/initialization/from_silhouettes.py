@@ -18,7 +18,7 @@ from kinefit.observations import SilhouetteFrame
 from kinefit.sensors.regions.silhouette import SilhouetteMeasurement
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.visibility.surface import TrackedSurface
+from kinefit.sensors.visibility.visibility import TrackedSurface
 
 
 class Level(NamedTuple):

@@ -21,9 +21,8 @@ from kinefit.live.cameras import LiveDetector
 from kinefit.live.folders import REPLAY
 from kinefit.live.inbox import Arrived, Inbox
 from kinefit.live.packets import Answer, PosePacket, Wish, read_wish
-from kinefit.live.people import LivePerson
-from kinefit.live.seen import SeenRecord
-from kinefit.live.sizing import LiveSize
+from kinefit.live.people import LivePerson, LiveSize
+from kinefit.live.record import SeenRecord
 from kinefit.observations import Keypoints
 from kinefit.tracking.session import axis_of
 from kinefit.tracking.tracker import Tracker

@@ -17,10 +17,9 @@ from kinefit.images.depth_scene import background_model
 from kinefit.images.detectors.models import Models
 from kinefit.live.cameras import CameraStream, LiveDetector, SessionClock, VideoReplay
 from kinefit.live.folders import DepthFolderStream, ImageFolderStream, KeypointFolderStream, Replay
-from kinefit.live.people import LivePerson
-from kinefit.live.seen import SeenRecord
+from kinefit.live.people import LivePerson, LiveSize
+from kinefit.live.record import SeenRecord
 from kinefit.live.session import LiveSession, Receiver, Source
-from kinefit.live.sizing import LiveSize
 from kinefit.observations import KEYPOINT_SIGMA
 from kinefit.preparing.detecting import hushed, networks
 from kinefit.preparing.each_video import Tell

@@ -118,7 +118,7 @@ def shown_video(take: Take, seen: Observations, camera: str, *, find: bool = Tru
     offset = next(entry.time_offset for entry in take.cameras if entry.name == camera)
 
     def of_keypoints(frame: int) -> NDArray:
-        from kinefit.images.detectors.face_detector import head_circles
+        from kinefit.images.detectors.faces import head_circles
 
         circles = [np.zeros((0, 3))]
         for keypoints in seen.keypoints:
@@ -155,7 +155,7 @@ def ensure_faces(
     jobs = {job: _seconds_key(job, f"{MODELS_PACKAGE} {_METHOD}") for job in chosen}
     todo = [job for job, key in jobs.items() if find and _read(_file(job), key) is None]
     if todo:
-        from kinefit.images.detectors.face_detector import FaceDetector
+        from kinefit.images.detectors.faces import FaceDetector
         from kinefit.preparing.detecting import hushed
 
         folder, threads = networks(progress, tell).folder, max(cores() // len(todo), 1)
@@ -180,7 +180,7 @@ def _file(job: DetectionJob) -> Path:
 
 def find_faces(job: DetectionJob, *, threads: int = 1, folder: Path | None = None, step: Step | None = None) -> Heads:
     """Look through the frames of a video that a take uses; `folder` is that of the networks."""
-    from kinefit.images.detectors.face_detector import FaceDetector
+    from kinefit.images.detectors.faces import FaceDetector
 
     detect = FaceDetector(folder or networks(None, lambda text: None).folder, threads)
     with Video(job.video, rate=job.rate) as video:

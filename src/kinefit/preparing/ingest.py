@@ -51,7 +51,7 @@ def hide_in_copies(path: Path, progress: Step | None, tell: Tell) -> list[Path]:
         found = read_detections(job.file) if key is not None else None
 
         def of_people(frame: int, points: NDArray | None = None if found is None else found.points) -> NDArray:
-            from kinefit.images.detectors.face_detector import head_circles
+            from kinefit.images.detectors.faces import head_circles
 
             return np.zeros((0, 3)) if points is None else head_circles(points[frame, :, :11])
 

@@ -15,7 +15,7 @@ from kinefit.correspondences import targets
 from kinefit.correspondences.contours.morphed import on_moved_joints
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.rows import DofRows, Rows
-from kinefit.sensors.visibility.surface import TrackedSurface
+from kinefit.sensors.visibility.visibility import TrackedSurface
 
 if TYPE_CHECKING:
     from kinefit.sensors.base import Measurement

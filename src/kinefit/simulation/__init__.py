@@ -1,12 +1,10 @@
 """Simulate known motions, and the data that sensors would record of them."""
 
-from kinefit.simulation.figures import draw_figure
+from kinefit.simulation.figures import draw_figure, in_front
 from kinefit.simulation.keypoints import simulate_keypoints, studio_rig
 from kinefit.simulation.movements import Performer, movement, people, squat_and_wave
-from kinefit.simulation.placing import in_front
 from kinefit.simulation.recordings import SENSORS, write_recording
-from kinefit.simulation.rendering.pictures import COLOUR, STEREO, ColourSensor, StereoSensor, picture
-from kinefit.simulation.rendering.scenes import SimulatedScene
+from kinefit.simulation.rendering.scenes import COLOUR, STEREO, ColourSensor, SimulatedScene, StereoSensor, picture
 from kinefit.simulation.rendering.sensors import KINECT, TOF, DepthSensor, simulate_depth
 from kinefit.simulation.retarget import cut, known_motion, on_body, resampled, retarget
 from kinefit.simulation.takes import write_synthetic_take

@@ -21,11 +21,10 @@ from kinefit.errors import ExportError, ObservationError, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import Motion
 from kinefit.readers.calibration.read import write_calibration
+from kinefit.simulation.figures import in_front, places
 from kinefit.simulation.keypoints import simulate_keypoints
-from kinefit.simulation.placing import in_front, places
-from kinefit.simulation.rendering.pictures import COLOUR, STEREO, ColourSensor, depth_picture, picture
-from kinefit.simulation.rendering.room import room as room_around
-from kinefit.simulation.rendering.scenes import SimulatedScene
+from kinefit.simulation.rendering.scenes import COLOUR, STEREO, ColourSensor, SimulatedScene, depth_picture, picture
+from kinefit.simulation.rendering.scenes import room as room_around
 from kinefit.simulation.rendering.sensors import DEPTH_SENSORS, DepthSensor, simulate_depth
 
 SENSORS = (*DEPTH_SENSORS, "stereo", "colour", "keypoints")

@@ -16,8 +16,7 @@ from kinefit.errors import ExportError, ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 from kinefit.motion import UP_AXES, Motion
-from kinefit.simulation.figures import draw_figure
-from kinefit.simulation.placing import look_at, places
+from kinefit.simulation.figures import draw_figure, look_at, places
 
 _SLOPE_COLOUR = (240, 232, 226)  # BGR
 _GRID_COLOUR = (214, 202, 192)  # BGR

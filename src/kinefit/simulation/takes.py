@@ -1,4 +1,4 @@
-"""Write a synthetic take of a known motion: videos, keypoints, calibration and take file."""
+"""Synthetic takes of a known motion: videos, keypoints, calibration, take file; tiny ones that warm kernels up."""
 
 from __future__ import annotations
 
@@ -12,12 +12,17 @@ import numpy as np
 
 from kinefit.errors import ExportError
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.motion import Motion
-from kinefit.observations import Keypoints
+from kinefit.motion import UP_AXES, Motion
+from kinefit.observations import DepthFrame, Keypoints
 from kinefit.readers.calibration.read import write_calibration
-from kinefit.simulation.figures import draw_figure
+from kinefit.simulation.figures import draw_figure, in_front
 from kinefit.simulation.keypoints import simulate_keypoints, studio_rig
 from kinefit.simulation.movements import squat_and_wave
+from kinefit.simulation.rendering.sensors import KINECT, simulate_depth
+from kinefit.simulation.retarget import cut
+from kinefit.tracking.recording import Recording
+from kinefit.tracking.tracker import Tracker
+from kinefit.tracking.video import track
 
 _IMAGE_SIZE = (544, 960)  # [px]
 _KEYPOINT_SIGMA = 2.0  # [px] in the take file
@@ -100,3 +105,20 @@ def _take(motion: Motion, rig: Rig) -> str:
         for name in rig.names
     ]
     return "\n".join(parts)
+
+
+def warm_keypoints() -> None:
+    """Run the fit of the person, tracking and smoothing once on keypoints."""
+    motion = cut(squat_and_wave(), 0, 4)
+    rig = studio_rig(motion)
+    track(Recording.of_keypoints(rig, simulate_keypoints(motion, rig, "BODY_25B"), up=motion.up), motion.body)
+
+
+def warm_depth() -> None:
+    """Run depth tracking once, without a start pose, so the search for it is included."""
+    motion = cut(squat_and_wave(), 0, 3)
+    camera = in_front(motion, KINECT.camera(name="kinect"), near=KINECT.near, far=KINECT.far)
+    video = simulate_depth(motion, camera, KINECT)
+    tracker = Tracker(motion.body, Rig((camera,)), rate=motion.rate, up=UP_AXES[motion.up])
+    for i in range(len(motion)):
+        tracker.update([DepthFrame("kinect", motion.times[i], video.frame(i).depth)])

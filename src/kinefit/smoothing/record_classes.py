@@ -16,14 +16,11 @@ from kinefit.sensors.points.image_lines import ImageLineMatched, ImageLineMeasur
 from kinefit.sensors.points.keypoints import KeypointMatched, KeypointMeasurement
 from kinefit.sensors.points.lifted import LiftedMatched, LiftedMeasurement
 from kinefit.sensors.points.markers import MarkerMatched, MarkerMeasurement
-from kinefit.sensors.regions.region_image import Coloured, Kept
-from kinefit.sensors.regions.region_parts import Lines
-from kinefit.sensors.regions.region_seams import Seams
+from kinefit.sensors.regions.region_parts import Coloured, Kept, Lines, Seams
 from kinefit.sensors.regions.regions import RegionMatched, RegionMeasurement
 from kinefit.sensors.regions.silhouette import SilhouetteMatched, SilhouetteMeasurement
 from kinefit.sensors.surfaces.depth_image import DepthImageMatched, DepthImageMeasurement
-from kinefit.sensors.surfaces.point_cloud import PointCloudMatched, PointCloudMeasurement
-from kinefit.sensors.surfaces.surface_match import FreePairs, SurfacePairs
+from kinefit.sensors.surfaces.point_cloud import FreePairs, PointCloudMatched, PointCloudMeasurement, SurfacePairs
 from kinefit.sensors.surfaces.surface_points import SurfacePointMatched, SurfacePointMeasurement
 from kinefit.sensors.visibility.occlusion import Hidden
 

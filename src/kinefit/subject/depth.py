@@ -22,8 +22,7 @@ from kinefit.sensors.base import Matched, Measurement, matched_by, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.sensors.surfaces.depth_view import DepthView, outside, splat, view_of
-from kinefit.sensors.surfaces.point_cloud import PointCloudSensor
-from kinefit.sensors.surfaces.surface_match import SurfacePairs
+from kinefit.sensors.surfaces.point_cloud import PointCloudSensor, SurfacePairs
 from kinefit.subject import fit as joint
 from kinefit.subject.parameters import Parameters, SegmentScales
 from kinefit.subject.subject import SubjectFit

@@ -13,8 +13,7 @@ from kinefit.errors import ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.rows import Rows
-from kinefit.sensors.base import Sensor, Unknown
-from kinefit.sensors.checks import of_kind
+from kinefit.sensors.base import Sensor, Unknown, of_kind
 from kinefit.sensors.displaced import AXES, CLOCK
 from kinefit.sensors.settings import CameraErrors
 from kinefit.solvers import _kernels_border

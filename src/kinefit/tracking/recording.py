@@ -35,8 +35,7 @@ from kinefit.observations import (
     sensor_of,
 )
 from kinefit.observations.arrays import is_number
-from kinefit.sensors.base import Sensor
-from kinefit.sensors.checks import of_kind
+from kinefit.sensors.base import Sensor, of_kind
 
 _FIRST_STEPS = 100  # in which every sensor that takes part is expected to see something
 _PARTS = ("keypoint_set", "marker_set", "segment")  # of which one sensor may have several frames at one time

@@ -23,8 +23,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.observations.arrays import is_number
 from kinefit.rows import AnyRows
-from kinefit.sensors.base import Measurement, Sensor, named
-from kinefit.sensors.checks import of_kind
+from kinefit.sensors.base import Measurement, Sensor, named, of_kind
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.mobility import check_closed

@@ -6,7 +6,7 @@ from kinefit._arguments import checked
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError
 from kinefit.motion import Motion
-from kinefit.sensors.checks import of_kind
+from kinefit.sensors.base import of_kind
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.online.fixed_lag import lag_frames
 from kinefit.smoothing.online.known_noise import KnownNoise

@@ -3,9 +3,9 @@
 import warnings
 
 from kinefit.viewers.live import View
-from kinefit.viewers.pictures import CameraImages
 from kinefit.viewers.player import Player
 from kinefit.viewers.show import Choice, ViewerContent, page
+from kinefit.viewers.stage import CameraImages
 
 __all__ = ["CameraImages", "Choice", "Player", "View", "ViewerContent", "page"]
 

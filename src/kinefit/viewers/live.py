@@ -14,7 +14,7 @@ from kinefit.bodies import Body, BodyState
 from kinefit.errors import BodyError, CalibrationError, choices
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.serving.access import Access
-from kinefit.viewers import figure, pictures, scene, stage
+from kinefit.viewers import figure, scene, stage
 
 _TELL_INTERVAL_S, _RATE_INTERVAL_S = 0.2, 2.0  # of the words on the page; of the mean of the frame rate
 
@@ -151,11 +151,11 @@ class View:
         if self._rig is None or name not in self._rig:
             raise CalibrationError(choices("camera", name, self._rig.names if self._rig else ()))
         if name not in self._maps:
-            view = pictures.flat_view(self._rig[name], stage.FRUSTUM_IMAGE_PX)
-            self._maps[name] = pictures.undistortion(
+            view = stage.flat_view(self._rig[name], stage.FRUSTUM_IMAGE_PX)
+            self._maps[name] = stage.undistortion(
                 self._rig[name], self._frames.get(name, ImageFrame.identity()), view
             )
-        return pictures.flatten(image, self._maps[name])
+        return stage.flatten(image, self._maps[name])
 
     def close(self) -> None:
         """End the server."""

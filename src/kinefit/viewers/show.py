@@ -15,8 +15,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion, known_median, nearest_frame
 from kinefit.observations import Markers
 from kinefit.viewers import figure, scene, stage
-from kinefit.viewers.pictures import CameraImages
-from kinefit.viewers.stage import POLICY, open_server, quiet
+from kinefit.viewers.stage import POLICY, CameraImages, open_server, quiet
 
 if TYPE_CHECKING:
     import viser

@@ -13,7 +13,7 @@ from kinefit.cli.checks._refine import free_name
 from kinefit.cli.checks.check import check
 from kinefit.diagnostics.checks import Checked
 from kinefit.errors import ExportError, KinefitError, TakeError
-from kinefit.exporters.marker_files import write_markers
+from kinefit.exporters.c3d_file import write_markers
 from kinefit.findings import Edit, Finding
 from kinefit.geometry import se3
 from kinefit.observations import Markers

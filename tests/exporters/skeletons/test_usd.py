@@ -9,7 +9,7 @@ from tests.exporters.synthetic import smooth_motion
 from kinefit.bodies import load_body, parse_body
 from kinefit.errors import ExportError
 from kinefit.exporters import write_usd
-from kinefit.exporters.skeletons.usd import joint_paths
+from kinefit.exporters.skeletons.glb import joint_paths
 
 pxr = pytest.importorskip("pxr")
 

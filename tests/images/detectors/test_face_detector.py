@@ -5,7 +5,7 @@ import pytest
 
 from kinefit import assets
 from kinefit.errors import AssetError
-from kinefit.images.detectors.face_detector import FaceDetector, head_circles, parts
+from kinefit.images.detectors.faces import FaceDetector, head_circles, parts
 from kinefit.readers.video import Video
 
 

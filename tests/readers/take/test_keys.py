@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import TakeError
-from kinefit.exporters.marker_files import write_markers
+from kinefit.exporters.c3d_file import write_markers
 from kinefit.observations import Markers
 from kinefit.readers.take.entries import RENAMED, TABLES, Take, keys_of
 from kinefit.readers.take.file import read_take

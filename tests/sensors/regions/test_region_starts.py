@@ -10,9 +10,8 @@ from kinefit.frame.trust import angles_off_prediction
 from kinefit.observations import DepthFrame
 from kinefit.rendering import render_body
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.regions.region_limbs import Limbs
-from kinefit.sensors.regions.region_seams import Seams
-from kinefit.sensors.regions.region_starts import Flips
+from kinefit.sensors.regions.region_parts import Limbs, Seams
+from kinefit.sensors.regions.region_search import Flips
 from kinefit.sensors.regions.regions import RegionSensor
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings

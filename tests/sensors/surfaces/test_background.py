@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kinefit.geometry.camera import Camera
-from kinefit.sensors.surfaces.background import Background
+from kinefit.sensors.surfaces.depth_view import Background
 
 WALL, BODY, SIGMA, WAIT = 4.0, 2.5, 0.01, 8
 CAMERA = Camera("depth", (80, 60), np.array([[70.0, 0, 39.5], [0, 70.0, 29.5], [0, 0, 1]]))

@@ -21,8 +21,8 @@ from kinefit.rendering import Canvas, render_body
 from kinefit.rows import DofRows
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surfaces.background import Background
 from kinefit.sensors.surfaces.depth_image import DepthImageSensor
+from kinefit.sensors.surfaces.depth_view import Background
 from kinefit.solvers.equations import normal_equations
 from kinefit.solvers.least_squares import gauss_newton
 

@@ -27,8 +27,8 @@ from kinefit.simulation import (
     simulate_depth,
     squat_and_wave,
 )
-from kinefit.simulation.placing import look_at
-from kinefit.simulation.rendering.room import room
+from kinefit.simulation.figures import look_at
+from kinefit.simulation.rendering.scenes import room
 
 
 @pytest.fixture(scope="module")

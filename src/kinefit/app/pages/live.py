@@ -9,10 +9,10 @@ from pathlib import Path
 from nicegui import ui
 
 from kinefit.app.desk import Desk
-from kinefit.app.images import jpeg, unrecognisable
 from kinefit.app.jobs import FAILED, Job
 from kinefit.app.live import followable, found_cameras, is_up, page_of, recorded_take, start_live
 from kinefit.app.pages.shell import card, in_thread, link, page_frame, shell, short, show_error, texts
+from kinefit.app.people import jpeg, unrecognisable
 from kinefit.app.texts import Texts
 from kinefit.app.webcams import Recorder, Webcam, find_webcams, write_live_take
 from kinefit.errors import KinefitError

@@ -59,7 +59,7 @@ def learn(
 ) -> None:  # fmt: skip
     """Learn a subject's markers from labelled takes, best from a take in which every joint moves."""
     from kinefit.cli._screen import check_file
-    from kinefit.cli.markers._name import learn_files
+    from kinefit.cli.markers._fit import learn_files
     from kinefit.identification.model.model import save_model
 
     if no_set and (marker_set or frame is not None):
@@ -99,7 +99,7 @@ def write_set(takes: tuple[Path, ...], out: Path | None, name: str | None, unit:
     file before you learn with it.
     """
     from kinefit.cli._screen import check_file
-    from kinefit.cli.markers._name import write_first_set
+    from kinefit.cli.markers._fit import write_first_set
 
     out = out or Path(f"{takes[0].stem}.toml")
     check_file(out)
@@ -135,7 +135,7 @@ def identify(
     SUBJECTS are files of `kinefit markers learn`, one for each person in the take. Existing labels of the take are
     ignored. Points without a certain label stay unlabelled. The worst doubtful frames are printed; a table lists all.
     """
-    from kinefit.cli.markers._name import identify_file
+    from kinefit.cli.markers._fit import identify_file
     from kinefit.identification.take.takes import TakeSettings
 
     settings = TakeSettings() if fill else TakeSettings(fill=0.0)
@@ -196,8 +196,7 @@ def fit(
 ) -> None:  # fmt: skip
     """Fit a body to markers: size and marker offsets from all frames, then joint angles of each frame."""
     from kinefit.cli._summary import print_summary
-    from kinefit.cli.markers._fit import FORMATS, MarkerFitOptions, fit_file
-    from kinefit.cli.markers._name import identify_file
+    from kinefit.cli.markers._fit import FORMATS, MarkerFitOptions, fit_file, identify_file
 
     out = out or take.with_name(f"{take.stem}-kinefit")
     chosen = FORMATS if formats is None else tuple(part.strip().lower() for part in formats.split(",") if part.strip())
@@ -242,7 +241,7 @@ def audit(
 ) -> None:  # fmt: skip
     """Find swapped labels, exchanged sides, a mirrored world, and markers off their segment, in labelled takes."""
     from kinefit.bodies.marker_sets import load_marker_set
-    from kinefit.cli.markers._name import check_labels, read_file
+    from kinefit.cli.markers._fit import check_labels, read_file
     from kinefit.identification.audit.audit import audit_take
     from kinefit.identification.model.model import load_model
 

@@ -66,8 +66,13 @@ def surface(
     With --flat there is no calibration: all arguments are photographs, before and after.
     """
     from kinefit.cli._screen import check_folder
-    from kinefit.cli.surfaces._files import read_views
-    from kinefit.cli.surfaces._measure import Wanted, measure_one_camera, measure_photographs, measure_videos
+    from kinefit.cli.surfaces._measure import (
+        Wanted,
+        measure_one_camera,
+        measure_photographs,
+        measure_videos,
+        read_views,
+    )
     from kinefit.errors import ObservationError
 
     check_folder(out)

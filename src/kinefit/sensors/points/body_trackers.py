@@ -24,8 +24,7 @@ from kinefit.geometry import se3
 from kinefit.losses import Loss
 from kinefit.observations import BodyTrackerFrame
 from kinefit.rows import AnyRows, DofRows
-from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor, Unknown
-from kinefit.sensors.checks import of_kind
+from kinefit.sensors.base import Hints, Leftover, Matched, Measurement, Sensor, Unknown, of_kind
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import MARKER_LOSS, TrackSettings
 

@@ -29,10 +29,8 @@ from kinefit.observations import ColourFrame
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments
 from kinefit.sensors.evidence import Evidence
-from kinefit.sensors.regions.region_image import Coloured, kept
-from kinefit.sensors.regions.region_parts import OTHER, Drawn, Lines, Parts
-from kinefit.sensors.regions.region_seams import SEAM_SPACING_PX, Seams
-from kinefit.sensors.regions.region_starts import Starts
+from kinefit.sensors.regions.region_parts import OTHER, SEAM_SPACING_PX, Coloured, Drawn, Lines, Parts, Seams, kept
+from kinefit.sensors.regions.region_search import Starts
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 

@@ -20,10 +20,9 @@ from kinefit.correspondences import surface_rows
 from kinefit.errors import ObservationError
 from kinefit.observations import SurfacePointFrame
 from kinefit.rows import AnyRows, Rows
-from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments
-from kinefit.sensors.checks import of_kind
+from kinefit.sensors.base import Leftover, Matched, Measurement, Sensor, by_segments, of_kind
 from kinefit.sensors.scene import Scene
-from kinefit.sensors.surfaces.surface_match import SurfacePairs
+from kinefit.sensors.surfaces.point_cloud import SurfacePairs
 
 _MAX_WANDER = 0.05  # of the slide, from step to step on a converged limb: 0.5 mm, a degree of a thin arm
 _MAX_WAIT_STEPS = 10  # until a limb counts as converged: a cloud never fixes the rotation of a round one

@@ -18,8 +18,7 @@ from kinefit.correspondences.closures import hard_equations
 from kinefit.errors import ObservationError
 from kinefit.frame.results import FrameResult, frame_result
 from kinefit.observations.arrays import is_number
-from kinefit.sensors.base import Measurement
-from kinefit.sensors.checks import of_kind
+from kinefit.sensors.base import Measurement, of_kind
 from kinefit.smoothing.online.known_noise import KnownNoise
 from kinefit.smoothing.online.lag_frame import FrameCosts, LagFrame, TrackerLike
 from kinefit.smoothing.unwrap import boxes, continued
