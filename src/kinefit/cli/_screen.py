@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
     from kinefit.findings import Finding
 
+PATH = click.Path(path_type=Path)
+"""Type of arguments and options that are files or folders."""
+
 INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 

@@ -8,15 +8,13 @@ import click
 
 from kinefit.cli import _screen
 
-_EXAMPLES = """\b
+
+@click.command("app", short_help="Do all of it in a page of the browser.", epilog="""\b
 Examples:
   kinefit app                       recordings in this folder and below it
   kinefit app my_sessions           recordings in another folder
-"""
-
-
-@click.command("app", short_help="Do all of it in a page of the browser.", epilog=_EXAMPLES)
-@click.argument("folder", type=click.Path(path_type=Path), default=".")
+""")  # fmt: skip
+@click.argument("folder", type=_screen.PATH, default=".")
 @click.option("--port", type=click.IntRange(0, 65535), default=8090, show_default=True, help="0: any free one.")
 @_screen.token_option
 @click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page.")

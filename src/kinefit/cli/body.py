@@ -10,8 +10,6 @@ import click
 from kinefit.cli import _screen
 from kinefit.cli._screen import CommandGroup
 
-_FILE = click.Path(path_type=Path)
-
 
 @click.group(cls=CommandGroup, short_help="List, copy and render bodies; check closed chains.",
              invoke_without_command=True, epilog="""\b
@@ -40,17 +38,16 @@ def body(ctx: click.Context) -> None:
 
 @body.command(short_help="Copy a body file of the catalogue, to edit.")
 @click.argument("name")
-@click.argument("file", type=_FILE, required=False)
+@click.argument("file", type=_screen.PATH, required=False)
 def copy(name: str, file: Path | None) -> None:
     """Write a body of the catalogue as a TOML file that you can edit."""
     from kinefit.bodies.toml.bodies import catalogue_text
-    from kinefit.cli._screen import check_file
     from kinefit.errors import FileError
 
     text, target = catalogue_text(name), file or Path(f"{name}.toml")
     if target.exists():
         raise FileError("this file already exists", file=target, remedy="Give another --out, or move this file.")
-    check_file(target, "FILE")
+    _screen.check_file(target, "FILE")
     target.write_text(text, encoding="utf-8")
     _screen.say(f"{target}: name it in the take, body = \"{target}\"")
 
@@ -88,18 +85,17 @@ def check(file: str, planar: bool) -> None:
 
 @body.command(short_help="Render a body with its closures satisfied.")
 @click.argument("file")
-@click.option("-o", "--out", type=_FILE, required=True, help="PNG or JPEG file.")
+@click.option("-o", "--out", type=_screen.PATH, required=True, help="PNG or JPEG file.")
 @click.option("--azimuth", type=float, default=40.0, show_default=True, help="[deg] Camera angle, 0 in front.")
 def picture(file: str, out: Path, azimuth: float) -> None:
     """Render a body in the pose nearest to its reference pose that satisfies its closures."""
     from kinefit.bodies import load_body
-    from kinefit.cli._screen import check_file
     from kinefit.errors import FileError
     from kinefit.exporters.atomic import write_image
     from kinefit.simulation.figures import portrait
 
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise FileError("images are written only as .png or .jpg", file=out, remedy=f"Write to {out.stem}.png.")
-    check_file(out)
+    _screen.check_file(out)
     write_image(out, portrait(load_body(file), azimuth))
     _screen.say(str(out))

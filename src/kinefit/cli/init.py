@@ -20,22 +20,21 @@ if TYPE_CHECKING:
     from kinefit.readers.take.file import Take
     from kinefit.readers.take.load import Observations
 
-_EXAMPLES = """\b
+_COLOURS = {"sure": "green", "likely": "cyan", "guess": "yellow", "open": "bold red"}
+
+
+@click.command(short_help="Write a take file for the recording in a folder.", epilog="""\b
 Examples:
   kinefit init my_recording
   kinefit init my_recording --out takes/monday.toml
   kinefit init my_recording --click                   the first pose from joints that you click
   kinefit init my_recording --points clicks.json      the first pose from clicks in a file
-"""
-_COLOURS = {"sure": "green", "likely": "cyan", "guess": "yellow", "open": "bold red"}
-
-
-@click.command(short_help="Write a take file for the recording in a folder.", epilog=_EXAMPLES)
-@click.argument("folder", type=click.Path(path_type=Path))
-@click.option("-o", "--out", type=click.Path(path_type=Path), help="Take file.  [default: FOLDER/take.toml]")
+""")  # fmt: skip
+@click.argument("folder", type=_screen.PATH)
+@click.option("-o", "--out", type=_screen.PATH, help="Take file.  [default: FOLDER/take.toml]")
 @click.option("--force", is_flag=True, help="Overwrite an existing take file.")
 @click.option("--click", "clicked", is_flag=True, help="Click joints in images, in the browser.")
-@click.option("--points", type=click.Path(path_type=Path), metavar="JSON", help="JSON file of clicked joints.")
+@click.option("--points", type=_screen.PATH, metavar="JSON", help="JSON file of clicked joints.")
 @click.option("--step", type=click.IntRange(min=0), help="With --click: step of the images.  [default: the first]")
 @click.option("--body", metavar="BODY", help="Body for the clicks: of the catalogue, or a file.  [default: humanoid]")
 @click.option(
@@ -60,7 +59,6 @@ def init(
         raise click.UsageError("--step needs --click; a file of --points has its own step.")
     if body is not None and not (clicked or points):
         raise click.UsageError("--body needs --click or --points; without them, write body into the take file.")
-    from kinefit.cli._screen import check_file
     from kinefit.errors import TakeError, command
     from kinefit.exporters.atomic import write_text
     from kinefit.readers.guess.folder import guess_take
@@ -70,7 +68,7 @@ def init(
         remedy = f"Use it: {command('check', out)}. Or give another file with --out, or overwrite it with --force."
         raise TakeError("the take file already exists", file=out, remedy=remedy)
     if folder.is_dir():
-        check_file(out)
+        _screen.check_file(out)
     guess = guess_take(folder, beside=out.absolute().parent)
     write_text(out, guess.text)
     show(guess.notes)

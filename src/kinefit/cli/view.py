@@ -13,26 +13,23 @@ if TYPE_CHECKING:
     from kinefit.serving.access import Access
     from kinefit.viewers.show import ViewerContent
 
-_EXAMPLES = """\b
+@click.command(short_help="Show a motion, a take or a folder of results in 3D.", epilog="""\b
 Examples:
   kinefit view my_take-kinefit                  a folder of results, with its take
   kinefit view motion.npz --take take.toml      a motion with the cameras of its take
   kinefit view motion.npz other.npz             two motions in one scene
   kinefit view take.toml                        cameras and keypoints before anything is tracked
   kinefit view motion.npz --html scene.html     the scene as one HTML file
-"""
-
-
-@click.command(short_help="Show a motion, a take or a folder of results in 3D.", epilog=_EXAMPLES)
-@click.argument("sources", metavar="SOURCE [OTHER]...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--take", type=click.Path(path_type=Path), help="Take file that gives cameras and markers.")
+""")  # fmt: skip
+@click.argument("sources", metavar="SOURCE [OTHER]...", nargs=-1, required=True, type=_screen.PATH)
+@click.option("--take", type=_screen.PATH, help="Take file that gives cameras and markers.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True, help="0: any free port.")
 @click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 admits other computers.")
 @_screen.token_option
 @click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page in the browser.")
 @_screen.hide_faces_option
 @click.option("--cylinders", is_flag=True, help="Show the body's cylinders and bones instead of a skin.")
-@click.option("--html", type=click.Path(path_type=Path), help="Write one self-contained page instead of serving it.")
+@click.option("--html", type=_screen.PATH, help="Write one self-contained page instead of serving it.")
 @_screen.verbose_option
 def view(
     sources: tuple[Path, ...], take: Path | None, port: int, host: str, token: str | None, browser: bool,
@@ -44,11 +41,10 @@ def view(
     shown in the same scene. Ctrl-C ends the command.
     """
     from kinefit.batch.viewed import gather
-    from kinefit.cli._screen import check_file
     from kinefit.serving.access import Access
 
     if html is not None:
-        check_file(html, "--html")
+        _screen.check_file(html, "--html")
     with _screen.bars() as step:
         recording = gather(sources, take, hide_faces=hide_faces, step=step, tell=_screen.note)
     if html is not None:

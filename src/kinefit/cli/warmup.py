@@ -13,16 +13,15 @@ from kinefit.cli import _screen
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_EXAMPLES = """\b
-Examples:
-  kinefit warmup
-  KINEFIT_CACHE=/var/cache/kinefit kinefit warmup     store them in another folder
-"""
 _PARTS = "surfaces", "keypoints", "depth"  # the longest first
 _PROCESSES = 2  # more would compile the kernels that the parts share once more, instead of loading them
 
 
-@click.command(short_help="Compile the kernels now, so that the first run starts at once.", epilog=_EXAMPLES)
+@click.command(short_help="Compile the kernels now, so that the first run starts at once.", epilog="""\b
+Examples:
+  kinefit warmup
+  KINEFIT_CACHE=/var/cache/kinefit kinefit warmup     store them in another folder
+""")  # fmt: skip
 @_screen.verbose_option
 def warmup() -> None:
     """Compile the kernels now and store them, so that later commands start at once.

@@ -16,25 +16,23 @@ if TYPE_CHECKING:
     from kinefit.calibration.bar.calibrate import BarCalibration
     from kinefit.calibration.bar.targets import BarViews
 
-_EXAMPLES = """\b
+_RESIDUAL_SCALE = 200  # a residual of 0.1 px is drawn 20 px long
+
+
+@click.command(short_help="Intrinsics, poses and scale from a bar with two targets.", epilog="""\b
 Examples:
   kinefit calibrate bar videos/ --length 0.9
   kinefit calibrate bar left.mp4 right.mp4 --length 0.5 --floor 12,80 -o room.toml
   kinefit calibrate bar centroids.csv --length 0.9 --size 1920x1080
   kinefit calibrate bar videos/ --length 0.9 --interiors lenses.toml --distance cam01:cam03:4.21
-"""
-_RESIDUAL_SCALE = 200  # a residual of 0.1 px is drawn 20 px long
-
-
-@click.command(short_help="Intrinsics, poses and scale from a bar with two targets.", epilog=_EXAMPLES)
-@click.argument("sources", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="VIDEO_FOLDER_OR_CSV...")
+""")  # fmt: skip
+@click.argument("sources", nargs=-1, required=True, type=_screen.PATH, metavar="VIDEO_FOLDER_OR_CSV...")
 @click.option("--length", type=float, required=True, metavar="M", help="Distance of the targets' centres.")
 @click.option("--length-sigma", type=float, metavar="M", help="Standard deviation of the length.  [default: 0.0001]")
-@click.option("-o", "--out", type=click.Path(path_type=Path), default=Path("calibration.toml"), show_default=True,
+@click.option("-o", "--out", type=_screen.PATH, default=Path("calibration.toml"), show_default=True,
               help="File to write, Pose2Sim TOML; with it a table of parameters and an image of the coverage.")
-@click.option("--interiors", type=click.Path(path_type=Path), metavar="FILE", help="Calibration with the intrinsics.")
-@click.option("--floor", metavar="FRAMES",
-              help="Frames in which the bar lies on the floor, in two directions: 12,80.")
+@click.option("--interiors", type=_screen.PATH, metavar="FILE", help="Calibration with the intrinsics.")
+@click.option("--floor", metavar="FRAMES", help="Frames in which the bar lies on the floor, in two directions: 12,80.")
 @click.option("--distance", metavar="A:B:M", help="Measured distance between the lenses of two cameras, as a check.")
 @click.option("--size", metavar="WxH", help="Image size for the centroids of a CSV file.")
 @click.option("--max-frames", type=click.IntRange(12), default=400, show_default=True,
@@ -51,7 +49,6 @@ def bar(
     frame numbers mean equal times. Or give a CSV file of centroids: camera,frame,u,v, with two rows for each image.
     """
     from kinefit.calibration.bar.calibrate import LENGTH_SIGMA, calibrate_bar, check_bar
-    from kinefit.cli._screen import check_new
     from kinefit.readers.calibration.read import read_calibration, write_calibration
 
     sigma = LENGTH_SIGMA if length_sigma is None else length_sigma
@@ -59,7 +56,7 @@ def bar(
     on_floor, known = _frames(floor), _distance(distance)
     beside = [out, out.with_suffix(".csv"), out.with_suffix(".png")]
     for file in beside:
-        check_new(file, overwrite)
+        _screen.check_new(file, overwrite)
     kept = read_calibration(interiors, exteriors=False) if interiors else None
     with _screen.bars() as step:
         seen = _seen(sources, size, kept, max_frames, on_floor, step)

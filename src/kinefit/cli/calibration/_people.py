@@ -8,16 +8,14 @@ import click
 
 from kinefit.cli import _screen
 
-_EXAMPLES = """\b
+
+@click.command(short_help="Estimate camera poses from the people in view.", epilog="""\b
 Examples:
   kinefit calibrate people take.toml --height 1.78
   kinefit calibrate people take.toml --focal --time-offsets -o cameras.toml
-"""
-
-
-@click.command(short_help="Estimate camera poses from the people in view.", epilog=_EXAMPLES)
-@click.argument("take", type=click.Path(path_type=Path))
-@click.option("-o", "--out", type=click.Path(path_type=Path), help="File to write.  [default: TAKE-people.toml]")
+""")  # fmt: skip
+@click.argument("take", type=_screen.PATH)
+@click.option("-o", "--out", type=_screen.PATH, help="File to write.  [default: TAKE-people.toml]")
 @click.option(
     "--height", type=float, metavar="M", help="Stature of the person, which sets the scale.  [default: the take's]"
 )
@@ -35,7 +33,6 @@ def people(
 
     from kinefit.bodies import load_body
     from kinefit.calibration.people.calibrate import calibrate_people
-    from kinefit.cli._screen import check_new
     from kinefit.preparing.take import with_detections
     from kinefit.readers.calibration.read import write_calibration
     from kinefit.readers.take.file import read_take
@@ -44,7 +41,7 @@ def people(
 
     take = find_take(take, wanted=("calibrate", "people"))
     out = out or take.with_name(f"{take.stem}-people.toml")
-    check_new(out, remedy="Give another file with --out.")
+    _screen.check_new(out, remedy="Give another file with --out.")
     entry = read_take(take)
     with _screen.bars() as step:
         entry = with_detections(entry, step, _screen.note)

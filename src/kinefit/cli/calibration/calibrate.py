@@ -47,15 +47,15 @@ def calibrate() -> None:
 
 
 @click.command(short_help="Intrinsics and extrinsics from a checkerboard or ChArUco board.", epilog=_EXAMPLES)
-@click.argument("sources", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="VIDEO_OR_FOLDER...")
+@click.argument("sources", nargs=-1, required=True, type=_screen.PATH, metavar="VIDEO_OR_FOLDER...")
 @click.option(
     "--board", "spec", required=True, metavar="SPEC",
     help="checkerboard:9x6:0.025 (inner corners; side of a square in m) or charuco:5x7:0.04:0.03[:DICTIONARY] "
     "(squares; sides of a square and of a marker in m).",
 )
-@click.option("-o", "--out", type=click.Path(path_type=Path), default=Path("calibration.toml"), show_default=True,
+@click.option("-o", "--out", type=_screen.PATH, default=Path("calibration.toml"), show_default=True,
               help="File to write, Pose2Sim TOML.")
-@click.option("--interiors", type=click.Path(path_type=Path), metavar="FILE", help="Calibration with the intrinsics.")
+@click.option("--interiors", type=_screen.PATH, metavar="FILE", help="Calibration with the intrinsics.")
 @click.option("--interiors-only", is_flag=True, help="Estimate only intrinsics; cameras may see the board one by one.")
 @click.option("--floor", metavar="FRAME", help="Frame (12) or time (3.5s) with the board face up on the floor.")
 @click.option("--max-frames", type=click.IntRange(4), default=200, show_default=True,
@@ -75,12 +75,11 @@ def board(
     from kinefit.calibration.board.calibrate import calibrate_board
     from kinefit.calibration.board.detection import Board
     from kinefit.calibration.board.sources import camera_sources, find_boards
-    from kinefit.cli._screen import check_new
     from kinefit.readers.calibration.read import read_calibration, write_calibration
 
     described = Board.parse(spec)
     found = camera_sources(sources)
-    check_new(out, overwrite)
+    _screen.check_new(out, overwrite)
     kept = read_calibration(interiors, exteriors=False) if interiors else None
     frame = _frame(floor, found)
     with _screen.bars() as step:

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 MOST_DOUBTS = 12
 """Doubtful spans that are printed; the table has all."""
 
-_EXAMPLES = """\b
+_unit = click.option("--unit", metavar="UNIT", help="Unit of the file, if it states none or a wrong one: mm, cm, m.")
+
+
+@click.group(cls=CommandGroup, short_help="Label the markers of a take, fit a body to them, check labels.", epilog="""\b
 Examples:
   kinefit markers learn labelled.c3d -o anna.json         learn how Anna's markers lie on her segments
   kinefit markers set labelled.c3d -o lab.toml            write a marker set for labels that the catalogue lacks
@@ -26,14 +29,7 @@ Examples:
   kinefit markers fit walk-named.c3d                      fit a body: joint angles, .mot, BVH, GLB
   kinefit markers fit walk.c3d --subject anna.json        label and fit in one command
   kinefit markers audit walk-named.c3d                    find swapped labels of a labelled take
-"""
-_FILE = click.Path(path_type=Path)
-_unit = click.option("--unit", metavar="UNIT", help="Unit of the file, if it states none or a wrong one: mm, cm, m.")
-
-
-@click.group(
-    cls=CommandGroup, short_help="Label the markers of a take, fit a body to them, check labels.", epilog=_EXAMPLES
-)
+""")  # fmt: skip
 def markers() -> None:
     """Label the markers of a take (C3D, TRC), fit a body to them, check labels."""
 
@@ -44,8 +40,8 @@ Examples:
   kinefit markers learn static.c3d walk.c3d squat.c3d -o anna.json
   kinefit markers learn static.c3d --frame 100 --set cmu_41
 """)  # fmt: skip
-@click.argument("takes", nargs=-1, required=True, type=_FILE)
-@click.option("-o", "--out", type=_FILE, help="Subject file to write.  [default: NAME.json]")
+@click.argument("takes", nargs=-1, required=True, type=_screen.PATH)
+@click.option("-o", "--out", type=_screen.PATH, help="Subject file to write.  [default: NAME.json]")
 @click.option("--name", help="Name of the subject.  [default: name of the first take]")
 @click.option("--set", "marker_set", metavar="NAME", help="Marker set of the catalogue, or a file.  [default: the set "
               "that has the labels]")  # fmt: skip
@@ -58,14 +54,13 @@ def learn(
     frame: int | None, unit: str | None,
 ) -> None:  # fmt: skip
     """Learn a subject's markers from labelled takes, best from a take in which every joint moves."""
-    from kinefit.cli._screen import check_file
     from kinefit.cli.markers._fit import learn_files
     from kinefit.identification.model.model import save_model
 
     if no_set and (marker_set or frame is not None):
         raise click.UsageError("--no-set learns from the motion alone: leave out --set and --frame.")
     if out is not None:
-        check_file(out)
+        _screen.check_file(out)
     model, findings = learn_files(takes, name=name, marker_set="" if no_set else marker_set, frame=frame, unit=unit)
     out = out or Path(f"{model.name}.json")
     save_model(model, out)
@@ -86,8 +81,8 @@ Examples:
   kinefit markers set range_of_motion.c3d -o lab.toml
   kinefit markers learn range_of_motion.c3d --set lab.toml -o anna.json
 """)  # fmt: skip
-@click.argument("takes", nargs=-1, required=True, type=_FILE)
-@click.option("-o", "--out", type=_FILE, help="Marker set to write.  [default: TAKE.toml]")
+@click.argument("takes", nargs=-1, required=True, type=_screen.PATH)
+@click.option("-o", "--out", type=_screen.PATH, help="Marker set to write.  [default: TAKE.toml]")
 @click.option("--name", help="Name of the set.  [default: name of the file]")
 @_unit
 @_screen.verbose_option
@@ -98,11 +93,10 @@ def write_set(takes: tuple[Path, ...], out: Path | None, name: str | None, unit:
     with known words on the humanoid's landmarks, and assigns every marker to the segment that it moves with. Check the
     file before you learn with it.
     """
-    from kinefit.cli._screen import check_file
     from kinefit.cli.markers._fit import write_first_set
 
     out = out or Path(f"{takes[0].stem}.toml")
-    check_file(out)
+    _screen.check_file(out)
     found = write_first_set(takes, out, name=name, unit=unit)
     for segment, labels in found.segments.items():
         _screen.say(f"  {segment}: {', '.join(labels)}")
@@ -120,9 +114,9 @@ Examples:
   kinefit markers identify dance.c3d anna.json bob.json -o dance-named.c3d
   kinefit markers identify walk.trc anna.json --no-fill --rest
 """)  # fmt: skip
-@click.argument("take", type=_FILE)
-@click.argument("subjects", nargs=-1, required=True, type=_FILE)
-@click.option("-o", "--out", type=_FILE, help="Labelled take, .c3d or .trc.  [default: TAKE-named]")
+@click.argument("take", type=_screen.PATH)
+@click.argument("subjects", nargs=-1, required=True, type=_screen.PATH)
+@click.option("-o", "--out", type=_screen.PATH, help="Labelled take, .c3d or .trc.  [default: TAKE-named]")
 @click.option("--fill/--no-fill", default=True, show_default=True, help="Fill gaps of up to half a second.")
 @click.option("--rest", is_flag=True, help='Also write unassigned points, as "*1", "*2" ...')
 @_unit
@@ -174,11 +168,11 @@ Examples:
   kinefit markers fit walk.c3d --subject anna.json --static static.c3d
   kinefit markers fit walk.trc --height 1.78 --formats mot,osim
 """)  # fmt: skip
-@click.argument("take", type=_FILE)
-@click.option("-o", "--out", type=_FILE, help="Folder of results.  [default: TAKE-kinefit]")
-@click.option("--subject", "subjects", multiple=True, type=_FILE,
+@click.argument("take", type=_screen.PATH)
+@click.option("-o", "--out", type=_screen.PATH, help="Folder of results.  [default: TAKE-kinefit]")
+@click.option("--subject", "subjects", multiple=True, type=_screen.PATH,
               help="Label the points first, with this file of `learn`; repeat for more people.")  # fmt: skip
-@click.option("--static", type=_FILE, help="Labelled static trial of the same subject.")
+@click.option("--static", type=_screen.PATH, help="Labelled static trial of the same subject.")
 @click.option("--body", default="humanoid", show_default=True, help="Body of the catalogue, or a body file.")
 @click.option("--set", "marker_set", metavar="NAME", help="Marker set.  [default: the set that has the labels]")
 @click.option("--height", type=click.FloatRange(0.5, 2.6), metavar="M", help="Height of the subject, barefoot [m].")
@@ -228,8 +222,8 @@ Examples:
   kinefit markers audit walk.c3d squat.c3d
   kinefit markers audit walk.c3d --subject anna.json
 """)  # fmt: skip
-@click.argument("takes", nargs=-1, required=True, type=_FILE)
-@click.option("--subject", type=_FILE, help="File of `kinefit markers learn`, to find swaps of whole takes.")
+@click.argument("takes", nargs=-1, required=True, type=_screen.PATH)
+@click.option("--subject", type=_screen.PATH, help="File of `kinefit markers learn`, to find swaps of whole takes.")
 @click.option("--set", "marker_set", metavar="NAME", help="Marker set.  [default: the set that has the labels]")
 @click.option("--strict", is_flag=True, help="End with exit code 2 if a label is wrong.")
 @_unit

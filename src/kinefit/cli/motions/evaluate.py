@@ -11,16 +11,15 @@ from kinefit.cli import _screen
 if TYPE_CHECKING:
     from kinefit.evaluation.voodoo import Summary
 
-_EXAMPLES = """\b
+_NAMES = {"3d": "3D (depth)", "2d": "2D (face, hands)", "fusion": "fusion"}
+
+
+@click.command(short_help="Grade a tracker on simulated sequences of known motion.", epilog="""\b
 Examples:
   kinefit evaluate                                 the fusion tracker on all 100 sequences
   kinefit evaluate --method voodoo                 the published method, with three improvements
   kinefit evaluate --sensor kinect --count 10      ten sequences, each movement and each person once
-"""
-_NAMES = {"3d": "3D (depth)", "2d": "2D (face, hands)", "fusion": "fusion"}
-
-
-@click.command(short_help="Grade a tracker on simulated sequences of known motion.", epilog=_EXAMPLES)
+""")  # fmt: skip
 @click.option("--suite", type=click.Choice(["voodoo"]), default="voodoo", show_default=True,
               help="Ten movements by ten people: depth images, and face and hands in 2D.")  # fmt: skip
 @click.option("--count", type=click.IntRange(1, 100), default=100, show_default=True, help="Number of sequences.")

@@ -86,20 +86,20 @@ def _format(ctx: click.Context, parameter: click.Parameter, value: str | None) -
 
 
 @click.command(short_help="Write a motion file in another format.", epilog=_EXAMPLES)
-@click.argument("motion", type=click.Path(path_type=Path))
+@click.argument("motion", type=_screen.PATH)
 @click.option(
     "--to", "format", callback=_format, metavar=f"[{'|'.join(FREEDOM)}]",
     help="Format to write; csv and parquet give a folder of tables. Required without --retarget.",
 )
 @click.option(
-    "--retarget", "character", type=click.Path(path_type=Path), metavar="CHARACTER",
+    "--retarget", "character", type=_screen.PATH, metavar="CHARACTER",
     help="Write the motion on the skeleton and mesh of a GLB, VRM, glTF or BVH file.",
 )
 @click.option(
-    "--names-table", "table", type=click.Path(path_type=Path), metavar="TOML",
+    "--names-table", "table", type=_screen.PATH, metavar="TOML",
     help="With --retarget: lines such as thigh_l = \"JointName\", for joints that are not recognised by name.",
 )
-@click.option("-o", "--out", type=click.Path(path_type=Path), help="File or folder.  [default: next to MOTION]")
+@click.option("-o", "--out", type=_screen.PATH, help="File or folder.  [default: next to MOTION]")
 @click.option("--unit", metavar="UNIT", help="Unit of length: m, cm or mm.")
 @click.option("--up", metavar="AXIS", help="Vertical axis: x, y, z, -x, -y or -z.")
 @click.option("--names", metavar="NAMES", help="Names of joints: kinefit, mixamo, cmu, opensim, hanim or bvh.")

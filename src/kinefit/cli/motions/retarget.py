@@ -8,21 +8,19 @@ import click
 
 from kinefit.cli import _screen
 
-_EXAMPLES = """\b
+
+@click.command(short_help="Retarget a recorded motion (BVH, ASF/AMC) to the humanoid.", epilog="""\b
 Examples:
   kinefit retarget walk.bvh
   kinefit retarget 02_01.amc --asf 02.asf --rate 60 --out walk.npz
   kinefit export walk.npz --retarget character.glb
-"""
-
-
-@click.command(short_help="Retarget a recorded motion (BVH, ASF/AMC) to the humanoid.", epilog=_EXAMPLES)
-@click.argument("recording", type=click.Path(path_type=Path))
-@click.option("--asf", type=click.Path(path_type=Path), help="Skeleton (.asf) of an .amc file.")
-@click.option("-o", "--out", type=click.Path(path_type=Path), help="Motion file.  [default: RECORDING with .npz]")
+""")  # fmt: skip
+@click.argument("recording", type=_screen.PATH)
+@click.option("--asf", type=_screen.PATH, help="Skeleton (.asf) of an .amc file.")
+@click.option("-o", "--out", type=_screen.PATH, help="Motion file.  [default: RECORDING with .npz]")
 @click.option("--rate", type=click.FloatRange(min=0, min_open=True), help="Frames per second.  [default: as recorded]")
 @click.option(
-    "--names-table", "table", type=click.Path(path_type=Path), metavar="TOML",
+    "--names-table", "table", type=_screen.PATH, metavar="TOML",
     help="Lines such as thigh_l = \"JointName\", for joints that are not recognised by name.",
 )
 @click.option("--unit", metavar="UNIT", default="auto", help="Unit of length: m, cm, mm, in.  [default: by the size]")
@@ -32,7 +30,6 @@ def retarget(
     recording: Path, asf: Path | None, out: Path | None, rate: float | None, table: Path | None, unit: str, up: str
 ) -> None:
     """Retarget a recorded motion to the humanoid, by the directions of its bones."""
-    from kinefit.cli._screen import check_file
     from kinefit.cli.motions.simulate import check_recording, read_skeleton
     from kinefit.exporters import write_motion
     from kinefit.findings import of_provenance
@@ -41,7 +38,7 @@ def retarget(
 
     check_recording(recording, asf, (".bvh", ".amc"), "RECORDING")
     out = out or recording.with_suffix(".npz")
-    check_file(out)
+    _screen.check_file(out)
     skeleton = read_skeleton(recording, asf, unit=unit, up=up)
     with _screen.bars() as step:
         step("retargeting", 0, 0)

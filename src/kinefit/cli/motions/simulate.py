@@ -15,15 +15,6 @@ if TYPE_CHECKING:
     from kinefit.observations.recordings import SkeletonMotion
 
 _SENSORS = ("tof", "kinect", "stereo", "colour", "keypoints")
-_EXAMPLES = """\b
-Examples:
-  kinefit simulate walk.bvh -o walk --sensor kinect
-  kinefit simulate motion.npz -o seen --sensor tof --sensor stereo --azimuth 30
-  kinefit simulate 02_01.amc --asf 02.asf -o seen --frames 100:200 --body humanoid10
-  kinefit track seen/take.toml
-"""
-
-
 def _frames(ctx: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int | None] | None:
     if value is None:
         return None
@@ -34,15 +25,21 @@ def _frames(ctx: click.Context, parameter: click.Parameter, value: str | None) -
         raise click.BadParameter("give FIRST:LAST, without the frame LAST.") from None
 
 
-@click.command(short_help="Simulate depth, stereo and colour cameras for a motion.", epilog=_EXAMPLES)
-@click.argument("motion", type=click.Path(path_type=Path))
-@click.option("-o", "--out", type=click.Path(path_type=Path), required=True, help="Folder for the take.")
+@click.command(short_help="Simulate depth, stereo and colour cameras for a motion.", epilog="""\b
+Examples:
+  kinefit simulate walk.bvh -o walk --sensor kinect
+  kinefit simulate motion.npz -o seen --sensor tof --sensor stereo --azimuth 30
+  kinefit simulate 02_01.amc --asf 02.asf -o seen --frames 100:200 --body humanoid10
+  kinefit track seen/take.toml
+""")  # fmt: skip
+@click.argument("motion", type=_screen.PATH)
+@click.option("-o", "--out", type=_screen.PATH, required=True, help="Folder for the take.")
 @click.option(
     "--sensor", "sensors", type=click.Choice(_SENSORS), multiple=True, default=("kinect",), show_default=True,
     help="Sensor to simulate; repeat for several.",
 )  # fmt: skip
 @click.option("--body", help="Body of the catalogue, or a file.  [default: the motion's, or humanoid]")
-@click.option("--asf", type=click.Path(path_type=Path), help="Skeleton (.asf) of an .amc file.")
+@click.option("--asf", type=_screen.PATH, help="Skeleton (.asf) of an .amc file.")
 @click.option("--rate", type=click.FloatRange(min=0, min_open=True), help="Frames per second.  [default: at most 30]")
 @click.option("--frames", callback=_frames, help="FIRST:LAST at this rate, without LAST.  [default: all]")
 @click.option("--distance", type=click.FloatRange(0.1, 50), help="[m] to the sensors.  [default: nearest full view]")

@@ -8,40 +8,36 @@ import click
 
 from kinefit.cli import _screen
 
-_EXAMPLES = """\b
+
+@click.command(short_help="Measure a surface without a body: points, mesh, strain.", epilog="""\b
 Examples:
   kinefit surface calib.toml left=left.png right=right.png            points, mesh, standard deviations
   kinefit surface calib.toml 201=states/201 202=states/202 --gauge 5  folders: states of one surface; strain over 5 mm
   kinefit surface calib.toml a=a.mp4 b=b.mp4 --window 21              videos: the surface is tracked
   kinefit surface before.png after.png --flat 0.05 --gauge 5          one camera, a flat plate, 0.05 mm per pixel
-"""
-
-
-@click.command(short_help="Measure a surface without a body: points, mesh, strain.", epilog=_EXAMPLES)
-@click.argument("calibration", type=click.Path(path_type=Path))
+""")  # fmt: skip
+@click.argument("calibration", type=_screen.PATH)
 @click.argument("views", nargs=-1, required=True, metavar="CAMERA=PATH...")
-@click.option("-o", "--out", type=click.Path(path_type=Path), default=Path("surface"), help="Output folder.")
+@click.option("-o", "--out", type=_screen.PATH, default=Path("surface"), help="Output folder.")
 @click.option("--unit", default="auto", help="Calibration's unit: m, cm, mm, or metres.  [default: as it states]")
 @click.option("--window", default="13", show_default=True, help="Side of the matched windows [px], odd; or 'texture'.")
 @click.option("--step", type=click.IntRange(1), default=6, show_default=True, help="Grid spacing [px].")
-@click.option("--mask", type=click.Path(path_type=Path), help="PNG mask of the first image, black outside the surface.")
+@click.option("--mask", type=_screen.PATH, help="PNG mask of the first image, black outside the surface.")
 @click.option(
-    "--seeds", type=click.Path(path_type=Path),
+    "--seeds", type=_screen.PATH,
     help="CSV of known points: u and v in each camera, in the order of the views.  [default: found automatically]",
 )  # fmt: skip
 @click.option("--least", type=click.FloatRange(0, 1), help="Smallest correlation of a match.  [default: 0.8]")
 @click.option("--gauge", type=click.FloatRange(min=0, min_open=True), help="Gauge length of the strain [mm].")
 @click.option("--incremental", is_flag=True, help="Refer each state to the previous state, not to the first.")
 @click.option("--still", type=click.IntRange(1), help="State without motion: its strain is the noise floor.")
-@click.option(
-    "--smooth", type=click.FloatRange(0, 5), default=0.0, help="Gaussian blur [px], for aliased texture."
-)
+@click.option("--smooth", type=click.FloatRange(0, 5), default=0.0, help="Gaussian blur [px], for aliased texture.")
 @click.option(
     "--flat", type=click.FloatRange(min=0, min_open=True), metavar="MM",
     help="One camera that faces a flat surface; MM is the width of a pixel on it, in mm.",
 )  # fmt: skip
 @click.option(
-    "--motion", type=click.Path(path_type=Path),
+    "--motion", type=_screen.PATH,
     help="Videos: motion.npz, or its folder, of the body in view; it predicts where lost points reappear.",
 )  # fmt: skip
 @click.option(
@@ -65,7 +61,6 @@ def surface(
 
     With --flat there is no calibration: all arguments are photographs, before and after.
     """
-    from kinefit.cli._screen import check_folder
     from kinefit.cli.surfaces._measure import (
         Wanted,
         measure_one_camera,
@@ -75,7 +70,7 @@ def surface(
     )
     from kinefit.errors import ObservationError
 
-    check_folder(out)
+    _screen.check_folder(out)
     wanted = Wanted(
         out, window, step, mask, seeds, least, gauge, incremental, still, field, smooth, motion, bounds, neighbours
     )  # fmt: skip

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from kinefit.batch.one import Choices
     from kinefit.batch.summary import Row
 
-_EXAMPLES = """\b
+@click.command(short_help="Track many takes in parallel, with one summary.", epilog="""\b
 Examples:
   kinefit batch 'sessions/**/take.toml' --workers 4
   kinefit batch sessions --out study --no-overlays --formats motion,csv
@@ -22,13 +22,10 @@ Examples:
 
 \b
 Exit codes: 0 where all takes are done, 2 where some have failed (the others are done all the same).
-"""
-
-
-@click.command(short_help="Track many takes in parallel, with one summary.", epilog=_EXAMPLES)
+""")  # fmt: skip
 @click.argument("patterns", nargs=-1, required=True, metavar="PATTERN...")
 @click.option(
-    "-o", "--out", type=click.Path(path_type=Path), default=Path("kinefit-batch"), show_default=True,
+    "-o", "--out", type=_screen.PATH, default=Path("kinefit-batch"), show_default=True,
     help="Folder of all results.",
 )
 @click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Number of processes.  [default: 1]")

@@ -8,17 +8,13 @@ import click
 
 from kinefit.cli import _screen
 
-_EXAMPLES = """\b
+
+@click.command(short_help="Track a real person in four sample videos.", epilog="""\b
 Examples:
   kinefit demo
   kinefit demo --out there --synthetic
-"""
-
-
-@click.command(short_help="Track a real person in four sample videos.", epilog=_EXAMPLES)
-@click.option(
-    "-o", "--out", type=click.Path(path_type=Path), default=Path("kinefit-demo"), show_default=True, help="Folder."
-)
+""")  # fmt: skip
+@click.option("-o", "--out", type=_screen.PATH, default=Path("kinefit-demo"), show_default=True, help="Folder.")
 @click.option("--synthetic", is_flag=True, help="Use a simulated figure instead; nothing is downloaded.")
 @_screen.verbose_option
 @click.pass_context

@@ -16,15 +16,6 @@ from kinefit.errors import command
 if TYPE_CHECKING:
     from kinefit.live.session import LiveSession, Receiver
 
-_EXAMPLES = """\b
-Examples:
-  kinefit live take.toml                       a recorded take, replayed in real time
-  kinefit live studio.toml --vmc localhost:39539      cameras with streams; moves an avatar
-  kinefit live studio.toml --lsl kinefit --out session1
-  kinefit live take.toml --json - --no-page | my_program
-"""
-
-
 def _address(ctx: click.Context, parameter: click.Parameter, value: str | None) -> tuple[str, int] | None:
     """Host and port of "HOST:PORT"."""
     if value is None:
@@ -35,9 +26,15 @@ def _address(ctx: click.Context, parameter: click.Parameter, value: str | None) 
     return host.strip("[]"), int(port)
 
 
-@click.command(short_help="Track a person live, and stream the poses.", epilog=_EXAMPLES)
-@click.argument("take", type=click.Path(path_type=Path))
-@click.option("-o", "--out", type=click.Path(path_type=Path), help="Folder of the session.  [default: TAKE-live]")
+@click.command(short_help="Track a person live, and stream the poses.", epilog="""\b
+Examples:
+  kinefit live take.toml                       a recorded take, replayed in real time
+  kinefit live studio.toml --vmc localhost:39539      cameras with streams; moves an avatar
+  kinefit live studio.toml --lsl kinefit --out session1
+  kinefit live take.toml --json - --no-page | my_program
+""")  # fmt: skip
+@click.argument("take", type=_screen.PATH)
+@click.option("-o", "--out", type=_screen.PATH, help="Folder of the session.  [default: TAKE-live]")
 @click.option("--page/--no-page", default=True, show_default=True, help="Serve a web page, and poses by WebSocket.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="0: any free port.")
 @click.option("--host", default="127.0.0.1", show_default=True, help="0.0.0.0 admits other computers.")

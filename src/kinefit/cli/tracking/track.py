@@ -29,18 +29,6 @@ def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -
 
 PICTURES = ("full", "blurred", "none")
 
-_EXAMPLES = """\b
-Examples:
-  kinefit track my_take/take.toml
-  kinefit track my_videos               a folder that has only the videos of one to eight cameras
-  kinefit track take.toml --out results --no-overlays --formats bvh,csv
-  kinefit track take.toml --realtime    filter: estimate each frame only from earlier frames
-  kinefit track take.toml --lag 0.1     filter with 0.1 s of later frames: far smoother
-  kinefit track take.toml --person moving      track one of several people
-  kinefit track take.toml -v            also print the residual of every point in every camera
-"""
-
-
 def choices_options(command: Callable) -> Callable:
     """Add the options that say what is made of a take, given to the command as `Choices`, `choices`.
 
@@ -117,9 +105,18 @@ def _check(choices: Choices, wanted: bool) -> None:
         raise click.UsageError("--overlays shows the videos, --pictures none does not: give one of them.")
 
 
-@click.command(short_help="Track the person of a take file and write all results.", epilog=_EXAMPLES)
-@click.argument("take", type=click.Path(path_type=Path))
-@click.option("-o", "--out", type=click.Path(path_type=Path), help="Folder of results.  [default: TAKE-kinefit]")
+@click.command(short_help="Track the person of a take file and write all results.", epilog="""\b
+Examples:
+  kinefit track my_take/take.toml
+  kinefit track my_videos               a folder that has only the videos of one to eight cameras
+  kinefit track take.toml --out results --no-overlays --formats bvh,csv
+  kinefit track take.toml --realtime    filter: estimate each frame only from earlier frames
+  kinefit track take.toml --lag 0.1     filter with 0.1 s of later frames: far smoother
+  kinefit track take.toml --person moving      track one of several people
+  kinefit track take.toml -v            also print the residual of every point in every camera
+""")  # fmt: skip
+@click.argument("take", type=_screen.PATH)
+@click.option("-o", "--out", type=_screen.PATH, help="Folder of results.  [default: TAKE-kinefit]")
 @choices_options
 @_screen.quiet_options
 @_screen.verbose_option
