@@ -24,11 +24,11 @@ from kinefit.errors import KinefitError
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: its threads only wait for each other here
 
 COMMANDS = {
-    "demo": "tracking.demo", "init": "init", "calibrate": "calibration.calibrate", "detect": "detect",
-    "check": "checks.check", "track": "tracking.track", "live": "tracking.live", "batch": "tracking.batch",
+    "demo": "tracking.track", "init": "init", "calibrate": "calibration.calibrate", "detect": "detect",
+    "check": "checks.check", "track": "tracking.track", "live": "tracking.live", "batch": "tracking.track",
     "markers": "markers.markers", "surface": "surfaces.surface", "body": "body", "view": "view", "app": "app",
-    "replay": "motions.replay", "export": "motions.export", "retarget": "motions.retarget",
-    "simulate": "motions.simulate", "evaluate": "motions.evaluate", "warmup": "warmup",
+    "replay": "motions.simulate", "export": "motions.export", "retarget": "motions.simulate",
+    "simulate": "motions.simulate", "evaluate": "motions.simulate", "warmup": "warmup",
 }  # fmt: skip
 """Commands in the order of use, and their modules."""
 

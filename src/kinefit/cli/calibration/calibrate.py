@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from importlib import import_module
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,12 +12,11 @@ from kinefit.cli import _screen
 from kinefit.cli._screen import CommandGroup
 
 if TYPE_CHECKING:
-    from kinefit.calibration.board.calibrate import BoardCalibration
+    from numpy.typing import NDArray
 
-_WAYS = {
-    "board": "kinefit.cli.calibration.calibrate", "bar": "kinefit.cli.calibration._bar",
-    "people": "kinefit.cli.calibration._people",
-}  # fmt: skip
+    from kinefit.calibration.bar.calibrate import BarCalibration
+    from kinefit.calibration.bar.targets import BarViews
+    from kinefit.calibration.board.calibrate import BoardCalibration
 
 _EXAMPLES = """\b
 Examples:
@@ -29,24 +28,14 @@ Examples:
 """
 
 
-class _Ways(CommandGroup):
-    """Subcommands that are imported when they are called."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        """In the order of use."""
-        return list(_WAYS)
-
-    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
-        """Import a subcommand."""
-        return getattr(import_module(_WAYS[name]), name) if name in _WAYS else None
-
-
-@click.group(cls=_Ways, epilog=_EXAMPLES, short_help="Calibrate cameras with a board, a bar, or from people in view.")
+@click.group(
+    cls=CommandGroup, epilog=_EXAMPLES, short_help="Calibrate cameras with a board, a bar, or from people in view."
+)
 def calibrate() -> None:
     """Calibrate cameras: with a board in view, with a bar that is waved, or from the people in view alone."""
 
 
-@click.command(short_help="Intrinsics and extrinsics from a checkerboard or ChArUco board.", epilog=_EXAMPLES)
+@calibrate.command(short_help="Intrinsics and extrinsics from a checkerboard or ChArUco board.", epilog=_EXAMPLES)
 @click.argument("sources", nargs=-1, required=True, type=_screen.PATH, metavar="VIDEO_OR_FOLDER...")
 @click.option(
     "--board", "spec", required=True, metavar="SPEC",
@@ -137,3 +126,242 @@ def _tell(result: BoardCalibration) -> None:
     _screen.say(result.world)
     for line in result.advice:
         _screen.say(f"To improve: {line}")
+
+
+_RESIDUAL_SCALE = 200  # a residual of 0.1 px is drawn 20 px long
+
+
+@calibrate.command(short_help="Intrinsics, poses and scale from a bar with two targets.", epilog="""\b
+Examples:
+  kinefit calibrate bar videos/ --length 0.9
+  kinefit calibrate bar left.mp4 right.mp4 --length 0.5 --floor 12,80 -o room.toml
+  kinefit calibrate bar centroids.csv --length 0.9 --size 1920x1080
+  kinefit calibrate bar videos/ --length 0.9 --interiors lenses.toml --distance cam01:cam03:4.21
+""")  # fmt: skip
+@click.argument("sources", nargs=-1, required=True, type=_screen.PATH, metavar="VIDEO_FOLDER_OR_CSV...")
+@click.option("--length", type=float, required=True, metavar="M", help="Distance of the targets' centres.")
+@click.option("--length-sigma", type=float, metavar="M", help="Standard deviation of the length.  [default: 0.0001]")
+@click.option("-o", "--out", type=_screen.PATH, default=Path("calibration.toml"), show_default=True,
+              help="File to write, Pose2Sim TOML; with it a table of parameters and an image of the coverage.")
+@click.option("--interiors", type=_screen.PATH, metavar="FILE", help="Calibration with the intrinsics.")
+@click.option("--floor", metavar="FRAMES", help="Frames in which the bar lies on the floor, in two directions: 12,80.")
+@click.option("--distance", metavar="A:B:M", help="Measured distance between the lenses of two cameras, as a check.")
+@click.option("--size", metavar="WxH", help="Image size for the centroids of a CSV file.")
+@click.option("--max-frames", type=click.IntRange(12), default=400, show_default=True,
+              help="Frames of each camera to search, spread over the recording.")
+@click.option("--overwrite", is_flag=True, help="Overwrite an existing OUT.")
+@_screen.verbose_option
+def bar(
+    sources: tuple[Path, ...], length: float, length_sigma: float | None, out: Path, interiors: Path | None,
+    floor: str | None, distance: str | None, size: str | None, max_frames: int, overwrite: bool,
+) -> None:
+    """Intrinsics, camera poses and scale from a bar with two bright targets, waved through the volume.
+
+    Give a video for each camera, named like the camera, or folders of images. The videos must be synchronised: equal
+    frame numbers mean equal times. Or give a CSV file of centroids: camera,frame,u,v, with two rows for each image.
+    """
+    from kinefit.calibration.bar.calibrate import LENGTH_SIGMA, calibrate_bar, check_bar
+    from kinefit.readers.calibration.read import read_calibration, write_calibration
+
+    sigma = LENGTH_SIGMA if length_sigma is None else length_sigma
+    check_bar(length, sigma)
+    on_floor, known = _frames(floor), _distance(distance)
+    beside = [out, out.with_suffix(".csv"), out.with_suffix(".png")]
+    for file in beside:
+        _screen.check_new(file, overwrite)
+    kept = read_calibration(interiors, exteriors=False) if interiors else None
+    with _screen.bars() as step:
+        seen = _seen(sources, size, kept, max_frames, on_floor, step)
+        step("calibrating", 0, 1)
+        result = calibrate_bar(
+            seen, length, interiors=kept, floor=on_floor, known_distance=known,
+            length_sigma=sigma,
+        )  # fmt: skip
+        step("calibrating", 1, 1)
+    write_calibration(result.rig, out)
+    _write_table(result, beside[1])
+    _write_picture(result, beside[2])
+    _tell_bar(result, known is not None)
+    _screen.say(f"Written: {out}, {beside[1].name} (all parameters), {beside[2].name} (coverage)")
+
+
+def _seen(
+    sources: tuple[Path, ...], size: str | None, kept: object, max_frames: int, include: tuple[int, ...],
+    step: _screen.Step,
+) -> dict[str, BarViews]:
+    from kinefit.calibration.bar.calibrate import check_cameras
+    from kinefit.calibration.bar.table import read_centroids
+    from kinefit.calibration.bar.targets import find_bars
+    from kinefit.calibration.board.sources import camera_sources
+    from kinefit.geometry.camera import Rig
+
+    if not any(path.suffix.lower() == ".csv" for path in sources):
+        if size is not None:
+            raise click.BadParameter("use it only with a CSV file of centroids", param_hint="--size")
+        views = camera_sources(sources)
+        check_cameras(views)
+        return find_bars(views, max_frames=max_frames, include=include, progress=step)
+    if len(sources) > 1:
+        raise click.BadParameter("give one CSV file that holds all cameras", param_hint="VIDEO_FOLDER_OR_CSV")
+    if size is not None:
+        given = re.fullmatch(r"(\d+)[xX](\d+)", size)
+        if given is None:
+            raise click.BadParameter(f"'{size}' is not an image size; write it as 1920x1080", param_hint="--size")
+        return read_centroids(sources[0], (int(given[1]), int(given[2])))
+    if not isinstance(kept, Rig):
+        problem = "a CSV file needs the image size: give 1920x1080, or --interiors"
+        raise click.BadParameter(problem, param_hint="--size")
+    return read_centroids(sources[0], {camera.name: camera.size for camera in kept})
+
+
+def _frames(floor: str | None) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in floor.split(",")) if floor else ()
+    except ValueError:
+        raise click.BadParameter(f"'{floor}' is not two frames; write them as 12,80", param_hint="--floor") from None
+
+
+def _distance(text: str | None) -> tuple[str, str, float] | None:
+    if text is None:
+        return None
+    try:
+        a, b, metres = text.rsplit(":", 2)
+        return a, b, float(metres)
+    except ValueError:
+        raise click.BadParameter(f"'{text}' is not A:B:M; write cam01:cam03:4.21", param_hint="--distance") from None
+
+
+def _write_table(result: BarCalibration, file: Path) -> None:
+    """A row a parameter: camera, name, value, standard deviation, what it rests on."""
+    from kinefit.exporters.atomic import write_rows
+
+    rows: list[tuple[str, ...]] = [("camera", "parameter", "unit", "value", "std", "from")]
+    for name, report in result.cameras.items():
+        for parameter, value, std in zip(report.names, report.values, report.std):
+            unit = "px" if parameter in ("fx", "fy", "cx", "cy") else "m" if parameter in "xyz" else ""
+            unit = "rad" if parameter in ("rx", "ry", "rz") else unit
+            origin = "given" if not std else "assumption" if parameter in report.assumed else "recording"
+            rows.append((name, parameter, unit, f"{value:.9g}", f"{std:.4g}", origin))
+    write_rows(file, rows)
+
+
+def _write_picture(result: BarCalibration, file: Path) -> None:
+    """Where in each image targets were, and what is left of them, magnified."""
+    import cv2
+    import numpy as np
+
+    from kinefit.exporters.atomic import write_image
+
+    panels = []
+    for c, camera in enumerate(result.rig):
+        scale = 640 / camera.size[0]
+        panel = np.full((round(camera.size[1] * scale), 640, 3), 32, np.uint8)
+        uv, left = (a[:, c].reshape(-1, 2) for a in (result.uv, result.residuals))
+        fine = np.isfinite(left).all(axis=1)
+        for at, off in zip(scale * uv[fine], scale * _RESIDUAL_SCALE * left[fine]):
+            cv2.line(panel, _at(at), _at(at + off), (60, 140, 255), 1, cv2.LINE_AA)
+            cv2.circle(panel, _at(at), 2, (90, 240, 255), -1, cv2.LINE_AA)
+        report = result.cameras[camera.name]
+        title = f"{camera.name}: {report.used} points, {report.rms_px:.2f} px, residuals x {_RESIDUAL_SCALE}"
+        panels.append(_titled(panel, title))
+    height = max(len(panel) for panel in panels)
+    panels = [np.pad(panel, ((0, height - len(panel)), (4, 4), (0, 0))) for panel in panels]
+    columns = min(len(panels), 2 if len(panels) < 5 else 3)
+    panels += [np.zeros_like(panels[0])] * (-len(panels) % columns)
+    picture = np.vstack([np.hstack(panels[k : k + columns]) for k in range(0, len(panels), columns)])
+    write_image(file, picture)
+
+
+def _titled(panel: NDArray, text: str) -> NDArray:
+    import cv2
+    import numpy as np
+
+    out = np.vstack([np.zeros((28, panel.shape[1], 3), np.uint8), panel])
+    cv2.putText(out, text, (6, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (230, 230, 230), 1, cv2.LINE_AA)
+    return out
+
+
+def _at(uv: NDArray) -> tuple[int, int]:
+    return round(float(uv[0])), round(float(uv[1]))
+
+
+def _tell_bar(result: BarCalibration, checked: bool) -> None:
+    rows = []
+    for camera in result.rig:
+        report = result.cameras[camera.name]
+        lens = report.std_of("fx") > 0
+        place = 1e3 * sum(report.std_of(axis) ** 2 for axis in "xyz") ** 0.5
+        rows.append((
+            camera.name, f"{camera.matrix[0, 0]:.1f}", f"{report.std_of('fx'):.2f}" if lens else "given",
+            f"{max(report.std_of('cx'), report.std_of('cy')):.2f}" if lens else "given",
+            f"{report.used} of {report.places}",
+            f"{100 * report.coverage:.0f} %", f"{report.rms_px:.3f}", f"{place:.1f}",
+        ))  # fmt: skip
+    heads = ("camera", "focal px", "± px", "centre ± px", "bars", "image covered", "rms px", "position ± mm")
+    _screen.print_table(heads, rows, title=f"bar of {result.length:g} m")
+    _screen.say(
+        f"Target detection: sigma {result.sigma_px:.3f} px. Bar length: scatter {1e3 * result.scatter:.2f} mm over "
+        f"{len(result.frames)} frames. Rejected: {result.left_out} outliers, {result.ambiguous} in which the two "
+        "targets cannot be distinguished."
+    )
+    for (a, b), distance in result.rig.distances.items():
+        _screen.say(f"{a} to {b}: {distance:.4f} m")
+    _screen.say(result.world)
+    for line in result.advice:
+        _screen.say(f"To improve: {line}")
+    if not checked:
+        _screen.say(
+            "The scale follows from --length and was not checked: a length that is 1 % too long makes everything 1 % "
+            "too large. Measure the distance between two lenses with a tape, and give it with --distance."
+        )
+
+
+@calibrate.command(short_help="Estimate camera poses from the people in view.", epilog="""\b
+Examples:
+  kinefit calibrate people take.toml --height 1.78
+  kinefit calibrate people take.toml --focal --time-offsets -o cameras.toml
+""")  # fmt: skip
+@click.argument("take", type=_screen.PATH)
+@click.option("-o", "--out", type=_screen.PATH, help="File to write.  [default: TAKE-people.toml]")
+@click.option(
+    "--height", type=float, metavar="M", help="Stature of the person, which sets the scale.  [default: the take's]"
+)
+@click.option("--focal", is_flag=True, help="Estimate the focal lengths too.")
+@click.option("--time-offsets", is_flag=True, help="Estimate the time offset of each camera too.")
+@_screen.verbose_option
+def people(
+    take: Path, out: Path | None, height: float | None, focal: bool, time_offsets: bool
+) -> None:
+    """Estimate camera poses from the people in view.
+
+    The calibration of TAKE gives the intrinsics of its cameras. Its camera poses are not used.
+    """
+    from statistics import median
+
+    from kinefit.bodies import load_body
+    from kinefit.calibration.people.calibrate import calibrate_people
+    from kinefit.preparing.take import with_detections
+    from kinefit.readers.calibration.read import write_calibration
+    from kinefit.readers.take.file import read_take
+    from kinefit.readers.take.find import find_take
+    from kinefit.takes.track import load_keypoints
+
+    take = find_take(take, wanted=("calibrate", "people"))
+    out = out or take.with_name(f"{take.stem}-people.toml")
+    _screen.check_new(out, remedy="Give another file with --out.")
+    entry = read_take(take)
+    with _screen.bars() as step:
+        entry = with_detections(entry, step, _screen.note)
+        step("reading", 0, 0)
+        seen = load_keypoints(entry, exteriors=False)
+        step("reading", 1, 1)
+        assert seen.rig is not None
+        found = calibrate_people(
+            tuple(seen.rig), seen.keypoints, load_body(entry.body), height=height or entry.height, focal=focal,
+            time_offsets=time_offsets, up=entry.up, progress=step,
+            sigma=median(source.sigma for source in entry.keypoints),
+        )  # fmt: skip
+    write_calibration(found.rig, out)
+    for line in found.summary_lines():
+        _screen.say(line)
+    _screen.say(f"Written: {out}")

@@ -11,6 +11,7 @@ import click
 from kinefit.cli import _screen
 
 if TYPE_CHECKING:
+    from kinefit.evaluation.voodoo import Summary
     from kinefit.motion import Motion
     from kinefit.observations.recordings import SkeletonMotion
 
@@ -117,3 +118,153 @@ def read_skeleton(path: Path, asf: Path | None, **options: Any) -> SkeletonMotio
     from kinefit.readers.skeletons.bvh import read_bvh
 
     return read_amc(asf, path, **options) if asf else read_bvh(path, **options)
+
+
+_NAMES = {"3d": "3D (depth)", "2d": "2D (face, hands)", "fusion": "fusion"}
+
+
+@click.command(short_help="Grade a tracker on simulated sequences of known motion.", epilog="""\b
+Examples:
+  kinefit evaluate                                 the fusion tracker on all 100 sequences
+  kinefit evaluate --method voodoo                 the published method, with three improvements
+  kinefit evaluate --sensor kinect --count 10      ten sequences, each movement and each person once
+""")  # fmt: skip
+@click.option("--suite", type=click.Choice(["voodoo"]), default="voodoo", show_default=True,
+              help="Ten movements by ten people: depth images, and face and hands in 2D.")  # fmt: skip
+@click.option("--count", type=click.IntRange(1, 100), default=100, show_default=True, help="Number of sequences.")
+@click.option("--method", type=click.Choice(["fusion", "live", "voodoo"]), default="fusion", show_default=True,
+              help="The fusion tracker, smoothed or live; or VooDoo with three improvements.")  # fmt: skip
+@click.option("--sensor", type=click.Choice(["tof", "kinect"]), default="tof", show_default=True)
+@click.option("--start", type=click.Choice(["truth", "found"]), default="truth", show_default=True,
+              help="First pose: the true one, or estimated from the first depth image.")  # fmt: skip
+@click.option("--rate", type=click.FloatRange(1, 120), default=10.0, show_default=True, help="Frames per second.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of people and sensor noise.")
+@_screen.verbose_option
+def evaluate(
+    suite: str, count: int, method: str, sensor: str, start: str, rate: float, seed: int
+) -> None:  # fmt: skip
+    """Track simulated sequences of known motion and grade each 0 (lost), 1 (acceptable) or 2 (good).
+
+    Grade 2: the mean joint error is at most 60 mm, and no joint is off by more than 150 mm in over 5 % of the frames.
+    Grade 0: a joint is off by more than 250 mm at the end, or in most of the frames.
+    """
+    from kinefit.evaluation.sequences import sequences
+    from kinefit.evaluation.voodoo import METHODS, conclusions, found_start
+    from kinefit.evaluation.voodoo import evaluate as run_all
+    from kinefit.simulation.rendering.sensors import DEPTH_SENSORS
+
+    runs = sequences(count, sensor=DEPTH_SENSORS[sensor], rate=rate, seed=seed)
+    first = found_start if start == "found" else None
+    with _screen.bars() as step:
+        summaries = run_all(
+            runs, METHODS[method], start=first, step=lambda done: step(f"{method} on {sensor}", done, count)
+        )
+    for line in _table(list(summaries.values())):
+        _screen.say(line)
+    if any(s.named.graded for s in summaries.values()):
+        _screen.say()
+        _screen.say("the six movements that the paper names:")
+        for line in _table([s.named for s in summaries.values()]):
+            _screen.say(line)
+    _screen.say()
+    for text, holds in conclusions(summaries).items():
+        _screen.say(f"{'yes' if holds else 'NO ':3}  {text}")
+    if _screen.is_verbose():
+        _screen.say()
+        for line in _movements(list(summaries.values())):
+            _screen.say(line)
+
+
+def _table(summaries: list[Summary]) -> list[str]:
+    """Lost, acceptable and good sequences, mean grade and mean error, for every choice of sensors."""
+    lines = [f"{'sensors':18}{'lost':>6}{'acceptable':>12}{'good':>6}{'mean grade':>12}{'mean error':>12}"]
+    for s in summaries:
+        lost, some, good = s.counts
+        lines.append(f"{_NAMES[s.inputs]:18}{lost:6d}{some:12d}{good:6d}{s.mean_grade:12.2f}{1e3 * s.error:9.0f} mm")
+    return lines
+
+
+def _movements(summaries: list[Summary]) -> list[str]:
+    """Mean grade and mean error of every movement."""
+    names = list(dict.fromkeys(g.movement for g in summaries[0].graded))
+    lines = [f"{'movement':18}" + "".join(f"{_NAMES[s.inputs]:>22}" for s in summaries)]
+    for name in names:
+        cells = []
+        for s in summaries:
+            of = [g.grade for g in s.graded if g.movement == name]
+            mean, error = sum(g.grade for g in of) / len(of), sum(g.mean for g in of) / len(of)
+            cells.append(f"{mean:.1f}, {1e3 * error:.0f} mm")
+        lines.append(f"{name:18}" + "".join(f"{cell:>22}" for cell in cells))
+    return lines
+
+
+@click.command(short_help="Move a motion down a slope; render it from a new camera.", epilog="""\b
+Examples:
+  kinefit replay motion.npz -o ride.mp4 --speed 6               a video on a slope of 30 degrees
+  kinefit replay motion.npz -o ride.npz --speed 6 --gain 1.5    a motion; show it with kinefit view ride.npz
+""")  # fmt: skip
+@click.argument("source", metavar="MOTION", type=_screen.PATH)
+@click.option("-o", "--out", required=True, type=_screen.PATH, help="Video (.mp4) or motion (.npz).")
+@click.option("--slope", type=float, default=30.0, show_default=True, help="[deg] Slope of the floor.")
+@click.option("--heading", type=float, default=0.0, show_default=True, help="[deg] Direction of the fall line.")
+@click.option("--speed", type=float, default=4.0, show_default=True, help="[m/s] Initial speed down the slope.")
+@click.option("--gain", type=float, default=0.0, show_default=True, help="[m/s²] Acceleration down the slope.")
+@click.option("--azimuth", type=float, default=100.0, show_default=True, help="[deg] Camera from the fall line.")
+@_screen.verbose_option
+def replay(
+    source: Path, out: Path, slope: float, heading: float, speed: float, gain: float, azimuth: float
+) -> None:
+    """Place a motion on a slope, move it downhill, and write it as a video or a motion."""
+    from kinefit.exporters.motion_file import write_motion
+    from kinefit.readers.motion import read_motion
+    from kinefit.simulation.replay import film, replayed
+
+    _screen.check_file(out, "--out")
+    found = source / "motion.npz" if source.is_dir() else source
+    moved = replayed(read_motion(found), slope=slope, heading=heading, speed=speed, gain=gain)
+    if out.suffix.lower() == ".npz":
+        write_motion(moved, out)
+    else:
+        film(moved, out, slope=slope, heading=heading, azimuth=azimuth)
+    _screen.say(f"{out}: {len(moved)} frames")
+
+
+@click.command(short_help="Retarget a recorded motion (BVH, ASF/AMC) to the humanoid.", epilog="""\b
+Examples:
+  kinefit retarget walk.bvh
+  kinefit retarget 02_01.amc --asf 02.asf --rate 60 --out walk.npz
+  kinefit export walk.npz --retarget character.glb
+""")  # fmt: skip
+@click.argument("recording", type=_screen.PATH)
+@click.option("--asf", type=_screen.PATH, help="Skeleton (.asf) of an .amc file.")
+@click.option("-o", "--out", type=_screen.PATH, help="Motion file.  [default: RECORDING with .npz]")
+@click.option("--rate", type=click.FloatRange(min=0, min_open=True), help="Frames per second.  [default: as recorded]")
+@click.option(
+    "--names-table", "table", type=_screen.PATH, metavar="TOML",
+    help="Lines such as thigh_l = \"JointName\", for joints that are not recognised by name.",
+)
+@click.option("--unit", metavar="UNIT", default="auto", help="Unit of length: m, cm, mm, in.  [default: by the size]")
+@click.option("--up", metavar="AXIS", default="auto", help="Vertical axis: x, y, z, -x ...  [default: feet to head]")
+@_screen.verbose_option
+def retarget(
+    recording: Path, asf: Path | None, out: Path | None, rate: float | None, table: Path | None, unit: str, up: str
+) -> None:
+    """Retarget a recorded motion to the humanoid, by the directions of its bones."""
+    from kinefit.cli.motions.simulate import check_recording, read_skeleton
+    from kinefit.exporters import write_motion
+    from kinefit.findings import of_provenance
+    from kinefit.readers.skeletons.characters import read_names
+    from kinefit.simulation import retarget as retarget_motion
+
+    check_recording(recording, asf, (".bvh", ".amc"), "RECORDING")
+    out = out or recording.with_suffix(".npz")
+    _screen.check_file(out)
+    skeleton = read_skeleton(recording, asf, unit=unit, up=up)
+    with _screen.bars() as step:
+        step("retargeting", 0, 0)
+        motion = retarget_motion(skeleton, rate=rate, names=read_names(table) if table else None)
+        step("retargeting", len(motion), len(motion))
+        write_motion(motion, out)
+    _screen.say(f"{out}: {len(motion)} frames at {motion.rate:g} Hz of the body {motion.body.name}")
+    for found in of_provenance(motion.provenance):
+        _screen.tell_finding(found)

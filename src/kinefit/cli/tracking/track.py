@@ -14,9 +14,9 @@ from kinefit.cli import _screen
 
 if TYPE_CHECKING:
     from kinefit.batch.one import Choices, TrackedPerson
+    from kinefit.batch.summary import Row
     from kinefit.readers.take.file import Take
     from kinefit.takes.in_view import InView
-
 
 def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
     """Formats of a list such as "bvh,csv"."""
@@ -245,3 +245,140 @@ def _print_agreement(take: Take) -> None:
     ]  # fmt: skip
     _screen.say("\nA pair with a far larger error has a wrong calibration, differing clocks, or another person.")
     _screen.print_table(("cameras", "median reprojection error"), rows)
+
+
+@click.command(short_help="Track a real person in four sample videos.", epilog="""\b
+Examples:
+  kinefit demo
+  kinefit demo --out there --synthetic
+""")  # fmt: skip
+@click.option("-o", "--out", type=_screen.PATH, default=Path("kinefit-demo"), show_default=True, help="Folder.")
+@click.option("--synthetic", is_flag=True, help="Use a simulated figure instead; nothing is downloaded.")
+@_screen.verbose_option
+@click.pass_context
+def demo(ctx: click.Context, out: Path, synthetic: bool) -> None:
+    """Track a real person in four sample videos, and write overlay videos and a report.
+
+    The recording (51 MB) is downloaded once, through pip, and kept. If the download fails, a simulated figure is
+    tracked instead.
+    """
+    from kinefit.batch.one import Choices
+    from kinefit.errors import command
+
+    _screen.check_folder(out)
+    take = synthetic_take(out / "take") if synthetic else sample_take(out / "take")
+    code = run(take, out, Choices())
+    if code == 0:
+        _screen.say(f"\nOpen {out / 'report.html'} in a browser, then play {out / 'overlays'}.")
+        _screen.say("Next:")
+        _screen.say(f"  {command('view', out / 'motion.npz', '--take', take)}")
+        _screen.say(f"  {command('check', take)}")
+        _screen.say("  kinefit init FOLDER      writes a take file for your own recording")
+        _screen.say(f"  {command('export', out / 'motion.npz', '--to', 'bvh', '--unit', 'm', '--up', 'z')}")
+        _screen.say("  kinefit --help")
+    ctx.exit(code)
+
+
+def sample_take(folder: Path) -> Path:
+    """Write the sample recording as a take, with its credit shown; the drawn figure where it cannot be had."""
+    from kinefit.assets import SAMPLE_CREDIT, write_sample_take
+    from kinefit.errors import AssetError
+
+    try:
+        with _screen.bars() as step:
+            take = write_sample_take(folder, lambda done, total: step("download MB", done // 10**6, total // 10**6))
+    except AssetError as error:
+        _screen.tell_error(error)
+        _screen.note("The recording cannot be downloaded; a simulated figure is tracked instead.\n")
+        return synthetic_take(folder)
+    _screen.say(SAMPLE_CREDIT["title"], style="bold")
+    for what in ("credit", "licence", "calibration", "keypoints"):
+        _screen.say(f"  {what + ':':<13}{SAMPLE_CREDIT[what]}")
+    return take
+
+
+def synthetic_take(folder: Path) -> Path:
+    """Write a take of a drawn figure."""
+    from kinefit.simulation import write_synthetic_take
+
+    _screen.say("A simulated figure that squats and waves, in four cameras", style="bold")
+    with _screen.bars() as step:
+        step("rendering", 0, 1)
+        take = write_synthetic_take(folder)
+        step("rendering", 1, 1)
+    return take
+
+
+@click.command(short_help="Track many takes in parallel, with one summary.", epilog="""\b
+Examples:
+  kinefit batch 'sessions/**/take.toml' --workers 4
+  kinefit batch sessions --out study --no-overlays --formats motion,csv
+  kinefit batch 'sessions/**/take.toml' --cluster tcp://host:8786
+
+\b
+Exit codes: 0 where all takes are done, 2 where some have failed (the others are done all the same).
+""")  # fmt: skip
+@click.argument("patterns", nargs=-1, required=True, metavar="PATTERN...")
+@click.option(
+    "-o", "--out", type=_screen.PATH, default=Path("kinefit-batch"), show_default=True,
+    help="Folder of all results.",
+)
+@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Number of processes.  [default: 1]")
+@click.option("--cluster", metavar="ADDRESS", help="Scheduler of a Dask cluster, used instead of this machine.")
+@click.option(
+    "--retries", type=click.IntRange(min=0), default=2, show_default=True,
+    help="How often a take is repeated if its worker process ends abnormally.",
+)
+@click.option(
+    "--time-limit", type=click.FloatRange(min=0, min_open=True), default=120.0, show_default=True, metavar="MINUTES",
+    help="A take that makes no progress for so long is stopped and reported as failed; not on a cluster.",
+)
+@choices_options
+@_screen.verbose_option
+@click.pass_context
+def batch(
+    ctx: click.Context, patterns: tuple[str, ...], out: Path, workers: int | None, cluster: str | None, retries: int,
+    time_limit: float, choices: Choices, wanted: bool,
+) -> None:
+    """Track every take that PATTERN matches, like `kinefit track`, and write summary.html over all of them.
+
+    Put a pattern in quotes. A folder stands for every take.toml in it and below. A take that fails does not stop the
+    others: the summary has its error. After an interruption, the same command tracks only the remaining takes.
+    """
+    from kinefit.batch.many import find_takes, track_takes
+
+    if cluster is not None and workers is not None:
+        raise click.UsageError("--workers (processes on this machine) and --cluster exclude each other: give one.")
+    found = find_takes(patterns)
+    _screen.check_folder(out)
+    if found.left_out:
+        _screen.note(f"{len(found.left_out)} matching TOML files are no takes, and skipped: {_listed(found.left_out)}")
+    try:
+        with _screen.bars() as step:
+            step("takes", 0, len(found.takes))
+
+            def tell(done: int, total: int, ended: tuple[Row, ...]) -> None:
+                for row in ended:
+                    _screen.say(_line(row), style="" if row.status == "done" else "red")
+                step("takes", done, total)
+
+            rows = track_takes(
+                found, out, choices=choices, workers=workers or 1, cluster=cluster, retries=retries,
+                time_limit=time_limit, progress=tell,
+            )
+    except KeyboardInterrupt as stopped:
+        raise KeyboardInterrupt(f"Finished takes are in {out}; run the same command to continue.") from stopped
+    bad = len({row.take for row in rows if row.status != "done"})
+    _screen.say(f"{len(found.takes) - bad} of {len(found.takes)} takes are done: {out / 'summary.html'}")
+    ctx.exit(2 if bad else 0)
+
+
+def _line(row: Row) -> str:
+    who = f"{row.take}{f', person {row.person}' if row.person else ''}"
+    if row.quality is None:
+        return f"{row.status:<6} {who}: {row.error}"
+    return f"{row.status:<6} {who}: {row.frames} frames, quality {row.quality:.2f}"
+
+
+def _listed(files: tuple[Path, ...]) -> str:
+    return ", ".join(file.name for file in files[:5]) + (f" and {len(files) - 5} more" if len(files) > 5 else "")
