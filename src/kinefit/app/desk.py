@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from kinefit.app.jobs import Job, JobQueue
 from kinefit.app.people import PeoplePictures
@@ -40,8 +42,7 @@ class Desk:
         self.chosen: set[Path] = set()
         self.files = FilePages(root)
         self.jobs = JobQueue()
-        self._reviews: dict[Path, Review] = {}
-        self._comparisons: dict[tuple[Path, Path], Comparison] = {}
+        self._open: dict[Path | tuple[Path, Path], Any] = {}
         self._opening = threading.Lock()  # of two windows that open the same result, the second waits
         self.people = PeoplePictures()
         self.recorder: Recorder | None = None
@@ -53,35 +54,30 @@ class Desk:
 
     def review(self, take: Path, folder: Path) -> Review:
         """An open result; read anew if its motion was written since. Slow: call it in a thread."""
-        with self._opening:
-            known = self._reviews.get(folder)
-            if known is None or not known.is_current(bool(self.hide_faces)):
-                if known is not None:
-                    known.close()
-                self._reviews[folder] = known = Review(take, folder, hide_faces=bool(self.hide_faces))
-            return known
+        return self._current(folder, lambda: Review(take, folder, hide_faces=bool(self.hide_faces)))
 
     def opened(self, folder: Path) -> Review | None:
         """The result in a folder, if it is open."""
-        return self._reviews.get(folder)
+        return self._open.get(folder)
 
     def comparison(self, before: Path, after: Path) -> Comparison:
         """Two results side by side; read anew if a motion was written since. Slow: call it in a thread."""
+        return self._current((before, after), lambda: Comparison(before, after))
+
+    def _current(self, key: Any, read: Callable[[], Any]) -> Any:
         with self._opening:
-            known = self._comparisons.get((before, after))
-            if known is None or not known.is_current:
+            known = self._open.get(key)
+            if known is None or not known.is_current(bool(self.hide_faces)):
                 if known is not None:
                     known.close()
-                self._comparisons[before, after] = known = Comparison(before, after)
+                self._open[key] = known = read()
             return known
 
     async def close(self) -> None:
         """Pause all jobs, end the recording and close all results."""
         self.files.close()
-        for review in self._reviews.values():
-            review.close()
-        for comparison in self._comparisons.values():
-            comparison.close()
+        for result in self._open.values():
+            result.close()
         if self.recorder is not None:
             with suppress(KinefitError):  # a camera without images
                 self.recorder.stop()

@@ -22,7 +22,34 @@ from kinefit.readers.take.load import load_observations
 from kinefit.takes.missing import last_found
 
 
-class Review:
+class Opened:
+    """What is open of motions, whose files may be written anew.
+
+    Parameters
+    ----------
+    files : of the motions
+    hide_faces : whether faces are hidden in its images; None if it has none
+    """
+
+    scene: ScenePage
+
+    def __init__(self, *files: Path, hide_faces: bool | None = None) -> None:
+        self._files, self._hide_faces = files, hide_faces
+        self._written = self._changed()
+
+    def is_current(self, hide_faces: bool) -> bool:
+        """Whether no motion was written since, and faces are shown as they were."""
+        return self._changed() == self._written and self._hide_faces in (None, hide_faces)
+
+    def close(self) -> None:
+        """Close the 3D scene."""
+        self.scene.close()
+
+    def _changed(self) -> list[int]:
+        return [file.stat().st_mtime_ns if file.exists() else 0 for file in self._files]
+
+
+class Review(Opened):
     """A motion with everything to look at it.
 
     Parameters
@@ -44,9 +71,8 @@ class Review:
     """
 
     def __init__(self, take: Path, folder: Path, *, hide_faces: bool) -> None:
-        self.folder, self._hide_faces = folder, hide_faces
-        file = folder / "motion.npz"
-        self._written = file.stat().st_mtime_ns if file.exists() else 0
+        self.folder, file = folder, folder / "motion.npz"
+        super().__init__(file, hide_faces=hide_faces)
         self.motion = read_motion(file)
         self.take = last_found(replace(read_take(take), hide_faces=hide_faces))
         self.seen = load_observations(self.take)
@@ -63,11 +89,6 @@ class Review:
     def size(self, camera: str) -> tuple[int, int]:
         """(width, height) [px] of a camera's video."""
         return self._videos(camera).size
-
-    def is_current(self, hide_faces: bool) -> bool:
-        """Whether the motion was not written since, and faces are shown as they were."""
-        file = self.folder / "motion.npz"
-        return file.exists() and file.stat().st_mtime_ns == self._written and hide_faces == self._hide_faces
 
     def image(self, camera: str, frame: int) -> NDArray[np.uint8]:
         """A camera's image (H, W, 3) at a frame of the motion, with the fit drawn on it if `has_cameras`.
@@ -94,7 +115,7 @@ class Review:
 
     def close(self) -> None:
         """Close the 3D scene and all videos."""
-        self.scene.close()
+        super().close()
         self._videos.close()
 
 
@@ -116,7 +137,7 @@ class RangeChange:
     is_clear: bool
 
 
-class Comparison:
+class Comparison(Opened):
     """Two motions, of which the first is that before.
 
     Parameters
@@ -137,8 +158,7 @@ class Comparison:
     """
 
     def __init__(self, before: Path, after: Path) -> None:
-        self._files = before / "motion.npz", after / "motion.npz"
-        self._written = self._changed()
+        super().__init__(before / "motion.npz", after / "motion.npz")
         content = gather(self._files)
         first, second = content.motions
         self.ranges = _changes(ranges_of(first), ranges_of(second))
@@ -147,23 +167,11 @@ class Comparison:
         self.times = first.times - first.times[0], second.times - second.times[0]
         self.scene = ScenePage(content)
 
-    @property
-    def is_current(self) -> bool:
-        """Whether both motions are as they were when they were read."""
-        return self._changed() == self._written
-
     def points(self, angle: str, number: int, most: int) -> list[list[float]]:
         """[s, deg] of an angle of the motion 0 or 1, at most `most` points of it."""
         curve, times = self.angles[angle][number], self.times[number]
         step = max(1, -(-len(times) // most))
         return np.column_stack([times, curve.values])[::step].round(3).tolist()
-
-    def close(self) -> None:
-        """Close the scene."""
-        self.scene.close()
-
-    def _changed(self) -> list[int]:
-        return [file.stat().st_mtime_ns if file.exists() else 0 for file in self._files]
 
 
 def _changes(

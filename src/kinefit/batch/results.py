@@ -7,7 +7,7 @@ import platform
 from collections.abc import Callable, Iterable, Iterator
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,32 +21,59 @@ if TYPE_CHECKING:
 Step = Callable[[str, int, int], None]
 """Called with the name of the work, the number of steps done, and the number of all steps (0: unknown)."""
 
-NAMES = {
-    "motion": "motion.npz", "csv": "tables", "bvh": "motion.bvh", "glb": "motion.glb", "trc": "motion.trc",
-    "mot": "motion.mot", "osim": "body.osim", "parquet": "tables", "c3d": "motion.c3d", "usd": "motion.usdc",
-    "x3d": "motion.x3d", "nwb": "motion.nwb", "mcap": "motion.mcap", "rrd": "motion.rrd", "jsonl": "motion.jsonl",
+
+class Format(NamedTuple):
+    """A format of motions: its file or folder among results, its use, and what may be chosen of it, defaults first."""
+
+    file: str
+    use: str
+    unit: tuple[str, ...] = ()
+    up: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    rest: tuple[str, ...] = ()
+    why: str = ""  # there is no more choice
+
+
+_UNITS, _RESTS, _UPS = ("m", "cm", "mm"), ("body", "t"), ("x", "y", "z", "-x", "-y", "-z")
+_Y_UPS, _Z_UPS = ("y", "x", "z", *_UPS[3:]), ("z", "x", "y", *_UPS[3:])
+_JOINTS = ("kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh")
+_BVH, _HANIM = ((first, *(name for name in _JOINTS if name != first)) for first in ("bvh", "hanim"))
+_OPENSIM = "OpenSim files are in metres, y up, with the names of the body's coordinates"
+
+FORMATS = {
+    "motion": Format("motion.npz", "all results, for kinefit view, kinefit export and kinefit.read_motion"),
+    "csv": Format("tables", "tables of angles, joint centres, landmarks, quality, residuals", _UNITS, _UPS, _JOINTS),
+    "parquet": Format("tables", "the same tables as Parquet", _UNITS, _UPS, _JOINTS),
+    "bvh": Format("motion.bvh", "animated skeleton for animation programs", ("cm", "m", "mm"), _Y_UPS, _BVH, _RESTS),
+    "glb": Format("motion.glb", "animated figure for browsers and game engines", (), (), _JOINTS, _RESTS,
+                  "GLB is in metres and y up by its specification"),
+    "usd": Format("motion.usdc", "animated figure for film and simulation programs", _UNITS, ("y", "z"), _JOINTS,
+                  _RESTS, "USD supports only y and z up"),
+    "c3d": Format("motion.c3d", "joint centres and landmarks for motion laboratories", ("mm", "cm", "m"), _UPS,
+                  _JOINTS),
+    "trc": Format("motion.trc", "landmarks over time for OpenSim", _UNITS, _Y_UPS, (), (),
+                  "TRC has landmarks, with their H-Anim names"),
+    "x3d": Format("motion.x3d", "animated H-Anim figure for browsers and archives", (), (), _HANIM, _RESTS,
+                  "X3D is in metres and y up by its standard"),
+    "nwb": Format("motion.nwb", "joint centres with confidence for neuroscience", (), _UPS, _JOINTS, (),
+                  "kinefit writes NWB in metres"),
+    "mcap": Format("motion.mcap", "joint states and transforms for ROS 2", (), _Z_UPS, _JOINTS, (), "ROS is in metres"),
+    "rrd": Format("motion.rrd", "joints, error bars and angles for the viewer of Rerun", (), _UPS, _JOINTS, (),
+                  "kinefit writes RRD in metres"),
+    "jsonl": Format("motion.jsonl", "poses as JSON lines, as kinefit live sends them; for the Blender add-on", (), _UPS,
+                    (), (), "JSON lines are in metres, with the names of the body's segments"),
+    "mot": Format("motion.mot", "angles over time for OpenSim", why=_OPENSIM),
+    "osim": Format("body.osim", "the fitted body for OpenSim", why=_OPENSIM),
 }  # fmt: skip
+"""All formats of motions; `exporters` has a function `write_NAME` for each."""
+
+NAMES = {name: format.file for name, format in FORMATS.items()}
 """File or folder of each format in a folder of results."""
 
 DEFAULT_FORMATS = ("motion", "csv", "bvh", "glb", "trc", "mot", "osim")
 """Formats that are written by default."""
 
-DESCRIPTIONS = {
-    "motion": "all results, for kinefit view, kinefit export and kinefit.read_motion",
-    "csv": "tables of angles, joint centres, landmarks, quality, residuals",
-    "parquet": "the same tables as Parquet",
-    "bvh": "animated skeleton for animation programs",
-    "glb": "animated figure for browsers and game engines",
-    "trc": "landmarks over time for OpenSim",
-    "mot": "angles over time for OpenSim",
-    "osim": "the fitted body for OpenSim",
-    "c3d": "joint centres and landmarks for motion laboratories",
-    "usd": "animated figure for film and simulation programs",
-    "x3d": "animated H-Anim figure for browsers and archives",
-    "nwb": "joint centres with confidence for neuroscience",
-    "mcap": "joint states and transforms for ROS 2",
-    "jsonl": "poses as JSON lines, as kinefit live sends them; for the Blender add-on",
-    "rrd": "joints, error bars and angles for the viewer of Rerun",
+DESCRIPTIONS = {name: format.use for name, format in FORMATS.items()} | {
     "overlays": "videos with the fitted skeleton",
     "montage": "one image of all cameras",
     "report": "results with error bars and findings, as a page for the browser",
@@ -61,18 +88,10 @@ def silent(*_: object) -> None:
 
 
 def write_format(motion: Motion, format: str, path: Path, **options: Any) -> None:
-    """Write a motion in one of the formats of `NAMES`, with options of its exporter."""
+    """Write a motion in one of `FORMATS`, with options of its exporter."""
     from kinefit import exporters
 
-    writers: dict[str, Callable[..., Any]] = {
-        "motion": exporters.write_motion, "csv": exporters.write_csv, "parquet": exporters.write_parquet,
-        "bvh": exporters.write_bvh, "glb": exporters.write_glb, "trc": exporters.write_trc,
-        "c3d": exporters.write_c3d, "usd": exporters.write_usd, "mot": exporters.write_mot, "x3d": exporters.write_x3d,
-        "nwb": exporters.write_nwb, "mcap": exporters.write_mcap, "rrd": exporters.write_rrd,
-        "jsonl": exporters.write_jsonl,
-        "osim": lambda motion, path: exporters.write_osim(motion.body, path),
-    }  # fmt: skip
-    writers[format](motion, path, **options)
+    getattr(exporters, f"write_{format}")(motion.body if format == "osim" else motion, path, **options)
 
 
 def write_results(motion: Motion, folder: Path, formats: Iterable[str], step: Step, files: dict[str, Path]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -77,30 +78,11 @@ class DisplacedMatched(Matched):
     measurement: Displaced
     matched: Matched
 
-    @property
-    def of_points(self) -> bool:  # type: ignore[override]
-        """As of the sensor."""
-        return self.matched.of_points
-
-    @property
-    def shows_surface(self) -> bool:  # type: ignore[override]
-        """As of the sensor."""
-        return self.matched.shows_surface
-
-    @property
-    def channels(self) -> Sequence[str] | None:
-        """As of the sensor."""
-        return self.matched.channels
-
-    @property
-    def turns(self) -> Mapping[int, NDArray]:  # type: ignore[override]
-        """{segment: (3,) [rad]} as of the sensor, in the frames of the segments."""
-        return self.matched.turns
-
-    @property
-    def key(self) -> bytes:
-        """As of the sensor."""
-        return self.matched.key
+    of_points = property(attrgetter("matched.of_points"))  # type: ignore[assignment]
+    shows_surface = property(attrgetter("matched.shows_surface"))  # type: ignore[assignment]
+    channels = property(attrgetter("matched.channels"))
+    turns = property(attrgetter("matched.turns"))  # type: ignore[assignment]
+    key = property(attrgetter("matched.key"))
 
     def rows(self, scene: Scene) -> Sequence[AnyRows]:
         """The sensor's rows, in the world."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import click
 
@@ -13,41 +12,7 @@ from kinefit.cli import _screen
 from kinefit.errors import spelled
 from kinefit.readers.units import LENGTHS, worth
 
-
-class Freedom(NamedTuple):
-    """What may be chosen of a format, the default first; `why` there is no more choice."""
-
-    unit: tuple[str, ...] = ()
-    up: tuple[str, ...] = ()
-    names: tuple[str, ...] = ()
-    rest: tuple[str, ...] = ()
-    why: str = ""
-
-
-_UPS = ("x", "y", "z", "-x", "-y", "-z")
-_Y_UPS, _Z_UPS = (("y", "x", "z", *_UPS[3:]), ("z", "x", "y", *_UPS[3:]))
-_NAMES = ("kinefit", "mixamo", "cmu", "opensim", "hanim", "bvh")
-_RESTS = ("body", "t")
-_OF_BVH = ("bvh", *_NAMES[:-1])
-_OF_HANIM = ("hanim", *(name for name in _NAMES if name != "hanim"))
-_OPENSIM = "OpenSim files are in metres, y up, with the names of the body's coordinates"
-
-FREEDOM = {
-    "csv": Freedom(("m", "cm", "mm"), _UPS, _NAMES),
-    "parquet": Freedom(("m", "cm", "mm"), _UPS, _NAMES),
-    "bvh": Freedom(("cm", "m", "mm"), _Y_UPS, _OF_BVH, _RESTS),
-    "glb": Freedom((), (), _NAMES, _RESTS, "GLB is in metres and y up by its specification"),
-    "usd": Freedom(("m", "cm", "mm"), ("y", "z"), _NAMES, _RESTS, "USD supports only y and z up"),
-    "c3d": Freedom(("mm", "cm", "m"), _UPS, _NAMES),
-    "trc": Freedom(("m", "cm", "mm"), _Y_UPS, (), (), "TRC has landmarks, with their H-Anim names"),
-    "x3d": Freedom((), (), _OF_HANIM, _RESTS, "X3D is in metres and y up by its standard"),
-    "nwb": Freedom((), _UPS, _NAMES, (), "kinefit writes NWB in metres"),
-    "mcap": Freedom((), _Z_UPS, _NAMES, (), "ROS is in metres"),
-    "rrd": Freedom((), _UPS, _NAMES, (), "kinefit writes RRD in metres"),
-    "jsonl": Freedom((), _UPS, (), (), "JSON lines are in metres, with the names of the body's segments"),
-    "mot": Freedom(why=_OPENSIM),
-    "osim": Freedom(why=_OPENSIM),
-}
+FREEDOM = {name: format for name, format in results.FORMATS.items() if name != "motion"}
 """Choices of every format."""
 
 KEYS = ("unit", "up", "names", "rest")
