@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ import msgspec
 import numpy as np
 
 from kinefit._pictures import read_picture
-from kinefit.errors import FileError, KinefitError, ObservationError
+from kinefit.errors import FileError, ObservationError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.live.cameras import SessionClock, ThreadSource
 from kinefit.live.inbox import Arrived, Inbox
@@ -237,7 +236,7 @@ REPLAY = "replay"
 """Name of the sensor that stands for all sensors of a replayed take."""
 
 
-class Replay:
+class Replay(ThreadSource):
     """Source of the steps of a recording, each with the frames of all sensors.
 
     Parameters
@@ -248,22 +247,9 @@ class Replay:
     """
 
     def __init__(self, recording: Recording, keypoints: Sequence[Keypoints], *, speed: float = 1.0) -> None:
+        super().__init__(REPLAY, SessionClock())
         self.recording, self.keypoints, self.speed = recording, tuple(keypoints), speed
-        self.sensors: tuple[str, ...] = (REPLAY,)
         self.patient = not speed
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-
-    def start(self, inbox: Inbox) -> None:
-        """Start putting steps into the inbox."""
-        self._thread = threading.Thread(target=self._run, args=(inbox,), daemon=True, name=REPLAY)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop putting steps into the inbox."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join(timeout=2.0)
 
     def seen(self, step: int) -> list[Any]:
         """The frames of all sensors at a step."""
@@ -271,18 +257,11 @@ class Replay:
         return [*self.recording.steps(step), *own]
 
     def _run(self, inbox: Inbox) -> None:
-        error = None
-        try:
-            times, start = self.recording.times, time.monotonic()
-            for step in range(len(times)):
-                due = start + float(times[step] - times[0]) / self.speed if self.speed else start
-                if self._stop.wait(max(due - time.monotonic(), 0.0)):
-                    return
-                if not inbox.put(
-                    Arrived(REPLAY, float(times[step]), time.monotonic(), self.seen(step)), wait=not self.speed
-                ):
-                    return
-        except KinefitError as raised:
-            error = raised
-        finally:
-            inbox.end(REPLAY, error)
+        times, start = self.recording.times, time.monotonic()
+        for step in range(len(times)):
+            due = start + float(times[step] - times[0]) / self.speed if self.speed else start
+            if self._stop.wait(max(due - time.monotonic(), 0.0)):
+                return
+            arrived = Arrived(REPLAY, float(times[step]), time.monotonic(), self.seen(step))
+            if not inbox.put(arrived, wait=not self.speed):
+                return

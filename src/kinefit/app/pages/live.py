@@ -11,7 +11,7 @@ from nicegui import ui
 from kinefit.app.desk import Desk
 from kinefit.app.jobs import FAILED, Job
 from kinefit.app.live import followable, found_cameras, is_up, page_of, recorded_take, start_live
-from kinefit.app.pages.shell import card, in_thread, link, page_frame, shell, short, show_error, texts
+from kinefit.app.pages.shell import card, in_thread, link, notified, page_frame, shell, short, show_error, texts
 from kinefit.app.people import jpeg, unrecognisable
 from kinefit.app.texts import Texts
 from kinefit.app.webcams import Recorder, Webcam, find_webcams, write_live_take
@@ -144,21 +144,17 @@ class _LivePage:
         if not sizes or (len(sizes) > 1 and not calibration):
             ui.notify(self._t("live.needs_calibration" if sizes else "live.choose"), type="warning")
             return
-        try:
+        with notified():
             self._start(write_live_take(self._desk.root, sizes, Path(calibration) if calibration else None))
-        except (KinefitError, OSError) as error:
-            ui.notify(str(error), type="negative", timeout=0, close_button=True)
 
     async def _record(self, sizes: dict[int, tuple[int, int]]) -> None:
         if not sizes:
             ui.notify(self._t("live.choose"), type="warning")
             return
         folder = self._desk.root / f"walk-{time.strftime('%Y%m%d-%H%M%S')}"
-        try:
+        with notified():
             take = await in_thread(write_live_take, self._desk.root, sizes)
             self._desk.recorder = await in_thread(Recorder, take, folder)
-        except (KinefitError, OSError) as error:
-            ui.notify(str(error), type="negative", timeout=0, close_button=True)
         self._cameras.refresh()
 
     def _said(self) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 from nicegui import ui
 
 from kinefit.app.desk import Desk
-from kinefit.app.pages.shell import in_thread, link
+from kinefit.app.pages.shell import in_thread, link, notified
 from kinefit.app.people import PersonPicture
 from kinefit.app.texts import Texts
 from kinefit.batch import corrections
@@ -26,10 +26,8 @@ def people_cards(desk: Desk, t: Texts, take: Path, who: ui.select) -> None:
     shown: list[tuple[PersonPicture, ...]] = [()]
 
     def choose(number: int | None) -> None:
-        try:
+        with notified():
             corrections.choose_person(take, number)
-        except KinefitError as error:
-            ui.notify(str(error), type="negative", timeout=0, close_button=True)
         who.value = ""
         cards.refresh()
 

@@ -12,7 +12,18 @@ import numpy as np
 from nicegui import events, ui
 
 from kinefit.app.desk import Desk
-from kinefit.app.pages.shell import COLOURS, card, in_thread, link, loaded, page_frame, shell, show_error, texts
+from kinefit.app.pages.shell import (
+    COLOURS,
+    card,
+    in_thread,
+    link,
+    loaded,
+    notified,
+    page_frame,
+    shell,
+    show_error,
+    texts,
+)
 from kinefit.app.review import Review
 from kinefit.app.texts import Texts
 from kinefit.batch import corrections
@@ -252,10 +263,8 @@ class _ResultPage:
         return round(float(self._review.motion.times[frame]) * self._review.seen.rate)
 
     def _edit(self, edit: Callable[..., object], *arguments: Any) -> None:
-        try:
+        with notified():
             edit(*arguments)
-        except KinefitError as error:
-            ui.notify(str(error), type="negative", timeout=0, close_button=True)
         self._list.refresh()
 
     def _click(self, camera: str, event: events.MouseEventArguments) -> None:
@@ -282,11 +291,9 @@ class _ResultPage:
 
         async def write(format: str) -> None:
             file = self._review.folder / NAMES[format]
-            try:
+            with notified():
                 await in_thread(write_format, self._review.motion, format, file)
                 ui.notify(t("result.export_done", file=file), type="positive", timeout=10_000)
-            except KinefitError as error:
-                ui.notify(str(error), type="negative", timeout=0, close_button=True)
 
         with ui.row():
             for format in NAMES:

@@ -115,3 +115,12 @@ async def loaded(t: Texts, said: str, function: Callable[..., Value], *arguments
 def short(path: Path, root: Path) -> str:
     """A path relative to the session's folder where it lies in it."""
     return printable(path.relative_to(root).as_posix() if path.is_relative_to(root) else path)
+
+
+@contextmanager
+def notified() -> Iterator[None]:
+    """Notify the user of an error, in place of raising it."""
+    try:
+        yield
+    except (KinefitError, OSError) as error:
+        ui.notify(str(error), type="negative", timeout=0, close_button=True)

@@ -13,10 +13,9 @@ from kinefit.app.desk import Desk
 from kinefit.app.folders import NEW, OUTDATED, UNFINISHED, TakeFolder, video_files
 from kinefit.app.jobs import DONE, FAILED, PAUSED, RUNNING, WAITING, Job
 from kinefit.app.pages.people import people_cards
-from kinefit.app.pages.shell import COLOURS, card, link, loaded, page_frame, shell, short, show_error, texts
+from kinefit.app.pages.shell import COLOURS, card, link, loaded, notified, page_frame, shell, short, show_error, texts
 from kinefit.app.texts import Texts
 from kinefit.batch import corrections
-from kinefit.errors import KinefitError
 from kinefit.exporters.atomic import write_text
 from kinefit.findings import Edit, in_words
 from kinefit.readers.guess.draft import Note
@@ -189,12 +188,10 @@ class _TakePage:
         self._check()
 
     def _edit(self, edit: Callable[[], object], said: str) -> None:
-        try:
+        with notified():
             edit()
             self._take = read_take(self._folder.file)
             ui.notify(said, type="positive")
-        except KinefitError as error:
-            ui.notify(str(error), type="negative", timeout=0, close_button=True)
 
     def _detect(self) -> None:
         """Ask for the faster detection, where it was chosen and nothing is detected yet."""
