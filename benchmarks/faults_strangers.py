@@ -22,9 +22,8 @@ from scipy.io import savemat
 from tests.strangers import ENDINGS, ROADS, code_that_runs, outcome, without_end
 
 from benchmarks.figures import amount, figure
-from kinefit.live.cameras import SessionClock
+from kinefit.live.cameras import Inbox, SessionClock
 from kinefit.live.folders import ImageFolderStream
-from kinefit.live.inbox import Inbox
 from kinefit.simulation import write_synthetic_take
 
 _COMMAND_TIMEOUT_S = 120.0  # of a command that takes some 10 s

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kinefit import Keypoints, Motion, Recording, Rig
 from kinefit.sensors.channels import Channels, make_channels
-from kinefit.sensors.layout import Layout, projected
+from kinefit.sensors.points.keypoints import Layout, projected
 from kinefit.sensors.points.views import ViewBias, find_swaps, limb_groups
 from kinefit.sensors.scene import Scene
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.figures import amount, data, figure
-from kinefit.live.inbox import Arrived
+from kinefit.live.cameras import Arrived
 from kinefit.live.receivers.programs import JsonLines, Vmc
 from kinefit.live.receivers.websocket import WebSockets
 from kinefit.live.record import MotionRecord

@@ -9,8 +9,7 @@ from tests.live.taking import image, taken
 
 from kinefit.errors import FileError
 from kinefit.live import cameras
-from kinefit.live.cameras import CameraStream, SessionClock, VideoReplay
-from kinefit.live.inbox import Inbox
+from kinefit.live.cameras import CameraStream, Inbox, SessionClock, VideoReplay
 
 
 class Webcam:

@@ -14,9 +14,8 @@ from tests.live.taking import image, taken
 
 from kinefit.errors import FileError, ObservationError, TakeError
 from kinefit.geometry.camera import Rig
-from kinefit.live.cameras import SessionClock
+from kinefit.live.cameras import Inbox, SessionClock
 from kinefit.live.folders import DepthFolderStream, ImageFolderStream, KeypointFolderStream
-from kinefit.live.inbox import Inbox
 from kinefit.live.take import live_session
 from kinefit.readers.calibration.read import write_calibration
 from kinefit.readers.take.file import read_take

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from kinefit.errors import ObservationError
-from kinefit.live.inbox import Arrived, Inbox
+from kinefit.live.cameras import Arrived, Inbox
 
 
 def frame(sensor, number):
@@ -70,7 +70,7 @@ def test_an_error_of_a_source_reaches_who_takes():
 
 
 def test_a_silent_sensor_is_told_and_not_waited_for(monkeypatch):
-    monkeypatch.setattr("kinefit.live.inbox.SILENT_AFTER_S", 0.05)
+    monkeypatch.setattr("kinefit.live.cameras.SILENT_AFTER_S", 0.05)
     inbox = Inbox(["a", "b"], patience=0.02)
     inbox.put(frame("a", 0))
     inbox.take(1.0)

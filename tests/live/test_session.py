@@ -11,9 +11,8 @@ from tests.live.refused import REFUSED
 
 from kinefit.errors import BodyError, ObservationError
 from kinefit.frame.routing import MAX_SIGMA, MIN_SIGMA
-from kinefit.live.cameras import CameraSource, SessionClock
+from kinefit.live.cameras import Arrived, CameraSource, SessionClock
 from kinefit.live.folders import Replay
-from kinefit.live.inbox import Arrived
 from kinefit.live.people import LivePerson
 from kinefit.live.record import MotionRecord
 from kinefit.live.session import LiveSession

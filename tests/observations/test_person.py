@@ -3,7 +3,7 @@
 import pytest
 
 from kinefit.errors import ObservationError
-from kinefit.observations.person import PersonChoice
+from kinefit.observations.recordings import PersonChoice
 
 
 def test_the_forms_of_a_choice():

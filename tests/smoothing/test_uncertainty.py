@@ -9,7 +9,7 @@ from kinefit.bodies import PointSet, load_body
 from kinefit.correspondences import pixel_rows, prior_rows
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.channels import make_channels
-from kinefit.sensors.layout import Layout
+from kinefit.sensors.points.keypoints import Layout
 from kinefit.sensors.settings import CameraErrors
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.smoothing.shared_errors import SharedErrors

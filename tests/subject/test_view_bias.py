@@ -6,7 +6,7 @@ import numpy as np
 
 from kinefit.bodies import load_body
 from kinefit.sensors.channels import make_channels
-from kinefit.sensors.layout import Layout
+from kinefit.sensors.points.keypoints import Layout
 from kinefit.sensors.points.views import MIRRORED, TERMS, ViewBias
 from kinefit.sensors.scene import Scene
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig

@@ -13,16 +13,16 @@ from kinefit.app.people import ShownVideos
 from kinefit.app.served import ScenePage
 from kinefit.batch.viewed import content_of, gather, has_same_cameras
 from kinefit.errors import ObservationError
-from kinefit.exporters.curves import curves, spoken
 from kinefit.exporters.pictures.overlay import draw_overlay
 from kinefit.exporters.report.angles import Extremes, ranges_of, with_error
+from kinefit.exporters.tables import curves, spoken
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.takes.missing import last_found
 
 
-class Opened:
+class OpenResult:
     """What is open of motions, whose files may be written anew.
 
     Parameters
@@ -49,7 +49,7 @@ class Opened:
         return [file.stat().st_mtime_ns if file.exists() else 0 for file in self._files]
 
 
-class Review(Opened):
+class Review(OpenResult):
     """A motion with everything to look at it.
 
     Parameters
@@ -137,7 +137,7 @@ class RangeChange:
     is_clear: bool
 
 
-class Comparison(Opened):
+class Comparison(OpenResult):
     """Two motions, of which the first is that before.
 
     Parameters

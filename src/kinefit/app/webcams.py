@@ -18,8 +18,7 @@ from kinefit.errors import KinefitError, ObservationError
 from kinefit.exporters.atomic import write_text
 from kinefit.exporters.pictures.overlay import write_pictures
 from kinefit.exporters.take_text import quoted, with_keys
-from kinefit.live.cameras import SessionClock
-from kinefit.live.inbox import Arrived, Inbox
+from kinefit.live.cameras import Arrived, Inbox, SessionClock
 from kinefit.live.take import camera_source, stream_size
 from kinefit.preparing.detecting import hushed
 from kinefit.readers.guess.folder import guess_take

@@ -173,8 +173,8 @@ def outcome(row: Row) -> tuple[str, ...]:
 
 def by_joint(rows: Sequence[Row]) -> Html:
     """A menu of coordinates, each with tables of ranges by take, and by subject and session."""
-    from kinefit.exporters.curves import spoken
     from kinefit.exporters.report import page as p
+    from kinefit.exporters.tables import spoken
 
     names = list(dict.fromkeys(r.coordinate for row in rows for r in row.ranges))
     pages = {}

@@ -26,7 +26,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: its threads 
 COMMANDS = {
     "demo": "tracking.track", "init": "init", "calibrate": "calibration.calibrate", "detect": "detect",
     "check": "checks.check", "track": "tracking.track", "live": "tracking.live", "batch": "tracking.track",
-    "markers": "markers.markers", "surface": "surfaces.surface", "body": "body", "view": "view", "app": "app",
+    "markers": "markers.markers", "surface": "surfaces.surface", "body": "body", "view": "view", "app": "view",
     "replay": "motions.simulate", "export": "motions.export", "retarget": "motions.simulate",
     "simulate": "motions.simulate", "evaluate": "motions.simulate", "warmup": "warmup",
 }  # fmt: skip

@@ -2,7 +2,7 @@
 
 from kinefit.exporters.c3d_file import write_c3d, write_markers
 from kinefit.exporters.interchange import write_mcap, write_nwb, write_rrd
-from kinefit.exporters.motion_file import write_motion
+from kinefit.exporters.motion_file import write_jsonl, write_motion
 from kinefit.exporters.opensim.files import write_mot, write_osim, write_trc
 from kinefit.exporters.pictures.overlay import (
     depth_picture,
@@ -11,11 +11,10 @@ from kinefit.exporters.pictures.overlay import (
     write_montage,
     write_overlay,
 )
-from kinefit.exporters.pose_lines import write_jsonl
 from kinefit.exporters.report.report import write_report
 from kinefit.exporters.skeletons.bvh import write_bvh, write_x3d
-from kinefit.exporters.skeletons.characters import write_character
 from kinefit.exporters.skeletons.glb import write_glb, write_usd
+from kinefit.exporters.skeletons.retarget import write_character
 from kinefit.exporters.tables import tables, write_csv, write_parquet
 
 __all__ = [

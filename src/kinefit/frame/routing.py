@@ -27,7 +27,7 @@ from kinefit.observations import (
 )
 from kinefit.observations.arrays import is_number
 from kinefit.sensors.base import Matched, Measurement, Sensor, named, of_kind, rows_at
-from kinefit.sensors.channel_names import ChannelNames
+from kinefit.sensors.channels import ChannelNames
 from kinefit.sensors.points.image_lines import ImageLineSensor
 from kinefit.sensors.points.keypoints import KeypointSensor
 from kinefit.sensors.points.lifted import LiftedSensor

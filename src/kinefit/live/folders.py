@@ -14,8 +14,7 @@ import numpy as np
 from kinefit._pictures import read_picture
 from kinefit.errors import FileError, ObservationError
 from kinefit.geometry.camera import ImageFrame
-from kinefit.live.cameras import SessionClock, ThreadSource
-from kinefit.live.inbox import Arrived, Inbox
+from kinefit.live.cameras import Arrived, Inbox, SessionClock, ThreadSource
 from kinefit.observations import DepthFrame, Keypoints
 from kinefit.readers.depth.images import PICTURES, counts_of, depth_picture, natural
 from kinefit.readers.keypoints import read_openpose

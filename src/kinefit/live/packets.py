@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body
 from kinefit.errors import ObservationError
-from kinefit.exporters.pose_lines import pose
+from kinefit.exporters.motion_file import pose
 from kinefit.frame.results import FrameResult
 from kinefit.rendering.looks import uncertain_segments
 

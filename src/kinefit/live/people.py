@@ -20,7 +20,7 @@ from kinefit.frame.results import FrameResult
 from kinefit.geometry.camera import Rig
 from kinefit.multiview.association import choose_people, confidences, meeting_points
 from kinefit.observations import KEYPOINT_SIGMA, KeypointFrame, Keypoints, LiftedFrame, by_record
-from kinefit.observations.person import PersonChoice
+from kinefit.observations.recordings import PersonChoice
 from kinefit.sensors.channels import known_points
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation.takes import warm_keypoints

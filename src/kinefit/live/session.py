@@ -15,11 +15,10 @@ import numpy as np
 
 from kinefit.bodies import Body, catalogue, load_body
 from kinefit.errors import BodyError, KinefitError, ObservationError, check_choice, choices
-from kinefit.exporters.pose_lines import hello
+from kinefit.exporters.motion_file import hello
 from kinefit.frame.results import FrameResult
-from kinefit.live.cameras import LiveDetector
+from kinefit.live.cameras import Arrived, Inbox, LiveDetector
 from kinefit.live.folders import REPLAY
-from kinefit.live.inbox import Arrived, Inbox
 from kinefit.live.packets import Answer, PosePacket, Wish, read_wish
 from kinefit.live.people import LivePerson, LiveSize
 from kinefit.live.record import SeenRecord

@@ -17,7 +17,7 @@ from kinefit.multiview.likeness import ImageSource
 from kinefit.multiview.mirrors import mark_mirror_images
 from kinefit.multiview.people import SPEED_INTERVAL_S, PersonTrack, may_be_several, min_person_frames, people_of
 from kinefit.observations import Keypoints
-from kinefit.observations.person import FORMS, PersonChoice
+from kinefit.observations.recordings import FORMS, PersonChoice
 
 PEOPLE = "people"
 """Key of `Motion.provenance` for the people in view."""

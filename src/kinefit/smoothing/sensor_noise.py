@@ -17,7 +17,7 @@ from kinefit.frame.results import ROOT_PRIOR_STD
 from kinefit.frame.skin import skin_of
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.base import Matched, rows_at
-from kinefit.sensors.channel_names import ChannelResiduals
+from kinefit.sensors.channels import ChannelResiduals
 from kinefit.smoothing.linearised import OtherSensors, squares_of
 from kinefit.smoothing.spool import Spool
 from kinefit.solvers.bundle.border_frames import gram

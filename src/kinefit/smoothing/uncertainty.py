@@ -24,7 +24,7 @@ from kinefit.correspondences.closures import closed_at
 from kinefit.frame.results import FrameResult
 from kinefit.rows import Rows
 from kinefit.sensors.channels import Channels
-from kinefit.sensors.layout import Layout
+from kinefit.sensors.points.keypoints import Layout
 from kinefit.sensors.settings import CameraErrors
 from kinefit.smoothing.process_noise import SmoothTake
 from kinefit.smoothing.sensor_noise import OtherNoise, covariance_alone, leverages

@@ -14,7 +14,7 @@ import numpy as np
 
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched
-from kinefit.sensors.channel_names import ChannelResiduals
+from kinefit.sensors.channels import ChannelResiduals
 from kinefit.solvers.equations import residuals
 from kinefit.solvers.trajectory.variance_components import variance_components
 

@@ -14,8 +14,7 @@ from kinefit.initialization.from_points import first_scales, pose_from_points
 from kinefit.losses import geman_mcclure
 from kinefit.observations import KEYPOINTS
 from kinefit.sensors.channels import Channels, fitted_pixels
-from kinefit.sensors.layout import Layout
-from kinefit.sensors.points.keypoints import KeypointMeasurement, KeypointSensor
+from kinefit.sensors.points.keypoints import KeypointMeasurement, KeypointSensor, Layout
 from kinefit.sensors.points.views import ViewBias, find_swaps, limb_groups, triangulated
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import CameraErrors

@@ -15,8 +15,7 @@ from kinefit.frame.results import FrameResult
 from kinefit.motion import UP_AXES
 from kinefit.observations.arrays import numbers
 from kinefit.sensors.base import Leftover, Measurement, leftovers_at, pixels_of
-from kinefit.sensors.layout import Layout
-from kinefit.sensors.points.keypoints import KeypointMatched, KeypointMeasurement
+from kinefit.sensors.points.keypoints import KeypointMatched, KeypointMeasurement, Layout
 from kinefit.sensors.scene import Scene
 from kinefit.smoothing.linearised import ApartRows, SceneOf
 from kinefit.smoothing.spool import Spool

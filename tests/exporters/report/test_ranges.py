@@ -7,8 +7,8 @@ import pytest
 from tests.exporters.report.test_page import own
 from tests.exporters.synthetic import smooth_motion
 
-from kinefit.exporters.curves import NAMES, Curve, curves
 from kinefit.exporters.report.angles import MAX_STD_DEG, extremes, ranges_of, ranges_table
+from kinefit.exporters.tables import NAMES, Curve, curves
 
 RATE = 50.0
 TIMES = np.arange(101) / RATE

@@ -12,7 +12,6 @@ from tests.exporters.synthetic import a_camera, smooth_motion
 
 from kinefit.bodies import load_body
 from kinefit.errors import ExportError
-from kinefit.exporters.curves import _root_turns, curves
 from kinefit.exporters.report.fit import overall_median, sensor_fits
 from kinefit.exporters.report.flagged import close_up, report_frames
 from kinefit.exporters.report.methods import lengths_table, methods_sentences

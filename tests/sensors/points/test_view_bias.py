@@ -6,8 +6,7 @@ import numpy as np
 from kinefit.bodies import load_body
 from kinefit.losses import geman_mcclure
 from kinefit.sensors.channels import make_channels
-from kinefit.sensors.layout import Layout, projected
-from kinefit.sensors.points.keypoints import KeypointMeasurement, KeypointSensor
+from kinefit.sensors.points.keypoints import KeypointMeasurement, KeypointSensor, Layout, projected
 from kinefit.sensors.points.views import MIRRORED, TERMS, ViewBias, beside, directions, trunks
 from kinefit.sensors.scene import Scene
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig

@@ -5,8 +5,7 @@ import pytest
 
 from kinefit.losses import geman_mcclure
 from kinefit.sensors.channels import make_channels
-from kinefit.sensors.layout import Layout
-from kinefit.sensors.points.keypoints import KeypointMeasurement, KeypointSensor
+from kinefit.sensors.points.keypoints import KeypointMeasurement, KeypointSensor, Layout
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.solvers.bundle.border_frames import Weighing, frame_at, settle
 from kinefit.subject.matched_frames import MatchedFrames, Worlds

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.exporters.curves import DIGITS, FINGER_JOINTS, NAMES, Curve, curves, spoken
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.cycles import PERCENT, Cycles, Norms, normalised
+from kinefit.exporters.tables import DIGITS, FINGER_JOINTS, NAMES, Curve, curves, spoken
 from kinefit.motion import Motion
 
 _COLOURS = {"left": p.LEFT_COLOUR, "right": p.RIGHT_COLOUR, "": p.CENTRE_COLOUR}

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from kinefit.bodies import Body
-from kinefit.exporters.curves import split_side
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.fit import overall_median, sensor_fits
 from kinefit.findings import listed

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body
 from kinefit.bodies.limbs import finger_groups
-from kinefit.exporters.curves import DIGITS, split_side
+from kinefit.exporters.tables import DIGITS, split_side
 from kinefit.findings import listed, runs_of
 from kinefit.motion import Motion, Residuals
 

@@ -10,7 +10,7 @@ import numpy as np
 from kinefit._files import repeated
 from kinefit.errors import FileError, ObservationError, TakeError, choices
 from kinefit.motion import UP_AXES
-from kinefit.observations.person import PersonChoice
+from kinefit.observations.recordings import PersonChoice
 from kinefit.readers.depth.images import listed
 from kinefit.readers.keypoint_sets import FACE_SET
 from kinefit.readers.ros.recordings import inside

@@ -17,7 +17,7 @@ from typing import Any
 from kinefit._records import RecordFile
 from kinefit.errors import ExportError, FileError, ObservationError
 from kinefit.sensors.base import Sensor
-from kinefit.sensors.layout import Layout, Stream
+from kinefit.sensors.points.keypoints import Layout, Stream
 from kinefit.smoothing.record_classes import CODEC
 from kinefit.smoothing.spool import Store
 
