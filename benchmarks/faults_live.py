@@ -26,7 +26,7 @@ from kinefit.live.session import LiveSession
 from kinefit.motion import UP_AXES
 from kinefit.serving.access import Access
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
-from kinefit.simulation.takes import warm_keypoints
+from kinefit.simulation.recordings import warm_keypoints
 from kinefit.tracking.tracker import Tracker
 from kinefit.viewers.clicks import ClickPage
 from kinefit.viewers.stage import open_server, quiet

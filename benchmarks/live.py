@@ -25,7 +25,7 @@ from kinefit.live.session import LiveSession
 from kinefit.live.take import live_session
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.simulation.takes import warm_keypoints
+from kinefit.simulation.recordings import warm_keypoints
 
 TRIAL, RATE = "video_balancing_4cam", 30.0
 _CLIENT = (

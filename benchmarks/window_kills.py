@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.figures import amount, figure, quick
 from benchmarks.window import CHROMIUM, WAIT_MS, chromium, open_page, running_app
 from kinefit.readers.motion import read_motion
-from kinefit.simulation.takes import write_synthetic_take
+from kinefit.simulation.recordings import write_synthetic_take
 
 
 def run() -> None:

@@ -50,7 +50,7 @@ def warmup() -> None:
 
 def _compile(part: str) -> None:
     """Use the kernels of one kind of take once."""
-    from kinefit.simulation.takes import warm_depth, warm_keypoints
+    from kinefit.simulation.recordings import warm_depth, warm_keypoints
 
     {"surfaces": _surfaces, "keypoints": warm_keypoints, "depth": warm_depth}[part]()
 

@@ -23,7 +23,7 @@ from kinefit.observations import KEYPOINT_SIGMA, KeypointFrame, Keypoints, Lifte
 from kinefit.observations.recordings import PersonChoice
 from kinefit.sensors.channels import known_points
 from kinefit.sensors.settings import TrackSettings
-from kinefit.simulation.takes import warm_keypoints
+from kinefit.simulation.recordings import warm_keypoints
 from kinefit.tracking.recording import Recording, keypoint_records
 from kinefit.tracking.sizing import fitted_to_person
 

@@ -3,11 +3,10 @@
 from kinefit.simulation.figures import draw_figure, in_front
 from kinefit.simulation.keypoints import simulate_keypoints, studio_rig
 from kinefit.simulation.movements import Performer, movement, people, squat_and_wave
-from kinefit.simulation.recordings import SENSORS, write_recording
+from kinefit.simulation.recordings import SENSORS, write_recording, write_synthetic_take
 from kinefit.simulation.rendering.scenes import COLOUR, STEREO, ColourSensor, SimulatedScene, StereoSensor, picture
 from kinefit.simulation.rendering.sensors import KINECT, TOF, DepthSensor, simulate_depth
 from kinefit.simulation.retarget import cut, known_motion, on_body, resampled, retarget
-from kinefit.simulation.takes import write_synthetic_take
 
 __all__ = [
     "COLOUR",

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from fractions import Fraction
+from pathlib import Path
+
+import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -184,3 +189,17 @@ def _contour_points(limb: Surface, R_camera_segment: NDArray) -> NDArray:
         M = limb.axes.T @ np.diag([a, b, np.sqrt(a * b)]) ** 2 @ limb.axes  # ellipsoid; its farthest point outward
         ends.append(end + (outward @ M) / np.sqrt(np.sum(outward @ M * outward, axis=1))[:, None])
     return np.concatenate(ends)
+
+
+def write_video(
+    path: Path, images: Iterable[NDArray], rate: float, size: tuple[int, int], *, lossless: bool = False
+) -> None:
+    """Write images (H, W, 3) BGR, or (H, W) grey without loss, of a size (width, height) [px] as a video."""
+    lossy = "libx264" if "libx264" in av.codecs_available else "mpeg4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1" if lossless else lossy, rate=Fraction(rate).limit_denominator(1001))
+        stream.width, stream.height, stream.pix_fmt = *size, "gray" if lossless else "yuv420p"
+        for image in images:
+            frame = av.VideoFrame.from_ndarray(image, format="gray" if lossless else "bgr24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())

@@ -9,29 +9,34 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ExportError, ObservationError, choices
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.motion import Motion
+from kinefit.motion import UP_AXES, Motion
+from kinefit.observations import DepthFrame, Keypoints
 from kinefit.readers.calibration.read import write_calibration
-from kinefit.simulation.figures import in_front, places
-from kinefit.simulation.keypoints import simulate_keypoints
+from kinefit.simulation.figures import draw_figure, in_front, places, write_video
+from kinefit.simulation.keypoints import simulate_keypoints, studio_rig
+from kinefit.simulation.movements import squat_and_wave
 from kinefit.simulation.rendering.scenes import COLOUR, STEREO, ColourSensor, SimulatedScene, depth_picture, picture
 from kinefit.simulation.rendering.scenes import room as room_around
-from kinefit.simulation.rendering.sensors import DEPTH_SENSORS, DepthSensor, simulate_depth
+from kinefit.simulation.rendering.sensors import DEPTH_SENSORS, KINECT, DepthSensor, simulate_depth
+from kinefit.simulation.retarget import cut
+from kinefit.tracking.recording import Recording
+from kinefit.tracking.tracker import Tracker
+from kinefit.tracking.video import track
 
 SENSORS = (*DEPTH_SENSORS, "stereo", "colour", "keypoints")
 """Sensors that `write_recording` can simulate."""
 
 _DEPTH_UNIT = 0.001  # [m] of one count of a depth image
 _KEYPOINT_NOISE_PX = 1.5  # [px]
+_TITLE = "Simulated from a known motion. No recording of a person."
 _KEYPOINT_SIGMA = 2.0  # [px] in the take file: noise and small outliers
 _DISPARITY_SIGMA = 0.5  # [px] in the take file
 _PREVIEW_HEIGHT = 240  # [px]
@@ -126,7 +131,8 @@ def write_recording(
             entries = [entry for sensor in chosen for entry in _write_sensor(job, sensor, chosen, staging)]
             write_calibration(job.rig, staging / "calibration.toml")
             _save(staging / "preview.png", preview(job.scene, job.rig, seed=seed))
-            (staging / "take.toml").write_text(_take(motion, entries, str(body or motion.body.name)), encoding="utf-8")
+            text = _take_text(_TITLE, motion, entries, str(body or motion.body.name))
+            (staging / "take.toml").write_text(text, encoding="utf-8")
             if beside is not None:
                 beside(staging)
             _move(staging, folder)
@@ -199,16 +205,8 @@ def _save(path: Path, image: NDArray) -> None:
 
 def _write_video(job: _Job, name: str, sensor: ColourSensor, path: Path, *, grey: bool) -> None:
     camera = job.rig[name]
-    lossy = "libx264" if "libx264" in av.codecs_available else "mpeg4"
-    with av.open(str(path), "w") as container:
-        rate = Fraction(job.scene.motion.rate).limit_denominator(1001)
-        stream = container.add_stream("ffv1" if grey else lossy, rate=rate)
-        stream.width, stream.height = camera.size
-        stream.pix_fmt = "gray" if grey else "yuv420p"
-        for frame in job.frames(name):
-            image = picture(job.scene, frame, camera, sensor, grey=grey, seed=job.seed)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="gray" if grey else "bgr24")))
-        container.mux(stream.encode())
+    images = (picture(job.scene, n, camera, sensor, grey=grey, seed=job.seed) for n in job.frames(name))
+    write_video(path, images, job.scene.motion.rate, camera.size, lossless=grey)
 
 
 def _write_keypoints(job: _Job, folder: Path) -> str:
@@ -216,10 +214,22 @@ def _write_keypoints(job: _Job, folder: Path) -> str:
     (detected,) = simulate_keypoints(
         job.scene.motion, rig, "MEDIAPIPE_33", noise_px=_KEYPOINT_NOISE_PX, outliers=0.02, missing=0.05, seed=job.seed
     )
-    points = np.concatenate([detected.points[:, 0], detected.confidence[:, 0, :, None]], axis=-1)
-    np.save(folder / "mediapipe_colour.npy", np.nan_to_num(points).astype(np.float32))
+    return _write_landmarks(detected, folder)
+
+
+def _write_landmarks(keypoints: Keypoints, folder: Path) -> str:
+    """Write keypoints of one person in MediaPipe's format: x, y [px], visibility, all 0 for undetected ones.
+
+    Returns
+    -------
+    str
+        Their entry of a take file.
+    """
+    points = np.concatenate([keypoints.points[:, 0], keypoints.confidence[:, 0, :, None]], axis=-1)
+    file = f"mediapipe_{keypoints.camera}.npy"
+    np.save(folder / file, np.nan_to_num(points).astype(np.float32))
     return (
-        f'[[keypoints]]\ncamera = "colour"\nfile = "mediapipe_colour.npy"\nformat = "mediapipe"\n'
+        f'[[keypoints]]\ncamera = "{keypoints.camera}"\nfile = "{file}"\nformat = "mediapipe"\n'
         f"sigma = {_KEYPOINT_SIGMA}\n"
     )
 
@@ -246,9 +256,10 @@ def preview(scene: SimulatedScene, rig: Rig, *, frame: int | None = None, seed: 
     return np.hstack(images)
 
 
-def _take(motion: Motion, entries: Sequence[str], body: str) -> str:
+def _take_text(title: str, motion: Motion, entries: Sequence[str], body: str) -> str:
+    """A take file of a simulated motion, with its calibration and entries, as text."""
     head = [
-        "# Simulated from a known motion. No recording of a person.\n",
+        f"# {title}\n",
         f"[take]\nname = {json.dumps(motion.name, ensure_ascii=False)}\nrate = {float(motion.rate)}\n"
         f'up = "{motion.up}"\nbody = {json.dumps(body, ensure_ascii=False)}\n',
         '[calibration]\nfile = "calibration.toml"\n',
@@ -269,3 +280,73 @@ def _move(staging: Path, folder: Path) -> None:
                 new.replace(target / new.name)
         else:
             shutil.move(path, target)
+
+
+_IMAGE_SIZE = (544, 960)  # [px]
+_FOUR_CAMERAS = "A simulated figure in four cameras. No recording of a person."
+
+
+def write_synthetic_take(folder: str | os.PathLike[str], motion: Motion | None = None, *, seed: int = 0) -> Path:
+    """Write a take of a drawn figure: four videos with keypoints, calibration and take.toml.
+
+    Parameters
+    ----------
+    folder : path
+        Made where it does not exist; files of the same names in it are replaced.
+    motion : Motion, optional
+        Of the figure, at the videos' rate; default: `squat_and_wave`. Images are wide for a motion that goes far.
+    seed : int
+        Of the keypoints' errors: 1.5 px noise, 5 % outliers, 5 % undetected.
+
+    Returns
+    -------
+    Path
+        The take file, written last.
+
+    Raises
+    ------
+    ExportError
+        The folder cannot be written. It then contains no take file.
+    """
+    folder, motion = Path(folder), motion or squat_and_wave()
+    low, high = (limit(motion.positions(), axis=(0, 1)) for limit in (np.min, np.max))
+    goes_far = np.argmax(high - low) != "xyz".index(motion.up[-1])
+    rig = studio_rig(motion, size=_IMAGE_SIZE[::-1] if goes_far else _IMAGE_SIZE)
+    detections = simulate_keypoints(motion, rig, "MEDIAPIPE_33", noise_px=1.5, outliers=0.05, missing=0.05, seed=seed)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".writing-") as name:
+            staging = Path(name)
+            entries = [f'[[camera]]\nname = "{camera}"\nvideo = "{camera}.mp4"\n' for camera in rig.names]
+            for camera, keypoints in zip(rig, detections):
+                figures = (draw_figure(motion, frame, camera) for frame in range(len(motion)))
+                write_video(staging / f"{camera.name}.mp4", figures, motion.rate, camera.size)
+                entries.append(_write_landmarks(keypoints, staging))
+            write_calibration(rig, staging / "calibration.toml")
+            text = _take_text(_FOUR_CAMERAS, motion, entries, motion.body.name)
+            (staging / "take.toml").write_text(text, encoding="utf-8")
+            for path in sorted(staging.iterdir(), key=lambda path: path.name == "take.toml"):
+                path.replace(folder / path.name)
+    except OSError as error:  # PyAV's file errors are OSErrors too
+        raise ExportError(
+            f"the synthetic take cannot be written ({error.strerror or error})", file=folder,
+            remedy="Give a folder that can be written, on a disk with 10 MB free.",
+        ) from error
+    return folder / "take.toml"
+
+
+def warm_keypoints() -> None:
+    """Run the fit of the person, tracking and smoothing once on keypoints."""
+    motion = cut(squat_and_wave(), 0, 4)
+    rig = studio_rig(motion)
+    track(Recording.of_keypoints(rig, simulate_keypoints(motion, rig, "BODY_25B"), up=motion.up), motion.body)
+
+
+def warm_depth() -> None:
+    """Run depth tracking once, without a start pose, so the search for it is included."""
+    motion = cut(squat_and_wave(), 0, 3)
+    camera = in_front(motion, KINECT.camera(name="kinect"), near=KINECT.near, far=KINECT.far)
+    video = simulate_depth(motion, camera, KINECT)
+    tracker = Tracker(motion.body, Rig((camera,)), rate=motion.rate, up=UP_AXES[motion.up])
+    for i in range(len(motion)):
+        tracker.update([DepthFrame("kinect", motion.times[i], video.frame(i).depth)])

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +14,7 @@ from kinefit.errors import ExportError, ObservationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 from kinefit.motion import UP_AXES, Motion
-from kinefit.simulation.figures import draw_figure, look_at, places
+from kinefit.simulation.figures import draw_figure, look_at, places, write_video
 
 _SLOPE_COLOUR = (240, 232, 226)  # BGR
 _GRID_COLOUR = (214, 202, 192)  # BGR
@@ -100,15 +98,10 @@ def film(
     if target.suffix.lower() != ".mp4":
         raise ExportError("videos are written only as .mp4", file=path, remedy=f"Write to {target.stem}.mp4.")
     lines, (up, _, R) = _lines(motion, slope, heading), _inclined(motion, slope, heading)
-    codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
+    cameras = enumerate(_cameras(motion, heading, azimuth, size))
+    images = (draw_figure(motion, frame, camera, _backdrop(camera, lines, R @ up)) for frame, camera in cameras)
     try:
-        with av.open(str(target), "w") as container:
-            stream = container.add_stream(codec, rate=Fraction(motion.rate).limit_denominator(1001))
-            stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
-            for frame, camera in enumerate(_cameras(motion, heading, azimuth, size)):
-                image = draw_figure(motion, frame, camera, _backdrop(camera, lines, R @ up))
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="bgr24")))
-            container.mux(stream.encode())
+        write_video(target, images, motion.rate, size)
     except OSError as error:
         problem = f"the video cannot be written ({error.strerror or error})"
         raise ExportError(problem, file=path, remedy="Give a writable folder with free space.") from error

@@ -68,7 +68,7 @@ def live(
     from kinefit.live.record import MotionRecord
     from kinefit.live.take import folder_of, live_session
     from kinefit.readers.take.file import read_take
-    from kinefit.simulation.takes import warm_depth, warm_keypoints
+    from kinefit.simulation.recordings import warm_depth, warm_keypoints
 
     entry = read_take(take)
     quiet = lines == "-"
