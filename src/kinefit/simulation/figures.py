@@ -63,7 +63,7 @@ def in_front(
     eye = middle + (along.min() + height - middle @ up) * up
     for trial in (distance,) if distance is not None else np.arange(_MIN_DISTANCE, _MAX_DISTANCE, 0.05):
         placed = camera.with_pose(look_at(eye + trial * ahead, middle, up))
-        if distance is not None or _sees(placed, points, near, far):
+        if distance is not None or sees(placed, points, near, far):
             return placed
     depth = float(np.ptp(points @ ahead))
     raise ObservationError(
@@ -97,7 +97,8 @@ def beside(camera: Camera, name: str, baseline: float) -> Camera:
     return Camera(name, camera.size, camera.matrix, camera.distortion, camera.model, T @ camera.T_camera_world)
 
 
-def _sees(camera: Camera, x_world: NDArray, near: float, far: float) -> bool:
+def sees(camera: Camera, x_world: NDArray, near: float, far: float) -> bool:
+    """Whether a camera sees all points (N, 3) [m] between two depths [m], with a margin."""
     uv = camera.project(x_world) / camera.size
     z = x_world @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
     inside = np.all((uv > _MARGIN_SHARE) & (uv < 1 - _MARGIN_SHARE), axis=1)  # False for NaN

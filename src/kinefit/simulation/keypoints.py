@@ -6,13 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
+from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import Motion, rotation_between_up
 from kinefit.observations import Keypoints
 from kinefit.observations.recordings import mirror_name
 from kinefit.readers.keypoint_sets import keypoint_names
+from kinefit.simulation.figures import look_at, sees
 
-_MARGIN_SHARE = 0.04  # of the image, free around the person
+_DISTORTION = np.array([-0.06, 0.03, 0.0004, -0.0003])
 _MIN_DISTANCE, _MAX_DISTANCE = 3.0, 60.0  # [m]
 _MEAN_SWAP_FRAMES = 8  # length of a left-right swap
 _DEFAULT_VOLUME = np.array([[-0.8, 0.0, -0.8], [0.8, 2.0, 0.8]])  # [m], y up
@@ -61,6 +63,7 @@ def studio_rig(
     low, high = corners.min(axis=0), corners.max(axis=0)
     centre = np.array([0.5 * (low + high)[0], min(low[1] + 0.9, 0.5 * (low + high)[1]), 0.5 * (low + high)[2]])
     focal = focal or 1675.0 * size[1] / 1920.0
+    matrix = np.array([[focal, 0, 0.5 * (size[0] - 1)], [0, focal, 0.5 * (size[1] - 1)], [0, 0, 1]])
     placed = []
     for k in range(cameras):
         azimuth = 2 * np.pi * (k + 0.5) / cameras + (0.22 if k % 2 else -0.12)
@@ -68,8 +71,9 @@ def studio_rig(
         for distance in np.arange(_MIN_DISTANCE, _MAX_DISTANCE, 0.1):
             place = centre + distance * np.array([np.cos(azimuth), 0.0, np.sin(azimuth)])
             place[1] = height
-            camera = _camera(f"cam{k + 1:02d}", size, focal, place, centre)
-            if _sees(camera, corners):
+            T_camera_world = look_at(place, centre, np.array([0.0, 1.0, 0.0]))
+            camera = Camera(f"cam{k + 1:02d}", size, matrix, _DISTORTION, "radtan", T_camera_world)
+            if sees(camera, corners, -np.inf, np.inf):
                 break
         else:
             extent = " x ".join(f"{size:.1f}" for size in high - low)
@@ -77,31 +81,8 @@ def studio_rig(
                 f"no place within {_MAX_DISTANCE:.0f} m from which camera {k + 1} sees all of the motion ({extent} m)",
                 remedy="Give a shorter focal length, or a part of the motion.",
             )
-        placed.append(camera.with_pose(camera.T_camera_world @ _turn(R_world.T)))
+        placed.append(camera.with_pose(camera.T_camera_world @ se3.transform(R_world.T, np.zeros(3))))
     return Rig(tuple(placed))
-
-
-def _turn(R: NDArray) -> NDArray:
-    T = np.eye(4)
-    T[:3, :3] = R
-    return T
-
-
-def _camera(name: str, size: tuple[int, int], focal: float, place: NDArray, aim: NDArray) -> Camera:
-    """A camera at `place` (3,) [m] that looks at `aim` (3,) [m]; y up."""
-    z = (aim - place) / np.linalg.norm(aim - place)
-    x = np.cross(z, [0.0, 1.0, 0.0])
-    x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    T = _turn(R)
-    T[:3, 3] = -R @ place
-    matrix = np.array([[focal, 0, 0.5 * (size[0] - 1)], [0, focal, 0.5 * (size[1] - 1)], [0, 0, 1]])
-    return Camera(name, size, matrix, np.array([-0.06, 0.03, 0.0004, -0.0003]), "radtan", T)
-
-
-def _sees(camera: Camera, x_world: NDArray) -> bool:
-    uv = camera.project(x_world) / camera.size
-    return bool(np.all((uv > _MARGIN_SHARE) & (uv < 1 - _MARGIN_SHARE)))  # False for NaN
 
 
 def simulate_keypoints(
