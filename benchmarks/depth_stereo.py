@@ -135,7 +135,7 @@ def _skin() -> None:
     try:
         from kinefit import assets
         from kinefit.errors import KinefitError
-        from kinefit.images.detectors.models import Models
+        from kinefit.images.detectors.box_detector import Models
 
         if folder is None:
             raise FileNotFoundError("no recording")

@@ -15,7 +15,7 @@ from kinefit.assets import CAMERAS
 from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.geometry.triangulation import triangulate
-from kinefit.images.detectors.pose_model import MIRROR
+from kinefit.images.detectors.roi import MIRROR
 from kinefit.multiview.association import choose_people
 from kinefit.observations import Detections
 from kinefit.preparing import detecting

@@ -20,7 +20,7 @@ from kinefit.assets import CAMERAS
 from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.geometry.triangulation import triangulate
-from kinefit.images.detectors.pose_model import MIRROR
+from kinefit.images.detectors.roi import MIRROR
 from kinefit.multiview.association import choose_people
 from kinefit.preparing import detecting
 from kinefit.readers.calibration.read import read_calibration

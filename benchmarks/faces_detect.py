@@ -15,9 +15,9 @@ from benchmarks.detect_quality import held_out
 from benchmarks.figures import amount, data, figure
 from kinefit import load_body
 from kinefit.errors import AssetError, ObservationError
+from kinefit.images.detectors.box_detector import Models
 from kinefit.images.detectors.detection import detect_people
 from kinefit.images.detectors.faces import HEAD, FaceFinder, FaceModels
-from kinefit.images.detectors.models import Models
 from kinefit.observations import MEDIAPIPE_478, Detections
 from kinefit.preparing import detecting
 from kinefit.readers.calibration.read import read_calibration

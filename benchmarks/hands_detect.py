@@ -15,9 +15,9 @@ from benchmarks.figures import data, figure, quick
 from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.triangulation import triangulate
+from kinefit.images.detectors.box_detector import Models
 from kinefit.images.detectors.detection import detect_people
-from kinefit.images.detectors.hands import HandFollower, HandModels
-from kinefit.images.detectors.models import Models
+from kinefit.images.detectors.faces import HandFollower, HandModels
 from kinefit.preparing import detecting
 from kinefit.readers.video import Video
 

@@ -18,8 +18,7 @@ import numpy as np
 
 from benchmarks.figures import amount, data, figure
 from kinefit.live.cameras import Arrived
-from kinefit.live.receivers.programs import JsonLines, Vmc
-from kinefit.live.receivers.websocket import WebSockets
+from kinefit.live.receivers.websocket import JsonLines, Vmc, WebSockets
 from kinefit.live.record import MotionRecord
 from kinefit.live.session import LiveSession
 from kinefit.live.take import live_session

@@ -15,7 +15,7 @@ from kinefit.cli.detect import detect
 from kinefit.errors import AssetError, FileError, KinefitError, ObservationError, TakeError
 from kinefit.exporters.motion_file import write_detections
 from kinefit.images.detectors.box_detector import DetectedPerson
-from kinefit.images.detectors.pose_model import SIZE, PersonLandmarks
+from kinefit.images.detectors.roi import SIZE, PersonLandmarks
 from kinefit.observations import Detections
 from kinefit.preparing import detecting, each_video
 from kinefit.preparing.take import ensure_detections, with_detections
@@ -83,7 +83,7 @@ def take(take, white_video):
 
 @pytest.fixture(autouse=True)
 def networks(monkeypatch, tmp_path):
-    monkeypatch.setattr("kinefit.images.detectors.models.Models", Networks)
+    monkeypatch.setattr("kinefit.images.detectors.box_detector.Models", Networks)
     monkeypatch.setattr(
         detecting, "networks", lambda progress, tell, quality: detecting.Networks(
             tmp_path, tmp_path, detecting._name_of(quality)
@@ -346,7 +346,7 @@ def test_hands_are_looked_for_where_they_are_asked_for_and_kept(take, networks, 
         def landmarks(self, image, roi):
             return SimpleNamespace(presence=0.1)
 
-    monkeypatch.setattr("kinefit.images.detectors.hands.HandModels", NoHands)
+    monkeypatch.setattr("kinefit.images.detectors.faces.HandModels", NoHands)
     file = detections_file(take, "cam01")
     assert run(take).exit_code == 0 and read_detections(file).hands is None
     first = networks.pictures

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from kinefit.images.detectors.box_detector import DetectedPerson
-from kinefit.images.detectors.pose_model import SIZE, PersonLandmarks
+from kinefit.images.detectors.roi import SIZE, PersonLandmarks
 
 
 class DiscModels:

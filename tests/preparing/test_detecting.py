@@ -21,7 +21,7 @@ def look(images, models, *, camera, rate, people, masks, with_hands, with_faces)
 
 @pytest.fixture
 def found(write_frames, tmp_path, monkeypatch):
-    monkeypatch.setattr("kinefit.images.detectors.models.Models", lambda *given, **more: None)
+    monkeypatch.setattr("kinefit.images.detectors.box_detector.Models", lambda *given, **more: None)
     monkeypatch.setattr("kinefit.images.detectors.detection.detect_people", look)
 
     def run(steps, seconds=None):

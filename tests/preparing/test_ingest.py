@@ -36,7 +36,7 @@ def look(job, networks, settings, key, tell, threads):
 def take(copy_take, tmp_path, monkeypatch):
     networks = detecting.Networks(tmp_path, tmp_path, "best")
     monkeypatch.setattr("kinefit.images.detectors.faces.FaceDetector", SeesMiddle)
-    monkeypatch.setattr("kinefit.images.detectors.models.Models", lambda *given, **more: None)
+    monkeypatch.setattr("kinefit.images.detectors.box_detector.Models", lambda *given, **more: None)
     monkeypatch.setattr(detecting, "networks", lambda *given: networks)
     monkeypatch.setattr(faces, "networks", lambda *given: networks)
     monkeypatch.setattr(detecting, "_look_through", look)

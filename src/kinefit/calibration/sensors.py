@@ -27,7 +27,7 @@ from kinefit.readers.take.load import Observations
 from kinefit.sensors.displaced import AXES
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surfaces.registration import FINE_DISTANCES, Ends, Registration, apart, twist_of
+from kinefit.sensors.surfaces.point_cloud import FINE_DISTANCES, Ends, Registration, apart, twist_of
 from kinefit.subject.fit import fit_subject
 from kinefit.subject.keypoints import fit_subject as fit_person
 from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets

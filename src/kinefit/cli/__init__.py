@@ -27,7 +27,7 @@ COMMANDS = {
     "demo": "tracking.track", "init": "init", "calibrate": "calibration.calibrate", "detect": "detect",
     "check": "checks.check", "track": "tracking.track", "live": "tracking.live", "batch": "tracking.track",
     "markers": "markers.markers", "surface": "surfaces.surface", "body": "body", "view": "view", "app": "view",
-    "replay": "motions.simulate", "export": "motions.export", "retarget": "motions.simulate",
+    "replay": "motions.simulate", "export": "motions.simulate", "retarget": "motions.simulate",
     "simulate": "motions.simulate", "evaluate": "motions.simulate", "warmup": "warmup",
 }  # fmt: skip
 """Commands in the order of use, and their modules."""

@@ -14,7 +14,7 @@ from kinefit.errors import CalibrationError, TakeError, located
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
 from kinefit.identification.take.takes import with_names
 from kinefit.images.depth_scene import background_model
-from kinefit.images.detectors.models import Models
+from kinefit.images.detectors.box_detector import Models
 from kinefit.live.cameras import CameraStream, LiveDetector, SessionClock, VideoReplay
 from kinefit.live.folders import DepthFolderStream, ImageFolderStream, KeypointFolderStream, Replay
 from kinefit.live.people import LivePerson, LiveSize

@@ -151,7 +151,7 @@ def detect(
 
     Every file is written as soon as its video is done, so that what was interrupted goes on with the others.
     """
-    from kinefit.images.detectors.models import Models
+    from kinefit.images.detectors.box_detector import Models
     from kinefit.readers.detections import detections_key
 
     keys = {job: detection_key(job) for job in jobs}
@@ -206,10 +206,9 @@ def _look_through(
     job: DetectionJob, files: Networks, settings: DetectionSettings, key: str, tell: Step, threads: int
 ) -> None:
     from kinefit.exporters.motion_file import write_detections
+    from kinefit.images.detectors.box_detector import Models
     from kinefit.images.detectors.detection import detect_people
-    from kinefit.images.detectors.faces import FaceFinder, FaceModels
-    from kinefit.images.detectors.hands import HandFollower, HandModels
-    from kinefit.images.detectors.models import Models
+    from kinefit.images.detectors.faces import FaceFinder, FaceModels, HandFollower, HandModels
     from kinefit.readers.video import Video
 
     models = Models(files.folder, threads, files.landmarks, mirrored=files.mirrored)
@@ -240,7 +239,7 @@ def networks(progress: Step | None, tell: Tell, quality: str | Path = "balanced"
     it, and says so.
     """
     from kinefit.assets import MODELS_CREDIT, detector_models, landmark_models
-    from kinefit.images.detectors.models import LANDMARKS, check_runtime
+    from kinefit.images.detectors.box_detector import LANDMARKS, check_runtime
 
     check_runtime()
     fetched: list[int] = []

@@ -18,7 +18,7 @@ from kinefit.sensors.base import Measurement
 from kinefit.sensors.displaced import Displaced, displacement
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surfaces.registration import (
+from kinefit.sensors.surfaces.point_cloud import (
     COARSE_DISTANCES,
     FINE_DISTANCES,
     Ends,

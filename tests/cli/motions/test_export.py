@@ -65,7 +65,7 @@ EXTRAS = {"nwb": "ndx_pose", "mcap": "mcap_ros2", "rrd": "rerun"}
 
 
 def test_every_choice_that_help_lists_is_one_of_the_exporter(file):
-    from kinefit.cli.motions.export import FREEDOM
+    from kinefit.cli.motions.simulate import FREEDOM
 
     for format, free in FREEDOM.items():
         for key in ("unit", "up", "names", "rest"):

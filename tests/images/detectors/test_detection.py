@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import ImageFrame
 from kinefit.images.detectors.detection import detect_people
-from kinefit.images.detectors.pose_model import SIZE
-from kinefit.images.detectors.roi import Roi, mask_runs
+from kinefit.images.detectors.roi import SIZE, Roi, mask_runs
 from kinefit.observations import MEDIAPIPE_33, Detections
 
 

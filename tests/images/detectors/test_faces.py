@@ -7,9 +7,9 @@ import pytest
 
 from kinefit import assets
 from kinefit.errors import AssetError
+from kinefit.images.detectors.box_detector import Models
 from kinefit.images.detectors.detection import PersonDetection, detect_people
 from kinefit.images.detectors.faces import FaceFinder, FaceLandmarks, FaceModels, around_face, around_head
-from kinefit.images.detectors.models import Models
 from kinefit.images.detectors.roi import Roi
 from kinefit.readers.video import Video
 

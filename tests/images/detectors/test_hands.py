@@ -7,8 +7,9 @@ import pytest
 
 from kinefit import assets
 from kinefit.errors import AssetError
+from kinefit.images.detectors.box_detector import Models
 from kinefit.images.detectors.detection import PersonDetection, detect_people
-from kinefit.images.detectors.hands import (
+from kinefit.images.detectors.faces import (
     HANDS_ONLY_COLUMN,
     HandFollower,
     HandLandmarks,
@@ -16,7 +17,6 @@ from kinefit.images.detectors.hands import (
     around_hand,
     around_wrist,
 )
-from kinefit.images.detectors.models import Models
 from kinefit.images.detectors.roi import Roi
 from kinefit.readers.video import Video
 

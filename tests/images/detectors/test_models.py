@@ -3,7 +3,7 @@
 import pytest
 
 from kinefit.errors import FileError
-from kinefit.images.detectors.models import DETECTOR, LANDMARKS, Models
+from kinefit.images.detectors.box_detector import DETECTOR, LANDMARKS, Models
 
 pytest.importorskip("ai_edge_litert", reason="needs the extra detect")
 

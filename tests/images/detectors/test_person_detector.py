@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from kinefit.images.detectors.box_detector import DetectedPerson
-from kinefit.images.detectors.models import squares
+from kinefit.images.detectors.box_detector import DetectedPerson, squares
 
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])

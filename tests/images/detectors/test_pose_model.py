@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinefit.images.detectors.pose_model import MIRROR, SIZE, PersonLandmarks, PoseModel, mean_with_mirrored, refine
+from kinefit.images.detectors.roi import MIRROR, SIZE, PersonLandmarks, PoseModel, mean_with_mirrored, refine
 
 
 def heat(*peaks):

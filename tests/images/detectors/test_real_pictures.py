@@ -6,8 +6,8 @@ import pytest
 
 from kinefit import assets
 from kinefit.errors import AssetError
+from kinefit.images.detectors.box_detector import Models
 from kinefit.images.detectors.detection import detect_people
-from kinefit.images.detectors.models import Models
 from kinefit.readers.video import Video
 
 pytestmark = pytest.mark.network

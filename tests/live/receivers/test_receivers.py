@@ -14,8 +14,7 @@ from websockets.sync.client import connect
 
 from kinefit.errors import ExportError
 from kinefit.geometry import se3
-from kinefit.live.receivers.programs import BONES, JsonLines, Vmc
-from kinefit.live.receivers.websocket import WebSockets
+from kinefit.live.receivers.websocket import BONES, JsonLines, Vmc, WebSockets
 from kinefit.live.record import MotionRecord
 from kinefit.live.session import LiveSession
 from kinefit.motion import rotation_between_up
@@ -246,7 +245,7 @@ def test_an_unknown_host_is_told():
 
 def test_laboratories_get_angles_and_joints(scene, played):
     pylsl = pytest.importorskip("pylsl")
-    from kinefit.live.receivers.programs import Lsl
+    from kinefit.live.receivers.websocket import Lsl
 
     outlet = Lsl("kinefit-test", rate=30.0)
     outlet.hello(scene.motion.body, b"")

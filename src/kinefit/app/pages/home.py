@@ -1,4 +1,4 @@
-"""The first page: the choice of faces, then a recording from this computer or by dropping its videos."""
+"""The first page, with the choice of faces and the recordings; the session at a glance; two results side by side."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ from typing import Any
 from nicegui import ui
 
 from kinefit.app.desk import Desk
-from kinefit.app.folders import subfolders, takes_below, video_files
-from kinefit.app.pages.shell import card, in_thread, link, shell, short, show_error, texts
+from kinefit.app.folders import SessionRow, recordings, subfolders, takes_below, video_files
+from kinefit.app.jobs import DONE, RUNNING
+from kinefit.app.pages.shell import card, in_thread, link, loaded, page_frame, shell, short, show_error, texts
 from kinefit.app.pages.take import use_folder
+from kinefit.app.review import Comparison
 from kinefit.app.texts import Texts
 from kinefit.errors import KinefitError, printable
 from kinefit.exporters.atomic import writing
+from kinefit.rendering import looks
 
 _MAX_UPLOAD_BYTES = 2**30  # of a dropped video; larger ones are opened where they are
 _MAX_NAMES = 6  # of videos that are listed
@@ -126,3 +129,144 @@ async def _takes(desk: Desk, t: Texts) -> None:
     if takes:
         ui.link(t("home.session"), "/session")
     ui.link(t("home.live"), "/live")
+
+
+_REFRESH_S = 2.0  # between two looks at the folders
+_TEXTS, _NUMBERS = ("take", "state", "subject", "date", "movement"), ("seconds", "agreement")
+_LINK = '<q-td :props="props"><a :href="props.row.page" class="text-primary">{{ props.value }}</a></q-td>'
+"""Of the recording's cell: the way to its page."""
+
+
+async def session_page(desk: Desk) -> None:
+    """Build the page."""
+    t = texts()
+    with shell(desk, t, t("session.title", folder=desk.root)):
+        if desk.hide_faces is None:
+            ui.navigate.to("/")
+            return
+        columns = [
+            {"name": key, "label": t(f"session.{key}"), "field": key, "sortable": True,
+             "align": "left" if key in _TEXTS else "right"} for key in (*_TEXTS, *_NUMBERS)
+        ]  # fmt: skip
+        table = ui.table(columns=columns, rows=[], row_key="key", selection="multiple")
+        table.classes("w-full").props("dense hide-selected-banner")
+        table.props["no-data-label"] = t("session.reading")
+        table.add_slot("body-cell-take", _LINK)
+        with ui.row():
+            ui.button(t("session.compute"), icon="play_arrow", on_click=lambda: _compute(desk, t, table))
+            compare = ui.button(t("session.compare"), icon="compare", on_click=lambda: _compare(t, table))
+            compare.props("outline")
+        ui.label(t("session.agreement_text")).classes("text-sm")
+
+        async def look() -> None:
+            rows = [_row(desk, t, found) for found in await in_thread(recordings, desk.root)]
+            if rows != table.rows:
+                table.rows = rows
+            table.props["no-data-label"] = t("home.session_none")
+
+        ui.timer(_REFRESH_S, look)
+
+
+def _row(desk: Desk, t: Texts, found: SessionRow) -> dict[str, Any]:
+    """A row of the table: texts, and numbers, by which it is sorted."""
+    file = found.take.file
+    name = short(file.parent if file.name == "take.toml" else file, desk.root)
+    return {
+        "key": f"{file} {found.person}", "file": str(file), "folder": str(found.folder or ""),
+        "page": desk.prefix + link("/take", path=file),
+        "take": t("session.of_person", name=name, number=found.person) if found.person else name,
+        **{key: found.session.get(key, "") for key in ("subject", "date", "movement")},
+        "state": found.problem or _state(desk, t, found),
+        "seconds": found.seconds and round(found.seconds, 1),
+        "agreement": found.agreement and round(100 * found.agreement),
+    }  # fmt: skip
+
+
+def _state(desk: Desk, t: Texts, found: SessionRow) -> str:
+    """That of the last job of the take unless it is done, else that of its files."""
+    job = next((job for job in reversed(desk.jobs.jobs) if job.take == found.take.file and job.state != DONE), None)
+    if job is None:
+        return t(f"state.{found.state}")
+    share = [progress.share for progress in job.steps.values()][-1:] if job.state == RUNNING else []
+    return t(f"state.{job.state}") + "".join(f" {100 * done:.0f} %" for done in share)
+
+
+def _compute(desk: Desk, t: Texts, table: ui.table) -> None:
+    if not table.selected:
+        ui.notify(t("session.none"), type="warning")
+    for file in dict.fromkeys(row["file"] for row in table.selected):
+        desk.start(Path(file), "track", file, "--json")
+
+
+def _compare(t: Texts, table: ui.table) -> None:
+    keys = {row["key"] for row in table.selected}
+    chosen = sorted((row for row in table.rows if row["key"] in keys), key=lambda row: row["date"])
+    if len(chosen) != 2 or not all(row["folder"] for row in chosen):
+        ui.notify(t("session.two"), type="warning")
+        return
+    ui.navigate.to(link("/compare", a=chosen[0]["folder"], b=chosen[1]["folder"]))
+
+
+_MAX_POINTS = 2000  # of a curve
+
+
+async def compare_page(desk: Desk, before: Path, after: Path) -> None:
+    """Build the page of two folders of results."""
+    t = texts()
+    with shell(desk, t, t("compare.title")):
+        if desk.hide_faces is None:
+            ui.navigate.to("/")
+            return
+        names = t("compare.before", name=short(before, desk.root)), t("compare.after", name=short(after, desk.root))
+        with ui.row().classes("items-center"):
+            for name in names:
+                ui.label(name).classes("break-all")
+            to = link("/compare", a=after, b=before)
+            ui.button(t("compare.swap"), icon="swap_horiz", on_click=lambda: ui.navigate.to(to)).props("flat")
+        both = await loaded(t, t("compare.loading"), desk.comparison, before, after)
+        if both is None:
+            return
+        with card(t("compare.scene")):
+            page_frame(both.scene.address, t("compare.scene")).classes("w-full h-[32rem] border")
+        with card(t("compare.angle")):
+            _angles(t, both, names)
+        with card(t("compare.ranges")):
+            _ranges(t, both)
+
+
+def _angles(t: Texts, both: Comparison, names: tuple[str, str]) -> None:
+    """A choice of an angle, and its two curves from the first frame of each on."""
+
+    def draw() -> None:
+        series = [
+            {"type": "line", "name": names[k], "showSymbol": False, "data": both.points(choice.value, k, _MAX_POINTS),
+             "itemStyle": {"color": looks.to_hex((looks.LEFT_COLOUR, looks.RIGHT_COLOUR)[k])},
+             "lineStyle": {"type": ("solid", "dashed")[k]}} for k in (0, 1)
+        ]  # fmt: skip
+        chart.options.update({
+            "animation": False, "grid": {"left": 45, "right": 25, "top": 70, "bottom": 30},
+            "legend": {"top": 0, "orient": "vertical"}, "tooltip": {"trigger": "axis"},
+            "xAxis": {"type": "value", "name": "s"},
+            "yAxis": {"type": "value", "scale": True, "name": t("result.angles_unit")}, "series": series,
+        })  # fmt: skip
+        chart.update()
+
+    angles = list(both.angles)
+    first = next((name for name in angles if name.startswith("knee_angle")), angles[0])
+    choice = ui.select(angles, value=first, label=t("compare.angle"), on_change=draw).classes("w-48")
+    chart = ui.echart({}).classes("w-full h-[22rem]")
+    draw()
+
+
+def _ranges(t: Texts, both: Comparison) -> None:
+    ui.label(t("compare.ranges_text")).classes("text-sm")
+    keys = ("angle", "range_before", "range_after", "change")
+    columns = [
+        {"name": key, "label": t(f"compare.{key}"), "field": key, "align": "left" if key == "angle" else "right"}
+        for key in keys
+    ]
+    rows = []
+    for of in both.ranges:
+        values = (text.replace(" ", "\u00a0") for text in (of.before, of.after, "● " * of.is_clear + of.change))
+        rows.append(dict(zip(keys, (of.angle, *values), strict=True)))
+    ui.table(columns=columns, rows=rows, row_key="angle").classes("w-full").props("dense wrap-cells")

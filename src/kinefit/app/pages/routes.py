@@ -12,10 +12,9 @@ from nicegui import app, ui
 from numpy.typing import NDArray
 
 from kinefit.app.desk import Desk
-from kinefit.app.pages.home import home_page
+from kinefit.app.pages.home import compare_page, home_page, session_page
 from kinefit.app.pages.live import live_page
 from kinefit.app.pages.result import result_page
-from kinefit.app.pages.session import compare_page, session_page
 from kinefit.app.pages.take import take_page
 from kinefit.app.people import jpeg, unrecognisable
 from kinefit.errors import KinefitError

@@ -11,7 +11,7 @@ import numpy as np
 from kinefit.calibration.people.skeletons import LiftedSkeleton, match_skeletons, skeletons_of
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera
-from kinefit.images.detectors.pose_model import MIRROR
+from kinefit.images.detectors.roi import MIRROR
 from kinefit.observations import MEDIAPIPE_33, Detections, Keypoints
 from kinefit.readers.detections import read_detections
 from kinefit.readers.take.cameras import assumed_camera, is_uncalibrated

@@ -78,15 +78,15 @@ def live(
     try:
         rate, up = session.tracker.rate, entry.up
         if lines is not None:
-            from kinefit.live.receivers.programs import JsonLines
+            from kinefit.live.receivers.websocket import JsonLines
 
             receivers.append(JsonLines(lines))
         if vmc is not None:
-            from kinefit.live.receivers.programs import Vmc
+            from kinefit.live.receivers.websocket import Vmc
 
             receivers.append(Vmc(*vmc, up=up))
         if lsl is not None:
-            from kinefit.live.receivers.programs import Lsl
+            from kinefit.live.receivers.websocket import Lsl
 
             receivers.append(Lsl(lsl, rate=rate))
         kept = None if folder is None else MotionRecord(folder, rate=rate, up=up, name=entry.name)

@@ -13,10 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.images.detectors.box_detector import DetectedPerson
-from kinefit.images.detectors.models import Models
-from kinefit.images.detectors.pose_model import SIZE
-from kinefit.images.detectors.roi import MIN_MASK, Roi, Steady, cover, mask_runs, moved_mask, without_others
+from kinefit.images.detectors.box_detector import DetectedPerson, Models
+from kinefit.images.detectors.roi import MIN_MASK, SIZE, Roi, Steady, cover, mask_runs, moved_mask, without_others
 from kinefit.observations import Detections
 
 _MIN_PROBABILITY = 0.5  # of a person in a region

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import rgb_image
 from kinefit.errors import ObservationError
+from kinefit.images.detectors.box_detector import Models
 from kinefit.images.detectors.detection import Follower
-from kinefit.images.detectors.models import Models
 from kinefit.observations import KeypointFrame
 
 FACE, LEFT_HAND, RIGHT_HAND = 0, 1, 2
