@@ -88,7 +88,7 @@ def _deviations(found: BarCalibration, rig: Rig) -> np.ndarray:
 
 def _drawn() -> None:
     """Images of shining balls with lamps in view through the command."""
-    from kinefit.cli.calibration.calibrate import calibrate
+    from kinefit.cli.calibrate import calibrate
     from kinefit.readers.calibration.read import read_calibration
 
     rig, count = bar_rig(3, (1280, 720), seed=200), amount(120, 30)

@@ -24,7 +24,7 @@ from kinefit.errors import KinefitError
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: its threads only wait for each other here
 
 COMMANDS = {
-    "demo": "tracking.track", "init": "init", "calibrate": "calibration.calibrate", "detect": "detect",
+    "demo": "tracking.track", "init": "init", "calibrate": "calibrate", "detect": "detect",
     "check": "checks.check", "track": "tracking.track", "live": "tracking.live", "batch": "tracking.track",
     "markers": "markers.markers", "surface": "surfaces.surface", "body": "body", "view": "view", "app": "view",
     "replay": "motions.simulate", "export": "motions.simulate", "retarget": "motions.simulate",

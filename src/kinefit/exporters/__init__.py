@@ -3,7 +3,7 @@
 from kinefit.exporters.c3d_file import write_c3d, write_markers
 from kinefit.exporters.interchange import write_mcap, write_nwb, write_rrd
 from kinefit.exporters.motion_file import write_jsonl, write_motion
-from kinefit.exporters.opensim.files import write_mot, write_osim, write_trc
+from kinefit.exporters.opensim import write_mot, write_osim, write_trc
 from kinefit.exporters.pictures.overlay import (
     depth_picture,
     draw_overlay,

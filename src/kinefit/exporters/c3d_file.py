@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.errors import ExportError
 from kinefit.exporters.atomic import write_bytes, write_text
-from kinefit.exporters.opensim.files import trc_head
+from kinefit.exporters.opensim import trc_head
 from kinefit.exporters.skeletons.common import UNITS, bone_names, convention, length_factor, plain_names, turned
 from kinefit.exporters.tables import Curve, curves
 from kinefit.motion import Motion

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.errors import ExportError, extra
 from kinefit.exporters.atomic import writing
-from kinefit.exporters.opensim.files import root_coordinates
+from kinefit.exporters.opensim import root_coordinates
 from kinefit.exporters.skeletons.common import UNITS, bone_names, euler_zxy, length_factor, turned
 from kinefit.motion import Motion
 from kinefit.motion_columns import angle_columns, continuous_quaternions, joint_columns, place_columns

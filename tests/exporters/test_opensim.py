@@ -9,7 +9,7 @@ from tests.exporters.synthetic import smooth_motion
 from kinefit.bodies import load_body
 from kinefit.errors import ExportError
 from kinefit.exporters import write_mot, write_osim, write_trc
-from kinefit.exporters.opensim.files import mass_properties
+from kinefit.exporters.opensim import mass_properties
 from kinefit.geometry import se3
 
 

@@ -8,7 +8,7 @@ import pytest
 from benchmarks.bar_scene import bar_rig, draw_bar, see_bar, wave_bar
 from click.testing import CliRunner
 
-from kinefit.cli.calibration.calibrate import calibrate
+from kinefit.cli.calibrate import calibrate
 from kinefit.errors import CalibrationError, ExportError, FileError
 from kinefit.readers.calibration.read import read_calibration
 

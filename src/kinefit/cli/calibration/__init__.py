@@ -1,1 +1,0 @@
-"""`kinefit calibrate`."""
