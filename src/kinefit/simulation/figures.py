@@ -17,6 +17,7 @@ from kinefit.errors import BodyError, ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.motion import UP_AXES, Motion
 from kinefit.rendering.looks import side_colour
+from kinefit.simulation.retarget import known_motion
 from kinefit.solvers.mobility import closed_poses
 
 _MARGIN_SHARE = 0.04  # of the image, free around the landmarks
@@ -157,11 +158,7 @@ def portrait(body: Body, azimuth: float = 40.0, size: tuple[int, int] = (900, 90
     if not body.surfaces:
         raise BodyError(f"body '{body.name}' has no surfaces to render", remedy="Add a surface to its segments.")
     state = closed_poses(body, most=1)[0] if body.closures else body.usual_state()
-    count = len(body.tree.segments)
-    motion = Motion(
-        body, 1.0, np.zeros(1), state.T_world_root[None], state.angles[None], np.zeros((1, body.tree.n_dofs)),
-        np.zeros((1, count, 3)), np.ones(1), np.ones((1, count)),
-    )  # fmt: skip
+    motion = known_motion(body, 1.0, state.T_world_root[None], state.angles[None])
     frames, _ = body.tree.forward(state.T_world_root, state.angles)
     points_of_limbs = [
         limb.vertices if isinstance(limb, MeshSurface) else np.array([limb.start, limb.end]) for limb in body.surfaces
