@@ -50,7 +50,6 @@ def unrecognisable(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(scaled(image, _HIDDEN_PX), size, interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
-
 class ShownVideos:
     """The videos of a take as they may be shown, each opened when it is first asked for.
 

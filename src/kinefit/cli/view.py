@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from kinefit.serving.access import Access
     from kinefit.viewers.show import ViewerContent
 
+
 @click.command(short_help="Show a motion, a take or a folder of results in 3D.", epilog="""\b
 Examples:
   kinefit view my_take-kinefit                  a folder of results, with its take

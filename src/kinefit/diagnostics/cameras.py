@@ -164,7 +164,6 @@ def _in_other_frame(
     return replace(views, uv=uv)
 
 
-
 @dataclass(frozen=True, eq=False)
 class CameraBias:
     """Bias of one camera's keypoints.
@@ -324,7 +323,6 @@ def without_points(jacobian: NDArray, design: NDArray, residual: NDArray) -> tup
     return matrix, right
 
 
-
 def bias_findings(
     biases: Sequence[CameraBias], parts: Disagreement, accuracy: Mapping[str, float], take: Path
 ) -> list[Finding]:
@@ -439,7 +437,6 @@ def _explained(findings: list[Finding]) -> list[Finding]:
     follows = f"Nothing: the motion of {listed(moved.cameras)} explains it."
     out = [replace(f, severity="note", remedy=follows) if f in biases else f for f in findings if f is not moved]
     return [*out, replace(moved, severity=worst)]
-
 
 
 def distortion_findings(views: KeypointViews) -> list[Finding]:

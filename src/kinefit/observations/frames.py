@@ -176,7 +176,6 @@ class KeypointFrame(_SensorFrame):
         return out
 
 
-
 @dataclass(frozen=True, eq=False)
 class MarkerFrame(_SensorFrame):
     """3D positions of labelled markers.

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from kinefit.sensors.points.keypoints import KeypointMatched
     from kinefit.sensors.visibility.occlusion import DepthSeen
 
+
 def of_kind(value: object, kind: type, what: str, remedy: str, *, each: type | None = None) -> None:
     """Raise ObservationError if a value, called `what`, is text or not of a kind, or an item not of `each`."""
     if not isinstance(value, kind) or isinstance(value, str):

@@ -31,6 +31,7 @@ from kinefit.observations import Markers
 if TYPE_CHECKING:
     from kinefit.markers.first_set import FirstSet
 
+
 def read_file(path: str | PathLike[str], unit: str | None) -> Markers:
     """Read markers of a C3D or TRC file, and print what the reader notes on it."""
     from kinefit.readers.markers import read_markers

@@ -16,6 +16,7 @@ from kinefit.errors import command
 if TYPE_CHECKING:
     from kinefit.live.session import LiveSession, Receiver
 
+
 def _address(ctx: click.Context, parameter: click.Parameter, value: str | None) -> tuple[str, int] | None:
     """Host and port of "HOST:PORT"."""
     if value is None:

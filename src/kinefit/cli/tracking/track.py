@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from kinefit.readers.take.file import Take
     from kinefit.takes.in_view import InView
 
+
 def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -> tuple[str, ...]:
     """Formats of a list such as "bvh,csv"."""
     formats = tuple(dict.fromkeys(value.lower().replace(",", " ").split()))
@@ -28,6 +29,7 @@ def chosen_formats(ctx: click.Context, parameter: click.Parameter, value: str) -
 
 
 PICTURES = ("full", "blurred", "none")
+
 
 def choices_options(command: Callable) -> Callable:
     """Add the options that say what is made of a take, given to the command as `Choices`, `choices`.
