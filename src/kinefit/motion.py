@@ -39,6 +39,7 @@ OUTLIER_WEIGHT = 0.05
 """Robust weight below which a measurement had no say."""
 
 
+
 def rotation_between_up(source: str, target: str) -> NDArray:
     """(3, 3) rotation that takes a world with vertical axis `source` to one with vertical axis `target`.
 

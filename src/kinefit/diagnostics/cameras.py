@@ -164,6 +164,7 @@ def _in_other_frame(
     return replace(views, uv=uv)
 
 
+
 @dataclass(frozen=True, eq=False)
 class CameraBias:
     """Bias of one camera's keypoints.
@@ -323,6 +324,7 @@ def without_points(jacobian: NDArray, design: NDArray, residual: NDArray) -> tup
     return matrix, right
 
 
+
 def bias_findings(
     biases: Sequence[CameraBias], parts: Disagreement, accuracy: Mapping[str, float], take: Path
 ) -> list[Finding]:
@@ -437,6 +439,7 @@ def _explained(findings: list[Finding]) -> list[Finding]:
     follows = f"Nothing: the motion of {listed(moved.cameras)} explains it."
     out = [replace(f, severity="note", remedy=follows) if f in biases else f for f in findings if f is not moved]
     return [*out, replace(moved, severity=worst)]
+
 
 
 def distortion_findings(views: KeypointViews) -> list[Finding]:

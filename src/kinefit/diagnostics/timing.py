@@ -261,6 +261,7 @@ def _speed(x: NDArray, reach: int) -> NDArray:
     return np.where(known.sum(axis=1) > reach, slope, np.nan)
 
 
+
 def pair_curves(views: KeypointViews) -> dict[tuple[int, int], Curve]:
     """Cost curves {(a, b): (shifts [frames], cost [px])}: distance of rays of b, at each shift, from those of a."""
     reach = int(min(_MAX_OFFSET * views.rate, 0.4 * len(views)))
@@ -333,6 +334,7 @@ def _from_pairs(cameras: int, pairs: dict[tuple[int, int], tuple[float, float]])
     return np.round(delays - np.median(delays))
 
 
+
 def synchronised(views: KeypointViews) -> tuple[TimeOffsets, KeypointViews, dict[str, int]]:
     """Time offsets, and the views with left and right corrected and, where offsets are significant, synchronised.
 
@@ -361,6 +363,7 @@ def _unshifted(views: KeypointViews, moved: KeypointViews, delays: NDArray) -> K
         uv[frames, :, c] = uv[frames[:, None], views.partner, c]
         swapped[frames, c] = True
     return replace(views, uv=uv, swapped=swapped)
+
 
 
 def time_findings(
@@ -406,6 +409,7 @@ def time_findings(
         within = max(largest, float(np.max(times.std[known])) * times.rate)
         out.append(Finding("good", "time", f"The cameras are synchronised to {within:.2f} frames."))
     return out
+
 
 
 @dataclass(frozen=True)

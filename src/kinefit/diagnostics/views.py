@@ -223,6 +223,7 @@ def disagreement_share(rig: Rig, uv: NDArray) -> float:
     return float(np.minimum(error, limit)[detected].mean() / limit)
 
 
+
 def points_of_others(views: KeypointViews, c: int) -> NDArray:
     """Triangulate the points of `sample` without camera c: (N, 3) [m]; NaN where no two cameras agree."""
     others = views.without(c)
@@ -244,6 +245,7 @@ def share_against(x_world: NDArray, camera: Camera, uv: NDArray, limit: float) -
 def share_against_others(views: KeypointViews, c: int) -> float:
     """Median error, as a share 0..1 of the limit, of camera c against points triangulated by the other cameras."""
     return share_against(points_of_others(views, c), views.rig.cameras[c], sample(views)[:, c], views.limit)
+
 
 
 def errors_of(rig: Rig, uv: NDArray) -> NDArray:

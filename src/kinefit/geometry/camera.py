@@ -269,6 +269,7 @@ def _ratio(size: tuple[int, int], of: tuple[int, int]) -> tuple[float, float]:
     return size[0] / of[0], size[1] / of[1]
 
 
+
 @dataclass(frozen=True, eq=False)
 class Rig:
     """Cameras in one world; `rig["cam01"]` is one of them. A take of markers alone has none: `Rig(())`.

@@ -23,6 +23,7 @@ from kinefit.exporters.report.moments import (
 )
 from kinefit.exporters.report.page import band, thinned
 from kinefit.exporters.report.report import trust_sentence, write_report
+from kinefit.exporters.tables import _root_turns, curves
 from kinefit.findings import listed, runs_of
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig

@@ -12,6 +12,7 @@ import numpy as np
 from kinefit.bodies import Body
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.fit import overall_median, sensor_fits
+from kinefit.exporters.tables import split_side
 from kinefit.findings import listed
 from kinefit.motion import SHOWN_UNITS, Motion
 

@@ -35,6 +35,7 @@ from kinefit.exporters.report.moments import (
     shared_by_prior,
     throughout_sentence,
 )
+from kinefit.exporters.tables import curves, spoken
 from kinefit.findings import listed, of_provenance
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
