@@ -18,10 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from kinefit._files import read_bytes, regular
+from kinefit._files import read_bytes, regular, write_bytes, write_text, writing
 from kinefit.bodies import load_body
 from kinefit.errors import ExportError, KinefitError, TakeError, choices, located
-from kinefit.exporters.atomic import write_bytes, write_text, writing
 from kinefit.exporters.take_text import edited, quoted
 from kinefit.findings import Edit, joined
 from kinefit.preparing.take import has_face, uses_detector

@@ -27,7 +27,7 @@ def write_people_report(rows: Sequence[Row], folder: Path, *, pictures: bool) ->
     ExportError
         The page cannot be written.
     """
-    from kinefit.exporters.atomic import write_text
+    from kinefit._files import write_text
     from kinefit.exporters.report import page as p
 
     done = [row for row in rows if row.status == DONE]

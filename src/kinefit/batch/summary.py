@@ -33,7 +33,7 @@ def write_summary(rows: Sequence[Row], folder: Path) -> None:
     ExportError
         There are no rows, or they cannot be written.
     """
-    from kinefit.exporters.atomic import write_text
+    from kinefit._files import write_text
 
     if not rows:
         raise ExportError("there are no takes to summarise", file=folder, remedy="Give a pattern that matches takes.")

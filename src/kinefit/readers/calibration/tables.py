@@ -49,7 +49,8 @@ def read_table(text: str, kind: str, path: Path) -> Table:
         tree = _matrices(_PARSERS[kind](text))
         return tree if isinstance(tree, dict) else {"cameras": tree}
     except (ValueError, TypeError, RecursionError, OverflowError, ElementTree.ParseError) as error:
-        reason = str(error).strip().splitlines()[-1] if str(error).strip() else "broken syntax"
+        reason = next(reversed(str(error).strip().splitlines()), "broken syntax")
+        reason = "nested too deeply" if isinstance(error, RecursionError) else reason
         raise CalibrationError(
             f"not a readable {kind.upper()} file: {reason}", file=path, remedy="Write the file again; it may be cut."
         ) from None
