@@ -24,12 +24,11 @@ from kinefit.errors import ExportError, KinefitError, TakeError, choices, locate
 from kinefit.exporters.take_text import edited, quoted
 from kinefit.findings import Edit, joined
 from kinefit.preparing.take import has_face, uses_detector
-from kinefit.readers.clicks import Clicks, clicks_of, clicks_text, read_clicks
+from kinefit.readers.annotations import Clicks, clicks_of, clicks_text, read_clicks
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoint_sets import FACE_SET
 from kinefit.readers.motion import read_motion
-from kinefit.readers.take.file import Take, read_take
-from kinefit.readers.take.find import find_take
+from kinefit.readers.take.file import Take, find_take, read_take
 
 TakePath = str | PathLike[str]
 Range = tuple[int, int]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from kinefit._files import parse_toml, regular
 from kinefit.errors import FileError, KinefitError, command
-from kinefit.readers.take.find import is_take, takes_in
+from kinefit.readers.take.file import is_take, takes_in
 
 RECORD = "batch.json"
 """File in every folder of results of a batch: the take, its key, the files and the summary rows."""

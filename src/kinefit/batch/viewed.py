@@ -47,7 +47,7 @@ def gather(
         A file is missing or invalid, or two takes are given.
     """
     from kinefit.readers.motion import read_motion
-    from kinefit.readers.take.find import takes_in
+    from kinefit.readers.take.file import takes_in
     from kinefit.readers.take.load import load_observations
     from kinefit.takes.missing import find_cameras
     from kinefit.viewers.show import ViewerContent
@@ -193,7 +193,7 @@ def _triangulated(take: Take, seen: Observations, tell: Tell) -> NDArray | None:
     from kinefit.errors import TrackingError
     from kinefit.multiview.association import choose_people, person_records
     from kinefit.multiview.followed import follow
-    from kinefit.readers.take.pictures import TakePictures
+    from kinefit.readers.take.videos import TakePictures
     from kinefit.sensors.channels import make_channels
     from kinefit.sensors.points.triangulation import triangulated
 

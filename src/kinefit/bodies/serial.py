@@ -52,8 +52,7 @@ from kinefit._files import read_npz, writing
 from kinefit.bodies.anny import fetched_anny
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.closures import KINDS, Closure, Dimension
-from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph
-from kinefit.bodies.morphs.steering import Steering
+from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph, Steering
 from kinefit.bodies.surfaces import MeshSurface, Metaballs, SkinnedMesh, Surface, TaperedCylinder
 from kinefit.bodies.toml.bodies import read_toml_body
 from kinefit.bodies.toml.records import stature_of

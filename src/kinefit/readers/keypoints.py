@@ -18,8 +18,18 @@ from kinefit._files import no_column, read_npy, regular
 from kinefit.errors import FileError, ObservationError, check_choice, choices
 from kinefit.observations import Keypoints
 from kinefit.readers import keypoint_sets
-from kinefit.readers.keypoint_arrays import FACE_POINTS, cut_frames, face_mesh, in_right_order, keypoint_record
-from kinefit.readers.keypoint_sets import HAND_POINTS, KEYPOINT_SETS, MEDIAPIPE_SETS, OPENPOSE_HANDS, keypoint_names
+from kinefit.readers.keypoint_sets import (
+    FACE_POINTS,
+    HAND_POINTS,
+    KEYPOINT_SETS,
+    MEDIAPIPE_SETS,
+    OPENPOSE_HANDS,
+    cut_frames,
+    face_mesh,
+    in_right_order,
+    keypoint_names,
+    keypoint_record,
+)
 
 if TYPE_CHECKING:
     from kinefit.geometry.camera import ImageFrame

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit._files import regular
+from kinefit._files import LENGTHS, regular, worth
 from kinefit.errors import FileError, ObservationError, choices, shortened
 from kinefit.observations import MarkerEvent, Markers
 from kinefit.readers.c3d_file import C3d, read_c3d
-from kinefit.readers.units import LENGTHS, worth
 
 _MAX_NEAR_ORIGIN = 0.01  # [m] from the origin, of a person in metres that are read as millimetres
 _COMPUTED_POINTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  # of a C3D: no positions

@@ -6,7 +6,7 @@ from tests.bodies.surfaces.shapes import ball, box
 
 from kinefit.bodies import load_body
 from kinefit.bodies.surfaces import MeshSurface
-from kinefit.bodies.surfaces.obj import mesh_surface, read_obj
+from kinefit.bodies.surfaces.mesh import mesh_surface, read_obj
 from kinefit.errors import BodyError
 
 V, F = box((0.3, 0.2, 0.1))

@@ -6,8 +6,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from kinefit.errors import FileError
-from kinefit.readers.skeletons.amc import read_amc
-from kinefit.readers.skeletons.asf import read_asf
+from kinefit.readers.skeletons.acclaim import read_amc, read_asf
 from kinefit.readers.skeletons.bvh import read_bvh
 
 ASF = f"# comment\n{fuzz_seeds.ASF}"

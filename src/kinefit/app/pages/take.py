@@ -21,8 +21,7 @@ from kinefit.errors import KinefitError
 from kinefit.findings import Edit, in_words
 from kinefit.readers.guess.draft import Note
 from kinefit.readers.guess.folder import Guess, guess_take
-from kinefit.readers.take.file import Take, read_take
-from kinefit.readers.take.find import find_take, takes_in
+from kinefit.readers.take.file import Take, find_take, read_take, takes_in
 from kinefit.rendering.colours import to_hex
 
 _REFRESH_S = 0.5  # between two looks at the job

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from kinefit._files import read_npz, writing
 from kinefit._jit import cache_directory
-from kinefit.bodies.surfaces.obj import read_obj
+from kinefit.bodies.surfaces.mesh import read_obj
 from kinefit.errors import BodyError, FileError, check_choice
 
 TOPOLOGIES = ("full", "collapsed")

@@ -11,11 +11,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph
-from kinefit.bodies.morphs.steering import Steering
+from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph, Steering
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
 from kinefit.bodies.surfaces.files import SurfaceRecord, surfaces_of
-from kinefit.bodies.surfaces.obj import UNITS, read_obj
+from kinefit.bodies.surfaces.mesh import UNITS, read_obj
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError, check_choice, located
 from kinefit.geometry import se3

@@ -21,9 +21,9 @@ from kinefit.bodies.morphs.operators import (
     LocalMorph,
     Operator,
     SegmentMorph,
+    Steering,
     radial_basis,
 )
-from kinefit.bodies.morphs.steering import Steering
 from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.surfaces.skins import _kernels_skinning as kernels

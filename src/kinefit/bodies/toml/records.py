@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from kinefit._files import repeated
 from kinefit.bodies.morphs.morph_files import MorphRecord
 from kinefit.bodies.surfaces.files import SurfaceRecord
-from kinefit.bodies.surfaces.skins.skin_files import SkinRecord
+from kinefit.bodies.surfaces.skins.skinning import SkinRecord
 from kinefit.errors import BodyError
 
 Vector = tuple[float, float, float]

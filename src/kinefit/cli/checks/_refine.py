@@ -19,8 +19,8 @@ from kinefit.errors import CalibrationError, FileError, TakeError, command
 from kinefit.exporters.take_text import edited, quoted
 from kinefit.findings import Edit, in_words
 from kinefit.geometry.camera import Rig
+from kinefit.readers.annotations import read_static_points
 from kinefit.readers.calibration.write import write_calibration_like
-from kinefit.readers.static_points import read_static_points
 from kinefit.readers.take.file import read_take
 
 

@@ -62,7 +62,7 @@ def check(
     from kinefit.cli.checks._refine import refined_of, write_refined
     from kinefit.errors import KinefitError
     from kinefit.findings import as_records, fixes, in_words, ranked
-    from kinefit.readers.take.find import find_take
+    from kinefit.readers.take.file import find_take
 
     take = find_take(take, wanted=("check",))
     out = out or take.with_name(f"{take.stem}-check.html")

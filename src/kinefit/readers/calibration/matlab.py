@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from kinefit._files import regular
+from kinefit._files import LENGTHS, regular, worth
 from kinefit._processes import environment, python
 from kinefit.errors import CalibrationError, FileError
 from kinefit.readers.calibration.keys import Table, find
 from kinefit.readers.calibration.tables import is_transposed, numbers
-from kinefit.readers.units import LENGTHS, worth
 
 _AS_STRUCT = "In MATLAB: s = toStruct(params); save('calibration.mat', '-struct', 's', '-v7')"
 _MAX_READ_S = 60.0  # of a file; one of 20 MB takes 3 s on a slow computer

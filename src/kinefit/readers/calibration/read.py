@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from kinefit._arguments import checked
-from kinefit._files import regular, write_text
+from kinefit._files import LENGTHS, regular, worth, write_text
 from kinefit.errors import CalibrationError, FileError, choices, located
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
@@ -21,13 +21,11 @@ from kinefit.readers.calibration.colmap import colmap_cameras
 from kinefit.readers.calibration.file_storage import parse_xml
 from kinefit.readers.calibration.keys import find
 from kinefit.readers.calibration.matlab import matlab_tree, read_mat
-from kinefit.readers.calibration.qualisys import qualisys_cameras
+from kinefit.readers.calibration.mocap import qualisys_cameras, vicon_cameras
 from kinefit.readers.calibration.tables import Sizes, camera_from_table, read_table
 from kinefit.readers.calibration.trees import stereo_tables, tables_of
-from kinefit.readers.calibration.vicon import vicon_cameras
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.ros.rig import mcap_rig
-from kinefit.readers.units import LENGTHS, worth
 
 FORMATS = (
     "OpenCV YAML/XML/JSON, Pose2Sim, aniposelib, caliscope or FreeMoCap TOML, EasyMocap, CMU Panoptic, Qualisys or "

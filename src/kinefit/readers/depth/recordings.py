@@ -17,7 +17,7 @@ from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.readers.depth import clouds
 from kinefit.readers.depth.images import PICTURES, DepthSource, array_source, listed, picture_source, raw_source
 from kinefit.readers.depth.streams import bag_source, track_source
-from kinefit.readers.ros.depth import mcap_source
+from kinefit.readers.ros.images import mcap_source
 from kinefit.readers.ros.recordings import inside
 
 FORMATS = (

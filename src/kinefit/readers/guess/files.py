@@ -22,11 +22,10 @@ from kinefit.errors import CalibrationError, FileError, KinefitError
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, PAIRS, read_calibration
 from kinefit.readers.guess.names import camera_of, natural
-from kinefit.readers.image_folders import ENDINGS, ImageFolder
 from kinefit.readers.keypoint_sets import SPLIT, other_keypoints
 from kinefit.readers.keypoints import decode_openpose
 from kinefit.readers.ros.recordings import inside
-from kinefit.readers.video import Video
+from kinefit.readers.video import ENDINGS, ImageFolder, Video
 
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts", ".m2ts", ".ts", ".wmv", ".mxf"}
 CALIBRATIONS = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt", ".xcp", ".mat")

@@ -10,10 +10,9 @@ from os import PathLike
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import regular
+from kinefit._files import LENGTHS, regular, worth
 from kinefit.errors import FileError, check_choice
 from kinefit.motion import UP_AXES
-from kinefit.readers.units import LENGTHS, worth
 
 
 def read_text(path: str | PathLike[str], kind: str) -> str:

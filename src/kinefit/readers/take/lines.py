@@ -15,7 +15,7 @@ from kinefit._files import regular
 from kinefit.errors import FileError, ObservationError, TakeError, choices
 from kinefit.geometry.camera import ImageFrame
 from kinefit.observations import ClickVideo, LineVideo
-from kinefit.readers.clicks import read_clicks
+from kinefit.readers.annotations import read_clicks
 from kinefit.readers.take.cameras import stated_frame, stated_rate
 from kinefit.readers.take.entries import LinesEntry, Take
 

@@ -30,7 +30,6 @@ from kinefit.observations import (
     SurfacePointVideo,
 )
 from kinefit.observations.clocks import frame_times, is_even, on_steps
-from kinefit.readers.body_trackers import read_body_trackers
 from kinefit.readers.calibration.found import found_notes
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoint_sets import FACE_SET
@@ -46,13 +45,12 @@ from kinefit.readers.take.cameras import (
     stated_rate,
     what_is_assumed,
 )
+from kinefit.readers.take.checks import refuse_streams
 from kinefit.readers.take.depth import load_depth
 from kinefit.readers.take.entries import KeypointsEntry, MarkersEntry, Take, read_each, sensor_name
 from kinefit.readers.take.lines import load_clicks, load_lines
-from kinefit.readers.take.silhouettes import load_region, load_silhouettes
-from kinefit.readers.take.skin import load_skin
-from kinefit.readers.take.streams import refuse_streams
-from kinefit.readers.take.surface_points import read_surface_points
+from kinefit.readers.take.silhouettes import load_region, load_silhouettes, load_skin
+from kinefit.readers.tracked_points import read_body_trackers, read_surface_points
 from kinefit.readers.video import Video, common_frames
 
 _Timed = DepthVideo | CloudVideo | LineVideo | SurfacePointVideo | BodyTrackerVideo

@@ -1,4 +1,4 @@
-"""Masks of a take in files, by a video's background, the body's colour or the built-in detector; colour images."""
+"""Masks of a take in files, by a video's background, by colour or by detector; colour images; skin by its colour."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 from kinefit._pictures import read_picture
 from kinefit.errors import FileError, ObservationError, TakeError
 from kinefit.geometry.camera import ImageFrame, Rig
+from kinefit.images.detectors.skin import LANDMARKS, WRISTS, SkinTracker, face_box
 from kinefit.images.silhouette import colour_mask
 from kinefit.images.silhouette_background import BackgroundPlate
-from kinefit.observations import ColourVideo, Detections, SilhouetteVideo
+from kinefit.observations import ColourVideo, Detections, KeypointVideo, SilhouetteVideo
 from kinefit.observations.clocks import frame_times
 from kinefit.readers.depth.images import listed
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.take.cameras import stated_frame, stated_rate
-from kinefit.readers.take.entries import CameraEntry, RegionEntry, SilhouetteEntry, Take
+from kinefit.readers.take.entries import CameraEntry, KeypointsEntry, RegionEntry, SilhouetteEntry, Take
 from kinefit.readers.video import Video
 
 _SIDE = 1000  # [px] of an image that its background is taken from: larger ones are made smaller by a whole number
@@ -203,3 +204,74 @@ def load_region(entry: RegionEntry, take: Take, rig: Rig | None, frame: ImageFra
     video, size = Video(camera.video, rate=take.rate), rig[entry.camera].size
     image = lambda i: in_calibration(video.read(i), size, frame)
     return ColourVideo(entry.camera, video.rate, camera.time_offset + video.times, size, image, str(camera.video))
+
+
+_NAMES = {"HANDS": LANDMARKS, "WRISTS": WRISTS}
+
+
+def load_skin(entry: KeypointsEntry, take: Take, image: ImageFrame, file: Path, rate: float | None) -> KeypointVideo:
+    """A `[[keypoints]]` of a take with format = "skin"; images are read when their frames are asked for.
+
+    `rate` [Hz] is that of the take's steps.
+
+    Raises
+    ------
+    TakeError
+        Nothing states where the face is.
+    KinefitError
+        What reading the video, and the tracker at a face that is not in it, raise.
+    """
+    video = Video(file, rate=take.rate)
+    offset = next(camera.time_offset for camera in take.cameras if camera.name == entry.camera)
+    used = entry.frames or take.frames
+    begin, end = 0, len(video)
+    if used is not None:  # half a step before the first of them, and before the one after the last
+        bounds = (np.array(used) - 0.5) / (rate or video.rate) - offset
+        begin, end = (int(k) for k in np.searchsorted(video.times, bounds))
+    if begin >= end:
+        raise TakeError("none of its frames is in the video", remedy=f"The video has {len(video)} frames.")
+    face = entry.face
+    if face is None:
+        begin, face = _detected_face(take, entry, begin, end)
+    seen = _Seen(video, begin, face, image)
+    times = offset + video.times[begin:end]
+    return KeypointVideo(
+        entry.camera, video.rate, times, _NAMES[entry.set or "HANDS"], seen.points, source=str(file)
+    )
+
+
+def _detected_face(
+    take: Take, entry: KeypointsEntry, begin: int, end: int
+) -> tuple[int, tuple[float, float, float, float]]:
+    """The first frame in which the built-in detector saw somebody, and the face there, of which it saw best."""
+    file = detections_file(take.path, entry.camera)
+    if not file.exists():
+        raise TakeError(
+            "the place of the face is not stated",
+            remedy="Write face = [left, top, width, height] of the first image used, or run `kinefit detect`.",
+        )
+    found = read_detections(file)
+    frames = [i for i in range(begin, min(end, len(found))) if found.seen[i].any()]
+    if not frames:
+        raise TakeError("no person is detected", remedy="Write face = [left, top, width, height] of the first one.")
+    people = np.where(found.seen[frames[0]], found.confidence[frames[0]].mean(axis=1), -1.0)
+    return frames[0], face_box(found.points[frames[0], int(np.argmax(people))])
+
+
+class _Seen:
+    """Face and hands in the frames of a video: followed from the first one on, each image once."""
+
+    def __init__(
+        self, video: Video, begin: int, face: tuple[float, float, float, float], image: ImageFrame
+    ) -> None:
+        self._video, self._begin, self._image = video, begin, image
+        self._tracker = SkinTracker(video.read(begin), face, rate=video.rate)
+        self._found: list[tuple[NDArray, NDArray]] = []
+
+    def points(self, i: int) -> tuple[NDArray, NDArray]:
+        """Places (3, 2) [px] in the calibration's image and confidence (3,) in frame `i` after the first."""
+        while len(self._found) <= i:
+            self._tracker.update(self._video.read(self._begin + len(self._found)))
+            frame = self._tracker.frame("", 0.0)
+            self._found.append((self._image.to_calibration(frame.uv), frame.confidence))
+        return self._found[i]
