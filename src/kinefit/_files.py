@@ -132,7 +132,9 @@ def read_text(
         raise error(f"cannot read {what} ({reason})", file=path, remedy=remedy) from problem
 
 
-def parse_toml(text: str, file: str | os.PathLike[str], error: type[KinefitError] = FileError) -> dict[str, Any]:
+def parse_toml(
+    text: str, file: str | os.PathLike[str] | None, error: type[KinefitError] = FileError
+) -> dict[str, Any]:
     """The tables of a TOML text.
 
     Parameters

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import CalibrationError
+from kinefit.errors import CalibrationError, located
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.readers.calibration.tables import build_camera, numbers, rigid, rotation_of
+from kinefit.readers.calibration.tables import numbers, rigid, rotation_of
 
 _SUBPIXELS = 64.0  # focal lengths and centres are in 1/64 px; distortion coefficients are not scaled
 _MAX_SIDE = 16384.0  # [px] of an image: a larger number is in 1/64 px
@@ -26,7 +25,7 @@ _DISTORTION = (
 )
 
 
-def qualisys_cameras(root: Element, path: Path) -> list[Camera]:
+def qualisys_cameras(root: Element) -> list[Camera]:
     """Active cameras of a parsed file; translations in the file's unit (millimetres).
 
     Qualisys' file gives the camera's position p and, in r11..r33, the rotation r from world to camera axes:
@@ -39,20 +38,20 @@ def qualisys_cameras(root: Element, path: Path) -> list[Camera]:
         attributes = {key.lower().replace("tangential", "tangental"): text for key, text in element.attrib.items()}
         element.attrib.clear()
         element.attrib.update(attributes)
-    return [
-        _camera(element, path)
-        for element in root.iterfind("cameras/camera")
-        if element.get("active", "1") not in ("0", "false")
-    ]
+    return [_camera(element) for element in _active(root)]
 
 
-def _camera(element: Element, path: Path) -> Camera:
+def _active(root: Element) -> list[Element]:
+    return [one for one in root.iterfind("cameras/camera") if one.get("active", "1") not in ("0", "false")]
+
+
+def _camera(element: Element) -> Camera:
     name = element.get("serial") or "?"
 
     def value(group: str, key: str, default: float | None = None) -> float:
         found = element.find(group)
         text = default if found is None else found.get(key.lower(), default)
-        return float(numbers(text, (), path, f"camera {name}, {group}, {key}"))
+        return float(numbers(text, (), f"camera {name}, {group}, {key}"))
 
     left = top = 0.0
     subpixels = _SUBPIXELS
@@ -67,12 +66,9 @@ def _camera(element: Element, path: Path) -> Camera:
         subpixels = _SUBPIXELS if max(largest) > _MAX_SIDE else 1.0
         size = (int(largest[0] / subpixels) + 1, int(largest[1] / subpixels) + 1)
     if subpixels == _SUBPIXELS and element.get("viewrotation", "0") not in ("0", "0.0"):
-        raise CalibrationError(
-            f"its view is rotated by {element.get('viewrotation')} degrees",
-            file=path,
-            place=f"camera {name}",
-            remedy="Set the view rotation to 0, export again, and set the rotation of the video in the take file.",
-        )
+        problem = f"its view is rotated by {element.get('viewrotation')} degrees"
+        remedy = "Set the view rotation to 0, export again, and set the rotation of the video in the take file."
+        raise CalibrationError(problem, place=f"camera {name}", remedy=remedy)
     focal = [value("intrinsic", f"focalLength{axis}") / subpixels for axis in "UV"]
     centre = [value("intrinsic", f"centerPoint{axis}") / subpixels for axis in "UV"]
     skew = value("intrinsic", "skew", 0.0) / subpixels
@@ -81,10 +77,12 @@ def _camera(element: Element, path: Path) -> Camera:
     r = np.array([[value("transform", f"r{i}{j}") for j in (1, 2, 3)] for i in (1, 2, 3)])
     xyz = np.array([value("transform", axis) for axis in "xyz"])
     R, t = (r, xyz) if subpixels == 1.0 else (_FLIP @ r, -_FLIP @ r @ xyz)
-    return build_camera(name, size, K, k, "radtan", rigid(R, t, path, f"camera {name}, transform"), path)
+    with located(None, f"camera {name}, transform"):
+        T = rigid(R, t)
+    return Camera(name, size, K, k, "radtan", T)
 
 
-def qualisys_text(rig: Rig, text: str, metres_per_unit: float, path: Path) -> str:
+def qualisys_text(rig: Rig, text: str, metres_per_unit: float) -> str:
     """The text of a file with the cameras of a rig, matched by serial number; everything else is kept.
 
     `metres_per_unit` [m] is of the file; raises CalibrationError for a lens model that the format lacks.
@@ -92,16 +90,16 @@ def qualisys_text(rig: Rig, text: str, metres_per_unit: float, path: Path) -> st
     head, mark, rest = text.partition("<calibration")
     parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
     root = ElementTree.fromstring(mark + rest, parser)
-    for element in root.iterfind("cameras/camera"):
-        if element.get("active", "1") not in ("0", "false") and element.get("serial", "?") in rig:
-            _replace(element, rig[element.get("serial", "?")], metres_per_unit, path)
+    for element in _active(root):
+        if (name := element.get("serial", "?")) in rig:
+            _replace(element, rig[name], metres_per_unit)
     return head + ElementTree.tostring(root, encoding="us-ascii").decode("ascii") + "\n"
 
 
-def _replace(element: Element, camera: Camera, metres_per_unit: float, path: Path) -> None:
+def _replace(element: Element, camera: Camera, metres_per_unit: float) -> None:
     if camera.model != "radtan" or camera.distortion[5:].any():
         raise CalibrationError(
-            "Qualisys files cannot hold this lens model", file=path, place=f"camera {camera.name}",
+            "Qualisys files cannot hold this lens model", place=f"camera {camera.name}",
             remedy="Calibrate it with k1, k2, p1, p2, k3 alone, or write another format.",
         )
     fov, K = element.find("fov_video"), camera.matrix
@@ -129,7 +127,7 @@ _MAX_ASPECT_ERROR = 1e-3  # of a square pixel
 _COMPARED_RADII = 400  # at which both lens models are compared
 
 
-def vicon_cameras(root: Element, path: Path) -> list[Camera]:
+def vicon_cameras(root: Element) -> list[Camera]:
     """Calibrated video cameras of a parsed file; all cameras if it has no video. Translations in mm.
 
     A camera is named by its DEVICEID, which Nexus writes into the names of its videos. ORIENTATION is the quaternion
@@ -142,57 +140,60 @@ def vicon_cameras(root: Element, path: Path) -> list[Camera]:
     """
     cameras = [c for c in root.iter("Camera") if c.find("KeyFrames/KeyFrame") is not None]
     video_cameras = [c for c in cameras if c.get("ISDV", "0") != "0" or "video" in c.get("TYPE", "").lower()]
-    return [_vicon_camera(c, path) for c in video_cameras or cameras]
+    out = []
+    for element in video_cameras or cameras:
+        name = element.get("DEVICEID") or element.get("NAME") or "?"
+        with located(None, f"camera {name}"):
+            parts = _vicon_camera(element)
+        out.append(Camera(name, *parts))
+    return out
 
 
-def _vicon_camera(element: Element, path: Path) -> Camera:
-    name = element.get("DEVICEID") or element.get("NAME") or "?"
-    place = f"camera {name}"
+def _vicon_camera(element: Element) -> tuple[tuple[int, int], NDArray, NDArray, str, NDArray]:
+    """What a camera is made of, but for its name."""
     frames = element.findall("KeyFrames/KeyFrame")
     if len(frames) > 1:
-        raise CalibrationError(
-            f"{len(frames)} key frames: the camera moves", file=path, place=place, remedy="Export a static calibration."
-        )
+        problem = f"{len(frames)} key frames: the camera moves"
+        raise CalibrationError(problem, remedy="Export a static calibration.")
 
     def values(key: str, shape: tuple[int, ...] | None, default: str | None = None) -> NDArray:
         text = frames[0].get(key, element.get(key, default))
-        return numbers("missing" if text is None else text.split(), shape, path, f"{place}, {key}")
+        return numbers("missing" if text is None else text.split(), shape, key)
 
     width, height = values("SENSOR_SIZE", (2,))
     (focal,), centre = values("FOCAL_LENGTH", (1,)), values("PRINCIPAL_POINT", (2,))
     sides = [values(key, (1,), "1")[0] for key in ("PIXEL_ASPECT_RATIO", "PIXEL_ASPECT_RATIO_CORRECTION")]
     if max(abs(side - 1) for side in sides) > _MAX_ASPECT_ERROR or values("SKEW", (1,), "0")[0] != 0:
         problem = "pixels are not square: PIXEL_ASPECT_RATIO or SKEW"
-        raise CalibrationError(problem, file=path, place=place, remedy="Resample the video to square pixels.")
+        raise CalibrationError(problem, remedy="Resample the video to square pixels.")
     K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
-    R = rotation_of(np.roll(values("ORIENTATION", (4,)), 1), path, f"{place}, ORIENTATION")
-    radial = _radial(frames[0], centre, path, place)
+    R = rotation_of(np.roll(values("ORIENTATION", (4,)), 1))
+    radial = _radial(frames[0], centre)
     corner = float(np.hypot(*np.maximum(centre, np.subtract((width, height), centre))))
-    k = _opencv_radial(radial, corner, float(focal), path, place) if radial.any() else np.zeros(0)
-    T = rigid(R, -R @ values("POSITION", (3,)), path, place)
-    return build_camera(name, (int(width), int(height)), K, k, "radtan", T, path)
+    k = _opencv_radial(radial, corner, float(focal)) if radial.any() else np.zeros(0)
+    return (int(width), int(height)), K, k, "radtan", rigid(R, -R @ values("POSITION", (3,)))
 
 
-def _radial(frame: Element, centre: NDArray, path: Path, place: str) -> NDArray:
+def _radial(frame: Element, centre: NDArray) -> NDArray:
     """(3,) k1, k2, k3 [px⁻², px⁻⁴, px⁻⁶] from distorted to ideal."""
     words = (frame.get("VICON_RADIAL2") or "").split()
     if not words:
-        k = numbers((frame.get("VICON_RADIAL") or "0 0").split(), None, path, f"{place}, VICON_RADIAL").ravel()
+        k = numbers((frame.get("VICON_RADIAL") or "0 0").split(), None, "VICON_RADIAL").ravel()
     else:
         model = words.pop(0) if words[0][0].isalpha() else ""
-        k = numbers(words, (5,), path, f"{place}, VICON_RADIAL2")
+        k = numbers(words, (5,), "VICON_RADIAL2")
         known = model in ("", "Vicon3Parameter", "ViconRadial2")
         if k[2:].any() and (not known or np.abs(k[:2] - centre).max() > _MAX_CENTRE_OFFSET_PX):
             problem = "the centre of distortion is not the principal point" if known else f"a lens '{model}'"
             remedy = "Undistort the video in Vicon's program, or calibrate with a board."
-            raise CalibrationError(problem, file=path, place=f"{place}, VICON_RADIAL2", remedy=remedy)
+            raise CalibrationError(problem, place="VICON_RADIAL2", remedy=remedy)
         k = k[2:]
     if k.size > 3:
-        raise CalibrationError(f"{k.size} coefficients", file=path, place=place, remedy="Give k1 and k2.")
+        raise CalibrationError(f"{k.size} coefficients", remedy="Give k1 and k2.")
     return np.pad(k, (0, 3 - k.size))
 
 
-def _opencv_radial(radial: NDArray, corner: float, focal: float, path: Path, place: str) -> NDArray:
+def _opencv_radial(radial: NDArray, corner: float, focal: float) -> NDArray:
     """(8,) k1 k2 p1 p2 k3 k4 k5 k6 from ideal to distorted, by least squares over the image.
 
     Parameters
@@ -212,5 +213,5 @@ def _opencv_radial(radial: NDArray, corner: float, focal: float, path: Path, pla
         k[[0, 1, 4, 5, 6, 7]] = a / np.tile((ideal[-1] / focal) ** (2.0 * np.arange(1, 4)), 2)
     if error > _MAX_LENS_ERROR_PX:
         remedy = "Undistort the video in Vicon's program, or calibrate with a board."
-        raise CalibrationError("a distortion that OpenCV's lens cannot hold", file=path, place=place, remedy=remedy)
+        raise CalibrationError("a distortion that OpenCV's lens cannot hold", remedy=remedy)
     return k

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from kinefit._arguments import checked
-from kinefit._files import LENGTHS, regular, worth, write_text
+from kinefit._files import LENGTHS, read_text, worth, write_text
 from kinefit.errors import CalibrationError, FileError, choices, located
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
@@ -97,15 +97,16 @@ def read_calibration(
         raise FileError("no such file or folder", file=path, remedy="Check the path of the calibration.")
     if (recording := inside(path)) is not None:
         return mcap_rig(recording[0])
-    if path.is_dir():
-        return _read_folder(path, unit, image_size, exteriors)
     if path.stem in ("cameras", "images") and path.suffix in (".txt", ".bin"):
-        return _read_folder(path.parent, unit, image_size, exteriors)
-    kind, tree = _parse(path)
-    if kind in _XML_MAKERS:
-        return _rig(_XML_MAKERS[kind](tree, path), path, "mm" if unit == "auto" else unit)
-    tables = [(name, table, path) for name, table in tables_of(tree, path.stem, path, exteriors)]
-    return _rig_of(tables, path, unit, image_size, exteriors)
+        path = path.parent
+    with located(path):
+        if path.is_dir():
+            return _read_folder(path, unit, image_size, exteriors)
+        kind, tree = _parse(path)
+        if kind in _XML_MAKERS:
+            return _rig(_XML_MAKERS[kind](tree), "mm" if unit == "auto" else unit)
+        tables = [(name, table, path) for name, table in tables_of(tree, path.stem, exteriors)]
+        return _rig_of(tables, unit, image_size, exteriors)
 
 
 def read_opencv_stereo(
@@ -120,10 +121,9 @@ def read_opencv_stereo(
 
     The first camera is the world. Its unit is that of the board's squares: give their length in metres as `unit`.
     """
-    path = Path(intrinsics)
-    tree = _tree(path) | _tree(Path(extrinsics))
-    tables = stereo_tables(tree, path, names)
-    return _rig_of([(name, table, path) for name, table in tables], path, unit, image_size)
+    with located(path := Path(intrinsics)):
+        tables = stereo_tables(_tree(path) | _tree(Path(extrinsics)), names)
+        return _rig_of([(name, table, path) for name, table in tables], unit, image_size)
 
 
 @checked
@@ -169,7 +169,7 @@ def _toml(camera: Camera, path: Path) -> str:
 
 def _read_folder(folder: Path, unit: str | float, image_size: Sizes | None, exteriors: bool) -> Rig:
     if (folder / "cameras.txt").exists() or (folder / "cameras.bin").exists():
-        return _rig(colmap_cameras(folder), folder, unit)
+        return _rig(colmap_cameras(folder), unit)
     sources = calibration_sources(folder)
     if len(sources) == 1 and len(sources[0][1]) == 1:
         return read_calibration(sources[0][1][0], unit=unit, image_size=image_size, exteriors=exteriors)
@@ -178,8 +178,9 @@ def _read_folder(folder: Path, unit: str | float, image_size: Sizes | None, exte
         tree: dict = {}
         for file in group:
             tree |= _tree(file)
-        tables += [(camera, table, group[0]) for camera, table in tables_of(tree, name, group[0], exteriors)]
-    return _rig_of(tables, folder, unit, image_size, exteriors)
+        with located(group[0]):
+            tables += [(camera, table, group[0]) for camera, table in tables_of(tree, name, exteriors)]
+    return _rig_of(tables, unit, image_size, exteriors)
 
 
 def calibration_sources(path: Path) -> list[tuple[str, list[Path]]]:
@@ -204,30 +205,29 @@ def _calibration_files(folder: Path) -> list[Path]:
 
 
 def _rig_of(
-    tables: list[tuple[str, dict, Path]],
-    path: Path,
-    unit: str | float,
-    image_size: Sizes | None,
-    exteriors: bool = True,
+    tables: list[tuple[str, dict, Path]], unit: str | float, image_size: Sizes | None, exteriors: bool = True
 ) -> Rig:
     if len(tables) > _MAX_CAMERAS:
         problem = f"{len(tables)} cameras, more than {_MAX_CAMERAS}"
-        raise CalibrationError(problem, file=path, remedy="Remove the cameras that recorded nothing.")
-    pose_needed = len(tables) > 1 if exteriors else None
-    cameras = [
-        camera_from_table(name, table, file, image_size=image_size, pose_needed=pose_needed)
-        for name, table, file in tables
-    ]
-    return _rig(cameras, path, _chosen_unit([table for _, table, _ in tables], unit, path))
+        raise CalibrationError(problem, remedy="Remove the cameras that recorded nothing.")
+    pose_needed, cameras = len(tables) > 1 if exteriors else None, []
+    for name, table, file in tables:
+        with located(file):
+            cameras.append(camera_from_table(name, table, image_size=image_size, pose_needed=pose_needed))
+    return _rig(cameras, _chosen_unit([table for _, table, _ in tables], unit))
 
 
 def _parse(path: Path) -> tuple[str, Any]:
     """Kind of a file (of `recognise`, or "mat"), and its tables, or the root of its XML."""
-    if path.suffix.lower() == ".mat":
-        return "mat", read_mat(path)
-    text = _read_text(path)
-    kind = recognise(text, path)
-    return kind, _xml_root(text, path) if kind in _XML_MAKERS else matlab_tree(read_table(text, kind, path), path)
+    with located(path):
+        if path.suffix.lower() == ".mat":
+            return "mat", read_mat(path)
+        if (size := path.stat().st_size) > MAX_CALIBRATION_BYTES:
+            problem = f"{size / 1e6:.0f} MB, too large for a calibration"
+            raise FileError(problem, remedy=f"Is it another file? kinefit reads {FORMATS}.")
+        text = read_text(path, "the calibration", remedy=f"kinefit reads {FORMATS}.")
+        kind = recognise(text, path)
+        return kind, _xml_root(text) if kind in _XML_MAKERS else matlab_tree(read_table(text, kind))
 
 
 def _tree(path: Path) -> dict:
@@ -238,27 +238,17 @@ def _tree(path: Path) -> dict:
     return dict(tree)
 
 
-def _read_text(path: Path) -> str:
-    try:
-        if (size := path.stat().st_size) > MAX_CALIBRATION_BYTES:
-            problem = f"{size / 1e6:.0f} MB, too large for a calibration"
-            raise FileError(problem, file=path, remedy=f"Is it another file? kinefit reads {FORMATS}.")
-        return regular(path).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError):
-        raise FileError("cannot be read as text", file=path, remedy=f"kinefit reads {FORMATS}.") from None
-
-
 def recognise(text: str, path: Path) -> str:
     """Detect "toml", "json", "yaml", "xml" (OpenCV), "qualisys" or "vicon" from the content; else raise FileError."""
     for program, (mark, remedy) in _FOREIGN.items():
         if text.lstrip().startswith("<") and re.search(mark, text, re.S | re.I):
             raise CalibrationError(
-                "kinefit does not read this format", file=path, place=f"calibration of {program}",
+                "kinefit does not read this format", place=f"calibration of {program}",
                 remedy=f"{remedy}, or write K, dist, R, t and size of each camera as JSON (docs/calibration.md).",
             )  # fmt: skip
     start = text.lstrip()
     if start.startswith("<"):
-        tag = _xml_root(text, path).tag.lower()
+        tag = _xml_root(text).tag.lower()
         if tag in (roots := {"calibration": "qualisys", "opencv_storage": "xml", "cameras": "vicon"}):
             return roots[tag]
     elif start.startswith("{") or (start.startswith("[") and path.suffix.lower() == ".json"):
@@ -269,33 +259,33 @@ def recognise(text: str, path: Path) -> str:
         return "toml"
     elif re.search(r"^[ \t]*+[\w-]++[ \t]*+:", text, re.M):
         return "yaml"
-    raise FileError("not a calibration that kinefit knows", file=path, remedy=f"kinefit reads {FORMATS}.")
+    raise FileError("not a calibration that kinefit knows", remedy=f"kinefit reads {FORMATS}.")
 
 
-def _xml_root(text: str, path: Path) -> ElementTree.Element:
+def _xml_root(text: str) -> ElementTree.Element:
     try:
         return parse_xml(text)
     except (ElementTree.ParseError, ValueError) as error:
         remedy = "Export it again; it may be cut."
-        raise CalibrationError(f"broken XML: {error}", file=path, remedy=remedy) from None
+        raise CalibrationError(f"broken XML: {error}", remedy=remedy) from None
 
 
-def _chosen_unit(tables: list[dict], unit: str | float, path: Path) -> str | float:
+def _chosen_unit(tables: list[dict], unit: str | float) -> str | float:
     """The unit that is asked for, else that which the tables of all cameras state."""
     stated = [find(table, "unit") for table in tables] if unit == "auto" else [unit]
     units = {one if one and type(one) in (str, int, float) else "auto" for one in stated}
     if len(units) > 1:
         problem = f"its cameras state different units: {', '.join(sorted(map(str, units)))}"
-        raise CalibrationError(problem, file=path, remedy="Pass the unit that all of them have.")
+        raise CalibrationError(problem, remedy="Pass the unit that all of them have.")
     return units.pop() if units else unit
 
 
-def metres_per_unit(tables: list[dict], unit: str | float, path: Path) -> float:
+def metres_per_unit(tables: list[dict], unit: str | float) -> float:
     """Metres per unit of length of the tables of cameras; 1 if they state none."""
-    return _factor(_chosen_unit(tables, unit, path), path) or 1.0
+    return _factor(_chosen_unit(tables, unit)) or 1.0
 
 
-def _factor(unit: str | float, path: Path) -> float | None:
+def _factor(unit: str | float) -> float | None:
     """Metres per unit; None for "auto"."""
     if isinstance(unit, str):
         if unit == "auto":
@@ -303,21 +293,19 @@ def _factor(unit: str | float, path: Path) -> float | None:
         metres = worth(unit, LENGTHS)
         if metres is None:
             remedy = "Use one of these, or a number of metres."
-            raise CalibrationError(choices("unit of length", unit, LENGTHS), file=path, remedy=remedy)
+            raise CalibrationError(choices("unit of length", unit, LENGTHS), remedy=remedy)
         return metres
     if not (np.isfinite(unit) and unit > 0):
-        raise CalibrationError(f"unit of length {unit}", file=path, remedy="Give a positive number of metres.")
+        raise CalibrationError(f"unit of length {unit}", remedy="Give a positive number of metres.")
     return float(unit)
 
 
-def _in_metres(camera: Camera, factor: float | None, path: Path) -> Camera:
+def _in_metres(camera: Camera, factor: float | None) -> Camera:
     if factor is None:
         distance = float(np.linalg.norm(camera.centre_world))
         if distance > _MAX_ORIGIN_DISTANCE:
             raise CalibrationError(
-                f"stands {distance:.0f} from the world's origin, which cannot be metres",
-                file=path,
-                place=f"camera {camera.name}",
+                f"stands {distance:.0f} from the world's origin, which cannot be metres", place=f"camera {camera.name}",
                 remedy='Write unit = "mm" under [calibration] in the take (from Python: unit="mm").',
             )
         return camera
@@ -326,9 +314,8 @@ def _in_metres(camera: Camera, factor: float | None, path: Path) -> Camera:
     return camera.with_pose(T)
 
 
-def _rig(cameras: list[Camera], path: Path, unit: str | float) -> Rig:
+def _rig(cameras: list[Camera], unit: str | float) -> Rig:
     if not cameras:
-        raise CalibrationError("no camera in it", file=path, remedy=f"kinefit reads {FORMATS}.")
-    factor = _factor(unit, path)
-    with located(path):
-        return Rig(tuple(_in_metres(camera, factor, path) for camera in cameras))
+        raise CalibrationError("no camera in it", remedy=f"kinefit reads {FORMATS}.")
+    factor = _factor(unit)
+    return Rig(tuple(_in_metres(camera, factor) for camera in cameras))
