@@ -347,7 +347,7 @@ def _clouds(kind: str) -> Callable[[Path], Seed]:
         def read() -> object:
             cloud = read_cloud(path)
             if cloud.shape is not None:
-                camera_of(cloud, "a", path)
+                camera_of(cloud, "a")
                 depth_of(cloud)
             return in_sensor(cloud)
 

@@ -109,12 +109,15 @@ def regular(path: str | os.PathLike[str]) -> Path:
     return Path(path)
 
 
-def read_bytes(path: Path) -> bytes:
-    """All of a file; FileError where it cannot be read, or is no regular file."""
+def read_bytes(path: Path, most: int = -1) -> bytes:
+    """All of a file, or its first bytes; FileError where it cannot be read, or is no regular file."""
     try:
         if regular(path).is_dir():
             raise FileError("is not a file", file=path, remedy="Check the path.")
-        return regular(path).read_bytes()
+        with path.open("rb") as file:
+            return file.read(most)
+    except FileNotFoundError as problem:
+        raise FileError("no such file", file=path, remedy="Check the path.") from problem
     except (OSError, ValueError) as problem:
         reason = getattr(problem, "strerror", None) or str(problem)
         raise FileError(f"cannot be read ({reason})", file=path, remedy="Check the path.") from problem

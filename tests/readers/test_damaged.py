@@ -127,7 +127,7 @@ def test_a_matrix_of_rows_without_end_is_told(tmp_path):
 @pytest.mark.parametrize("text", ["a: " + "{" * 50_000, "a: " + "- " * 50_000, "a: " + '{"a":' * 50_000])
 def test_tables_within_tables_do_not_end_the_process(tmp_path, text):
     (tmp_path / "a.yml").write_text(f"%YAML:1.0\n---\n{text}\n")
-    with pytest.raises(CalibrationError, match=r"nested too deeply|line 3: a (key|value)"):
+    with pytest.raises(CalibrationError, match=r"nested too deeply|line 3: (exceeded maximum nesting|block sequence entries)"):
         read_calibration(tmp_path / "a.yml")
 
 
@@ -171,7 +171,7 @@ def test_points_at_the_end_of_the_world_are_told(tmp_path):
     points[:, 0] *= 1e300
     cloud = FileCloud(points, (20, 20), np.eye(4))
     with pytest.raises(CalibrationError, match="no camera sees"):
-        camera_of(cloud, "a", tmp_path / "a.pcd")
+        camera_of(cloud, "a")
 
 
 @pytest.mark.parametrize("base", ["humanoid" + "(" * 5000, "../../x", "a\\u0000.toml", "b" * 5000 + ".toml"])

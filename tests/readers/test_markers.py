@@ -270,7 +270,7 @@ def test_missing_and_foreign_files(tmp_path):
 
 def test_a_parameter_of_no_numbers_in_dimensions_beyond_bounds_is_refused():
     with pytest.raises(FileError, match="impossible dimensions"):
-        _values(bytes([2, 10, 0, *[255] * 9]), "intel", "POINT:X", Path("a.c3d"))
+        _values(bytes([2, 10, 0, *[255] * 9]), "intel", "POINT:X")
 
 
 def test_the_clock_is_the_files(data_dir, tmp_path):

@@ -111,10 +111,8 @@ def _distortion(table: Table, model: str) -> NDArray | None:
     names = _COEFFICIENTS if model == "radtan" else ("k1", "k2", "k3", "k4")
     odd = [key for key in scalars if scalars[key] and (key not in names or (key == "k4" and "k5" not in scalars))]
     if odd and (model == "radtan" or odd != ["k4"]):
-        raise CalibrationError(
-            f"{', '.join(odd)} of a lens whose model is not OpenCV's",
-            remedy='Write model = "fisheye" if it is (k1 k2 k3 k4 alone), else calibrate with k1, k2, p1, p2, k3.',
-        )  # fmt: skip
+        remedy = 'Write model = "fisheye" if it is (k1 k2 k3 k4 alone), else calibrate with k1, k2, p1, p2, k3.'
+        raise CalibrationError(f"{', '.join(odd)} of a lens whose model is not OpenCV's", remedy=remedy)
     given = [numbers(value).ravel() for value in find_all(table, "distortion")]
     if radial.size:
         first, second = (np.pad(part, (0, max(0, 2 - part.size))) for part in (radial, tangential))
