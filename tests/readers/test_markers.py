@@ -3,7 +3,6 @@
 import gzip
 import re
 import struct
-from pathlib import Path
 
 import ezc3d
 import numpy as np

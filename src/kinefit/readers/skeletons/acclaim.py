@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit.errors import FileError, check_choice, choices
+from kinefit.errors import FileError, check_choice, choices, located, names_file
 from kinefit.observations import SkeletonMotion
 from kinefit.readers.skeletons.common import (
     euler_rotations,
     given_unit,
     joint_poses,
     parse_numbers,
-    read_text,
+    text_of,
     vertical_axis,
 )
 
@@ -71,6 +71,7 @@ class AsfSkeleton:
 _LIMIT = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|[-+]?inf(?:inity)?", re.IGNORECASE)
 
 
+@names_file
 def read_asf(path: str | PathLike[str], *, unit: float | str | None = None) -> AsfSkeleton:
     """Read an ASF skeleton.
 
@@ -88,29 +89,29 @@ def read_asf(path: str | PathLike[str], *, unit: float | str | None = None) -> A
     sections = _sections(path)
     for name in ("root", "bonedata", "hierarchy"):
         if name not in sections:
-            raise FileError(f"holds no section :{name}", file=path, remedy="Give a whole ASF file.")
+            raise FileError(f"holds no section :{name}", remedy="Give a whole ASF file.")
     units = {words[0].lower(): (n, words[1]) for n, words in sections.get("units", []) if len(words) > 1}
     degrees = units.get("angle", (0, "deg"))[1].lower().startswith("deg")
     if unit is None or unit == "auto":
         line, length = units.get("length", (0, "1.0"))
-        (scale,) = parse_numbers([length], file=path, line=line)
+        (scale,) = parse_numbers([length], line)
         unit = _INCH / scale if scale > 0 else 0.0
-    unit = given_unit(unit, path)
+    unit = given_unit(unit)
 
     root = {words[0].lower(): (n, words[1:]) for n, words in sections["root"]}
     angle = np.pi / 180.0 if degrees else 1.0
-    position = np.array(_three(root.get("position", (0, ["0"] * 3)), path)) * unit
+    position = np.array(_three(root.get("position", (0, ["0"] * 3)))) * unit
     order = tuple(word.lower() for word in root.get("order", (0, _DOFS[3:] + _DOFS[:3]))[1])
     axis = "".join(root.get("axis", (0, ["XYZ"]))[1])
-    orientation = np.array(_three(root.get("orientation", (0, ["0"] * 3)), path)) * angle
-    _check_dofs(order, path, root.get("order", (0,))[0])
-    top = Bone("root", -1, np.zeros(3), _axes(orientation, axis, path, root.get("axis", (0,))[0]), order)
+    orientation = np.array(_three(root.get("orientation", (0, ["0"] * 3)))) * angle
+    _check_dofs(order, root.get("order", (0,))[0])
+    top = Bone("root", -1, np.zeros(3), _axes(orientation, axis, root.get("axis", (0,))[0]), order)
     loose = {"root": top}
-    for bone in _bones(sections["bonedata"], unit, angle, path):
+    for bone in _bones(sections["bonedata"], unit, angle):
         if bone.name in loose:
-            raise FileError(f"two bones are named '{bone.name}'", file=path, remedy="Rename one of them.")
+            raise FileError(f"two bones are named '{bone.name}'", remedy="Rename one of them.")
         loose[bone.name] = bone
-    bones = _in_order(sections["hierarchy"], loose, path)
+    bones = _in_order(sections["hierarchy"], loose)
     return AsfSkeleton(bones, position, float(unit), degrees, fspath(path))
 
 
@@ -118,7 +119,7 @@ def _sections(path: str | PathLike[str]) -> dict[str, list[tuple[int, list[str]]
     """Words of every line with its number, by section; comments dropped."""
     sections: dict[str, list[tuple[int, list[str]]]] = {}
     current: list[tuple[int, list[str]]] = []
-    for n, line in enumerate(read_text(path, "ASF").split("\n"), 1):
+    for n, line in enumerate(text_of(path, "ASF").split("\n"), 1):
         words = line.partition("#")[0].split()
         if words and words[0].startswith(":"):
             current = sections.setdefault(words[0][1:].lower(), [])
@@ -128,18 +129,18 @@ def _sections(path: str | PathLike[str]) -> dict[str, list[tuple[int, list[str]]
     return sections
 
 
-def _bones(lines: list[tuple[int, list[str]]], unit: float, angle: float, path: str | PathLike[str]) -> Iterator[Bone]:
+def _bones(lines: list[tuple[int, list[str]]], unit: float, angle: float) -> Iterator[Bone]:
     """Bones between "begin" and "end", with no parent yet."""
     entries: dict[str, tuple[int, list[str]]] | None = None
     key = ""
     for n, words in lines:
         word = words[0].lower()
         if (word == "begin") == (entries is not None):
-            raise FileError("begin and end do not match", file=path, place=f"line {n}", remedy="Give a whole ASF file.")
+            raise FileError("begin and end do not match", place=f"line {n}", remedy="Give a whole ASF file.")
         if word == "begin":
             entries, key = {}, ""
         elif word == "end":
-            yield _bone(entries or {}, n, unit, angle, path)
+            yield _bone(entries or {}, n, unit, angle)
             entries = None
         elif word.startswith("(") and key == "limits":
             entries[key][1].extend(words)  # type: ignore[index]  # limits go on over several lines
@@ -147,76 +148,64 @@ def _bones(lines: list[tuple[int, list[str]]], unit: float, angle: float, path: 
             key = word
             entries[key] = (n, words[1:])  # type: ignore[index]
     if entries is not None:
-        raise FileError(
-            "ends in the middle of a bone", file=path, place=f"line {lines[-1][0]}", remedy="Give a whole ASF file."
-        )
+        raise FileError("ends in the middle of a bone", place=f"line {lines[-1][0]}", remedy="Give a whole ASF file.")
 
 
-def _bone(entries: dict, line: int, unit: float, angle: float, path: str | PathLike[str]) -> Bone:
+def _bone(entries: dict, line: int, unit: float, angle: float) -> Bone:
     missing = [key for key in ("name", "direction", "length") if not entries.get(key, (0, []))[1]]
     if missing:
-        raise FileError(f"the bone lacks {', '.join(missing)}", file=path, place=f"line {line}", remedy="Add it.")
+        raise FileError(f"the bone lacks {', '.join(missing)}", place=f"line {line}", remedy="Add it.")
     name = entries["name"][1][0]
-    direction = np.array(_three(entries["direction"], path))
-    (length,) = parse_numbers(entries["length"][1][:1], file=path, line=entries["length"][0])
+    direction = np.array(_three(entries["direction"]))
+    (length,) = parse_numbers(entries["length"][1][:1], entries["length"][0])
     if length < 0 or not np.linalg.norm(direction) > 0:
-        raise FileError(
-            f"bone '{name}' has no direction or a negative length", file=path, place=f"line {line}", remedy="Set it."
-        )
+        raise FileError(f"bone '{name}' has no direction or a negative length", place=f"line {line}", remedy="Set it.")
     axis_line, axis = entries.get("axis", (line, ["0", "0", "0", "XYZ"]))
-    axes = _axes(np.array(_three((axis_line, axis[:3]), path)) * angle, "".join(axis[3:]) or "XYZ", path, axis_line)
+    axes = _axes(np.array(_three((axis_line, axis[:3]))) * angle, "".join(axis[3:]) or "XYZ", axis_line)
     dof_line, dofs = entries.get("dof", (line, []))
     dofs = tuple(dof.lower() for dof in dofs)
-    _check_dofs(dofs, path, dof_line)
+    _check_dofs(dofs, dof_line)
     limits = None
     if "limits" in entries:
         limit_line, words = entries["limits"]
         numbers = re.sub(r"[(),]", " ", " ".join(words)).split()
         if len(numbers) != 2 * len(dofs):
-            raise FileError(
-                f"bone '{name}' has {len(numbers)} limits for {len(dofs)} degrees of freedom",
-                file=path,
-                place=f"line {limit_line}",
-                remedy="Give a pair of limits for each.",
-            )
+            problem = f"bone '{name}' has {len(numbers)} limits for {len(dofs)} degrees of freedom"
+            raise FileError(problem, place=f"line {limit_line}", remedy="Give a pair of limits for each.")
         scale = np.array([angle if dof[0] == "r" else unit for dof in dofs])
         if not all(map(_LIMIT.fullmatch, numbers)):
             problem = f"bone '{name}' has limits that are no numbers"
-            raise FileError(problem, file=path, place=f"line {limit_line}", remedy="Give two limits for each.")
+            raise FileError(problem, place=f"line {limit_line}", remedy="Give two limits for each.")
         limits = np.array([float(x) for x in numbers]).reshape(-1, 2) * scale[:, None]  # may be infinite
     vector = direction / np.linalg.norm(direction) * length * unit
     return Bone(name, -1, vector, axes, dofs, limits)
 
 
-def _three(entry: tuple[int, Sequence[str]], path: str | PathLike[str]) -> list[float]:
+def _three(entry: tuple[int, Sequence[str]]) -> list[float]:
     line, words = entry
-    numbers = parse_numbers(words, file=path, line=line)
+    numbers = parse_numbers(words, line)
     if len(numbers) != 3:
-        raise FileError(f"{len(numbers)} numbers instead of 3", file=path, place=f"line {line}", remedy="Give 3.")
+        raise FileError(f"{len(numbers)} numbers instead of 3", place=f"line {line}", remedy="Give 3.")
     return numbers
 
 
-def _axes(angles: NDArray, order: str, path: str | PathLike[str], line: int) -> NDArray:
+def _axes(angles: NDArray, order: str, line: int) -> NDArray:
     """Rotation by angles listed in the given order, the first one acting first."""
     order = order.lower()
     if sorted(order) != ["x", "y", "z"]:
-        raise FileError(
-            f"the order of axes '{order}' is unknown", file=path, place=f"line {line}", remedy="Give one, as XYZ."
-        )
+        raise FileError(f"the order of axes '{order}' is unknown", place=f"line {line}", remedy="Give one, as XYZ.")
     return euler_rotations(angles[::-1], order[::-1])
 
 
-def _check_dofs(dofs: Sequence[str], path: str | PathLike[str], line: int) -> None:
+def _check_dofs(dofs: Sequence[str], line: int) -> None:
     unknown = [dof for dof in dofs if dof not in _DOFS]
     if unknown:
-        raise FileError(choices("degree of freedom", unknown[0], _DOFS), file=path, place=f"line {line}")
+        raise FileError(choices("degree of freedom", unknown[0], _DOFS), place=f"line {line}")
     if len(set(dofs)) < len(dofs):
-        raise FileError("a degree of freedom is listed twice", file=path, place=f"line {line}", remedy="List it once.")
+        raise FileError("a degree of freedom is listed twice", place=f"line {line}", remedy="List it once.")
 
 
-def _in_order(
-    lines: list[tuple[int, list[str]]], loose: dict[str, Bone], path: str | PathLike[str]
-) -> tuple[Bone, ...]:
+def _in_order(lines: list[tuple[int, list[str]]], loose: dict[str, Bone]) -> tuple[Bone, ...]:
     """Bones with their parents, depth first from the root."""
     parent_of: dict[str, str] = {}
     children: dict[str, list[str]] = {}
@@ -224,15 +213,11 @@ def _in_order(
         if parent.lower() in ("begin", "end") and not names:
             continue
         for name in (parent, *names):
-            check_choice("bone", name, loose, FileError, file=path, place=f"line {n}")
+            check_choice("bone", name, loose, FileError, place=f"line {n}")
         for name in names:
             if name in parent_of or name == "root":
-                raise FileError(
-                    f"bone '{name}' has two parents or is the root",
-                    file=path,
-                    place=f"line {n}",
-                    remedy="Name every bone once as a child.",
-                )
+                problem = f"bone '{name}' has two parents or is the root"
+                raise FileError(problem, place=f"line {n}", remedy="Name every bone once as a child.")
             parent_of[name] = parent
             children.setdefault(parent, []).append(name)
     bones: list[Bone] = []
@@ -247,12 +232,8 @@ def _in_order(
         stack.extend(reversed(children.get(name, [])))
     unreached = [name for name in loose if name not in index]
     if unreached:
-        raise FileError(
-            f"no path from the root to {', '.join(unreached)}",
-            file=path,
-            place=":hierarchy",
-            remedy="Name every bone once as a child.",
-        )
+        problem = f"no path from the root to {', '.join(unreached)}"
+        raise FileError(problem, place=":hierarchy", remedy="Name every bone once as a child.")
     return tuple(bones)
 
 
@@ -308,13 +289,15 @@ def read_amc(
             _move(Ts_parent_joint[:, i], bone, values[bone.name], skeleton.unit, degrees)
     names = tuple(bone.name for bone in bones) + tuple(f"{bones[i].name}_end" for i in leaves)
     Ts_world_joint = joint_poses(parents, Ts_parent_joint)
+    with located(amc_path):
+        up = vertical_axis(up, names, Ts_world_joint[..., :3, 3])
     return SkeletonMotion(
         names=names,
         parents=np.array(parents),
         offsets=offsets,
         rate=float(rate),
         Ts_world_joint=Ts_world_joint,
-        up=vertical_axis(up, names, Ts_world_joint[..., :3, 3], amc_path),
+        up=up,
         source=fspath(amc_path),
     )
 
@@ -331,6 +314,7 @@ def _move(Ts_parent_joint: NDArray, bone: Bone, values: NDArray, unit: float, de
             Ts_parent_joint[:, :3, 3] += values[:, k, None] * unit * axis
 
 
+@names_file
 def _read_values(path: str | PathLike[str], skeleton: AsfSkeleton) -> tuple[dict[str, NDArray], bool]:
     """Values (F, D) of every bone with degrees of freedom, in the file's units; whether angles are degrees."""
     counts = {bone.name: len(bone.dofs) for bone in skeleton.bones}
@@ -339,7 +323,7 @@ def _read_values(path: str | PathLike[str], skeleton: AsfSkeleton) -> tuple[dict
     degrees, first, frames, n = skeleton.degrees, 0, 0, 0
 
     def fault(problem: str, line: int, remedy: str) -> FileError:
-        return FileError(problem, file=path, place=f"line {line}", remedy=remedy)
+        return FileError(problem, place=f"line {line}", remedy=remedy)
 
     def check_whole(line: int) -> None:
         lacking = [name for name in moving if len(values[name]) != frames]
@@ -347,7 +331,7 @@ def _read_values(path: str | PathLike[str], skeleton: AsfSkeleton) -> tuple[dict
             remedy = "If it is the last frame the file was cut off: export it again or delete that frame."
             raise fault(f"frame {first + frames - 1} lacks or repeats {', '.join(lacking)}", line, remedy)
 
-    for n, line in enumerate(read_text(path, "AMC").split("\n"), 1):
+    for n, line in enumerate(text_of(path, "AMC").split("\n"), 1):
         words = line.partition("#")[0].split()
         if not words:
             continue
@@ -367,7 +351,7 @@ def _read_values(path: str | PathLike[str], skeleton: AsfSkeleton) -> tuple[dict
             problem = f"{len(words) - 1} values for the {counts[words[0]]} degrees of freedom of '{words[0]}'"
             raise fault(problem, n, f"Give this motion's skeleton, not {skeleton.source}; or the file was cut off.")
         elif len(words) > 1:
-            values[words[0]].append(parse_numbers(words[1:], file=path, line=n))
+            values[words[0]].append(parse_numbers(words[1:], n))
     if not frames:
         raise fault("holds no frames", n, "Give an AMC file.")
     check_whole(n)
