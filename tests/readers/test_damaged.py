@@ -127,7 +127,7 @@ def test_a_matrix_of_rows_without_end_is_told(tmp_path):
 @pytest.mark.parametrize("text", ["a: " + "{" * 50_000, "a: " + "- " * 50_000, "a: " + '{"a":' * 50_000])
 def test_tables_within_tables_do_not_end_the_process(tmp_path, text):
     (tmp_path / "a.yml").write_text(f"%YAML:1.0\n---\n{text}\n")
-    with pytest.raises(CalibrationError, match=r"nested too deeply|line 3: (exceeded maximum nesting|block sequence entries)"):
+    with pytest.raises(CalibrationError, match="nested too deeply|line 3: (exceeded|block sequence)"):
         read_calibration(tmp_path / "a.yml")
 
 

@@ -84,7 +84,11 @@ def catalogue_text(name: str) -> str:
 @checked
 def parse_body(text: str, source: str = "body") -> Body:
     """Parse a body from TOML text; `source` names it in messages. Raises a BodyError as `load_body` does."""
-    record = _record(text, source)
+    with located(source):
+        return _body(_record(text, source), source)
+
+
+def _body(record: FileRecord, source: str) -> Body:
     segments, points, usual, coupling, morph, closure = (
         record.segment, record.landmarks, record.usual, record.coupling, record.morph, record.closure
     )  # fmt: skip
@@ -94,11 +98,11 @@ def parse_body(text: str, source: str = "body") -> Body:
         usual = {left(n): v for n, v in usual.items()} | usual
         coupling, closure = with_images(coupling), with_images(closure)
         morph = _beside(morph, lambda m: m.kind != "global" and left(m.angle) != m.angle)
-    segments = _in_order(segments, source)
+    segments = _in_order(segments)
     groups = tuple(dict.fromkeys(s.scale or s.name for s in segments))
     index = {s.name: i for i, s in enumerate(segments)}
-    landmarks = _points(points, index, source)
-    tree = _with_posture(_coupled(_tree(segments, index, source), coupling, source), usual, source)
+    landmarks = _points(points, index)
+    tree = _with_posture(_coupled(_tree(segments, index), coupling), usual)
     body = Body(
         name=record.body.name,
         tree=tree,
@@ -107,9 +111,9 @@ def parse_body(text: str, source: str = "body") -> Body:
         segment_scale=np.array([groups.index(s.scale or s.name) for s in segments]),
         landmarks=landmarks,
         keypoint_sets={
-            n: _renamed(s, landmarks, f"keypoints.{n}", source) for n, s in extended(record.keypoints).items()
+            n: _renamed(s, landmarks, f"keypoints.{n}") for n, s in extended(record.keypoints).items()
         },
-        marker_sets={n: _markers(s, landmarks, index, f"markers.{n}", source) for n, s in record.markers.items()},
+        marker_sets={n: _markers(s, landmarks, index, f"markers.{n}") for n, s in record.markers.items()},
         surfaces=tuple(
             surface for s in segments
             for surface in surfaces_of(s.surface, index[s.name], source, f"surface of segment {s.name}")
@@ -118,11 +122,11 @@ def parse_body(text: str, source: str = "body") -> Body:
             c: {s.name: s.names[c] for s in segments if c in s.names}
             for c in dict.fromkeys(c for s in segments for c in s.names)
         },
-        stature=stature_of(record.body.stature or 0.0, source),
+        stature=stature_of(record.body.stature or 0.0),
         skin=skin_of(record.skin, tree, source),
         morphs=morphs_of(morph, tree, source),
     )  # fmt: skip
-    return closed(body, closure, record.dimension, source) if closure or record.dimension else body
+    return closed(body, closure, record.dimension) if closure or record.dimension else body
 
 
 def _record(text: str, source: str, above: tuple[str, ...] = ()) -> FileRecord:
@@ -132,18 +136,19 @@ def _record(text: str, source: str, above: tuple[str, ...] = ()) -> FileRecord:
     most = max(len(record.segment), len(record.coupling), len(record.closure), len(record.dimension))
     if most > _MAX_SEGMENTS:
         problem = f"{most} segments, couplings, closures or dimensions, more than {_MAX_SEGMENTS}"
-        raise BodyError(problem, file=source, remedy="Merge segments that do not move on their own.")
+        raise BodyError(problem, remedy="Merge segments that do not move on their own.")
     base = record.body.base
     if base is None:
         return record
     if base in above:
         problem = f"`base` entries form a cycle: {', '.join((*above, base))}"
-        raise BodyError(problem, file=source, place="body.base", remedy="Remove one.")
+        raise BodyError(problem, place="body.base", remedy="Remove one.")
     try:
         below, file = _text(base if not base.endswith(".toml") else Path(source).parent / base)
     except BodyError as error:
-        raise BodyError(error.problem, file=source, place="body.base", remedy=error.remedy) from error
-    return merged(_record(below, file, (*above, base)), record)
+        raise BodyError(error.problem, place="body.base", remedy=error.remedy) from error
+    with located(file):
+        return merged(_record(below, file, (*above, base)), record)
 
 
 def _beside(records: Iterable[Any], sided: Callable[[Any], bool]) -> list[Any]:
@@ -151,20 +156,20 @@ def _beside(records: Iterable[Any], sided: Callable[[Any], bool]) -> list[Any]:
     return [one for r in records for one in ((r, mirrored(r)) if sided(r) else (r,))]
 
 
-def _in_order(segments: list[SegmentRecord], source: str) -> list[SegmentRecord]:
+def _in_order(segments: list[SegmentRecord]) -> list[SegmentRecord]:
     """Sort segments depth first from the root: parents before children, limbs contiguous."""
     children: dict[str | None, list[SegmentRecord]] = {s.name: [] for s in segments}
-    refuse_repeated("segment", [s.name for s in segments], source)
-    refuse_repeated("joint", [s.joint.name for s in segments], source)
+    refuse_repeated("segment", [s.name for s in segments])
+    refuse_repeated("joint", [s.joint.name for s in segments])
     roots = [s for s in segments if s.parent is None]
     if len(roots) != 1:
         found = ", ".join(s.name for s in roots) or "none"
         problem = f"a body has exactly one segment without a parent, here: {found}"
-        raise BodyError(problem, file=source, remedy="Give the others a parent.")
+        raise BodyError(problem, remedy="Give the others a parent.")
     for s in segments:
         if s.parent is not None and s.parent not in children:
             place = f"parent of segment {s.name}"
-            raise BodyError(choices("segment", s.parent, children), file=source, place=place, remedy=_CHOOSE)
+            raise BodyError(choices("segment", s.parent, children), place=place, remedy=_CHOOSE)
         children.setdefault(s.parent, []).append(s)
     out: list[SegmentRecord] = []
     stack = [roots[0]]
@@ -176,18 +181,18 @@ def _in_order(segments: list[SegmentRecord], source: str) -> list[SegmentRecord]
         placed = {s.name for s in out}
         lost = ", ".join(s.name for s in segments if s.name not in placed)
         remedy = "Every chain of parents must end at the root."
-        raise BodyError(f"the segments {lost} form a cycle", file=source, remedy=remedy)
+        raise BodyError(f"the segments {lost} form a cycle", remedy=remedy)
     return out
 
 
-def _tree(segments: list[SegmentRecord], index: dict[str, int], source: str) -> KinematicTree:
+def _tree(segments: list[SegmentRecord], index: dict[str, int]) -> KinematicTree:
     rows: list[tuple[Any, ...]] = []
     for i, s in enumerate(segments):
-        with located(source, f"joint {s.joint.name}"):
+        with located(None, f"joint {s.joint.name}"):
             rows += _coordinates(i, s.joint)
     names = ("coordinates", "owners", *COLUMNS)
     columns = dict(zip(names, zip(*rows) if rows else [()] * len(names)))
-    refuse_repeated("coordinate", columns["coordinates"], source)
+    refuse_repeated("coordinate", columns["coordinates"])
     return KinematicTree(
         segments=tuple(index),
         parents=np.array([index[s.parent] if s.parent else -1 for s in segments]),
@@ -231,11 +236,11 @@ def _coordinates(owner: int, j: JointRecord) -> Iterator[tuple[Any, ...]]:
         yield name, owner, axis, slides[k], low * unit, high * unit, usual * unit, spread * unit
 
 
-def _coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord], source: str) -> KinematicTree:
+def _coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord]) -> KinematicTree:
     """Add the couplings of a file to a tree; weights have no unit, spreads are in degrees."""
     lines = np.zeros((len(couplings), len(tree.coordinates)))
     for line, c in zip(lines, couplings):
-        with located(source, f"coupling {c.name}"):
+        with located(None, f"coupling {c.name}"):
             for name, weight in c.of.items():
                 check_choice("coordinate", name, tree.coordinates, BodyError, remedy="Use one of these.")
                 line[tree.coordinate(name)] = weight
@@ -245,15 +250,15 @@ def _coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord], source: s
             if tree.prismatic[line != 0.0].any():
                 raise BodyError("it couples a coordinate that slides", remedy="Couple angles.")
         line /= np.radians(c.spread)
-    with located(source, "coupling"):
+    with located(None, "coupling"):
         return replace(tree, couplings=lines)
 
 
-def _with_posture(tree: KinematicTree, usual: Mapping[str, float], source: str) -> KinematicTree:
+def _with_posture(tree: KinematicTree, usual: Mapping[str, float]) -> KinematicTree:
     """Change the mean posture of a tree: values [deg] or [m] of some coordinates."""
     out = np.array(tree.usual)
     for name, value in usual.items():
-        with located(source, f"usual {name}"):
+        with located(None, f"usual {name}"):
             check_choice("coordinate", name, tree.coordinates, BodyError, remedy="Use one of these.")
             d = tree.coordinate(name)
             unit = 1.0 if tree.prismatic[d] else np.pi / 180.0
@@ -269,32 +274,30 @@ def _check_finite(at: Vector) -> None:
         raise BodyError(f"`at` is not finite: {list(at)}", remedy="Give three numbers in metres.")
 
 
-def _points(
-    points: Mapping[str, PointRecord], index: dict[str, int], source: str, what: str = "landmark "
-) -> PointSet:
+def _points(points: Mapping[str, PointRecord], index: dict[str, int], what: str = "landmark ") -> PointSet:
     for name, p in points.items():
-        with located(source, what + name):
+        with located(None, what + name):
             check_choice("segment", p.segment, index, BodyError, remedy=_CHOOSE)
             _check_finite(p.at)
     records = points.values()
     return PointSet(tuple(points), np.array([index[p.segment] for p in records]), np.array([p.at for p in records]))
 
 
-def _renamed(entries: dict[str, str], landmarks: PointSet, place: str, source: str) -> PointSet:
+def _renamed(entries: dict[str, str], landmarks: PointSet, place: str) -> PointSet:
     known = set(landmarks.names)
     for name, landmark in entries.items():
         if landmark not in known:
             problem = choices("landmark", landmark, landmarks.names)
-            raise BodyError(problem, file=source, place=f"{place}.{name}", remedy=_CHOOSE)
+            raise BodyError(problem, place=f"{place}.{name}", remedy=_CHOOSE)
     return replace(landmarks.select(tuple(entries.values())), names=tuple(entries))
 
 
-def _markers(entry: MarkerSetRecord, landmarks: PointSet, index: dict[str, int], place: str, source: str) -> PointSet:
-    on_landmarks = _renamed({n: n for n in entry.points}, landmarks, place, source)
-    placed = _points(entry.placed, index, source, f"{place}.")
+def _markers(entry: MarkerSetRecord, landmarks: PointSet, index: dict[str, int], place: str) -> PointSet:
+    on_landmarks = _renamed({n: n for n in entry.points}, landmarks, place)
+    placed = _points(entry.placed, index, f"{place}.")
     if twice := sorted(entry.placed.keys() & set(entry.points)):
         problem = f"marker named twice: {', '.join(twice)}"
-        raise BodyError(problem, file=source, place=place, remedy="Keep it in points or in placed.")
+        raise BodyError(problem, place=place, remedy="Keep it in points or in placed.")
     return PointSet(
         on_landmarks.names + placed.names,
         np.concatenate([on_landmarks.segments, placed.segments]),
@@ -307,9 +310,7 @@ _MAX_DIMENSION = 1e4  # [m] or [deg]
 _ZERO_VECTOR = (0.0, 0.0, 0.0)
 
 
-def closed(
-    body: Body, closures: Sequence[ClosureRecord], dimensions: Sequence[DimensionRecord], source: str
-) -> Body:
+def closed(body: Body, closures: Sequence[ClosureRecord], dimensions: Sequence[DimensionRecord]) -> Body:
     """Add the closures and dimensions of a file to a body.
 
     Raises
@@ -320,16 +321,16 @@ def closed(
     """
     if body.morphs:
         problem = "closures of a body whose joints or surfaces morph"
-        raise BodyError(problem, file=source, place="closure", remedy="Remove the morphs, or the closures.")
-    refuse_repeated("closure", [c.name for c in closures], source)
-    refuse_repeated("dimension", [d.name for d in dimensions], source)
+        raise BodyError(problem, place="closure", remedy="Remove the morphs, or the closures.")
+    refuse_repeated("closure", [c.name for c in closures])
+    refuse_repeated("dimension", [d.name for d in dimensions])
     made, drawn, wanted = list[Closure](), list[Dimension](), dict[str, float]()
     for c in closures:
-        with located(source, f"closure {c.name}"):
+        with located(None, f"closure {c.name}"):
             made.append(_closure(body, c))
     body = replace(body, closures=tuple(made))
     for r in dimensions:
-        with located(source, f"dimension {r.name}"):
+        with located(None, f"dimension {r.name}"):
             d, wanted[r.name] = _dimension(body, r)
         drawn.append(d)
     return with_dimensions(replace(body, dimensions=tuple(drawn)), wanted)
