@@ -21,8 +21,7 @@ from kinefit.errors import KinefitError
 from kinefit.evaluation import angle_errors
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.readers.calibration.found import read_found
-from kinefit.readers.calibration.read import read_calibration
+from kinefit.readers.calibration.read import read_calibration, read_found
 from kinefit.readers.guess.folder import guess_take
 from kinefit.takes.missing import cameras_file
 

@@ -19,7 +19,7 @@ from kinefit.observations import Detections
 from kinefit.readers.annotations import Clicks, read_clicks
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.ros import recordings
-from kinefit.readers.ros.rig import shown
+from kinefit.readers.ros.images import shown
 from kinefit.readers.skeletons.characters import _order, read_character
 from kinefit.readers.skeletons.gltf import read_gltf
 from kinefit.readers.video import Video

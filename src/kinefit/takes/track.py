@@ -16,7 +16,7 @@ from kinefit.identification.take.takes import with_names
 from kinefit.motion import Motion
 from kinefit.multiview.association import choose_people, person_records
 from kinefit.multiview.followed import follow
-from kinefit.readers.calibration.found import found_notes
+from kinefit.readers.calibration.read import found_notes
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.checks import check_enough
 from kinefit.readers.take.file import Take, read_take

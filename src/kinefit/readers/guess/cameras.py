@@ -17,8 +17,8 @@ from kinefit.observations.clocks import frame_times, is_even, on_steps, steps_of
 from kinefit.readers.guess import views as guess_views
 from kinefit.readers.guess.draft import Draft, Value
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile, KeypointFile
-from kinefit.readers.guess.keypoints import keypoint_entries, keypoint_sources, read_sources
 from kinefit.readers.guess.names import HOW, Trial, trials
+from kinefit.readers.guess.views import keypoint_entries, keypoint_sources, read_sources
 from kinefit.readers.take.cameras import DEFAULT_FIELD_OF_VIEW
 from kinefit.readers.take.checks import ONE_CAMERA
 from kinefit.readers.video import Video, common_frames

@@ -17,7 +17,7 @@ from kinefit.readers.guess.draft import Draft, Entry, Note, Value
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile
 from kinefit.readers.guess.names import trials
 from kinefit.readers.markers import read_markers
-from kinefit.readers.ros.rig import Shown, mcap_rig, shown
+from kinefit.readers.ros.images import Shown, mcap_rig, shown
 
 _CALIBRATE = (
     "Calibrate with a board (kinefit calibrate board) or, if the cameras' intrinsics are known, from the person "

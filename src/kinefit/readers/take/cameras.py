@@ -10,8 +10,7 @@ import numpy as np
 from kinefit.errors import CalibrationError, TakeError, choices
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
 from kinefit.motion import UP_AXES
-from kinefit.readers.calibration.found import found_notes
-from kinefit.readers.calibration.read import read_calibration
+from kinefit.readers.calibration.read import found_notes, read_calibration
 from kinefit.readers.take.entries import CameraEntry, Take
 from kinefit.readers.video import Video
 

@@ -30,7 +30,7 @@ from kinefit.observations import (
     SurfacePointVideo,
 )
 from kinefit.observations.clocks import frame_times, is_even, on_steps
-from kinefit.readers.calibration.found import found_notes
+from kinefit.readers.calibration.read import found_notes
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoint_sets import FACE_SET
 from kinefit.readers.keypoints import read_keypoints
