@@ -132,6 +132,7 @@ def read_text(
         return regular(path).read_text("utf-8-sig", errors)
     except (OSError, ValueError) as problem:
         reason = getattr(problem, "strerror", None) or problem
+        remedy = "Check the path." if isinstance(problem, FileNotFoundError) else remedy
         raise error(f"cannot read {what} ({reason})", file=path, remedy=remedy) from problem
 
 

@@ -126,10 +126,8 @@ def cut_frames(items: Any, frames: tuple[int, int] | None, file: Path) -> tuple[
     if frames is None:
         return items, 0
     if not 0 <= frames[0] < frames[1] <= len(items):
-        raise ObservationError(
-            f"frames [{frames[0]}, {frames[1]}] of {len(items)}", file=file,
-            remedy=f"Give frames within [0, {len(items)}].",
-        )
+        problem = f"frames [{frames[0]}, {frames[1]}] of {len(items)}"
+        raise ObservationError(problem, file=file, remedy=f"Give frames within [0, {len(items)}].")
     return items[frames[0] : frames[1]], frames[0]
 
 

@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import msgspec
 
 from kinefit._arguments import checked
-from kinefit._files import BACKSLASHES, LENGTHS, TIMES, parse_toml, regular, worth
+from kinefit._files import BACKSLASHES, LENGTHS, TIMES, parse_toml, read_text, worth
 from kinefit.errors import (
     FileError,
     KinefitError,
@@ -54,12 +54,9 @@ def read_take(path: str | PathLike[str]) -> Take:
         Unknown sensors, keys or values (the message lists what exists), no sensor at all, names that do not agree.
     """
     path = find_take(path).absolute()
-    try:
-        raw = parse_toml(regular(path).read_text(encoding="utf-8"), path)
-    except FileNotFoundError as error:
-        raise FileError("no such take file", file=path, remedy="Check the path.") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileError(f"cannot be read ({error})", file=path, remedy="Give a text file in UTF-8.") from error
+    if not path.exists():
+        raise FileError("no such take file", file=path, remedy="Check the path.")
+    raw = parse_toml(read_text(path, "the take file", remedy="Give a text file in UTF-8."), path)
     digest = hashlib.sha256(json.dumps(raw, sort_keys=True, default=str).encode()).hexdigest()
     _tidy(raw, path)
     head = raw.pop("take", {}) | {"path": path, "digest": digest}
@@ -188,8 +185,8 @@ def is_take(file: Path) -> bool:
     if file.name == "take.toml":
         return True
     try:
-        tables = parse_toml(regular(file).read_text("utf-8"), file)
-    except (OSError, UnicodeDecodeError, KinefitError):
+        tables = parse_toml(read_text(file, "it", remedy=""), file)
+    except KinefitError:
         return False
     return bool(set(tables) - {"calibration"}) and not set(tables) - set(TABLES)  # which calibrations have, too
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import regular
+from kinefit._files import read_text
 from kinefit.errors import FileError, ObservationError, TakeError, choices
 from kinefit.geometry.camera import ImageFrame
 from kinefit.observations import ClickVideo, LineVideo
@@ -63,14 +63,14 @@ def read_lines(path: Path, names: Iterable[str]) -> tuple[NDArray, NDArray]:
 def _rows(path: Path) -> Iterable[tuple[str, Mapping[str, Any]]]:
     """Rows of a table, each with its place for messages."""
     try:
-        text = regular(path).read_text(encoding="utf-8-sig")
+        text = read_text(path, "the lines", remedy=_REMEDY)
         if path.suffix.lower() == ".json":
             content = json.loads(text)
             if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
                 raise FileError("not a list of objects", file=path, remedy=_REMEDY)
             return [(f"entry {i}", row) for i, row in enumerate(content)]
         return [(f"line {i}", row) for i, row in enumerate(csv.DictReader(text.splitlines()), 2)]
-    except (OSError, ValueError, RecursionError, csv.Error) as error:
+    except (ValueError, RecursionError, csv.Error) as error:
         raise FileError(f"cannot read the lines ({error})", file=path, remedy=_REMEDY) from error
 
 

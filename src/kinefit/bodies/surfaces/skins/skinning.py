@@ -5,7 +5,6 @@ x_world = Σ_k w_k (R_k x_k + t_k). If one segment owns a node, its joints are P
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit._files import regular
+from kinefit._files import read_text
 from kinefit.bodies.surfaces.mesh import MAX_LENGTH, UNITS, check_triangles, read_obj
 from kinefit.bodies.surfaces.skins import _kernels_skinning as kernels
 from kinefit.bodies.surfaces.triangles import BodyMesh
@@ -205,15 +204,12 @@ def read_weights(path: Path, count: int, tree: KinematicTree) -> NDArray:
     BodyError
         A file that cannot be read, an invalid line, an unknown segment or vertex, a duplicate weight.
     """
-    try:
-        lines = list(csv.reader(regular(path).read_text(encoding="utf-8-sig").splitlines()))
-    except (OSError, ValueError, csv.Error) as error:
-        remedy = "Give the path of a CSV file with lines of vertex, segment, weight."
-        problem = f"cannot read the weights ({getattr(error, 'strerror', None) or error})"
-        raise BodyError(problem, file=path, remedy=remedy) from error
+    remedy = "Give the path of a CSV file with lines of vertex, segment, weight."
+    text = read_text(path, "the weights", remedy=remedy, error=BodyError)
+    lines = [line.split(",") for line in text.splitlines()]
     out = np.full((count, len(tree.segments)), np.nan)
     for number, line in enumerate(lines, 1):
-        cells = [cell.strip() for cell in line]
+        cells = [cell.strip(' \t"') for cell in line]
         if not any(cells) or (number == 1 and not cells[0].isdigit()):
             continue
         with located(path, f"line {number}"):
