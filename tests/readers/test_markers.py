@@ -263,7 +263,7 @@ def test_missing_and_foreign_files(tmp_path):
     (tmp_path / "a.c3d").write_bytes(b"")
     with pytest.raises(FileError, match="not a C3D file"):
         read_markers(tmp_path / "a.c3d")
-    with pytest.raises(FileError, match="cannot be read"):
+    with pytest.raises(FileError, match="is not a file"):
         read_markers(tmp_path)
 
 

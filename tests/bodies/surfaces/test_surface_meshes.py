@@ -110,8 +110,8 @@ def test_millimetres_taken_for_metres_are_noticed(tmp_path):
     with pytest.raises(BodyError, match='300 m long.*unit = "mm"'):
         mesh_surface(path, 0)
     np.testing.assert_allclose(mesh_surface(path, 0, unit="mm").vertices, V)
-    with pytest.raises(BodyError, match="no unit 'inch'"):
-        mesh_surface(path, 0, unit="inch")
+    with pytest.raises(BodyError, match="no unit 'yard'"):
+        mesh_surface(path, 0, unit="yard")
 
 
 BODY = """

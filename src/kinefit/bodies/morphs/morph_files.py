@@ -11,10 +11,11 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from kinefit._files import LENGTHS
 from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph, Steering
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
 from kinefit.bodies.surfaces.files import SurfaceRecord, surfaces_of
-from kinefit.bodies.surfaces.mesh import UNITS, read_obj
+from kinefit.bodies.surfaces.mesh import read_obj
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError, check_choice, located
 from kinefit.geometry import se3
@@ -94,9 +95,9 @@ def _morph(record: MorphRecord, tree: KinematicTree, source: str) -> Operator:
         surfaces = surfaces_of(record.surface, tree.segment(record.segment), source, "surface")
         return SegmentMorph(record.segment, tuple(surfaces), steering)
     unit = record.unit or "m"
-    check_choice("unit", unit, UNITS, BodyError, remedy="Use one of these.")
+    check_choice("unit", unit, LENGTHS, BodyError, remedy="Use one of these.")
     vertices, _ = read_obj(Path(source).parent / str(record.target))
-    return GlobalMorph(UNITS[unit] * vertices, steering)
+    return GlobalMorph(LENGTHS[unit] * vertices, steering)
 
 
 def _check_keys(record: MorphRecord) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit._files import read_text
+from kinefit._files import LENGTHS, read_text
 from kinefit.bodies.surfaces.closest.grid import DistanceGrid, cell_size, distance_grid, parts
 from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface, levels
 from kinefit.errors import BodyError, check_choice, located
@@ -182,7 +182,6 @@ def tube_faces(along: int, around: int) -> NDArray:
     return np.concatenate([sides, low, high])
 
 
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 MAX_LENGTH = 10.0  # [m] of a segment's mesh; a longer one is in another unit
 
 
@@ -262,14 +261,14 @@ def surface_of_file(
     BodyError
         As `mesh_surface`.
     """
-    check_choice("unit", unit, UNITS, BodyError, file=path, place=place, remedy="Give one of these.")
+    check_choice("unit", unit, LENGTHS, BodyError, file=path, place=place, remedy="Give one of these.")
     with located(path, place):
         shape, nodes = read()
         series = None
         if isinstance(shape, np.ndarray):
-            vertices, faces = UNITS[unit] * shape, nodes
+            vertices, faces = LENGTHS[unit] * shape, nodes
         else:
-            series = replace(shape, coefficients=UNITS[unit] * shape.coefficients)
+            series = replace(shape, coefficients=LENGTHS[unit] * shape.coefficients)
             vertices, faces = series.triangles(nodes)
         length = float(np.ptp(vertices, axis=0).max())
         if length > MAX_LENGTH:

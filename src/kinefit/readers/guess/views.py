@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import LENGTHS
 from kinefit.errors import KinefitError, ObservationError
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.geometry.triangulation import triangulate_robust
@@ -34,7 +35,7 @@ _BONES = {  # [m] in a person of 1.75 m (Winter 2009, table 4.1: shares of the s
     ("shoulder", "elbow"): 0.186 * 1.75, ("elbow", "wrist"): 0.146 * 1.75, ("hip", "knee"): 0.245 * 1.75,
     ("knee", "ankle"): 0.246 * 1.75, ("shoulder", "hip"): 0.288 * 1.75,
 }  # fmt: skip
-_UNITS = {"m": 1.0, "dm": 10.0, "inch": 39.37, "cm": 100.0, "mm": 1000.0}
+_UNITS = {unit: 1.0 / LENGTHS[unit] for unit in ("m", "dm", "inch", "cm", "mm")}
 _MAX_SIZE_RATIO = 1.45  # people differ by 1.25 in size; detectors and partly occluded bones add to it
 
 

@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit._files import read_text
-from kinefit.bodies.surfaces.mesh import MAX_LENGTH, UNITS, check_triangles, read_obj
+from kinefit._files import LENGTHS, read_text
+from kinefit.bodies.surfaces.mesh import MAX_LENGTH, check_triangles, read_obj
 from kinefit.bodies.surfaces.skins import _kernels_skinning as kernels
 from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.bodies.tree import KinematicTree
@@ -180,9 +180,9 @@ def skin_of(record: SkinRecord | None, tree: KinematicTree, source: str) -> Skin
         return None
     mesh, table = (Path(source).parent / name for name in (record.mesh, record.weights))
     with located(source, "skin"):
-        check_choice("unit", record.unit, UNITS, BodyError, remedy="Use one of these.")
+        check_choice("unit", record.unit, LENGTHS, BodyError, remedy="Use one of these.")
         vertices, faces = read_obj(mesh)
-        vertices = UNITS[record.unit] * vertices
+        vertices = LENGTHS[record.unit] * vertices
         if (size := float(np.ptp(vertices, axis=0).max())) > MAX_LENGTH:
             remedy = 'State the unit of its file, such as unit = "mm".'
             raise BodyError(f"the skin is {size:.4g} m long", file=mesh, remedy=remedy)
