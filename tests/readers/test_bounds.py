@@ -192,7 +192,7 @@ def gltf(tmp_path, binary=b"", **more):
 def test_nodes_are_ordered_in_one_pass(monkeypatch):
     monkeypatch.setattr(np, "flatnonzero", lambda *_: pytest.fail("a search among all nodes for each of them"))
     parents = np.array([1, -1, 1, 0, 3])
-    assert _order(parents, Path("a")).tolist() == [1, 0, 2, 3, 4]
+    assert _order(parents).tolist() == [1, 0, 2, 3, 4]
 
 
 def test_more_nodes_than_any_character_has_are_told(tmp_path):
@@ -244,7 +244,7 @@ def test_a_character_carries_off_no_file_from_outside_of_its_folder(tmp_path, ur
     folder.mkdir()
     tree = {"asset": {"version": "2.0"}, "nodes": [{}], "images": [{"uri": uri}]}
     (folder / "a.gltf").write_text(json.dumps(tree))
-    with pytest.raises(FileError, match=r"outside of its folder|cannot be read"):
+    with pytest.raises(FileError, match=r"outside of its folder|no such file|cannot be read"):
         read_gltf(folder / "a.gltf")
 
 

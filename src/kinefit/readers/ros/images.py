@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._pictures import check_image_size, decode_picture
-from kinefit.errors import CalibrationError, FileError, ObservationError
+from kinefit.errors import CalibrationError, FileError, ObservationError, names_file
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.readers.depth.images import DepthSource
@@ -51,7 +51,7 @@ def is_colour(message: Any) -> bool:
     return encoding(message) in COLOURS or (message is not None and encoding(message) in ("jpeg", "png"))
 
 
-def counts(message: Any, path: Path) -> NDArray:
+def counts(message: Any) -> NDArray:
     """(H, W) depth as recorded, in counts or metres; 0 or NaN at pixels without a measurement.
 
     Raises
@@ -60,11 +60,11 @@ def counts(message: Any, path: Path) -> NDArray:
         A damaged image.
     """
     if hasattr(message, "encoding"):
-        return _raw(message, np.dtype({"16UC1": "u2", "32FC1": "f4"}[message.encoding]), 1, path)[..., 0]
+        return _raw(message, np.dtype({"16UC1": "u2", "32FC1": "f4"}[message.encoding]), 1)[..., 0]
     data = bytes(message.data)
-    image = decode_picture(data[_HEADER_BYTES:], cv2.IMREAD_UNCHANGED, file=path, place="a compressed depth image")
+    image = decode_picture(data[_HEADER_BYTES:], cv2.IMREAD_UNCHANGED, file="", place="a compressed depth image")
     if image.ndim != 2 or image.dtype != np.uint16:
-        raise FileError("a compressed depth image that is no PNG of 16 bits", file=path, remedy="Record it raw.")
+        raise FileError("a compressed depth image that is no PNG of 16 bits", remedy="Record it raw.")
     if encoding(message) == "32FC1":  # inverse depth in steps (compressed_depth_image_transport)
         _, a, b = struct.unpack_from("<iff", data)
         with np.errstate(divide="ignore"):
@@ -72,7 +72,7 @@ def counts(message: Any, path: Path) -> NDArray:
     return image
 
 
-def colours(message: Any, path: Path) -> NDArray[np.uint8]:
+def colours(message: Any) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 RGB.
 
     Raises
@@ -81,23 +81,23 @@ def colours(message: Any, path: Path) -> NDArray[np.uint8]:
         A damaged image.
     """
     if not hasattr(message, "encoding"):
-        return decode_picture(bytes(message.data), file=path, place=f"a compressed image ({message.format})")
+        return decode_picture(bytes(message.data), file="", place=f"a compressed image ({message.format})")
     kind = str(message.encoding)
-    image = _raw(message, np.dtype("u1"), _CHANNELS.get(kind, 1), path)
+    image = _raw(message, np.dtype("u1"), _CHANNELS.get(kind, 1))
     change = COLOURS[kind]
     image = image if image.shape[2] > 1 else image[..., 0]
     return image if change is None else np.asarray(cv2.cvtColor(image, change), np.uint8)
 
 
-def _raw(message: Any, kind: np.dtype, channels: int, path: Path) -> NDArray:
+def _raw(message: Any, kind: np.dtype, channels: int) -> NDArray:
     """(H, W, channels) of an uncompressed image."""
     kind = kind.newbyteorder(">" if message.is_bigendian else "<")
     height, width, step = int(message.height), int(message.width), int(message.step)
-    check_image_size((width, height), path, "an image")
+    check_image_size((width, height), "", "an image")
     data, row = bytes(message.data), width * channels * kind.itemsize
     if not (height and width and step >= row and len(data) == height * step):
         problem = f"{len(data)} bytes for {width}x{height} px, {step} bytes a row"
-        raise FileError(problem, file=path, remedy="The recording is damaged: copy it again.")
+        raise FileError(problem, remedy="The recording is damaged: copy it again.")
     rows = np.ascontiguousarray(np.frombuffer(data, np.uint8).reshape(height, step)[:, :row])
     return rows.view(kind).reshape(height, width, channels)
 
@@ -118,7 +118,7 @@ def info_of(topics: Topics, image: str) -> Any:
     return None if topic is None else topics.first(topic)
 
 
-def camera(info: Any, name: str, size: tuple[int, ...], path: Path, *, rectified: bool = False) -> Camera | None:
+def camera(info: Any, name: str, size: tuple[int, ...], *, rectified: bool = False) -> Camera | None:
     """The camera of a CameraInfo, at the origin; None if it is not calibrated.
 
     Parameters
@@ -144,7 +144,7 @@ def camera(info: Any, name: str, size: tuple[int, ...], path: Path, *, rectified
     if (lens and info.distortion_model not in _LENS_MODELS) or part or (info.width, info.height) != tuple(size):
         stated = f"its CameraInfo has {info.width}x{info.height} px and the lens model '{info.distortion_model}'"
         problem = f"{stated}{', of a part of the image' if part else ''}; its images have {size[0]}x{size[1]} px"
-        raise CalibrationError(problem, file=path, remedy="Give intrinsics, and rectified images.")
+        raise CalibrationError(problem, remedy="Give intrinsics, and rectified images.")
     return Camera(name, (int(size[0]), int(size[1])), K, lens if any(lens) else ())  # type: ignore[arg-type]
 
 
@@ -165,7 +165,7 @@ def refuse_encoding(topics: Topics, topic: str | None, wanted: str, known: tuple
         found = encoding(topics.first(topic)) or "nothing"
         if found not in known:
             remedy = f"{wanted} is read from {', '.join(known)}."
-            raise ObservationError(f"topic {topic} has images of {found}, no {wanted}", file=topics.path, remedy=remedy)
+            raise ObservationError(f"topic {topic} has images of {found}, no {wanted}", remedy=remedy)
 
 
 def mcap_source(path: Path, name: str, topic: str | None = None) -> DepthSource:
@@ -184,20 +184,17 @@ def mcap_source(path: Path, name: str, topic: str | None = None) -> DepthSource:
         A lens model that OpenCV lacks, or a cropped image.
     """
     with reading(path) as reader:
-        topics = Topics(reader, path)
+        topics = Topics(reader)
         firsts = {t: topics.first(t) for t in topics.of(IMAGE, COMPRESSED)}
         deep = {t: first for t, first in firsts.items() if encoding(first) in UNITS}
         refuse_encoding(topics, topic, "depth", tuple(UNITS))
         topic = topics.chosen(topic, deep, "depth images (16UC1, 32FC1)", name)
         times, logged = topics.times(topic)
         info, first = info_of(topics, topic), deep[topic]
-        size = counts(first, path).shape[::-1]
-        seen_by = None if info is None else camera(info, name, size, path, rectified=is_rectified(topic))
-    messages = Messages(path, topic, logged)
-    return DepthSource(
-        len(times), lambda i: counts(messages(i), path).astype(np.float32), (size[0], size[1]), UNITS[encoding(first)],
-        True, times, seen_by,
-    )  # fmt: skip
+        size = counts(first).shape[::-1]
+        seen_by = None if info is None else camera(info, name, size, rectified=is_rectified(topic))
+    images = Messages(path, topic, logged, lambda message: counts(message).astype(np.float32))
+    return DepthSource(len(times), images, (size[0], size[1]), UNITS[encoding(first)], True, times, seen_by)
 
 
 _MAX_GAP_S = 0.5  # without an image, or three frames if that is longer
@@ -226,29 +223,28 @@ class McapVideo:
 
     def __init__(self, path: Path, topic: str | None) -> None:
         with reading(path) as reader:
-            topics = Topics(reader, path)
+            topics = Topics(reader)
             fitting = [t for t in topics.of(IMAGE, COMPRESSED) if is_colour(topics.first(t))]
             refuse_encoding(topics, topic, "image", (*COLOURS, "jpeg", "png"))
             self.topic = topics.chosen(topic, fitting, "images in colour or grey")
             times, logged = topics.times(self.topic)
-            first = colours(topics.first(self.topic), path)
-        rate = median_rate(times, self.topic, path)
-        gaps = np.flatnonzero(np.diff(times, prepend=0.0) > max(_MAX_GAP_S, 3.0 / rate))
-        if len(gaps):
-            begin, end = (0.0, *times)[gaps[0]], times[gaps[0]]
-            raise ObservationError(
-                f"no image on the topic {self.topic} from {begin:.2f} to {end:.2f} s", file=path,
-                remedy="Cut the recording to the time that all its cameras share: `mcap filter`.",
-            )  # fmt: skip
+            first = colours(topics.first(self.topic))
+            rate = median_rate(times, self.topic)
+            gaps = np.flatnonzero(np.diff(times, prepend=0.0) > max(_MAX_GAP_S, 3.0 / rate))
+            if len(gaps):
+                begin, end = (0.0, *times)[gaps[0]], times[gaps[0]]
+                problem = f"no image on the topic {self.topic} from {begin:.2f} to {end:.2f} s"
+                remedy = "Cut the recording to the time that all its cameras share: `mcap filter`."
+                raise ObservationError(problem, remedy=remedy)
+            if times[-1] * rate > _MAX_REPEATS * len(times):
+                problem = f"the images on the topic {self.topic} come in bursts at {rate:.6g} Hz, with gaps between"
+                raise ObservationError(problem, remedy="Record them with the times at which they were taken.")
         self.path, self.size = path, (int(first.shape[1]), int(first.shape[0]))
         self.rate = round(rate, 6)
-        if times[-1] * self.rate > _MAX_REPEATS * len(times):
-            problem = f"the images on the topic {self.topic} come in bursts at {self.rate:g} Hz, with gaps between"
-            raise ObservationError(problem, file=path, remedy="Record them with the times at which they were taken.")
         at = np.arange(round(times[-1] * self.rate) + 1) / self.rate
         after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
         self._shown = np.where(at - times[after - 1] <= times[after] - at + 1e-6, after - 1, after)
-        self._messages, self._last = Messages(path, self.topic, logged), (0, first)
+        self._messages, self._last = Messages(path, self.topic, logged, colours), (0, first)
 
     def __len__(self) -> int:
         return len(self._shown)
@@ -266,7 +262,7 @@ class McapVideo:
         """Frame `i` as (H, W, 3) uint8 RGB; raises ObservationError for an image of another size."""
         number = int(self._shown[i])
         if number != self._last[0]:
-            image = colours(self._messages(number), self.path)
+            image = self._messages(number)
             if image.shape[1::-1] != self.size:
                 problem = f"{image.shape[1]}x{image.shape[0]} px, but the first image has {self.size[0]}x{self.size[1]}"
                 remedy = "All images of a camera must have one size."
@@ -278,6 +274,7 @@ class McapVideo:
 _STATIC = "/tf_static"
 
 
+@names_file
 def mcap_rig(path: Path) -> Rig:
     """Read every camera with a CameraInfo; its name is the shortest unique end of the topic's folder.
 
@@ -294,21 +291,21 @@ def mcap_rig(path: Path) -> Rig:
         As `readers.ros.recordings.reading`.
     """
     with reading(path) as reader:
-        topics = Topics(reader, path)
+        topics = Topics(reader)
         infos, names = _infos(topics), camera_names(topics)
         tree = _tree(topics) if _STATIC in topics.kinds else {}
         images = topics.of(IMAGE, COMPRESSED)
         if not infos:
             remedy = "Record camera_info of each camera."
-            raise CalibrationError("no topic of it has a CameraInfo", file=path, remedy=remedy)
+            raise CalibrationError("no topic of it has a CameraInfo", remedy=remedy)
         cameras = []
         for folder, info in infos.items():
             in_folder = [topic for topic in images if topic.startswith(f"{folder}/")]
             rectified = bool(in_folder) and all(is_rectified(topic) for topic in in_folder)
-            found = camera(info, names[folder], (int(info.width), int(info.height)), path, rectified=rectified)
+            found = camera(info, names[folder], (int(info.width), int(info.height)), rectified=rectified)
             if found is None:
                 problem = f"the CameraInfo of {folder} is not calibrated"
-                raise CalibrationError(problem, file=path, remedy="Calibrate the camera, or record without this topic.")
+                raise CalibrationError(problem, remedy="Calibrate the camera, or record without this topic.")
             cameras.append(found)
         frames = [str(info.header.frame_id).lstrip("/") for info in infos.values()]
     if len(frames) == 1 and frames[0] not in tree:
@@ -318,7 +315,7 @@ def mcap_rig(path: Path) -> Rig:
         if root != roots[0][0]:
             raise CalibrationError(
                 f"no transform in {_STATIC} between the frames {frames[0]} (below {roots[0][0]}) and {frame} "
-                f"(below {root})", file=path, remedy=f"Record {_STATIC}, and publish where each camera stands.",
+                f"(below {root})", remedy=f"Record {_STATIC}, and publish where each camera stands.",
             )  # fmt: skip
     return Rig(tuple(_placed(c, T) for c, (_, T) in zip(cameras, roots)))
 
@@ -409,7 +406,7 @@ def shown(path: Path) -> list[Shown]:
     """
     out: dict[tuple[str, bool], Shown] = {}
     with reading(path) as reader:
-        topics = Topics(reader, path)
+        topics = Topics(reader)
         names = camera_names(topics)
         for topic in sorted(topics.of(IMAGE, COMPRESSED), key=lambda name: (is_rectified(name), len(name), name)):
             first = topics.first(topic)
@@ -417,7 +414,7 @@ def shown(path: Path) -> list[Shown]:
             times = topics.times(topic)[0] if deep or is_colour(first) else np.zeros(0)
             if len(times) > 1:
                 folder = (info_topic(topics, topic) or "").rpartition("/")[0]
-                rate = round(median_rate(times, topic, path), 3)
+                rate = round(median_rate(times, topic), 3)
                 found = Shown(topic, deep, names.get(folder), len(times), rate)
                 out.setdefault((found.name, deep), found)
     return sorted(out.values(), key=lambda found: found.topic)
