@@ -181,7 +181,7 @@ def _frame_of_static(
         describe_cameras(aside, calibration, still, points)
     except KinefitError:
         return None
-    found = next((entry["frame"] for _, entry in aside.keypoints if "frame" in entry), None)
+    found = next((entry["frame"] for _, entry in aside.tables["keypoints"] if "frame" in entry), None)
     if found is None or found.sure == "guess":
         return None
     return Value(found.value, "likely", f"as in the static trial, where {found.why}")

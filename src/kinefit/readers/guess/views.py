@@ -61,7 +61,7 @@ def guess_turn(rig: Rig, records: Mapping[str, Keypoints], sizes: Mapping[str, S
         images = {n: image_frame(rig[n].size, sizes[n], degrees, "scaled") for n in seen}
         x, residual = meet(rig, records, images)
         found = np.isfinite(x).all(-1).sum()
-        misses[degrees] = float(np.median(residual[np.isfinite(residual)])) / found if found else np.inf
+        misses[degrees] = _median(residual) / found if found else np.inf
     if misses and min(misses.values()) < _MAX_RESIDUAL_RATIO * max(misses.values()):
         best = min(misses, key=lambda degrees: misses[degrees])
         return Value(best, "likely", f"the keypoints of the cameras then agree; turned by {360 - best} they do not")
@@ -166,22 +166,25 @@ def keypoint_frame(
             if outside[other] > _MIN_OUTSIDE_SHARE > outside[frame]:
                 share = f"{100 * outside[other]:.1f} % of the points of {name} lie outside the {other}'s image"
                 return Value(frame, "sure" if outside[other] > 10 * _MIN_OUTSIDE_SHARE else "likely", share)
-    medians = {}
-    for frame in ("video", "calibration"):
-        residual = meet(rig, records, images if frame == "video" else {})[1]
-        medians[frame] = float(np.median(residual[np.isfinite(residual)])) if np.isfinite(residual).any() else np.nan
-    if not np.isfinite(list(medians.values())).all():
-        return Value("video", "guess", "detectors run on the video; too few detections to check this")
-    best, other = sorted(medians, key=lambda name: medians[name])
-    why = f"the cameras agree to {medians[best]:.1f} px; in the {other}'s image, to {medians[other]:.1f} px"
-    if medians[best] < _MAX_RESIDUAL_RATIO * medians[other]:
-        return Value(best, "likely", why)
-    for frame in medians:
-        residual = meet(rig, records, images if frame == "video" else {}, offset_rounds=_OFFSET_ROUNDS)[1]
-        medians[frame] = float(np.median(residual[np.isfinite(residual)]))
-    best, other = sorted(medians, key=lambda name: medians[name])
+    for rounds in (0, _OFFSET_ROUNDS):
+        medians = {
+            frame: _median(meet(rig, records, images if frame == "video" else {}, offset_rounds=rounds)[1])
+            for frame in ("video", "calibration")
+        }
+        if not np.isfinite(list(medians.values())).all():
+            return Value("video", "guess", "detectors run on the video; too few detections to check this")
+        best, other = sorted(medians, key=lambda name: medians[name])
+        if not rounds and medians[best] < _MAX_RESIDUAL_RATIO * medians[other]:
+            why = f"the cameras agree to {medians[best]:.1f} px; in the {other}'s image, to {medians[other]:.1f} px"
+            return Value(best, "likely", why)
     why = f"{medians[best]:.2f} px; in the {other}'s image, to {medians[other]:.2f} px"
     return Value(best, "guess", f"a small difference: without each camera's bias the cameras agree to {why}")
+
+
+def _median(residual: NDArray) -> float:
+    """Median of the finite ones; NaN without one."""
+    finite = residual[np.isfinite(residual)]
+    return float(np.median(finite)) if len(finite) else np.nan
 
 
 def meet(
@@ -396,7 +399,7 @@ def keypoint_entries(
             entry["set"] = Value(record.keypoint_set, "likely" if of_two else "sure", why)
         if frame is not None and name in images:
             entry["frame"] = frame
-        draft.keypoints.append((active, entry))
+        draft.tables["keypoints"].append((active, entry))
 
 
 def _hands_seen(record: Keypoints) -> bool:
