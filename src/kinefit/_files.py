@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import ExportError, FileError, KinefitError, ObservationError, printable
+from kinefit.errors import ExportError, FileError, KinefitError, ObservationError, choices, printable
 
 _Record = TypeVar("_Record")
 _MIN_STEP_S = 1e-6  # between frames of a table; shorter or longer than its inverse, times are in another unit
@@ -421,3 +421,10 @@ def worth(unit: Any, units: dict[str, float]) -> float | None:
     if not isinstance(unit, str):
         return None
     return units.get(re.sub(r"^([cm]?)(?:enti|illi)?met(?:er|re)s?$", r"\1m", unit.strip().lower()).removesuffix("es"))
+
+
+def metres_of(unit: str, error: type[KinefitError], what: str = "unit", **more: Any) -> float:
+    """Metres of a unit of length; `error`, with the units that there are, for any other."""
+    if (metres := worth(unit, LENGTHS)) is None:
+        raise error(choices(what, unit, LENGTHS), **more)
+    return metres

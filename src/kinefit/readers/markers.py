@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit._files import LENGTHS, read_bytes, worth
-from kinefit.errors import FileError, ObservationError, choices, names_file, shortened
+from kinefit._files import metres_of, read_bytes
+from kinefit.errors import FileError, ObservationError, names_file, shortened
 from kinefit.observations import MarkerEvent, Markers
 from kinefit.readers.c3d_file import C3d, read_c3d
 
@@ -65,11 +65,7 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
 def _metres(unit: str | None) -> float:
     if not unit:
         raise ObservationError("the file states no unit", place="units", remedy=_STATE)
-    metres = worth(unit, LENGTHS)
-    if metres is None:
-        problem = choices("unit", unit, LENGTHS)
-        raise ObservationError(problem, place="units", remedy=_STATE)
-    return metres
+    return metres_of(unit, ObservationError, place="units", remedy=_STATE)
 
 
 def _unique(names: list[str]) -> tuple[str, ...]:

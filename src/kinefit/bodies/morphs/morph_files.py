@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from kinefit._files import LENGTHS
+from kinefit._files import metres_of
 from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph, Steering
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
 from kinefit.bodies.surfaces.files import SurfaceRecord, surfaces_of
@@ -94,10 +94,9 @@ def _morph(record: MorphRecord, tree: KinematicTree, source: str) -> Operator:
         assert record.segment
         surfaces = surfaces_of(record.surface, tree.segment(record.segment), source, "surface")
         return SegmentMorph(record.segment, tuple(surfaces), steering)
-    unit = record.unit or "m"
-    check_choice("unit", unit, LENGTHS, BodyError, remedy="Use one of these.")
+    metres = metres_of(record.unit or "m", BodyError, remedy="Use one of these.")
     vertices, _ = read_obj(Path(source).parent / str(record.target))
-    return GlobalMorph(LENGTHS[unit] * vertices, steering)
+    return GlobalMorph(metres * vertices, steering)
 
 
 def _check_keys(record: MorphRecord) -> None:

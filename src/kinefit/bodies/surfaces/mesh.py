@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit._files import LENGTHS, read_text
+from kinefit._files import metres_of, read_text
 from kinefit.bodies.surfaces.closest.grid import DistanceGrid, cell_size, distance_grid, parts
 from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface, levels
-from kinefit.errors import BodyError, check_choice, located
+from kinefit.errors import BodyError, located
 
 WELD = 1e-6  # [m] distance below which corners are merged: the rounding of six decimals in a file
 
@@ -261,14 +261,14 @@ def surface_of_file(
     BodyError
         As `mesh_surface`.
     """
-    check_choice("unit", unit, LENGTHS, BodyError, file=path, place=place, remedy="Give one of these.")
     with located(path, place):
+        metres = metres_of(unit, BodyError, remedy="Give one of these.")
         shape, nodes = read()
         series = None
         if isinstance(shape, np.ndarray):
-            vertices, faces = LENGTHS[unit] * shape, nodes
+            vertices, faces = metres * shape, nodes
         else:
-            series = replace(shape, coefficients=LENGTHS[unit] * shape.coefficients)
+            series = replace(shape, coefficients=metres * shape.coefficients)
             vertices, faces = series.triangles(nodes)
         length = float(np.ptp(vertices, axis=0).max())
         if length > MAX_LENGTH:

@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 
 from kinefit._arguments import checked
-from kinefit._files import LENGTHS, parse_toml, read_bytes, read_text, worth, write_text
-from kinefit.errors import CalibrationError, FileError, choices, located
+from kinefit._files import metres_of, parse_toml, read_bytes, read_text, write_text
+from kinefit.errors import CalibrationError, FileError, located
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
 from kinefit.readers.calibration.colmap import colmap_cameras
@@ -292,11 +292,8 @@ def _factor(unit: str | float) -> float | None:
     if isinstance(unit, str):
         if unit == "auto":
             return None
-        metres = worth(unit, LENGTHS)
-        if metres is None:
-            remedy = "Use one of these, or a number of metres."
-            raise CalibrationError(choices("unit of length", unit, LENGTHS), remedy=remedy)
-        return metres
+        remedy = "Use one of these, or a number of metres."
+        return metres_of(unit, CalibrationError, "unit of length", remedy=remedy)
     if not (np.isfinite(unit) and unit > 0):
         raise CalibrationError(f"unit of length {unit}", remedy="Give a positive number of metres.")
     return float(unit)

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit._files import LENGTHS, read_text
+from kinefit._files import metres_of, read_text
 from kinefit.bodies.surfaces.mesh import MAX_LENGTH, check_triangles, read_obj
 from kinefit.bodies.surfaces.skins import _kernels_skinning as kernels
 from kinefit.bodies.surfaces.triangles import BodyMesh
@@ -180,9 +180,9 @@ def skin_of(record: SkinRecord | None, tree: KinematicTree, source: str) -> Skin
         return None
     mesh, table = (Path(source).parent / name for name in (record.mesh, record.weights))
     with located(source, "skin"):
-        check_choice("unit", record.unit, LENGTHS, BodyError, remedy="Use one of these.")
+        metres = metres_of(record.unit, BodyError, remedy="Use one of these.")
         vertices, faces = read_obj(mesh)
-        vertices = LENGTHS[record.unit] * vertices
+        vertices = metres * vertices
         if (size := float(np.ptp(vertices, axis=0).max())) > MAX_LENGTH:
             remedy = 'State the unit of its file, such as unit = "mm".'
             raise BodyError(f"the skin is {size:.4g} m long", file=mesh, remedy=remedy)
