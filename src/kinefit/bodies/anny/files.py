@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from kinefit._files import read_npz, writing
 from kinefit._jit import cache_directory
@@ -197,6 +196,8 @@ def nearest_on_triangles(x: NDArray, vertices: NDArray, faces: NDArray, tried: i
 
     Searches the `tried` triangles with the nearest centres, as all triangles have about the same size here.
     """
+    from scipy.spatial import cKDTree
+
     corners, share = np.empty((len(x), 3), np.int64), np.empty((len(x), 3))
     near = cKDTree(vertices[faces].mean(1)).query(x, min(tried, len(faces)))[1].reshape(len(x), -1)
     for i, point in enumerate(x):
