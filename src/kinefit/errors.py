@@ -66,7 +66,8 @@ def located(file: str | PathLike[str] | None = None, place: str | None = None) -
         yield
     except KinefitError as error:
         where = ", ".join(part for part in (place, error.place) if part)
-        raise type(error)(error.problem, file=error.file or file, place=where or None, remedy=error.remedy) from error
+        again = type(error)(error.problem, file=error.file or file, place=where or None, remedy=error.remedy)
+        raise again from error.__cause__ or error
 
 
 def names_file(read: F) -> F:
