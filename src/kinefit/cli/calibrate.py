@@ -233,7 +233,7 @@ def _distance(text: str | None) -> tuple[str, str, float] | None:
 
 def _write_table(result: BarCalibration, file: Path) -> None:
     """A row a parameter: camera, name, value, standard deviation, what it rests on."""
-    from kinefit.exporters.atomic import write_rows
+    from kinefit._files import write_rows
 
     rows: list[tuple[str, ...]] = [("camera", "parameter", "unit", "value", "std", "from")]
     for name, report in result.cameras.items():
@@ -250,7 +250,7 @@ def _write_picture(result: BarCalibration, file: Path) -> None:
     import cv2
     import numpy as np
 
-    from kinefit.exporters.atomic import write_image
+    from kinefit._files import write_image
 
     panels = []
     for c, camera in enumerate(result.rig):
@@ -342,8 +342,7 @@ def people(
     from kinefit.calibration.people.calibrate import calibrate_people
     from kinefit.preparing.take import with_detections
     from kinefit.readers.calibration.read import write_calibration
-    from kinefit.readers.take.file import read_take
-    from kinefit.readers.take.find import find_take
+    from kinefit.readers.take.file import find_take, read_take
     from kinefit.takes.track import load_keypoints
 
     take = find_take(take, wanted=("calibrate", "people"))

@@ -16,7 +16,7 @@ from kinefit.errors import TakeError, TrackingError, choices
 
 if TYPE_CHECKING:
     from kinefit.bodies import Body
-    from kinefit.readers.clicks import Clicks
+    from kinefit.readers.annotations import Clicks
     from kinefit.readers.take.file import Take
     from kinefit.readers.take.load import Observations
 
@@ -59,8 +59,8 @@ def init(
         raise click.UsageError("--step needs --click; a file of --points has its own step.")
     if body is not None and not (clicked or points):
         raise click.UsageError("--body needs --click or --points; without them, write body into the take file.")
+    from kinefit._files import write_text
     from kinefit.errors import TakeError, command
-    from kinefit.exporters.atomic import write_text
     from kinefit.readers.guess.folder import guess_take
 
     out = out or folder / "take.toml"
@@ -91,7 +91,7 @@ def init(
 
 def write_first_take(folder: Path) -> Path:
     """The take file of a folder that has none: guessed, shown, with the person's height where somebody answers."""
-    from kinefit.exporters.atomic import write_text
+    from kinefit._files import write_text
     from kinefit.readers.guess.folder import OPEN_HEIGHT, guess_take
 
     guess, out = guess_take(folder), folder / "take.toml"
@@ -139,7 +139,7 @@ def start_from_clicks(out: Path, points: Path | None, step: int | None, body: st
     body : name or file of the body
     """
     from kinefit.bodies import load_body
-    from kinefit.readers.clicks import read_clicks
+    from kinefit.readers.annotations import read_clicks
     from kinefit.readers.take.file import read_take
     from kinefit.readers.take.load import load_observations
     from kinefit.takes.missing import last_found
@@ -160,7 +160,7 @@ def _ask(out: Path, take: Take, seen: Observations, body: Body, step: int, brows
     import webbrowser
 
     from kinefit.initialization.from_clicks import clickable
-    from kinefit.readers.clicks import clicks_of
+    from kinefit.readers.annotations import clicks_of
     from kinefit.viewers.clicks import ClickPage
 
     def taken(clicks: Any) -> str:
@@ -206,10 +206,10 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, steps: Seque
     """Write body and start of the first step, and the clicks of all, to which the take file refers; what to tell."""
     import numpy as np
 
+    from kinefit._files import write_text
     from kinefit.bodies.serial import save_body
-    from kinefit.exporters.atomic import write_text
     from kinefit.initialization.from_clicks import clickable, clicked_points, clicked_start
-    from kinefit.readers.clicks import clicks_text
+    from kinefit.readers.annotations import clicks_text
 
     assert seen.rig is not None
     clicks = steps[0]

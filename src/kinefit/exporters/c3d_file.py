@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
+from kinefit._files import write_bytes, write_text
 from kinefit.errors import ExportError
-from kinefit.exporters.atomic import write_bytes, write_text
 from kinefit.exporters.opensim import trc_head
 from kinefit.exporters.skeletons.common import UNITS, bone_names, convention, length_factor, plain_names, turned
 from kinefit.exporters.tables import Curve, curves

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
+from kinefit._files import write_lines, writing
 from kinefit.bodies import Body
 from kinefit.bodies.serial import arrays_of, body_to_arrays
 from kinefit.errors import ExportError
-from kinefit.exporters.atomic import write_lines, writing
 from kinefit.exporters.skeletons.common import turned
 from kinefit.geometry import se3
 from kinefit.motion import Motion

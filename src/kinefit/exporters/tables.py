@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
+from kinefit._files import writing
 from kinefit.errors import ExportError, extra
-from kinefit.exporters.atomic import writing
 from kinefit.exporters.opensim import root_coordinates
 from kinefit.exporters.skeletons.common import UNITS, bone_names, euler_zxy, length_factor, turned
 from kinefit.motion import Motion

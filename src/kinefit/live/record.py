@@ -13,10 +13,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import regular
+from kinefit._files import regular, write_text
 from kinefit.bodies import Body
 from kinefit.errors import ExportError
-from kinefit.exporters.atomic import write_text
 from kinefit.exporters.motion_file import write_detections, write_motion
 from kinefit.geometry.camera import Rig
 from kinefit.live.packets import PosePacket

@@ -8,6 +8,7 @@ from typing import Any
 
 from nicegui import ui
 
+from kinefit._files import writing
 from kinefit.app.desk import Desk
 from kinefit.app.folders import SessionRow, recordings, subfolders, takes_below, video_files
 from kinefit.app.jobs import DONE, RUNNING
@@ -16,7 +17,6 @@ from kinefit.app.pages.take import use_folder
 from kinefit.app.review import Comparison
 from kinefit.app.texts import Texts
 from kinefit.errors import KinefitError, printable
-from kinefit.exporters.atomic import writing
 from kinefit.rendering import looks
 
 _MAX_UPLOAD_BYTES = 2**30  # of a dropped video; larger ones are opened where they are

@@ -9,6 +9,7 @@ from typing import Any
 
 from nicegui import ui
 
+from kinefit._files import write_text
 from kinefit.app.desk import Desk
 from kinefit.app.folders import NEW, OUTDATED, UNFINISHED, TakeFolder, video_files
 from kinefit.app.jobs import DONE, FAILED, PAUSED, RUNNING, WAITING, Job
@@ -29,13 +30,11 @@ from kinefit.app.people import PersonPicture
 from kinefit.app.texts import Texts
 from kinefit.batch import corrections
 from kinefit.errors import KinefitError
-from kinefit.exporters.atomic import write_text
 from kinefit.findings import Edit, in_words
 from kinefit.readers.guess.draft import Note
 from kinefit.readers.guess.folder import Guess, guess_take
 from kinefit.readers.take.entries import CameraEntry
-from kinefit.readers.take.file import Take, read_take
-from kinefit.readers.take.find import find_take, takes_in
+from kinefit.readers.take.file import Take, find_take, read_take, takes_in
 from kinefit.rendering.looks import to_hex
 
 _CARDS_REFRESH_S = 3.0  # between two looks at what is detected

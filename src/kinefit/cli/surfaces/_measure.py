@@ -37,9 +37,8 @@ from kinefit.photogrammetry.surface import MeasuredSurface
 from kinefit.photogrammetry.surface_tracking import SurfaceTracker, SurfaceTracking
 from kinefit.photogrammetry.trajectories import Trajectories, filtered
 from kinefit.readers.calibration.read import read_calibration
-from kinefit.readers.image_folders import images_in
 from kinefit.readers.motion import read_motion
-from kinefit.readers.video import Video
+from kinefit.readers.video import Video, images_in
 
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 

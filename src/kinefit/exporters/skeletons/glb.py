@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
+from kinefit._files import write_bytes, writing
 from kinefit.bodies import Body, MeshSurface
 from kinefit.bodies.surfaces import Surface
 from kinefit.errors import ExportError, extra
-from kinefit.exporters.atomic import write_bytes, writing
 from kinefit.exporters.skeletons.common import (
     UNITS,
     Rest,
