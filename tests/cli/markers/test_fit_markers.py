@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.exporters.opensim.test_files import poses_by_opensim, read_mot
+from tests.exporters.test_opensim import poses_by_opensim, read_mot
 
 from kinefit import Markers, read_markers, read_motion
 from kinefit.bodies import PointSet
