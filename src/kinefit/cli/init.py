@@ -79,8 +79,6 @@ def init(
             copies = hide_in_copies(out, progress, _screen.note)
         _screen.say(f"{len(copies)} copies with blurred faces: {copies[0].parent}. The originals are unchanged.")
     if clicked or points is not None:
-        from kinefit.cli.init import start_from_clicks
-
         start_from_clicks(out, points, step, body or "humanoid", browser)
     asked = any(note.about == "rate" and note.sure == "open" for note in guess.notes)
     alone = any(note.about == "cameras" and note.sure == "open" for note in guess.notes)

@@ -384,7 +384,6 @@ def retarget(
     recording: Path, asf: Path | None, out: Path | None, rate: float | None, table: Path | None, unit: str, up: str
 ) -> None:
     """Retarget a recorded motion to the humanoid, by the directions of its bones."""
-    from kinefit.cli.motions.simulate import check_recording, read_skeleton
     from kinefit.exporters import write_motion
     from kinefit.findings import of_provenance
     from kinefit.readers.skeletons.characters import read_names
