@@ -20,7 +20,7 @@ from kinefit import Motion, track_take
 from kinefit.exporters.report.ranges import ranges_of
 
 PARTS = {"sigma": "ranges of motion of five joints, from two and four cameras and from markers"}
-FIRST, DRAWS, FRAMES = 9000, 16, 90
+FIRST, DRAWS, FRAMES = 9000, 40, 90
 JOINTS = {"hip": "hip_flexion", "knee": "knee_angle", "ankle": "ankle_angle", "shoulder": "arm_flex",
           "elbow": "elbow_flex"}  # fmt: skip
 SETUPS = ("2 cameras", "4 cameras", "markers")
