@@ -21,10 +21,8 @@ import numpy as np
 from benchmarks.figures import amount, figure
 from benchmarks.long import write_long_take
 from kinefit.batch.cluster import run_there
-from kinefit.batch.find import RECORD
-from kinefit.batch.one import Choices
-from kinefit.batch.outcome import Row
-from kinefit.batch.work import TakeJob
+from kinefit.batch.one import Choices, TakeJob
+from kinefit.batch.summary import RECORD, Row
 
 TAKES = 10_000
 """Takes that the scheduler of Dask gets."""

@@ -14,11 +14,11 @@ from benchmarks.figures import data, figure
 from benchmarks.motions import library
 from benchmarks.tracking import DETECTORS, NOISE, TRIAL, take_text
 from kinefit import Keypoints, Motion, Rig
-from kinefit.calibration.check.check import check_take
 from kinefit.diagnostics.checks import Checked, check_keypoints
 from kinefit.diagnostics.timing import time_offsets
 from kinefit.diagnostics.views import make_views, with_sides_right
 from kinefit.simulation import simulate_keypoints, squat_and_wave, studio_rig
+from kinefit.takes.check import check_take
 
 FINE = 4  # frames of a recorded motion are one of the take: quarters of a frame are exact then
 LATE = (0.5, -0.25, 0.0, 0.0)  # [frames]

@@ -451,8 +451,8 @@ def _marker_set(folder: Path) -> Seed:
 
 def _subject(folder: Path) -> Seed:
     from kinefit.bodies.marker_sets import load_marker_set
-    from kinefit.identification.model.files import load_model, save_model
     from kinefit.identification.model.from_frame import model_from_frame
+    from kinefit.identification.model.model import load_model, save_model
 
     markers = load_marker_set("cmu_41")
     save_model(model_from_frame(markers.places, markers.labels, markers), folder / "anna.json")

@@ -28,7 +28,7 @@ from kinefit.evaluation import angle_errors
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.agreement import sentences as contradicting
+from kinefit.tracking.cameras import contradiction_sentences as contradicting
 from kinefit.tracking.cameras import sentences as moved
 
 FIRST, DRAWS, TURNED = 40, 20, 20

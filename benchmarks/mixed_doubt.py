@@ -1,9 +1,9 @@
 """What is called doubtful, and what is wrong: of segments in frames of all simulated takes (for `benchmarks.mixed`).
 
 An error is a segment of which an end (its joint centre, a child's, or where its surface ends) is farther than 8 cm from
-the truth. It is said where the segment is doubtful in that frame (`kinefit.exporters.report.doubt`); "said" counts what
-is lost, too. All takes count together: precision is the share of what is said that is an error, recall the share of the
-errors that is said. The limit was chosen on draws 0 to 35, one take of each: figures are of draws 36 and on.
+the truth. It is said where the segment is doubtful in that frame (`kinefit.exporters.report.moments`); "said" counts
+what is lost, too. All takes count together: precision is the share of what is said that is an error, recall the share
+of the errors that is said. The limit was chosen on draws 0 to 35, one take of each: figures are of draws 36 and on.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing import spool
 from kinefit.smoothing.smoother import smooth_results
 from kinefit.tracking import motions
-from kinefit.tracking.takes.take_recording import recording_of
+from kinefit.tracking.take_recording import recording_of
 
 GOALS = {"keypoints": 100.0, "all": 300.0}  # [kB] an hour at 30 Hz then needs 11 GB, ten minutes 5 GB
 PARTS = {"keypoints": ("keypoints",), "all": ("keypoints", "masks", "depth")}

@@ -30,7 +30,7 @@ from benchmarks.smoothing import acceleration_noise, peak_speeds
 from kinefit import Motion, track_take
 from kinefit.bodies import PointSet
 from kinefit.evaluation import angle_errors
-from kinefit.exporters.report.doubt import DOUBT_DISTANCE_M, contradicted, doubtful, end_sigmas
+from kinefit.exporters.report.moments import DOUBT_DISTANCE_M, contradicted, doubtful, end_sigmas
 
 MIXES: dict[str, tuple[str, ...]] = {
     "cameras": ("keypoints",),

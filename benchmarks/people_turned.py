@@ -25,7 +25,7 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.sensors.settings import CameraErrors, TrackSettings
 from kinefit.simulation import simulate_keypoints, studio_rig
-from kinefit.tracking.agreement import sentences as contradicting
+from kinefit.tracking.cameras import contradiction_sentences as contradicting
 from kinefit.tracking.cameras import sentences as moved
 from kinefit.tracking.video import track
 

@@ -18,7 +18,7 @@ from benchmarks.mixed_takes import record, take_text, write
 from benchmarks.setups import around
 from kinefit import Motion, track_take
 from kinefit.evaluation import angle_errors
-from kinefit.exporters.report.ranges import ranges_of
+from kinefit.exporters.report.angles import ranges_of
 
 PARTS = {"sigma": "ranges of motion of five joints, from two and four cameras and from markers"}
 FIRST, DRAWS, FRAMES = 9000, 40, 90

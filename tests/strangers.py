@@ -108,7 +108,7 @@ ENDINGS = {
     "kinefit.bodies:load_body": ("a.toml",),
     "kinefit.bodies.marker_sets.files:find_record": ("a.toml",),
     "kinefit.bodies.surfaces.obj:read_obj": ("a.obj",),
-    "kinefit.identification.model.files:load_model": ("a.json",),
+    "kinefit.identification.model.model:load_model": ("a.json",),
 }
 """{module:function that reads a path: names of files that it reads}."""
 

@@ -51,7 +51,7 @@ from kinefit.markers.subject import fit_marker_subject as fit_marker_subject
 
 # Calibration, and checks of a recording
 from kinefit.calibration.board.calibrate import calibrate_board as calibrate_board
-from kinefit.calibration.check.check import check_take as check_take
+from kinefit.takes.check import check_take as check_take
 from kinefit.calibration.people.calibrate import calibrate_people as calibrate_people
 from kinefit.calibration.refine.refine import refine as refine
 

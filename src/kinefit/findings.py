@@ -19,14 +19,9 @@ _GUESSES = ("Guess", "A guess", "Uncertain")  # how the confidence of a guess be
 FINDINGS = "findings"
 """Key of `Motion.provenance`: the faults that `track` found in its inputs, as mappings of a `Finding`'s parts."""
 
-CLOCKS = "clocks"
-"""Key of `Motion.provenance`: sentences about cameras whose clocks are off, with what to write."""
-
-LABELS = "labels"
-"""Key of `Motion.provenance`: sentences about marker labels that were ignored, or that do not decide left and right."""
-
-STATURE = "stature"
-"""Key of `Motion.provenance`: sentences about a person who is as tall as few adults are, with what to do."""
+NOTES = "notes"
+"""Key of `Motion.provenance`: sentences on what to do about clocks that are off, marker labels that are ignored or do
+not decide left and right, and a person who is as tall as few adults are."""
 
 INVERTED = "upside down"
 """Key of `Motion.provenance`: the depth camera in which people are explained better upside down."""
@@ -139,9 +134,11 @@ def of_provenance(provenance: Mapping[str, Any]) -> tuple[Finding, ...]:
         return ()
 
 
-def listed(names: Iterable[str]) -> str:
-    """Names as "a", "a and b" or "a, b and c"."""
+def listed(names: Iterable[str], most: int = 99) -> str:
+    """Names as "a", "a and b" or "a, b and c"; those beyond `most` are counted."""
     names = list(names)
+    if len(names) > most + 1:
+        names = [*names[:most], f"{len(names) - most} more"]
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1] if names else "none"
 
 

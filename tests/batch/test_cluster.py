@@ -10,8 +10,8 @@ from tests.batch.test_many import CHOICES, contents, drawn_sessions, sessions
 
 from kinefit import track_takes
 from kinefit.batch.cluster import run_there
-from kinefit.batch.find import RECORD
 from kinefit.batch.processes import Failure
+from kinefit.batch.summary import RECORD
 from kinefit.errors import ExportError
 
 __all__ = ["drawn_sessions", "sessions"]

@@ -28,7 +28,7 @@ from kinefit.observations.recordings import mirror_name
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.takes.track import track_take
-from kinefit.tracking.takes.take_recording import recording_of
+from kinefit.tracking.take_recording import recording_of
 
 
 @pytest.fixture

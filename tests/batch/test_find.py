@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from kinefit.batch.find import RECORD, find_takes
+from kinefit.batch.many import find_takes
+from kinefit.batch.summary import RECORD
 from kinefit.errors import FileError
 
 TAKE = '[take]\nname = "walk"\n[[markers]]\nfile = "a.trc"\n'

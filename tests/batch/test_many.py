@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from kinefit import track_takes
-from kinefit.batch.find import RECORD
-from kinefit.batch.one import Choices
-from kinefit.batch.work import TakeJob, work
+from kinefit.batch.one import Choices, TakeJob, work
+from kinefit.batch.summary import RECORD
 from kinefit.errors import ExportError, FileError
 from kinefit.tracking import run as running
 from kinefit.tracking.tracker import Tracker
@@ -108,7 +107,7 @@ def test_done_takes_are_done_again_only_where_something_changed(sessions, tmp_pa
     take, out = sessions / "s01" / "pre" / "take.toml", tmp_path / "a"
     rows = work(job(take, out))
     assert rows[0].status == "done" and rows[0].folder == "a"
-    from kinefit.batch import work as module
+    from kinefit.batch import one as module
 
     class Again(Exception):
         pass

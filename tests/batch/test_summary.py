@@ -6,8 +6,7 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from kinefit.batch.outcome import FAILED, Range, Row
-from kinefit.batch.summary import write_summary
+from kinefit.batch.summary import FAILED, Range, Row, write_summary
 from kinefit.errors import ExportError
 from kinefit.findings import Finding
 

@@ -103,4 +103,4 @@ def test_fingers_of_a_hand_are_one_group():
     assert set(groups) == {"hand_l", "hand_r"} and finger_groups(load_body("humanoid")) == {}
     assert all(len(own) == 15 and all(s.startswith(FINGERS) for s in own) for own in groups.values())
     words = spoken_segments(BODY, ["ring_distal_l", "hand_l", "little_distal_l", "index_distal_r"])
-    assert words == ["fingers of the left hand", "left hand", "right index finger (distal)"]
+    assert words == "fingers of the left hand, left hand and right index finger (distal)"

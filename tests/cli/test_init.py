@@ -22,7 +22,7 @@ from kinefit.errors import TakeError
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 from kinefit.simulation import squat_and_wave
-from kinefit.tracking.takes.take_recording import recording_of
+from kinefit.tracking.take_recording import recording_of
 
 
 def run(*args):
@@ -163,7 +163,7 @@ def test_clicked_joints_give_body_and_start(folder, tmp_path):
 def test_clicks_are_measurements_of_their_frames(folder, tmp_path):
     """Clicks of two frames stay with the take: each frame of them alone gives the pose that was clicked there."""
     from kinefit.observations import LineFrame
-    from kinefit.tracking.takes.take_recording import recording_of
+    from kinefit.tracking.take_recording import recording_of
 
     motion = squat_and_wave()
     assert run("init", folder).exit_code == 0

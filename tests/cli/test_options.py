@@ -28,7 +28,7 @@ from kinefit.smoothing.online.known_noise import KnownNoise
 from kinefit.subject.subject import Subject
 from kinefit.takes.track import track_take
 from kinefit.tracking.recording import Recording
-from kinefit.tracking.takes.take_recording import recording_of
+from kinefit.tracking.take_recording import recording_of
 from kinefit.tracking.tracker import Tracker
 from kinefit.tracking.video import track
 

@@ -2,9 +2,9 @@
 
 from dataclasses import fields, replace
 
-from kinefit.calibration.check.check import ALL_CHECKS
 from kinefit.diagnostics.checks import CHECKS, QUICK_S, Check, Checked, run
 from kinefit.findings import Edit, Finding, as_records, fixes, in_words, of_provenance
+from kinefit.takes.check import ALL_CHECKS
 
 
 def test_every_check_has_its_needs_its_cost_and_what_would_look_the_same():

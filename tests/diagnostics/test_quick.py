@@ -12,7 +12,7 @@ from kinefit.diagnostics.quick import input_findings, motion_findings, with_caus
 from kinefit.diagnostics.timing import group_findings
 from kinefit.diagnostics.views import make_views, sample
 from kinefit.errors import TrackingError
-from kinefit.findings import CLOCKS, FINDINGS, INVERTED, STATURE, Finding, faults_of, of_provenance
+from kinefit.findings import FINDINGS, INVERTED, NOTES, Finding, faults_of, of_provenance
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES
@@ -86,14 +86,14 @@ def test_a_person_of_a_size_that_few_adults_have_is_questioned(scale):
     """1.36 m and 2.1 m: `check` doubts it, `track` says so; not where the take states the height."""
     body = load_body("humanoid")
     person = replace(MOTION, body=body.scaled(np.full(len(body.scale_groups), scale)))
-    told = with_findings(person, (), Nothing, None).provenance.get(STATURE)
+    told = with_findings(person, (), Nothing, None).provenance.get(NOTES)
     doubts = [f for f in check_keypoints(changed(translated(scale)), SEEN).findings if f.kind == "scale"]
     assert [f.severity for f in doubts] == ["good" if scale == 1.0 else "doubt"]
     assert (told is None) == (scale == 1.0)
     if told:
         assert f"{person.body.stature:.2f} m tall" in told[0] and "a child" in told[0] and "board" in told[0]
         assert "height = " in told[0] and doubts[0].remedy in told[0]
-    assert STATURE not in with_findings(person, (), Nothing, 1.36).provenance
+    assert NOTES not in with_findings(person, (), Nothing, 1.36).provenance
 
 
 def test_a_large_scale_of_a_lens_is_not_taken_for_a_unit():
@@ -280,9 +280,9 @@ def test_a_camera_that_is_late_by_part_of_a_slow_frame_is_named_with_the_line_to
     assert late.severity == "doubt" and late.cameras == ("cam02",) and faults_of([late]) == ()
     assert found(5, 0) == found(1, 1) == ()
     provenance = with_findings(MOTION, (late,), Nothing, None).provenance
-    (sentence,) = provenance[CLOCKS]
+    (sentence,) = provenance[NOTES]
     assert "time_offset = 0." in sentence and "cam02" in sentence and provenance[FINDINGS] == []
-    assert CLOCKS not in with_findings(MOTION, (), Nothing, None).provenance
+    assert NOTES not in with_findings(MOTION, (), Nothing, None).provenance
     error = TrackingError("lost")
     assert with_cause(error, (late,)) is error
 

@@ -3,7 +3,7 @@
 import numpy as np
 from tests.oracle import rig_around
 
-from kinefit.multiview.medians import distances, medians
+from kinefit.multiview.association import distances, medians
 
 
 def test_medians_are_those_of_what_is_finite():

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 from tests.calibration.people.test_skeletons import FRAMES, LATE, seen, turn_errors
 from tests.calibration.people_data import BODY, room, walker
 
-from kinefit import read_motion, read_take, track_take
+from kinefit import check_take, read_motion, read_take, track_take
 from kinefit.cli import main
 from kinefit.errors import FileError, TakeError
 from kinefit.exporters.motion_file import write_detections
@@ -84,6 +84,11 @@ def kept(folder, monkeypatch):
 
 def silent(text):
     raise AssertionError(text)
+
+
+def test_check_take_has_the_cameras_too_as_kinefit_check(kept):
+    found = check_take(kept / "take.toml", tell=silent)
+    assert found.take.calibration is not None and len(found.biases) == len(room())
 
 
 @pytest.mark.parametrize("change", [

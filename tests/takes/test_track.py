@@ -14,7 +14,7 @@ from kinefit.readers.take.load import load_observations
 from kinefit.simulation import squat_and_wave
 from kinefit.simulation.movements import movement, people
 from kinefit.takes.track import track_take
-from kinefit.tracking.takes.take_recording import recording_of
+from kinefit.tracking.take_recording import recording_of
 
 MARKERS = ("l_wrist", "r_wrist", "l_knee")
 

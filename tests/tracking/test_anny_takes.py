@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from tests.sensors.scenes import posture, ring
-from tests.tracking.takes.test_starts import saved
+from tests.tracking.test_starts import saved
 
 from kinefit import load_body, read_motion
 from kinefit.assets import anny_files

@@ -23,7 +23,7 @@ from kinefit.observations import SilhouetteFrame
 from kinefit.readers.motion import read_motion
 from kinefit.rendering import render_body
 from kinefit.sensors.settings import TrackSettings
-from kinefit.tracking.agreement import sentences
+from kinefit.tracking.cameras import contradiction_sentences
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.video import track
 
@@ -204,7 +204,7 @@ def test_sensors_that_contradict_each_other_are_told():
         assert told and set(told) <= {"keypoints", "mocap"}
         gaps = [np.array(one["shift_m"]) for one in told.values()]
         assert max(abs(g[0]) for g in gaps) > 0.05 and all(one["deviations"] > 3.0 for one in told.values())
-        assert any(next(iter(told)) in text and "mm" in text for text in sentences(told))
+        assert any(next(iter(told)) in text and "mm" in text for text in contradiction_sentences(told))
 
 
 @pytest.mark.parametrize("mix", ["keypoints", "markers alone", "everything"])

@@ -49,7 +49,7 @@ def test_a_turned_depth_camera_is_told_from_one_that_fits_and_one_upside_down(sc
     given, body, settings = recording(scene, turn), load_body("humanoid"), TrackSettings()
     subject = fit_subject(body, channels_of(given, body, settings), cameras=PRIOR)
     placed = placed_cameras(given, subject, settings)["depth"]
-    assert (placed.fits, placed.usable) == (fits, usable)
+    assert (placed.is_near, placed.usable) == (fits, usable)
     if usable:
         true, stated = scene[0]["depth"], given.rig["depth"]
         x = scene[1].positions()[0]

@@ -15,7 +15,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import cut, resampled, simulate_keypoints, squat_and_wave, studio_rig
 from kinefit.takes.track import track_take
-from kinefit.tracking.agreement import sentences
+from kinefit.tracking.cameras import contradiction_sentences
 from kinefit.tracking.cameras import sentences as moved_cameras
 
 
@@ -85,7 +85,8 @@ def test_a_camera_that_was_turned_is_named_and_spoils_little(truth, smooth, exac
     told = motion.provenance["contradictions"]
     if exact:  # a calibration that is stated to be exact stays: the camera contradicts
         assert set(told) == {"cam03"} and told["cam03"]["median_px"] > 50.0 > told["cam03"]["others_px"]
-        assert "cam03 contradicts the other cameras" in sentences(told)[0] and "px" in sentences(told)[0]
+        sentence = contradiction_sentences(told)[0]
+        assert "cam03 contradicts the other cameras" in sentence and "px" in sentence
     else:
         (named,) = moved_cameras(motion.provenance, TrackSettings().camera_errors)
         assert not told and named.startswith("camera cam03 was found")

@@ -10,7 +10,7 @@ import numpy as np
 from kinefit.app.scene import ScenePage
 from kinefit.batch.viewed import gather
 from kinefit.exporters.curves import curves, spoken
-from kinefit.exporters.report.ranges import Extremes, ranges_of, with_error
+from kinefit.exporters.report.angles import Extremes, ranges_of, with_error
 
 
 @dataclass(frozen=True)

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+import warnings
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
+from kinefit._files import regular
+from kinefit.batch.processes import progress
 from kinefit.batch.results import DEFAULT_FORMATS, Step, write_overlays, write_results
-from kinefit.errors import KinefitError, TakeError
+from kinefit.batch.summary import DONE, RECORD, Range, Row, failed, write_people_report
+from kinefit.errors import KinefitError, TakeError, printable
+from kinefit.findings import of_provenance
 
 if TYPE_CHECKING:
     from kinefit.motion import Motion
     from kinefit.preparing.each_video import Tell
     from kinefit.readers.take.file import Take
     from kinefit.takes.in_view import InView
-
 
 @dataclass(frozen=True)
 class Choices:
@@ -139,15 +146,14 @@ def track_person(
     KinefitError
         Tracking or writing fails.
     """
-    from kinefit.batch.report import provenance, write_track_report
+    from kinefit.batch.results import provenance, write_track_report
     from kinefit.batch.viewed import OUTDATED, inputs_entry, is_outdated
-    from kinefit.findings import CLOCKS, LABELS, STATURE
+    from kinefit.findings import NOTES
     from kinefit.multiview import followed
     from kinefit.takes.track import settings_of, track_take
     from kinefit.tracking import cameras
-    from kinefit.tracking.agreement import sentences
     from kinefit.tracking.checkpoints.checkpoint import Checkpoint, key_of
-    from kinefit.tracking.takes.floor_level import floor_sentences
+    from kinefit.tracking.take_recording import floor_sentences
     from kinefit.tracking.video import TrackingInterrupted
 
     notes: list[str] = []
@@ -167,11 +173,10 @@ def track_person(
             motion, seen = track_take(
                 take, **how, checkpoint=unfinished, view=view, progress=read
             )
-            notes += [*seen.notes, *sentences(motion.provenance["contradictions"])]
+            notes += [*seen.notes, *cameras.contradiction_sentences(motion.provenance["contradictions"])]
             notes += followed.sentences(motion.provenance, asked=take.person is not None)
             notes += cameras.sentences(motion.provenance, settings_of(take).camera_errors)
-            notes += [*motion.provenance.get(CLOCKS, ()), *motion.provenance.get(LABELS, ())]
-            notes += [*motion.provenance.get(STATURE, ()), *floor_sentences(motion.provenance)]
+            notes += [*motion.provenance.get(NOTES, ()), *floor_sentences(motion.provenance)]
         except TrackingInterrupted as stopped:
             motion, total = stopped.motion, stopped.total
         motion = replace(motion, provenance=provenance(take, **inputs, **motion.provenance))
@@ -185,3 +190,128 @@ def track_person(
         if not total:
             unfinished.remove()
     return TrackedPerson(motion, tuple(notes), total)
+
+
+class _TakeRecord(msgspec.Struct, frozen=True):
+    take: str
+    key: str
+    files: tuple[str, ...]
+    rows: tuple[Row, ...]
+
+
+@dataclass(frozen=True)
+class TakeJob:
+    """One take to be tracked.
+
+    Parameters
+    ----------
+    take : Path, absolute
+    label : name in the summary
+    out : Path, folder of its results
+    folder : the same, relative to the summary
+    choices : Choices
+    """
+
+    take: Path
+    label: str
+    out: Path
+    folder: str
+    choices: Choices
+
+
+def work(job: TakeJob) -> tuple[Row, ...]:
+    """Track a take with all its people, or reuse an earlier run's results; returns a row for each person.
+
+    Faults of the take are in its rows. Other errors are raised, since they may not occur again.
+    """
+    from kinefit.readers.take.cameras import is_uncalibrated
+    from kinefit.takes.missing import last_found
+    from kinefit.tracking.checkpoints.checkpoint import key_of
+
+    start, said = Row(take=job.label), list[str]()
+    try:
+        with _warnings_in(said):
+            take = asked_take(job.take, job.choices)
+        keys = ("subject", "visit", "date", "movement")
+        start = msgspec.structs.replace(start, **{key: take.session.stated.get(key, "") for key in keys})
+        key = key_of(take, **asdict(replace(job.choices, restart=False)))
+        complete = not is_uncalibrated(last_found(take))  # whoever deletes found cameras wants others
+    except KinefitError as error:
+        return (failed(start, str(error)),)
+    known = None if job.choices.restart else _read(job.out / RECORD)
+    if known is not None and known.take != printable(job.take):
+        problem = f"{job.folder} has the results of another take ({known.take})"
+        return (failed(start, f"{problem}. Give another folder with --out, or overwrite them with --restart."),)
+    if known is not None and known.key == key and complete and all((job.out / name).exists() for name in known.files):
+        return known.rows
+    rows, made = _tracked(job, take, start, said)
+    if all(row.status == DONE for row in rows):
+        _write(job.out / RECORD, _TakeRecord(printable(job.take), key, tuple(made), rows))
+    return rows
+
+
+@contextmanager
+def _warnings_in(said: list[str]) -> Iterator[None]:
+    """Collect warnings about old keys of a take into `said`."""
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always", FutureWarning)
+        try:
+            yield
+        finally:
+            said += [str(w.message) for w in warned if issubclass(w.category, FutureWarning)]
+
+
+def _tracked(job: TakeJob, take: Take, start: Row, said: list[str]) -> tuple[tuple[Row, ...], list[str]]:
+    """Track all people of a take; returns a row for each, and the written files relative to the folder of results."""
+    try:
+        view, people = people_of(take, job.out, progress, said.append)
+    except KinefitError as error:
+        return (failed(start, str(error)),), []
+    rows, made = [], []
+    for k, (person, folder) in enumerate(people, 1):
+        alone = len(people) == 1
+        row = msgspec.structs.replace(
+            start, person=0 if alone else k, folder=job.folder if alone else f"{job.folder}/person-{k}"
+        )
+        if not alone:
+            folder.mkdir(parents=True, exist_ok=True)
+        files: dict[str, Path] = {}
+        try:
+            done = track_person(person, folder, job.choices, view=view, step=progress, tell=progress, files=files)
+        except KinefitError as error:  # the other people are tracked nevertheless
+            rows.append(failed(msgspec.structs.replace(row, folder=""), str(error)))
+            continue
+        made += [path.relative_to(job.out).as_posix() for path in files.values()]
+        rows.append(of_motion(row, done.motion, (*said, *done.notes)))
+    if len(rows) > 1 and job.choices.report:
+        page_rows = [msgspec.structs.replace(r, take=take.name, folder=r.folder and f"person-{r.person}") for r in rows]
+        made.append(write_people_report(page_rows, job.out, pictures=job.choices.draws).name)
+    return tuple(rows), made
+
+
+def of_motion(row: Row, motion: Motion, notes: tuple[str, ...]) -> Row:
+    """The row with a motion's length, quality, ranges of motion and findings."""
+    from kinefit.exporters.report.angles import ranges_of
+
+    ranges = [
+        Range(coordinate, side, *((r.lowest[0], r.highest[0], *r.span, r.share) if r else ()))
+        for coordinate, sides in ranges_of(motion).items() for side, r in sides.items()
+    ]  # fmt: skip
+    return msgspec.structs.replace(
+        row, frames=len(motion), seconds=len(motion) / motion.rate, quality=float(motion.quality.mean()),
+        lost=float(motion.lost.mean()), notes=notes, findings=of_provenance(motion.provenance), ranges=tuple(ranges),
+    )  # fmt: skip
+
+
+def _read(path: Path) -> _TakeRecord | None:
+    """The record of an earlier run; None if there is none that can be read."""
+    try:
+        return msgspec.json.decode(regular(path).read_bytes(), type=_TakeRecord)
+    except (OSError, msgspec.MsgspecError):
+        return None
+
+
+def _write(path: Path, record: _TakeRecord) -> None:
+    from kinefit.exporters.atomic import write_bytes
+
+    write_bytes(path, msgspec.json.encode(record))

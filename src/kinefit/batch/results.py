@@ -1,23 +1,25 @@
-"""Write the results of one motion into a folder: formats, overlay videos, a montage of all cameras."""
+"""Write the results of one motion into a folder: formats, overlay videos, a montage, the report with provenance."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import hashlib
+import platform
+from collections.abc import Callable, Iterable, Iterator
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from kinefit.motion import Motion, Residuals
     from kinefit.readers.take.file import Take
     from kinefit.readers.take.load import Observations
+    from kinefit.readers.video import Video
 
 Step = Callable[[str, int, int], None]
 """Called with the name of the work, the number of steps done, and the number of all steps (0: unknown)."""
-
-
-def silent(*_: object) -> None:
-    """Report nothing: in place of a `Step` or a function for sentences."""
-
 
 NAMES = {
     "motion": "motion.npz", "csv": "tables", "bvh": "motion.bvh", "glb": "motion.glb", "trc": "motion.trc",
@@ -50,6 +52,12 @@ DESCRIPTIONS = {
     "report": "results with error bars and findings, as a page for the browser",
 }
 """Use of each kind of result."""
+
+_PACKAGES = ("kinefit", "numpy", "numba", "opencv-python-headless", "av")
+
+
+def silent(*_: object) -> None:
+    """Report nothing: in place of a `Step` or a function for sentences."""
 
 
 def write_format(motion: Motion, format: str, path: Path, **options: Any) -> None:
@@ -93,24 +101,20 @@ def write_overlays(
 
     from kinefit.exporters import depth_picture, draw_overlay, write_depth_overlay, write_montage, write_overlay
     from kinefit.exporters.pictures.overlay import frames_of
-    from kinefit.preparing.faces import shown_video
 
     if not (seen.videos or seen.depth) or seen.rig is None:
         return
     pictures, middle = {}, motion.times[len(motion) // 2]
-    for name in seen.videos:
-        offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
-        given: dict[str, Any] = {"image_frame": seen.images[name], "residuals": _residuals(motion, name), "skin": skin}
-        with shown_video(take, seen, name) as colour:
-            shown = colour.frame_at(float(np.clip(middle - offset, 0.0, colour.times[-1]))) or 0
-            at = motion.frame_at(colour.times[shown] + offset)
-            pictures[name] = draw_overlay(colour.read(shown), motion, at, seen.rig[name], **given)
-            bar, count = f"overlay {name}", len(frames_of(motion, colour.times + offset))
-            step(bar, 0, count)
-            write_overlay(
-                motion, seen.rig[name], colour, folder / "overlays" / f"{name}.mp4", time_offset=offset,
-                progress=lambda done: step(bar, done, count), **given,  # noqa: B023
-            )  # fmt: skip
+    for name, colour, offset, given in _shown_videos(motion, take, seen):
+        shown = colour.frame_at(float(np.clip(middle - offset, 0.0, colour.times[-1]))) or 0
+        at = motion.frame_at(colour.times[shown] + offset)
+        pictures[name] = draw_overlay(colour.read(shown), motion, at, seen.rig[name], skin=skin, **given)
+        bar, count = f"overlay {name}", len(frames_of(motion, colour.times + offset))
+        step(bar, 0, count)
+        write_overlay(
+            motion, seen.rig[name], colour, folder / "overlays" / f"{name}.mp4", time_offset=offset,
+            progress=lambda done: step(bar, done, count), skin=skin, **given,  # noqa: B023
+        )  # fmt: skip
         files["overlays"] = folder / "overlays"
     for video in seen.depth:
         camera, shown = seen.rig[video.sensor], video.nearest(float(middle))
@@ -127,7 +131,107 @@ def write_overlays(
     files["montage"] = folder / "montage.png"
 
 
+def _shown_videos(
+    motion: Motion, take: Take, seen: Observations
+) -> Iterator[tuple[str, Video, float, dict[str, Any]]]:
+    """Each camera's name, video, time offset [s], and what drawing on it needs."""
+    from kinefit.preparing.faces import shown_video
+
+    for name in seen.videos:
+        offset = next(entry.time_offset for entry in take.cameras if entry.name == name)
+        with shown_video(take, seen, name) as video:
+            yield name, video, offset, {"image_frame": seen.images[name], "residuals": _residuals(motion, name)}
+
+
 def _residuals(motion: Motion, camera: str) -> Residuals | None:
     """Residuals of a camera's first detector; None if it has none."""
     labels = [label for label in motion.residuals if label == camera or label.startswith(f"{camera} ")]
     return motion.residuals[labels[0]] if labels else None
+
+
+def write_track_report(
+    motion: Motion, take: Take, seen: Observations, folder: Path, step: Step, files: dict[str, Path],
+    pictures: str = "full", notes: Iterable[str] = (),
+) -> None:  # fmt: skip
+    """Write report.html into a folder of results, with links to `files`; it is added to them.
+
+    Parameters
+    ----------
+    pictures : "full" or "none"
+    notes : sentences for the user
+    """
+    from kinefit.exporters.report.cycles import read_norms
+    from kinefit.exporters.report.report import write_report
+
+    norms = read_norms(take.session.norms) if take.session.norms else None
+    shown = {} if pictures == "none" else take_pictures(motion, take, seen, step)
+    step("report", 0, 1)
+    links = {path.relative_to(folder).as_posix(): DESCRIPTIONS.get(name, name) for name, path in files.items()}
+    files["report"] = write_report(
+        motion, folder / "report.html", rig=seen.rig, pictures=shown, files=links, norms=norms,
+        findings=[("warning", f"{note.rstrip('.')}.", "") for note in notes],
+    )
+    step("report", 1, 1)
+
+
+def take_pictures(
+    motion: Motion, take: Take, seen: Observations, step: Step
+) -> dict[str, dict[int, NDArray[np.uint8]]]:
+    """{camera: {frame: image (H, W, 3) of the person with the fit drawn on it}} of the frames that a report shows.
+
+    Frames outside a camera's video are omitted.
+    """
+    from kinefit.exporters.report.flagged import close_up, report_frames
+
+    out: dict[str, dict[int, NDArray[np.uint8]]] = {}
+    if seen.rig is None:
+        return out
+    frames = sorted(report_frames(motion))
+    for number, (name, video, offset, given) in enumerate(_shown_videos(motion, take, seen)):
+        step("images", number, len(seen.videos))
+        for frame in frames:
+            shown = video.frame_at(motion.times[frame] - offset)
+            if shown is not None:
+                picture = close_up(video.read(shown), motion, frame, seen.rig[name], **given)
+                out.setdefault(name, {})[frame] = picture
+    step("images", len(seen.videos), len(seen.videos))
+    return out
+
+
+def provenance(take: Take, **more: Any) -> dict[str, Any]:
+    """Provenance of a tracked take, for `Motion.provenance`: files, standard deviations, versions.
+
+    `more` are further entries, such as smoothing={...} or tracking={...}.
+    """
+    out: dict[str, Any] = {
+        "kinefit": metadata.version("kinefit"),
+        "python": platform.python_version(),
+        "packages": {name: version for name in _PACKAGES if (version := _version(name))},
+        "take": take.path.name,
+    }
+    if take.calibration is not None:
+        out["calibration"] = {"file": take.calibration.file.name, "unit": take.calibration.unit}
+        if take.calibration.file.is_file():
+            out["calibration"]["sha256"] = hashlib.sha256(take.calibration.file.read_bytes()).hexdigest()
+    out["cameras"] = [
+        {"name": c.name, "video": c.video.name if c.video else None, "image": c.image, "rotation": c.rotation,
+         "time_offset": c.time_offset}
+        for c in take.cameras
+    ]  # fmt: skip
+    out["keypoints"] = [
+        {"camera": k.camera, "file": k.file.name if k.file else None, "format": k.format, "set": k.set,
+         "accuracy": k.sigma}
+        for k in take.keypoints
+    ]  # fmt: skip
+    if take.height:
+        out["height"] = take.height
+    if take.session.stated:
+        out["session"] = take.session.stated
+    return out | more
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None

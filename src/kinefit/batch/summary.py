@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import mean, stdev
 from typing import TYPE_CHECKING
 
-from kinefit.batch.outcome import DONE, Row
+import msgspec
+
 from kinefit.errors import ExportError
+from kinefit.findings import Finding
 
 if TYPE_CHECKING:
-    from kinefit.batch.outcome import Range
     from kinefit.exporters.report.page import Html
+
+RECORD = "batch.json"
+"""File in every folder of results of a batch: the take, its key, the files and the summary rows."""
+
+DONE, FAILED = "done", "failed"
 
 _ID_COLUMNS = ("take", "person", "subject", "visit", "date", "movement")
 _TAKE_COLUMNS = (*_ID_COLUMNS, "frames", "seconds", "quality", "lost share", "status", "error", "faults", "folder")
@@ -23,6 +27,75 @@ _RANGE_COLUMNS = (
     *_ID_COLUMNS, "coordinate", "side", "lowest [deg]", "highest [deg]", "range [deg]", "range 2 std [deg]",
     "observed share",
 )  # fmt: skip
+_RANGES_NOTE = (
+    "In degrees, as in the report of each take: highest minus lowest angle, ± two standard deviations. Subjects and "
+    "sessions: mean over takes, and the standard deviation between takes (not of the measurement) if there are two or "
+    "more. * marks takes in which the angle was unobserved in some frames."
+)
+_GROUPED = "Subjects and sessions"
+OUTCOME = "status", "frames", "seconds", "quality", "lost"
+
+
+class Range(msgspec.Struct, frozen=True):
+    """Range of motion of one angle [deg], as in the report.
+
+    Parameters
+    ----------
+    coordinate : name without its side
+    side : "left", "right" or "" for a midline angle
+    lowest, highest, span : float [deg]; None if the angle is observed in fewer than two frames
+    twice : float [deg], two standard deviations of the span
+    share : of the frames in which it is observed
+    """
+
+    coordinate: str
+    side: str
+    lowest: float | None = None
+    highest: float | None = None
+    span: float | None = None
+    twice: float | None = None
+    share: float = 0.0
+
+
+class Row(msgspec.Struct, frozen=True, kw_only=True):
+    """One person of one take in the summary.
+
+    Parameters
+    ----------
+    take : path of the take file relative to the folder of all takes
+    person : int, number of the person; 0 if the take has one
+    subject, visit, date, movement : from the take's `[session]`
+    folder : of the results, relative to the summary; "" if there are none
+    frames : int
+    seconds, quality, lost : float [s], mean quality, and share of lost segments over all frames; None if failed
+    status : "done" or "failed"
+    error : message of the error
+    notes : sentences for the user
+    findings : faults of the inputs
+    ranges : tuple of Range
+    """
+
+    take: str
+    person: int = 0
+    subject: str = ""
+    visit: str = ""
+    date: str = ""
+    movement: str = ""
+    folder: str = ""
+    frames: int = 0
+    seconds: float | None = None
+    quality: float | None = None
+    lost: float | None = None
+    status: str = DONE
+    error: str = ""
+    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    ranges: tuple[Range, ...] = ()
+
+
+def failed(row: Row, error: str) -> Row:
+    """The row with the status "failed" and an error."""
+    return msgspec.structs.replace(row, status=FAILED, error=error)
 
 
 def write_summary(rows: Sequence[Row], folder: Path) -> None:
@@ -33,7 +106,7 @@ def write_summary(rows: Sequence[Row], folder: Path) -> None:
     ExportError
         There are no rows, or they cannot be written.
     """
-    from kinefit.exporters.atomic import write_text
+    from kinefit.exporters.atomic import write_rows, write_text
 
     if not rows:
         raise ExportError("there are no takes to summarise", file=folder, remedy="Give a pattern that matches takes.")
@@ -43,8 +116,8 @@ def write_summary(rows: Sequence[Row], folder: Path) -> None:
         (*_ids(row), r.coordinate, r.side, *map(_number, (r.lowest, r.highest, r.span, r.twice, r.share)))
         for row in rows for r in row.ranges
     ]  # fmt: skip
-    write_text(folder / "summary.csv", _csv(_TAKE_COLUMNS, table))
-    write_text(folder / "ranges.csv", _csv(_RANGE_COLUMNS, ranges))
+    write_rows(folder / "summary.csv", [_TAKE_COLUMNS, *table])
+    write_rows(folder / "ranges.csv", [_RANGE_COLUMNS, *ranges])
     write_text(folder / "summary.html", summary_page(rows, folder))
 
 
@@ -79,29 +152,14 @@ def fault_boxes(rows: Iterable[Row]) -> list[Html]:
     ]  # fmt: skip
 
 
-_RANGES_NOTE = (
-    "In degrees, as in the report of each take: highest minus lowest angle, ± two standard deviations. Subjects and "
-    "sessions: mean over takes, and the standard deviation between takes (not of the measurement) if there are two or "
-    "more. * marks takes in which the angle was unobserved in some frames."
-)
-
-
-_GROUPED = "Subjects and sessions"
-
-
 def _takes(rows: Sequence[Row], folder: Path) -> Html:
     from kinefit.exporters.report import page as p
 
-    cells = []
-    for row in rows:
-        report = f"{row.folder}/report.html"
-        linked = p.file_link(report, row.take) if row.folder and (folder / report).is_file() else row.take
-        cells.append((linked, _person(row), row.subject, row.visit, row.date, row.movement, *outcome(row), row.error))
-    columns = ("take", "person", *_ID_COLUMNS[2:], *OUTCOME, "error")
-    return p.table(columns, cells, first_left=7)
-
-
-OUTCOME = "status", "frames", "seconds", "quality", "lost"
+    cells = [
+        (_linked(row, folder, row.take), _person(row), row.subject, row.visit, row.date, row.movement, *outcome(row),
+         row.error) for row in rows
+    ]  # fmt: skip
+    return p.table(("take", "person", *_ID_COLUMNS[2:], *OUTCOME, "error"), cells, first_left=7)
 
 
 def outcome(row: Row) -> tuple[str, ...]:
@@ -135,17 +193,17 @@ def by_joint(rows: Sequence[Row]) -> Html:
 
 def _cells(ranges: dict[str, Range], sides: Sequence[str]) -> list[str]:
     """Range of each side, and their difference."""
-    from kinefit.exporters.report import ranges as report_ranges
+    from kinefit.exporters.report.angles import with_error
 
     def cell(r: Range | None) -> str:
         if r is None or r.span is None or r.twice is None:
             return "not observed"
-        return report_ranges.with_error(r.span, r.twice) + ("" if r.share > 0.995 else "*")
+        return with_error(r.span, r.twice) + ("" if r.share > 0.995 else "*")
 
     out = [cell(ranges.get(side)) for side in sides]
     if len(sides) == 2:
         difference = _difference(ranges)
-        out.append("–" if difference is None else report_ranges.with_error(*difference))
+        out.append("–" if difference is None else with_error(*difference))
     return out
 
 
@@ -189,9 +247,55 @@ def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.6g}"
 
 
-def _csv(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(head)
-    writer.writerows(rows)
-    return out.getvalue()
+def write_people_report(rows: Sequence[Row], folder: Path, *, pictures: bool) -> Path:
+    """Write report.html into the folder of a take with several people, whose results are in its folders `person-K`.
+
+    Parameters
+    ----------
+    rows : one for each person, failed ones included
+    folder : of the take's results
+    pictures : bool, whether each person's montage is shown
+
+    Raises
+    ------
+    ExportError
+        The page cannot be written.
+    """
+    from kinefit.exporters.atomic import write_text
+    from kinefit.exporters.report import page as p
+
+    done = [row for row in rows if row.status == DONE]
+    text = f"{len(done)} of {len(rows)} people in view were tracked. Each of them has its own results and report."
+    cells = [(_linked(row, folder, f"person {row.person}"), *outcome(row)) for row in rows]
+    parts: list[p.Section | str] = [
+        *fault_boxes(rows), p.callout("good" if len(done) == len(rows) else "warning" if done else "bad", text),
+        p.table(("person", *OUTCOME), cells, first_left=2),
+    ]  # fmt: skip
+    parts += [p.section(f"Person {row.person}", *_parts_of_person(row, folder, pictures)) for row in rows]
+    if done:
+        parts.append(p.section("Range of motion", by_joint(done)))
+    path = folder / "report.html"
+    write_text(path, p.page(rows[0].take, parts, subtitle=f"{len(rows)} people"))
+    return path
+
+
+def _parts_of_person(row: Row, folder: Path, pictures: bool) -> list[str]:
+    """The montage of all cameras, the error and the notes of one person, and a link to the report."""
+    from kinefit._pictures import read_picture
+    from kinefit.exporters.report import page as p
+
+    montage = folder / row.folder / "montage.png"
+    has_montage = pictures and row.folder and montage.is_file()
+    parts: list[str] = [p.picture(read_picture(montage), width=1400)] if has_montage else []
+    parts += [p.callout("bad", row.error)] if row.error else []
+    parts += [p.bullets(row.notes)] if row.notes else []
+    linked = _linked(row, folder, f"Report of person {row.person}")
+    return [*parts, p.paragraph(linked)] if row.status == DONE else parts
+
+
+def _linked(row: Row, folder: Path, text: str) -> str:
+    """A link to the row's report below a folder; the text alone where there is none."""
+    from kinefit.exporters.report import page as p
+
+    report = f"{row.folder}/report.html"
+    return p.file_link(report, text) if row.folder and (folder / report).is_file() else text

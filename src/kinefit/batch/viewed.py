@@ -191,21 +191,22 @@ def _triangulated(take: Take, seen: Observations, tell: Tell) -> NDArray | None:
 
     from kinefit.bodies import load_body
     from kinefit.errors import TrackingError
-    from kinefit.multiview.association import choose_people, person_records
     from kinefit.multiview.followed import follow
     from kinefit.readers.take.pictures import TakePictures
-    from kinefit.sensors.channels import make_channels
     from kinefit.sensors.points.triangulation import triangulated
+    from kinefit.sensors.settings import TrackSettings
+    from kinefit.tracking.recording import Recording
+    from kinefit.tracking.sizing import channels_of
 
     if seen.rig is None or not seen.keypoints:
         return None
+    sigma = [entry.sigma for entry in take.keypoints]
     try:
         with TakePictures(take, seen) as pictures:
-            keypoints = follow(seen.rig, seen.keypoints, take.person, images=pictures).keypoints
-        people = choose_people(seen.rig, keypoints)
+            people = follow(seen.rig, seen.keypoints, images=pictures).people
+        person = Recording.of_keypoints(seen.rig, seen.keypoints, sigma=sigma, person=take.person, people=people)
     except TrackingError as error:
         tell(f"Only cameras are shown: {error.problem}.")
         return None
-    sigma = [entry.sigma for entry in take.keypoints]
-    channels = make_channels(load_body(take.body), seen.rig, person_records(keypoints, people), sigma)
+    channels = channels_of(person, load_body(take.body), TrackSettings())
     return triangulated(channels, np.arange(len(channels.uv)))

@@ -226,7 +226,8 @@ def _person(c: Checked) -> list[Finding]:
         return []
     why = "" if c.take.person is not None else ", who moves most and so shows the cameras' errors best"
     text = f"{len(followed.people)} people are in view; the check is by person {followed.number}{why}."
-    return [Finding("note", "people", text, remedy="For another person, write person = 2 (or its number) into [take].")]
+    others = " or ".join(str(k) for k in range(1, len(followed.people) + 1) if k != followed.number)
+    return [Finding("note", "people", text, remedy=f"For another person, write person = {others} into [take].")]
 
 
 def _nobody(c: Checked) -> list[Finding]:

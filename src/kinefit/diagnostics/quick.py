@@ -9,21 +9,11 @@ from typing import Any
 import numpy as np
 
 from kinefit.bodies import Body
+from kinefit.diagnostics.cameras import MIN_SIGMAS
 from kinefit.diagnostics.checks import CHECKS, Checked, run
 from kinefit.diagnostics.person import size_findings
 from kinefit.errors import KinefitError
-from kinefit.findings import (
-    CLOCKS,
-    FINDINGS,
-    INVERTED,
-    LABELS,
-    STATURE,
-    Edit,
-    Finding,
-    as_records,
-    faults_of,
-    in_words,
-)
+from kinefit.findings import FINDINGS, INVERTED, NOTES, Edit, Finding, as_records, faults_of, in_words
 from kinefit.motion import UP_AXES, Motion
 from kinefit.observations import Keypoints
 from kinefit.readers.guess.views import nearest_axis
@@ -36,7 +26,6 @@ _MIN_INVERTED_ANGLE = 135.0  # [deg] median angle between trunk and vertical
 _MIN_LYING_ANGLE = 60.0  # [deg] the same; a median, as bending is brief
 _MIN_LYING_TRAVEL = 0.5  # [m] across the trunk: a lying person does not move so far
 _MIN_LATE_S = 0.05  # of a camera's clock: a hand that gestures at 0.5 m/s is 2.5 cm off by that
-_MIN_LATE_SIGMAS = 8.0  # standard errors of the same
 
 
 def input_findings(take: Take, seen: Observations, keypoints: Sequence[Keypoints], body: Body) -> tuple[Finding, ...]:
@@ -63,7 +52,7 @@ def input_findings(take: Take, seen: Observations, keypoints: Sequence[Keypoints
     )  # fmt: skip
     found, late = run(checked, CHECKS).findings, list[Finding]()
     if (t := checked.times) is not None:
-        clear = np.abs(t.offsets) >= np.maximum(_MIN_LATE_S, _MIN_LATE_SIGMAS * t.std)
+        clear = np.abs(t.offsets) >= np.maximum(_MIN_LATE_S, 2 * MIN_SIGMAS * t.std)
         names = {name for name, is_late in zip(t.cameras, clear) if is_late}
         late = [f for f in found if f.kind == "time" and f.severity == "doubt" and names & {*f.cameras}]
     return *faults_of(found), *late
@@ -113,17 +102,17 @@ def with_findings(motion: Motion, findings: Sequence[Finding], seen: Observation
 
     height [m]: stature as the take states it, or None.
     """
-    late = [f"{found.text} {found.remedy}" for found in findings if found.severity == "doubt"]
-    notes = [str(found) for found in findings if found.severity == "note"]
+    notes = [f"{found.text} {found.remedy}" for found in findings if found.severity == "doubt"]
+    notes += [str(found) for found in findings if found.severity == "note"]
     findings = faults_of(findings)
     if len({k.camera for k in seen.keypoints}) < 2 and (seen.markers or seen.depth or seen.clouds):
         inverted = inverted_findings(motion.provenance, motion.up)
         findings = [*findings, *motion_findings(motion, height), *inverted]
-    entries: dict[str, Any] = {key: texts for key, texts in ((CLOCKS, late), (LABELS, notes)) if texts}
     sizes = size_findings(motion.body.stature, height) if motion.body.stature and height is None else []
     if any(f.severity == "doubt" for f in sizes) and not any(f.kind == "scale" for f in findings):
-        entries[STATURE] = [f"{f.text} {f.remedy}" for f in sizes]
-    return replace(motion, provenance={**motion.provenance, FINDINGS: as_records(findings), **entries})
+        notes += [f"{f.text} {f.remedy}" for f in sizes]
+    entries = {FINDINGS: as_records(findings)} | ({NOTES: notes} if notes else {})
+    return replace(motion, provenance={**motion.provenance, **entries})
 
 
 def inverted_findings(provenance: Mapping[str, Any], up: str) -> list[Finding]:

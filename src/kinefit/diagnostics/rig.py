@@ -17,8 +17,7 @@ _FIELD_OF_VIEW_RANGE = (15.0, 130.0)  # [deg] of the longer side: from a long te
 _MAX_ASPECT_ERROR = 0.03  # log ratio of fx and fy of a sensor with square pixels
 _MAX_CENTRE_OFFSET = 0.12  # of the principal point from the middle, as a share of the image's size
 _MAX_FOCAL_DIFFERENCE = 0.15  # log ratio, of equal lenses and image sizes
-_MIN_ANGLE = 15.0  # [deg] between two views: below, depth is 4 times less certain than the lateral position
-_MAX_ANGLE = 165.0  # [deg] the same, of opposite views
+_MIN_ANGLE = 15.0  # [deg] between the lines of two views: below, depth is 4 times less certain than what is lateral
 _MAX_ANISOTROPY = 4.0  # of a point's standard deviations
 _MIN_HEIGHT_PX = 200  # of a person: pose detectors scale people to about this
 _GRID_CELLS = 6  # of the volume along each axis, for a camera's coverage
@@ -108,11 +107,11 @@ def placement_findings(rig: Rig, x: NDArray) -> list[Finding]:
     ways = ways / np.maximum(distance, 1e-9)[:, None]
     pairs = combinations(range(len(rig)), 2)
     angles = {(a, b): float(np.degrees(np.arccos(np.clip(ways[a] @ ways[b], -1, 1)))) for a, b in pairs}
-    across = [v for v in angles.values() if _MIN_ANGLE <= v <= _MAX_ANGLE]
+    across = [v for v in angles.values() if min(v, 180.0 - v) >= _MIN_ANGLE]
     anisotropy = _anisotropy(ways)
     enough = bool(across) and anisotropy <= _MAX_ANISOTROPY
     for (a, b), angle in angles.items():
-        if _MIN_ANGLE <= angle <= _MAX_ANGLE:
+        if min(angle, 180.0 - angle) >= _MIN_ANGLE:
             continue
         names = (rig.names[a], rig.names[b])
         how = "are side by side" if angle < _MIN_ANGLE else "face each other"

@@ -25,8 +25,11 @@ MIN_MISFIT = np.radians(0.5), 0.015
 cameras, each with errors of 0.1 degree about and 3 mm along each axis, measure a person at 4 m with an error of 8 mm,
 and rarely 15 mm."""
 
-POSE_SIGMAS = 0.1, float(np.radians(5.0))
-"""[m], [rad] prior standard deviations of a sensor's stated pose, about its own origin."""
+POSE_SIGMAS = 0.1, float(np.radians(5.0)), 0.02
+"""[m], [rad], [s] prior standard deviations of a sensor's stated pose, about its own origin, and of its clock."""
+
+_MAX_COARSE_ERROR = float(np.radians(3.0)), 0.05
+"""[rad], [m] by which a sensor that fits seems off by nearest points alone: a body's shapes are simple."""
 
 _COVERAGE = 0.95  # share of errors within the error bars
 _MONTE_CARLO_DRAWS = 4000  # for the error bars
@@ -71,6 +74,16 @@ class SensorAlignment:
     def turn(self) -> float:
         """Rotation angle [rad]."""
         return float(np.linalg.norm(self.twist[3:6]))
+
+    @property
+    def is_near(self) -> bool:
+        """Whether it stands where it is stated, as far as nearest points show that."""
+        return not self.falls or (self.turn < _MAX_COARSE_ERROR[0] and self.shift < _MAX_COARSE_ERROR[1])
+
+    @property
+    def usable(self) -> bool:
+        """Whether it is so near to where it is stated that a person's surface tells where it belongs."""
+        return self.turn < MISFIT_SIGMAS * POSE_SIGMAS[1]
 
     @cached_property
     def bars(self) -> tuple[float, float]:

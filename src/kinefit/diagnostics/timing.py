@@ -27,7 +27,7 @@ from kinefit.diagnostics.views import (
 from kinefit.errors import TrackingError
 from kinefit.findings import Edit, Finding, Severity, in_words, listed
 from kinefit.geometry.camera import Rig
-from kinefit.multiview.medians import medians
+from kinefit.multiview.association import medians
 from kinefit.observations import Keypoints
 
 Curve = tuple[NDArray, NDArray]
@@ -39,7 +39,8 @@ _MAX_PAIR_FRAMES = 400  # of the first camera, for the cost of a shift
 _MAX_COST_RATIO = 0.9  # of a shift to no shift: one that fits no better counts as none
 _MAX_WEIGHT = 2.0  # of a pair's shift: one pair with a periodic motion must not outvote the others
 _MIN_DEPTH = 1.4
-"""Ratio of the median cost to the smallest one: noise alone gives 1.1, a waving hand 1.8."""
+"""Ratio of the median cost to the smallest one: noise alone gives 1.1, a waving hand 1.8. Also how far the advantage of
+no shift falls from the part where groups agree to the other."""
 _MIN_SINE = 0.15  # of the angle between ray and baseline: below, the ray is not informative
 _MIN_FRAMES = 12
 """Smallest number of frames from which a shift is estimated."""
@@ -49,10 +50,9 @@ _SPEED_WINDOW = 0.1  # [s] before and after, for a speed: longer than a detector
 _NOISE_VARIANCES = 4.0  # of a speed, subtracted from its square
 _MAX_ITERATIONS = 12
 _MIN_SIGMA = 0.02  # [frames] added to the standard error: the excess error found in recorded motions
-_MIN_OFFSET_NOTE = 0.1  # [frames]
-_MIN_OFFSET_DOUBT = 0.2  # [frames]
-_MIN_OFFSET_FAULT = 2.0  # [frames] free-running webcams differ by up to 1.6 from the median in a real recording
-_MIN_OFFSET_FAULT_OF_TWO = 4.0  # [frames] the same of two cameras, without a third to compare: 3.4
+_MIN_OFFSET_NOTE = 0.1  # [frames] twice as much is a doubt
+_MIN_OFFSET_FAULT = 2.0  # [frames] free-running webcams differ by up to 1.6 from the median in a real recording; of two
+# cameras, without a third to compare, twice as much: 3.4
 _MIN_SHARE_OF_LARGEST = 0.7  # of the largest offset: smaller ones may come from an error of the median camera
 _MAX_OFFSET_SIGMA = 0.5  # [frames] standard error beyond which an offset is undetermined
 _MIN_PART_FRAMES = 30  # of a part: 12 of both cameras must remain after shifts of up to 0.4 of it
@@ -63,7 +63,6 @@ _MAX_PART_FRAMES = 90  # of a part that are compared, consecutive
 _MAX_MEDIAN_ADVANTAGE = 1.2
 _MAX_PAIR_ADVANTAGE = 1.45
 _MIN_WITHIN_ADVANTAGE = 1.3  # of a pair within a group: there is motion
-_MIN_ADVANTAGE_FALL = 1.4  # factor, of the median from the part where the groups agree to the other
 _MIN_COST_RISE = 1.5  # factor, of the cost itself
 
 
@@ -389,7 +388,7 @@ def time_findings(
         text = f"Too little motion to check the clock of {listed(undetermined)}."
         out.append(Finding("note", "time", text, tuple(undetermined)))
     largest = float(np.max(np.abs(times.frames[known])))
-    least = _MIN_OFFSET_FAULT if known.sum() > 2 else _MIN_OFFSET_FAULT_OF_TWO
+    least = _MIN_OFFSET_FAULT * (1 if known.sum() > 2 else 2)
     for c in np.flatnonzero(known):
         name, late, std = times.cameras[c], times.frames[c], times.std[c] * times.rate
         if abs(late) < max(_MIN_OFFSET_NOTE, MIN_SIGMAS * std):
@@ -400,7 +399,7 @@ def time_findings(
         text = f"{name} is {amount} {way} than the take states, which moves a fast point by "
         text += f"{abs(late) * whole.get(name, np.nan):.0f} px."
         is_fault = confirmed and abs(late) >= max(least + 3.0 * std, _MIN_SHARE_OF_LARGEST * largest)
-        severity: Severity = "fault" if is_fault else "doubt" if abs(late) >= _MIN_OFFSET_DOUBT else "note"
+        severity: Severity = "fault" if is_fault else "doubt" if abs(late) >= 2 * _MIN_OFFSET_NOTE else "note"
         confidence = "Certain" if abs(late) >= 2 * max(_MIN_OFFSET_NOTE, MIN_SIGMAS * std) else "Likely"
         if abs(late) < 1.0:
             confidence += "; but temporal smoothing in a detector, or a rolling shutter, also delays by part of a frame"
@@ -489,7 +488,7 @@ def _differs(good: _Part, bad: _Part, group: tuple[int, ...]) -> bool:
     rise = float(np.median(bad.cost[across] / good.cost[across]))
     fits_nowhere = median <= _MAX_MEDIAN_ADVANTAGE and bad.advantage[across].max() <= _MAX_PAIR_ADVANTAGE
     moves = within.max() >= _MIN_WITHIN_ADVANTAGE
-    return bool(fits_nowhere and moves and fall >= _MIN_ADVANTAGE_FALL and rise >= _MIN_COST_RISE)
+    return bool(fits_nowhere and moves and fall >= _MIN_DEPTH and rise >= _MIN_COST_RISE)
 
 
 def _constant(values: NDArray) -> NDArray:

@@ -86,7 +86,7 @@ def write_bytes(path: str | PathLike[str], data: bytes) -> None:
 
 def write_rows(path: str | PathLike[str], rows: Iterable[Iterable[object]]) -> None:
     """Write a whole CSV file, row by row, or nothing."""
-    with writing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+    with writing(path) as temporary, temporary.open("w", encoding="utf-8", errors="replace", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows(rows)
 
 

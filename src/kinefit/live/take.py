@@ -38,7 +38,7 @@ from kinefit.takes.missing import find_cameras, last_found
 from kinefit.takes.track import settings_of, trial_of
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import tracker_of
-from kinefit.tracking.takes.take_recording import posed_start, recording_of
+from kinefit.tracking.take_recording import posed_start, recording_of
 
 
 def live_session(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.geometry.triangulation import triangulate_robust
-from kinefit.multiview.medians import medians
+from kinefit.multiview.association import medians
 from kinefit.observations import Keypoints
 
 ImageSource = Callable[[str, int], tuple[NDArray, ImageFrame | None] | None]

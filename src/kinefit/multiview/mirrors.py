@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate_robust
-from kinefit.multiview.medians import heights, medians
+from kinefit.multiview.association import heights, medians
 from kinefit.multiview.people import PersonTrack
 from kinefit.observations import Keypoints
 from kinefit.observations.recordings import mirror_name

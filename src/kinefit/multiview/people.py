@@ -17,14 +17,23 @@ from numpy.typing import NDArray
 
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate_robust
-from kinefit.multiview.association import MAX_SPEED, MAX_STEP, Node, confidences, group_views, link_views, some_columns
-from kinefit.multiview.boxes import match_by_boxes, suppress_duplicates
+from kinefit.multiview.association import (
+    MAX_SPEED,
+    MAX_STEP,
+    Node,
+    confidences,
+    distances,
+    group_views,
+    heights,
+    link_views,
+    medians,
+    some_columns,
+)
+from kinefit.multiview.boxes import assign, match_by_boxes, suppress_duplicates
 from kinefit.multiview.likeness import ImageSource
-from kinefit.multiview.medians import distances, heights, medians
 from kinefit.multiview.returns import MAX_SHORT_ABSENCE_S, Chain, PresenceSpan, Return, link_spans
 from kinefit.observations import MEDIAPIPE_478, Keypoints
 from kinefit.observations.recordings import mirror_name
-from kinefit.solvers.assignment import assign
 
 _MAX_DETECTION_DISTANCE = 0.25  # relative to the detection's height, plus the motion of ...
 _ASSUMED_STATURE = 1.7  # [m] ... a person of this stature between frames; at most half a height

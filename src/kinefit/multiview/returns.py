@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.geometry.camera import Rig
-from kinefit.multiview.association import MAX_SPEED, MAX_STEP, Node
+from kinefit.multiview.association import MAX_SPEED, MAX_STEP, Node, medians
+from kinefit.multiview.boxes import assign
 from kinefit.multiview.likeness import Appearance, ImageSource, bones_of, clothes_colours, common_cues, same_log_ratio
-from kinefit.multiview.medians import medians
 from kinefit.observations import Keypoints
-from kinefit.solvers.assignment import assign
 
 MAX_SHORT_ABSENCE_S = 1.0  # shorter absences are bridged by position alone: people walk less far than they stand apart
 _MIN_SPAN_S = 0.3  # of spans that are compared: in shorter ones a detector's errors do not average out

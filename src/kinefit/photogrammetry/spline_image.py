@@ -74,8 +74,9 @@ class SplineImage:
         if smooth < 0.0 or not np.isfinite(smooth):
             raise ObservationError(f"a smoothing of {smooth} px", remedy="Give 0, or a positive number.")
         pixels = cv2.GaussianBlur(pixels, (5, 5), smooth) if smooth > 0.0 else pixels
-        out = np.empty_like(pixels)
-        kernels.coefficients(pixels, out)
+        from scipy.ndimage import spline_filter  # a third of a second, for matched images alone
+
+        out = spline_filter(pixels, order=5, output=np.float32, mode="mirror")
         return cls(pixels, out, pixel_noise(pixels))
 
     @property

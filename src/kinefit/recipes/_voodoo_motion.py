@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.correspondences.bands import Bands
 from kinefit.recipes import _voodoo_steps as steps
-from kinefit.solvers.limbs import absolute_orientation, move
+from kinefit.solvers.rigid_clusters import absolute_orientation, move
 
 
 def band_ends(body: Body, frames: NDArray, bands: Bands) -> tuple[NDArray, NDArray]:

@@ -35,8 +35,7 @@ from kinefit.smoothing.shape_errors import SAMPLED_FRAMES, ShapeErrors
 from kinefit.smoothing.shared_errors import SharedErrors
 from kinefit.smoothing.spool import stretches
 from kinefit.solvers.bundle.border_frames import gram
-from kinefit.solvers.bundle.whitened import PoseScrews, columns
-from kinefit.solvers.equations import block_diagonal, joint_moves, product
+from kinefit.solvers.equations import block_diagonal, columns, joint_moves, product
 from kinefit.solvers.trajectory.variance_components import VarianceComponents, variance_components
 from kinefit.subject.matched_frames import closing_moves, point_moves
 from kinefit.subject.point_moves import ClosureMoves, PointMoves
@@ -280,7 +279,7 @@ def pixel_columns(
         np.zeros((len(weight), 2)), np.ascontiguousarray(own),
     )  # fmt: skip
     root = np.sqrt(own[rows.group])[:, None]
-    whitened = columns(rows, PoseScrews.of(layout.body, state))
+    whitened = columns(rows, layout.body, state)
     twice = shared.whitened(shared.whitened(whitened, own, rows.group), own, rows.group)
     return rows, whitened / np.where(root > 0.0, root, 1.0), root * twice
 

@@ -30,40 +30,6 @@ def gram(A, B, out):
 
 
 @jit
-def solve(A, right):
-    """Solve A x = right in place, A (n, n) symmetric and positive, right (n, m); False where it is not positive."""
-    n, m = right.shape
-    for k in range(n):
-        for i in range(k + 1):
-            s = A[k, i]
-            for j in range(i):
-                s -= A[k, j] * A[i, j]
-            if i < k:
-                A[k, i] = s / A[i, i]
-            elif s > 0.0:
-                A[k, k] = math.sqrt(s)
-            else:
-                return False
-    for k in range(n):
-        for j in range(k):
-            a = A[k, j]
-            for q in range(m):
-                right[k, q] -= a * right[j, q]
-        a = 1.0 / A[k, k]
-        for q in range(m):
-            right[k, q] *= a
-    for k in range(n - 1, -1, -1):
-        for j in range(k + 1, n):
-            a = A[j, k]
-            for q in range(m):
-                right[k, q] -= a * right[j, q]
-        a = 1.0 / A[k, k]
-        for q in range(m):
-            right[k, q] *= a
-    return True
-
-
-@jit
 def along(data, segment, centre, screws, dof_parent, last_dof, J):
     """J (N, n): derivatives of the points of rows, data (6 or more, N), along their directions."""
     J[:] = 0.0

@@ -230,39 +230,6 @@ def invert_diagonal(C, chain, depth, out):
 
 
 @jit
-def eliminate(H, g, n, damping, chain, depth, S, b, both):
-    """Eliminate n pose unknowns from a system H (m, m; lower), g (m,): S −= Bᵀ A⁻¹ B, b −= Bᵀ A⁻¹ g (Schur complement).
-
-    Fills both (p + 1, n) = A⁻¹ [B, g] for back substitution. A is damped by its own diagonal. False if not positive.
-    """
-    p = H.shape[0] - n
-    A = np.empty(chain.shape)
-    pack(H, chain, depth, A)
-    mean = 0.0
-    for i in range(n):
-        mean += H[i, i] / n
-    for i in range(n):
-        A[i, depth[i]] += damping * (H[i, i] + 1e-6 * mean)
-    if not factor_tree(A, chain, depth):
-        return False
-    for q in range(p + 1):
-        for i in range(n):
-            both[q, i] = H[n + q, i] if q < p else g[i]
-        solve_tree(A, chain, depth, both[q])
-    for q in range(p):
-        for r in range(q + 1):
-            v = 0.0
-            for i in range(n):
-                v += H[n + q, i] * both[r, i]
-            S[q, r] -= v
-        v = 0.0
-        for i in range(n):
-            v += H[n + q, i] * both[p, i]
-        b[q] -= v
-    return True
-
-
-@jit
 def multiply(A, B, out):
     """out = A B; zeros of A are skipped."""
     for i in range(A.shape[0]):

@@ -23,8 +23,8 @@ from kinefit.correspondences.closures import closed_at
 from kinefit.errors import BodyError, check_choice
 from kinefit.rows import AnyRows
 from kinefit.solvers import _kernels_linear
-from kinefit.solvers.equations import lock, normal_equations
-from kinefit.solvers.least_squares import Fit, MakeRows, Step, bounds_of
+from kinefit.solvers.equations import Equations, lock, normal_equations
+from kinefit.solvers.least_squares import Fit, MakeRows, Step, bounds_of, fitted
 
 CLOSED = 1e-9
 """[m, rad] largest residual of an equation that counts as satisfied."""
@@ -125,11 +125,11 @@ def _stopped(
 
 
 def _step(
-    H: NDArray, g: NDArray, damping: float, A: NDArray, c: NDArray, state: BodyState,
-    bounds: tuple[NDArray, NDArray], locked: NDArray,
-) -> tuple[NDArray, float]:  # fmt: skip
+    eq: Equations, damping: float, constraint: Constraint, bounds: tuple[NDArray, NDArray], locked: NDArray
+) -> tuple[NDArray, float]:
     """δ (n,) of the constrained step from a state with c = 0, and the fall of the cost that it predicts."""
-    damped = H + damping * np.eye(len(H))
+    state, g, (c, A) = eq.state, eq.gradient, constraint(eq.state)
+    damped = eq.matrix + damping * np.eye(len(g))
     at_limit = np.zeros(len(g), bool)
     at_limit[6:] = ((state.angles <= bounds[0]) & (g[6:] < 0.0)) | ((state.angles >= bounds[1]) & (g[6:] > 0.0))
     held, stops, delta = locked | at_limit, np.zeros(len(g), bool), np.zeros(len(g))
@@ -163,27 +163,15 @@ def closed_fit(
     eq = normal_equations(body, state, make_rows(state))
     if off > CLOSED:
         return Fit(state, eq, 1, False, damping or 0.0)
-    mean = float(eq.diagonal.mean()) + 1e-300
-    least = _kernels_linear.LEAST_DAMPING * mean
-    damping, growth = (0.1 * mean if damping is None else max(damping, least)), 2.0
-    nothing, H, g = 1e-16 * eq.cost, eq.matrix, eq.gradient
-    c, A = constraint(state)
-    for iteration in range(1, max_iterations + 1):
-        delta, predicted = _step(H, g, damping, A, c, state, bounds, held)
-        if predicted <= tolerance * eq.cost + nothing:
-            return Fit(state, eq, iteration, True, damping)
-        candidate, off = onto(body, state.retract(delta, bounds), constraint, steps=8)
-        fall, new = -1.0, None
-        if off <= CLOSED:
-            new = normal_equations(body, candidate, make_rows(candidate))
-            fall = eq.cost - new.cost
-        damping, growth = _kernels_linear.adapt(damping, growth, fall, predicted, least)
-        if new is not None and fall > 0.0:
-            state, eq, H, g = candidate, new, new.matrix, new.gradient
-            c, A = constraint(state)
-        elif damping > 1e16 * mean:
-            return Fit(state, eq, iteration, True, damping)
-    return Fit(state, eq, max_iterations, False, damping)
+
+    def solve(eq: Equations, damping: float) -> tuple[NDArray, float]:
+        return _step(eq, damping, constraint, bounds, held)
+
+    def follow(eq: Equations, delta: NDArray) -> Equations | None:
+        candidate, off = onto(body, eq.state.retract(delta, bounds), constraint, steps=8)
+        return normal_equations(body, candidate, make_rows(candidate)) if off <= CLOSED else None
+
+    return fitted(eq, solve, follow, damping, max_iterations, tolerance)
 
 
 def closed_step(
@@ -193,8 +181,7 @@ def closed_step(
     bounds, held = bounds_of(body, True), lock(body, None)
     eq = normal_equations(body, state, rows)
     damping = _kernels_linear.LEAST_DAMPING * float(eq.diagonal.mean()) + 1e-300
-    c, A = constraint(state)
-    delta, _ = _step(eq.matrix, eq.gradient, damping, A, c, state, bounds, held)
+    delta, _ = _step(eq, damping, constraint, bounds, held)
     moved, _ = onto(body, state.retract(delta, bounds), constraint)
     return Step(moved, delta, float(np.linalg.norm(delta)), eq)
 

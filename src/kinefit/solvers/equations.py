@@ -14,7 +14,7 @@ from kinefit._arguments import checked
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, Loss
-from kinefit.rows import AnyRows, DofRows, Rows, sort_out
+from kinefit.rows import AnyRows, DofRows, ParameterRows, Rows, sort_out
 from kinefit.solvers import _kernels, _kernels_border, _kernels_linear
 
 _MIN_INFORMATION_RATIO = 1e-14  # to the most informed degree of freedom: information below it is rounding
@@ -140,16 +140,41 @@ def _counting(rows: AnyRows, share: float) -> AnyRows:
     return rows if share == 1.0 or isinstance(rows, Rows | DofRows) else replace(rows, weight=share * rows.weight)
 
 
+def residuals(rows: AnyRows) -> NDArray:
+    """(N,) whitened residuals √w·r, before any loss; Lᵀ r for a joint weight W = L Lᵀ."""
+    if rows.weight.ndim == 2:
+        return np.asarray(np.linalg.cholesky(rows.weight).T @ rows.residual)
+    return np.asarray(np.sqrt(rows.weight) * rows.residual)
+
+
+def softening(rows: AnyRows, loss: Loss) -> tuple[NDArray, float]:
+    """(N,) square roots of robust factors, and the cost Σ ρ (a number); `loss` is for rows without their own."""
+    if isinstance(rows, Rows):
+        factor, cost = (rows.loss or loss).of_rows(rows.data, rows.group)
+        return np.sqrt(factor), cost
+    if isinstance(rows, DofRows):
+        data = np.zeros((8, len(rows)))
+        data[6], data[7] = rows.residual, rows.weight
+        factor, cost = (rows.loss or loss).of_rows(data, rows.group)
+        return np.sqrt(factor), cost
+    r = residuals(rows)
+    return np.ones(len(rows)), float(r @ r)
+
+
+def columns(rows: AnyRows, body: Body, state: BodyState) -> NDArray:
+    """(N, n) whitened derivatives of rows by the degrees of freedom: a step δ changes residuals by −columns · δ."""
+    J = design(body, state, rows)
+    if rows.weight.ndim == 2:
+        return np.asarray(np.linalg.cholesky(rows.weight).T @ J)
+    return np.sqrt(rows.weight)[:, None] * J
+
+
 def _add_dense(rows: DofRows, share: float, body: Body, loss: Loss, H: NDArray, g: NDArray) -> float:
     """Add rows on all degrees of freedom to H and g, multiplied by a share; returns their cost."""
-    if rows.jacobian.shape[1] != len(g):
-        problem = f"rows on {rows.jacobian.shape[1]} degrees of freedom, but body '{body.name}' has {len(g)}"
-        raise ObservationError(problem, remedy="Make the rows with the body that is fitted.")
-    data = np.zeros((8, len(rows)))
-    data[6], data[7] = rows.residual, rows.weight
-    factor, cost = (rows.loss or loss).of_rows(data, rows.group)
-    weighted = rows.jacobian * (share * rows.weight * factor)[:, None]
-    H += rows.jacobian.T @ weighted
+    J = _jacobian(rows, body)
+    root, cost = softening(rows, loss)
+    weighted = J * (share * rows.weight * root**2)[:, None]
+    H += J.T @ weighted
     g += rows.residual @ weighted
     return share * float(cost)
 
@@ -198,15 +223,42 @@ def product(A: NDArray, B: NDArray) -> NDArray:
     return out.reshape(*A.shape[:-1], B.shape[1])
 
 
-def design(body: Body, state: BodyState, rows: Rows | DofRows) -> NDArray:
-    """(N, n) derivatives of rows by every degree of freedom: how far each point moves along its direction."""
+def design(body: Body, state: BodyState, rows: AnyRows) -> NDArray:
+    """(N, n) derivatives of rows by every degree of freedom: a step δ changes residuals by −design · δ.
+
+    Raises
+    ------
+    ObservationError
+        Rows on degrees of freedom or segments that the body lacks.
+    """
+    tree = body.tree
     if isinstance(rows, DofRows):
-        return rows.jacobian
-    tree, out = body.tree, np.empty((len(rows), body.tree.n_dofs))
+        return _jacobian(rows, body)
+    if isinstance(rows, ParameterRows):
+        check_indices("degree of freedom", tree.n_dofs, body, rows.index)
+        return np.eye(tree.n_dofs)[rows.index]
     _, screws = tree.forward(state.T_world_root, state.angles)
     centre = np.ascontiguousarray(state.T_world_root[:3, 3])
-    _kernels_border.along(rows.data, rows.segment, centre, screws, tree.dof_parent, tree.last_dof, out)
-    return out
+
+    def along(segment: NDArray, data: NDArray) -> NDArray:
+        check_indices("segment", len(tree.segments), body, segment)
+        out = np.empty((len(segment), tree.n_dofs))
+        _kernels_border.along(data, segment, centre, screws, tree.dof_parent, tree.last_dof, out)
+        return out
+
+    if isinstance(rows, Rows):
+        return along(rows.segment, rows.data)
+    ends = (np.concatenate([x.T, rows.direction.T]) for x in (rows.point_a, rows.point_b))
+    a, b = (along(np.ascontiguousarray(s), data) for s, data in zip(rows.segments.T, ends))
+    return a - b
+
+
+def _jacobian(rows: DofRows, body: Body) -> NDArray:
+    """(N, n) of rows on all degrees of freedom, checked."""
+    if rows.jacobian.shape[1] != body.tree.n_dofs:
+        problem = f"rows on {rows.jacobian.shape[1]} degrees of freedom, but body '{body.name}' has {body.tree.n_dofs}"
+        raise ObservationError(problem, remedy="Make the rows with the body that is fitted.")
+    return rows.jacobian
 
 
 def check_indices(what: str, count: int, body: Body, *indices: NDArray) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,8 @@ from kinefit.solvers.equations import Equations, lock, normal_equations
 
 _MAX_TRIES = 30  # of more damping, for a matrix that is not positive definite
 
-LEAST_SCALED_DAMPING = 1e-9
-"""Least λ of solvers that scale each diagonal element of H by 1 + λ (bundle adjustment). Only it fixes a free gauge."""
+MAX_DAMPING = 1e8
+"""λ as a share of H's diagonal, above which no step lowers the cost."""
 
 MakeRows = Callable[[BodyState], AnyRows | Iterable[AnyRows]]
 
@@ -59,38 +59,69 @@ class Step:
         return self.equations.cost
 
 
-def relax(damping: float) -> float:
-    """Reduce the λ (unitless) that scales the diagonal of H, after a step that lowered the cost."""
-    return max(0.1 * damping, LEAST_SCALED_DAMPING)
+class WithCost(Protocol):
+    """A problem linearised at some values of its unknowns."""
+
+    @property
+    def cost(self) -> float:
+        """Cost of these values, in squared standard deviations."""
+        ...
 
 
-State = TypeVar("State")
+At = TypeVar("At", bound=WithCost)
+Move = TypeVar("Move")
 
 
-def descend(
-    state: State, cost_of: Callable[[State], float], step: Callable[[State, float], State | None], *, iterations: int,
-    tolerance: float, damping: float = 1e-4, most: float = 1e8,
-) -> tuple[State, float]:  # fmt: skip
-    """Minimise a cost by steps whose damping grows until they lower it; returns the state and its cost.
+@dataclass(frozen=True, eq=False)
+class Descent(Generic[At]):
+    """The end of `descend`.
 
     Parameters
     ----------
-    step : (state, λ) -> state after a step with λ times the diagonal of H added to H; None if H is singular
-    tolerance : stop when a step lowers the cost by less than this share of it
-    damping, most : first λ, and the λ at which the search ends; unitless
+    at : the problem there
+    iterations : int, number of steps tried
+    converged : bool, False if the iterations were used up
+    damping : float, last λ
     """
-    cost = cost_of(state)
-    for _ in range(iterations):
-        before = cost
-        while damping < most:
-            trial = step(state, damping)
-            if trial is not None and (new := cost_of(trial)) < cost:
-                state, cost, damping = trial, new, relax(damping)
-                break
-            damping *= 10.0
-        if not before - cost > tolerance * cost:
-            break
-    return state, cost
+
+    at: At
+    iterations: int
+    converged: bool
+    damping: float
+
+
+def descend(
+    at: At, solve: Callable[[At, float], tuple[Move, float]], follow: Callable[[At, Move], At | None], *,
+    iterations: int, tolerance: float, damping: float, nothing: float = 1e-300,
+    least: float = _kernels_linear.LEAST_DAMPING, most: float = MAX_DAMPING,
+) -> Descent[At]:  # fmt: skip
+    """Minimise a cost by damped Gauss-Newton steps, their damping adapted by Nielsen's rule.
+
+    Parameters
+    ----------
+    at : the problem to start from
+    solve : (problem, λ) -> step, and the fall of the cost that it predicts; negative if H is not positive definite
+    follow : (problem, step) -> the problem after the step; None if that is impossible
+    iterations : number of steps tried, at most
+    tolerance, nothing : stop when the predicted fall of the cost is below this share of it plus `nothing`
+    damping, least, most : first λ, the least, and the λ at which the search ends, in the unit of `solve`
+    """
+    growth = 2.0
+    for tried in range(1, iterations + 1):
+        move, predicted = solve(at, damping)
+        if predicted < 0.0:
+            damping, growth = _kernels_linear.adapt(damping, growth, -1.0, 1.0, least)
+            continue
+        if predicted <= tolerance * at.cost + nothing:
+            return Descent(at, tried, True, damping)
+        new = follow(at, move)
+        fall = -1.0 if new is None else at.cost - new.cost
+        damping, growth = _kernels_linear.adapt(damping, growth, fall, predicted, least)
+        if new is not None and fall > 0.0:
+            at = new
+        elif damping > most:
+            return Descent(at, tried, True, damping)
+    return Descent(at, iterations, False, damping)
 
 
 def _step(eq: Equations, damping: float, bounds: tuple[NDArray, NDArray], locked: NDArray) -> tuple[NDArray, float]:
@@ -173,24 +204,29 @@ def levenberg_marquardt(
         Stop when the predicted fall of the cost is below this share of it, or below 1e-16 of the first cost.
     """
     bounds, held = bounds_of(body, limits), lock(body, locked)
+
+    def follow(eq: Equations, delta: NDArray) -> Equations:
+        moved = eq.state.retract(delta, bounds)
+        return normal_equations(body, moved, make_rows(moved), loss=loss)
+
     state = state.retract(np.zeros(body.tree.n_dofs), bounds)
-    eq = normal_equations(body, state, make_rows(state), loss=loss)
-    mean = float(eq.diagonal.mean()) + 1e-300
+    start = normal_equations(body, state, make_rows(state), loss=loss)
+
+    def solve(eq: Equations, damping: float) -> tuple[NDArray, float]:
+        return _step(eq, damping, bounds, held)
+
+    return fitted(start, solve, follow, damping, max_iterations, tolerance)
+
+
+def fitted(
+    start: Equations, solve: Callable[[Equations, float], tuple[NDArray, float]],
+    follow: Callable[[Equations, NDArray], Equations | None], damping: float | None, iterations: int, tolerance: float,
+) -> Fit:  # fmt: skip
+    """The end of `descend` from a pose's equations, with the damping of `levenberg_marquardt`."""
+    mean = float(start.diagonal.mean()) + 1e-300
     least = _kernels_linear.LEAST_DAMPING * mean
-    damping, growth = (0.1 * mean if damping is None else max(damping, least)), 2.0
-    nothing = 1e-16 * eq.cost
-    for iteration in range(1, max_iterations + 1):
-        delta, predicted = _step(eq, damping, bounds, held)
-        if predicted < 0.0:
-            damping, growth = _kernels_linear.adapt(damping, growth, -1.0, 1.0, least)
-            continue
-        if predicted <= tolerance * eq.cost + nothing:
-            return Fit(state, eq, iteration, True, damping)
-        candidate = state.retract(delta, bounds)
-        new = normal_equations(body, candidate, make_rows(candidate), loss=loss)
-        damping, growth = _kernels_linear.adapt(damping, growth, eq.cost - new.cost, predicted, least)
-        if new.cost < eq.cost:
-            state, eq = candidate, new
-        elif damping > 1e16 * mean:
-            return Fit(state, eq, iteration, True, damping)
-    return Fit(state, eq, max_iterations, False, damping)
+    end = descend(
+        start, solve, follow, iterations=iterations, tolerance=tolerance, nothing=1e-16 * start.cost,
+        damping=0.1 * mean if damping is None else max(damping, least), least=least, most=1e16 * mean,
+    )  # fmt: skip
+    return Fit(end.at.state, end.at, end.iterations, end.converged, end.damping)

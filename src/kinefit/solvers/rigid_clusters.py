@@ -1,4 +1,4 @@
-"""Rigid clusters of markers: their mean shape, and its pose in every frame."""
+"""Rigid clusters: the mean shape of markers and its pose in every frame, and motions of limbs from pairs of points."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._arguments import check_shape
+from kinefit.errors import ObservationError
 from kinefit.geometry.se3 import nearest_rotation
 
 
@@ -62,3 +64,53 @@ def shape_of(y: NDArray) -> NDArray:
         typical = middle(local(*rigid_frames(shape, y), y), axis=0)
         shape = np.where(np.isfinite(typical), typical, shape)
     return shape
+
+
+def absolute_orientation(
+    source: NDArray, target: NDArray, weight: NDArray, limb: NDArray, count: int, *, stay: float = 0.0
+) -> tuple[NDArray, NDArray]:
+    """The rigid motion x -> R x + t of each limb that minimises Σ w |R source + t − target|² over its pairs.
+
+    The rotation is the one nearest to Σ w b aᵀ, a and b being source and target about their weighted means (Horn,
+    JOSA A 4, 1987; Kabsch 1978; P2 4.2.7). Pairs that do not determine it (one pair, or all on a line) have several:
+    a quarter of `stay`, added to the diagonal, prefers the identity.
+
+    Parameters
+    ----------
+    source, target : (N, 3) [m] pairs of points
+    weight : (N,) not negative
+    limb : (N,) int in 0 .. count - 1
+    count : int, number of limbs
+    stay : float [m² times the unit of the weights]
+        Preference for small rotations, equal to that of unmoved pairs with a quarter of this as second moment.
+
+    Returns
+    -------
+    R (count, 3, 3), t (count, 3) [m]; the identity for limbs without pairs
+
+    Raises
+    ------
+    ObservationError
+        Pairs that do not match, are not finite, or have a negative weight.
+    """
+    n = len(source)
+    for array, shape in ((source, (n, 3)), (target, (n, 3)), (weight, (n,)), (limb, (n,))):
+        check_shape(array, shape, "pairs")
+    if not np.isfinite([source.sum(), target.sum(), weight.sum()]).all() or (n and weight.min() < 0.0):
+        raise ObservationError("pairs are not finite, or have a negative weight", remedy="Remove unknown pairs.")
+    total = np.bincount(limb, weight, count)
+    share = 1.0 / np.where(total > 0.0, total, 1.0)
+    mean_source, mean_target = (
+        np.stack([np.bincount(limb, weight * x[:, k], count) for k in range(3)], axis=1) * share[:, None]
+        for x in (source, target)
+    )
+    a, b = source - mean_source[limb], (target - mean_target[limb]) * weight[:, None]
+    cross = np.stack([np.bincount(limb, b[:, i] * a[:, j], count) for i in range(3) for j in range(3)], axis=1)
+    R = nearest_rotation(cross.reshape(-1, 3, 3) + 0.25 * (stay + 1e-12) * np.eye(3))
+    return R, mean_target - (R @ mean_source[:, :, None])[..., 0]
+
+
+def move(frames: NDArray, R: NDArray, t: NDArray) -> NDArray:
+    """Frames (S, 12) of segments after motions R (S, 3, 3), t (S, 3) [m] in the world."""
+    turned = (R @ frames[:, :9].reshape(-1, 3, 3)).reshape(-1, 9)
+    return np.concatenate([turned, (R @ frames[:, 9:, None])[..., 0] + t], axis=1)

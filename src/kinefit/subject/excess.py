@@ -15,7 +15,7 @@ import numpy as np
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched
 from kinefit.sensors.channel_residuals import ChannelResiduals
-from kinefit.solvers.bundle.whitened import residuals
+from kinefit.solvers.equations import residuals
 from kinefit.solvers.trajectory.variance_components import variance_components
 
 _MIN_RESIDUALS = 10  # of a sensor: with fewer its excess is not estimated

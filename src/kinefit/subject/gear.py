@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.closures import Closure, Dimension, known_gear, with_dimensions, with_places
 from kinefit.geometry import se3
-from kinefit.subject.parameters import World
+from kinefit.subject.parameters import Parameters, World
 
-_STEP = 1e-4  # [m, rad] of finite differences
 _WHERE = ("x", "y", "z", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True, eq=False)
-class Gear:
+class Gear(Parameters):
     """Dimensions of a body's gear and places of closures in the world, of those that the body file marks as unknown.
 
     A place is a translation [m] and, for a rigid closure, a rotation vector [rad], both from the world's origin.
@@ -62,11 +61,6 @@ class Gear:
         std = [d.std for d in self.dimensions]
         std += [s for c in self.places for s in (*[c.place_std] * 3, *[c.turn_std] * 3)[: _count(c)]]
         return np.diag(np.array(std) ** -2.0)
-
-    @property
-    def step(self) -> NDArray:
-        """(p,) [m, rad] steps of finite differences."""
-        return np.full(len(self.names), _STEP)
 
     def apply(self, world: World, values: NDArray) -> World:
         """The world with gear of these values (p,) [m, rad], which count as known."""

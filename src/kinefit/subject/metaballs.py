@@ -16,16 +16,15 @@ from kinefit.bodies.surfaces.metaballs import LEVEL, pack_balls
 from kinefit.errors import BodyError, ObservationError
 from kinefit.losses import SQUARED, Loss, huber
 from kinefit.solvers.equations import inverse
-from kinefit.solvers.least_squares import relax
-from kinefit.subject.parameters import World
+from kinefit.solvers.least_squares import MAX_DAMPING, descend
+from kinefit.subject.parameters import Parameters, World
 
 RADIUS_STD = 0.2
 """Standard deviation of a radius' logarithm between people, as of cylinders' half axes."""
 _WEIGHT_STD = 0.3  # standard deviation of a weight's logarithm
-_STEP = 1e-3  # of finite differences
 _HUBER_SIGMAS = 2.0
 _MAX_ITERATIONS = 30
-_MIN_STEP = 1e-6  # in a logarithm: below it the fit has converged
+_TOLERANCE = 1e-10  # share of the cost that a step must be predicted to lower it by
 _MAX_POINT_DISTANCE = 0.2  # [m] of a point from the surface
 _MIN_RADIUS_RATIO = 0.2  # to the radius at the start: a smaller ball has collapsed
 
@@ -36,7 +35,7 @@ minimum, as in two of four arms."""
 
 
 @dataclass(frozen=True, eq=False)
-class MetaballShape:
+class MetaballShape(Parameters):
     """Logarithms of the radii of a body's metaballs, and optionally of their weights, limb by limb.
 
     Parameters
@@ -54,6 +53,7 @@ class MetaballShape:
     body: Body
     weights: bool = False
     girth: float = RADIUS_STD
+    difference = 1e-3
 
     def __post_init__(self) -> None:
         if not self._limbs:
@@ -82,20 +82,10 @@ class MetaballShape:
         return tuple(frozenset((segment,)) for segment, count in each for _ in range(count))
 
     @property
-    def mean(self) -> NDArray:
-        """(p,) zero."""
-        return np.zeros(len(self.names))
-
-    @property
     def information(self) -> NDArray:
         """(p, p) prior information."""
         std = [_WEIGHT_STD if name.endswith("weight") else self.girth for name in self.names]
         return np.diag(np.array(std) ** -2.0)
-
-    @property
-    def step(self) -> NDArray:
-        """(p,) steps of finite differences."""
-        return np.full(len(self.names), _STEP)
 
     def apply(self, world: World, values: NDArray) -> World:
         """The body with these logarithms (p,) of factors on radii and weights."""
@@ -234,38 +224,40 @@ def _least_squares(
     loss: Loss, radii: int, lowest: float, iterations: int,
 ) -> tuple[NDArray, NDArray, NDArray, int]:  # fmt: skip
     """Levenberg-Marquardt on θ -> (J, r): final θ, normal matrix without the prior, r, number of steps tried."""
+    collapsed: list[int] = []
 
-    def normal(t: NDArray) -> tuple[NDArray, NDArray, float, NDArray]:
+    def at(t: NDArray) -> _Balls:
         J, r = residuals(t)
         rho, factor = loss.weigh(weight * r * r)
         w = weight * factor
-        return J.T @ (w[:, None] * J), J.T @ (w * r) - prior * t, float(rho.sum() + prior @ t**2), r
+        return _Balls(t, r, J.T @ (w[:, None] * J), J.T @ (w * r) - prior * t, float(rho.sum() + prior @ t**2))
 
-    H, b, cost, r = normal(theta)
-    damping, tried = 1e-3, 0
-    for _ in range(iterations):
-        tried += 1
-        A = H + np.diag(prior)
-        scale = np.maximum(np.diag(A), 1e-12 * A.max() + 1e-300)  # a radius without influence stays
-        step = np.linalg.solve(A + damping * np.diag(scale), b)
-        trial = theta + np.clip(step, -0.5, 0.5)
-        if trial[:radii].min() < lowest:
-            damping *= 10.0
-            if damping > 1e8:
-                k = int(np.argmin(trial[:radii])) // 3
-                problem = f"ball {k + 1} collapses: a radius falls below {np.exp(lowest):.2g} of its start"
-                raise BodyError(problem, remedy="Give points all around the limb, or fewer balls.")
-            continue
-        H2, b2, cost2, r2 = normal(trial)
-        if cost2 <= cost:
-            theta, H, b, cost, r, damping = trial, H2, b2, cost2, r2, relax(damping)
-            if np.abs(step).max() < _MIN_STEP:
-                break
-        else:
-            damping *= 10.0
-            if damping > 1e8:
-                break
-    return theta, H, r, tried
+    def solve(now: _Balls, damping: float) -> tuple[NDArray, float]:
+        A = now.H + np.diag(prior)
+        scale = damping * np.maximum(np.diag(A), 1e-12 * A.max() + 1e-300)  # a radius without influence stays
+        step = np.linalg.solve(A + np.diag(scale), now.g)
+        return np.clip(step, -0.5, 0.5), float(step @ (now.g + scale * step))
+
+    def follow(now: _Balls, step: NDArray) -> _Balls | None:
+        collapsed[:] = np.flatnonzero((now.theta + step)[:radii] < lowest)
+        return None if collapsed else at(now.theta + step)
+
+    end = descend(at(theta), solve, follow, iterations=iterations, tolerance=_TOLERANCE, damping=1e-3)
+    if collapsed and end.damping > MAX_DAMPING:
+        problem = f"ball {collapsed[0] // 3 + 1} collapses: a radius falls below {np.exp(lowest):.2g} of its start"
+        raise BodyError(problem, remedy="Give points all around the limb, or fewer balls.")
+    return end.at.theta, end.at.H, end.at.r, end.iterations
+
+
+@dataclass(frozen=True, eq=False)
+class _Balls:
+    """Logarithms θ (p,), residuals (N,), normal matrix without the prior, gradient with it, and cost."""
+
+    theta: NDArray
+    r: NDArray
+    H: NDArray
+    g: NDArray
+    cost: float
 
 
 def unmeshed(limb: Metaballs, values: NDArray, weights: bool) -> Metaballs:

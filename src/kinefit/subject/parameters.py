@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +27,6 @@ KNOWN_SIZE_STD = 0.02
 """Standard deviation of the logarithm of a person's size if the stature is known: shoes, posture."""
 
 _MIDLINE_STD = 0.002  # [m] of a midline point to either side
-_STEP = 1e-4  # [m, rad, logarithm] of finite differences
 _PRIOR_COORDINATES = 5.0  # number of measured coordinates that the prior value of a spread counts as
 
 
@@ -60,6 +59,8 @@ class Parameters(Protocol):
     - `touches`: (p,) for each parameter the only segments whose rows depend on it.
     """
 
+    difference: ClassVar[float] = 1e-4  # [m, rad, logarithm]
+
     @property
     def names(self) -> tuple[str, ...]:
         """(p,) unique names."""
@@ -67,8 +68,8 @@ class Parameters(Protocol):
 
     @property
     def mean(self) -> NDArray:
-        """(p,) prior mean."""
-        ...
+        """(p,) prior mean; zero by default."""
+        return np.zeros(len(self.names))
 
     @property
     def information(self) -> NDArray:
@@ -77,8 +78,8 @@ class Parameters(Protocol):
 
     @property
     def step(self) -> NDArray:
-        """(p,) steps of the central differences."""
-        ...
+        """(p,) steps of the central differences, `difference` by default."""
+        return np.full(len(self.names), self.difference)
 
     def apply(self, world: World, values: NDArray) -> World:
         """The world with these values (p,); pure."""
@@ -86,7 +87,7 @@ class Parameters(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class SegmentScales:
+class SegmentScales(Parameters):
     """Logarithms of the scales of a body's lengths: `Body.scale_groups`.
 
     All lengths follow the person's size, with a standard deviation of `about_std`, or 2 % if `size` is given. Each
@@ -129,11 +130,6 @@ class SegmentScales:
         """(G, G) prior information of the logarithms."""
         common = self.about_std if self.size is None else KNOWN_SIZE_STD
         return np.linalg.inv(np.eye(len(self.names)) * self.proportions**2 + common**2)
-
-    @property
-    def step(self) -> NDArray:
-        """(G,) steps of finite differences."""
-        return np.full(len(self.names), _STEP)
 
     @cached_property
     def touches(self) -> tuple[frozenset[int] | None, ...]:
@@ -184,7 +180,7 @@ class KnownLengths(SegmentScales):
 
 
 @dataclass(frozen=True, eq=False)
-class PointOffsets:
+class PointOffsets(Parameters):
     """Landmark offsets [m] of a detector's keypoints or of markers, along their segment's axes.
 
     Parameters
@@ -234,22 +230,12 @@ class PointOffsets:
         return tuple(f"{self.name} {self.points.names[k]} {axis}" for k in self._shared[2] for axis in "xyz")
 
     @property
-    def mean(self) -> NDArray:
-        """(3 L,) [m] zero."""
-        return np.zeros(len(self.names))
-
-    @property
     def information(self) -> NDArray:
         """(3 L, 3 L) [1/m²]."""
         _, sign, leaders = self._shared
         std = np.repeat(np.broadcast_to(np.asarray(self.std, float), len(self.points))[leaders], 3)
         std[3 * np.flatnonzero(sign[leaders] == 0.0) + 2] = _MIDLINE_STD
         return np.diag(std**-2)
-
-    @property
-    def step(self) -> NDArray:
-        """(3 L,) [m] steps of finite differences."""
-        return np.full(len(self.names), _STEP)
 
     @property
     def touches(self) -> tuple[frozenset[int], ...]:

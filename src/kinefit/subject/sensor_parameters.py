@@ -19,19 +19,18 @@ from kinefit.sensors.displaced import AXES, CLOCK
 from kinefit.sensors.settings import CameraErrors
 from kinefit.solvers import _kernels_border
 from kinefit.solvers.equations import inverse
-from kinefit.subject.parameters import World, place_spread
+from kinefit.subject.parameters import Parameters, World, place_spread
 
 OUTLIER_SIGMAS = 3.0
 """Standard deviations of a camera's calibration: one of 24 numbers is farther off in 6 % of takes."""
 
 _MIN_WRONG_FACTOR = 2.0  # estimated over stated standard deviations of a camera: above it the calibration is wrong
 _ROUNDS = 30  # of alternating spreads and moves; the slowest change by less than a hundredth from then on
-_STEP = 1e-4  # [m, rad] of finite differences
 _GAUGE_FACTOR = 1e4  # of information of the cameras' common motion over that of single cameras, where it is a gauge
 
 
 @dataclass(frozen=True, eq=False)
-class CameraExtrinsics:
+class CameraExtrinsics(Parameters):
     """Extrinsics of cameras: six parameters each, the twist (v, ω) [m, rad] of the pose in the camera's own frame.
 
     No measurement of cameras observes a common motion of cameras and bodies. So one camera is the gauge and stays, or
@@ -160,11 +159,6 @@ class CameraExtrinsics:
         """Whether a camera's calibration is wrong; always False for two cameras, where it could be either of them."""
         return len(self.free) > 2 and float(self._times.max()) > _MIN_WRONG_FACTOR
 
-    @property
-    def step(self) -> NDArray:
-        """(6 C,) [m, rad] steps of finite differences."""
-        return np.full(len(self.names), _STEP)
-
     def apply(self, world: World, values: NDArray) -> World:
         """The world with cameras moved by twists (6 C,) [m, rad]."""
         twist = dict(zip(self.free, np.asarray(values, float).reshape(-1, 6)))
@@ -207,7 +201,7 @@ def moved_rig(rig: Rig, twists: Mapping[str, ArrayLike]) -> Rig:
 
 
 @dataclass(frozen=True, eq=False)
-class SensorFrames:
+class SensorFrames(Parameters):
     """Pose of a sensor's frame in the world and its clock offset, of `Displaced` measurements: seven parameters each.
 
     Other sensors must constrain the world, such as keypoints of calibrated cameras.
@@ -238,11 +232,6 @@ class SensorFrames:
         return tuple(f"{sensor} {what}" for sensor in self.sensors for what in (*AXES, CLOCK))
 
     @property
-    def mean(self) -> NDArray:
-        """(7 S,) zero."""
-        return np.zeros(len(self.names))
-
-    @property
     def information(self) -> NDArray:
         """(7 S, 7 S) prior information."""
         out = np.zeros((len(self.names), len(self.names)))
@@ -252,11 +241,6 @@ class SensorFrames:
             out[7 * k : 7 * k + 7, 7 * k : 7 * k + 7] = A.T @ np.diag(np.repeat(self.std, (3, 3, 1)) ** -2.0) @ A
         return out
 
-    @property
-    def step(self) -> NDArray:
-        """(7 S,) steps of finite differences."""
-        return np.full(len(self.names), _STEP)
-
     def apply(self, world: World, values: NDArray) -> World:
         """The world with sensors' frames and clocks of these values (7 S,) [m, rad, s]."""
         own = np.asarray(values, float).reshape(-1, 7)
@@ -265,7 +249,7 @@ class SensorFrames:
 
 
 @dataclass(frozen=True, eq=False)
-class OwnUnknowns:
+class OwnUnknowns(Parameters):
     """Unknowns of sensors, such as a rope's length or a clock's delay: `Sensor.unknowns`.
 
     Parameters

@@ -25,11 +25,10 @@ SURFACE_OFFSET_STD = 0.015
 """[m] between people, of a surface's place on its bone."""
 
 _KINDS = ("start a", "start b", "end a", "end b", "start offset", "end offset")
-_STEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class CylinderShape:
+class CylinderShape(Parameters):
     """Half axes (logarithms) and forward offsets [m] of tapered cylinders; left and right share them.
 
     Parameters
@@ -77,11 +76,6 @@ class CylinderShape:
         return tuple(segments for segments in on for _ in _KINDS)
 
     @property
-    def mean(self) -> NDArray:
-        """(6 C,) zero."""
-        return np.zeros(len(self.names))
-
-    @property
     def information(self) -> NDArray:
         """(6 C, 6 C) prior information."""
         return np.diag(np.tile([self.girth] * 4 + [self.offset] * 2, len(self._groups[0])) ** -2.0)
@@ -89,7 +83,7 @@ class CylinderShape:
     @property
     def step(self) -> NDArray:
         """(6 C,) steps of finite differences: of logarithms, and a tenth of that in metres."""
-        return np.tile([_STEP] * 4 + [0.1 * _STEP] * 2, len(self._groups[0]))
+        return np.tile([1e-3] * 4 + [1e-4] * 2, len(self._groups[0]))
 
     def apply(self, world: World, values: NDArray) -> World:
         """The body with cylinders of these values (6 C,)."""
@@ -102,7 +96,7 @@ class CylinderShape:
 
 
 @dataclass(frozen=True, eq=False)
-class Girths:
+class Girths(Parameters):
     """Logarithms of the girths of a body's cylinders along both half axes, one pair for each of its scale groups.
 
     Girths of one person are correlated: half of the variance is common to all of them. A few frames determine these
@@ -121,6 +115,7 @@ class Girths:
 
     body: Body
     girth: float = GIRTH_STD
+    difference = 1e-3
 
     def __post_init__(self) -> None:
         if not self._groups:
@@ -144,19 +139,9 @@ class Girths:
         return tuple(segments for segments in on for _ in "ab")
 
     @property
-    def mean(self) -> NDArray:
-        """(2 G,) zero."""
-        return np.zeros(len(self.names))
-
-    @property
     def information(self) -> NDArray:
         """(2 G, 2 G) prior information."""
         return np.linalg.inv(self.girth**2 * (0.5 * np.eye(len(self.names)) + 0.5))
-
-    @property
-    def step(self) -> NDArray:
-        """(2 G,) steps of finite differences."""
-        return np.full(len(self.names), _STEP)
 
     def apply(self, world: World, values: NDArray) -> World:
         """The body with these logarithms of girths (2 G,)."""
@@ -182,7 +167,7 @@ def _shaped(surface: TaperedCylinder, size: tuple[float, ...]) -> Surface:
 
 
 @dataclass(frozen=True, eq=False)
-class AnnyShape:
+class AnnyShape(Parameters):
     """Sex, muscle, weight, height and proportions of an Anny body, as logits over 4 about a mean shape.
 
     By default it replaces the body by one of the model's, so it must be the first kind of parameters. `SegmentScales`
@@ -200,6 +185,7 @@ class AnnyShape:
     usual: NDArray
     std: float = 0.25
     flesh: bool = False
+    difference = 1e-3
 
     @cached_property
     def _family(self) -> AnnyFamily:
@@ -219,19 +205,9 @@ class AnnyShape:
         return tuple(f"anny {name}" for name in self._family.names)
 
     @property
-    def mean(self) -> NDArray:
-        """(5,) zero."""
-        return np.zeros(len(self.names))
-
-    @property
     def information(self) -> NDArray:
         """(5, 5) prior information."""
         return np.eye(len(self.names)) / self.std**2
-
-    @property
-    def step(self) -> NDArray:
-        """(5,) steps of finite differences."""
-        return np.full(len(self.names), _STEP)
 
     def apply(self, world: World, values: NDArray) -> World:
         """The world with a body of this shape (5,)."""

@@ -25,7 +25,7 @@ from kinefit.readers.take.pictures import TakePictures
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.foot_contacts import FloorPlane
 from kinefit.tracking.recording import Recording
-from kinefit.tracking.takes.take_recording import recording_of
+from kinefit.tracking.take_recording import recording_of
 from kinefit.tracking.video import track
 
 _LIKE = 0.4  # score of a start in a thing that is a person: 0.45 and more of people of another size than the body's

@@ -17,6 +17,7 @@ from kinefit.bodies import load_body
 from kinefit.calibration.people.altered import refuse_videos
 from kinefit.calibration.people.calibrate import GUESSED_FOCAL_SIGMA, STATED_FOCAL_SIGMA, calibrate_people
 from kinefit.calibration.refine.gauge import resized
+from kinefit.errors import KinefitError
 from kinefit.preparing.each_video import Step, Tell
 from kinefit.preparing.faces import ensure_faces
 from kinefit.preparing.take import warn, with_detections
@@ -37,7 +38,7 @@ def cameras_file(take: Path) -> Path:
     return take.with_name(f"{take.stem}-cameras.toml")
 
 
-def prepared(take: Take, progress: Step | None = None, tell: Tell = warn) -> Take:
+def prepared(take: Take, progress: Step | None = None, tell: Tell = warn, *, lenient: bool = False) -> Take:
     """The take with everything that tracking it needs; as it is where nothing is missing.
 
     The built-in detector looks through the videos of a take that names no keypoints, nor another sensor that shows a
@@ -48,13 +49,20 @@ def prepared(take: Take, progress: Step | None = None, tell: Tell = warn) -> Tak
     ----------
     progress : called with (what, done, total)
     tell : called with what is worth saying; default: a warning.
+    lenient : bool, whether to go on without keypoints where none are detected
 
     Raises
     ------
     KinefitError
         As `ensure_detections`, `find_cameras`; what cannot be fetched.
     """
-    take = find_cameras(with_detections(take, progress, tell), progress, tell)
+    try:
+        take = with_detections(take, progress, tell)
+    except KinefitError as error:
+        if not lenient:
+            raise
+        tell(f"note: checked without keypoints: {error}")
+    take = find_cameras(take, progress, tell)
     if take.hide_faces and any(camera.video for camera in take.cameras):
         ensure_faces(take, progress, tell)
     if take.body == "anny":

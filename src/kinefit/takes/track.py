@@ -14,14 +14,11 @@ from kinefit.diagnostics.quick import input_findings, with_cause, with_findings
 from kinefit.errors import KinefitError, TakeError, command
 from kinefit.identification.take.takes import with_names
 from kinefit.motion import Motion
-from kinefit.multiview.association import choose_people, person_records
-from kinefit.multiview.followed import follow
 from kinefit.readers.calibration.found import found_notes
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.checks import check_enough
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import Observations, load_observations
-from kinefit.sensors.channels import make_channels
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.online.known_noise import KnownNoise
 from kinefit.subject.keypoints import fit_subject
@@ -31,8 +28,9 @@ from kinefit.takes.missing import prepared
 from kinefit.tracking.cameras import as_found
 from kinefit.tracking.checkpoints.checkpoint import Checkpoint
 from kinefit.tracking.checkpoints.interrupted import TrackingInterrupted
-from kinefit.tracking.takes.floor_level import on_floor, rig_on_floor
-from kinefit.tracking.takes.take_recording import from_afar, label_findings_of, recording_of
+from kinefit.tracking.recording import Recording
+from kinefit.tracking.sizing import channels_of
+from kinefit.tracking.take_recording import from_afar, label_findings_of, on_floor, recording_of, rig_on_floor
 from kinefit.tracking.video import Progress, track
 
 _DEFAULT_BODY = "humanoid"  # body of a take that names none
@@ -74,10 +72,7 @@ def track_take(
             remedy='Add [start], or [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
         )  # fmt: skip
     if not alone:
-        raise TakeError(
-            "the take has no [[keypoints]] and no other sensor", file=take.path,
-            remedy=f"Add keypoints of two or more cameras; {command('detect', take.path)} detects them in videos.",
-        )  # fmt: skip
+        raise _without_keypoints(take, " and no other sensor")
     named = body if take.start is None or take.body == _DEFAULT_BODY else load_body(take.body)
     if named.tree.segments != body.tree.segments:
         raise TakeError(
@@ -126,12 +121,13 @@ def load_keypoints(take: Take, *, exteriors: bool = True) -> Observations:
     """
     observations = load_observations(take, exteriors=exteriors)
     if not observations.keypoints or observations.rig is None:
-        raise TakeError(
-            "the take has no [[keypoints]]",
-            file=take.path,
-            remedy=f"Add keypoints of two or more cameras; {command('detect', take.path)} detects them in videos.",
-        )
+        raise _without_keypoints(take)
     return observations
+
+
+def _without_keypoints(take: Take, more: str = "") -> TakeError:
+    remedy = f"Add keypoints of two or more cameras; {command('detect', take.path)} detects them in videos."
+    return TakeError(f"the take has no [[keypoints]]{more}", file=take.path, remedy=remedy)
 
 
 def trial_of(take: Take, *, frames: int = 50) -> Subject | None:
@@ -147,6 +143,6 @@ def trial_of(take: Take, *, frames: int = 50) -> Subject | None:
     seen, body = load_keypoints(trial), load_body(take.body)
     assert seen.rig is not None
     sigma, cameras = [entry.sigma for entry in trial.keypoints], settings_of(trial).camera_errors
-    keypoints = follow(seen.rig, seen.keypoints, trial.person).keypoints
-    channels = make_channels(body, seen.rig, person_records(keypoints, choose_people(seen.rig, keypoints)), sigma)
+    of_person = Recording.of_keypoints(seen.rig, seen.keypoints, sigma=sigma, person=trial.person)
+    channels = channels_of(of_person, body, TrackSettings())
     return fit_subject(body, channels, frames=frames, height=trial.height or take.height, cameras=cameras)

@@ -29,8 +29,7 @@ from kinefit.smoothing.tracked_frames import TrackedFrames
 from kinefit.smoothing.uncertainty import MOTION_CORRELATION_TIME, pixel_information, with_systematic_errors
 from kinefit.smoothing.unwrap import unwrap
 from kinefit.subject.subject import Subject, SubjectFit
-from kinefit.tracking.agreement import LOOKS, cameras_apart, contradictions
-from kinefit.tracking.cameras import CAMERAS, as_record, composed
+from kinefit.tracking.cameras import CAMERAS, LOOKS, as_record, cameras_apart, composed, contradictions
 from kinefit.tracking.recording import spread
 
 

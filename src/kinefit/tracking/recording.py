@@ -17,8 +17,7 @@ from kinefit.errors import ObservationError, check_choice, choices
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import UP_AXES, Motion
 from kinefit.multiview.association import choose_people, person_records
-from kinefit.multiview.followed import PersonKeypoints, follow
-from kinefit.multiview.one_camera import only_lifted
+from kinefit.multiview.followed import PersonKeypoints, follow, only_lifted
 from kinefit.multiview.people import PersonTrack
 from kinefit.observations import (
     KEYPOINT_SIGMA,

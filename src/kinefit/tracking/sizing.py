@@ -163,10 +163,10 @@ def _with_depth_cameras(person: SizedPerson, settings: TrackSettings) -> SizedPe
     rig, gone = person.recording.rig, dict[str, list[float]]()
     for name, placed in placed_cameras(person.recording, person.subject, settings).items():
         camera = rig[name]
-        if placed.usable and not placed.fits:
+        if placed.usable and not placed.is_near:
             twist = se3.log(camera.T_camera_world @ se3.inverse(placed.T) @ se3.inverse(camera.T_camera_world))
             rig = moved_rig(rig, {camera.name: twist})
-        elif not placed.fits:
+        elif not placed.is_near:
             gone[name] = [placed.shift, placed.turn]
     person = person if rig is person.recording.rig else _with_cameras(person, rig)
     if not gone:

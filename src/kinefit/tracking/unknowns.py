@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.geometry.camera import Rig
-from kinefit.multiview.one_camera import only_lifted
+from kinefit.multiview.followed import only_lifted
 from kinefit.sensors.points.lifted import SIZE_STD, person_size
 from kinefit.sensors.settings import CameraErrors
 from kinefit.subject.gear import Gear

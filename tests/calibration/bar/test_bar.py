@@ -94,7 +94,7 @@ def test_derivatives_of_the_adjustment(known):
             return problem.system(there, x + sign * move).cost
 
         numeric = (cost(1.0) - cost(-1.0)) / 2
-        told = -2 * (system.b @ step + np.sum(system.bf * move.reshape(-1, 6)))
+        told = -2 * (system.arrow.g @ step + np.sum(system.arrow.blocks[0].g * move.reshape(-1, 6)))
         assert told == pytest.approx(numeric, rel=1e-4)
 
 

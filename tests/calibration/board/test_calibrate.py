@@ -187,7 +187,7 @@ def test_gradient_of_the_cost_against_differences(interiors):
     )
     problem = _BoardProblem(placed.corners, interiors, (1e-3, 2e-3))
     system = problem.system(placed.rig, placed.Ts_world_board)
-    free, b = system.free.reshape(2, -1), system.b.reshape(2, -1)
+    free, b = system.free.reshape(2, -1), system.arrow.g.reshape(2, -1)
     P, h = free.shape[1], 1e-6
 
     def cost(d_camera, d_board):
@@ -220,7 +220,8 @@ def test_gradient_of_the_cost_against_differences(interiors):
         step = zero_b.copy()
         step[f, j] = h
         numeric = (cost(zero_c, step) - cost(zero_c, -step)) / (2 * h)
-        assert -2 * system.bf[f, j] == pytest.approx(numeric, rel=2e-3, abs=2e-3 * np.abs(system.bf[f]).max())
+        g = system.arrow.blocks[0].g
+        assert -2 * g[f, j] == pytest.approx(numeric, rel=2e-3, abs=2e-3 * np.abs(g[f]).max())
 
 
 def test_adjustment_of_exact_corners_changes_nothing():

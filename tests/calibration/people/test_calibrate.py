@@ -9,7 +9,7 @@ from tests.calibration.people_data import BODY, ERRORS, errors, room, seen, walk
 from kinefit.calibration.people.calibrate import calibrate_people
 from kinefit.calibration.people.first_rig import first_rig
 from kinefit.calibration.people.floor import centre_of_mass, settled
-from kinefit.calibration.people.steady import steady_person
+from kinefit.calibration.people.skeletons import steady_person
 from kinefit.errors import CalibrationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig

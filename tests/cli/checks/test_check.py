@@ -9,7 +9,6 @@ from click.testing import CliRunner
 
 from kinefit.batch.corrections import undo
 from kinefit.bodies import load_body
-from kinefit.calibration.check import check as checking
 from kinefit.cli.checks._refine import free_name
 from kinefit.cli.checks.check import check
 from kinefit.diagnostics.checks import Checked
@@ -21,6 +20,7 @@ from kinefit.observations import Markers
 from kinefit.readers.calibration.read import read_calibration, write_calibration
 from kinefit.readers.take.file import read_take
 from kinefit.simulation import known_motion, movement, simulate_keypoints, studio_rig
+from kinefit.takes import check as checking
 
 
 def run(*args):
@@ -231,7 +231,7 @@ def test_fix_writes_nothing_where_nothing_is_certain_or_the_take_is_read_only(ta
 
 def test_fix_refuses_findings_that_contradict_each_other(take, monkeypatch):
     twice = tuple(Finding("fault", "up", "", edits=(Edit("take", "up", f'"{axis}"'),)) for axis in "xy")
-    monkeypatch.setattr(checking, "check_take", lambda take, progress: Checked(take.name, twice, take))
+    monkeypatch.setattr(checking, "check_take", lambda take, progress, tell: Checked(take.name, twice, take))
     before = take.read_bytes()
     told = run(take, "--fix")
     assert isinstance(told.exception, TakeError) and 'up = "x" and up = "y"' in str(told.exception)

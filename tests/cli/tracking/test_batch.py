@@ -3,7 +3,7 @@
 import pytest
 from click.testing import CliRunner
 
-from kinefit.batch.outcome import FAILED, Row
+from kinefit.batch.summary import FAILED, Row
 from kinefit.cli import main
 
 

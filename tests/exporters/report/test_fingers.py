@@ -7,9 +7,8 @@ import pytest
 
 from kinefit.bodies import load_body
 from kinefit.exporters.curves import curves, spoken
-from kinefit.exporters.report.angles import by_joint
+from kinefit.exporters.report.angles import by_joint, ranges_of
 from kinefit.exporters.report.moments import doubtful_moments, plain, throughout_sentence
-from kinefit.exporters.report.ranges import ranges_of
 from kinefit.geometry import se3
 from kinefit.motion import Residuals
 from kinefit.simulation import known_motion

@@ -24,7 +24,7 @@ def test_values_are_sorted_by_percent(tmp_path):
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("", "no column 'coordinate'"), (HEAD, "no column"), ("coordinate,percent,mean\na,1,2\n", "'sd'"),
+        ("", "no column coordinate"), (HEAD, "no line of values"), ("coordinate,percent,mean\na,1,2\n", "column sd"),
         (HEAD + "knee_angle,0,1,2\nknee_angle,101,1,2\n", "line 3"), (HEAD + "knee_angle,0,nan,2\n", "line 2"),
         (HEAD + "knee_angle,0,1,-2\n", "line 2"), (HEAD + "knee_angle,0,one,2\n", "line 2"),
         (HEAD + "knee_angle,0\n", "line 2"),
@@ -37,7 +37,7 @@ def test_what_is_no_table_of_norms_is_told(tmp_path, text, told):
 
 
 def test_a_missing_table_and_an_unknown_coordinate(tmp_path):
-    with pytest.raises(FileError, match="no such table"):
+    with pytest.raises(FileError, match="No such file"):
         read_norms(tmp_path / "none.csv")
     norms = read_norms(table(tmp_path, HEAD + "knie,0,1,2\n"))
     with pytest.raises(ExportError, match="knie"):

@@ -8,7 +8,7 @@ from tests.exporters.report.test_page import own
 from tests.exporters.synthetic import smooth_motion
 
 from kinefit.exporters.curves import NAMES, Curve, curves
-from kinefit.exporters.report.ranges import MAX_STD_DEG, extremes, ranges_of, ranges_table
+from kinefit.exporters.report.angles import MAX_STD_DEG, extremes, ranges_of, ranges_table
 from kinefit.lasting_errors import LastingErrors
 from kinefit.motion import BRIEF_S
 

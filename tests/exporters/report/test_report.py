@@ -18,14 +18,13 @@ from kinefit.exporters.report.flagged import close_up, report_frames
 from kinefit.exporters.report.methods import lengths_table, methods_sentences
 from kinefit.exporters.report.moments import (
     doubtful_moments,
-    listed,
     never_observed,
     shared_by_prior,
     throughout_sentence,
 )
-from kinefit.exporters.report.plots import band, thinned
+from kinefit.exporters.report.page import band, thinned
 from kinefit.exporters.report.report import trust_sentence, write_report
-from kinefit.findings import runs_of
+from kinefit.findings import listed, runs_of
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Residuals
@@ -191,7 +190,7 @@ def test_stretches_and_lists():
     assert runs_of(flags, gap=2) == [(0, 4), (7, 8)]
     assert runs_of(np.zeros(5, bool)) == []
     assert listed(["a"]) == "a" and listed(["a", "b", "c"]) == "a, b and c"
-    assert listed(list("abcdefg")) == "a, b, c, d and 3 more"
+    assert listed("abcdefg", 4) == "a, b, c, d and 3 more"
 
 
 # Fit

@@ -6,29 +6,10 @@ from benchmarks.synthetic_points import synthetic_body
 from scipy.optimize import minimize
 
 from kinefit.geometry.se3 import exp_so3, log_so3
-from kinefit.identification.frame._kernels_posture import inverse, rotate_by, turn_costs, turn_of
+from kinefit.identification.frame._kernels_posture import turn_costs
 from kinefit.identification.frame.identify import identify, posture_of
 from kinefit.identification.model.learn import learn_model
 from kinefit.observations import Markers
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-8, 1e-3, 1.0, 3.1, np.pi])
-def test_turns_are_those_of_the_library(angle):
-    axis = np.array([0.6, -0.48, 0.64])
-    R, out, turned = exp_so3(angle * axis), np.empty(3), np.empty((3, 3))
-    turn_of(R, out)
-    np.testing.assert_allclose(exp_so3(out), R, atol=2e-6)
-    assert np.linalg.norm(out) == pytest.approx(np.linalg.norm(log_so3(R)), abs=1e-6)
-    start = exp_so3(np.array([0.3, 0.2, -0.1]))
-    rotate_by(angle * axis, start, turned)
-    np.testing.assert_allclose(turned, R @ start, atol=1e-9)
-
-
-def test_inverse_is_the_inverse():
-    A = np.random.default_rng(0).standard_normal((3, 5))
-    A, out = A @ A.T, np.empty((3, 3))
-    inverse(A, out)
-    np.testing.assert_allclose(out, np.linalg.inv(A), rtol=1e-9)
 
 
 def chain(rng, turn):

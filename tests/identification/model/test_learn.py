@@ -6,10 +6,10 @@ import pytest
 from kinefit.bodies.marker_sets import load_marker_set
 from kinefit.errors import ExportError, FileError, ObservationError
 from kinefit.geometry.se3 import exp_so3
-from kinefit.identification.model.files import load_model, save_model
 from kinefit.identification.model.from_frame import model_from_frame
 from kinefit.identification.model.gate import training_gate
 from kinefit.identification.model.learn import learn_model
+from kinefit.identification.model.model import load_model, save_model
 from kinefit.identification.model.rigid import fit_joint_few, reference_turn
 from kinefit.observations import Markers
 from kinefit.readers.markers import read_markers

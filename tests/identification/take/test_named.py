@@ -7,8 +7,8 @@ from benchmarks.marker_takes import broken
 from kinefit.bodies.marker_sets import placement
 from kinefit.errors import FileError, ObservationError
 from kinefit.exporters import write_markers
-from kinefit.identification.model.files import save_model
 from kinefit.identification.model.learn import learn_model
+from kinefit.identification.model.model import save_model
 from kinefit.identification.take.takes import named_markers, with_names
 from kinefit.observations import Markers
 from kinefit.readers.take.file import read_take

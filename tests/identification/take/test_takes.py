@@ -9,9 +9,8 @@ from kinefit.errors import ObservationError
 from kinefit.identification.frame.identify import Identification
 from kinefit.identification.model.learn import learn_model
 from kinefit.identification.take.consistency import Consistency, fill_gaps, gaps_of
-from kinefit.identification.take.pieces import find_pieces
 from kinefit.identification.take.takes import TakeSettings, identify_people, identify_take, one_after_the_other
-from kinefit.identification.take.votes import Votes, assign_pieces
+from kinefit.identification.take.votes import Votes, assign_pieces, find_pieces
 from kinefit.observations import Markers
 from kinefit.simulation import squat_and_wave
 

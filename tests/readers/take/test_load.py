@@ -9,7 +9,7 @@ from kinefit.errors import ObservationError
 from kinefit.exporters import write_markers
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.tracking.takes.take_recording import recording_of
+from kinefit.tracking.take_recording import recording_of
 
 
 def write_take(path, text, **clock):

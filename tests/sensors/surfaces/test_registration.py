@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body
-from kinefit.calibration.check.sensors import fit_sensors
+from kinefit.calibration.sensors import fit_sensors
 from kinefit.cli.checks._refine import Refined, write_refined
 from kinefit.diagnostics.sensors import misfits, moved_cameras, sensor_findings
 from kinefit.geometry import se3

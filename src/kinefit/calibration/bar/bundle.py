@@ -14,8 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.calibration.board.bundle import CameraEquations, moved_camera, pixel_columns
+from kinefit.calibration.board.bundle import CameraEquations, moved_rig, pixel_columns
+from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
+from kinefit.losses import huber
+from kinefit.solvers.bundle.arrow import Blocks, assembled
 from kinefit.solvers.least_squares import descend
 
 POSE = 6
@@ -63,9 +66,6 @@ class _BarEquations(CameraEquations):
     count: int  # pixel coordinates
 
 
-_Linearised = tuple[Rig, NDArray, _BarEquations]
-
-
 class BarProblem:
     """Observations and free parameters of the adjustment.
 
@@ -87,24 +87,23 @@ class BarProblem:
     def adjust(self, rig: Rig, x_world: NDArray, *, rounds: int = 4, iterations: int = 15) -> tuple[Rig, NDArray]:
         """Minimise the cost over the rig and ends (F, 2, 3) [m], with new variance components in every round."""
         for _ in range(rounds):
-            begin, stop = (rig, x_world, self.system(rig, x_world)), 1e-7
-            found, _ = descend(begin, lambda at: at[2].cost, self._step, iterations=iterations, tolerance=stop)
-            rig, x_world, system = found
+            system = descend(
+                self.system(rig, x_world), lambda at, damping: at.arrow.relative_step(damping), self._moved,
+                iterations=iterations, damping=1e-4, tolerance=1e-7,
+            ).at  # fmt: skip
+            rig, x_world = system.rig, system.unknowns
             before = self.sigma, self.scatter
             self._components(rig, system)
             if abs(self.sigma / before[0] - 1) < 0.02 and abs(self.scatter / before[1] - 1) < 0.1:
                 break
         return rig, x_world
 
-    def _step(self, now: _Linearised, damping: float) -> _Linearised | None:
-        cameras, ends = now[2].step(damping)
+    def _moved(self, at: _BarEquations, move: tuple[NDArray, list[NDArray]]) -> _BarEquations | None:
         try:
-            parts = zip(now[0], cameras.reshape(self.free.shape))
-            rig = Rig(tuple(moved_camera(c, d, self.interiors) for c, d in parts))
+            rig = moved_rig(at.rig, move[0], self.interiors)
         except (ValueError, ArithmeticError, np.linalg.LinAlgError):
             return None
-        x_world = now[1] + ends.reshape(now[1].shape)
-        return rig, x_world, self.system(rig, x_world)
+        return self.system(rig, at.unknowns + move[1][0].reshape(at.unknowns.shape))
 
     def _components(self, rig: Rig, system: _BarEquations) -> None:
         """Estimate the variances of pixels and distance from their squares and shares of the redundancy."""
@@ -141,46 +140,36 @@ class BarProblem:
 
     def system(self, rig: Rig, x_world: NDArray) -> _BarEquations:
         """Linearise at a rig and ends (F, 2, 3) [m]."""
-        F, C, P = len(self.uv), len(rig), self.columns
-        H, b, cross = np.zeros((C * P, C * P)), np.zeros(C * P), np.zeros((F, 6, C * P))
-        Hp, bp = np.zeros((F, 6, 6)), np.zeros((F, 6))
-        residuals, cost, squares, total = np.full(self.uv.shape, np.nan), 0.0, 0.0, 0
+        place, view, end = np.nonzero(np.isfinite(self.uv).all(axis=(2, 3))[..., None] & np.ones(2, bool))
+        P, M, C = self.columns, len(place), len(rig)
+        A = np.zeros((M, 2, P + 7))  # derivatives by the camera, by the ends; residual
         for c, camera in enumerate(rig):
-            seen = np.isfinite(self.uv[:, c]).all(axis=(1, 2))
-            x = (x_world[seen] @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]).reshape(-1, 3)
-            front = (x[:, 2] > 1e-3).reshape(-1, 2).all(axis=1)
+            own = view == c
+            x = se3.apply(camera.T_camera_world, x_world[place[own], end[own]])
             uv, J, J_interior = pixel_columns(camera, np.where(x[:, 2:] > 1e-3, x, [0.0, 0.0, 1.0]), self.interiors)
-            left = self.uv[seen, c].reshape(-1, 2) - uv
-            fine = np.repeat(front & np.isfinite(left).reshape(-1, 4).all(axis=1), 2)
-            left = np.where(fine[:, None], left, 0.0)
-            size = np.linalg.norm(left, axis=1) / self.sigma
-            w = np.where(fine, np.minimum(1.0, _HUBER / np.maximum(size, 1e-12)), 0.0) / self.sigma**2
-            behind = 1e4 * (~fine).sum()  # a constant that no step gains by
-            cost += float(np.sum(np.where(size < _HUBER, size**2, _HUBER * (2 * size - _HUBER))) + behind)
-            squares, total = squares + float(np.sum(w[:, None] * left**2)), total + 2 * int(fine.sum())
-            of_camera = np.concatenate([J, np.cross(x[:, None], J), J_interior], axis=2) * self.free[c]
-            of_camera = np.where(fine[:, None, None], of_camera, 0.0)
-            of_end = np.where(fine[:, None, None], J @ camera.T_camera_world[:3, :3], 0.0)
-            weighted = w[:, None, None] * of_camera
-            own = slice(c * P, (c + 1) * P)
-            H[own, own] = np.tensordot(weighted, of_camera, axes=([0, 1], [0, 1]))
-            b[own] = np.einsum("nkp,nk->p", weighted, left)
-            Hx = np.einsum("nki,nkj->nij", w[:, None, None] * of_end, of_end).reshape(-1, 2, 3, 3)
-            bx = np.einsum("nki,nk->ni", w[:, None, None] * of_end, left).reshape(-1, 6)
-            places = np.flatnonzero(seen)
-            for e in (0, 1):
-                part = slice(3 * e, 3 * e + 3)
-                Hp[places, part, part] += Hx[:, e]
-            bp[places] += bx
-            cross[places, :, own] = np.einsum("nki,nkp->nip", of_end, weighted).reshape(-1, 6, P)
-            residuals[places, c] = np.where(fine[:, None], left, np.nan).reshape(-1, 2, 2)
+            A[own, :, :P] = np.concatenate([J, np.cross(x[:, None], J), J_interior], axis=2) * self.free[c]
+            of_end = (J @ camera.T_camera_world[:3, :3])[:, :, None] * (end[own, None] == (0, 1))[:, None, :, None]
+            A[own, :, P:-1] = of_end.reshape(-1, 2, 6)
+            A[own, :, -1] = np.where(x[:, 2:] > 1e-3, self.uv[place[own], c, end[own]] - uv, np.nan)
+        fine = np.isfinite(A[..., -1]).all(axis=1).reshape(-1, 2).all(axis=1).repeat(2)  # both ends of a view
+        A[~fine] = 0.0
+        squares = np.sum(A[..., -1] ** 2, axis=1)
+        rho, factor = huber(_HUBER).weigh(squares / self.sigma**2)
+        w = np.where(fine, factor, 0.0) / self.sigma**2
+        cost = float(rho.sum()) + 1e4 * float((~fine).sum())  # a constant that no step gains by
+        residuals = np.full(self.uv.shape, np.nan)
+        residuals[place, view, end] = np.where(fine[:, None], A[..., -1], np.nan)
+        arrow = assembled(A.swapaxes(1, 2) @ (w[:, None, None] * A), view, place, C, len(self.uv), 6)
         information, pull = self._prior(rig)
         cost += float(np.sum(pull**2 / np.where(information > 0, information, 1.0)))
-        H, b = H + np.diag(information), b + pull
+        arrow = arrow.with_prior(information + ~self.free.ravel(), pull)
         if self.interiors:
-            cost += self._square_pixels(rig, H, b)
-        misfit, more = self._distances(x_world, Hp, bp)
-        return _BarEquations(H, b, Hp, bp, cross, self.free.ravel(), cost + more, residuals, misfit, squares, total)
+            cost += self._square_pixels(rig, arrow.H, arrow.g)
+        misfit, more = self._distances(x_world, arrow.blocks[0])
+        return _BarEquations(
+            rig, x_world, arrow, self.free.ravel(), cost + more, residuals, misfit, float(w @ squares),
+            2 * int(fine.sum()),
+        )
 
     def _square_pixels(self, rig: Rig, H: NDArray, b: NDArray) -> float:
         """Add the prior fx - fy = 0 of each camera; returns its cost."""
@@ -193,15 +182,15 @@ class BarProblem:
             cost += weight * off**2
         return cost
 
-    def _distances(self, x_world: NDArray, Hp: NDArray, bp: NDArray) -> tuple[NDArray, float]:
+    def _distances(self, x_world: NDArray, ends: Blocks) -> tuple[NDArray, float]:
         """Add |b - a| = length of each place; returns the misfits (F,) [m] and the cost."""
         way = x_world[:, 1] - x_world[:, 0]
         distance = np.linalg.norm(way, axis=1)
         n = way / np.maximum(distance, 1e-12)[:, None]
         self._normals = np.concatenate([-n, n], axis=1)
         misfit = self.length - distance
-        size = np.abs(misfit) / self.scatter
-        w = np.minimum(1.0, _HUBER / np.maximum(size, 1e-12)) / self.scatter**2
-        Hp += w[:, None, None] * self._normals[:, :, None] * self._normals[:, None, :]
-        bp += (w * misfit)[:, None] * self._normals
-        return misfit, float(np.sum(np.where(size < _HUBER, size**2, _HUBER * (2 * size - _HUBER))))
+        rho, factor = huber(_HUBER).weigh((misfit / self.scatter) ** 2)
+        w = factor / self.scatter**2
+        ends.H[:] += w[:, None, None] * self._normals[:, :, None] * self._normals[:, None, :]
+        ends.g[:] += (w * misfit)[:, None] * self._normals
+        return misfit, float(rho.sum())

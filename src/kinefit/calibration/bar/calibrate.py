@@ -15,7 +15,7 @@ from kinefit.calibration.bar.report import BarCameraReport, advice_of, reports_o
 from kinefit.calibration.bar.start import MIN_PLACES, first_pairs, inlier_distance, resect
 from kinefit.calibration.bar.targets import BarViews
 from kinefit.calibration.bar.world import on_floor
-from kinefit.calibration.known import known_camera
+from kinefit.calibration.board.intrinsics import known_camera
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
+from kinefit.solvers.bundle.arrow import Arrow, assembled
 from kinefit.solvers.least_squares import descend
 
 _POSE = 6  # parameters of a pose
@@ -126,6 +127,12 @@ def moved_camera(camera: Camera, delta: NDArray, interiors: bool) -> Camera:
     return replace(camera, matrix=K, distortion=camera.distortion + d[4:], T_camera_world=T)
 
 
+def moved_rig(rig: Rig, delta: NDArray, interiors: bool) -> Rig:
+    """All cameras changed by delta (C · (6 + P),)."""
+    parts = zip(rig, delta.reshape(len(rig), -1))
+    return Rig(tuple(moved_camera(camera, d, interiors) for camera, d in parts))
+
+
 def pixel_columns(camera: Camera, x_camera: NDArray, interiors: bool) -> tuple[NDArray, NDArray, NDArray]:
     """Pixels (M, 2), their derivatives by the point in the camera's frame (M, 2, 3) and by the interior (M, 2, P)."""
     if not interiors:
@@ -140,40 +147,18 @@ def pixel_columns(camera: Camera, x_camera: NDArray, interiors: bool) -> tuple[N
 
 @dataclass(frozen=True, eq=False)
 class CameraEquations:
-    """Normal equations: H, b of n parameters of cameras; Hf (F, 6, 6), bf of frames; cross (F, 6, n); free (n,)."""
+    """Cameras, the unknowns of blocks, their arrow and cost; free: (n,) bool, the cameras' parameters that move."""
 
-    H: NDArray
-    b: NDArray
-    Hf: NDArray
-    bf: NDArray
-    cross: NDArray
+    rig: Rig
+    unknowns: NDArray
+    arrow: Arrow
     free: NDArray
     cost: float
 
-    def reduced(self, damping: float) -> tuple[NDArray, NDArray, NDArray]:
-        """Schur complement of the cameras, (n, n) and (n,), and the inverse blocks of the frames (F, 6, 6)."""
-        diagonal = np.einsum("fii->fi", self.Hf)
-        inverse = np.linalg.inv(self.Hf + np.eye(6) * (damping * diagonal + 1e-12 * diagonal.max() + 1e-12)[:, None, :])
-        weighted = inverse @ self.cross
-        S = self.H + np.diag(damping * np.diag(self.H) + ~self.free)
-        S = S - np.tensordot(self.cross, weighted, axes=([0, 1], [0, 1]))
-        return S, self.b - np.einsum("fij,fi->j", weighted, self.bf), inverse
-
-    def step(self, damping: float) -> tuple[NDArray, NDArray]:
-        """Steps of the cameras' parameters (N,) and of the frames' unknowns (F, 6)."""
-        S, b, inverse = self.reduced(damping)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))  # units differ by many orders of magnitude
-        delta = scale * np.linalg.solve(S * np.outer(scale, scale) + 1e-14 * np.eye(len(S)), scale * b)
-        return delta, (inverse @ (self.bf - self.cross @ delta)[..., None])[..., 0]
-
     def covariances(self) -> tuple[NDArray, NDArray]:
         """Covariances (N, N) of the cameras, zero for fixed parameters, and (F, 6, 6) of the frames' unknowns."""
-        S, _, inverse = self.reduced(0.0)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(S), 1e-300))
-        cov = np.linalg.pinv(S * np.outer(scale, scale), hermitian=True, rcond=1e-15) * np.outer(scale, scale)
-        cov = np.where(np.outer(self.free, self.free), cov, 0.0)
-        gain = inverse @ self.cross
-        return cov, inverse + gain @ cov @ np.swapaxes(gain, 1, 2)
+        cov, (blocks,) = self.arrow.covariances()
+        return np.where(np.outer(self.free, self.free), cov, 0.0), blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,9 +166,6 @@ class _BoardEquations(CameraEquations):
     within: NDArray
     eta: NDArray  # (V, 6)
     spread: NDArray  # (V, 6) variances of η
-
-
-_Linearised = tuple[Rig, NDArray, _BoardEquations]
 
 
 class _BoardProblem:
@@ -201,16 +183,15 @@ class _BoardProblem:
     def solve(self, rig: Rig, Ts_world_board: NDArray, max_iterations: int) -> tuple[Rig, NDArray]:
         """Minimise the cost by damped Gauss-Newton."""
 
-        def step(now: _Linearised, damping: float) -> _Linearised:
-            cameras, boards = now[2].step(damping)
-            parts = zip(now[0], cameras.reshape(len(rig), -1))
-            new_rig = Rig(tuple(moved_camera(camera, d, self.interiors) for camera, d in parts))
-            new_boards = np.stack([T @ se3.exp(d) for T, d in zip(now[1], boards)])
-            return new_rig, new_boards, self.system(new_rig, new_boards)
+        def follow(at: _BoardEquations, move: tuple[NDArray, list[NDArray]]) -> _BoardEquations:
+            boards = np.stack([T @ se3.exp(d) for T, d in zip(at.unknowns, move[1][0])])
+            return self.system(moved_rig(at.rig, move[0], self.interiors), boards)
 
-        begin = rig, Ts_world_board, self.system(rig, Ts_world_board)
-        found, _ = descend(begin, lambda at: at[2].cost, step, iterations=max_iterations, damping=1e-3, tolerance=1e-6)
-        return found[:2]
+        end = descend(
+            self.system(rig, Ts_world_board), lambda at, damping: at.arrow.relative_step(damping), follow,
+            iterations=max_iterations, damping=1e-3, tolerance=1e-6,
+        ).at  # fmt: skip
+        return end.rig, end.unknowns
 
     def jitter_of(self, rig: Rig, Ts_world_board: NDArray) -> tuple[float, float]:
         """Standard deviations (shift, turn) of η over the views of frames shared by two or more cameras."""
@@ -243,21 +224,14 @@ class _BoardProblem:
             part[..., P:-1] = np.concatenate([JR, np.cross(x_board[:, None], JR)], axis=2)
             part[..., -1] = corners.uv[own] - uv
             G[own] = np.where(np.isfinite(part).all(axis=(1, 2), keepdims=True) & (x[:, 2, None, None] > 0), part, 0.0)
-        H, Hb, cross = np.zeros((C, P, C, P)), np.zeros((F, 6, 6)), np.zeros((F, 6, C, P))
-        b, bb, cost, within = np.zeros((C, P)), np.zeros((F, 6)), 0.0, np.zeros(corners.uv.shape)
+        grams, cost, within = np.empty((V, P + 7, P + 7)), 0.0, np.zeros(corners.uv.shape)
         eta, spread = np.zeros((V, 6)), np.zeros((V, 6))
         for v, (start, stop) in enumerate(self.views):
-            M, left, eta[v], spread[v], more = self._view(G[start:stop], P)
-            c, f = self.camera[v], self.frame[v]
-            H[c, :, c] += M[:P, :P]
-            b[c] += M[:P, -1]
-            Hb[f] += M[P:-1, P:-1]
-            bb[f] += M[P:-1, -1]
-            cross[f, :, c] += M[P:-1, :P]
-            within[start:stop], cost = left, cost + more
-        n = free.size
-        cameras = H.reshape(n, n), b.ravel(), Hb, bb, cross.reshape(F, 6, n), free.ravel()
-        return _BoardEquations(*cameras, cost, within, eta, spread)
+            grams[v], within[start:stop], eta[v], spread[v], more = self._view(G[start:stop], P)
+            cost += more
+        arrow = assembled(grams, self.camera, self.frame, C, F, _POSE)
+        arrow = arrow.with_prior((~free.ravel()).astype(float), np.zeros(free.size))
+        return _BoardEquations(rig, Ts, arrow, free.ravel(), cost, within, eta, spread)
 
     def _view(self, G: NDArray, P: int) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
         """One view's equations with η eliminated; its residuals at the best η, η, its variances, the cost."""

@@ -12,8 +12,7 @@ from kinefit._arguments import checked
 from kinefit.calibration.board.bundle import BoardBundle, adjust_boards
 from kinefit.calibration.board.detection import Board, CameraViews
 from kinefit.calibration.board.extrinsics import Placed, place_cameras
-from kinefit.calibration.board.intrinsics import Interiors, calibrate_interiors, coverage
-from kinefit.calibration.known import known_camera
+from kinefit.calibration.board.intrinsics import Interiors, calibrate_interiors, coverage, known_camera
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import inverse

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.calibration.board.detection import Board, BoardView, CameraViews
-from kinefit.errors import CalibrationError
-from kinefit.geometry.camera import Camera
+from kinefit.errors import CalibrationError, choices
+from kinefit.geometry.camera import Camera, Rig
 
 MIN_VIEWS = 4  # three determine focal length and centre; one more allows a check
 _MAX_VIEWS = 60  # more add time, hardly accuracy
@@ -136,3 +136,27 @@ def _shape(view: BoardView, size: tuple[int, int]) -> NDArray:
     centre, spread = view.uv.mean(axis=0) / size, np.cov(view.uv.T)
     root = np.sqrt(np.linalg.det(spread) + 1e-9)
     return np.array([*centre, np.log(root) / 4, spread[0, 0] / root / 4, spread[0, 1] / root / 2])
+
+
+def known_camera(interiors: Rig, name: str, size: tuple[int, int]) -> Camera:
+    """The camera of known intrinsics, at the world's origin.
+
+    Parameters
+    ----------
+    size : (width, height) [px] of its new images
+
+    Raises
+    ------
+    CalibrationError
+        No camera of this name, or one with another image size.
+    """
+    if name not in interiors:
+        problem = choices("intrinsics of camera", name, interiors.names)
+        raise CalibrationError(problem, remedy="Name the videos like the cameras.")
+    camera = interiors[name].with_pose(np.eye(4))
+    if camera.size != size:
+        raise CalibrationError(
+            f"its image has {size[0]}x{size[1]} px, its intrinsics are of {camera.size[0]}x{camera.size[1]}",
+            place=f"camera {name}", remedy="Calibrate the intrinsics again, or record at the calibrated size.",
+        )  # fmt: skip
+    return camera

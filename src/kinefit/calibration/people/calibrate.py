@@ -13,9 +13,7 @@ from kinefit.bodies import Body, PointSet
 from kinefit.bodies.limbs import rigid_pairs
 from kinefit.calibration.people.first_rig import first_rig
 from kinefit.calibration.people.floor import centre_of_mass, settled
-from kinefit.calibration.people.skeletons import first_cameras, in_step
-from kinefit.calibration.people.steady import steady_person
-from kinefit.calibration.refine.bundle import bundle_adjust
+from kinefit.calibration.people.skeletons import first_cameras, in_step, steady_person
 from kinefit.calibration.refine.gauge import resized
 from kinefit.calibration.refine.refine import Length, check_input, length_of, prior_sigma, refine_from
 from kinefit.calibration.refine.result import Refinement
@@ -27,6 +25,7 @@ from kinefit.geometry.triangulation import triangulate, triangulate_robust
 from kinefit.multiview.association import person_records
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.sensors.channels import Channels, make_channels
+from kinefit.solvers.bundle.body_bundle import BundleState, adjust
 from kinefit.solvers.bundle.cameras import FOCAL, TIME, CameraPrior, PointPixels
 
 _MIN_CONFIDENCE = 0.3  # confidence of a keypoint that takes part in the start
@@ -184,7 +183,7 @@ def _adjusted(
         prior_std[:, FOCAL] = focal / np.sqrt(_CORRELATED_PIXELS)
         prior_std[1:, TIME] = clock
         mean = Rig(tuple(replace(a, matrix=b.matrix) for a, b in zip(rig, given, strict=True)))
-        bundle = bundle_adjust(rig, pixels, x[good], CameraPrior(mean, prior_std), offsets=offsets)
+        bundle = adjust(BundleState(rig, offsets, x[good]), CameraPrior(mean, prior_std), pixels)
         rig, offsets = bundle.rig, bundle.offsets
     first = people[0].reshape(-1, len(rig), 2)
     x = triangulate_robust(rig, first, max_residual_px=_MAX_RAY_SIGMAS * sigma)[0]

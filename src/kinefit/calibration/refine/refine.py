@@ -27,7 +27,7 @@ from kinefit.errors import CalibrationError, ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
 from kinefit.geometry.triangulation import triangulate
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
-from kinefit.solvers.bundle.body_bundle import BundleState, fit_body_and_cameras
+from kinefit.solvers.bundle.body_bundle import BundleState, adjust
 from kinefit.solvers.bundle.cameras import COLUMNS, FOCAL, POSE, RADIAL, TIME, CameraPrior, PointPixels, departure
 
 PLACE_SIGMA = 0.05
@@ -148,8 +148,10 @@ def refine_from(
         _check_frames(seen, chosen)
         pixels, (model, theta) = pixel_frames(seen, chosen), body_model(seen, trial.body)
         states = [seen.motion.state(int(f)) for f in chosen]
-        start = BundleState(rig, np.zeros(len(rig)), theta, states, static_start(rig, static))
-        bundle = fit_body_and_cameras(model, pixels, start, prior, static=static)
+        start = BundleState(rig, np.zeros(len(rig)), static_start(rig, static), theta, states)
+        bundle = adjust(
+            start, prior, static, model=model, frames=pixels, max_iterations=20, tolerance=1e-3
+        )  # fmt: skip
         change = np.abs(departure(bundle.rig, rig)[:, POSE]).max(), np.abs(np.ptp(bundle.offsets))
         rig, offsets = bundle.rig, offsets + bundle.offsets
         offsets = offsets - offsets[0]

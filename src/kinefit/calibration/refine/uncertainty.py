@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from kinefit.calibration.refine.gauge import aligned, covariance_in_gauge
 from kinefit.calibration.refine.sightings import PersonSighting, correlation_time
-from kinefit.solvers.bundle.body_bundle import BodyBundle, BundleState, fit_body_and_cameras
+from kinefit.solvers.bundle.body_bundle import Bundle, BundleState, adjust
 from kinefit.solvers.bundle.cameras import CameraPrior, PointPixels, departure
 from kinefit.solvers.bundle.shape import PixelFrames, ShapeParameters
 
 _MAX_JACKKNIFE_FRAMES = 40
 
 
-def chance(bundle: BodyBundle, prior: CameraPrior, seen: PersonSighting, frames: NDArray) -> NDArray:
+def chance(bundle: Bundle, prior: CameraPrior, seen: PersonSighting, frames: NDArray) -> NDArray:
     """Covariance (C · 10, C · 10) of the cameras from random errors.
 
     Their variance and correlation time are those of the residuals without each channel's mean.
@@ -32,7 +32,7 @@ def chance(bundle: BodyBundle, prior: CameraPrior, seen: PersonSighting, frames:
 
 
 def bias(
-    model: ShapeParameters, bundle: BodyBundle, frames: PixelFrames, prior: CameraPrior, static: PointPixels
+    model: ShapeParameters, bundle: Bundle, frames: PixelFrames, prior: CameraPrior, static: PointPixels
 ) -> NDArray:
     """Covariance (C · 10, C · 10) of the cameras from systematic errors.
 
@@ -43,12 +43,14 @@ def bias(
     owner = frames.points.segments[frames.column]
     groups = np.unique(owner)
 
-    def fit(start: BundleState, without: int | None) -> BodyBundle:
+    def fit(start: BundleState, without: int | None) -> Bundle:
         kept = np.ones(len(owner)) if without is None else (owner != without).astype(float)
         velocity = None if frames.velocity is None else frames.velocity[some]
         part = replace(frames, uv=frames.uv[some], weight=frames.weight[some] * kept, velocity=velocity)
         start = replace(start, offsets=bundle.offsets)
-        return fit_body_and_cameras(model, part, start, prior, static=static, max_iterations=6)
+        return adjust(
+            start, prior, static, model=model, frames=part, max_iterations=6, tolerance=1e-3
+        )  # fmt: skip
 
     whole = fit(replace(bundle, states=[bundle.states[f] for f in some]), None)
     away = []

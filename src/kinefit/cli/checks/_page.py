@@ -17,8 +17,6 @@ from kinefit.diagnostics.views import from_others
 from kinefit.errors import KinefitError
 from kinefit.exporters.pictures.drawing import DARK, MEASURED, draw_dot, draw_line
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.page import finding_callout
-from kinefit.exporters.report.plots import line
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import UP_AXES
 from kinefit.preparing.faces import shown_video
@@ -58,7 +56,7 @@ def verdict(check: Checked) -> str:
 
 
 def _findings(check: Checked) -> p.Section:
-    shown = [finding_callout(found) for found in check.findings if found.severity != "good"]
+    shown = [p.finding_callout(found) for found in check.findings if found.severity != "good"]
     good = [found.text for found in check.findings if found.severity == "good"]
     parts = shown or [p.callout("good", "The check found no faults and no doubts.")]
     if good:
@@ -216,7 +214,7 @@ def _plan(check: Checked) -> p.Section:
             outline = camera.centre_world + 0.45 * reach * np.stack([ends[0], np.zeros(3), ends[1]])
             bad = any(found.severity == "fault" for found in check.of(camera.name))
             colour = p.RIGHT_COLOUR if bad else p.LEFT_COLOUR
-            traces.append(line(outline @ a, outline @ b, camera.name, colour, 1))
+            traces.append(p.line(outline @ a, outline @ b, camera.name, colour, 1))
             traces.append({
                 "x": outline[1:2] @ a, "y": outline[1:2] @ b, "mode": "markers+text", "type": "scatter",
                 "text": [camera.name], "textposition": "top center", "showlegend": False,
@@ -236,7 +234,7 @@ def _plan(check: Checked) -> p.Section:
 
 def _times(check: Checked) -> p.Section:
     traces = [
-        line(shifts, cost, f"{a} - {b}", colour, 1.6, hover=f"{a} - {b} %{{y:.1f}} px", legend=True)
+        p.line(shifts, cost, f"{a} - {b}", colour, 1.6, hover=f"{a} - {b} %{{y:.1f}} px", legend=True)
         for ((a, b), (shifts, cost)), colour in zip(check.times.curves.items(), cycle(p.SERIES))
     ]
     layout = {

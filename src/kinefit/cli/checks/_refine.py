@@ -8,9 +8,9 @@ from typing import Any
 
 from kinefit.batch.results import Step
 from kinefit.bodies import load_body
-from kinefit.calibration.check.sensors import fit_sensors
 from kinefit.calibration.refine.refine import refine
 from kinefit.calibration.refine.result import Refinement
+from kinefit.calibration.sensors import fit_sensors
 from kinefit.cli import _screen
 from kinefit.diagnostics.checks import Checked
 from kinefit.diagnostics.sensors import SensorAlignment, alignment_line, marker_edits, misfits, moved_cameras

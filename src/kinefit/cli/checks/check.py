@@ -107,24 +107,13 @@ def check(
 
 
 def _checked(take: Path, hide_faces: bool, step: Step) -> tuple[Checked, bytes]:
-    """The check of a take, after keypoints, cameras and faces are found where it needs that; and the take's content."""
-    from kinefit.calibration.check.check import check_take
-    from kinefit.errors import KinefitError
-    from kinefit.preparing.faces import ensure_faces
-    from kinefit.preparing.take import with_detections
+    """The check of a take, and the content of its file."""
     from kinefit.readers.take.file import read_take
-    from kinefit.takes.missing import find_cameras
+    from kinefit.takes.check import check_take
 
     entry, content = read_take(take), take.read_bytes()
     entry = replace(entry, hide_faces=entry.hide_faces or hide_faces)
-    try:
-        entry = with_detections(entry, step, _screen.note)
-    except KinefitError as error:  # the rest can be checked without
-        _screen.note(f"note: checked without keypoints: {error}")
-    entry = find_cameras(entry, step, _screen.note)
-    if entry.hide_faces and any(camera.video for camera in entry.cameras):
-        ensure_faces(entry, step, _screen.note)
-    return check_take(entry, progress=step), content
+    return check_take(entry, progress=step, tell=_screen.note), content
 
 
 def _print(found: Checked) -> None:

@@ -17,11 +17,10 @@ from kinefit.cli._results import check_file
 from kinefit.cli._screen import Step, note
 from kinefit.errors import KinefitError, ObservationError
 from kinefit.findings import Finding
-from kinefit.identification.model.files import load_model
 from kinefit.identification.model.from_frame import model_from_frame
 from kinefit.identification.model.gate import TrainingFinding, training_gate
 from kinefit.identification.model.learn import learn_model
-from kinefit.identification.model.model import MarkerModel
+from kinefit.identification.model.model import MarkerModel, load_model
 from kinefit.identification.take.takes import TakeIdentification, TakeSettings, identify_people, one_after_the_other
 from kinefit.observations import Markers
 

@@ -60,7 +60,7 @@ def learn(
     """Learn a subject's markers from labelled takes, best from a take in which every joint moves."""
     from kinefit.cli._results import check_file
     from kinefit.cli.markers._name import learn_files
-    from kinefit.identification.model.files import save_model
+    from kinefit.identification.model.model import save_model
 
     if no_set and (marker_set or frame is not None):
         raise click.UsageError("--no-set learns from the motion alone: leave out --set and --frame.")
@@ -244,7 +244,7 @@ def audit(
     from kinefit.bodies.marker_sets import load_marker_set
     from kinefit.cli.markers._name import check_labels, read_file
     from kinefit.identification.audit.audit import audit_take
-    from kinefit.identification.model.files import load_model
+    from kinefit.identification.model.model import load_model
 
     model = load_model(subject) if subject else None
     known = load_marker_set(marker_set) if marker_set else None

@@ -12,7 +12,7 @@ from kinefit.cli.tracking.track import choices_options
 
 if TYPE_CHECKING:
     from kinefit.batch.one import Choices
-    from kinefit.batch.outcome import Row
+    from kinefit.batch.summary import Row
 
 _EXAMPLES = """\b
 Examples:
@@ -53,8 +53,7 @@ def batch(
     Put a pattern in quotes. A folder stands for every take.toml in it and below. A take that fails does not stop the
     others: the summary has its error. After an interruption, the same command tracks only the remaining takes.
     """
-    from kinefit.batch.find import find_takes
-    from kinefit.batch.many import track_takes
+    from kinefit.batch.many import find_takes, track_takes
 
     if cluster is not None and workers is not None:
         raise click.UsageError("--workers (processes on this machine) and --cluster exclude each other: give one.")

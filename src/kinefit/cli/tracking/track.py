@@ -162,10 +162,8 @@ def run(
     `results` is filled with a record of each person, for --json.
     """
     results = [] if results is None else results
-    from kinefit.batch.one import asked_take, check_drawable, people_of
-    from kinefit.batch.outcome import Row, failed
-    from kinefit.batch.people_report import write_people_report
-    from kinefit.batch.work import of_motion
+    from kinefit.batch.one import asked_take, check_drawable, of_motion, people_of
+    from kinefit.batch.summary import Row, failed, write_people_report
     from kinefit.errors import KinefitError
 
     take = asked_take(path, choices)
@@ -203,7 +201,6 @@ def _track_one(
     """Track one person of a take, write what comes of it and tell it; returns the exit code and what was tracked."""
     from kinefit.batch.one import track_person
     from kinefit.cli._summary import as_record, print_files, print_summary
-    from kinefit.cli.tracking._agreement import print_agreement
     from kinefit.errors import TrackingError
     from kinefit.findings import of_provenance
 
@@ -215,7 +212,7 @@ def _track_one(
         if files:
             print_files(files)
         if _screen.is_verbose() and isinstance(error, TrackingError):
-            print_agreement(take)
+            _print_agreement(take)
         if files and isinstance(error, KeyboardInterrupt):
             raise KeyboardInterrupt("The files listed are complete; no others were written.") from error
         raise
@@ -231,3 +228,23 @@ def _track_one(
         _screen.tell_interrupted(f"{text} Run the same command to continue.")
         return _screen.INTERRUPTED, done
     return 0, done
+
+
+def _print_agreement(take: Take) -> None:
+    """Print, for every two cameras, how far the points that both saw miss each other."""
+    from itertools import combinations
+
+    from kinefit.diagnostics.views import make_views, pair_misses
+    from kinefit.readers.take.load import load_observations
+
+    seen = load_observations(take)
+    if seen.rig is None or len({k.camera for k in seen.keypoints}) < 2:
+        return
+    views = make_views(seen.rig, seen.keypoints)
+    misses = pair_misses(views)
+    rows = [
+        (f"{views.rig.names[a]} - {views.rig.names[b]}", f"{misses[a, b]:.1f} px" if misses[a, b] >= 0.0 else "-")
+        for a, b in combinations(range(len(views.rig)), 2)
+    ]  # fmt: skip
+    _screen.say("\nA pair with a far larger error has a wrong calibration, differing clocks, or another person.")
+    _screen.print_table(("cameras", "median reprojection error"), rows)

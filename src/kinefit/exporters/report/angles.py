@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.exporters.curves import DIGITS, FINGER_JOINTS, NAMES, Curve, curves
+from kinefit.exporters.curves import DIGITS, FINGER_JOINTS, NAMES, Curve, curves, spoken
+from kinefit.exporters.report import page as p
 from kinefit.exporters.report.cycles import PERCENT, Cycles, Norms, normalised
-from kinefit.exporters.report.page import CENTRE_COLOUR, LEFT_COLOUR, RIGHT_COLOUR, Html
-from kinefit.exporters.report.plots import band, line, mark, stacked, thinned
 from kinefit.motion import Motion
 
-_COLOURS = {"left": LEFT_COLOUR, "right": RIGHT_COLOUR, "": CENTRE_COLOUR}
+_COLOURS = {"left": p.LEFT_COLOUR, "right": p.RIGHT_COLOUR, "": p.CENTRE_COLOUR}
 _GREY = "#8a949e"
 
 # In the humanoid's order of interest; a joint that is not here keeps its own name and comes last.
@@ -38,8 +38,13 @@ _POSITIVE = {
     **{f"thumb_{joint}_abd": "away from the palm" for joint in FINGER_JOINTS},
 }  # fmt: skip
 
+MAX_STD_DEG = 45.0
+"""[deg] standard deviation beyond which an angle counts as not observed: ±2 of it are half a turn."""
 
-def joint_plots(motion: Motion) -> dict[str, Html]:
+_HEAD = ("lowest", "highest", "range", "fastest")
+
+
+def joint_plots(motion: Motion) -> dict[str, p.Html]:
     """{joint: plot} of all coordinates over time with bands of ±2 standard deviations."""
     out = {}
     for joint, rows in by_joint(curves(motion)).items():
@@ -53,7 +58,7 @@ def joint_plots(motion: Motion) -> dict[str, Html]:
     return out
 
 
-def cycle_plots(motion: Motion, cycles: Cycles, norms: Norms | None = None) -> dict[str, Html]:
+def cycle_plots(motion: Motion, cycles: Cycles, norms: Norms | None = None) -> dict[str, p.Html]:
     """{joint: plot} of all coordinates over the cycle: mean, ±1 standard deviation, few cycles singly; norms behind."""
     spans = {side.name: side.spans for side in cycles.sides}
     other = next(iter(spans))  # of the middle of the body: the cycles of this side
@@ -69,7 +74,7 @@ def cycle_plots(motion: Motion, cycles: Cycles, norms: Norms | None = None) -> d
                 continue
             wanted = dict.fromkeys((*(c.name for c in usable), stem))
             for percent, mean, sd in (norms[name].T for name in wanted if norms and name in norms):
-                traces += band(percent, mean, sd, "norm", _GREY, len(shown))
+                traces += p.band(percent, mean, sd, "norm", _GREY, len(shown))
             for curve in usable:
                 side = curve.side if curve.side in spans else other
                 values = normalised(curve.values, spans[side])
@@ -77,7 +82,7 @@ def cycle_plots(motion: Motion, cycles: Cycles, norms: Norms | None = None) -> d
             shown[stem] = usable
         if shown:
             of = {c.side or other for sides in shown.values() for c in sides}
-            lines = [mark("x", at, _COLOURS[side], 1.2, "dash") for side, at in marks.items() if side in of]
+            lines = [p.mark("x", at, _COLOURS[side], 1.2, "dash") for side, at in marks.items() if side in of]
             out[joint] = _stacked(traces, list(shown.values()), [None] * len(shown), "cycle [%]", marks=lines)
     return out
 
@@ -92,14 +97,14 @@ def by_joint(found: list[Curve]) -> dict[str, dict[str, list[Curve]]]:
 
 
 def _over_time(curve: Curve, times: NDArray, row: int, legend: bool) -> list[dict]:
-    at = thinned(curve.values)
+    at = p.thinned(curve.values)
     ends = np.append(at[1:], len(curve.values))
     std = np.array([curve.std[a:b].max() for a, b in zip(at, ends)]) if len(at) < len(curve.std) else curve.std
     t, values, known = times[at], curve.values[at], np.isfinite(std)
     name, colour = curve.side or "middle", _COLOURS[curve.side]
-    out = band(t, values, np.where(known, 2 * std, np.nan), name, colour, row)
+    out = p.band(t, values, np.where(known, 2 * std, np.nan), name, colour, row)
     if known.any():
-        out.append(line(
+        out.append(p.line(
             t, np.where(known, values, np.nan), name, colour, 1.8, row=row, legend=legend and row == 0,
             hover=f"{name} %{{y:.4~g}} ± %{{customdata:.2~g}} {curve.unit}", customdata=np.where(known, 2 * std, 0),
         ))  # fmt: skip
@@ -107,7 +112,7 @@ def _over_time(curve: Curve, times: NDArray, row: int, legend: bool) -> list[dic
         near = ~known
         near[:-1] |= ~known[1:]
         near[1:] |= ~known[:-1]
-        out.append(line(
+        out.append(p.line(
             t, np.where(near, values, np.nan), name, _GREY, 1.4, dash="dash" if curve.side == "right" else "dot",
             row=row, hover=f"{name} %{{y:.4~g}} {curve.unit}, not observed",
         ))  # fmt: skip
@@ -116,12 +121,12 @@ def _over_time(curve: Curve, times: NDArray, row: int, legend: bool) -> list[dic
 
 def _over_cycle(curve: Curve, values: NDArray, row: int, of: str) -> list[dict]:
     name, colour, mean = curve.side or "middle", _COLOURS[curve.side], values.mean(axis=0)
-    out = band(PERCENT, mean, values.std(axis=0, ddof=1), name, colour, row) if len(values) >= 3 else []
+    out = p.band(PERCENT, mean, values.std(axis=0, ddof=1), name, colour, row) if len(values) >= 3 else []
     if len(values) <= 8:
-        out += [line(PERCENT, cycle, name, colour, 0.8, row=row, opacity=0.45) for cycle in values]
+        out += [p.line(PERCENT, cycle, name, colour, 0.8, row=row, opacity=0.45) for cycle in values]
     unseen = not np.isfinite(curve.std).mean() > 0.5
     label = f"{name}, {len(values)} {'' if of.strip() == curve.side else of}cycles"
-    return [*out, line(
+    return [*out, p.line(
         PERCENT, mean, label, _GREY if unseen else colour, 2.2, dash="dot" if unseen else "", row=row, legend=row == 0,
         hover=f"{name} %{{y:.4~g}} {curve.unit}", legendgroup=name,
     )]  # fmt: skip
@@ -133,12 +138,12 @@ def _range(sides: list[Curve]) -> list[float]:
     least = 10.0 if sides[0].unit == "deg" else 0.05
     stds = np.concatenate([c.std for c in sides])
     finite = stds[np.isfinite(stds)]
-    band = 2 * float(np.percentile(finite, 90)) if len(finite) else 0.0
-    pad = max(0.08 * (high - low), 0.3 * least, min(1.15 * band, max(2 * (high - low), 2 * least)))
+    width = 2 * float(np.percentile(finite, 90)) if len(finite) else 0.0
+    pad = max(0.08 * (high - low), 0.3 * least, min(1.15 * width, max(2 * (high - low), 2 * least)))
     return [low - pad, high + pad]
 
 
-def _stacked(traces: list[dict], rows: list[list[Curve]], ranges: list[Any], x: str, **more: Any) -> Html:
+def _stacked(traces: list[dict], rows: list[list[Curve]], ranges: list[Any], x: str, **more: Any) -> p.Html:
     names = []
     for sides in rows:
         unseen = [c.side or "all of it" for c in sides if not np.isfinite(c.std).any()]
@@ -148,4 +153,109 @@ def _stacked(traces: list[dict], rows: list[list[Curve]], ranges: list[Any], x: 
         names.append(text + (f"  (not observed: {' and '.join(unseen)})" if unseen else ""))
     axes = [{"title": sides[0].unit, **({"range": of} if of else {})} for sides, of in zip(rows, ranges)]
     label = f"{', '.join(sides[0].stem for sides in rows)} over {x.split()[0]}"
-    return stacked(traces, axes, x, label, names=names, **more)
+    return p.stacked(traces, axes, x, label, names=names, **more)
+
+
+@dataclass(frozen=True)
+class Extremes:
+    """How far one coordinate moved, each with two standard deviations [deg, deg/s].
+
+    Parameters
+    ----------
+    lowest, highest, span : (value, two standard deviations)
+        Those of the span are of the difference: what both ends have in common is not in it, see `Motion.std_of`.
+    fastest : largest speed; its deviation is NaN where the motion does not tell it. Of a greatest of many it is no
+        interval of its own: that of noise alone is above zero, too.
+    share : of the frames in which the coordinate was observed.
+    ends : frames of the lowest and the highest value
+    coordinate : its number in `Motion.dof_std`, None for a mixture of several
+    """
+
+    lowest: tuple[float, float]
+    highest: tuple[float, float]
+    span: tuple[float, float]
+    fastest: tuple[float, float]
+    share: float
+    ends: tuple[int, int]
+    coordinate: int | None
+
+
+def extremes(curve: Curve, motion: Motion, tracked: NDArray) -> Extremes | None:
+    """Of one angle [deg] of a motion over time; None where it was observed in no two frames.
+
+    tracked : (F,) bool, frames in which somebody was seen.
+    """
+    known = tracked & (curve.std < MAX_STD_DEG)
+    if known.sum() < 2:
+        return None
+    at = np.flatnonzero(known)
+    low, high = (int(at[k]) for k in (np.argmin(curve.values[at]), np.argmax(curve.values[at])))
+    span = float(curve.values[high] - curve.values[low])
+    speed = np.abs(np.gradient(curve.values)) * motion.rate
+    inside = known & np.roll(known, 1) & np.roll(known, -1)
+    inside[[0, -1]] = False
+    fastest = float(speed[inside].max()) if inside.any() else np.nan
+    ends = [(float(curve.values[f]), float(2 * curve.std[f])) for f in (low, high)]
+    share = float(known.mean())
+    of_span = span, float(np.hypot(ends[0][1], ends[1][1]))
+    if curve.coordinate is not None:
+        of_span = span, 2.0 * float(np.degrees(motion.std_of((high, low), (curve.coordinate,) * 2, (1, -1))))
+    return Extremes(ends[0], ends[1], of_span, (fastest, 2.0 * curve.speed_std), share, (low, high), curve.coordinate)
+
+
+def ranges_of(motion: Motion) -> dict[str, dict[str, Extremes | None]]:
+    """{coordinate without its side: {"left", "right", or "" of the body's middle: how far it moved}} of all angles.
+
+    None stands for what was observed in no two frames.
+    """
+    tracked = motion.quality > 0
+    out: dict[str, dict[str, Extremes | None]] = {}
+    for rows in by_joint(curves(motion)).values():
+        for stem, found in rows.items():
+            of = {c.side: extremes(c, motion, tracked) for c in found if c.unit == "deg"}
+            if of:
+                out[stem] = of
+    return out
+
+
+def ranges_table(motion: Motion) -> p.Html:
+    """Two tables: what the body has twice, left beside right, and its middle."""
+    paired: list[tuple[str, ...]] = []
+    single: list[tuple[str, ...]] = []
+    for stem, of in ranges_of(motion).items():
+        name = spoken(stem)
+        name = name[0].upper() + name[1:]
+        if "" in of:
+            single.append((name, *_cells(of[""])))
+        else:
+            left, right = of.get("left"), of.get("right")
+            paired.append((name, *_cells(left), *_cells(right), _difference(motion, left, right)))
+    parts = []
+    if paired:
+        columns = [f"{side} {what}" for side in ("left", "right") for what in _HEAD]
+        parts.append(p.table(["[°], [°/s]", *columns, "range, left minus right"], paired))
+    if single:
+        parts.append(p.table(["[°], [°/s]", *_HEAD], single))
+    return p.joined(*parts)
+
+
+def _cells(found: Extremes | None) -> tuple[str, ...]:
+    if found is None:
+        return ("not observed", "", "", "")
+    part = "" if found.share > 0.995 else "*"
+    speed, twice = found.fastest
+    fastest = "–" if not np.isfinite(speed) else with_error(speed, twice) if np.isfinite(twice) else f"{speed:.0f}"
+    return (*(with_error(*pair) for pair in (found.lowest, found.highest)), with_error(*found.span) + part, fastest)
+
+
+def _difference(motion: Motion, left: Extremes | None, right: Extremes | None) -> str:
+    if left is None or right is None:
+        return "–"
+    frames, coordinates = zip(*((f, side.coordinate) for side in (left, right) for f in side.ends[::-1]))
+    std = motion.std_of(frames, coordinates, (1, -1, -1, 1))
+    return with_error(left.span[0] - right.span[0], 2.0 * float(np.degrees(std)))
+
+
+def with_error(value: float, twice: float) -> str:
+    """A value with two standard deviations."""
+    return f"{value:.0f} ± {twice:.0f}".replace("-0 ", "0 ").replace("-", "−")

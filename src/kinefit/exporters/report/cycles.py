@@ -8,7 +8,6 @@ that it holds on a treadmill too.
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from itertools import pairwise
 from os import PathLike
@@ -17,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import read_table
 from kinefit.errors import FileError
 from kinefit.motion import Motion, rotation_between_up
 
@@ -267,25 +267,14 @@ def read_norms(path: str | PathLike[str]) -> Norms:
         The file is missing or no such table; the message names the line.
     """
     path = Path(path)
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
-    except FileNotFoundError as error:
-        raise FileError("no such table of normative values", file=path, remedy="Check the path.") from error
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise FileError(f"cannot be read ({error})", file=path, remedy="Give a CSV in UTF-8.") from error
-    lacking = [name for name in COLUMNS if not rows or name not in rows[0]]
-    if lacking:
-        remedy = f"Head its columns {', '.join(COLUMNS)}, and give a line below."
-        raise FileError(f"has no column '{lacking[0]}'", file=path, remedy=remedy)
-    found: dict[str, list[tuple[float, ...]]] = {}
-    for number, row in enumerate(rows, 2):
-        try:
-            percent, mean, sd = (float(row[name]) for name in COLUMNS[1:])
-        except (TypeError, ValueError):
-            percent = mean = sd = np.nan
-        if not (0 <= percent <= 100 and np.isfinite(mean) and 0 <= sd < np.inf):
-            remedy = "percent lies within 0 to 100, mean and sd are degrees, and sd is not negative."
-            raise FileError("is no normative value", file=path, place=f"line {number}", remedy=remedy)
-        found.setdefault((row["coordinate"] or "").strip(), []).append((percent, mean, sd))
-    return {name: np.array(sorted(values)) for name, values in found.items()}
+    remedy = "Give a CSV with the columns coordinate, percent (0 to 100), mean and sd (not negative) [deg]."
+    names, values = read_table(path, COLUMNS[1:], remedy, text=COLUMNS[0])
+    if not names:
+        raise FileError("has no line of values", file=path, remedy=remedy)
+    percent, _, sd = values.T
+    wrong = ~(np.isfinite(values).all(axis=1) & (percent >= 0.0) & (percent <= 100.0) & (sd >= 0.0))
+    if wrong.any():
+        line = f"line {int(np.argmax(wrong)) + 2}"
+        raise FileError("is no normative value", file=path, place=line, remedy=remedy)
+    of = np.array(names)
+    return {name: np.array(sorted(values[of == name].tolist())) for name in dict.fromkeys(names)}

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.exporters.report import page as p
 from kinefit.exporters.report.moments import POORLY_SUPPORTED, Moment
-from kinefit.exporters.report.page import SERIES, Html, joined, moment, shaded, table
-from kinefit.exporters.report.plots import MAX_CURVE_POINTS, line, mark, stacked, thinned
 from kinefit.findings import runs_of
 from kinefit.motion import SHOWN_UNITS, Motion, Residuals, known_median
 
@@ -53,7 +52,7 @@ def overall_median(motion: Motion, unit: str = "px") -> float:
     return SHOWN_UNITS[unit][0] * known_median(np.concatenate([*(r.norms.ravel() for r in chosen), np.zeros(0)]))
 
 
-def sensor_table(motion: Motion, fits: Sequence[SensorFit]) -> Html:
+def sensor_table(motion: Motion, fits: Sequence[SensorFit]) -> p.Html:
     """One row a sensor."""
     columns = ["sensor", "median", "95 % below", "shift u or x", "v or y", "z", "points seen", "rejected"]
     columns.append("left/right swaps")
@@ -62,9 +61,9 @@ def sensor_table(motion: Motion, fits: Sequence[SensorFit]) -> Html:
     for f in fits:
         shift = [f"{v:+.1f}" for v in f.shift] + ["–"] * (3 - len(f.shift))
         swaps = runs_of(np.asarray(motion.residuals[f.name].swapped, bool), round(0.1 * motion.rate))
-        links = [moment(motion.times[a], f"{motion.times[a]:.2f} s") for a, _ in swaps[:6]]
+        links = [p.moment(motion.times[a], f"{motion.times[a]:.2f} s") for a, _ in swaps[:6]]
         more = " …" if len(swaps) > 6 else ""
-        swapped = joined(f"{f.swapped} frames: ", Html(", ".join(links)), more) if swaps else "–"
+        swapped = p.joined(f"{f.swapped} frames: ", p.Html(", ".join(links)), more) if swaps else "–"
         rows.append(
             [f.name, value_text(f.median, f.unit), value_text(f.most, f.unit), *(shift[:2] if flat else shift),
              f"{100 * f.seen:.0f} %", f"{100 * f.left_out:.1f} %", swapped]
@@ -72,10 +71,10 @@ def sensor_table(motion: Motion, fits: Sequence[SensorFit]) -> Html:
     if flat:
         columns.remove("z")
         columns[3:5] = ["shift u", "v"]
-    return table(columns, rows)
+    return p.table(columns, rows)
 
 
-def point_table(motion: Motion) -> Html:
+def point_table(motion: Motion) -> p.Html:
     """Median residual of every point in every sensor, the darker the larger; the share left out where it is much."""
     sensors = dict(motion.residuals)
     names = list(dict.fromkeys(name for r in sensors.values() for name in r.names))
@@ -94,27 +93,28 @@ def point_table(motion: Motion) -> Html:
         for sensor, r in sensors.items():
             value, share = medians[sensor].get(name, np.nan), left_out[sensor].get(name, 0.0)
             text = f"{value:.1f}" if np.isfinite(value) else "–"
-            cells.append(shaded(text + (f" ({100 * share:.0f} %)" if share >= 0.05 else ""), value / largest[r.unit]))
+            cells.append(p.shaded(text + (f" ({100 * share:.0f} %)" if share >= 0.05 else ""), value / largest[r.unit]))
         rows.append(cells)
     heads = [f"{s} [{SHOWN_UNITS[r.unit][1]}]" for s, r in sensors.items()]
     caption = "Median residual of every point; in brackets the share rejected as outliers, if it is 5 % or more."
-    return table(["point", *heads], rows, caption=caption)
+    return p.table(["point", *heads], rows, caption=caption)
 
 
-def quality_plot(motion: Motion, moments: Sequence[Moment]) -> Html:
+def quality_plot(motion: Motion, moments: Sequence[Moment]) -> p.Html:
     """Quality and every sensor's residual over time, doubtful moments shaded; a click moves the 3D figure."""
-    times, at, half = motion.times, thinned(motion.quality), 0.5 / motion.rate
+    times, at, half = motion.times, p.thinned(motion.quality), 0.5 / motion.rate
     hover = "quality %{y:.2f}"
-    traces = [line(times[at], motion.quality[at], "quality", "#4d4d4d", 1.8, hover=hover)]
+    traces = [p.line(times[at], motion.quality[at], "quality", "#4d4d4d", 1.8, hover=hover)]
     units = list(dict.fromkeys(r.unit for r in motion.residuals.values()))
     for k, (name, r) in enumerate(motion.residuals.items()):
         factor, unit = SHOWN_UNITS[r.unit]
         level = factor * np.array([known_median(norms) for norms in r.norms])
         known = np.flatnonzero(np.isfinite(level))
-        at = np.arange(len(level)) if len(level) <= MAX_CURVE_POINTS or not len(known) else known[thinned(level[known])]
+        whole = len(level) <= p.MAX_CURVE_POINTS or not len(known)
+        at = np.arange(len(level)) if whole else known[p.thinned(level[known])]
         hover, row = f"{name} %{{y:.1f}} {unit}", 1 + units.index(r.unit)
         traces.append(
-            line(times[at], level[at], name, SERIES[k % len(SERIES)], 1.4, hover=hover, row=row, legend=True)
+            p.line(times[at], level[at], name, p.SERIES[k % len(p.SERIES)], 1.4, hover=hover, row=row, legend=True)
         )
     axes: list[dict[str, Any]] = [{"title": "quality", "range": [0, 1.03]}]
     axes += [{"title": f"residual [{SHOWN_UNITS[unit][1]}]", "rangemode": "tozero"} for unit in units]
@@ -123,8 +123,8 @@ def quality_plot(motion: Motion, moments: Sequence[Moment]) -> Html:
          "x1": times[m.stop - 1] + half, "fillcolor": "rgba(224,161,0,0.25)", "line": {"width": 0}, "layer": "below"}
         for m in moments[:100]
     ]  # fmt: skip
-    marks.append(mark("y", POORLY_SUPPORTED, "#a87600", 1, "dot"))
-    return stacked(traces, axes, "time [s]", "quality and residuals over time", marks=marks, seeks=True)
+    marks.append(p.mark("y", POORLY_SUPPORTED, "#a87600", 1, "dot"))
+    return p.stacked(traces, axes, "time [s]", "quality and residuals over time", marks=marks, seeks=True)
 
 
 def _fit(name: str, r: Residuals) -> SensorFit:

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from kinefit.exporters.pictures.drawing import draw_body, draw_residuals, drawn_points
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.moments import Moment, doubtful_moments, listed, place, span, spoken_segments
-from kinefit.exporters.report.plots import line
+from kinefit.exporters.report.moments import Moment, doubtful_moments, place, span, spoken_segments
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals
 
@@ -52,7 +51,7 @@ def time_line(motion: Motion, moments: Sequence[Moment]) -> p.Html:
     """When what is doubtful: one row for each part of the body, the worst first; a click moves the 3D figure there."""
     rows: dict[str, list[Moment]] = {}
     for m in moments:
-        rows.setdefault(listed(spoken_segments(motion.body, m.segments)) or "whole body", []).append(m)
+        rows.setdefault(spoken_segments(motion.body, m.segments), []).append(m)
     shown = list(rows)[:_MAX_TIMELINE_ROWS]
     traces = []
     for name in reversed(shown):  # plots grow upwards
@@ -63,7 +62,7 @@ def time_line(motion: Motion, moments: Sequence[Moment]) -> p.Html:
                     half = 0.5 / motion.rate
                     x += [motion.times[m.start] - half, motion.times[m.stop - 1] + half, np.nan]
             if x:
-                traces.append(line(x, [name] * len(x), name, colour, 12, hover=f"{name} %{{x:.2f}} s"))
+                traces.append(p.line(x, [name] * len(x), name, colour, 12, hover=f"{name} %{{x:.2f}} s"))
     layout = {
         "margin": {"l": 10, "r": 12, "t": 30, "b": 40}, "yaxis": {"type": "category", "automargin": True},
         "xaxis": {"title": "time [s]", "range": [float(motion.times[0]), float(motion.times[-1])]},

@@ -13,7 +13,7 @@ from kinefit.bodies import Body
 from kinefit.exporters.curves import split_side
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.fit import overall_median, sensor_fits
-from kinefit.exporters.report.moments import listed
+from kinefit.findings import listed
 from kinefit.motion import SHOWN_UNITS, Motion
 
 _DETECTORS = {
@@ -121,13 +121,13 @@ def _cameras(provenance: Mapping[str, Any], names: list[str]) -> str:
     formats = [(str(e.get("format", "")), e.get("set") or "") for e in keypoints]
     kinds = dict.fromkeys(f"{_DETECTORS.get(name, name)} {points}".strip() for name, points in formats)
     accuracies = sorted({float(e["accuracy"]) for e in keypoints if isinstance(e.get("accuracy"), int | float)})
-    text = f"2D keypoints {f'({listed([k for k in kinds if k])}) ' if any(kinds) else ''}of {listed(names, 12)}"
+    text = f"2D keypoints {f'({listed([k for k in kinds if k], 4)}) ' if any(kinds) else ''}of {listed(names, 12)}"
     stated = f" with a stated standard deviation of {listed([f'{a:g}' for a in accuracies])} px" if accuracies else ""
     return f"{text} were used{stated}."
 
 
 def _markers(names: list[str]) -> str:
-    return f"Markers of {listed(names)} were used." if names else ""
+    return f"Markers of {listed(names, 4)} were used." if names else ""
 
 
 def _calibration(provenance: Mapping[str, Any]) -> str:

@@ -11,13 +11,108 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body
 from kinefit.bodies.limbs import finger_groups
 from kinefit.exporters.curves import DIGITS, split_side
-from kinefit.exporters.report.doubt import contradicted, doubtful, end_sigmas, uncertain_throughout
-from kinefit.findings import runs_of
+from kinefit.findings import listed, runs_of
 from kinefit.motion import Motion, Residuals
+
+DOUBT_DISTANCE_M = 0.08  # [m] from the truth: about as thick as a limb, which then lies beside itself
+_DOUBTFUL = 0.11  # [m] root of the summed variances, above which `DOUBT_DISTANCE_M` is likely exceeded: 9 cm of an
+# error that is alike in all directions, 12 of one along a line; on simulated takes of all sensors 10 were 45 to 61 %
+_FLAT_ROOT_SIGMA = 1.0  # [m, rad] of a root that nothing holds
+_MAX_STD = 1e3  # [rad, m] of a coordinate without a prior
+_WINDOW = 0.05  # [s] to either side, in which most views must contradict: an outlier is alone
 
 POORLY_SUPPORTED = 0.5  # quality below which the measurements support less than half of the body
 _GAP = 0.1  # [s] stretches nearer than this are one to somebody who looks at the video
 _MIN_OUTLIER_SHARE = 0.25  # reported as a cause; fits of good keypoints reject less than a tenth
+
+
+def doubtful(sigmas: NDArray, against: NDArray) -> NDArray:
+    """(F, S) bool: segments of which an end is rather more than 8 cm off than not, or is so in most views.
+
+    By `end_sigmas` and `contradicted`.
+    """
+    return np.asarray((sigmas > _DOUBTFUL) | against)
+
+
+def uncertain_throughout(motion: Motion) -> dict[str, float]:
+    """Segments with an end that is uncertain by more than 8 cm in most frames, and its median sigma [m]."""
+    if not motion.residuals or not len(motion):
+        return {}
+    middle = np.median(end_sigmas(motion), axis=0)
+    return {name: float(m) for name, m in zip(motion.body.tree.segments, middle) if m > DOUBT_DISTANCE_M}
+
+
+def end_sigmas(motion: Motion) -> NDArray:
+    """(F, S) [m] standard deviation, in all directions together, of the less certain end of each segment."""
+    tree, surfaces = motion.body.tree, motion.body.segment_ends()
+    prior = np.concatenate([np.full(6, _FLAT_ROOT_SIGMA), np.minimum(tree.posture_std, _MAX_STD)])
+    std = np.where(np.isfinite(motion.dof_std), motion.dof_std, prior)
+    known = np.linalg.norm(motion.joint_std, axis=-1)
+    unbounded = ~np.isfinite(known)
+    sigma = np.where(unbounded, 0.0, known)
+    for s, parent in enumerate(tree.parents):  # of an unbounded one what is known of the joint before it
+        if parent >= 0:
+            sigma[:, s] = np.where(unbounded[:, s], sigma[:, parent], sigma[:, s])
+    for f in np.flatnonzero(unbounded.any(axis=1)):
+        alone = np.where(np.isfinite(motion.dof_std[f]), 0.0, prior)
+        unknown = np.sqrt(_square_moves(motion, int(f)) @ np.square(alone))
+        sigma[f] = np.where(unbounded[f], np.hypot(sigma[f], unknown), sigma[f])
+    out = sigma.copy()
+    for s in range(len(tree.segments)):
+        children = np.flatnonzero(tree.parents == s)
+        if len(children):
+            out[:, s] = np.maximum(sigma[:, s], sigma[:, children].max(axis=1))
+        elif s in surfaces:
+            own = np.flatnonzero(tree.owners == s)
+            levers = np.linalg.norm(np.cross(tree.axes[own], surfaces[s]), axis=-1)
+            out[:, s] = np.sqrt(np.square(sigma[:, s]) + np.square(std[:, 6 + own]) @ np.square(levers))
+    return out
+
+
+def contradicted(motion: Motion) -> NDArray:
+    """(F, S) bool: segments whose points most views, for a tenth of a second, show more than 8 cm beside the fit."""
+    shape = motion.segment_quality.shape
+    seen, off = np.zeros(shape), np.zeros(shape)
+    for r in motion.residuals.values():
+        if r.unit != "px" or not r.of_points:
+            continue
+        owners, there = np.asarray(r.segments), np.isfinite(r.norms)
+        fitted = np.where(there[..., None], r.measured - r.values, np.nan)
+        joints = np.where(there[..., None], motion.joint_centres[:, owners], np.nan)
+        far = r.norms > DOUBT_DISTANCE_M * _pixels_per_metre(fitted, joints)[:, None]
+        for s in np.unique(owners):
+            count = there[:, owners == s].sum(axis=1)
+            seen[:, s] += count > 0
+            off[:, s] += 2 * (far & there)[:, owners == s].sum(axis=1) > np.maximum(count, 1)
+    half = max(round(_WINDOW * motion.rate), 1)
+    summed = [
+        np.lib.stride_tricks.sliding_window_view(np.pad(x, ((half, half), (0, 0))), 2 * half + 1, axis=0).sum(axis=-1)
+        for x in (off, seen)
+    ]
+    return np.asarray((2 * summed[0] > summed[1]) & (seen > 0))
+
+
+def _pixels_per_metre(fitted: NDArray, joints: NDArray) -> NDArray:
+    """(F,) about how large a metre at the body is in an image, from fitted points (F, K, 2) and their joints."""
+    extents = []
+    for x in (fitted, joints):
+        count = np.isfinite(x[..., 0]).sum(axis=1)
+        middle = np.nansum(x, axis=1) / np.maximum(count, 1)[:, None]
+        extents.append(np.sqrt(np.nansum(np.square(x - middle[:, None]), axis=(1, 2))))
+    return np.asarray(np.where(extents[1] > 0.0, extents[0] / np.maximum(extents[1], 1e-9), np.inf))
+
+
+def _square_moves(motion: Motion, frame: int) -> NDArray:
+    """(S, 6 + D) [m²] squared ways of the joint centres, by a unit of every degree of freedom."""
+    tree, state = motion.body.tree, motion.state(frame)
+    _, screws = tree.forward(state.T_world_root, state.angles)
+    x = tree.segment_poses(state.T_world_root[None], state.angles[None])[0, :, :3, 3] - state.T_world_root[:3, 3]
+    lines = np.concatenate([np.eye(6), screws])  # (v, ω)
+    out = np.square(lines[:, :3] + np.cross(lines[:, 3:], x[:, None])).sum(axis=-1)
+    moved = np.zeros(out.shape, bool)
+    for s, last in enumerate(tree.last_dof):
+        moved[s, tree.chain[last, : tree.depth[last] + 1]] = True
+    return np.where(moved, out, 0.0)
 
 
 @dataclass(frozen=True)
@@ -86,7 +181,8 @@ def throughout_sentence(motion: Motion) -> str:
     widest: dict[str, float] = {}
     for name, words in _spoken(motion.body, list(sigmas)).items():
         widest[words] = max(sigmas[name], widest.get(words, 0.0))
-    return listed([f"{name} (±{200 * sigma:.0f}\u00a0cm)" for name, sigma in widest.items()], 20)
+    each = [f"{name} (±{200 * sigma:.0f}\u00a0cm)" for name, sigma in widest.items()]
+    return listed(each, 20) if each else ""
 
 
 def when(motion: Motion, m: Moment) -> str:
@@ -103,7 +199,7 @@ def span(motion: Motion, m: Moment) -> str:
 def place(motion: Motion, m: Moment) -> str:
     """Frames and segments of a moment: "(frames 36–43): head"."""
     frames = f"frame {m.start}" if m.stop - m.start == 1 else f"frames {m.start}–{m.stop - 1}"
-    return f"({frames}): {listed(spoken_segments(motion.body, m.segments)) or 'whole body'}"
+    return f"({frames}): {spoken_segments(motion.body, m.segments)}"
 
 
 def never_observed(motion: Motion) -> tuple[str, ...]:
@@ -138,23 +234,15 @@ def plain(segment: str) -> str:
     return f"{side} {f'{DIGITS[digit].lower()} ({bone})' if bone and digit in DIGITS else name}".strip()
 
 
-def spoken_segments(body: Body, segments: Sequence[str]) -> list[str]:
+def spoken_segments(body: Body, segments: Sequence[str]) -> str:
     """Segments in words, each once; several fingers of a hand together: "fingers of the left hand"."""
-    return list(dict.fromkeys(_spoken(body, segments).values()))
+    return listed(dict.fromkeys(_spoken(body, segments).values()) or ["whole body"], 4)
 
 
 def _spoken(body: Body, segments: Sequence[str]) -> dict[str, str]:
     groups = finger_groups(body)
     hand = {s: name for name, own in groups.items() if len(set(own) & set(segments)) > 1 for s in own}
     return {s: f"fingers of the {plain(hand[s])}" if s in hand else plain(s) for s in segments}
-
-
-def listed(names: Sequence[str], most: int = 4) -> str:
-    """Names as "a, b and c"; those beyond `most` are counted."""
-    names = list(names)
-    if len(names) > most + 1:
-        names = [*names[:most], f"{len(names) - most} more"]
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def _runs(motion: Motion, flags: NDArray) -> list[tuple[int, int]]:
@@ -214,7 +302,7 @@ def _sentences(body: Body, group: Sequence[_Doubt]) -> Iterable[str]:
     """What a moment's findings say; what is the same of several segments is said once, of all."""
     for kind in dict.fromkeys(g.kind for g in group):
         same = [g for g in group if g.kind == kind]
-        names = listed(spoken_segments(body, [g.segment for g in same]))
+        names = spoken_segments(body, [g.segment for g in same])
         most = max(g.amount for g in same)
         if kind == "nobody":
             yield "The person was not observed; the body keeps its last pose."
@@ -248,7 +336,7 @@ def causes(motion: Motion, moment: Moment) -> tuple[str, ...]:
     for text, of in (("No measurement supports {}", quality <= 0), (more, quality > 0)):
         gone = 2 * (of & motion.lost[frames]).sum(axis=0) > len(quality)
         if names := [n for n in moment.segments if gone[motion.body.tree.segments.index(n)]]:
-            out.append(text.format(listed(spoken_segments(motion.body, names))) + ".")
+            out.append(text.format(spoken_segments(motion.body, names)) + ".")
     swapped = [name for name, r in pixels.items() if np.any(np.asarray(r.swapped)[frames])]
     if swapped:
         out.append(f"The detector swapped left and right in {listed(swapped)} (corrected).")

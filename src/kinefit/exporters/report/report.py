@@ -21,7 +21,7 @@ from kinefit.errors import ExportError, choices
 from kinefit.exporters.atomic import write_text
 from kinefit.exporters.curves import curves, spoken
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.angles import cycle_plots, joint_plots
+from kinefit.exporters.report.angles import cycle_plots, joint_plots, ranges_table
 from kinefit.exporters.report.cycles import Cycles, Norms, find_cycles, gait_numbers
 from kinefit.exporters.report.figure import figure
 from kinefit.exporters.report.fit import overall_median, point_table, quality_plot, sensor_fits, sensor_table
@@ -32,14 +32,11 @@ from kinefit.exporters.report.moments import (
     Moment,
     doubt_sentence,
     doubtful_moments,
-    listed,
     never_observed,
     shared_by_prior,
     throughout_sentence,
 )
-from kinefit.exporters.report.page import fault_sections
-from kinefit.exporters.report.ranges import ranges_table
-from kinefit.findings import of_provenance
+from kinefit.findings import listed, of_provenance
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 
@@ -104,7 +101,7 @@ def write_report(
     _check_norms(motion, norms, path)
     width = round(640 * min(1.0, (_BUDGET / max(1, sum(map(len, shown.values())))) ** 0.5))
     sections = [
-        *fault_sections(of_provenance(motion.provenance)),
+        *p.fault_sections(of_provenance(motion.provenance)),
         _summary(motion, moments, list(findings), date),
         p.section("Moving figure", figure(motion, rig), p.paragraph(
             "Drag to turn. Click, then use the wheel (or two fingers) to zoom. Blue is left, orange right. Parts "

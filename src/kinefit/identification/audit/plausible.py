@@ -98,15 +98,17 @@ def _fits_other_segments(model: MarkerModel, places: Sequence[NDArray], s: int, 
         known = np.isfinite(places[t]).all(1)
         if known.sum() < 3:
             continue
-        misfit = []
-        for reference in (model.reference, swapped):
-            actual = np.vstack([reference[list(members)], *_joint_places(model, t)])
-            scale, R, shift = similarity(places[t][known], actual[known], np.eye(3))
-            residuals = actual[known] - (scale * places[t][known] @ R.T + shift)
-            misfit.append(float(np.sqrt((residuals**2).sum(1).mean()) / max(scale, 1e-6)))
-        if misfit[1] > max(misfit[0], MIN_PLACEMENT_RMS):
+        actual = (np.vstack([x[list(members)], *_joint_places(model, t)])[known] for x in (model.reference, swapped))
+        before, after = (_placement_rms(places[t][known], x) for x in actual)
+        if after > max(before, MIN_PLACEMENT_RMS):
             return False
     return True
+
+
+def _placement_rms(expected: NDArray, actual: NDArray) -> float:
+    """Root mean square [m] of places (k, 3) about the expected ones, fitted by a similarity, at the expected scale."""
+    scale, R, t = similarity(expected, actual, np.eye(3))
+    return float(np.sqrt(((actual - (scale * expected @ R.T + t)) ** 2).sum(1).mean()) / max(scale, 1e-6))
 
 
 def _swaps_by_place(model: MarkerModel, s: int, places: Sequence[NDArray]) -> Iterator[PairFinding]:
@@ -117,21 +119,14 @@ def _swaps_by_place(model: MarkerModel, s: int, places: Sequence[NDArray]) -> It
     firm = np.flatnonzero(known[: len(members)])
     if known.sum() < 4:
         return
-
-    def rms_of(order: NDArray) -> float:
-        scale, R, t = similarity(expected[known], actual[order][known], np.eye(3))
-        residuals = actual[order][known] - (scale * expected[known] @ R.T + t)
-        return float(np.sqrt((residuals**2).sum(1).mean()) / max(scale, 1e-6))
-
-    identity = np.arange(len(actual))
-    rms = rms_of(identity)
+    rms = _placement_rms(expected[known], actual[known])
     if rms < MIN_PLACEMENT_RMS:
         return
     trials = []
     for a, b in combinations(firm.tolist(), 2):
-        order = identity.copy()
-        order[[a, b]] = order[[b, a]]
-        trials.append((rms_of(order), a, b))
+        swapped = actual.copy()
+        swapped[[a, b]] = swapped[[b, a]]
+        trials.append((_placement_rms(expected[known], swapped[known]), a, b))
     rms_after, a, b = min(trials, default=(np.inf, 0, 0))
     if rms_after < MAX_RATIO_AFTER_SWAP * rms and _fits_other_segments(model, places, s, (members[a], members[b])):
         pair = (model.labels[members[a]], model.labels[members[b]])

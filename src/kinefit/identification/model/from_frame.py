@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -176,22 +176,15 @@ def reachable_distances(
     mean = np.linalg.norm(reference[:, None] - reference, axis=-1)
     joint_of = {j.child: j for j in joints}
 
-    def path_to_root(s: int) -> list[int]:
-        path = [s]
-        while path[-1] in joint_of:
-            path.append(joint_of[path[-1]].parent)
-        return path
-
     for a in range(size):
         for b in range(a, size):
-            up, down = path_to_root(a), path_to_root(b)
             if a == b:
                 i = np.ix_(list(members[a]), list(members[a]))
                 low[i], high[i] = mean[i], mean[i]
                 continue
-            common = next(s for s in up if s in down)
-            chain = [(joint_of[s].in_child, joint_of[s].in_parent) for s in up[: up.index(common)]]
-            chain += [(joint_of[s].in_parent, joint_of[s].in_child) for s in down[: down.index(common)]][::-1]
+            up, down = joints_between(a, b, {child: j.parent for child, j in joint_of.items()})
+            chain = [(joint_of[s].in_child, joint_of[s].in_parent) for s in up]
+            chain += [(joint_of[s].in_parent, joint_of[s].in_child) for s in reversed(down)]
             inner = [float(np.linalg.norm(k[1] - n[0])) for k, n in pairwise(chain)]
             first = np.linalg.norm(reference[list(members[a])] - chain[0][0], axis=-1)
             last = np.linalg.norm(reference[list(members[b])] - chain[-1][1], axis=-1)
@@ -203,6 +196,19 @@ def reachable_distances(
             low[i] = np.maximum(low[i], least)
             high[j], low[j] = high[i].T, low[i].T
     return low, np.maximum(high, low)
+
+
+def joints_between(a: int, b: int, parent: Mapping[int, int]) -> tuple[list[int], list[int]]:
+    """The segments whose parent joints lie on the path between segments a and b: upwards from a, and from b."""
+    paths = []
+    for s in (a, b):
+        path = [s]
+        while path[-1] in parent:
+            path.append(parent[path[-1]])
+        paths.append(path)
+    common = next(s for s in paths[0] if s in paths[1])
+    up, down = (path[: path.index(common)] for path in paths)
+    return up, down
 
 
 def prior_deviation(mean: NDArray, skeleton: Skeleton, low: NDArray, high: NDArray) -> NDArray:

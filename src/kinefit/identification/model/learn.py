@@ -11,19 +11,8 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import MarkerSet, find_marker_set, load_marker_set
 from kinefit.errors import ObservationError
+from kinefit.identification.model import from_frame
 from kinefit.identification.model.clusters import learn_segments
-from kinefit.identification.model.from_frame import (
-    DISTANCE_NOISE,
-    JOINT_SPREAD,
-    MARKER_SPREAD,
-    Skeleton,
-    assign_unknown,
-    place_joints,
-    prior_deviation,
-    reachable_distances,
-    shared_marker,
-    skeleton_of,
-)
 from kinefit.identification.model.model import MarkerJoint, MarkerModel
 from kinefit.identification.model.rigid import exercised_share, fit_joint, joint_ranges, reference_turn
 from kinefit.observations import Markers
@@ -68,7 +57,7 @@ def learn_model(markers: Markers, *, name: str = "subject", template: MarkerSet 
         )
     tables = distance_statistics(positions)
     if isinstance(marker_set, MarkerSet):
-        skeleton = assign_unknown(skeleton_of(labels, marker_set), tables[1])
+        skeleton = from_frame.assign_unknown(from_frame.skeleton_of(labels, marker_set), tables[1])
     else:
         skeleton = learn_segments(positions, labels, tables[0], tables[1])
     return fit_model(positions, labels, skeleton, tables, name, gaps)
@@ -136,8 +125,8 @@ def distance_statistics(positions: NDArray) -> tuple[NDArray, NDArray, NDArray, 
 
 
 def fit_model(
-    positions: NDArray, labels: list[str], skeleton: Skeleton, tables: tuple[NDArray, NDArray, NDArray, NDArray],
-    name: str, gaps: tuple[str, ...],
+    positions: NDArray, labels: list[str], skeleton: from_frame.Skeleton,
+    tables: tuple[NDArray, NDArray, NDArray, NDArray], name: str, gaps: tuple[str, ...],
 ) -> MarkerModel:
     """Fit reference shape, joints and distances of a model whose segments are known.
 
@@ -154,7 +143,7 @@ def fit_model(
     """
     mean, deviation, low, high = tables
     reference = mean_shape(positions, skeleton.members, mean)
-    places = place_joints(reference, skeleton)
+    places = from_frame.place_joints(reference, skeleton)
     joints: list[MarkerJoint] = []
     Rs: list[NDArray] = []
     ts: list[NDArray] = []
@@ -164,7 +153,7 @@ def fit_model(
         if p < 0:
             R, t = rigid_frames(x, y, np.broadcast_to(np.eye(3), (len(y), 3, 3)))
         else:
-            marker = shared_marker(skeleton, s, places[s], reference)
+            marker = from_frame.shared_marker(skeleton, s, places[s], reference)
             guess = places[s] if marker is None else reference[marker]
             a = b = guess
             if marker is None:
@@ -174,23 +163,23 @@ def fit_model(
             R, t = rigid_frames(np.vstack([x, b]), np.concatenate([y, known[:, None]], 1), Rs[p])
             spread = np.linalg.norm(known - (R @ b + t), axis=-1)
             spread = spread[np.isfinite(spread)]
-            typical = float(np.sqrt(np.median(spread**2))) if len(spread) else JOINT_SPREAD
+            typical = float(np.sqrt(np.median(spread**2))) if len(spread) else from_frame.JOINT_SPREAD
             is_observed = np.isfinite(y[..., 0]).sum(1) >= min(3, len(x))
             ranges = joint_ranges(Rs[p], R, is_observed)
             joint = MarkerJoint(p, s, a, b, typical, marker, ranges[0], ranges)
             share = exercised_share(joint, skeleton.ranges[s])
             turn, give = reference_turn(Rs[p], R, is_observed, skeleton.ranges[s])
             joint = replace(joint, turn=turn, give=give)
-            prior_spread = max(typical, MARKER_SPREAD if marker is not None else JOINT_SPREAD)
+            prior_spread = max(typical, from_frame.MARKER_SPREAD if marker is not None else from_frame.JOINT_SPREAD)
             joints.append(replace(joint, spread=float(np.sqrt(share * typical**2 + (1 - share) * prior_spread**2))))
         Rs.append(R)
         ts.append(t)
-    tree_low, tree_high = reachable_distances(reference, skeleton.members, joints)
+    tree_low, tree_high = from_frame.reachable_distances(reference, skeleton.members, joints)
     reference_distances = np.linalg.norm(reference[:, None] - reference, axis=-1)
     mean = np.where(np.isfinite(mean), mean, reference_distances)
-    guess = prior_deviation(mean, skeleton, tree_low, tree_high)
+    guess = from_frame.prior_deviation(mean, skeleton, tree_low, tree_high)
     known = np.where(np.isfinite(deviation), exercised_shares(skeleton, joints, len(labels)), 0.0)
-    deviation = np.nan_to_num(np.hypot(deviation, DISTANCE_NOISE))
+    deviation = np.nan_to_num(np.hypot(deviation, from_frame.DISTANCE_NOISE))
     deviation = np.sqrt(known * deviation**2 + (1 - known) * np.maximum(deviation, guess) ** 2)
     np.fill_diagonal(deviation, 0.0)
     low, high = np.fmin(low, mean), np.fmax(high, mean)
@@ -201,7 +190,7 @@ def fit_model(
     )
 
 
-def exercised_shares(skeleton: Skeleton, joints: Sequence[MarkerJoint], count: int) -> NDArray:
+def exercised_shares(skeleton: from_frame.Skeleton, joints: Sequence[MarkerJoint], count: int) -> NDArray:
     """(M, M) in 0..1: share of each distance's range that the training motion showed.
 
     Across joints: the least share of the joints between. Within a segment: the mean over its joints, as they move skin.
@@ -216,23 +205,11 @@ def exercised_shares(skeleton: Skeleton, joints: Sequence[MarkerJoint], count: i
                 adjacent_shares = [v for c, v in share.items() if a in (c, parent[c])]
                 value = float(np.mean(adjacent_shares)) if adjacent_shares else 1.0
             else:
-                value = min(share[s] for s in _joints_between(a, b, parent))
+                value = min(share[s] for path in from_frame.joints_between(a, b, parent) for s in path)
             i, j = np.ix_(list(members[a]), list(members[b])), np.ix_(list(members[b]), list(members[a]))
             known[i] = np.minimum(known[i], value)
             known[j] = np.minimum(known[j], value)
     return known
-
-
-def _joints_between(a: int, b: int, parent: dict[int, int]) -> list[int]:
-    """The segments whose parent joints lie on the path between segments a and b."""
-    paths = []
-    for s in (a, b):
-        path = [s]
-        while path[-1] in parent:
-            path.append(parent[path[-1]])
-        paths.append(path)
-    common = next(s for s in paths[0] if s in paths[1])
-    return [s for path in paths for s in path[: path.index(common)]]
 
 
 def mean_shape(positions: NDArray, segments: tuple[tuple[int, ...], ...], mean: NDArray) -> NDArray:

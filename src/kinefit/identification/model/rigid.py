@@ -43,12 +43,19 @@ def fit_joint(
     valid = np.isfinite(tp).all(1) & np.isfinite(tc).all(1)
     if not valid.any():
         return guess, guess
-    A = np.concatenate([Rp[valid], -Rc[valid]], axis=2)
-    r = tc[valid] - tp[valid] - (A @ np.concatenate([guess, guess]))
-    H = np.einsum("fij,fik->jk", A, A) / valid.sum()
-    g = np.einsum("fij,fi->j", A, r) / valid.sum()
-    step = np.linalg.solve(H + 0.02 * np.eye(6), g)
-    return guess + step[:3], guess + step[3:]
+    found, _ = _least_squares(Rp[valid], tp[valid], Rc[valid], tc[valid], np.concatenate([guess, guess]), 0.02)
+    return found[:3], found[3:]
+
+
+def _least_squares(
+    Rp: NDArray, tp: NDArray, Rc: NDArray, tc: NDArray, start: NDArray, weight: float
+) -> tuple[NDArray, NDArray]:
+    """The joint (6,) [m] in both frames, with the weight of a start (6,), and its residuals (F, 3) [m]."""
+    A = np.concatenate([Rp, -Rc], axis=2)
+    r = tc - tp - A @ start
+    H = np.einsum("fij,fik->jk", A, A) / len(A)
+    step = np.linalg.solve(H + weight * np.eye(6), np.einsum("fij,fi->j", A, r) / len(A))
+    return start + step, r - A @ step
 
 
 def fit_joint_few(Rp: NDArray, tp: NDArray, x: NDArray, y: NDArray, guess: NDArray) -> tuple[NDArray, NDArray]:
@@ -96,14 +103,9 @@ def joint_residual(parent: tuple[NDArray, ...], child: tuple[NDArray, ...] | Non
         valid = np.isfinite(tp).all(1) & np.isfinite(tc).all(1)
         if valid.sum() < 3:
             return np.inf
-        A = np.concatenate([Rp[valid], -Rc[valid]], axis=2)
-        r = tc[valid] - tp[valid]
         start = np.concatenate([local(Rp[valid], tp[valid], y[valid]).mean((0, 1)), np.zeros(3)])
         start[3:] = middle(local(Rc[valid], tc[valid], y[valid]), axis=(0, 1))
-        start = np.nan_to_num(start)
-        H = np.einsum("fij,fik->jk", A, A) / valid.sum() + 1e-3 * np.eye(6)
-        g = np.einsum("fij,fi->j", A, r - A @ start) / valid.sum()
-        residuals = r - A @ (start + np.linalg.solve(H, g))
+        _, residuals = _least_squares(Rp[valid], tp[valid], Rc[valid], tc[valid], np.nan_to_num(start), 1e-3)
         return float(np.sqrt(np.median((residuals**2).sum(1))))
     local_points = local(Rp, tp, y)
     guess = local_points[frame].copy()

@@ -11,8 +11,7 @@ from kinefit.identification.frame.beliefs import Beliefs, learn_beliefs
 from kinefit.identification.frame.identify import Identification
 from kinefit.identification.model.model import MarkerModel
 from kinefit.identification.take.consistency import Consistency
-from kinefit.identification.take.pieces import Pieces
-from kinefit.identification.take.votes import Votes, assign_pieces
+from kinefit.identification.take.votes import Pieces, Votes, assign_pieces
 
 Step = Callable[[str, int, int], None]
 

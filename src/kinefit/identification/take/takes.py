@@ -15,11 +15,10 @@ from kinefit.errors import ObservationError, located
 from kinefit.findings import runs_of
 from kinefit.identification.frame.beliefs import Beliefs
 from kinefit.identification.frame.identify import Identification, IdentifySettings, identify
-from kinefit.identification.model.files import load_model
-from kinefit.identification.model.model import MarkerModel
+from kinefit.identification.model.model import MarkerModel, load_model
 from kinefit.identification.take.consistency import fill_gaps
 from kinefit.identification.take.naming import INLIER_SIGMAS, OUTLIER_SIGMAS, Naming, Step
-from kinefit.identification.take.pieces import find_pieces
+from kinefit.identification.take.votes import find_pieces
 from kinefit.observations import Markers
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations

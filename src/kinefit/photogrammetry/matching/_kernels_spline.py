@@ -1,4 +1,4 @@
-"""Compiled quintic B-splines: the coefficients that pass through the pixels of an image, and its values in between."""
+"""Compiled quintic B-splines: values of an image between its pixels, from its coefficients."""
 
 from __future__ import annotations
 
@@ -8,57 +8,8 @@ import numpy as np
 
 from kinefit._jit import jit
 
-POLES = (-0.430575347099973791, -0.0430962882032646511)  # of the fifth degree, Unser, Aldroubi and Eden 1993, table I
 MARGIN = 2  # whole pixels that a value needs on its left; on its right one more
-_MEMORY = 30  # pixels after which the larger pole's power is below 1e-10
 _ONE, _TENTH = np.float32(1.0), np.float32(1.0 / 120.0)
-
-
-@jit
-def coefficients(image, out):
-    """Coefficients (H, W) of the quintic spline through an image, mirrored at its edges; sides of 2 pixels or more."""
-    height, width = image.shape
-    reach_x, reach_y = min(_MEMORY, width), min(_MEMORY, height)
-    line, first = np.empty(width), np.empty(width)
-    work = np.empty((height, width))
-    for j in range(height):
-        for i in range(width):
-            line[i] = 120.0 * image[j, i]
-        for pole in POLES:
-            start, power = 0.0, 1.0
-            for i in range(reach_x):
-                start += power * line[i]
-                power *= pole
-            line[0] = start
-            for i in range(1, width):
-                line[i] += pole * line[i - 1]
-            line[width - 1] = (line[width - 1] + pole * line[width - 2]) * pole / (pole * pole - 1.0)
-            for i in range(width - 2, -1, -1):
-                line[i] = pole * (line[i + 1] - line[i])
-        for i in range(width):
-            work[j, i] = 120.0 * line[i]
-    for pole in POLES:
-        power = 1.0
-        for i in range(width):
-            first[i] = 0.0
-        for j in range(reach_y):
-            for i in range(width):
-                first[i] += power * work[j, i]
-            power *= pole
-        for i in range(width):
-            work[0, i] = first[i]
-        for j in range(1, height):
-            for i in range(width):
-                work[j, i] += pole * work[j - 1, i]
-        for i in range(width):
-            last = work[height - 1, i] + pole * work[height - 2, i]
-            work[height - 1, i] = last * pole / (pole * pole - 1.0)
-        for j in range(height - 2, -1, -1):
-            for i in range(width):
-                work[j, i] = pole * (work[j + 1, i] - work[j, i])
-    for j in range(height):
-        for i in range(width):
-            out[j, i] = work[j, i]
 
 
 @jit

@@ -6,7 +6,6 @@ import math
 
 from kinefit._jit import jit
 from kinefit.geometry._kernels_camera import CX, CY, DIST, FX, FY, MODEL, ROT, SKEW, TRANS, project_jacobian
-from kinefit.losses._kernels import robust
 
 COLUMNS = 10
 """Parameters of a camera: v, ω in its own frame [m, rad], log of the focal length, k1, k2, time offset [s]."""
@@ -71,13 +70,3 @@ def point_systems(cameras, freedom, camera, point, x, velocity, value, J_point, 
                 J_point[m, 0, i] = J_point[m, 1, i] = 0.0
             for i in range(COLUMNS):
                 J_camera[m, 0, i] = J_camera[m, 1, i] = 0.0
-
-
-@jit
-def robust_values(kind, scale, s2, factor):
-    """Robust factor (M,) of squared residuals s2 (M,) in standard deviations; returns the sum of their cost."""
-    cost = 0.0
-    for m in range(s2.size):
-        rho, factor[m] = robust(kind, scale, s2[m])
-        cost += rho
-    return cost

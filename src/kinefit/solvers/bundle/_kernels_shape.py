@@ -129,18 +129,3 @@ def frame_system(
                 if ib <= ia:
                     H[ia, ib] += wu * ju[b] + wv * jv[b]
     return cost
-
-
-@jit
-def frame_cost(owner, rest, cameras, camera, column, target, weight, share, frames, kind, scale):
-    """Robust cost of one frame's pixels alone."""
-    cost = 0.0
-    for m in range(camera.size):
-        if weight[m] <= 0.0:
-            continue
-        x, y, z = place(frames, owner, rest, column[m])
-        ok, u, v, _, _, _, _, _, _ = project_jacobian(cameras[camera[m]], x, y, z)
-        if ok:
-            du, dv = target[m, 0] - u, target[m, 1] - v
-            cost += share[m] * robust(kind, scale, weight[m] * (du * du + dv * dv))[0]
-    return cost

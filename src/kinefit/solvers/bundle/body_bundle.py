@@ -1,165 +1,141 @@
-"""Bundle adjustment with a body: fit its shape, its poses and the cameras jointly."""
+"""Bundle adjustment: cameras with free points, and with a body's shape and poses (B. Triggs et al., 1999)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
 from kinefit.geometry.camera import Rig
-from kinefit.losses import geman_mcclure
-from kinefit.solvers import _kernels_linear
-from kinefit.solvers.bundle import _kernels_shape
+from kinefit.losses import Loss, geman_mcclure
+from kinefit.solvers.bundle.arrow import Arrow, Blocks
 from kinefit.solvers.bundle.border_frames import POSTURE_SHARE
-from kinefit.solvers.bundle.cameras import (
-    COLUMNS,
-    TIME,
-    CameraPrior,
-    PointPixels,
-    Reduced,
-    moved_rig,
-    reduce_points,
-    residuals,
-    robust_cost,
-)
+from kinefit.solvers.bundle.cameras import COLUMNS, TIME, CameraPrior, PointPixels, moved_rig, point_arrow
 from kinefit.solvers.bundle.shape import PixelFrames, ShapeParameters
-from kinefit.solvers.least_squares import LEAST_SCALED_DAMPING, relax
+from kinefit.solvers.equations import block_diagonal
+from kinefit.solvers.least_squares import descend
 
-_TOLERANCE = 1e-3  # fall of the cost in an iteration, as a share of it, below which the fit ends
+_SCALE_LIMITS = 0.2, 5.0  # of a length
 
 
 @dataclass(frozen=True, eq=False)
 class BundleState:
-    """Cameras, shape and poses.
+    """Cameras, points, and shape and poses of a body.
 
     Parameters
     ----------
     rig : Rig
     offsets : (C,) [s]
+    x_static : (P, 3) [m] free points
     theta : (p,) shape parameters
     states : of all frames
-    x_static : (P, 3) [m] static points
     """
 
     rig: Rig
     offsets: NDArray
-    theta: NDArray
-    states: Sequence[BodyState]
     x_static: NDArray
+    theta: NDArray = field(default_factory=lambda: np.zeros(0))
+    states: Sequence[BodyState] = ()
 
 
 @dataclass(frozen=True, eq=False)
-class BodyBundle(BundleState):
-    """Fitted cameras, shape and poses.
+class Bundle(BundleState):
+    """A state, its cost with the priors, and its equations without the cameras' prior.
 
     Parameters
     ----------
     cost : float
-    S : (C · 10, C · 10) information of the data on the cameras, all other unknowns eliminated
+    arrow : Arrow, shape parameters before those of the cameras
     """
 
-    cost: float
-    S: NDArray
+    cost: float = 0.0
+    arrow: Arrow = field(kw_only=True)
+
+    @cached_property
+    def S(self) -> NDArray:
+        """(C · 10, C · 10) information of the data on the cameras, all other unknowns eliminated."""
+        p, S = len(self.theta), self.arrow.reduced(*self.arrow.relative(0.0))[0]
+        return np.asarray(S[p:, p:] - S[p:, :p] @ np.linalg.solve(S[:p, :p], S[:p, p:]))
 
 
-def fit_body_and_cameras(
-    model: ShapeParameters,
-    frames: PixelFrames,
+def adjust(
     start: BundleState,
     prior: CameraPrior,
+    points: PointPixels | None = None,
     *,
-    static: PointPixels | None = None,
-    max_iterations: int = 15,
-) -> BodyBundle:
-    """Minimise the robust pixel error over cameras, shape and poses (Schur complement: poses and points eliminated).
+    model: ShapeParameters | None = None,
+    frames: PixelFrames | None = None,
+    loss: Loss | None = None,
+    max_iterations: int = 30,
+    tolerance: float = 1e-4,
+) -> Bundle:
+    """Minimise the robust pixel error over cameras, free points, shape and poses (Schur complement).
 
     Parameters
     ----------
-    model : ShapeParameters with its prior
-    frames : PixelFrames, with velocities if time offsets are estimated
-    start : BundleState
     prior : CameraPrior
-    static : PointPixels of static points
+        Free parameters and their priors. Without priors only the damping fixes the gauge (position, rotation, scale).
+    points : PointPixels of the free points
+    model : ShapeParameters with its prior; None if no body is seen
+    frames : PixelFrames of the body, with velocities if time offsets are estimated
+    tolerance : float
+        Share of the cost; a step that is predicted to lower it by less is not taken.
     """
-    loss = geman_mcclure()
-    tree, n, p = model.body.tree, model.body.tree.n_dofs, len(model.mean)
-    groups, size = len(model.body.scale_groups), len(start.rig) * COLUMNS
-    posture = POSTURE_SHARE * tree.posture_precision
-    chain, depth, _ = tree.coupled_pattern
-    shape_prior = model.prior
-    precision, freedom = prior.precision, prior.freedom
-    owner = frames.points.segments
-    if static is None:
-        static = PointPixels(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
+    loss, points = loss or geman_mcclure(), points or PointPixels.none()
 
-    def cost_of(at: BundleState) -> float:
-        moved, rest, _ = model.geometry(at.theta)
-        pixels = frames.with_offsets(at.offsets)
-        camera_change, shape_change = prior.departure(at.rig, at.offsets), at.theta - model.mean
-        total = float(precision @ camera_change**2 + shape_change @ shape_prior @ shape_change)
-        total += robust_cost(residuals(at.rig, at.offsets, static, at.x_static), static.weight, loss)[0]
-        for f, state in enumerate(at.states):
-            placed, _ = moved.forward(state.T_world_root, state.angles)
-            total += tree.posture_cost(state.angles, POSTURE_SHARE) + _kernels_shape.frame_cost(
-                owner, rest, at.rig.packed, frames.camera, frames.column, pixels.uv[f], frames.weight[f],
-                frames.shares, placed, loss.kind, loss.scale,
-            )  # fmt: skip
-        return total
+    def at(rig: Rig, offsets: NDArray, x: NDArray, theta: NDArray, states: Sequence[BodyState]) -> Bundle:
+        arrow, cost = point_arrow(rig, offsets, prior.freedom, points, x, loss)
+        if model is not None and frames is not None:
+            arrow, more = _with_body(arrow, model, frames, BundleState(rig, offsets, x, theta, states), prior, loss)
+            cost += more
+        return Bundle(rig, offsets, x, theta, states, cost + prior.cost(rig, offsets), arrow=arrow)
 
-    def systems_of(at: BundleState) -> list[tuple[NDArray, NDArray]]:
-        out, pixels = [], frames.with_offsets(at.offsets)
-        for f, state in enumerate(at.states):
-            H, g = model.equations(at.theta, state, at.rig, pixels, f, loss=loss, freedom=freedom)
-            H[6:n, 6:n] += posture
-            g[6:n] -= posture @ (state.angles - tree.usual)
-            if not tree.root_free:
-                H[:6], H[:, :6], g[:6] = 0.0, 0.0, 0.0
-                H[range(6), range(6)] = 1.0
-            out.append((H, g))
-        return out
+    def solve(now: Bundle, damping: float) -> tuple[tuple[NDArray, list[NDArray]], float]:
+        information, pull = prior.equations(now.rig, now.offsets)
+        before = np.zeros(len(now.theta))
+        both = np.concatenate([before, information]), np.concatenate([before, pull])
+        return now.arrow.with_prior(*both).relative_step(damping)
 
-    def reduced(
-        systems: list[tuple[NDArray, NDArray]], at: BundleState, damping: float
-    ) -> tuple[NDArray, NDArray, NDArray, Reduced]:
-        points = reduce_points(at.rig, at.offsets, freedom, static, at.x_static, loss, damping)
-        S, b = np.zeros((p + size, p + size)), np.zeros(p + size)
-        S[:p, :p], b[:p] = shape_prior, shape_prior @ (model.mean - at.theta)
-        S[p:, p:], b[p:] = points.S, points.b
-        solutions = np.empty((len(systems), p + size + 1, n))
-        for f, (H, g) in enumerate(systems):
-            S += H[n:, n:]
-            b += g[n:]
-            if not _kernels_linear.eliminate(H, g, n, damping, chain, depth, S, b, solutions[f]):
-                solutions[f] = 0.0
-        return np.tril(S) + np.tril(S, -1).T, b, solutions, points
+    def follow(now: Bundle, move: tuple[NDArray, list[NDArray]]) -> Bundle | None:
+        (delta, (x, *poses)), p, theta, states = move, len(now.theta), now.theta, now.states
+        if model is not None:
+            tree, groups, theta = model.body.tree, len(model.body.scale_groups), theta + delta[:p]
+            theta[:groups] = np.clip(theta[:groups], *_SCALE_LIMITS)
+            states = [s.retract(m, (tree.lower, tree.upper)) for s, m in zip(states, poses[0], strict=True)]
+        try:
+            rig, late = moved_rig(now.rig, delta[p:].reshape(-1, COLUMNS)), delta[p:].reshape(-1, COLUMNS)[:, TIME]
+            return at(rig, now.offsets + late, now.x_static + x, theta, states)
+        except ValueError:  # no camera: its distortion overflows
+            return None
 
-    now, cost, damping = start, cost_of(start), 1e-3
-    for _ in range(max_iterations):
-        systems, before = systems_of(now), cost
-        while damping < 1e5:
-            S, b, solutions, points = reduced(systems, now, damping)
-            S[range(p, p + size), range(p, p + size)] += precision
-            b[p:] -= precision * prior.departure(now.rig, now.offsets)
-            delta = np.linalg.solve(S + damping * np.diag(np.diag(S)), b)
-            by_camera = delta[p:].reshape(-1, COLUMNS)
-            theta = now.theta + delta[:p]
-            theta[:groups] = np.clip(theta[:groups], 0.2, 5.0)
-            moves = solutions[:, -1] - delta @ solutions[:, :-1]
-            new = BundleState(
-                moved_rig(now.rig, by_camera), now.offsets + by_camera[:, TIME], theta,
-                [s.retract(m, (tree.lower, tree.upper)) for s, m in zip(now.states, moves, strict=True)],
-                now.x_static + points.points_step(delta[p:]),
-            )  # fmt: skip
-            if (fallen := cost_of(new)) < cost:
-                now, cost, damping = new, fallen, relax(damping)
-                break
-            damping *= 10.0
-        if not before - cost > _TOLERANCE * cost:
-            break
-    S, _, _, _ = reduced(systems_of(now), now, LEAST_SCALED_DAMPING)
-    body, across, cameras = S[:p, :p], S[:p, p:], S[p:, p:]
-    S = cameras - across.T @ np.linalg.solve(body, across)
-    return BodyBundle(now.rig, now.offsets, now.theta, tuple(now.states), now.x_static, cost, S)
+    begin = at(start.rig, start.offsets, start.x_static, start.theta, start.states)
+    return descend(begin, solve, follow, iterations=max_iterations, tolerance=tolerance, damping=1e-3).at
+
+
+def _with_body(
+    arrow: Arrow, model: ShapeParameters, frames: PixelFrames, at: BundleState, prior: CameraPrior, loss: Loss
+) -> tuple[Arrow, float]:
+    """The arrow of cameras and points, with the poses as blocks and the shape before the cameras; the body's cost."""
+    tree, n, p, F = model.body.tree, model.body.tree.n_dofs, len(at.theta), len(at.states)
+    m, pixels, away = p + len(arrow.g), frames.with_offsets(at.offsets), model.mean - at.theta
+    posture, cost = POSTURE_SHARE * tree.posture_precision, float(away @ model.prior @ away)
+    border, pull = block_diagonal(model.prior, arrow.H), np.concatenate([model.prior @ away, arrow.g])
+    H, g, B = np.empty((F, n, n)), np.empty((F, n)), np.empty((F, n, m))
+    for f, state in enumerate(at.states):
+        whole, gradient, more = model.equations(at.theta, state, at.rig, pixels, f, loss=loss, freedom=prior.freedom)
+        H[f], g[f], B[f] = whole[:n, :n], gradient[:n], whole[n:, :n].T
+        border += np.tril(whole[n:, n:]) + np.tril(whole[n:, n:], -1).T
+        pull += gradient[n:]
+        H[f, 6:, 6:] += posture
+        g[f, 6:] -= posture @ (state.angles - tree.usual)
+        cost += more + tree.posture_cost(state.angles, POSTURE_SHARE)
+    H = np.tril(H) + np.tril(H, -1).swapaxes(1, 2)
+    if not tree.root_free:
+        H[:, :6], H[:, :, :6], B[:, :6], g[:, :6] = np.eye(6, n), np.eye(n, 6), 0.0, 0.0
+    (of_points,) = arrow.blocks
+    padded = Blocks(of_points.H, of_points.g, np.pad(of_points.B, ((0, 0), (0, 0), (p, 0))))
+    return Arrow(border, pull, (padded, Blocks(H, g, B))), cost

@@ -9,7 +9,7 @@ robust factors. So sensors need not know the parameters.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import BodyState
 from kinefit.solvers import _kernels_linear
+from kinefit.solvers.bundle.arrow import Arrow, Blocks
 from kinefit.solvers.bundle.border_frames import (
     MAX_POSE_STEPS,
     BorderedProblem,
@@ -25,14 +26,12 @@ from kinefit.solvers.bundle.border_frames import (
     differences,
     gram,
     settle,
-    solved,
 )
 from kinefit.solvers.equations import lock
-from kinefit.solvers.least_squares import bounds_of
+from kinefit.solvers.least_squares import MAX_DAMPING, bounds_of, descend
 
 _INITIAL_DAMPING = 1e-3  # as a share of the poses' mean diagonal
 _PARAMETER_DAMPING_RATIO = 0.01  # to the poses' damping: parameters have a prior, few angles have one
-_MAX_DAMPING = 1e8  # as a share of the poses' mean diagonal: with more the cost cannot fall
 _MAX_REUSE_CHANGE = 0.02  # [m, rad] of poses (RMS) plus parameters (largest), within which derivatives are reused
 _MIN_POSE_DAMPING = 0.3  # [1/m², 1/rad²] of poses in steps with parameters
 
@@ -80,18 +79,6 @@ class Bordered:
         return self.compute_information()
 
 
-@dataclass(frozen=True, eq=False)
-class _Block:
-    """One frame's part of the arrow."""
-
-    frame: FrameEquations
-    by_theta: NDArray  # (N, p) whitened derivatives, without robust factors
-    used: NDArray  # (N,) bool, rows with a weight above 0
-    B: NDArray  # (n, p)
-    S: NDArray  # (p, p)
-    b: NDArray  # (p,)
-
-
 def solve(
     problem: BorderedProblem,
     theta: NDArray,
@@ -121,105 +108,100 @@ def solve(
     ObservationError
         A sensor's rows differ in number between two worlds; rows on segments that the body lacks.
     """
-    task = _Task(problem, prior, np.asarray(steps, float), weighing or Weighing())
-    theta, bounds, (most, settling) = np.array(theta, float), bounds_of(problem.body(theta), True), iterations
-    states = [s.retract(np.zeros(6 + len(s.angles)), bounds) for s in states]
-    frames, states = settle(problem, theta, states, task.weighing, settling)
-    cost, blocks, reusable = task.cost(theta, frames), None, None
-    mean = float(np.mean([np.trace(f.H) / len(f.H) for f in frames])) if frames else 1.0
-    least = _kernels_linear.LEAST_DAMPING * mean
-    damping, growth, converged, tried, change = _INITIAL_DAMPING * mean, 2.0, False, 0, 0.0
-    while tried < most and not converged:
-        tried += 1
-        if blocks is None:  # on demand: derivatives by θ are most of the work
-            blocks = task.blocks(theta, states, frames, reusable)
-        delta, moves, predicted = task.step(theta, blocks, damping)
-        if predicted <= tolerance * cost + 1e-300:
-            converged = True
-            continue
-        trial = theta + delta
-        moved = [s.retract(m, bounds) for s, m in zip(states, moves, strict=True)]
-        settled, moved = settle(problem, trial, moved, task.weighing, settling)
-        new = task.cost(trial, settled)
-        damping, growth = _kernels_linear.adapt(damping, growth, cost - new, predicted, least)
-        if new < cost:
-            turns = np.array([a.difference(b) for a, b in zip(states, moved)])
-            change += float(np.sqrt(np.mean(np.square(turns))) + np.abs(delta).max())
-            theta, states, frames, cost = trial, moved, settled, new
-            reusable = blocks if change <= _MAX_REUSE_CHANGE else None
-            change, blocks = change if reusable else 0.0, None
-        elif damping > _MAX_DAMPING * mean:
-            converged = True
-
-    def compute_information() -> NDArray:
-        last = task.blocks(theta, states, frames, reusable) if blocks is None else blocks
-        return _information(last, len(theta), lock(problem.body(theta), None))
-
-    return Bordered(theta, tuple(states), prior, cost, tried, converged, compute_information)
+    task = _Task(problem, prior, np.asarray(steps, float), weighing or Weighing(), iterations[1])
+    bounds = bounds_of(problem.body(np.asarray(theta, float)), True)
+    start = task.at(np.array(theta, float), [s.retract(np.zeros(6 + len(s.angles)), bounds) for s in states])
+    mean = float(np.mean([np.trace(f.H) / len(f.H) for f in start.frames])) if start.frames else 1.0
+    end = descend(
+        start, _Point.step, _Point.follow, iterations=iterations[0], tolerance=tolerance,
+        damping=_INITIAL_DAMPING * mean, least=_kernels_linear.LEAST_DAMPING * mean, most=MAX_DAMPING * mean,
+    )  # fmt: skip
+    at = end.at
+    return Bordered(at.theta, tuple(at.states), prior, at.cost, end.iterations, end.converged, at.information)
 
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """A problem with its prior, difference steps and weights."""
+    """A problem with its prior, difference steps, weights, and number of steps of the poses alone."""
 
     problem: BorderedProblem
     prior: Prior
     steps: NDArray
     weighing: Weighing
+    settling: int
 
-    @property
-    def _least(self) -> float:
-        """Damping of poses in steps with θ; weakly constrained angles then move in steps of the poses alone."""
-        return _MIN_POSE_DAMPING * self.weighing.most
-
-    def cost(self, theta: NDArray, frames: Sequence[FrameEquations]) -> float:
-        """Cost of rows, postures and prior, with parameters (p,)."""
+    def at(self, theta: NDArray, states: Sequence[BodyState]) -> _Point:
+        """The point with parameters (p,) and near states, each pose fitted alone."""
+        frames, states = settle(self.problem, theta, states, self.weighing, self.settling)
         away = theta - self.prior.mean
-        return float(away @ self.prior.information @ away) + sum(f.cost for f in frames)
-
-    def blocks(
-        self,
-        theta: NDArray,
-        states: Sequence[BodyState],
-        frames: Sequence[FrameEquations],
-        reusable: Sequence[_Block] | None,
-    ) -> list[_Block]:
-        """The frames' parts of the arrow, with derivatives by θ of `reusable` blocks if the used rows are the same."""
-        used = [frame.used for frame in frames]
-        if reusable is not None and all(np.array_equal(a.used, b) for a, b in zip(reusable, used, strict=True)):
-            by_theta = [block.by_theta for block in reusable]
-        else:
-            by_theta = differences(self.problem, theta, self.steps, states)
-        out = []
-        for frame, D, some in zip(frames, by_theta, used, strict=True):
-            T = (frame.factor * some)[:, None] * D
-            out.append(_Block(frame, D, some, gram(frame.J, T), gram(T, T), frame.residual @ T))
-        return out
-
-    def step(self, theta: NDArray, blocks: Sequence[_Block], damping: float) -> tuple[NDArray, list[NDArray], float]:
-        """δθ (p,), each pose's δ (n,), and the predicted fall of the cost."""
-        p = len(theta)
-        S = self.prior.information + _PARAMETER_DAMPING_RATIO * damping * np.eye(p)
-        pull = self.prior.information @ (self.prior.mean - theta)
-        b, solutions = pull.copy(), []
-        for block in blocks:
-            frame = block.frame
-            back = solved(frame.H, np.column_stack([block.B, frame.g]), frame.held, damping + self._least)
-            both = gram(block.B, back)
-            S += block.S - both[:, :p]
-            b += block.b - both[:, p]
-            solutions.append(back)
-        delta = np.linalg.solve(S, b)
-        moves = [back[:, p] - back[:, :p] @ delta for back in solutions]
-        fall = float(delta @ pull) + _PARAMETER_DAMPING_RATIO * damping * float(delta @ delta)
-        for block, move in zip(blocks, moves, strict=True):
-            fall += float(block.b @ delta + block.frame.g @ move) + (damping + self._least) * float(move @ move)
-        return delta, moves, fall
+        cost = float(away @ self.prior.information @ away) + sum(f.cost for f in frames)
+        return _Point(self, theta, states, frames, cost)
 
 
-def _information(blocks: Sequence[_Block], p: int, known: NDArray) -> NDArray:
-    """Information (p, p) of all frames on θ, their poses eliminated; joint limits do not count."""
-    out = np.zeros((p, p))
-    for block in blocks:
-        out += block.S - gram(block.B, solved(block.frame.H, block.B, known, 0.0))
-    return 0.5 * (out + out.T)
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Parameters, states and their frames' equations; cost of rows, postures and prior.
+
+    `known` are used rows and derivatives of an earlier point, and `change` the way from it.
+    """
+
+    task: _Task
+    theta: NDArray
+    states: Sequence[BodyState]
+    frames: Sequence[FrameEquations]
+    cost: float
+    known: tuple[list[NDArray], list[NDArray]] | None = None
+    change: float = 0.0
+
+    @cached_property
+    def used(self) -> list[NDArray]:
+        """(N,) bool of every frame: rows with a weight above 0."""
+        return [frame.used for frame in self.frames]
+
+    @cached_property
+    def by_theta(self) -> list[NDArray]:
+        """(N, p) of every frame: whitened derivatives, without robust factors; known ones if the used rows are same."""
+        if self.known is not None and all(map(np.array_equal, self.known[0], self.used)):
+            return self.known[1]
+        return differences(self.task.problem, self.theta, self.task.steps, self.states)
+
+    @cached_property
+    def _open(self) -> Arrow:
+        """The equations without the prior, as if all coordinates moved."""
+        p, n, F = len(self.theta), len(self.frames[0].g) if self.frames else 0, len(self.frames)
+        S, b, H, g, B = np.zeros((p, p)), np.zeros(p), np.empty((F, n, n)), np.empty((F, n)), np.empty((F, n, p))
+        for f, (frame, D, used) in enumerate(zip(self.frames, self.by_theta, self.used, strict=True)):
+            T = (frame.factor * used)[:, None] * D
+            S += gram(T, T)
+            b += frame.residual @ T
+            H[f], g[f], B[f] = frame.H, frame.g, gram(frame.J, T)
+        return Arrow(S, b, (Blocks(H, g, B),))
+
+    @cached_property
+    def _held(self) -> Arrow:
+        """The equations with the prior; coordinates at a limit do not move."""
+        prior, held = self.task.prior, np.array([frame.held for frame in self.frames])
+        arrow = self._open.holding(held)
+        return arrow.with_prior(prior.information, prior.information @ (prior.mean - self.theta))
+
+    def step(self, damping: float) -> tuple[tuple[NDArray, list[NDArray]], float]:
+        """δθ (p,) and each pose's δ (n,), and the predicted fall of the cost."""
+        # weakly constrained angles move in steps of the poses alone
+        of_poses = np.full(self._held.blocks[0].g.shape, damping + _MIN_POSE_DAMPING * self.task.weighing.most)
+        return self._held.step(np.full(len(self.theta), _PARAMETER_DAMPING_RATIO * damping), [of_poses])
+
+    def follow(self, move: tuple[NDArray, list[NDArray]]) -> _Point:
+        """The point after a step."""
+        (delta, (moves,)), theta = move, self.theta + move[0]
+        bounds = bounds_of(self.task.problem.body(theta), True)
+        new = self.task.at(theta, [s.retract(m, bounds) for s, m in zip(self.states, moves, strict=True)])
+        turns = np.array([a.difference(b) for a, b in zip(self.states, new.states)])
+        change = self.change + float(np.sqrt(np.mean(np.square(turns))) + np.abs(delta).max())
+        return replace(new, known=(self.used, self.by_theta), change=change) if change <= _MAX_REUSE_CHANGE else new
+
+    def information(self) -> NDArray:
+        """Information (p, p) of all frames on θ, their poses eliminated; joint limits do not count."""
+        known = lock(self.task.problem.body(self.theta), None)
+        arrow = self._open.holding(np.tile(known, (len(self.frames), 1)))
+        S = arrow.reduced(np.zeros(len(self.theta)), [np.zeros(arrow.blocks[0].g.shape)])[0]
+        return 0.5 * (S + S.T)

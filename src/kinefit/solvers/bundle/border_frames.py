@@ -15,9 +15,9 @@ from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, Loss
 from kinefit.rows import AnyRows, Rows
 from kinefit.solvers import _kernels_border, _kernels_linear
-from kinefit.solvers.bundle.whitened import PoseScrews, columns, residuals, softening
-from kinefit.solvers.equations import dense_pattern, lock, normal_equations
-from kinefit.solvers.least_squares import bounds_of
+from kinefit.solvers.bundle.arrow import MIN_DIAGONAL_RATIO
+from kinefit.solvers.equations import columns, dense_pattern, lock, normal_equations, residuals, softening
+from kinefit.solvers.least_squares import bounds_of, descend
 from kinefit.solvers.pixels import fit_pixels
 
 POSTURE_SHARE = 0.01
@@ -29,7 +29,6 @@ MAX_POSE_STEPS = 6
 _INITIAL_DAMPING = 1e-3  # as a share of the pose's mean diagonal
 _MIN_COST_FALL = 1e-3  # of a pose's cost: below it the pose has converged
 _KERNEL_TOLERANCE = 1e-5  # the same as a share of the cost, in the compiled kernel: the cost is about a hundred
-_MIN_DIAGONAL_RATIO = 1e-9  # to a pose's mean diagonal, added to its diagonal for unmeasured coordinates
 
 Part = tuple[str, AnyRows]
 """Name of a sensor, and its rows."""
@@ -108,8 +107,8 @@ class FrameEquations:
     @cached_property
     def J(self) -> NDArray:
         """(N, n) derivatives by the pose, whitened and softened."""
-        pose = PoseScrews.of(self.body, self.state)
-        blocks = [np.empty((0, len(self.g))), *(columns(rows, pose) for _, rows in self.parts)]
+        own = (columns(rows, self.body, self.state) for _, rows in self.parts)
+        blocks = [np.empty((0, len(self.g))), *own]
         return np.asarray(self.factor[:, None] * np.concatenate(blocks))
 
     @property
@@ -140,7 +139,9 @@ class FrameEquations:
             lock(self.body, None), L, move,
         )  # fmt: skip
         if fall < 0.0:
-            move = solved(self.H, self.g[:, None], self.held, damping)[:, 0]
+            free, move = ~self.held, np.zeros(n)
+            A = self.H + (damping + _floor(self.H)) * np.eye(n)
+            move[free] = np.linalg.lstsq(A[np.ix_(free, free)], self.g[free])[0]
             fall = float(self.g @ move) + damping * float(move @ move)
         return move, float(fall)
 
@@ -189,18 +190,17 @@ def settle(
             continue
         frame = frame_at(problem, theta, f, state, weighing)
         mean = float(np.trace(frame.H)) / len(frame.H) + 1e-12
-        damping, growth, least = _INITIAL_DAMPING * mean, 2.0, _kernels_linear.LEAST_DAMPING * mean
-        for _ in range(steps):
-            move, predicted = frame.step(damping)
-            if predicted <= _MIN_COST_FALL * (1.0 + 1e-3 * frame.cost):
-                break
-            moved = state.retract(move, bounds)
-            new = frame_at(problem, theta, f, moved, weighing)
-            damping, growth = _kernels_linear.adapt(damping, growth, frame.cost - new.cost, predicted, least)
-            if new.cost < frame.cost:
-                frame, state = new, moved
+
+        def follow(now: FrameEquations, move: NDArray, f: int = f) -> FrameEquations:
+            return frame_at(problem, theta, f, now.state.retract(move, bounds), weighing)
+
+        frame = descend(
+            frame, FrameEquations.step, follow, iterations=steps, tolerance=1e-3 * _MIN_COST_FALL,
+            nothing=_MIN_COST_FALL, damping=_INITIAL_DAMPING * mean, least=_kernels_linear.LEAST_DAMPING * mean,
+            most=np.inf,
+        ).at  # fmt: skip
         frames.append(frame)
-        out.append(state)
+        out.append(frame.state)
     return frames, out
 
 
@@ -299,18 +299,9 @@ def apart(touches: Sequence[frozenset[int] | None], some: Iterable[int]) -> list
     return out + [members for members, _ in groups]
 
 
-def solved(H: NDArray, right: NDArray, held: NDArray, damping: float) -> NDArray:
-    """(H + damping)⁻¹ right (n, m) of a pose's H (n, n), `damping` in units of H; zero for held (n,) coordinates."""
-    A, right = H.copy(), np.ascontiguousarray(right).copy()
-    A.flat[:: len(H) + 1] += damping + _floor(H)
-    A[held], A[:, held], right[held] = 0.0, 0.0, 0.0
-    A[held, held] = 1.0
-    return right if _kernels_border.solve(A.copy(), right) else np.linalg.lstsq(A, right)[0]
-
-
 def _floor(H: NDArray) -> float:
     """Least value added to the diagonal of a pose's H (n, n)."""
-    return _MIN_DIAGONAL_RATIO * float(H.trace()) / len(H) + 1e-12
+    return MIN_DIAGONAL_RATIO * float(H.trace()) / len(H) + 1e-12
 
 
 def gram(A: NDArray, B: NDArray) -> NDArray:

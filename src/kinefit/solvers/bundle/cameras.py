@@ -16,6 +16,7 @@ from kinefit.geometry.camera import Camera, Rig
 from kinefit.losses import Loss
 from kinefit.solvers.bundle import _kernels_cameras
 from kinefit.solvers.bundle._kernels_cameras import COLUMNS
+from kinefit.solvers.bundle.arrow import Arrow, assembled
 
 _INVISIBLE_SQUARE = 1e6  # squared residual, in variances, of a point that its camera cannot see
 POSE, FOCAL, RADIAL, TIME = slice(0, 6), 6, slice(7, 9), 9
@@ -79,6 +80,14 @@ class CameraPrior:
         out[:, TIME] = offsets
         return (out * self.freedom).ravel()
 
+    def cost(self, rig: Rig, offsets: NDArray) -> float:
+        """Cost of a rig and its time offsets (C,) [s]."""
+        return float(self.precision @ self.departure(rig, offsets) ** 2)
+
+    def equations(self, rig: Rig, offsets: NDArray) -> tuple[NDArray, NDArray]:
+        """Information (C · 10,) and gradient (C · 10,) at a rig and its time offsets (C,) [s]."""
+        return self.precision, -self.precision * self.departure(rig, offsets)
+
 
 @dataclass(frozen=True, eq=False)
 class PointPixels:
@@ -98,74 +107,33 @@ class PointPixels:
     weight: NDArray
     velocity: NDArray | None = None
 
+    @classmethod
+    def none(cls) -> PointPixels:
+        """No pixels."""
+        return cls(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
+
     @property
     def motion(self) -> NDArray:
         """(M, 2) [px/s] velocity of the pixels, 0 by default."""
         return np.zeros(self.uv.shape) if self.velocity is None else self.velocity
 
 
-@dataclass(frozen=True, eq=False)
-class Reduced:
-    """Normal equations of the cameras with the points eliminated, S (C·10, C·10) and b, and their back substitution."""
-
-    S: NDArray
-    b: NDArray
-    inverse: NDArray  # (P, 3, 3)
-    cross: NDArray  # (P, 3, C·10)
-    right: NDArray  # (P, 3)
-
-    def points_step(self, delta: NDArray) -> NDArray:
-        """(P, 3) [m] steps of the points for the cameras' δ (C·10,)."""
-        return (self.inverse @ (self.right - self.cross @ delta)[..., None])[..., 0]
-
-
-def residuals(rig: Rig, offsets: NDArray, pixels: PointPixels, x: NDArray) -> NDArray:
-    """(M, 2) [px] measured minus projected points x (P, 3) [m], time offsets (C,) [s] included; NaN if invisible."""
-    projected = np.full(pixels.uv.shape, np.nan)
-    for c, camera in enumerate(rig):
-        in_camera = pixels.camera == c
-        projected[in_camera] = camera.project(x[pixels.point[in_camera]])
-    return pixels.uv - projected - offsets[pixels.camera, None] * pixels.motion
-
-
-def robust_cost(residual: NDArray, weight: NDArray, loss: Loss) -> tuple[float, NDArray]:
-    """Σ ρ(w r²) of residuals (M, 2) with weights (M,), and robust factors (M,); NaN counts as an outlier."""
-    s2 = weight * np.sum(residual * residual, axis=1)
-    visible, factor = np.isfinite(s2), np.empty(len(s2))
-    cost = _kernels_cameras.robust_values(loss.kind, loss.scale, np.where(visible, s2, _INVISIBLE_SQUARE), factor)
-    return float(cost), np.where(visible, factor, 0.0)
-
-
-def reduce_points(
-    rig: Rig, offsets: NDArray, freedom: NDArray, pixels: PointPixels, x: NDArray, loss: Loss, damping: float = 0.0
-) -> Reduced:
-    """Eliminate free points x (P, 3) [m] from the normal equations of the cameras (Schur complement)."""
-    M, P, C = len(pixels.uv), len(x), len(rig)
-    value, J_point, J_camera = np.empty((M, 2)), np.empty((M, 2, 3)), np.empty((M, 2, COLUMNS))
-    motion = pixels.motion
+def point_arrow(
+    rig: Rig, offsets: NDArray, freedom: NDArray, pixels: PointPixels, x: NDArray, loss: Loss
+) -> tuple[Arrow, float]:
+    """Equations of the cameras (C · 10,) and of free points x (P, 3) [m], and their cost."""
+    M = len(pixels.uv)
+    value, A = np.empty((M, 2)), np.empty((M, 2, COLUMNS + 4))
     _kernels_cameras.point_systems(
-        rig.packed, freedom, pixels.camera, pixels.point, x, motion, value, J_point, J_camera
+        rig.packed, freedom, pixels.camera, pixels.point, x, pixels.motion, value, A[..., COLUMNS:-1], A[..., :COLUMNS]
     )
-    residual = pixels.uv - value - offsets[pixels.camera, None] * motion
-    w = pixels.weight * robust_cost(residual, pixels.weight, loss)[1]
-    residual = np.where(w[:, None] > 0, residual, 0.0)
-    JwT, JcT = w[:, None, None] * J_point.transpose(0, 2, 1), w[:, None, None] * J_camera.transpose(0, 2, 1)
-    V, right = np.zeros((P, 3, 3)), np.zeros((P, 3))
-    np.add.at(V, pixels.point, JwT @ J_point)
-    np.add.at(right, pixels.point, (JwT @ residual[..., None])[..., 0])
-    cross = np.zeros((P, C, 3, COLUMNS))
-    np.add.at(cross, (pixels.point, pixels.camera), JwT @ J_camera)
-    U, b = np.zeros((C, COLUMNS, COLUMNS)), np.zeros((C, COLUMNS))
-    np.add.at(U, pixels.camera, JcT @ J_camera)
-    np.add.at(b, pixels.camera, (JcT @ residual[..., None])[..., 0])
-    trace = np.trace(V, axis1=1, axis2=2)[:, None, None]
-    inverse = np.linalg.inv(V + (damping * trace + 1e-9 * trace + 1e-12) * np.eye(3))
-    flat = cross.transpose(0, 2, 1, 3).reshape(P, 3, C * COLUMNS)
-    S = np.zeros((C, COLUMNS, C, COLUMNS))
-    S[np.arange(C), :, np.arange(C)] = U
-    back = (inverse @ flat).reshape(P * 3, C * COLUMNS)
-    S = S.reshape(C * COLUMNS, C * COLUMNS) - flat.reshape(P * 3, C * COLUMNS).T @ back
-    return Reduced(S, b.ravel() - back.T @ right.ravel(), inverse, flat, right)
+    A[..., -1] = pixels.uv - value - offsets[pixels.camera, None] * pixels.motion
+    s2 = pixels.weight * np.sum(A[..., -1] ** 2, axis=1)
+    visible = np.isfinite(s2)
+    A[~visible] = 0.0
+    rho, factor = loss.weigh(np.where(visible, s2, _INVISIBLE_SQUARE))
+    grams = A.swapaxes(1, 2) @ ((pixels.weight * factor)[:, None, None] * A)
+    return assembled(grams, pixels.camera, pixels.point, len(rig), len(x), 3), float(rho.sum())
 
 
 def camera_jacobian(camera: Camera, x_world: NDArray) -> NDArray:

@@ -117,8 +117,8 @@ class ShapeParameters:
     def equations(
         self, theta: NDArray, state: BodyState, rig: Rig, pixels: PixelFrames, f: int, *, loss: Loss = SQUARED,
         freedom: NDArray | None = None,
-    ) -> tuple[NDArray, NDArray]:  # fmt: skip
-        """Normal equations of frame f's pixels: H (n + p, n + p; lower triangle) and g (n + p,), pose then shape.
+    ) -> tuple[NDArray, NDArray, float]:  # fmt: skip
+        """Equations of frame f's pixels: H (n + p, n + p; lower triangle), g (n + p,), pose then shape; their cost.
 
         With `freedom` (C, 10) the cameras' parameters follow, see `solvers.bundle.cameras`.
         """
@@ -128,7 +128,7 @@ class ShapeParameters:
         first = tree.n_dofs + len(self.mean)
         size = first + (0 if freedom is None else freedom.size)
         H, g = np.zeros((size, size)), np.zeros(size)
-        _kernels_shape.frame_system(
+        cost = _kernels_shape.frame_system(
             tree.parents, tree.dof_parent, tree.last_dof, tree.offsets, body.segment_scale, len(body.scale_groups),
             self.points.segments, rest, self.points.points, self.shift, self.mirror, rig.packed, pixels.camera,
             pixels.column, pixels.uv[f], pixels.weight[f], pixels.shares, placed, screws,
@@ -136,7 +136,7 @@ class ShapeParameters:
             np.empty((0, 0)) if freedom is None else freedom, -1 if freedom is None else first,
             np.zeros(pixels.uv[f].shape) if pixels.velocity is None else pixels.velocity[f], H, g,
         )  # fmt: skip
-        return H, g
+        return H, g, cost
 
 
 def shape_parameters(

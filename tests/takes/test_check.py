@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from kinefit.calibration.check.check import check_take
 from kinefit.diagnostics.cameras import camera_biases, disagreement, frame_findings, without_points
 from kinefit.diagnostics.checks import check_keypoints
 from kinefit.diagnostics.rig import lens_findings, placement_findings
@@ -24,6 +23,7 @@ from kinefit.simulation import (
     squat_and_wave,
     studio_rig,
 )
+from kinefit.takes.check import check_take
 
 MOTION = cut(squat_and_wave(duration=2.0), 0, 60)
 RIG = studio_rig(MOTION)

@@ -20,7 +20,7 @@ from kinefit.simulation import squat_and_wave
 from kinefit.smoothing.foot_contacts import soles
 from kinefit.takes.in_view import people_in_view
 from kinefit.takes.track import track_take
-from kinefit.tracking.takes.take_recording import recording_of
+from kinefit.tracking.take_recording import recording_of
 
 SIZE, RATE = (720, 1280), 30.0
 HEAD = f"[take]\nrate = {RATE}\n"

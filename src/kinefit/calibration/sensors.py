@@ -7,18 +7,16 @@ estimates poses, the person's surface, marker and landmark offsets, and the fram
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies import Body, BodyState, load_body
+from kinefit.bodies import Body, load_body
 from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.diagnostics.sensors import MISFIT_SIGMAS, POSE_SIGMAS, SensorAlignment, doubts_of
 from kinefit.errors import ObservationError
-from kinefit.frame.routing import Sensors
-from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
 from kinefit.identification.take.takes import with_names
 from kinefit.motion import Motion
@@ -26,30 +24,20 @@ from kinefit.observations import sensor_of
 from kinefit.readers.take.entries import sensor_name
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
-from kinefit.sensors.base import Measurement
-from kinefit.sensors.displaced import AXES, Displaced, displacement
+from kinefit.sensors.displaced import AXES
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
-from kinefit.sensors.surfaces.registration import (
-    COARSE_DISTANCES,
-    FINE_DISTANCES,
-    Ends,
-    Registration,
-    apart,
-    starts,
-    twist_of,
-    values_of,
-)
+from kinefit.sensors.surfaces.registration import FINE_DISTANCES, Ends, Registration, apart, twist_of
 from kinefit.subject.fit import fit_subject
 from kinefit.subject.keypoints import fit_subject as fit_person
 from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets
 from kinefit.subject.sensor_parameters import SensorFrames
 from kinefit.subject.subject import Subject, SubjectFit
 from kinefit.subject.surfaces import CylinderShape
-from kinefit.tracking.placing import PlacedCamera, placed_cameras
+from kinefit.tracking.placing import Look, measurements_at, placed_camera, registration, sensors_of, wide_sensors
 from kinefit.tracking.recording import Recording, spread
 from kinefit.tracking.sizing import channels_of
-from kinefit.tracking.takes.take_recording import recording_of
+from kinefit.tracking.take_recording import recording_of
 from kinefit.tracking.video import track
 
 FRAMES = 12
@@ -67,9 +55,6 @@ _LANDMARK_SIGMA = 0.005  # [m] of a detector's points about the fit of the keypo
 # people (draws 100 to 102 of `benchmarks.mixed_misfit`).
 _SURFACE_SIGMA = np.array([0.003, 0.003, 0.003, 0.004, 0.004, 0.004, 0.0])  # [m, rad, s]
 _UP_SIGMA = 0.01  # [m] in addition, upwards
-_SETTINGS = TrackSettings(through=np.inf)  # two heights were off by 7 and 17 mm; with free space by 8 and 21
-_WIDE_SETTINGS = replace(_SETTINGS, reach=0.45, render_every=1)  # for a sensor that is off by three sigmas of 10 cm
-_CLOCK_SIGMA = 0.02  # [s]
 
 
 def fit_sensors(
@@ -102,41 +87,13 @@ def fit_sensors(
         seen = replace(seen, rig=Rig(tuple(cameras)))
     seen = with_names(take, seen)
     recording, body = recording_of(replace(take, start=None), seen, load_body(take.body))
-    alone = replace(
-        recording, steps=recording.keypoints_at, markers=(), depth={}, on_body=(), backgrounds={}
-    )  # fmt: skip
+    alone = replace(recording, steps=recording.keypoints_at, markers=(), depth={}, on_body=(), backgrounds={})
     person = fit_person(body, channels_of(recording, body, TrackSettings()), height=take.height, progress=progress)
     motion = track(alone, body, subject=person, progress=progress)
-    placed = placed_cameras(recording, person, TrackSettings())
-    away = [_elsewhere(name, p, motion) for name, p in placed.items() if not (p.usable or p.fits)]
-    recording, depth = recording.without(names := {fit.sensor for fit in away}), depth - names
     origins = {name: recording.rig[name].centre_world for name in depth}
     for k, entry in enumerate(take.markers):
         origins[sensor_name("markers", take.markers, k)] = entry.T_world_file[:3, 3]
-    problem = _PlacementProblem(recording, motion, person, frozenset(depth), origins)
-    chosen = problem.chosen(frames)
-    return (*away, *(problem.fits(chosen) if len(chosen) >= _MIN_FRAMES else ()))
-
-
-def _elsewhere(sensor: str, placed: PlacedCamera, motion: Motion) -> SensorAlignment:
-    """Alignment of a depth camera too far from its stated pose for a correction, such as upside down."""
-    T, centre = placed.T, motion.positions().mean(axis=(0, 1))
-    twist = np.array([*(se3.apply(T, centre) - centre), *se3.log_so3(T[:3, :3]), 0.0])
-    std = np.array([*np.repeat(POSE_SIGMAS, 3), _CLOCK_SIGMA])
-    limit = np.degrees(MISFIT_SIGMAS * POSE_SIGMAS[1])
-    doubts = (f"it would turn by {np.degrees(placed.turn):.0f}°: more than {limit:.0f}°",)
-    return SensorAlignment(sensor, "depth", twist, np.diag(std**2), centre, True, doubts)
-
-
-@dataclass(frozen=True, eq=False)
-class _Look:
-    """One frame of the motion: the sensors' frames, the body's state, time [s] and velocity (n,)."""
-
-    frame: int
-    seen: Sequence[Any]
-    state: BodyState
-    time: float
-    velocity: NDArray
+    return _PlacementProblem(recording, motion, person, frozenset(depth), origins).fits(frames)
 
 
 class _PlacementProblem:
@@ -145,50 +102,60 @@ class _PlacementProblem:
     def __init__(
         self, recording: Recording, motion: Motion, person: Subject, depth: frozenset[str], origins: dict[str, NDArray]
     ) -> None:
-        self.recording, self.motion, self.depth, self.settings = recording, motion, depth, _SETTINGS
+        self.recording, self.motion, self.depth = recording, motion, depth
         self.person, self.origins, self.centre = person, origins, np.zeros(3)
         self.body: Body = motion.body
         self.first = round((motion.times[0] - recording.times[0]) * recording.rate)
-        self.sensors, self.wide = self.prepared(_SETTINGS), self.prepared(_WIDE_SETTINGS)
-        self.names: tuple[str, ...] = ()
-
-    def prepared(self, settings: TrackSettings) -> Sensors:
-        """The sensors with their backgrounds."""
-        of = self.recording
-        out = Sensors(of.rig, of.rate, of.sigma, settings, on_body=of.on_body)
-        for name, empty in of.backgrounds.items():
-            out.know_background(name, empty)
-        return out
-
-    def look(self, frame: int) -> _Look:
-        """The data of one frame of the motion."""
-        time = float(self.recording.times[frame + self.first])
-        return _Look(frame, self.seen(frame), self.motion.state(frame), time, self.velocity(frame))
+        self.sensors, self.wide = sensors_of(recording, TrackSettings()), wide_sensors(recording, TrackSettings())
 
     def seen(self, frame: int) -> list[Any]:
         """The sensors' frames at a frame of the motion."""
         return [f for f in self.recording.steps(frame + self.first) if sensor_of(f) in self.origins]
 
-    def chosen(self, most: int) -> NDArray:
-        """(K,) at most `most` frames with a tracked person and a frame of a sensor."""
-        good = np.flatnonzero(self.motion.quality > _MIN_QUALITY)
-        some = np.array([f for f in good[spread(len(good), 4 * most)] if self.seen(int(f))], int)
-        return some[spread(len(some), most)]
+    def look(self, frame: int) -> Look:
+        """The data of one frame of the motion."""
+        scene = Scene(
+            self.body, self.motion.state(frame), self.recording.rig,
+            time=float(self.recording.times[frame + self.first]), velocity=self.velocity(frame),
+            samples=TrackSettings().samples,
+        )  # fmt: skip
+        return self.seen(frame), scene
 
-    def fits(self, chosen: NDArray) -> tuple[SensorAlignment, ...]:
-        """Alignments of the sensors from frames (K,); those that do not fit also from each half of the frames."""
-        looks = [self.look(int(f)) for f in chosen]
-        self.names = tuple(dict.fromkeys(f.sensor for look in looks for f in look.seen))
+    def fits(self, most: int) -> tuple[SensorAlignment, ...]:
+        """Alignments of the sensors; those that do not fit also from each half of the frames.
+
+        From at most `most` frames with a tracked person and a frame of a sensor; `FRAMES` show where cameras belong.
+        """
+        good, wanted = np.flatnonzero(self.motion.quality > _MIN_QUALITY), max(most, FRAMES)
+        some = np.array([f for f in good[spread(len(good), 4 * wanted)] if self.seen(int(f))], int)
+        chosen = some[spread(len(some), wanted)]
+        if len(chosen) < _MIN_FRAMES:
+            return ()
+        every = [self.look(int(f)) for f in chosen]
         self.centre = np.mean([self.motion.positions()[f].mean(axis=0) for f in chosen], axis=0)
-        self.place = SensorFrames(
-            self.names, (*POSE_SIGMAS, _CLOCK_SIGMA), {name: self.origins[name] - self.centre for name in self.names}
-        )
-        near, ends = self.coarse(looks)
+        names = tuple(dict.fromkeys(f.sensor for frames, _ in every for f in frames))
+        away, found = list[SensorAlignment](), dict[str, Ends | None]()
+        for name in (name for name in names if name in self.depth):
+            T_camera_world = self.recording.rig[name].T_camera_world
+            fit, found[name] = placed_camera(name, every, self.wide, T_camera_world, self.centre, thorough=True)
+            if not (fit.usable or fit.is_near):
+                doubt = f"it would turn by {np.degrees(fit.turn):.0f}°: more than "
+                doubt += f"{np.degrees(MISFIT_SIGMAS * POSE_SIGMAS[1]):.0f}°"
+                away.append(replace(fit, falls=True, doubts=(doubt,)))
+        gone = {fit.sensor for fit in away}
+        self.names = tuple(name for name in names if name not in gone)
+        if not self.names:
+            return tuple(away)
+        few = [every[k] for k in spread(len(every), most)]
+        looks = [([f for f in frames if f.sensor not in gone], scene) for frames, scene in few]
+        arms = {name: self.origins[name] - self.centre for name in self.names}
+        self.place = SensorFrames(self.names, POSE_SIGMAS, arms)
+        near, ends = self.coarse(looks, found)
         out = [self.with_surface(fit) for fit in self.fitted(looks, near)]
         if any(fit.misfit for fit in out):
             a, b = (self.fitted(looks[k::2], near) for k in range(2))
             out = [self.judged(looks, fit, (a[k], b[k]), ends.get(fit.sensor)) for k, fit in enumerate(out)]
-        return tuple(out)
+        return (*away, *out)
 
     def with_surface(self, fit: SensorAlignment) -> SensorAlignment:
         """The alignment with the surface's systematic errors added to the covariance."""
@@ -198,12 +165,9 @@ class _PlacementProblem:
         return replace(fit, covariance=fit.covariance + np.diag(_SURFACE_SIGMA**2) + _UP_SIGMA**2 * np.outer(up, up))
 
     def judged(
-        self,
-        looks: Sequence[_Look],
-        fit: SensorAlignment,
-        halves: tuple[SensorAlignment, SensorAlignment],
+        self, looks: Sequence[Look], fit: SensorAlignment, halves: tuple[SensorAlignment, SensorAlignment],
         ends: Ends | None,
-    ) -> SensorAlignment:
+    ) -> SensorAlignment:  # fmt: skip
         """The alignment with the difference of two halves of the frames in its covariance, and reasons for doubt."""
         if not fit.misfit:
             return fit
@@ -213,47 +177,39 @@ class _PlacementProblem:
         rivals = ends.rivals if ends is not None else ()
         return replace(wide, doubts=doubts_of(wide, self.origins[fit.sensor], halves, rivals))
 
-    def coarse(self, looks: Sequence[_Look]) -> tuple[dict[str, NDArray], dict[str, Ends]]:
-        """Initial twists (7,) of all sensors; of depth sensors also all local minima."""
-        ends = {}
-        for sensor in self.names:
-            if sensor in self.depth:
-                own = self.registration(sensor, looks)
-                first = starts(self.origins[sensor], self.centre, POSE_SIGMAS)
-                rest = [own.settled(twist, (*COARSE_DISTANCES, *FINE_DISTANCES)) for twist in first]
-                ends[sensor] = Ends(own, tuple(own.height(twist, self.recording.up_axis) for twist in rest))
+    def coarse(
+        self, looks: Sequence[Look], found: Mapping[str, Ends | None]
+    ) -> tuple[dict[str, NDArray], dict[str, Ends]]:
+        """Initial twists (7,) of all sensors; of depth sensors also all local minima, at their best heights."""
+        up = self.recording.up_axis
+        ends = {
+            name: Ends(end.registration, tuple(end.registration.height(twist, up) for twist in end.twists))
+            for name, end in found.items() if end is not None and name in self.names
+        }  # fmt: skip
         near = {sensor: end.best for sensor, end in ends.items()}
         named = tuple(name for name in self.names if name not in near)
         if named:
             few = [looks[k] for k in spread(len(looks), _FIRST_FRAMES)]
-            few = [replace(look, seen=[f for f in look.seen if f.sensor in named]) for look in few]
+            few = [([f for f in frames if f.sensor in named], scene) for frames, scene in few]
             place = replace(self.place, sensors=named)
             start, reach = np.zeros(len(place.names)), _MARKER_DISTANCES
-            found = self.fit(few, {}, [place], start, reach=reach, rounds=len(reach), looks=1.0)
-            near |= {name: twist_of(found.values[name]) for name in named}
+            fit = self.fit(few, {}, [place], start, reach=reach, rounds=len(reach), looks=1.0)
+            near |= {name: twist_of(fit.values[name]) for name in named}
         return near, ends
 
-    def registration(self, sensor: str, looks: Sequence[_Look]) -> Registration:
+    def registration(self, sensor: str, looks: Sequence[Look]) -> Registration:
         """The measurements of one sensor, with the poses from the keypoints alone."""
-        own = [replace(look, seen=[f for f in look.seen if f.sensor == sensor]) for look in looks]
-        own = [look for look in own if look.seen]
-        scenes = [
-            Scene(self.body, look.state, self.recording.rig, time=look.time, velocity=look.velocity,
-                  samples=self.settings.samples) for look in own
-        ]  # fmt: skip
-        place = replace(self.place, sensors=(sensor,))
-        return Registration(sensor, self.measured(own, {}, self.wide), scenes, self.centre, place.information[:6, :6])
+        return registration(sensor, looks, self.wide, self.origins[sensor], self.centre)
 
-    def fitted(self, looks: Sequence[_Look], near: Mapping[str, NDArray]) -> list[SensorAlignment]:
+    def fitted(self, looks: Sequence[Look], near: Mapping[str, NDArray]) -> list[SensorAlignment]:
         """Joint fit of some frames, from twists (7,) of the sensors."""
         twists = dict(near)
         for sensor in self.depth & set(self.names):
             own = self.registration(sensor, looks)
             twists[sensor] = own.height(own.settled(twists[sensor], FINE_DISTANCES), self.recording.up_axis)
-        parameters = [*self.parameters([look.seen for look in looks]), self.place]
+        parameters = [*self.parameters([frames for frames, _ in looks]), self.place]
         start = np.concatenate([*(p.mean for p in parameters[:-1]), *(twists[name] for name in self.names)])
-        values = {name: values_of(twist) for name, twist in twists.items()}
-        found = self.fit(looks, values, parameters, start, rounds=_JOINT_ROUNDS)
+        found = self.fit(looks, twists, parameters, start, rounds=_JOINT_ROUNDS)
         out = []
         for sensor in self.names:
             k = found.names.index(f"{sensor} {AXES[0]}")
@@ -263,14 +219,19 @@ class _PlacementProblem:
         return out
 
     def fit(
-        self, some: Sequence[_Look], values: Mapping[str, Mapping[str, float]], parameters: Sequence[Parameters],
-        start: NDArray, **options: Any,
+        self, some: Sequence[Look], twists: dict[str, NDArray], parameters: Sequence[Parameters], start: NDArray,
+        **options: Any,
     ) -> SubjectFit:  # fmt: skip
-        """Fit parameters to some frames from a start (P,), at which the sensors have `values`."""
+        """Fit parameters to some frames from a start (P,), at which the sensors have twists (7,)."""
+        measured, scenes = [], [scene for _, scene in some]
+        for look in some:
+            at = round((look[1].time - self.recording.times[0]) * self.recording.rate)
+            pixels = self.sensors.measurements(self.recording.keypoints_at(at), look[1])
+            measured.append([*measurements_at(look, self.sensors, self.centre, twists), *pixels])
         return fit_subject(
-            self.body, self.recording.rig, self.measured(some, values, self.sensors), [look.state for look in some],
-            parameters, start=start, times=[look.time for look in some],
-            velocities=[look.velocity for look in some], loss=self.settings.loss, **options,
+            self.body, self.recording.rig, measured, [scene.state for scene in scenes], parameters, start=start,
+            times=[scene.time for scene in scenes], loss=TrackSettings().loss,
+            velocities=[scene.velocity for scene in scenes if scene.velocity is not None], **options,
         )  # fmt: skip
 
     def parameters(self, frames: Sequence[Sequence[Any]]) -> list[Parameters]:
@@ -286,21 +247,6 @@ class _PlacementProblem:
         out += [PointOffsets(self.body, name, std) for name, std in sets.items()]
         detected = dict.fromkeys(k.keypoint_set for k in self.recording.keypoints)
         return out + [PointOffsets(self.body, name, _LANDMARK_SIGMA) for name in detected]
-
-    def measured(self, looks: Sequence[_Look], values: Any, sensors: Sensors) -> list[list[Measurement]]:
-        """Measurements of each frame, prepared with the body in the sensors' frames."""
-        out = []
-        for look in looks:
-            several: list[Measurement] = []
-            for frame in look.seen:
-                T = displacement(values.get(frame.sensor, {}), self.centre)
-                there = BodyState(se3.inverse(T) @ look.state.T_world_root, look.state.angles)
-                scene = Scene(self.body, there, self.recording.rig, time=look.time, samples=self.settings.samples)
-                several += [Displaced(m, self.centre) for m in sensors.measurements([frame], scene)]
-            scene = Scene(self.body, look.state, self.recording.rig, time=look.time)
-            pixels = self.recording.keypoints_at(look.frame + self.first)
-            out.append([*several, *self.sensors.measurements(pixels, scene)])
-        return out
 
     def velocity(self, frame: int) -> NDArray:
         """(n,) [m/s, rad/s] of the body, from the adjacent frames; raises ObservationError for a single frame."""

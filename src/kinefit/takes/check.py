@@ -7,36 +7,47 @@ from os import PathLike
 
 from kinefit._arguments import checked
 from kinefit.bodies import load_body
-from kinefit.calibration.check.sensors import fit_sensors
+from kinefit.calibration.sensors import fit_sensors
 from kinefit.diagnostics.checks import CHECKS, Check, Checked, Progress, run
 from kinefit.diagnostics.images import finding_of
 from kinefit.diagnostics.quick import inverted_findings
 from kinefit.diagnostics.sensors import sensor_findings
 from kinefit.errors import KinefitError, command
 from kinefit.findings import Finding
+from kinefit.preparing.each_video import Tell
+from kinefit.preparing.take import warn
 from kinefit.readers.take.cameras import is_alone
 from kinefit.readers.take.file import Take, read_take
 from kinefit.subject.subject import Subject
+from kinefit.takes.missing import prepared
 from kinefit.tracking.sizing import SizedPerson, sized_by_depth
-from kinefit.tracking.takes.take_recording import label_findings_of, recording_of
+from kinefit.tracking.take_recording import label_findings_of, recording_of
 
 
 @checked
-def check_take(take: Take | str | PathLike[str], *, progress: Progress = lambda *_: None) -> Checked:
-    """Find all faults of a take.
+def check_take(
+    take: Take | str | PathLike[str], *, progress: Progress = lambda *_: None, tell: Tell = warn
+) -> Checked:
+    """Find all faults of a take, as `kinefit check` does.
 
-    Files that cannot be read, and images that do not fit their calibration, become findings; the check goes on without
-    them.
+    What the take lacks is found first and kept beside it (`prepared`): keypoints, cameras, clocks. Files that cannot be
+    read, and images that do not fit their calibration, become findings; the check goes on without them.
+
+    Parameters
+    ----------
+    progress : called with an action, the steps done and their number
+    tell : called with what was found first, in sentences; default: a warning
 
     Raises
     ------
     KinefitError
-        The take file itself cannot be read.
+        The take file itself cannot be read; what finding cameras raises.
     """
     take = take if isinstance(take, Take) else read_take(take)
     if is_alone(take):
         text = f"Camera {take.cameras[0].name} is alone and not calibrated: there is nothing to check it against."
         return Checked(take.name, (Finding("note", "load", text, remedy=f"Run: {command('track', take.path)}"),), take)
+    take = prepared(take, progress, tell, lenient=True)
     known = Checked(take.name, take=take, body=take.body, up=take.up, height=take.height, progress=progress)
     return run(known, ALL_CHECKS)
 

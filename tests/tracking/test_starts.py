@@ -21,7 +21,7 @@ from kinefit.observations import SilhouetteFrame
 from kinefit.readers.take.file import read_take
 from kinefit.rendering import render_body
 from kinefit.takes.track import track_take
-from kinefit.tracking.takes.take_recording import recording_of
+from kinefit.tracking.take_recording import recording_of
 
 FRAMES, TURN = 8, np.radians(5.0)
 BODY = """

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.multiview.followed import follow
-from kinefit.multiview.one_camera import only_lifted
+from kinefit.multiview.followed import follow, only_lifted
 from kinefit.observations import MEDIAPIPE_33, Keypoints
 
 T = np.eye(4)

@@ -1,1 +1,0 @@
-"""Tracking of a take file: its recording, and its floor."""
