@@ -28,7 +28,7 @@ from kinefit.cli.markers._fit import fit_file
 from kinefit.exporters import write_markers
 from kinefit.motion import Motion
 from kinefit.observations import Markers, SkeletonMotion
-from kinefit.readers.skeletons.amc import read_amc
+from kinefit.readers.skeletons.acclaim import read_amc
 from kinefit.readers.skeletons.bvh import read_bvh
 from kinefit.simulation import squat_and_wave
 

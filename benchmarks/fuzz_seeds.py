@@ -242,7 +242,7 @@ def _bvh(folder: Path) -> Seed:
 
 
 def _amc(folder: Path) -> Seed:
-    from kinefit.readers.skeletons.amc import read_amc
+    from kinefit.readers.skeletons.acclaim import read_amc
 
     (folder / "a.asf").write_text(ASF)
     (folder / "a.amc").write_text(AMC)
@@ -251,7 +251,7 @@ def _amc(folder: Path) -> Seed:
 
 
 def _static_points(folder: Path) -> Seed:
-    from kinefit.readers.static_points import read_static_points
+    from kinefit.readers.annotations import read_static_points
 
     (folder / "points.toml").write_text("[beam]\na = [1.5, 2.0]\nb = [3.0, 4.0]\n[post]\na = [5, 6]\nb = [7, 8]\n")
     return Seed((folder / "points.toml",), lambda: read_static_points(folder / "points.toml", ("a", "b")))
@@ -347,7 +347,7 @@ def _clouds(kind: str) -> Callable[[Path], Seed]:
         def read() -> object:
             cloud = read_cloud(path)
             if cloud.shape is not None:
-                camera_of(cloud, "a", path)
+                camera_of(cloud, "a")
                 depth_of(cloud)
             return in_sensor(cloud)
 

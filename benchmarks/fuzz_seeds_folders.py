@@ -61,7 +61,7 @@ def packed_glb(tree: dict, binary: bytes) -> bytes:
 
 
 def _clicks(folder: Path) -> Seed:
-    from kinefit.readers.clicks import clicks_text, read_clicks
+    from kinefit.readers.annotations import clicks_text, read_clicks
 
     points = {camera: {name: [812.0, 401.5] for name in ("r_knee", "l_knee", "c7")} for camera in ("a", "b")}
     (folder / "clicks.json").write_text(json.dumps({"step": 0, "points": points}))
@@ -111,7 +111,7 @@ def _folder_of(take: Callable[[Path], Seed]) -> Callable[[Path], Seed]:
     def make(folder: Path) -> Seed:
         from kinefit.readers.take.file import read_take
         from kinefit.readers.take.load import load_observations
-        from kinefit.readers.take.stereo import load_stereo
+        from kinefit.readers.take.videos import load_stereo
 
         take(folder)
 

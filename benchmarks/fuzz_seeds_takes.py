@@ -153,7 +153,7 @@ def _tracker_table(path: Path) -> None:
 
 
 def _trackers(folder: Path) -> Seed:
-    from kinefit.readers.body_trackers import read_body_trackers
+    from kinefit.readers.tracked_points import read_body_trackers
 
     _tracker_table(folder / "trackers.csv")
 
@@ -211,7 +211,7 @@ def _sensors(folder: Path) -> Seed:
     from kinefit.readers.calibration.read import read_calibration, write_calibration
     from kinefit.readers.take.file import read_take
     from kinefit.readers.take.load import load_observations
-    from kinefit.readers.take.stereo import load_stereo
+    from kinefit.readers.take.videos import load_stereo
 
     calibration_of(folder)
     first = read_calibration(folder / "calibration.toml")["cam01"]

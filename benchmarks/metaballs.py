@@ -32,7 +32,7 @@ from kinefit.bodies.surfaces import Metaballs, nearest
 from kinefit.bodies.surfaces.metaballs import LEVEL
 from kinefit.bodies.surfaces.skins.body_skin import BodySkin, body_skins
 from kinefit.bodies.surfaces.skins.skin_tubes import field
-from kinefit.bodies.surfaces.skins.subdivision import subdivided
+from kinefit.bodies.surfaces.skins.skinning import subdivided
 from kinefit.correspondences import field_rows, surface_rows
 from kinefit.errors import BodyError
 from kinefit.exporters import write_glb

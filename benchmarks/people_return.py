@@ -24,7 +24,7 @@ from kinefit.observations import Keypoints
 from kinefit.preparing import detecting
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.readers.take.pictures import TakePictures
+from kinefit.readers.take.videos import TakePictures
 from kinefit.simulation import simulate_keypoints, studio_rig
 from kinefit.simulation.movements import movement
 from kinefit.takes.missing import prepared

@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from benchmarks.figures import LEFT_OUT, data, figure, quick
 from benchmarks.phones_rooms import turns_between
 from kinefit import Motion, find_cameras, track_take
+from kinefit._files import write_text
 from kinefit.errors import KinefitError
 from kinefit.evaluation import angle_errors
-from kinefit.exporters.atomic import write_text
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.readers.calibration.found import read_found
-from kinefit.readers.calibration.read import read_calibration
+from kinefit.readers.calibration.read import read_calibration, read_found
 from kinefit.readers.guess.folder import guess_take
 from kinefit.takes.missing import cameras_file
 

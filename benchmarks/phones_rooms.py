@@ -29,8 +29,7 @@ from kinefit.exporters.motion_file import write_detections
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import Detections
-from kinefit.readers.calibration.found import FoundCameras, read_found
-from kinefit.readers.calibration.read import write_calibration
+from kinefit.readers.calibration.read import FoundCameras, read_found, write_calibration
 from kinefit.readers.keypoint_sets import MEDIAPIPE_33
 from kinefit.simulation import cut, known_motion, resampled, simulate_keypoints
 from kinefit.simulation.keypoints import drift

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, data, figure
 from benchmarks.regions_scene import away, rigid, state_of
 from kinefit.bodies import Body
-from kinefit.bodies.surfaces.obj import read_obj
+from kinefit.bodies.surfaces.mesh import read_obj
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import Motion
 from kinefit.observations import ColourFrame

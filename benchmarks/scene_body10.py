@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, KinematicTree, PointSet
 from kinefit.bodies.surfaces import MeshSurface
-from kinefit.bodies.surfaces.obj import read_obj
+from kinefit.bodies.surfaces.mesh import read_obj
 from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import ColourFrame, DepthFrame

@@ -18,8 +18,7 @@ from kinefit.assets import anny_files
 from kinefit.bodies import Body, BodyState, load_body
 from kinefit.bodies.anny import AnnyModel, load_anny
 from kinefit.bodies.morphs.morphing import Morphing
-from kinefit.bodies.morphs.operators import GlobalMorph, LocalMorph
-from kinefit.bodies.morphs.steering import Steering
+from kinefit.bodies.morphs.operators import GlobalMorph, LocalMorph, Steering
 from kinefit.errors import AssetError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera

@@ -251,7 +251,7 @@ def test_the_readme_has_the_two_commands_that_the_checks_run():
 
 _PACKAGES = {
     "cv2": "opencv-python-headless", "ai_edge_litert": "ai-edge-litert", "mcap_ros2": "mcap-ros2-support",
-    "rerun": "rerun-sdk", "ndx_pose": "ndx-pose", "pxr": "usd-core",
+    "rerun": "rerun-sdk", "ndx_pose": "ndx-pose", "pxr": "usd-core", "yaml": "pyyaml",
 }  # fmt: skip
 
 

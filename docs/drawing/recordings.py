@@ -20,7 +20,7 @@ from kinefit.exporters.report.cycles import PERCENT, find_cycles, normalised
 from kinefit.readers.skeletons.bvh import read_bvh
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.readers.take.pictures import TakePictures
+from kinefit.readers.take.videos import TakePictures
 from kinefit.readers.video import Video
 from kinefit.rendering import render_body
 from kinefit.rendering.colours import LEFT_COLOUR, RIGHT_COLOUR, to_hex

@@ -74,7 +74,7 @@ from kinefit.readers.detections import read_detections as read_detections
 from kinefit.readers.keypoints import read_caliscope_csv as read_caliscope_csv, read_keypoints as read_keypoints
 from kinefit.readers.markers import read_markers as read_markers
 from kinefit.readers.motion import read_motion as read_motion
-from kinefit.readers.skeletons.amc import read_amc as read_amc
+from kinefit.readers.skeletons.acclaim import read_amc as read_amc
 from kinefit.readers.skeletons.bvh import read_bvh as read_bvh
 from kinefit.simulation.retarget import retarget as retarget
 

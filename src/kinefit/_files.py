@@ -1,14 +1,18 @@
-"""Files that may hold anything: TOML, tables and numpy archives are read here, within bounds of time and memory."""
+"""Files: TOML, tables and numpy archives are read within bounds of time and memory, and files are written whole."""
 
 from __future__ import annotations
 
 import csv
+import errno
 import os
 import re
 import tomllib
 import zipfile
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from glob import escape
+from os import PathLike
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
@@ -16,7 +20,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import FileError, KinefitError, ObservationError
+from kinefit.errors import ExportError, FileError, KinefitError, ObservationError, choices, printable
 
 _Record = TypeVar("_Record")
 _MIN_STEP_S = 1e-6  # between frames of a table; shorter or longer than its inverse, times are in another unit
@@ -105,12 +109,15 @@ def regular(path: str | os.PathLike[str]) -> Path:
     return Path(path)
 
 
-def read_bytes(path: Path) -> bytes:
-    """All of a file; FileError where it cannot be read, or is no regular file."""
+def read_bytes(path: Path, most: int = -1) -> bytes:
+    """All of a file, or its first bytes; FileError where it cannot be read, or is no regular file."""
     try:
         if regular(path).is_dir():
             raise FileError("is not a file", file=path, remedy="Check the path.")
-        return regular(path).read_bytes()
+        with path.open("rb") as file:
+            return file.read(most)
+    except FileNotFoundError as problem:
+        raise FileError("no such file", file=path, remedy="Check the path.") from problem
     except (OSError, ValueError) as problem:
         reason = getattr(problem, "strerror", None) or str(problem)
         raise FileError(f"cannot be read ({reason})", file=path, remedy="Check the path.") from problem
@@ -125,10 +132,13 @@ def read_text(
         return regular(path).read_text("utf-8-sig", errors)
     except (OSError, ValueError) as problem:
         reason = getattr(problem, "strerror", None) or problem
+        remedy = "Check the path." if isinstance(problem, FileNotFoundError) else remedy
         raise error(f"cannot read {what} ({reason})", file=path, remedy=remedy) from problem
 
 
-def parse_toml(text: str, file: str | os.PathLike[str], error: type[KinefitError] = FileError) -> dict[str, Any]:
+def parse_toml(
+    text: str, file: str | os.PathLike[str] | None, error: type[KinefitError] = FileError
+) -> dict[str, Any]:
     """The tables of a TOML text.
 
     Parameters
@@ -314,3 +324,107 @@ def _header(stream: IO[bytes]) -> tuple[_Shape, bool, np.dtype]:
         return read(stream)
     except MemoryError:  # what Python's parser says of brackets within brackets
         raise ValueError("a header that cannot be understood") from None
+
+
+_REMEDIES = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "Free some space, or write to another disk."),
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "Write to a folder that you may change."),
+    **dict.fromkeys((errno.EISDIR, errno.ENOTDIR, errno.EEXIST), "A folder or file of that name is in the way."),
+}
+
+
+@contextmanager
+def writing(path: str | PathLike[str]) -> Iterator[Path]:
+    """Give a temporary path beside `path`; what was written there takes its place when the block ends well.
+
+    Folders on the way are made. After any error, Ctrl-C included, nothing new is left and an older file stays; what a
+    process left that was killed, the next one that writes there removes.
+
+    Raises
+    ------
+    ExportError
+        Where the system refuses (full disk, no permission): names the file and the remedy.
+    """
+    target = Path(path)
+    if target.exists() and not target.is_file():
+        raise ExportError("a folder or a device of that name is in the way", file=target, remedy="Give another name.")
+    temporary = target.with_name(f".{target.stem}-{os.getpid()}{target.suffix}")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _remove_of_the_dead(target)
+        yield temporary
+        os.replace(temporary, target)
+    except OSError as error:
+        remedy = _REMEDIES.get(error.errno or 0, "Check the path and the disk.")
+        raise ExportError(f"cannot be written ({error.strerror or error})", file=target, remedy=remedy) from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+
+
+def _remove_of_the_dead(target: Path) -> None:
+    """Remove temporary files of `target` whose process is there no more."""
+    if os.name != "posix":
+        return
+    for left in target.parent.glob(f".{escape(target.stem)}-*{escape(target.suffix)}"):
+        number = left.name.removeprefix(f".{target.stem}-").removesuffix(target.suffix)
+        if number.isdecimal():
+            try:
+                os.kill(int(number), 0)
+            except ProcessLookupError:
+                left.unlink(missing_ok=True)
+            except (OSError, OverflowError):  # another user's, which lives
+                pass
+
+
+def write_text(path: str | PathLike[str], text: str) -> None:
+    """Write a whole text file (UTF-8, line ends as they are) or nothing."""
+    with writing(path) as temporary:
+        temporary.write_bytes(printable(text).encode("utf-8"))
+
+
+def write_lines(path: str | PathLike[str], lines: Iterable[str]) -> None:
+    """Write a whole text file (UTF-8), line by line as they are made, or nothing."""
+    with writing(path) as temporary, temporary.open("w", encoding="utf-8", errors="replace", newline="\n") as file:
+        file.writelines(f"{line}\n" for line in lines)
+
+
+def write_bytes(path: str | PathLike[str], data: bytes) -> None:
+    """Write a whole binary file or nothing."""
+    with writing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_rows(path: str | PathLike[str], rows: Iterable[Iterable[object]]) -> None:
+    """Write a whole CSV file, row by row, or nothing."""
+    with writing(path) as temporary, temporary.open("w", encoding="utf-8", errors="replace", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
+
+
+def write_image(path: str | PathLike[str], image: NDArray) -> None:
+    """Write an image (H, W, 3) uint8 BGR as JPEG, or as PNG by any other ending, whole or not at all."""
+    import cv2
+
+    kind = ".jpg" if Path(path).suffix.lower() in (".jpg", ".jpeg") else ".png"
+    write_bytes(path, cv2.imencode(kind, image)[1].tobytes())
+
+
+LENGTHS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0.0254, "ft": 0.3048}
+"""{unit: metres}; `worth` reads the words, too."""
+
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+"""{unit: seconds}."""
+
+
+def worth(unit: Any, units: dict[str, float]) -> float | None:
+    """Value of a unit in metres or seconds, ignoring case, also of "inches", "millimetres"; None of any other."""
+    if not isinstance(unit, str):
+        return None
+    return units.get(re.sub(r"^([cm]?)(?:enti|illi)?met(?:er|re)s?$", r"\1m", unit.strip().lower()).removesuffix("es"))
+
+
+def metres_of(unit: str, error: type[KinefitError], what: str = "unit", **more: Any) -> float:
+    """Metres of a unit of length; `error`, with the units that there are, for any other."""
+    if (metres := worth(unit, LENGTHS)) is None:
+        raise error(choices(what, unit, LENGTHS), **more)
+    return metres

@@ -6,11 +6,14 @@ import difflib
 import os
 import shlex
 import subprocess
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 class KinefitError(Exception):
@@ -63,7 +66,20 @@ def located(file: str | PathLike[str] | None = None, place: str | None = None) -
         yield
     except KinefitError as error:
         where = ", ".join(part for part in (place, error.place) if part)
-        raise type(error)(error.problem, file=error.file or file, place=where or None, remedy=error.remedy) from error
+        again = type(error)(error.problem, file=error.file or file, place=where or None, remedy=error.remedy)
+        raise again from error.__cause__ or error
+
+
+def names_file(read: F) -> F:
+    """The same reader, whose errors name the file that is its first argument, unless they name one."""
+    name = read.__code__.co_varnames[0]
+
+    @wraps(read)
+    def call(*args: Any, **more: Any) -> Any:
+        with located(args[0] if args else more.get(name)):
+            return read(*args, **more)
+
+    return cast(F, call)
 
 
 @contextmanager

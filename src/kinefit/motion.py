@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.state import BodyState
+from kinefit.bodies.tree import BodyState
 from kinefit.errors import ExportError, ObservationError, check_choice
 from kinefit.geometry import se3
 from kinefit.lasting_errors import LastingErrors

@@ -9,7 +9,7 @@ import pytest
 from tests.app.running import running_app
 
 from kinefit import read_motion
-from kinefit.readers.clicks import read_clicks
+from kinefit.readers.annotations import read_clicks
 from kinefit.readers.take.file import read_take
 from kinefit.readers.video import Video
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.free_parts import free_parts, parts_state
+from kinefit.bodies.parts import free_parts, parts_state
 from kinefit.errors import BodyError
 from kinefit.geometry import se3
 

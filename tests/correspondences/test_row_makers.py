@@ -23,7 +23,7 @@ import kinefit.correspondences as correspondences
 from kinefit.bodies import BodyState, PointSet, TaperedCylinder, load_body
 from kinefit.bodies.closures import Closure
 from kinefit.bodies.morphs.morphing import JointMotion, LocalMorph, Morphing
-from kinefit.bodies.morphs.steering import Steering
+from kinefit.bodies.morphs.operators import Steering
 from kinefit.bodies.surfaces import Metaballs, SkinnedMesh
 from kinefit.correspondences import (
     Bands,

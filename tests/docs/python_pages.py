@@ -15,8 +15,8 @@ from tests.subject.measured import pixels
 
 import kinefit
 from kinefit.bodies import load_body
-from kinefit.bodies.free_parts import free_parts, parts_state
 from kinefit.bodies.morphs.morphing import Morphing
+from kinefit.bodies.parts import free_parts, parts_state
 from kinefit.exporters import write_markers, write_motion
 from kinefit.geometry.camera import Rig
 from kinefit.observations import DepthFrame, KeypointFrame, PointCloud

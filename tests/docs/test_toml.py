@@ -10,7 +10,7 @@ from tests.docs.blocks import blocks, pages
 from kinefit.bodies import load_body
 from kinefit.bodies.marker_sets import placement
 from kinefit.cli import main
-from kinefit.readers.static_points import read_static_points
+from kinefit.readers.annotations import read_static_points
 from kinefit.readers.take.entries import TABLES
 from kinefit.readers.take.file import read_take
 

@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from kinefit.bodies import BodyState, PointSet, load_body
-from kinefit.bodies.free_parts import free_parts, parts_state
+from kinefit.bodies.parts import free_parts, parts_state
 from kinefit.cli import main
 from kinefit.errors import ObservationError
 from kinefit.evaluation.sequences import FEATURES, sequence, sequences

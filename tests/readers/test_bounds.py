@@ -16,10 +16,10 @@ from kinefit.bodies import load_body
 from kinefit.bodies.serial import body_to_arrays
 from kinefit.errors import BodyError, FileError, ObservationError
 from kinefit.observations import Detections
-from kinefit.readers.clicks import Clicks, read_clicks
+from kinefit.readers.annotations import Clicks, read_clicks
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.ros import recordings
-from kinefit.readers.ros.contents import shown
+from kinefit.readers.ros.images import shown
 from kinefit.readers.skeletons.characters import _order, read_character
 from kinefit.readers.skeletons.gltf import read_gltf
 from kinefit.readers.video import Video
@@ -192,7 +192,7 @@ def gltf(tmp_path, binary=b"", **more):
 def test_nodes_are_ordered_in_one_pass(monkeypatch):
     monkeypatch.setattr(np, "flatnonzero", lambda *_: pytest.fail("a search among all nodes for each of them"))
     parents = np.array([1, -1, 1, 0, 3])
-    assert _order(parents, Path("a")).tolist() == [1, 0, 2, 3, 4]
+    assert _order(parents).tolist() == [1, 0, 2, 3, 4]
 
 
 def test_more_nodes_than_any_character_has_are_told(tmp_path):
@@ -244,7 +244,7 @@ def test_a_character_carries_off_no_file_from_outside_of_its_folder(tmp_path, ur
     folder.mkdir()
     tree = {"asset": {"version": "2.0"}, "nodes": [{}], "images": [{"uri": uri}]}
     (folder / "a.gltf").write_text(json.dumps(tree))
-    with pytest.raises(FileError, match=r"outside of its folder|cannot be read"):
+    with pytest.raises(FileError, match=r"outside of its folder|no such file|cannot be read"):
         read_gltf(folder / "a.gltf")
 
 

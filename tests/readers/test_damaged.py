@@ -23,16 +23,16 @@ from kinefit.bodies import load_body
 from kinefit.bodies.surfaces import Metaballs
 from kinefit.cli.surfaces._files import read_seeds
 from kinefit.errors import BodyError, CalibrationError, FileError, KinefitError, ObservationError
+from kinefit.readers.annotations import read_static_points
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.depth.clouds import FileCloud, camera_of, read_cloud
 from kinefit.readers.depth.images import listed
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.guess.names import camera_number, natural
 from kinefit.readers.keypoints import read_caliscope_csv, read_keypoints
-from kinefit.readers.skeletons.asf import read_asf
-from kinefit.readers.static_points import read_static_points
+from kinefit.readers.skeletons.acclaim import read_asf
 from kinefit.readers.take.file import read_take
-from kinefit.readers.take.surface_points import read_surface_points
+from kinefit.readers.tracked_points import read_surface_points
 from kinefit.readers.video import Video
 
 COPIES = 25  # of each reader here; `python -m benchmarks.product fuzz` reads thousands
@@ -127,7 +127,7 @@ def test_a_matrix_of_rows_without_end_is_told(tmp_path):
 @pytest.mark.parametrize("text", ["a: " + "{" * 50_000, "a: " + "- " * 50_000, "a: " + '{"a":' * 50_000])
 def test_tables_within_tables_do_not_end_the_process(tmp_path, text):
     (tmp_path / "a.yml").write_text(f"%YAML:1.0\n---\n{text}\n")
-    with pytest.raises(CalibrationError, match=r"nested too deeply|line 3: a (key|value)"):
+    with pytest.raises(CalibrationError, match="nested too deeply|line 3: (exceeded|block sequence)"):
         read_calibration(tmp_path / "a.yml")
 
 
@@ -171,7 +171,7 @@ def test_points_at_the_end_of_the_world_are_told(tmp_path):
     points[:, 0] *= 1e300
     cloud = FileCloud(points, (20, 20), np.eye(4))
     with pytest.raises(CalibrationError, match="no camera sees"):
-        camera_of(cloud, "a", tmp_path / "a.pcd")
+        camera_of(cloud, "a")
 
 
 @pytest.mark.parametrize("base", ["humanoid" + "(" * 5000, "../../x", "a\\u0000.toml", "b" * 5000 + ".toml"])

@@ -233,9 +233,9 @@ def test_caliscope_table(data_dir, tmp_path):
     assert cameras["cam_0"].rate == pytest.approx(30.4, abs=0.1)
     assert cameras["cam_0"].points[0, 0, 0].tolist() == [520, 193]
     (tmp_path / "x.csv").write_text("sync_index,port\n0,1\n")
-    with pytest.raises(ObservationError, match="no column frame_time"):
+    with pytest.raises(FileError, match="no column frame_time"):
         read_caliscope_csv(tmp_path / "x.csv")
-    with pytest.raises(FileError, match="no such file"):
+    with pytest.raises(FileError, match="No such file"):
         read_caliscope_csv(tmp_path / "y.csv")
     apart = np.concatenate([_of_wrists(k) for k in cameras.values()])
     assert np.all(np.nanmedian(apart, axis=0)[[0, 1], [0, 1]] < 35)  # each hand at its own side's wrist
@@ -248,7 +248,7 @@ def test_caliscope_table(data_dir, tmp_path):
     np.testing.assert_array_equal(without.points, cameras["cam_0"].points[:, :, :33])
     text = path.read_text().splitlines()[:9]
     (tmp_path / "x.csv").write_text("\n".join([*text, "0,0,0,1.0,3,abc,5,,"]))
-    with pytest.raises(ObservationError, match="not a number"):
+    with pytest.raises(FileError, match="not a number"):
         read_caliscope_csv(tmp_path / "x.csv")
 
 

@@ -13,7 +13,7 @@ from kinefit.findings import of_provenance
 from kinefit.geometry import se3
 from kinefit.motion import rotation_between_up
 from kinefit.observations import SkeletonMotion
-from kinefit.readers.skeletons.amc import read_amc
+from kinefit.readers.skeletons.acclaim import read_amc
 from kinefit.readers.skeletons.bvh import read_bvh
 from kinefit.simulation import cut, resampled, retarget, squat_and_wave
 from kinefit.simulation.skeletons import bone_directions

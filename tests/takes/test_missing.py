@@ -14,7 +14,7 @@ from kinefit.errors import FileError, TakeError
 from kinefit.exporters.motion_file import write_detections
 from kinefit.live.take import live_session
 from kinefit.observations import Detections
-from kinefit.readers.calibration.found import read_found
+from kinefit.readers.calibration.read import read_found
 from kinefit.readers.take.load import load_observations
 from kinefit.takes import missing
 from kinefit.takes.missing import cameras_file, find_cameras, last_found

@@ -8,9 +8,9 @@ from tests.tracking.movements import BODY, RATE, a_motion
 from kinefit.cli import main
 from kinefit.errors import FileError, KinefitError, ObservationError
 from kinefit.geometry import se3
-from kinefit.readers.body_trackers import read_body_trackers
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
+from kinefit.readers.tracked_points import read_body_trackers
 from kinefit.takes.track import track_take
 
 HEADER = "time_s,tracker,x,y,z,qw,qx,qy,qz\n"

@@ -15,7 +15,7 @@ from kinefit.batch.viewed import is_outdated
 from kinefit.errors import FileError, KinefitError, printable
 from kinefit.readers.depth.images import natural
 from kinefit.readers.guess.files import VIDEOS
-from kinefit.readers.take.find import takes_in
+from kinefit.readers.take.file import takes_in
 
 NEW = "new"
 UNFINISHED = "unfinished"

@@ -11,8 +11,8 @@ from kinefit.app.folders import takes_below
 from kinefit.app.jobs import Job, JobQueue
 from kinefit.errors import KinefitError
 from kinefit.readers.take.cameras import is_uncalibrated
+from kinefit.readers.take.checks import streams_of
 from kinefit.readers.take.file import read_take
-from kinefit.readers.take.streams import streams_of
 from kinefit.serving import TOKEN_VARIABLE
 from kinefit.serving.access import Access
 from kinefit.takes.missing import cameras_file, last_found

@@ -13,9 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import regular
+from kinefit._files import regular, write_text
 from kinefit.errors import KinefitError, ObservationError
-from kinefit.exporters.atomic import write_text
 from kinefit.exporters.pictures.overlay import write_pictures
 from kinefit.exporters.take_text import quoted, with_keys
 from kinefit.live.cameras import SessionClock

@@ -18,19 +18,17 @@ from typing import Any
 
 import numpy as np
 
-from kinefit._files import read_bytes, regular
+from kinefit._files import read_bytes, regular, write_bytes, write_text, writing
 from kinefit.bodies import load_body
 from kinefit.errors import ExportError, KinefitError, TakeError, choices, located
-from kinefit.exporters.atomic import write_bytes, write_text, writing
 from kinefit.exporters.take_text import edited, quoted
 from kinefit.findings import Edit, joined
 from kinefit.preparing.take import has_face, uses_detector
-from kinefit.readers.clicks import Clicks, clicks_of, clicks_text, read_clicks
+from kinefit.readers.annotations import Clicks, clicks_of, clicks_text, read_clicks
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoint_sets import FACE_SET
 from kinefit.readers.motion import read_motion
-from kinefit.readers.take.file import Take, read_take
-from kinefit.readers.take.find import find_take
+from kinefit.readers.take.file import Take, find_take, read_take
 
 TakePath = str | PathLike[str]
 Range = tuple[int, int]

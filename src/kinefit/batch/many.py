@@ -15,7 +15,7 @@ from kinefit.batch.one import Choices, TakeJob, work
 from kinefit.batch.processes import Failure, run_here
 from kinefit.batch.summary import RECORD, Row, failed, write_summary
 from kinefit.errors import ExportError, FileError, KinefitError, command, printable
-from kinefit.readers.take.find import is_take, takes_in
+from kinefit.readers.take.file import is_take, takes_in
 
 
 @dataclass(frozen=True)

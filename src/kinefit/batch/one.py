@@ -312,6 +312,6 @@ def _read(path: Path) -> _TakeRecord | None:
 
 
 def _write(path: Path, record: _TakeRecord) -> None:
-    from kinefit.exporters.atomic import write_bytes
+    from kinefit._files import write_bytes
 
     write_bytes(path, msgspec.json.encode(record))

@@ -106,7 +106,7 @@ def write_summary(rows: Sequence[Row], folder: Path) -> None:
     ExportError
         There are no rows, or they cannot be written.
     """
-    from kinefit.exporters.atomic import write_rows, write_text
+    from kinefit._files import write_rows, write_text
 
     if not rows:
         raise ExportError("there are no takes to summarise", file=folder, remedy="Give a pattern that matches takes.")
@@ -261,7 +261,7 @@ def write_people_report(rows: Sequence[Row], folder: Path, *, pictures: bool) ->
     ExportError
         The page cannot be written.
     """
-    from kinefit.exporters.atomic import write_text
+    from kinefit._files import write_text
     from kinefit.exporters.report import page as p
 
     done = [row for row in rows if row.status == DONE]

@@ -47,7 +47,7 @@ def gather(
         A file is missing or invalid, or two takes are given.
     """
     from kinefit.readers.motion import read_motion
-    from kinefit.readers.take.find import takes_in
+    from kinefit.readers.take.file import takes_in
     from kinefit.readers.take.load import load_observations
     from kinefit.takes.missing import find_cameras
     from kinefit.viewers.show import ViewerContent
@@ -192,7 +192,7 @@ def _triangulated(take: Take, seen: Observations, tell: Tell) -> NDArray | None:
     from kinefit.bodies import load_body
     from kinefit.errors import TrackingError
     from kinefit.multiview.followed import follow
-    from kinefit.readers.take.pictures import TakePictures
+    from kinefit.readers.take.videos import TakePictures
     from kinefit.sensors.points.triangulation import triangulated
     from kinefit.sensors.settings import TrackSettings
     from kinefit.tracking.recording import Recording

@@ -37,7 +37,6 @@ Names that are part of a key are percent-encoded.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Mapping
 from os import PathLike
 from pathlib import Path
@@ -49,12 +48,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit._files import read_npz
+from kinefit._files import read_npz, writing
 from kinefit.bodies.anny import fetched_anny
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.closures import KINDS, Closure, Dimension
-from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph
-from kinefit.bodies.morphs.steering import Steering
+from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph, Steering
 from kinefit.bodies.surfaces import MeshSurface, Metaballs, SkinnedMesh, Surface, TaperedCylinder
 from kinefit.bodies.toml.bodies import read_toml_body
 from kinefit.bodies.toml.records import stature_of
@@ -210,19 +208,14 @@ def save_body(body: Body, path: str | PathLike[str]) -> None:
     Raises
     ------
     BodyError
-        A name that does not end in .npz, or a file that cannot be written; an older file is then kept.
+        A name that does not end in .npz.
+    ExportError
+        The file cannot be written; an older file is then kept.
     """
-    target = Path(path)
-    if target.suffix != ".npz":
-        raise BodyError("a body is saved as .npz", file=path, remedy=f"Call it {target.stem}.npz.")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".writing-") as folder:
-            np.savez_compressed(Path(folder) / target.name, **body_to_arrays(body))  # type: ignore[arg-type]
-            (Path(folder) / target.name).replace(target)
-    except OSError as error:
-        remedy = "Choose a folder with write permission and free space."
-        raise BodyError(f"cannot write the body ({error.strerror or error})", file=path, remedy=remedy) from error
+    if Path(path).suffix != ".npz":
+        raise BodyError("a body is saved as .npz", file=path, remedy=f"Call it {Path(path).stem}.npz.")
+    with writing(path) as temporary:
+        np.savez_compressed(temporary, **body_to_arrays(body))  # type: ignore[arg-type]
 
 
 @checked

@@ -13,7 +13,7 @@ from kinefit.errors import TakeError, TrackingError, choices
 
 if TYPE_CHECKING:
     from kinefit.bodies import Body
-    from kinefit.readers.clicks import Clicks
+    from kinefit.readers.annotations import Clicks
     from kinefit.readers.take.file import Take
     from kinefit.readers.take.load import Observations
 
@@ -35,7 +35,7 @@ def start_from_clicks(out: Path, points: Path | None, step: int | None, body: st
     body : name or file of the body
     """
     from kinefit.bodies import load_body
-    from kinefit.readers.clicks import read_clicks
+    from kinefit.readers.annotations import read_clicks
     from kinefit.readers.take.file import read_take
     from kinefit.readers.take.load import load_observations
     from kinefit.takes.missing import last_found
@@ -56,7 +56,7 @@ def _ask(out: Path, take: Take, seen: Observations, body: Body, step: int, brows
     import webbrowser
 
     from kinefit.initialization.from_clicks import clickable
-    from kinefit.readers.clicks import clicks_of
+    from kinefit.readers.annotations import clicks_of
     from kinefit.viewers.clicks import ClickPage
 
     def taken(clicks: Any) -> str:
@@ -102,10 +102,10 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, steps: Seque
     """Write body and start of the first step, and the clicks of all, to which the take file refers; what to tell."""
     import numpy as np
 
+    from kinefit._files import write_text
     from kinefit.bodies.serial import save_body
-    from kinefit.exporters.atomic import write_text
     from kinefit.initialization.from_clicks import clickable, clicked_points, clicked_start
-    from kinefit.readers.clicks import clicks_text
+    from kinefit.readers.annotations import clicks_text
 
     assert seen.rig is not None
     clicks = steps[0]

@@ -92,10 +92,10 @@ def check(file: str, planar: bool) -> None:
 @click.option("--azimuth", type=float, default=40.0, show_default=True, help="[deg] Camera angle, 0 in front.")
 def picture(file: str, out: Path, azimuth: float) -> None:
     """Render a body in the pose nearest to its reference pose that satisfies its closures."""
+    from kinefit._files import write_image
     from kinefit.bodies import load_body
     from kinefit.cli._results import check_file
     from kinefit.errors import FileError
-    from kinefit.exporters.atomic import write_image
     from kinefit.simulation.figures import portrait
 
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):

@@ -49,9 +49,9 @@ def init(
         raise click.UsageError("--step needs --click; a file of --points has its own step.")
     if body is not None and not (clicked or points):
         raise click.UsageError("--body needs --click or --points; without them, write body into the take file.")
+    from kinefit._files import write_text
     from kinefit.cli._results import check_file
     from kinefit.errors import TakeError, command
-    from kinefit.exporters.atomic import write_text
     from kinefit.readers.guess.folder import guess_take
 
     out = out or folder / "take.toml"
@@ -82,7 +82,7 @@ def init(
 
 def write_first_take(folder: Path) -> Path:
     """The take file of a folder that has none: guessed, shown, with the person's height where somebody answers."""
-    from kinefit.exporters.atomic import write_text
+    from kinefit._files import write_text
     from kinefit.readers.guess.folder import OPEN_HEIGHT, guess_take
 
     guess, out = guess_take(folder), folder / "take.toml"

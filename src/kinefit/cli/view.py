@@ -83,7 +83,7 @@ def _serve(recording: ViewerContent, port: int, access: Access, browser: bool, c
 
 
 def _write(recording: ViewerContent, html: Path, cylinders: bool) -> None:
-    from kinefit.exporters.atomic import write_text
+    from kinefit._files import write_text
     from kinefit.viewers.show import CYLINDERS, DEFAULT_LAYERS, Choice, page
 
     _screen.note("Rendering the scene ...")

@@ -102,7 +102,7 @@ def band_rows(body: Body, state: BodyState, bands: Bands, *, sigma: ArrayLike = 
     Parameters
     ----------
     body : Body
-        Of free parts (`bodies.free_parts`); in an ordinary body the bands are never stretched.
+        Of free parts (`bodies.parts.free_parts`); in an ordinary body the bands are never stretched.
     state : BodyState
     bands : Bands
     sigma : scalar or (K,) [m]

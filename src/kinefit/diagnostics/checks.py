@@ -25,7 +25,7 @@ from kinefit.multiview.followed import follow
 from kinefit.observations import Keypoints
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
-from kinefit.readers.take.pictures import TakePictures
+from kinefit.readers.take.videos import TakePictures
 
 Progress = Callable[[str, int, int], None]
 

@@ -21,7 +21,7 @@ from kinefit.readers.guess.draft import Value
 from kinefit.readers.guess.views import black_bars, picture
 from kinefit.readers.take.entries import CameraEntry, Take
 from kinefit.readers.take.load import Observations, load_observations
-from kinefit.readers.take.pictures import TakePictures
+from kinefit.readers.take.videos import TakePictures
 from kinefit.readers.video import Video
 
 _EITHER = Value(90, "guess", "clockwise or counter-clockwise: try 90, then 270")

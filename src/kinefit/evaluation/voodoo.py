@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.free_parts import free_parts, parts_state
+from kinefit.bodies.parts import free_parts, parts_state
 from kinefit.errors import ObservationError
 from kinefit.evaluation.sequences import FEATURES, INPUTS, Inputs, TruthSequence
 from kinefit.motion import Motion

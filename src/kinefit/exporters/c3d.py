@@ -7,8 +7,8 @@ from os import PathLike
 import numpy as np
 
 from kinefit._arguments import checked
+from kinefit._files import write_bytes
 from kinefit.errors import ExportError
-from kinefit.exporters.atomic import write_bytes
 from kinefit.exporters.c3d_file import MAX_FRAMES, Groups, c3d_bytes, label_groups, screens
 from kinefit.exporters.curves import Curve, curves
 from kinefit.exporters.skeletons.common import UNITS, bone_names, convention, length_factor, plain_names, turned

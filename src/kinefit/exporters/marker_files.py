@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
+from kinefit._files import write_bytes, write_text
 from kinefit.errors import ExportError
-from kinefit.exporters.atomic import write_bytes, write_text
 from kinefit.exporters.c3d_file import MAX_FRAMES, Value, c3d_bytes, label_groups, screens
 from kinefit.exporters.opensim.files import trc_head
 from kinefit.exporters.skeletons.common import length_factor

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from os import PathLike
 
+from kinefit._files import writing
 from kinefit.errors import ExportError, extra
-from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import bone_names, turned
 from kinefit.exporters.skeletons.rest import rest_pose
 from kinefit.motion import Motion

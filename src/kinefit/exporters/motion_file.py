@@ -12,9 +12,9 @@ from urllib.parse import quote
 import numpy as np
 
 from kinefit._arguments import checked
+from kinefit._files import writing
 from kinefit.bodies.serial import arrays_of, body_to_arrays
 from kinefit.errors import ExportError
-from kinefit.exporters.atomic import writing
 from kinefit.motion import Motion
 from kinefit.observations import Detections
 from kinefit.readers import detections as detections_format

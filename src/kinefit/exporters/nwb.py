@@ -12,8 +12,8 @@ from uuid import NAMESPACE_URL, uuid5
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import writing
 from kinefit.errors import ExportError, extra
-from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import bone_names, convention, plain_names, turned
 from kinefit.motion import Motion
 

@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import write_lines
 from kinefit.bodies import Body
-from kinefit.exporters.atomic import write_lines
 from kinefit.exporters.skeletons.common import turned
 from kinefit.geometry import se3
 from kinefit.motion import Motion

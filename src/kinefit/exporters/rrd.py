@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from kinefit._files import writing
 from kinefit.errors import ExportError, extra
-from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import bone_names, turned
 from kinefit.motion import Motion
 

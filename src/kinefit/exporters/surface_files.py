@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import write_bytes, write_image, write_rows
 from kinefit.errors import ExportError
-from kinefit.exporters.atomic import write_bytes, write_image, write_rows
 from kinefit.photogrammetry.returning import PointReturn
 from kinefit.photogrammetry.states import displacement_std
 from kinefit.photogrammetry.strain import Strain

@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
+from kinefit._files import writing
 from kinefit.errors import ExportError, extra
-from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import UNITS, bone_names, length_factor, turned
 from kinefit.motion import Motion
 from kinefit.motion_columns import angle_columns, continuous_quaternions, joint_columns, place_columns

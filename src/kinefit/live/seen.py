@@ -10,9 +10,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import regular
+from kinefit._files import regular, write_text
 from kinefit.errors import ExportError
-from kinefit.exporters.atomic import write_text
 from kinefit.exporters.motion_file import write_detections
 from kinefit.geometry.camera import Rig
 from kinefit.observations import MEDIAPIPE_33, Detections, KeypointFrame, LiftedFrame, by_record

@@ -30,10 +30,10 @@ from kinefit.preparing.take import warn
 from kinefit.readers.depth.recordings import read_depth
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.cameras import assumed_camera, image_frame, is_alone, read_rig
+from kinefit.readers.take.checks import streams_of
 from kinefit.readers.take.depth import stated_camera
 from kinefit.readers.take.entries import CameraEntry, DepthEntry, Take
 from kinefit.readers.take.load import load_observations
-from kinefit.readers.take.streams import streams_of
 from kinefit.takes.missing import find_cameras, last_found
 from kinefit.takes.track import settings_of, trial_of
 from kinefit.tracking.recording import Recording

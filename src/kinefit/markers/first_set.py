@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit.bodies.body import Body
-from kinefit.bodies.marker_sets.files import LANDMARK_SPREAD, MarkerRecord, SetRecord, catalogue
-from kinefit.bodies.marker_sets.labels import bare, plain, side_pairs
 from kinefit.bodies.marker_sets.placement import placed
+from kinefit.bodies.marker_sets.sets import LANDMARK_SPREAD, MarkerRecord, SetRecord, bare, catalogue, plain, side_pairs
 from kinefit.errors import KinefitError
 from kinefit.identification.model.learn import learn_model, usable_markers
 from kinefit.markers.fit import fit_markers

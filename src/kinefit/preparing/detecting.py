@@ -182,7 +182,7 @@ def detect(
 
 def _from_beside(job: DetectionJob, key: str, wanted: Mapping[str, object]) -> None:
     """Copy what another take of the same folder found in the same video already."""
-    from kinefit.exporters.atomic import writing
+    from kinefit._files import writing
     from kinefit.readers.detections import detections_key
 
     if _fits(detections_key(job.file), key, wanted, job.seconds):

@@ -74,7 +74,7 @@ def video_key(path: Path, rate: float | None, method: str) -> str:
     FileError
         The video cannot be read.
     """
-    from kinefit.readers.image_folders import images_in
+    from kinefit.readers.video import images_in
 
     digest, size = hashlib.sha256(), 0
     images = images_in(path) if path.is_dir() or "*" in path.name else []

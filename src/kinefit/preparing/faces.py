@@ -204,7 +204,7 @@ def _grid(first: int, last: int, every: float) -> list[int]:
 
 
 def _write(heads: Heads, path: Path, key: str) -> None:
-    from kinefit.exporters.atomic import writing
+    from kinefit._files import writing
 
     with writing(path) as temporary:
         np.savez_compressed(

@@ -35,7 +35,7 @@ def hide_in_copies(path: Path, progress: Step | None, tell: Tell) -> list[Path]:
     KinefitError
         As `ensure_faces`, `with_detections`.
     """
-    from kinefit.exporters.atomic import write_text
+    from kinefit._files import write_text
     from kinefit.exporters.motion_file import write_detections
     from kinefit.exporters.pictures.overlay import write_pictures
     from kinefit.readers.detections import detections_key, read_detections

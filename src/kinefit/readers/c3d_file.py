@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import regular
-from kinefit.errors import FileError
+from kinefit._files import read_bytes
+from kinefit.errors import FileError, names_file
 
 _BLOCK_BYTES = 512
 _MAX_WORD = 65535  # what the header's counters hold
@@ -52,22 +52,18 @@ class C3d:
     notes: tuple[str, ...] = ()
 
 
+@names_file
 def read_c3d(path: Path) -> C3d:
     """Read the points and all parameters; raises FileError for a damaged, truncated or contradictory file."""
-    try:
-        raw = regular(path).read_bytes()
-    except FileNotFoundError as error:
-        raise FileError("no such file", file=path) from error
-    except OSError as error:
-        raise FileError(f"cannot be read ({error})", file=path) from error
+    raw = read_bytes(path)
     if len(raw) < 2 * _BLOCK_BYTES or raw[1] != 0x50 or raw[0] == 0:
-        raise FileError(f"not a C3D file ({len(raw)} bytes)", file=path, remedy="Name a C3D file of your system.")
+        raise FileError(f"not a C3D file ({len(raw)} bytes)", remedy="Name a C3D file of your system.")
     section = (raw[0] - 1) * _BLOCK_BYTES
     processor = _PROCESSORS.get(raw[section + 3]) if section + 4 <= len(raw) else None
     if processor is None:
-        raise FileError("it points to no parameter section", file=path, place="header", remedy=_REMEDY)
-    parameters = _read_parameters(raw, section, processor, path)
-    return _read_points(raw, processor, parameters, path)
+        raise FileError("it points to no parameter section", place="header", remedy=_REMEDY)
+    parameters = _read_parameters(raw, section, processor)
+    return _read_points(raw, processor, parameters)
 
 
 def _numbers(raw: bytes, kind: int, processor: str) -> NDArray:
@@ -84,7 +80,7 @@ def _numbers(raw: bytes, kind: int, processor: str) -> NDArray:
     return np.where(bits & 0x7F800000, bits.view(np.float32) / 4, np.float32(0)).astype(np.float32)
 
 
-def _read_parameters(raw: bytes, section: int, processor: str, path: Path) -> dict[str, Values]:
+def _read_parameters(raw: bytes, section: int, processor: str) -> dict[str, Values]:
     groups: dict[int, str] = {}
     records: list[tuple[int, str, bytes]] = []
     data_start = (int(np.frombuffer(raw[16:18], ">u2" if processor == "mips" else "<u2")[0]) - 1) * _BLOCK_BYTES
@@ -97,15 +93,13 @@ def _read_parameters(raw: bytes, section: int, processor: str, path: Path) -> di
         if group == 0:
             break
         if pointer + 2 > end:
-            raise FileError("a parameter extends beyond its section", file=path, place=f"after {last}", remedy=_REMEDY)
+            raise FileError("a parameter extends beyond its section", place=f"after {last}", remedy=_REMEDY)
         name = raw[at + 2 : pointer].decode("latin-1").strip().upper()
         offset = int.from_bytes(raw[pointer : pointer + 2], "big" if processor == "mips" else "little")
         following = pointer + offset
         if not name.isprintable() or (offset and (offset < 3 or following > end)):
-            raise FileError(
-                f"the record of parameter {name!r} points {offset} bytes ahead, outside its section", file=path,
-                place=f"after {last}", remedy=_REMEDY,
-            )
+            problem = f"the record of parameter {name!r} points {offset} bytes ahead, outside its section"
+            raise FileError(problem, place=f"after {last}", remedy=_REMEDY)
         if group < 0:
             groups[-group] = name
         else:
@@ -117,22 +111,22 @@ def _read_parameters(raw: bytes, section: int, processor: str, path: Path) -> di
     parameters = {}
     for group, name, record in records:
         key = f"{groups.get(group, group)}:{name}"
-        parameters[key] = _values(record, processor, key, path)
+        parameters[key] = _values(record, processor, key)
     return parameters
 
 
-def _values(record: bytes, processor: str, key: str, path: Path) -> Values:
+def _values(record: bytes, processor: str, key: str) -> Values:
     kind, rank = (int(np.frombuffer(record[:1], np.int8)[0]), record[1]) if len(record) > 1 else (0, 0)
     shape = tuple(record[2 : 2 + rank])
     size = _SIZES.get(kind, 0) * int(np.prod(shape, dtype=object)) if rank else _SIZES.get(kind, 0)
     data = record[2 + rank : 2 + rank + size]
     if kind not in _SIZES or len(shape) < rank or len(data) < size:
-        raise FileError("is longer than its record, or its type is unknown", file=path, place=key, remedy=_REMEDY)
+        raise FileError("is longer than its record, or its type is unknown", place=key, remedy=_REMEDY)
     if kind != -1:
         try:
             return _numbers(data, kind, processor).reshape(shape, order="F")
         except ValueError as error:  # no numbers, in impossible dimensions
-            raise FileError(f"impossible dimensions ({error})", file=path, place=key, remedy=_REMEDY) from error
+            raise FileError(f"impossible dimensions ({error})", place=key, remedy=_REMEDY) from error
     width = shape[0] if shape else 1
     cells = [data[i : i + width] for i in range(0, size, width)] if size else []
     return [_text(cell) for cell in cells]
@@ -156,7 +150,7 @@ def _stated(parameters: dict[str, Values], key: str) -> float:
     return value if np.isfinite(value) else 0.0
 
 
-def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path: Path) -> C3d:
+def _read_points(raw: bytes, processor: str, parameters: dict[str, Values]) -> C3d:
     word = "<u2" if processor != "mips" else ">u2"
     count, analog, first, last, _, _, _, start, samples = (int(v) for v in np.frombuffer(raw[2:20], word))
     header_scale, rate = (float(_numbers(raw[at : at + 4], 4, processor)[0]) for at in (12, 20))
@@ -165,16 +159,16 @@ def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path
     if header_scale * scale < 0 or (_differ(header_scale, scale) and scale > 0):
         raise FileError(
             f"the header's scale is {header_scale:g}, POINT:SCALE is {scale:g} (negative: the data are floats, "
-            "positive: integers to be multiplied by it)", file=path, place="header, POINT:SCALE", remedy=_REMEDY,
+            "positive: integers to be multiplied by it)", place="header, POINT:SCALE", remedy=_REMEDY,
         )  # fmt: skip
     if _differ(header_scale, scale):
         notes.append(f"the header's scale of residuals is {-header_scale:g}, POINT:SCALE's {-scale:g} counts")
-    rate = _rate(rate, samples if analog else 0, parameters, path, notes)
+    rate = _rate(rate, samples if analog else 0, parameters, notes)
     points_used = _number(parameters, "POINT:USED")
     if points_used is not None and int(points_used) % 65536 != count:
-        raise FileError(f"{count} points, POINT:USED says {points_used:.0f}", file=path, place="header", remedy=_REMEDY)
+        raise FileError(f"{count} points, POINT:USED says {points_used:.0f}", place="header", remedy=_REMEDY)
     if not (np.isfinite(scale) and scale != 0 and np.isfinite(rate) and rate > 0):
-        raise FileError(f"scale {scale:g}, rate {rate:g} Hz", file=path, place="header", remedy=_REMEDY)
+        raise FileError(f"scale {scale:g}, rate {rate:g} Hz", place="header", remedy=_REMEDY)
     width = 4 if scale < 0 else 2
 
     def spare(start: int, analog: int) -> int:
@@ -191,7 +185,7 @@ def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path
         listed = " or ".join(f"{a} analog values a frame from block {s} on" for s, a in layouts)
         raise FileError(
             f"header, ANALOG and POINT:DATA_START contradict each other: {listed}; the file's length fits "
-            f"{len(exact) or 'none'} of them", file=path, place="header", remedy=_REMEDY,
+            f"{len(exact) or 'none'} of them", place="header", remedy=_REMEDY,
         )  # fmt: skip
     if exact and exact[0] != layouts[0]:
         start, analog = exact[0]
@@ -205,12 +199,10 @@ def _read_points(raw: bytes, processor: str, parameters: dict[str, Values], path
     room = (len(raw) - begin) // step if step and start > 1 else 0
     frames = _count(parameters, first, last, room)
     if count == 0 or frames <= 0:
-        raise FileError(f"{max(frames, 0)} frames of {count} points: no markers in this file", file=path)
+        raise FileError(f"{max(frames, 0)} frames of {count} points: no markers in this file")
     if frames > room:
-        raise FileError(
-            f"the file is truncated: {max(room, 0)} of {frames} frames can be read", file=path,
-            remedy="Copy or export it again.",
-        )
+        problem = f"the file is truncated: {max(room, 0)} of {frames} frames can be read"
+        raise FileError(problem, remedy="Copy or export it again.")
     if (room - frames) * step >= _BLOCK_BYTES:
         notes.append(f"{room - frames} more frames have room in the file, which states {frames}")
     data = np.frombuffer(raw, np.uint8, frames * step, begin).reshape(frames, step)
@@ -252,7 +244,7 @@ def _differ(a: float, b: float) -> bool:
     return bool(a and b and abs(abs(a / b) - 1.0) > _MAX_RATIO_ERROR)
 
 
-def _rate(header: float, samples: int, parameters: dict[str, Values], path: Path, notes: list[str]) -> float:
+def _rate(header: float, samples: int, parameters: dict[str, Values], notes: list[str]) -> float:
     """Rate [Hz] of the points: POINT:RATE, or the header's if the analog rate supports that alone."""
     rate = _number(parameters, "POINT:RATE") or header
     if not _differ(header, rate):
@@ -261,7 +253,7 @@ def _rate(header: float, samples: int, parameters: dict[str, Values], path: Path
     supported = [r for r in (header, rate) if analog and not _differ(r, analog)]
     what = f"the header's rate is {header:g} Hz, POINT:RATE is {rate:g} Hz"
     if len(supported) != 1:
-        raise FileError(what, file=path, place="header, POINT:RATE", remedy=f"Correct the wrong one. {_REMEDY}")
+        raise FileError(what, place="header, POINT:RATE", remedy=f"Correct the wrong one. {_REMEDY}")
     notes.append(f"{what}: {supported[0]:g} Hz counts, which {samples} analog samples a frame support")
     return supported[0]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from dataclasses import replace
 from os import PathLike
@@ -14,12 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit._files import no_column, read_npy, regular
-from kinefit.errors import FileError, ObservationError, check_choice, choices
+from kinefit._files import read_bytes, read_npy, read_table
+from kinefit.errors import FileError, ObservationError, check_choice, choices, names_file
 from kinefit.observations import Keypoints
 from kinefit.readers import keypoint_sets
-from kinefit.readers.keypoint_arrays import FACE_POINTS, cut_frames, face_mesh, in_right_order, keypoint_record
-from kinefit.readers.keypoint_sets import HAND_POINTS, KEYPOINT_SETS, MEDIAPIPE_SETS, OPENPOSE_HANDS, keypoint_names
+from kinefit.readers.keypoint_sets import (
+    FACE_POINTS,
+    HAND_POINTS,
+    KEYPOINT_SETS,
+    MEDIAPIPE_SETS,
+    OPENPOSE_HANDS,
+    cut_frames,
+    face_mesh,
+    in_right_order,
+    keypoint_names,
+    keypoint_record,
+)
 
 if TYPE_CHECKING:
     from kinefit.geometry.camera import ImageFrame
@@ -49,6 +58,7 @@ decode_openpose = msgspec.json.Decoder(_OpenPoseFrame).decode
 
 
 @checked
+@names_file
 def read_openpose(
     folder: str | PathLike[str], *, camera: str, rate: float, keypoint_set: str | None = None,
     frames: tuple[int, int] | None = None, time_offset: float = 0.0, image_frame: ImageFrame | None = None,
@@ -93,7 +103,7 @@ def read_openpose(
     people = [_numbers(persons, path, named) for persons, path in zip(read, paths, strict=True)]
     if folder.is_dir() and not any(map(len, people)):
         raise ObservationError(
-            f"no person is detected in any of the {len(paths)} frames of camera {camera}", file=folder,
+            f"no person is detected in any of the {len(paths)} frames of camera {camera}",
             remedy="Check that the detector ran on this camera's video, or remove this camera.",
         )
     data = np.zeros((len(people), max(map(len, people)), len(names), 3))
@@ -104,6 +114,7 @@ def read_openpose(
 
 
 @checked
+@names_file
 def read_mediapipe(
     path: str | PathLike[str], *, camera: str, rate: float, frames: tuple[int, int] | None = None,
     time_offset: float = 0.0, image_frame: ImageFrame | None = None,
@@ -134,7 +145,7 @@ def read_mediapipe(
     sets |= dict.fromkeys(((n, 3) for n in FACE_POINTS), "MEDIAPIPE_478")
     if data.dtype.kind not in "fiu" or data.shape[1:] not in sets:
         remedy = "Give x, y [px], visibility: (frames, 33, 3), with hands (frames, 75, 3), of a face (frames, 478, 3)."
-        raise ObservationError(f"landmarks have shape {data.shape}", file=path, remedy=remedy)
+        raise ObservationError(f"landmarks have shape {data.shape}", remedy=remedy)
     data, start = cut_frames(data, frames, path)
     data, keypoint_set = np.array(data, dtype=float), sets[data.shape[1:]]
     names = KEYPOINT_SETS[keypoint_set]
@@ -143,15 +154,13 @@ def read_mediapipe(
         part[np.isnan(part).all(axis=(1, 2))] = 0
     if not np.isfinite(data).all():
         frame, point, _ = np.argwhere(~np.isfinite(data))[0]
-        raise ObservationError(
-            f"NaN or infinity at {names[point]}", file=path, place=f"frame {start + frame}",
-            remedy="A frame without a person must be all NaN (or zero).",
-        )
+        remedy = "A frame without a person must be all NaN (or zero)."
+        raise ObservationError(f"NaN or infinity at {names[point]}", place=f"frame {start + frame}", remedy=remedy)
     if keypoint_set == "MEDIAPIPE_478":
         data = face_mesh(data)
     if not data[..., 2].any():
         raise ObservationError(
-            f"no person is detected in any of the {len(data)} frames of camera {camera}", file=path,
+            f"no person is detected in any of the {len(data)} frames of camera {camera}",
             remedy="Check that the detector ran on this camera's video, or remove this camera.",
         )
     return keypoint_record(data[:, None], camera, keypoint_set, rate, time_offset, start, path, image_frame)
@@ -162,6 +171,7 @@ _GAPS, _PORTS = 20, 100  # indices for each that is there, and cameras, beyond w
 
 
 @checked
+@names_file
 def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) -> dict[str, Keypoints]:
     """Read MediaPipe's landmarks of all cameras from a table of caliscope (pyxy3d): xy_*.csv.
 
@@ -187,26 +197,16 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
     """
     path, pose = Path(path), len(KEYPOINT_SETS["MEDIAPIPE_33"])
     columns = ("sync_index", "port", "frame_time", "point_id", "img_loc_x", "img_loc_y")
-    try:
-        with regular(path).open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            if missing := [c for c in columns if c not in (reader.fieldnames or ())]:
-                needed = f"Needed: {', '.join(columns)}."
-                raise ObservationError(no_column(missing, reader.fieldnames), file=path, remedy=needed)
-            table = np.array([[row[c] for c in columns] for row in reader], dtype=float).reshape(-1, len(columns))
-    except FileNotFoundError as error:
-        raise FileError("no such file", file=path, remedy="Check the path.") from error
-    except (OSError, ValueError, TypeError, csv.Error) as error:
-        raise ObservationError(f"a cell is not a number ({error})", file=path, remedy="Export it again.") from error
+    table = read_table(path, columns, f"Export it again, with {', '.join(columns)}.")[1]
     right, left = (np.isin(table[:, 3], begin + np.arange(HAND_POINTS)) for begin in _CALISCOPE_HANDS)
     table = table[((table[:, 3] < pose) | right | left) & np.isfinite(table).all(axis=1)]
     if not len(table):
-        raise ObservationError("no landmark of the body in this table", file=path, remedy="Track the whole pose.")
+        raise ObservationError("no landmark of the body in this table", remedy="Track the whole pose.")
     numbers = table[:, (0, 1, 3)]
     if (wrong := (numbers < 0) | (numbers > 2**31) | (numbers % 1 != 0)).any():
         row, k = np.argwhere(wrong)[0]
         problem = f"{('sync_index', 'port', 'point_id')[k]} = {numbers[row, k]:g}"
-        raise ObservationError(problem, file=path, remedy="They are whole numbers from 0 on: export the table again.")
+        raise ObservationError(problem, remedy="They are whole numbers from 0 on: export the table again.")
     frame, port, point = numbers.astype(int).T
     keypoint_set = MEDIAPIPE_SETS[int(point.max() >= pose)]
     for k, begin in enumerate(_CALISCOPE_HANDS):  # the left hand comes first in the set
@@ -214,7 +214,7 @@ def read_caliscope_csv(path: str | PathLike[str], *, rate: float | None = None) 
     frame = frame - frame.min()
     if frame.max() > _GAPS * len(np.unique(frame)) + 1000 or len(np.unique(port)) > _PORTS:
         problem = f"{len(np.unique(frame))} frames of {len(np.unique(port))} ports in {frame.max() + 1} of sync_index"
-        raise ObservationError(problem, file=path, remedy="Indices follow each other: export the table again.")
+        raise ObservationError(problem, remedy="Indices follow each other: export the table again.")
     if rate is None:
         first = port == port[0]
         _, at = np.unique(frame[first], return_index=True)
@@ -255,13 +255,14 @@ def read_keypoints(path: str | PathLike[str], *, format: str | None = None, **op
     return reader(path, **options)
 
 
+@names_file
 def _caliscope_camera(
     path: Path, *, camera: str, rate: float, time_offset: float = 0.0, image_frame: ImageFrame | None = None
 ) -> Keypoints:
     ports, numbers = read_caliscope_csv(path, rate=rate), re.findall(r"\d+", camera)
     port = ports.get(f"cam_{int(numbers[-1][-18:])}" if numbers else "")
     if port is None:
-        raise ObservationError(choices("camera in this table named", camera, ports), file=path)
+        raise ObservationError(choices("camera in this table named", camera, ports))
     points = port.points if image_frame is None else image_frame.to_calibration(port.points)
     return replace(port, camera=camera, points=points, time_offset=time_offset)
 
@@ -272,7 +273,7 @@ def _numbered_files(folder: Path) -> list[Path]:
         return [folder]
     if not folder.is_dir():
         remedy = 'Name the folder, not one of its files; .npy files are of format = "mediapipe", .csv of "caliscope".'
-        raise FileError("no such folder of json files", file=folder, remedy=remedy)
+        raise FileError("no such folder of json files", remedy=remedy)
     numbered: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() != ".json":
@@ -283,21 +284,19 @@ def _numbered_files(folder: Path) -> list[Path]:
             raise ObservationError("no frame number in this name", file=path, remedy="Expected NAME_0012.json.")
         number = int(match[1])
         if number in numbered:
-            raise ObservationError(
-                f"frame {number} appears twice, also as {numbered[number].name}", file=path,
-                remedy="Keep one camera in each folder.",
-            )
+            problem = f"frame {number} appears twice, also as {numbered[number].name}"
+            raise ObservationError(problem, file=path, remedy="Keep one camera in each folder.")
         numbered[number] = path
     if not numbered:
         remedy = "Name the folder that the detector wrote for this camera."
-        raise FileError("there are no json files in this folder", file=folder, remedy=remedy)
+        raise FileError("there are no json files in this folder", remedy=remedy)
     first, last = min(numbered), max(numbered)
     count = last - first + 1 - len(numbered)
     if count:
         missing = next(i for i in range(first, last) if i not in numbered)
         before = numbered[missing - 1]
         raise ObservationError(
-            f"{count} of the frames {first} to {last} are missing, the first is {missing}", file=folder,
+            f"{count} of the frames {first} to {last} are missing, the first is {missing}",
             place=f"after {before.name}", remedy="Run the detector again with one file per frame, also for empty ones.",
         )
     return [numbered[i] for i in range(first, last + 1)]
@@ -305,7 +304,7 @@ def _numbered_files(folder: Path) -> list[Path]:
 
 def _read_people(path: Path) -> list[OpenPosePerson]:
     """All people of one frame."""
-    raw = regular(path).read_bytes()
+    raw = read_bytes(path)
     try:
         return decode_openpose(raw).people
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit._files import regular
-from kinefit.errors import FileError, ObservationError, choices, shortened
+from kinefit._files import metres_of, read_bytes
+from kinefit.errors import FileError, ObservationError, names_file, shortened
 from kinefit.observations import MarkerEvent, Markers
 from kinefit.readers.c3d_file import C3d, read_c3d
-from kinefit.readers.units import LENGTHS, worth
 
 _MAX_NEAR_ORIGIN = 0.01  # [m] from the origin, of a person in metres that are read as millimetres
 _COMPUTED_POINTS = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  # of a C3D: no positions
@@ -30,6 +29,7 @@ _TRC_REMEDY = "Expected: PathFileType, names and values of DataRate NumFrames Nu
 
 
 @checked
+@names_file
 def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Markers:
     """Read a C3D or TRC file; its content decides which.
 
@@ -54,30 +54,18 @@ def read_markers(path: str | PathLike[str], *, unit: str | None = None) -> Marke
         No or unknown unit, or two in one file; no marker, or none visible in any frame; a rate that contradicts the
         times.
     """
-    path = Path(path)
-    try:
-        with regular(path).open("rb") as file:
-            head = file.read(64)
-    except FileNotFoundError as error:
-        raise FileError("no such file", file=path) from error
-    except OSError as error:
-        remedy = "Give a .c3d or .trc file."
-        raise FileError(f"cannot be read ({error.strerror})", file=path, remedy=remedy) from error
+    path, head = Path(path), read_bytes(Path(path), 64)
     if head[1:2] == b"\x50" or path.suffix.lower() == ".c3d":
-        return _of_one_unit(_markers_of_c3d(read_c3d(path), path, unit), path)
+        return _of_one_unit(_markers_of_c3d(read_c3d(path), path, unit))
     if head.lstrip(b"\xef\xbb\xbf \t\r\n").lower().startswith(b"pathfiletype") or path.suffix.lower() == ".trc":
-        return _of_one_unit(_read_trc(path, unit), path)
-    raise FileError("neither C3D nor TRC", file=path, remedy="Markers are read from .c3d and .trc files.")
+        return _of_one_unit(_read_trc(path, unit))
+    raise FileError("neither C3D nor TRC", remedy="Markers are read from .c3d and .trc files.")
 
 
-def _metres(unit: str | None, path: Path) -> float:
+def _metres(unit: str | None) -> float:
     if not unit:
-        raise ObservationError("the file states no unit", file=path, place="units", remedy=_STATE)
-    metres = worth(unit, LENGTHS)
-    if metres is None:
-        problem = choices("unit", unit, LENGTHS)
-        raise ObservationError(problem, file=path, place="units", remedy=_STATE)
-    return metres
+        raise ObservationError("the file states no unit", place="units", remedy=_STATE)
+    return metres_of(unit, ObservationError, place="units", remedy=_STATE)
 
 
 def _unique(names: list[str]) -> tuple[str, ...]:
@@ -94,13 +82,13 @@ def _unique(names: list[str]) -> tuple[str, ...]:
     return tuple(unique)
 
 
-def _unseen(markers: int, frames: int, path: Path) -> ObservationError:
+def _unseen(markers: int, frames: int) -> ObservationError:
     problem = f"none of the {markers} markers is visible in any of the {frames} frames"
     remedy = "Export it again with its trajectories, or choose another trial."
-    return ObservationError(problem, file=path, remedy=remedy)
+    return ObservationError(problem, remedy=remedy)
 
 
-def _of_one_unit(markers: Markers, path: Path) -> Markers:
+def _of_one_unit(markers: Markers) -> Markers:
     """The markers; raises ObservationError if three to half of them stay near the origin: these have another unit."""
     away = np.nan_to_num(np.linalg.norm(markers.positions, axis=-1)).max(axis=0)
     near = [name for name, far in zip(markers.names, away, strict=True) if 0 < far < _MAX_NEAR_ORIGIN]
@@ -108,8 +96,7 @@ def _of_one_unit(markers: Markers, path: Path) -> Markers:
         listed = ", ".join(near[:4]) + (" ..." if len(near) > 4 else "")
         raise ObservationError(
             f"{len(near)} of {len(away)} markers stay within {1e3 * _MAX_NEAR_ORIGIN:.0f} mm of the origin ({listed}), "
-            f"others go {away.max():.3g} m away: two units in one file",
-            file=path, remedy="Export all markers in one unit.",
+            f"others go {away.max():.3g} m away: two units in one file", remedy="Export all markers in one unit.",
         )
     return markers
 
@@ -131,12 +118,12 @@ def _markers_of_c3d(c3d: C3d, path: Path, unit: str | None) -> Markers:
     computed = {name for kind in _COMPUTED_POINTS for name in _texts(c3d, f"POINT:{kind}")} - {""}
     keep = [i for i, label in enumerate(labels) if label not in computed]
     if not keep:
-        raise ObservationError("all points of this file are computed quantities, none is a marker", file=path)
+        raise ObservationError("all points of this file are computed quantities, none is a marker")
     screen = "".join(_texts(c3d, "POINT:Y_SCREEN")[:1]).strip().lower().removeprefix("+")
     unit = unit or next(iter(_texts(c3d, "POINT:UNITS")), None)
-    metres = _metres(unit, path)
+    metres = _metres(unit)
     if c3d.missing[:, keep].all():
-        raise _unseen(len(keep), len(c3d.points), path)
+        raise _unseen(len(keep), len(c3d.points))
     positions = np.where(c3d.missing[..., None], np.nan, c3d.points) * metres
     return Markers(
         tuple(_unique(labels)[i] for i in keep), c3d.rate, positions[:, keep], residual=c3d.residual[:, keep] * metres,
@@ -160,40 +147,36 @@ def _events(c3d: C3d) -> tuple[MarkerEvent, ...]:
 
 
 def _read_trc(path: Path, unit: str | None) -> Markers:
-    text = regular(path).read_bytes().decode("utf-8-sig", errors="replace")
+    text = read_bytes(path).decode("utf-8-sig", errors="replace")
     lines = text.splitlines()
     if len(lines) < 5 or not lines[0].lstrip().lower().startswith("pathfiletype"):
-        raise FileError("not a TRC file", file=path, place="line 1", remedy=_TRC_REMEDY)
+        raise FileError("not a TRC file", place="line 1", remedy=_TRC_REMEDY)
     header = dict(zip(map(str.lower, lines[1].split()), lines[2].split(), strict=False))
     try:
         rate, stated = float(header["datarate"]), int(float(header["numframes"]))
         count = int(float(header["nummarkers"]))
     except (KeyError, ValueError, OverflowError) as error:
         problem = f"DataRate, NumFrames or NumMarkers is missing or not a number ({error})"
-        raise FileError(problem, file=path, place="line 3", remedy=_TRC_REMEDY) from error
+        raise FileError(problem, place="line 3", remedy=_TRC_REMEDY) from error
     if not 0 < rate < np.inf:
-        raise FileError(f"rate {rate:g} Hz", file=path, place="line 3", remedy="Correct DataRate.")
+        raise FileError(f"rate {rate:g} Hz", place="line 3", remedy="Correct DataRate.")
     if not 0 <= count <= len(text) or stated < 0:  # a cell takes a character at least
-        raise FileError(f"{count} markers in {stated} frames", file=path, place="line 3", remedy="Correct NumMarkers.")
-    names = _trc_names(lines, count, path)
-    metres = _metres(unit or header.get("units"), path)
-    frames, times, rows = _trc_rows(lines, text.endswith(("\n", "\r")), len(names), path)
-    steps, rate, notes = _trc_clock(frames, times, rate, path)
+        raise FileError(f"{count} markers in {stated} frames", place="line 3", remedy="Correct NumMarkers.")
+    names = _trc_names(lines, count)
+    metres = _metres(unit or header.get("units"))
+    frames, times, rows = _trc_rows(lines, text.endswith(("\n", "\r")), len(names))
+    steps, rate, notes = _trc_clock(frames, times, rate)
     if len(steps) and steps[-1] + 1 < stated - 1:  # some writers count one too many
-        raise FileError(
-            f"the file is truncated: {len(frames)} of {stated} frames can be read", file=path,
-            remedy="Copy or export it again; or, if it is complete, correct NumFrames in line 3.",
-        )
+        problem = f"the file is truncated: {len(frames)} of {stated} frames can be read"
+        raise FileError(problem, remedy="Copy or export it again; or, if it is complete, correct NumFrames in line 3.")
     if not names or not len(frames):
-        raise ObservationError(
-            f"{len(frames)} frames of {len(names)} markers: nothing in this file", file=path,
-            remedy="Export it again, or choose another trial.",
-        )
+        problem = f"{len(frames)} frames of {len(names)} markers: nothing in this file"
+        raise ObservationError(problem, remedy="Export it again, or choose another trial.")
     positions = np.full((int(steps[-1]) + 1, len(names), 3), np.nan)
     positions[steps] = rows
     missing = ~positions.any(axis=-1) | ~np.isfinite(positions).all(axis=-1)
     if missing.all():
-        raise _unseen(len(names), len(frames), path)
+        raise _unseen(len(names), len(frames))
     return Markers(
         _unique(names), rate, np.where(missing[..., None], np.nan, positions * metres), first_frame=int(frames[0]),
         source=str(path), unit=str(unit or header.get("units")).strip().lower(), first_time=float(times[0]),
@@ -205,7 +188,7 @@ def _cells(line: str) -> list[str]:
     return [cell.strip() for cell in line.split("\t")] if "\t" in line else line.split()
 
 
-def _trc_names(lines: list[str], count: int, path: Path) -> list[str]:
+def _trc_names(lines: list[str], count: int) -> list[str]:
     """Names of the markers by the columns that they stand above, "" for one without; a name of three axes once."""
     cells = _cells(lines[3])
     filled = [k for k, cell in enumerate(cells) if cell][2:]
@@ -227,13 +210,13 @@ def _trc_names(lines: list[str], count: int, path: Path) -> list[str]:
             return [named.get(slot, "") for slot in range(wide)]
     if len(names) < count:
         raise FileError(
-            f"{len(names)} names for {count} markers, and not above their columns", file=path, place="line 4",
+            f"{len(names)} names for {count} markers, and not above their columns", place="line 4",
             remedy="Write each name above the first of its three columns, with tabs between the columns.",
         )  # fmt: skip
     return names
 
 
-def _trc_clock(numbers: NDArray, times: NDArray, rate: float, path: Path) -> tuple[NDArray, float, list[str]]:
+def _trc_clock(numbers: NDArray, times: NDArray, rate: float) -> tuple[NDArray, float, list[str]]:
     """Frame (F,) of each row, from 0; the rate [Hz] of the times; notes on missing rows and contradictions."""
     rows = np.arange(len(times))
     if len(times) < 3:
@@ -260,10 +243,8 @@ def _trc_clock(numbers: NDArray, times: NDArray, rate: float, path: Path) -> tup
     trials += [(f, measured(f), limit) for f in (rows, numbered) if abs(measured(f) / rate - 1.0) < _MAX_RATE_ERROR]
     frames, found = next(((f, r) for f, r, most in trials if jitter(f, r) <= most), (rows, np.nan))
     if np.isnan(found):
-        raise ObservationError(
-            f"DataRate {rate:g} Hz, but the {len(times)} rows go from {times[0]:g} to {times[-1]:g} s", file=path,
-            place="line 3", remedy="Correct DataRate or the times.",
-        )
+        problem = f"DataRate {rate:g} Hz, but the {len(times)} rows go from {times[0]:g} to {times[-1]:g} s"
+        raise ObservationError(problem, place="line 3", remedy="Correct DataRate or the times.")
     own = measured(frames)
     if abs(own / rate - 1.0) > _MIN_RATE_ERROR and jitter(frames, rate) > 4.0 * jitter(frames, own) + rounding:
         found = own
@@ -277,7 +258,7 @@ def _trc_clock(numbers: NDArray, times: NDArray, rate: float, path: Path) -> tup
     return np.round(frames).astype(int), found, notes
 
 
-def _trc_rows(lines: list[str], ended: bool, count: int, path: Path) -> tuple[NDArray, NDArray, NDArray]:
+def _trc_rows(lines: list[str], ended: bool, count: int) -> tuple[NDArray, NDArray, NDArray]:
     """Frame numbers (F,), times (F,) [s] and positions (F, M, 3) in the file's unit; NaN where a cell is empty."""
     width = 2 + 3 * count
     rows: list[list[float]] = []
@@ -293,17 +274,17 @@ def _trc_rows(lines: list[str], ended: bool, count: int, path: Path) -> tuple[ND
             cells += [""] * short  # trailing markers without data
         elif short > 0 and cut:
             problem = f"the file is truncated: {len(rows)} frames can be read"
-            raise FileError(problem, file=path, place=f"line {number}", remedy="Copy or export it again.")
+            raise FileError(problem, place=f"line {number}", remedy="Copy or export it again.")
         elif short:
             problem = f"{len(cells)} cells where {count} markers need {width}"
-            raise FileError(problem, file=path, place=f"line {number}", remedy=_TRC_REMEDY)
+            raise FileError(problem, place=f"line {number}", remedy=_TRC_REMEDY)
         try:
             rows.append([float(cell or "nan") for cell in cells])
         except ValueError as error:
             remedy = "Leave the cells of a marker empty where it is not seen."
             problem = f"a cell is not a number ({shortened(str(error), 120)})"
-            raise FileError(problem, file=path, place=f"line {number}", remedy=remedy) from error
+            raise FileError(problem, place=f"line {number}", remedy=remedy) from error
     table = np.array(rows, dtype=float).reshape(len(rows), width)
     if not np.isfinite(table[:, :2]).all():
-        raise FileError("a row without frame number or time", file=path, remedy=_TRC_REMEDY)
+        raise FileError("a row without frame number or time", remedy=_TRC_REMEDY)
     return table[:, 0], table[:, 1], table[:, 2:].reshape(len(rows), count, 3)

@@ -21,7 +21,7 @@ from kinefit.multiview.people import PersonTrack
 from kinefit.observations import DepthFrame
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
-from kinefit.readers.take.pictures import TakePictures
+from kinefit.readers.take.videos import TakePictures
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.foot_contacts import FloorPlane
 from kinefit.tracking.recording import Recording

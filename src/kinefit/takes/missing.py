@@ -21,7 +21,7 @@ from kinefit.errors import KinefitError
 from kinefit.preparing.each_video import Step, Tell
 from kinefit.preparing.faces import ensure_faces
 from kinefit.preparing.take import warn, with_detections
-from kinefit.readers.calibration.found import FoundCameras, read_found, write_found
+from kinefit.readers.calibration.read import FoundCameras, read_found, write_found
 from kinefit.readers.sound import sound_offsets
 from kinefit.readers.take.cameras import DEFAULT_FIELD_OF_VIEW, is_uncalibrated
 from kinefit.readers.take.entries import CalibrationEntry

@@ -14,7 +14,7 @@ from kinefit.diagnostics.quick import input_findings, with_cause, with_findings
 from kinefit.errors import KinefitError, TakeError, command
 from kinefit.identification.take.takes import with_names
 from kinefit.motion import Motion
-from kinefit.readers.calibration.found import found_notes
+from kinefit.readers.calibration.read import found_notes
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.checks import check_enough
 from kinefit.readers.take.file import Take, read_take

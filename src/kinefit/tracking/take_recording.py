@@ -35,7 +35,7 @@ from kinefit.readers.take.cameras import is_level
 from kinefit.readers.take.entries import sensor_name
 from kinefit.readers.take.file import Take
 from kinefit.readers.take.load import Observations
-from kinefit.readers.take.stereo import load_stereo, stereo_sigma
+from kinefit.readers.take.videos import load_stereo, stereo_sigma
 from kinefit.sensors.base import Sensor
 from kinefit.sensors.points.body_trackers import BodyTrackerSensor
 from kinefit.sensors.settings import TrackSettings

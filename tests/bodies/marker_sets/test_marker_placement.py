@@ -14,7 +14,7 @@ from kinefit.bodies.marker_sets import (
     placement,
     subject_of,
 )
-from kinefit.bodies.marker_sets.files import catalogue
+from kinefit.bodies.marker_sets.sets import catalogue
 from kinefit.errors import FileError, ObservationError
 
 BODY = load_body("humanoid")

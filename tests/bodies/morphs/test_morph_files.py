@@ -9,11 +9,11 @@ import pytest
 from kinefit.bodies import BodyState, load_body, parse_body, save_body
 from kinefit.bodies.morphs.morph_files import format_morphs
 from kinefit.bodies.morphs.morphing import GlobalMorph, JointMotion, LocalMorph, Morphing, SegmentMorph
-from kinefit.bodies.morphs.steering import Steering
+from kinefit.bodies.morphs.operators import Steering
 from kinefit.bodies.parts import without_part
 from kinefit.bodies.serial import body_from_arrays, body_to_arrays
 from kinefit.bodies.surfaces import SkinnedMesh, body_mesh
-from kinefit.errors import BodyError
+from kinefit.errors import BodyError, ExportError
 
 OWN = """
 [body]
@@ -254,7 +254,7 @@ def test_a_saved_body_is_loaded_by_its_path(tmp_path):
     with pytest.raises(BodyError, match="Call it person.npz"):
         save_body(body, tmp_path / "person.toml")
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(BodyError, match="cannot write the body"):
+    with pytest.raises(ExportError, match="cannot be written"):
         save_body(body, tmp_path / "file" / "person.npz")
     for content in (b"", b"not an archive", (tmp_path / "new" / "person.npz").read_bytes()[:2000]):
         (tmp_path / "spoilt.npz").write_bytes(content)

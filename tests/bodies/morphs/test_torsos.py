@@ -5,8 +5,7 @@ import pytest
 
 from kinefit.bodies import BodyState, load_body
 from kinefit.bodies.morphs.morphing import Morphing
-from kinefit.bodies.morphs.operators import GlobalMorph, LocalMorph
-from kinefit.bodies.morphs.steering import Steering
+from kinefit.bodies.morphs.operators import GlobalMorph, LocalMorph, Steering
 
 BODY = load_body("humanoid_morphing")
 REST = Morphing(BODY, operators=())

@@ -6,7 +6,7 @@ from tests.bodies.surfaces.shapes import ball, box
 
 from kinefit.bodies import load_body
 from kinefit.bodies.surfaces import MeshSurface
-from kinefit.bodies.surfaces.obj import mesh_surface, read_obj
+from kinefit.bodies.surfaces.mesh import mesh_surface, read_obj
 from kinefit.errors import BodyError
 
 V, F = box((0.3, 0.2, 0.1))
@@ -110,8 +110,8 @@ def test_millimetres_taken_for_metres_are_noticed(tmp_path):
     with pytest.raises(BodyError, match='300 m long.*unit = "mm"'):
         mesh_surface(path, 0)
     np.testing.assert_allclose(mesh_surface(path, 0, unit="mm").vertices, V)
-    with pytest.raises(BodyError, match="no unit 'inch'"):
-        mesh_surface(path, 0, unit="inch")
+    with pytest.raises(BodyError, match="no unit 'yard'"):
+        mesh_surface(path, 0, unit="yard")
 
 
 BODY = """

@@ -214,7 +214,7 @@ def test_bad_skins_of_a_file_are_told(arm, tmp_path):
     for shape, unit, message in (
         (flipped(faces), "mm", "skin.obj, skin: .*opposite ways"),
         (faces[:-8], "mm", "skin.obj, skin: .*hole"),
-        (faces, "inch", "no unit 'inch'"),
+        (faces, "yard", "no unit 'yard'"),
         (faces, "m", "m long.*unit"),
     ):
         path = written(tmp_path, arm, x, shape, weights, unit)

@@ -201,7 +201,7 @@ def test_a_model_comes_back_from_its_file(tmp_path):
         np.testing.assert_allclose(mine.turn, theirs.turn, atol=3e-6)
         np.testing.assert_allclose(mine.give, theirs.give, atol=1e-6)
     with pytest.raises(ExportError, match="cannot be written"):
-        save_model(model, tmp_path / "none" / "anna.json")
+        save_model(model, tmp_path / "anna.json" / "anna.json")
     assert [f.name for f in tmp_path.iterdir()] == ["anna.json"]
 
 

@@ -77,15 +77,20 @@ def test_yaml_by_hand_is_read_as_opencv_reads_it(text):
 def test_yaml_that_opencv_cannot_read():
     assert storage_of_yaml("%YAML:1.0\n---\na: null\n") == {"a": None}  # a text to OpenCV 4.11, not to 5.0
     assert storage_of_yaml("a:\n- 1\n- 2\n'b c': x # remark\n") == {"a": [1, 2], "b c": "x"}
+    assert storage_of_yaml("a: |\n  x: 1\n  y\n") == {"a": "x: 1\ny"}
+    assert storage_of_yaml("a: { b:1, c:'d, e:f' } # g:h\n") == {"a": {"b": 1, "c": "d, e:f"}}
     assert storage_of_yaml("a: [ 1, # one\n  2,\n]\r\nb: 1 2 3") == {"a": [1, 2], "b": "1 2 3"}
 
 
 @pytest.mark.parametrize(
     ("text", "told"),
-    [("a: 1\n  b: 2", "line 2: unexpected indentation"), ("a: 1\na: 2", "line 2: the key 'a' appears twice"),
-     ("a: |\n  x", "line 1: a value"), ("a: &b 1", "a value"), ("a: *b", "a value"), ('a: "x', "a value"),
-     ("a: [1, {b: 2]", "a comma or '}' is missing"), ("a: [1", "a comma or"), ("a:\n  b: 1\n c", "line 3: unexpected"),
-     ("x: {1}", "a key with a colon is missing")],
+    [("a: 1\n  b: 2", "line 2: mapping values are not allowed"), ("a: 1\na: 2", "line 2: the key 'a' appears twice"),
+     ("a: *b", "line 1: found undefined alias"), ("a: &b [1]\nc: *b", "an anchor that is used again"),
+     ("a: &b [*b]", "an anchor that is used again"), ('a: "x', "unexpected end of stream"), ("a: - b", "line 1: block"),
+     ("a: [1, {b: 2]", "line 1: did not find expected ',' or '}'"), ("a: [1", "did not find expected"),
+     ("a:\n  b: 1\n c", "line 3: did not find expected key"), ("x: {[1]: 2}", "line 1: the key"),
+     ("a: " + "[" * 5000, "maximum nesting depth"), ("a: " + "[" * 900 + "]" * 900, "nested too deeply"),
+     ("a: \0", "not allowed")],
 )  # fmt: skip
 def test_broken_yaml_is_told_with_its_line(tmp_path, text, told):
     (tmp_path / "a.yml").write_text(f"%YAML:1.0\n{text}\n")
@@ -96,7 +101,7 @@ def test_broken_yaml_is_told_with_its_line(tmp_path, text, told):
 
 @pytest.mark.parametrize(
     ("text", "told"),
-    [("<a>1</a><a>2</a>", "<a> twice"), ("<a>" * 100, "nested too deeply"), ("<a>", "mismatched tag")],
+    [("<a>1</a><a>2</a>", "<a> twice"), ("<a>" * 9000 + "</a>" * 9000, "nested too deeply"), ("<a>", "mismatched tag")],
 )
 def test_broken_xml_is_told(tmp_path, text, told):
     (tmp_path / "a.xml").write_text(f"<opencv_storage>{text}</opencv_storage>")
@@ -111,6 +116,12 @@ def test_entities_are_refused_before_they_are_expanded(tmp_path, monkeypatch):
     monkeypatch.setattr("xml.etree.ElementTree.fromstring", lambda *_: pytest.fail("they would be expanded"))
     with pytest.raises(CalibrationError, match="a document type"):
         read_calibration(tmp_path / "a.xml")
+
+
+def test_anchors_are_refused_before_they_are_expanded():
+    laughs = "l0: &l0 [ha]\n" + "".join(f"l{k + 1}: &l{k + 1} [{', '.join([f'*l{k}'] * 10)}]\n" for k in range(99))
+    with pytest.raises(ValueError, match="line 1: an anchor"):
+        storage_of_yaml(laughs)
 
 
 def operations(function, *arguments):

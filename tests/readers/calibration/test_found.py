@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import FileError, KinefitError
-from kinefit.readers.calibration.found import FoundCameras, read_found, write_found
-from kinefit.readers.calibration.read import read_calibration, write_calibration
+from kinefit.readers.calibration.read import FoundCameras, read_calibration, read_found, write_calibration, write_found
 from kinefit.simulation import studio_rig
 
 

@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from kinefit.cli import main
-from kinefit.readers.guess.lens import field_of_view, stated_focal_length
+from kinefit.readers.guess.cameras import field_of_view, stated_focal_length
 from kinefit.readers.take.file import read_take
 
 KEY = "com.apple.quicktime.camera.focal_length.35mm_equivalent"

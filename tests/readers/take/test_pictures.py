@@ -7,7 +7,7 @@ from tests.readers.two_people import COUNT, write_take
 
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
-from kinefit.readers.take.pictures import TakePictures
+from kinefit.readers.take.videos import TakePictures
 
 
 @pytest.fixture

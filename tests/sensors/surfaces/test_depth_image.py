@@ -11,7 +11,7 @@ from tests.tracking.movements import BODY, SENSOR, a_motion, a_rig, images, turn
 
 from kinefit.bodies import load_body
 from kinefit.bodies.morphs.morphing import JointMotion, Morphing
-from kinefit.bodies.morphs.steering import Steering
+from kinefit.bodies.morphs.operators import Steering
 from kinefit.correspondences import depth_image_rows, free_space_rows, surface_rows
 from kinefit.correspondences.occupancy.free_space import FreeSpace
 from kinefit.errors import BodyError, ObservationError

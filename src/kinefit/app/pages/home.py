@@ -8,13 +8,13 @@ from typing import Any
 
 from nicegui import ui
 
+from kinefit._files import writing
 from kinefit.app.desk import Desk
 from kinefit.app.folders import subfolders, takes_below, video_files
 from kinefit.app.pages.shell import card, in_thread, link, shell, short, show_error, texts
 from kinefit.app.pages.take import use_folder
 from kinefit.app.texts import Texts
 from kinefit.errors import KinefitError, printable
-from kinefit.exporters.atomic import writing
 
 _MAX_UPLOAD_BYTES = 2**30  # of a dropped video; larger ones are opened where they are
 _MAX_NAMES = 6  # of videos that are listed

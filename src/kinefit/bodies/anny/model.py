@@ -19,11 +19,10 @@ from kinefit._jit import cache_directory
 from kinefit.bodies.anny.files import FACTORS, AnnyData, read_anny
 from kinefit.bodies.body import Body
 from kinefit.bodies.morphs.morphing import Morphing
-from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces import SkinnedMesh, TaperedCylinder
 from kinefit.bodies.surfaces.skins.skinning import strongest
 from kinefit.bodies.toml.bodies import read_toml_body
-from kinefit.bodies.tree import KinematicTree
+from kinefit.bodies.tree import BodyState, KinematicTree
 from kinefit.errors import BodyError, check_choice
 from kinefit.geometry import se3
 

@@ -1,7 +1,5 @@
 """The catalogue of marker sets: labels, segments, positions on a body; and the matching of labels."""
 
-from kinefit.bodies.marker_sets.files import GIVE, LANDMARK_SPREAD, RANGE, marker_set_names
-from kinefit.bodies.marker_sets.labels import SIDES, bare, matched, read_sides, side_pairs, subject_of
 from kinefit.bodies.marker_sets.placement import (
     MarkerPlacement,
     find_placement,
@@ -11,11 +9,21 @@ from kinefit.bodies.marker_sets.placement import (
     placement,
 )
 from kinefit.bodies.marker_sets.sets import (
+    GIVE,
+    LANDMARK_SPREAD,
     MIN_COMMON_LABELS,
+    RANGE,
+    SIDES,
     MarkerSet,
     SetSegment,
+    bare,
     find_marker_set,
     load_marker_set,
+    marker_set_names,
+    matched,
+    read_sides,
+    side_pairs,
+    subject_of,
 )
 
 __all__ = [

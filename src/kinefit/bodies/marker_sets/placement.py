@@ -10,16 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.marker_sets.files import (
+from kinefit.bodies.marker_sets.sets import (
     LANDMARK_SPREAD,
+    MIN_COMMON_LABELS,
     MarkerRecord,
     SetRecord,
     catalogue,
     find_record,
     marker_set_names,
+    matched,
+    plain,
 )
-from kinefit.bodies.marker_sets.labels import matched, plain
-from kinefit.bodies.marker_sets.sets import MIN_COMMON_LABELS
 from kinefit.errors import FileError, ObservationError
 
 

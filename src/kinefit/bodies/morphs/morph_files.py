@@ -11,11 +11,11 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph
-from kinefit.bodies.morphs.steering import Steering
+from kinefit._files import metres_of
+from kinefit.bodies.morphs.operators import GlobalMorph, JointMotion, LocalMorph, Operator, SegmentMorph, Steering
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
 from kinefit.bodies.surfaces.files import SurfaceRecord, surfaces_of
-from kinefit.bodies.surfaces.obj import UNITS, read_obj
+from kinefit.bodies.surfaces.mesh import read_obj
 from kinefit.bodies.tree import KinematicTree
 from kinefit.errors import BodyError, check_choice, located
 from kinefit.geometry import se3
@@ -94,10 +94,9 @@ def _morph(record: MorphRecord, tree: KinematicTree, source: str) -> Operator:
         assert record.segment
         surfaces = surfaces_of(record.surface, tree.segment(record.segment), source, "surface")
         return SegmentMorph(record.segment, tuple(surfaces), steering)
-    unit = record.unit or "m"
-    check_choice("unit", unit, UNITS, BodyError, remedy="Use one of these.")
+    metres = metres_of(record.unit or "m", BodyError, remedy="Use one of these.")
     vertices, _ = read_obj(Path(source).parent / str(record.target))
-    return GlobalMorph(UNITS[unit] * vertices, steering)
+    return GlobalMorph(metres * vertices, steering)
 
 
 def _check_keys(record: MorphRecord) -> None:

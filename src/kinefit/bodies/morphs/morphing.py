@@ -21,14 +21,14 @@ from kinefit.bodies.morphs.operators import (
     LocalMorph,
     Operator,
     SegmentMorph,
+    Steering,
     radial_basis,
 )
-from kinefit.bodies.morphs.steering import Steering
-from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.surfaces.skins import _kernels_skinning as kernels
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
 from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh, triangles
+from kinefit.bodies.tree import BodyState
 from kinefit.errors import BodyError, choices
 from kinefit.geometry import se3
 

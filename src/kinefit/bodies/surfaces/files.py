@@ -12,9 +12,8 @@ import numpy as np
 from kinefit._files import regular
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
 from kinefit.bodies.surfaces.fourier import FourierCurve, FourierSurface, by_length
-from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.bodies.surfaces.mesh import MeshSurface, mesh_surface, surface_of_file
 from kinefit.bodies.surfaces.metaballs import Metaballs
-from kinefit.bodies.surfaces.obj import mesh_surface, surface_of_file
 from kinefit.errors import BodyError, located
 from kinefit.geometry.se3 import exp_so3
 

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit.bodies.surfaces.mesh import MeshSurface, tube_faces
-from kinefit.bodies.surfaces.obj import MAX_LENGTH
+from kinefit.bodies.surfaces.mesh import MAX_LENGTH, MeshSurface, tube_faces
 from kinefit.errors import BodyError
 
 LEVEL = 0.5  # of the field on the surface (P4, w_t)

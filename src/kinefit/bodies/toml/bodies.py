@@ -9,16 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import parse_toml, read_text, record_of
 from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.closures import KINDS, Closure, Dimension, with_dimensions
 from kinefit.bodies.morphs.morph_files import morphs_of
 from kinefit.bodies.surfaces.files import surfaces_of
-from kinefit.bodies.surfaces.skins.skin_files import skin_of
-from kinefit.bodies.toml.closures import closed
+from kinefit.bodies.surfaces.skins.skinning import skin_of
 from kinefit.bodies.toml.records import (
+    ClosureRecord,
     CouplingRecord,
+    DimensionRecord,
     FileRecord,
     JointRecord,
     MarkerSetRecord,
@@ -81,7 +84,11 @@ def catalogue_text(name: str) -> str:
 @checked
 def parse_body(text: str, source: str = "body") -> Body:
     """Parse a body from TOML text; `source` names it in messages. Raises a BodyError as `load_body` does."""
-    record = _record(text, source)
+    with located(source):
+        return _body(_record(text, source), source)
+
+
+def _body(record: FileRecord, source: str) -> Body:
     segments, points, usual, coupling, morph, closure = (
         record.segment, record.landmarks, record.usual, record.coupling, record.morph, record.closure
     )  # fmt: skip
@@ -91,11 +98,11 @@ def parse_body(text: str, source: str = "body") -> Body:
         usual = {left(n): v for n, v in usual.items()} | usual
         coupling, closure = with_images(coupling), with_images(closure)
         morph = _beside(morph, lambda m: m.kind != "global" and left(m.angle) != m.angle)
-    segments = _in_order(segments, source)
+    segments = _in_order(segments)
     groups = tuple(dict.fromkeys(s.scale or s.name for s in segments))
     index = {s.name: i for i, s in enumerate(segments)}
-    landmarks = _points(points, index, source)
-    tree = _with_posture(_coupled(_tree(segments, index, source), coupling, source), usual, source)
+    landmarks = _points(points, index)
+    tree = _with_posture(_coupled(_tree(segments, index), coupling), usual)
     body = Body(
         name=record.body.name,
         tree=tree,
@@ -104,9 +111,9 @@ def parse_body(text: str, source: str = "body") -> Body:
         segment_scale=np.array([groups.index(s.scale or s.name) for s in segments]),
         landmarks=landmarks,
         keypoint_sets={
-            n: _renamed(s, landmarks, f"keypoints.{n}", source) for n, s in extended(record.keypoints).items()
+            n: _renamed(s, landmarks, f"keypoints.{n}") for n, s in extended(record.keypoints).items()
         },
-        marker_sets={n: _markers(s, landmarks, index, f"markers.{n}", source) for n, s in record.markers.items()},
+        marker_sets={n: _markers(s, landmarks, index, f"markers.{n}") for n, s in record.markers.items()},
         surfaces=tuple(
             surface for s in segments
             for surface in surfaces_of(s.surface, index[s.name], source, f"surface of segment {s.name}")
@@ -115,11 +122,11 @@ def parse_body(text: str, source: str = "body") -> Body:
             c: {s.name: s.names[c] for s in segments if c in s.names}
             for c in dict.fromkeys(c for s in segments for c in s.names)
         },
-        stature=stature_of(record.body.stature or 0.0, source),
+        stature=stature_of(record.body.stature or 0.0),
         skin=skin_of(record.skin, tree, source),
         morphs=morphs_of(morph, tree, source),
     )  # fmt: skip
-    return closed(body, closure, record.dimension, source) if closure or record.dimension else body
+    return closed(body, closure, record.dimension) if closure or record.dimension else body
 
 
 def _record(text: str, source: str, above: tuple[str, ...] = ()) -> FileRecord:
@@ -129,18 +136,19 @@ def _record(text: str, source: str, above: tuple[str, ...] = ()) -> FileRecord:
     most = max(len(record.segment), len(record.coupling), len(record.closure), len(record.dimension))
     if most > _MAX_SEGMENTS:
         problem = f"{most} segments, couplings, closures or dimensions, more than {_MAX_SEGMENTS}"
-        raise BodyError(problem, file=source, remedy="Merge segments that do not move on their own.")
+        raise BodyError(problem, remedy="Merge segments that do not move on their own.")
     base = record.body.base
     if base is None:
         return record
     if base in above:
         problem = f"`base` entries form a cycle: {', '.join((*above, base))}"
-        raise BodyError(problem, file=source, place="body.base", remedy="Remove one.")
+        raise BodyError(problem, place="body.base", remedy="Remove one.")
     try:
         below, file = _text(base if not base.endswith(".toml") else Path(source).parent / base)
     except BodyError as error:
-        raise BodyError(error.problem, file=source, place="body.base", remedy=error.remedy) from error
-    return merged(_record(below, file, (*above, base)), record)
+        raise BodyError(error.problem, place="body.base", remedy=error.remedy) from error
+    with located(file):
+        return merged(_record(below, file, (*above, base)), record)
 
 
 def _beside(records: Iterable[Any], sided: Callable[[Any], bool]) -> list[Any]:
@@ -148,20 +156,20 @@ def _beside(records: Iterable[Any], sided: Callable[[Any], bool]) -> list[Any]:
     return [one for r in records for one in ((r, mirrored(r)) if sided(r) else (r,))]
 
 
-def _in_order(segments: list[SegmentRecord], source: str) -> list[SegmentRecord]:
+def _in_order(segments: list[SegmentRecord]) -> list[SegmentRecord]:
     """Sort segments depth first from the root: parents before children, limbs contiguous."""
     children: dict[str | None, list[SegmentRecord]] = {s.name: [] for s in segments}
-    refuse_repeated("segment", [s.name for s in segments], source)
-    refuse_repeated("joint", [s.joint.name for s in segments], source)
+    refuse_repeated("segment", [s.name for s in segments])
+    refuse_repeated("joint", [s.joint.name for s in segments])
     roots = [s for s in segments if s.parent is None]
     if len(roots) != 1:
         found = ", ".join(s.name for s in roots) or "none"
         problem = f"a body has exactly one segment without a parent, here: {found}"
-        raise BodyError(problem, file=source, remedy="Give the others a parent.")
+        raise BodyError(problem, remedy="Give the others a parent.")
     for s in segments:
         if s.parent is not None and s.parent not in children:
             place = f"parent of segment {s.name}"
-            raise BodyError(choices("segment", s.parent, children), file=source, place=place, remedy=_CHOOSE)
+            raise BodyError(choices("segment", s.parent, children), place=place, remedy=_CHOOSE)
         children.setdefault(s.parent, []).append(s)
     out: list[SegmentRecord] = []
     stack = [roots[0]]
@@ -173,18 +181,18 @@ def _in_order(segments: list[SegmentRecord], source: str) -> list[SegmentRecord]
         placed = {s.name for s in out}
         lost = ", ".join(s.name for s in segments if s.name not in placed)
         remedy = "Every chain of parents must end at the root."
-        raise BodyError(f"the segments {lost} form a cycle", file=source, remedy=remedy)
+        raise BodyError(f"the segments {lost} form a cycle", remedy=remedy)
     return out
 
 
-def _tree(segments: list[SegmentRecord], index: dict[str, int], source: str) -> KinematicTree:
+def _tree(segments: list[SegmentRecord], index: dict[str, int]) -> KinematicTree:
     rows: list[tuple[Any, ...]] = []
     for i, s in enumerate(segments):
-        with located(source, f"joint {s.joint.name}"):
+        with located(None, f"joint {s.joint.name}"):
             rows += _coordinates(i, s.joint)
     names = ("coordinates", "owners", *COLUMNS)
     columns = dict(zip(names, zip(*rows) if rows else [()] * len(names)))
-    refuse_repeated("coordinate", columns["coordinates"], source)
+    refuse_repeated("coordinate", columns["coordinates"])
     return KinematicTree(
         segments=tuple(index),
         parents=np.array([index[s.parent] if s.parent else -1 for s in segments]),
@@ -228,11 +236,11 @@ def _coordinates(owner: int, j: JointRecord) -> Iterator[tuple[Any, ...]]:
         yield name, owner, axis, slides[k], low * unit, high * unit, usual * unit, spread * unit
 
 
-def _coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord], source: str) -> KinematicTree:
+def _coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord]) -> KinematicTree:
     """Add the couplings of a file to a tree; weights have no unit, spreads are in degrees."""
     lines = np.zeros((len(couplings), len(tree.coordinates)))
     for line, c in zip(lines, couplings):
-        with located(source, f"coupling {c.name}"):
+        with located(None, f"coupling {c.name}"):
             for name, weight in c.of.items():
                 check_choice("coordinate", name, tree.coordinates, BodyError, remedy="Use one of these.")
                 line[tree.coordinate(name)] = weight
@@ -242,15 +250,15 @@ def _coupled(tree: KinematicTree, couplings: Sequence[CouplingRecord], source: s
             if tree.prismatic[line != 0.0].any():
                 raise BodyError("it couples a coordinate that slides", remedy="Couple angles.")
         line /= np.radians(c.spread)
-    with located(source, "coupling"):
+    with located(None, "coupling"):
         return replace(tree, couplings=lines)
 
 
-def _with_posture(tree: KinematicTree, usual: Mapping[str, float], source: str) -> KinematicTree:
+def _with_posture(tree: KinematicTree, usual: Mapping[str, float]) -> KinematicTree:
     """Change the mean posture of a tree: values [deg] or [m] of some coordinates."""
     out = np.array(tree.usual)
     for name, value in usual.items():
-        with located(source, f"usual {name}"):
+        with located(None, f"usual {name}"):
             check_choice("coordinate", name, tree.coordinates, BodyError, remedy="Use one of these.")
             d = tree.coordinate(name)
             unit = 1.0 if tree.prismatic[d] else np.pi / 180.0
@@ -266,34 +274,141 @@ def _check_finite(at: Vector) -> None:
         raise BodyError(f"`at` is not finite: {list(at)}", remedy="Give three numbers in metres.")
 
 
-def _points(
-    points: Mapping[str, PointRecord], index: dict[str, int], source: str, what: str = "landmark "
-) -> PointSet:
+def _points(points: Mapping[str, PointRecord], index: dict[str, int], what: str = "landmark ") -> PointSet:
     for name, p in points.items():
-        with located(source, what + name):
+        with located(None, what + name):
             check_choice("segment", p.segment, index, BodyError, remedy=_CHOOSE)
             _check_finite(p.at)
     records = points.values()
     return PointSet(tuple(points), np.array([index[p.segment] for p in records]), np.array([p.at for p in records]))
 
 
-def _renamed(entries: dict[str, str], landmarks: PointSet, place: str, source: str) -> PointSet:
+def _renamed(entries: dict[str, str], landmarks: PointSet, place: str) -> PointSet:
     known = set(landmarks.names)
     for name, landmark in entries.items():
         if landmark not in known:
             problem = choices("landmark", landmark, landmarks.names)
-            raise BodyError(problem, file=source, place=f"{place}.{name}", remedy=_CHOOSE)
+            raise BodyError(problem, place=f"{place}.{name}", remedy=_CHOOSE)
     return replace(landmarks.select(tuple(entries.values())), names=tuple(entries))
 
 
-def _markers(entry: MarkerSetRecord, landmarks: PointSet, index: dict[str, int], place: str, source: str) -> PointSet:
-    on_landmarks = _renamed({n: n for n in entry.points}, landmarks, place, source)
-    placed = _points(entry.placed, index, source, f"{place}.")
+def _markers(entry: MarkerSetRecord, landmarks: PointSet, index: dict[str, int], place: str) -> PointSet:
+    on_landmarks = _renamed({n: n for n in entry.points}, landmarks, place)
+    placed = _points(entry.placed, index, f"{place}.")
     if twice := sorted(entry.placed.keys() & set(entry.points)):
         problem = f"marker named twice: {', '.join(twice)}"
-        raise BodyError(problem, file=source, place=place, remedy="Keep it in points or in placed.")
+        raise BodyError(problem, place=place, remedy="Keep it in points or in placed.")
     return PointSet(
         on_landmarks.names + placed.names,
         np.concatenate([on_landmarks.segments, placed.segments]),
         np.concatenate([on_landmarks.points, placed.points]),
     )
+
+
+ESTIMATE = "estimate"
+_MAX_DIMENSION = 1e4  # [m] or [deg]
+_ZERO_VECTOR = (0.0, 0.0, 0.0)
+
+
+def closed(body: Body, closures: Sequence[ClosureRecord], dimensions: Sequence[DimensionRecord]) -> Body:
+    """Add the closures and dimensions of a file to a body.
+
+    Raises
+    ------
+    BodyError
+        A duplicate name; an unknown point, segment or kind; a closure of a segment with itself; a standard deviation
+        that is not positive; missing or contradictory keys.
+    """
+    if body.morphs:
+        problem = "closures of a body whose joints or surfaces morph"
+        raise BodyError(problem, place="closure", remedy="Remove the morphs, or the closures.")
+    refuse_repeated("closure", [c.name for c in closures])
+    refuse_repeated("dimension", [d.name for d in dimensions])
+    made, drawn, wanted = list[Closure](), list[Dimension](), dict[str, float]()
+    for c in closures:
+        with located(None, f"closure {c.name}"):
+            made.append(_closure(body, c))
+    body = replace(body, closures=tuple(made))
+    for r in dimensions:
+        with located(None, f"dimension {r.name}"):
+            d, wanted[r.name] = _dimension(body, r)
+        drawn.append(d)
+    return with_dimensions(replace(body, dimensions=tuple(drawn)), wanted)
+
+
+def _check(good: bool, problem: str, remedy: str) -> None:
+    if not good:
+        raise BodyError(problem, remedy=remedy)
+
+
+def _closure(body: Body, r: ClosureRecord) -> Closure:
+    names, segments = body.landmarks.names, body.landmarks.segments
+    for point in (r.point, r.point if r.to is None else r.to):
+        check_choice("landmark", point, names, BodyError, remedy="Use one of these, or add it under [landmarks].")
+    check_choice("kind of closure", r.kind, KINDS, BodyError, remedy="Use one of these.")
+    check_choice("mode", r.mode, ("soft", "hard"), BodyError, remedy="Use one of these.")
+    one = (r.to is None) != (r.at is None)
+    _check(one, "`to` and `at`: one of them is needed", "Give `to` a landmark, or `at` a place in the world.")
+    unknown = r.at == ESTIMATE
+    at = r.mean if unknown else (r.at or _ZERO_VECTOR)
+    if isinstance(at, str):
+        raise BodyError(f"at = {at!r}", remedy='Give three numbers in metres, or "estimate".')
+    wanted = (r.kind in ("line", "plane")) == (r.axis is not None)
+    _check(wanted, f"a {r.kind} closure with axis {r.axis}", "Give an axis to lines and planes, and to no other.")
+    turned = r.turn is None or r.kind == "rigid"
+    _check(turned, f"a {r.kind} closure with a turn", "Remove it: only rigid closures constrain rotation.")
+    free = r.mode == "soft" or (r.sigma is None and r.turn_sigma is None)
+    _check(free, "a hard closure cannot have a standard deviation", 'Remove it, or set mode = "soft".')
+    sigma = Closure.sigma if r.sigma is None else r.sigma
+    sigmas = (sigma, 2.0 if r.turn_sigma is None else r.turn_sigma, r.std, r.turn_std)
+    _check(all(0.0 < s < np.inf for s in sigmas), f"standard deviations {sigmas}", "Give positive ones.")
+    apart = r.to is None or segments[names.index(r.to)] != segments[names.index(r.point)]
+    _check(apart, f"'{r.point}' and '{r.to}' are of one segment", "Close the chain between two segments.")
+    axis = direction("y" if r.axis is None else r.axis)
+    if axis is None:
+        remedy = 'Use "x", "y", "z", or three numbers that are not all zero.'
+        raise BodyError(f"axis {r.axis!r} is no direction", remedy=remedy)
+    _check(bool(np.isfinite([*at, *(r.turn or ())]).all()), "numbers that are not finite", "Give metres and degrees.")
+    turn, turn_sigma, turn_std = np.radians(r.turn or _ZERO_VECTOR), np.radians(sigmas[1]), np.radians(r.turn_std)
+    return Closure(
+        r.name, r.kind, r.point, r.to or "", at, _vector(axis), _vector(turn), sigma, float(turn_sigma),
+        r.mode == "hard", r.std if unknown else 0.0, float(turn_std) if unknown and r.kind == "rigid" else 0.0,
+    )  # fmt: skip
+
+
+def _vector(v: NDArray) -> Vector:
+    return (float(v[0]), float(v[1]), float(v[2]))
+
+
+def _dimension(body: Body, r: DimensionRecord) -> tuple[Dimension, float]:
+    """A dimension at its drawn value, and its actual value [m] or [rad]."""
+    one = (r.along is None) != (r.about is None)
+    _check(one, "`along` and `about`: one of them is needed", "Give `along` for a length, `about` for an angle.")
+    mean = r.drawn if r.mean is None else r.mean
+    estimated = r.value == ESTIMATE
+    value = mean if estimated else r.value
+    if isinstance(value, str):
+        raise BodyError(f"value = {value!r}", remedy='Give a number, or "estimate".')
+    std = r.std or 0.0
+    if estimated:
+        problem = f"a value to estimate with std = {r.std}"
+        _check(0.0 < std < np.inf, problem, "Give `std`, its standard deviation about `mean`.")
+    closures = {c.name: c for c in body.closures}
+    _check(bool(r.moves), "it moves nothing", "Name landmarks, segments or closures in `moves`.")
+    for name in r.moves:
+        closure = closures.get(name)
+        meanings = (closure is not None) + (name in body.landmarks.names) + (name in body.tree.segments)
+        problem = f"'{name}' is " + ("a name with several meanings" if meanings else "nothing of the body")
+        _check(meanings == 1, problem, "Name landmarks, segments or closures of this body.")
+        rigid = r.about is None or (closure is not None and closure.kind == "rigid")
+        _check(rigid, f"an angle that moves '{name}'", "Angles turn rigid closures, and nothing else.")
+        placed = r.along is None or closure is None or not closure.to
+        _check(placed, f"it shifts closure '{name}' between two landmarks", "Name one of the landmarks.")
+    fits = np.abs([r.drawn, mean, value, *(r.along or r.about or ())]) < _MAX_DIMENSION
+    _check(bool(fits.all()), "numbers are not finite, or not a dimension", "Give metres and degrees.")
+    axis = np.zeros(3) if r.about is None else direction(r.about)
+    if axis is None:
+        raise BodyError("`about` is no direction", remedy="Give three numbers that are not all zero.")
+    unit = 1.0 if r.about is None else np.pi / 180.0
+    std = std * unit if estimated else 0.0
+    return Dimension(r.name, r.drawn * unit, r.along or _ZERO_VECTOR, _vector(axis), tuple(r.moves), std), value * unit

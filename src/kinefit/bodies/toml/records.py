@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from os import PathLike
 from typing import Any, TypeVar
 
 import msgspec
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from kinefit._files import repeated
 from kinefit.bodies.morphs.morph_files import MorphRecord
 from kinefit.bodies.surfaces.files import SurfaceRecord
-from kinefit.bodies.surfaces.skins.skin_files import SkinRecord
+from kinefit.bodies.surfaces.skins.skinning import SkinRecord
 from kinefit.errors import BodyError
 
 Vector = tuple[float, float, float]
@@ -102,7 +101,7 @@ class HeadRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     mirror: bool | None = None
 
 
-def stature_of(value: float, source: str | PathLike[str] | None = None) -> float:
+def stature_of(value: float) -> float:
     """Check a stature [m] as stated in a file; 0 if not stated.
 
     Raises
@@ -111,7 +110,7 @@ def stature_of(value: float, source: str | PathLike[str] | None = None) -> float
         A number that is no stature.
     """
     if not 0 <= value <= _TALLEST:
-        raise BodyError(f"a stature of {value:g} m", file=source, place="body.stature", remedy="Give metres.")
+        raise BodyError(f"a stature of {value:g} m", place="body.stature", remedy="Give metres.")
     return value
 
 
@@ -227,11 +226,11 @@ def _mirrored_axis(axis: str | Vector, slides: bool) -> str | Vector:
     return (x, y, -z) if slides else (-x, -y, z)
 
 
-def refuse_repeated(what: str, names: Iterable[str], source: str) -> None:
+def refuse_repeated(what: str, names: Iterable[str]) -> None:
     """Raise a BodyError for names that a file gives twice, such as of segments."""
     if twice := repeated(names):
         problem = f"{what} named twice: {', '.join(sorted(twice))}"
-        raise BodyError(problem, file=source, remedy="Rename one of them.")
+        raise BodyError(problem, remedy="Rename one of them.")
 
 
 _EXTENDS = {"MEDIAPIPE_75": "MEDIAPIPE_33", "BODY_25_HANDS": "BODY_25", "COCO_WHOLEBODY_133": "COCO_17"}

@@ -124,7 +124,7 @@ def _distance(text: str | None) -> tuple[str, str, float] | None:
 
 def _write_table(result: BarCalibration, file: Path) -> None:
     """A row a parameter: camera, name, value, standard deviation, what it rests on."""
-    from kinefit.exporters.atomic import write_rows
+    from kinefit._files import write_rows
 
     rows: list[tuple[str, ...]] = [("camera", "parameter", "unit", "value", "std", "from")]
     for name, report in result.cameras.items():
@@ -141,7 +141,7 @@ def _write_picture(result: BarCalibration, file: Path) -> None:
     import cv2
     import numpy as np
 
-    from kinefit.exporters.atomic import write_image
+    from kinefit._files import write_image
 
     panels = []
     for c, camera in enumerate(result.rig):

@@ -38,8 +38,7 @@ def people(
     from kinefit.cli._results import check_new
     from kinefit.preparing.take import with_detections
     from kinefit.readers.calibration.read import write_calibration
-    from kinefit.readers.take.file import read_take
-    from kinefit.readers.take.find import find_take
+    from kinefit.readers.take.file import find_take, read_take
     from kinefit.takes.track import load_keypoints
 
     take = find_take(take, wanted=("calibrate", "people"))

@@ -55,14 +55,14 @@ def check(
         raise click.UsageError("--focal, --distortion, --time-offsets and --points need --refine.")
     if points is not None and not points.is_file():
         raise click.BadParameter(f"no such file: {points}", param_hint="--points")
+    from kinefit._files import write_text
     from kinefit.batch.corrections import write_edits
     from kinefit.cli._results import check_file
     from kinefit.cli.checks._page import check_page
     from kinefit.cli.checks._refine import refined_of, write_refined
     from kinefit.errors import KinefitError
-    from kinefit.exporters.atomic import write_text
     from kinefit.findings import as_records, fixes, in_words, ranked
-    from kinefit.readers.take.find import find_take
+    from kinefit.readers.take.file import find_take
 
     take = find_take(take, wanted=("check",))
     out = out or take.with_name(f"{take.stem}-check.html")

@@ -86,7 +86,7 @@ def write_first_set(
     KinefitError
         A file cannot be read or written, or shows too little.
     """
-    from kinefit.exporters.atomic import write_text
+    from kinefit._files import write_text
     from kinefit.markers.first_set import first_set
 
     markers = one_after_the_other([read_file(path, unit) for path in paths])
@@ -126,8 +126,8 @@ def identify_file(
     KinefitError
         A file cannot be read or written, or no subject is found.
     """
+    from kinefit._files import write_rows
     from kinefit.exporters import write_markers
-    from kinefit.exporters.atomic import write_rows
 
     source = Path(path)
     target = Path(out) if out is not None else source.with_name(f"{source.stem}-named{source.suffix}")

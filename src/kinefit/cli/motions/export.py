@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import click
 
+from kinefit._files import LENGTHS, worth
 from kinefit.batch import results
 from kinefit.cli import _results, _screen
 from kinefit.errors import spelled
-from kinefit.readers.units import LENGTHS, worth
 
 
 class Freedom(NamedTuple):

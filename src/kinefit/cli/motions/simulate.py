@@ -116,7 +116,7 @@ def check_recording(path: Path, asf: Path | None, endings: Sequence[str], name: 
 
 def read_skeleton(path: Path, asf: Path | None, **options: Any) -> SkeletonMotion:
     """The skeleton and motion of a .bvh file, or of an .amc file with its .asf."""
-    from kinefit.readers.skeletons.amc import read_amc
+    from kinefit.readers.skeletons.acclaim import read_amc
     from kinefit.readers.skeletons.bvh import read_bvh
 
     return read_amc(asf, path, **options) if asf else read_bvh(path, **options)

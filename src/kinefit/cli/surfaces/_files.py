@@ -17,8 +17,7 @@ from kinefit.errors import FileError, ObservationError, shortened
 from kinefit.geometry.camera import Rig
 from kinefit.photogrammetry.region_growing import Seeds
 from kinefit.readers.calibration.read import read_calibration
-from kinefit.readers.image_folders import images_in
-from kinefit.readers.video import Video
+from kinefit.readers.video import Video, images_in
 
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 

@@ -143,7 +143,7 @@ def track(
     If the keypoints show several people, the results of each are in OUT/person-1, OUT/person-2 and so on.
     """
     from kinefit.cli.init import write_first_take
-    from kinefit.readers.take.find import find_take, takes_in
+    from kinefit.readers.take.file import find_take, takes_in
 
     take = write_first_take(take) if take.is_dir() and not takes_in(take) else find_take(take)
     out = out or take.with_name(f"{take.stem}-kinefit")

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from kinefit._arguments import checked
+from kinefit._files import write_lines, write_text
 from kinefit.bodies import Body, PointSet
-from kinefit.exporters.atomic import write_lines, write_text
 from kinefit.exporters.opensim.model import model
 from kinefit.exporters.skeletons.common import UNITS, check_up, euler_zxy, length_factor, plain_names
 from kinefit.motion import Motion

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import write_image, writing
 from kinefit._threads import ahead
 from kinefit.errors import ExportError
-from kinefit.exporters.atomic import write_image, writing
 from kinefit.exporters.pictures.drawing import WHITE, draw_body, draw_residuals, draw_skin, write_lines
 from kinefit.geometry.camera import Camera, ImageFrame
 from kinefit.motion import Motion, Residuals

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from kinefit._arguments import checked
+from kinefit._files import write_text
 from kinefit.errors import ExportError, choices
-from kinefit.exporters.atomic import write_text
 from kinefit.exporters.curves import curves, spoken
 from kinefit.exporters.report import page as p
 from kinefit.exporters.report.angles import cycle_plots, joint_plots, ranges_table

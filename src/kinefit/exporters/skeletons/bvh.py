@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
+from kinefit._files import write_lines
 from kinefit.bodies import Body
-from kinefit.exporters.atomic import write_lines
 from kinefit.exporters.skeletons.common import (
     UNITS,
     bone_names,

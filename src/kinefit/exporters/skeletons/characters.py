@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
+from kinefit._files import write_bytes, write_lines
 from kinefit.errors import ExportError
-from kinefit.exporters.atomic import write_bytes, write_lines
 from kinefit.exporters.skeletons.bvh import bvh_motion
 from kinefit.exporters.skeletons.common import euler
 from kinefit.exporters.skeletons.glb import GltfFile

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
+from kinefit._files import write_bytes
 from kinefit.errors import ExportError
-from kinefit.exporters.atomic import write_bytes
 from kinefit.exporters.skeletons.common import bone_names, moving_segments, plain_names
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
 from kinefit.motion import Motion

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import writing
 from kinefit.bodies import Body, MeshSurface
 from kinefit.bodies.surfaces import Surface
 from kinefit.errors import ExportError, extra
-from kinefit.exporters.atomic import writing
 from kinefit.exporters.skeletons.common import UNITS, bone_names, length_factor, turned
 from kinefit.exporters.skeletons.rest import Rest, rest_pose
 from kinefit.geometry import se3

@@ -10,9 +10,9 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._files import write_lines
 from kinefit.bodies import Body
 from kinefit.errors import ExportError
-from kinefit.exporters.atomic import write_lines
 from kinefit.exporters.skeletons.common import bone_names, moving_segments, numbers, plain_names
 from kinefit.exporters.skeletons.rest import Rest, rest_pose, standing
 from kinefit.motion import Motion

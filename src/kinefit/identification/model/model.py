@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from contextlib import suppress
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -13,8 +11,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import read_bytes, record_of
-from kinefit.errors import ExportError, FileError, ObservationError
+from kinefit._files import read_bytes, record_of, write_bytes
+from kinefit.errors import FileError, ObservationError
 from kinefit.geometry.se3 import exp_so3, log_so3
 
 
@@ -177,17 +175,7 @@ def save_model(model: MarkerModel, path: str | PathLike[str]) -> None:
         "joints": joints, "gaps": model.gaps,
         "distances": {key: [row[i + 1 :] for i, row in enumerate(getattr(model, key)[:-1])] for key in _TABLES},
     }  # fmt: skip
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}-{os.getpid()}")
-    try:
-        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(record, enc_hook=_rounded), indent=1) + b"\n")
-        os.replace(temporary, target)
-    except OSError as error:
-        remedy = "Choose an existing folder with write permission and free space."
-        raise ExportError(f"cannot be written ({error.strerror or error})", file=target, remedy=remedy) from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
+    write_bytes(path, msgspec.json.format(msgspec.json.encode(record, enc_hook=_rounded), indent=1) + b"\n")
 
 
 def load_model(path: str | PathLike[str]) -> MarkerModel:

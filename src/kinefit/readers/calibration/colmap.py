@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import regular
-from kinefit.errors import CalibrationError, choices
+from kinefit.errors import CalibrationError, check_choice, located
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import quaternion
-from kinefit.readers.calibration.tables import build_camera, numbers, rigid, rotation_of
+from kinefit.readers.calibration.tables import numbers, rigid, rotation_of
 
 # Parameters of every model, in COLMAP's order.
 _MODELS = {
@@ -46,27 +46,19 @@ def colmap_cameras(folder: Path) -> list[Camera]:
         No text model, an unknown lens model, an image without its camera, numbers that are missing or not finite.
     """
     intrinsics = _cameras(folder / "cameras.txt")
-    path = folder / "images.txt"
-    entries = []
-    for number, line in _images(path):
+    entries: list[tuple[PurePosixPath, Intrinsics, NDArray]] = []
+    for number, line in _images(path := folder / "images.txt"):
         parts = line.split(maxsplit=9)
-        place = f"line {number}"
-        values = numbers(parts[:8], None, path, place)
-        if len(parts) != 10 or parts[8] not in intrinsics:
-            raise CalibrationError(
-                "not an image of a known camera",
-                file=path,
-                place=place,
-                remedy="An image's line is: ID QW QX QY QZ TX TY TZ CAMERA_ID NAME. Its points may follow in one line "
-                f"of X Y POINT3D_ID each. Cameras: {', '.join(intrinsics)}.",
-            )
-        entries.append((place, values, intrinsics[parts[8]], PurePosixPath(parts[9])))
-    names = image_names([image for *_, image in entries])
-    cameras = []
-    for name, (place, values, (size, K, k, model), _) in zip(names, entries):
-        T = rigid(rotation_of(values[1:5], path, place), values[5:8], path, place)
-        cameras.append(build_camera(name, size, K, k, model, T, path))
-    return cameras
+        with located(path, f"line {number}"):
+            values = numbers(parts[:8])
+            if len(parts) != 10 or parts[8] not in intrinsics:
+                remedy = "An image's line is: ID QW QX QY QZ TX TY TZ CAMERA_ID NAME. Its points may follow in one "
+                remedy += f"line of X Y POINT3D_ID each. Cameras: {', '.join(intrinsics)}."
+                raise CalibrationError("not an image of a known camera", remedy=remedy)
+            T = rigid(rotation_of(values[1:5]), values[5:8])
+        entries.append((PurePosixPath(parts[9]), intrinsics[parts[8]], T))
+    names = image_names([image for image, *_ in entries])
+    return [Camera(name, *lens, T) for name, (_, lens, T) in zip(names, entries)]
 
 
 def image_names(images: list[PurePosixPath]) -> list[str]:
@@ -99,10 +91,9 @@ def colmap_texts(rig: Rig, folder: Path, metres_per_unit: float) -> dict[str, st
             continue
         camera, owner = rig[name], owners.setdefault(parts[8], rig[name])
         if not (np.array_equal(camera.matrix, owner.matrix) and np.array_equal(camera.distortion, owner.distortion)):
-            raise CalibrationError(
-                f"images {owner.name} and {name} share camera {parts[8]}, but now differ in their lens", file=path,
-                place=f"line {number}", remedy="Give each its own camera in cameras.txt.",
-            )
+            problem = f"images {owner.name} and {name} share camera {parts[8]}, but now differ in their lens"
+            remedy = "Give each its own camera in cameras.txt."
+            raise CalibrationError(problem, file=path, place=f"line {number}", remedy=remedy)
         T = camera.T_camera_world
         pose = [*quaternion(T[:3, :3]), *(T[:3, 3] / metres_per_unit)]
         texts["images.txt"][number - 1] = " ".join([parts[0], *(repr(float(v)) for v in pose), *parts[8:]])
@@ -130,21 +121,14 @@ def _camera_line(number: str, model: str, camera: Camera) -> str:
 def _cameras(path: Path) -> dict[str, Intrinsics]:
     found = {}
     for number, line in _lines(path):
-        place = f"line {number}"
-        if not line.strip():
+        if not (parts := line.split()):
             continue
-        parts = line.split()
         model = parts[1] if len(parts) > 1 else ""
-        if model not in _MODELS:
-            raise CalibrationError(
-                choices("camera model", model, _MODELS), file=path, place=place, remedy="Undistort to one of these."
-            )
-        names = _MODELS[model].split()
-        values = numbers(parts[2:], None, path, place)
-        if len(values) != 2 + len(names):
-            raise CalibrationError(
-                f"{len(values) - 2} parameters", file=path, place=place, remedy=f"{model} has: {_MODELS[model]}."
-            )
+        with located(path, f"line {number}"):
+            check_choice("camera model", model, _MODELS, CalibrationError, remedy="Undistort to one of these.")
+            names, values = _MODELS[model].split(), numbers(parts[2:])
+            if len(values) != 2 + len(names):
+                raise CalibrationError(f"{len(values) - 2} parameters", remedy=f"{model} has: {_MODELS[model]}.")
         given = dict(zip(names, values[2:]))
         fx, fy = given.get("f", given.get("fx")), given.get("f", given.get("fy"))
         K = np.array([[fx, 0, given["cx"] - 0.5], [0, fy, given["cy"] - 0.5], [0, 0, 1]], dtype=float)
@@ -171,11 +155,8 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     try:
         text = regular(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError):
-        raise CalibrationError(
-            "cannot be read as text",
-            file=path,
-            remedy=f"Convert a binary model: colmap model_converter --input_path {path.parent} --output_path "
-            f"{path.parent} --output_type TXT.",
-        ) from None
+        converter = f"colmap model_converter --input_path {path.parent} --output_path {path.parent} --output_type TXT"
+        remedy = f"Convert a binary model: {converter}."
+        raise CalibrationError("cannot be read as text", file=path, remedy=remedy) from None
     return [(i, line) for i, line in enumerate(text.splitlines(), 1) if not line.lstrip().startswith("#")]
 

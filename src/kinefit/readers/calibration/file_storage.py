@@ -3,31 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
-_MAX_DEPTH = 40  # tables within tables; calibrations have five
+if TYPE_CHECKING:
+    from yaml import Node
+
 _NUMBER = re.compile(r"[-+]?(?:\d+(\.\d*)?|(\.\d+))([eE][-+]?\d+)?")
-_WORDS = {".inf": float("inf"), "+.inf": float("inf"), "-.inf": -float("inf"), ".nan": float("nan"), "null": None}
-_QUOTED = r"\"(?:[^\"\\]|\\.)*+\"|'(?:[^']|'')*+'"
-_ESCAPE = re.compile(r"\\(x[0-9a-fA-F]{2}|.)", re.DOTALL)
-_ESCAPES = {"n": "\n", "t": "\t", "r": "\r", "0": "\0"}
-
-
-class _BoundedTree(ElementTree.TreeBuilder):
-    """Builder of XML elements with a limited depth."""
-
-    depth = 0
-
-    def start(self, tag: Any, attributes: Any) -> Any:
-        self.depth += 1
-        _check_depth(self.depth)
-        return super().start(tag, attributes)
-
-    def end(self, tag: Any) -> Any:
-        self.depth -= 1
-        return super().end(tag)
+_WORDS = {
+    ".inf": float("inf"), "+.inf": float("inf"), "-.inf": -float("inf"), ".nan": float("nan"), "null": None, "": None
+}  # fmt: skip
+_AS_OPENCV = re.compile(
+    r"#[^\n]*|(?<![^\s\[{,:])(?:(?P<text>\"(?:[^\"\\]|\\.)*+\")|'(?:[^']|'')*+')|"
+    r"(?<![^{,\n])(?P<key>[ \t]*+(?:-[ \t]++)*+[A-Za-z_][\w.-]*+:)(?=[^\s:/])"
+)
+"""What OpenCV writes otherwise than YAML: quotes with a backslash in texts, keys whose colon no blank follows."""
 
 
 def parse_xml(text: str) -> ElementTree.Element:
@@ -42,7 +32,7 @@ def parse_xml(text: str) -> ElementTree.Element:
     """
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("a document type (<!DOCTYPE ...>), which no calibration has")
-    return ElementTree.fromstring(text, ElementTree.XMLParser(target=_BoundedTree()))
+    return ElementTree.fromstring(text)
 
 
 def storage_of_xml(text: str) -> Any:
@@ -75,147 +65,45 @@ def _words(text: str | None) -> list[Any]:
 def storage_of_yaml(text: str) -> Any:
     """Values of OpenCV's YAML: dicts, lists, numbers, texts, None.
 
-    Block and flow collections, quoted and plain scalars and comments are read; tags are skipped. Anchors and text over
-    several lines raise ValueError.
+    Tags are skipped, and no word but null and the infinities has a meaning; a repeated key and an anchor raise
+    ValueError, as all that is no YAML does.
     """
+    import yaml
+
     # Headers differ: OpenCV 4 writes "%YAML:1.0" and "---", OpenCV 5 "%YAML 1.2", people write none.
     lines = ["" if line.startswith(("%", "---", "...")) else line for line in text.splitlines()]
-    return _Yaml("\n".join(lines)).document()
+    try:
+        root = yaml.compose(_AS_OPENCV.sub(_as_yaml, "\n".join(lines)), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        return None if root is None else _node(root, set())
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        raise ValueError(f"line {mark.line + 1}: {error.problem}" if mark else str(error.problem)) from None
+    except yaml.YAMLError as error:
+        raise ValueError(str(error).partition("\n")[0]) from None
 
 
-class _Yaml:
-    """Recursive-descent parser of a YAML text."""
+def _as_yaml(found: re.Match[str]) -> str:
+    if found["text"]:
+        return re.sub(r"(\\\\)|\\'", lambda quote: quote[1] or "'", found[0])
+    return f"{found[0]} " if found["key"] else found[0]
 
-    _GAP = re.compile(r"(?:[ \t\n]++|#[^\n]*+)*+")
-    _TAG = re.compile(r"!\S*+")
-    _ENTRY = re.compile(r"-(?=[ \n]|\Z)")
-    _KEY = re.compile(rf"({_QUOTED}|[^\s\"'#\[\]{{}},][^:\n]*+)[ \t]*+:(?:[ \t]*+!\S*+)?[ \t]*+")
-    _FLOW_KEY = re.compile(rf"({_QUOTED}|[^\s\"'#\[\]{{}},:][^:\n,\[\]{{}}]*+)[ \t]*+:(?:[ \t]*+!\S*+)?[ \t]*+")
-    _QUOTED_TEXT = re.compile(_QUOTED)
-    _PLAIN = re.compile(r"[^\n]*+")
-    _FLOW_PLAIN = re.compile(r"[^\n,\[\]{}#]++")
-    _PLAIN_LIST = re.compile(r"\[([^\[\]{}\"'#]*+)\]")
 
-    def __init__(self, text: str) -> None:
-        self._text, self._at, self._depth = text, 0, 0
-
-    def document(self) -> Any:
-        value = self._block(-1)
-        if self._at < len(self._text):
-            self._fail("unexpected indentation or text")
-        return value
-
-    def _block(self, parent: int) -> Any:
-        """A value on lines that are indented by more than `parent` columns; None where there is none."""
-        self._skip()
-        if (tag := self._TAG.match(self._text, self._at)) is not None:
-            self._at = tag.end()
-            self._skip()
-        column = self._column()
-        if column <= parent:
-            return None
-        if self._ENTRY.match(self._text, self._at):
-            return self._nested(self._sequence, column)
-        if self._KEY.match(self._text, self._at):
-            return self._nested(self._mapping, column)
-        return self._inline()
-
-    def _sequence(self, column: int) -> list[Any]:
-        out = []
-        while self._column() == column and (entry := self._ENTRY.match(self._text, self._at)):
-            self._at = entry.end()
-            out.append(self._block(column))
-            self._skip()
-        return out
-
-    def _mapping(self, column: int) -> dict[str, Any]:
-        out: dict[str, Any] = {}
-        while self._column() == column and not self._ENTRY.match(self._text, self._at):
-            name = self._key(self._KEY, out)
-            if self._text.startswith(("\n", "#"), self._at) or self._at == len(self._text):
-                self._skip()  # the value follows on lines of its own; a sequence may stand below its key
-                below = self._ENTRY.match(self._text, self._at) is not None and self._column() == column
-                out[name] = self._block(column - below)
-            else:
-                out[name] = self._inline()
-            self._skip()
-        return out
-
-    def _inline(self) -> Any:
-        """A value that begins on this line: a flow collection or a scalar."""
-        if self._text.startswith(("[", "{"), self._at):
-            return self._nested(self._flow)
-        if (quoted := self._QUOTED_TEXT.match(self._text, self._at)) is not None:
-            return self._take(quoted)
-        return _scalar(re.split(r"[ \t]#", self._take_text(self._PLAIN), maxsplit=1)[0].strip())
-
-    def _flow(self) -> Any:
-        if (plain := self._PLAIN_LIST.match(self._text, self._at)) is not None:
-            self._at = plain.end()
-            items = plain[1].split(",")
-            return [_scalar(item.strip()) for item in (items if items[-1].strip() else items[:-1])]
-        keyed = self._text[self._at] == "{"
-        close, table, items = "}" if keyed else "]", dict[str, Any](), list[Any]()
-        self._at += 1
-        self._skip()
-        while not self._text.startswith(close, self._at):
-            name = self._key(self._FLOW_KEY, table) if keyed else ""
-            value = self._flow_value()
-            table[name] = value
-            items.append(value)
-            self._skip()
-            if self._text.startswith(",", self._at):
-                self._at += 1
-                self._skip()
-            elif not self._text.startswith(close, self._at):
-                self._fail(f"a comma or '{close}' is missing")
-        self._at += 1
-        return table if keyed else items
-
-    def _flow_value(self) -> Any:
-        self._skip()
-        if self._text.startswith(("[", "{"), self._at):
-            return self._nested(self._flow)
-        if (quoted := self._QUOTED_TEXT.match(self._text, self._at)) is not None:
-            return self._take(quoted)
-        return _scalar(self._take_text(self._FLOW_PLAIN).strip())
-
-    def _key(self, pattern: re.Pattern[str], table: dict[str, Any]) -> str:
-        if (found := pattern.match(self._text, self._at)) is None:
-            self._fail("a key with a colon is missing")
-        name = _unquoted(found[1].strip())
-        if name in table:
-            self._fail(f"the key '{name}' appears twice")
-        self._at = found.end()
-        return name
-
-    def _nested(self, read: Callable[..., Any], *where: int) -> Any:
-        self._depth += 1
-        _check_depth(self._depth)
-        value = read(*where)
-        self._depth -= 1
-        return value
-
-    def _take(self, quoted: re.Match[str]) -> str:
-        self._at = quoted.end()
-        return _unquoted(quoted[0])
-
-    def _take_text(self, pattern: re.Pattern[str]) -> str:
-        found = pattern.match(self._text, self._at)
-        if found is None or found[0].startswith(("&", "*", "|", ">", "`", "@", '"', "'", "- ")):
-            self._fail("a value that OpenCV does not write")
-        self._at = found.end()
-        return found[0]
-
-    def _skip(self) -> None:
-        self._at = self._GAP.match(self._text, self._at).end()  # type: ignore[union-attr]
-
-    def _column(self) -> int:
-        """Of the next character; -1 at the end."""
-        return self._at - self._text.rfind("\n", 0, self._at) - 1 if self._at < len(self._text) else -1
-
-    def _fail(self, problem: str) -> NoReturn:
-        raise ValueError(f"line {self._text.count(chr(10), 0, self._at) + 1}: {problem}")
+def _node(node: Node, read: set[int]) -> Any:
+    """The value of a node; `read`: identities of the nodes so far, as an alias leads to a node again."""
+    place = f"line {node.start_mark.line + 1}"
+    if id(node) in read:
+        raise ValueError(f"{place}: an anchor that is used again, which OpenCV does not write")
+    read.add(id(node))
+    if isinstance(node.value, str):
+        return node.value if getattr(node, "style", None) else _scalar(node.value)
+    if node.id == "sequence":
+        return [_node(item, read) for item in node.value]
+    out: dict[str, Any] = {}
+    for key, value in node.value:
+        if not isinstance(key.value, str) or key.value in out:
+            raise ValueError(f"line {key.start_mark.line + 1}: the key '{key.value}' appears twice, or is no text")
+        out[key.value] = _node(value, read)
+    return out
 
 
 def _scalar(text: str) -> Any:
@@ -224,14 +112,3 @@ def _scalar(text: str) -> Any:
     if number is None:
         return _WORDS[text.lower()] if text.lower() in _WORDS else text
     return float(text) if any(number.groups(default="")) or number[1] is not None else int(text)
-
-
-def _unquoted(text: str) -> str:
-    if text[:1] == '"':
-        return _ESCAPE.sub(lambda m: chr(int(m[1][1:], 16)) if len(m[1]) > 1 else _ESCAPES.get(m[1], m[1]), text[1:-1])
-    return text[1:-1].replace("''", "'") if text[:1] == "'" else text
-
-
-def _check_depth(depth: int) -> None:
-    if depth > _MAX_DEPTH:
-        raise ValueError("tables are nested too deeply for a calibration")

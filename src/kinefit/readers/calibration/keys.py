@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -120,7 +119,7 @@ def _states_convention(key: Any, value: Any) -> bool:
     return bool(is_text and (_CONVENTION.search(spelled(key)) or _SAYS_IT.fullmatch(spelled(value))))
 
 
-def conventions(table: Table, path: Path, place: str) -> set[str]:
+def conventions(table: Table) -> set[str]:
     """What a table says of its poses: "c2w", "w2c", "opengl" (a camera looks along -z, y up), "opencv".
 
     Raises
@@ -142,18 +141,18 @@ def conventions(table: Table, path: Path, place: str) -> set[str]:
             said |= {what} if count else set()
         if _AS_HERE.sub("", text):
             raise CalibrationError(
-                f"kinefit does not know what {key} = {value!r} means", file=path, place=place,
+                f"kinefit does not know what {key} = {value!r} means",
                 remedy="Give poses from world to camera, which looks along z, y down, rotation vectors in radians, and "
                 'write "opencv"; "opengl", "c2w" and "w2c" are read, too.',
             )  # fmt: skip
     for pair in ({"c2w", "w2c"}, {"opengl", "opencv"}):
         if pair <= said:
             problem = f"its conventions contradict each other: {' and '.join(sorted(pair))}"
-            raise CalibrationError(problem, file=path, place=place, remedy="Remove the wrong one.")
+            raise CalibrationError(problem, remedy="Remove the wrong one.")
     return said
 
 
-def lens_model(table: Table, path: Path, place: str) -> str:
+def lens_model(table: Table) -> str:
     """Model of a table's lens: "radtan" or "fisheye".
 
     Raises CalibrationError for another model. `model` and `type` may name a product, which is no lens model.
@@ -167,12 +166,12 @@ def lens_model(table: Table, path: Path, place: str) -> str:
                 continue  # as RealSense's colour cameras have it
             if _OTHER_LENS.search(text) or (kind == "lens model" and not known):
                 remedy = "Undistort the videos, or calibrate again with OpenCV's model: k1, k2, p1, p2, k3, or fisheye."
-                raise CalibrationError(f"a lens of the model {value}", file=path, place=place, remedy=remedy)
+                raise CalibrationError(f"a lens of the model {value}", remedy=remedy)
             fisheye |= any(word in text for word in _FISHEYE) or (kind == "lens model" and text == "1")
     return "fisheye" if fisheye else "radtan"
 
 
-def refuse_unread(table: Table, path: Path, place: str, *, has_lens: bool, has_pose: bool) -> None:
+def refuse_unread(table: Table, *, has_lens: bool, has_pose: bool) -> None:
     """Raise CalibrationError for a key that speaks of the lens, the pose or the scale and that kinefit does not read.
 
     Parameters
@@ -195,10 +194,8 @@ def refuse_unread(table: Table, path: Path, place: str, *, has_lens: bool, has_p
             subject, remedy = "unit of length", 'Apply it to the translations, or write unit = "mm"'
         else:
             continue
-        raise CalibrationError(
-            f"kinefit does not read {key}, which may be its {subject}", file=path, place=place,
-            remedy=f"{remedy}; remove {key} if it is none.",
-        )  # fmt: skip
+        problem = f"kinefit does not read {key}, which may be its {subject}"
+        raise CalibrationError(problem, remedy=f"{remedy}; remove {key} if it is none.")
 
 
 def _numbers(value: Any) -> NDArray:

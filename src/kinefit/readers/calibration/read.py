@@ -3,33 +3,31 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 from xml.etree import ElementTree
 
+import msgspec
 import numpy as np
 
 from kinefit._arguments import checked
-from kinefit._files import regular
-from kinefit.errors import CalibrationError, ExportError, FileError, choices, located
+from kinefit._files import metres_of, parse_toml, read_bytes, read_text, write_text
+from kinefit.errors import CalibrationError, FileError, located
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import log_so3
 from kinefit.readers.calibration.colmap import colmap_cameras
 from kinefit.readers.calibration.file_storage import parse_xml
 from kinefit.readers.calibration.keys import find
 from kinefit.readers.calibration.matlab import matlab_tree, read_mat
-from kinefit.readers.calibration.qualisys import qualisys_cameras
+from kinefit.readers.calibration.mocap import qualisys_cameras, vicon_cameras
 from kinefit.readers.calibration.tables import Sizes, camera_from_table, read_table
 from kinefit.readers.calibration.trees import stereo_tables, tables_of
-from kinefit.readers.calibration.vicon import vicon_cameras
+from kinefit.readers.ros.images import mcap_rig
 from kinefit.readers.ros.recordings import inside
-from kinefit.readers.ros.rig import mcap_rig
-from kinefit.readers.units import LENGTHS, worth
+from kinefit.readers.take.entries import CalibrationEntry
 
 FORMATS = (
     "OpenCV YAML/XML/JSON, Pose2Sim, aniposelib, caliscope or FreeMoCap TOML, EasyMocap, CMU Panoptic, Qualisys or "
@@ -101,15 +99,16 @@ def read_calibration(
         raise FileError("no such file or folder", file=path, remedy="Check the path of the calibration.")
     if (recording := inside(path)) is not None:
         return mcap_rig(recording[0])
-    if path.is_dir():
-        return _read_folder(path, unit, image_size, exteriors)
     if path.stem in ("cameras", "images") and path.suffix in (".txt", ".bin"):
-        return _read_folder(path.parent, unit, image_size, exteriors)
-    kind, tree = _parse(path)
-    if kind in _XML_MAKERS:
-        return _rig(_XML_MAKERS[kind](tree, path), path, "mm" if unit == "auto" else unit)
-    tables = [(name, table, path) for name, table in tables_of(tree, path.stem, path, exteriors)]
-    return _rig_of(tables, path, unit, image_size, exteriors)
+        path = path.parent
+    with located(path):
+        if path.is_dir():
+            return _read_folder(path, unit, image_size, exteriors)
+        kind, tree = _parse(path)
+        if kind in _XML_MAKERS:
+            return _rig(_XML_MAKERS[kind](tree), "mm" if unit == "auto" else unit)
+        tables = [(name, table, path) for name, table in tables_of(tree, path.stem, exteriors)]
+        return _rig_of(tables, unit, image_size, exteriors)
 
 
 def read_opencv_stereo(
@@ -124,10 +123,9 @@ def read_opencv_stereo(
 
     The first camera is the world. Its unit is that of the board's squares: give their length in metres as `unit`.
     """
-    path = Path(intrinsics)
-    tree = _tree(path) | _tree(Path(extrinsics))
-    tables = stereo_tables(tree, path, names)
-    return _rig_of([(name, table, path) for name, table in tables], path, unit, image_size)
+    with located(path := Path(intrinsics)):
+        tables = stereo_tables(_tree(path) | _tree(Path(extrinsics)), names)
+        return _rig_of([(name, table, path) for name, table in tables], unit, image_size)
 
 
 @checked
@@ -150,18 +148,7 @@ def write_calibration(
     path = Path(path)
     more = "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in metadata.items())
     last = f'[metadata]\nadjusted = false\nerror = 0.0\nunit = "m"\n{more}'
-    text = "\n".join([*(_toml(camera, path) for camera in rig), last])
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
-        os.replace(temporary, path)
-    except OSError as error:
-        raise ExportError(
-            f"cannot be written: {error.strerror}", file=path, remedy="Choose a folder that exists and has room."
-        ) from None
-    finally:
-        with suppress(OSError):
-            temporary.unlink()
+    write_text(path, "\n".join([*(_toml(camera, path) for camera in rig), last]))
 
 
 def _toml(camera: Camera, path: Path) -> str:
@@ -184,7 +171,7 @@ def _toml(camera: Camera, path: Path) -> str:
 
 def _read_folder(folder: Path, unit: str | float, image_size: Sizes | None, exteriors: bool) -> Rig:
     if (folder / "cameras.txt").exists() or (folder / "cameras.bin").exists():
-        return _rig(colmap_cameras(folder), folder, unit)
+        return _rig(colmap_cameras(folder), unit)
     sources = calibration_sources(folder)
     if len(sources) == 1 and len(sources[0][1]) == 1:
         return read_calibration(sources[0][1][0], unit=unit, image_size=image_size, exteriors=exteriors)
@@ -193,8 +180,9 @@ def _read_folder(folder: Path, unit: str | float, image_size: Sizes | None, exte
         tree: dict = {}
         for file in group:
             tree |= _tree(file)
-        tables += [(camera, table, group[0]) for camera, table in tables_of(tree, name, group[0], exteriors)]
-    return _rig_of(tables, folder, unit, image_size, exteriors)
+        with located(group[0]):
+            tables += [(camera, table, group[0]) for camera, table in tables_of(tree, name, exteriors)]
+    return _rig_of(tables, unit, image_size, exteriors)
 
 
 def calibration_sources(path: Path) -> list[tuple[str, list[Path]]]:
@@ -219,30 +207,29 @@ def _calibration_files(folder: Path) -> list[Path]:
 
 
 def _rig_of(
-    tables: list[tuple[str, dict, Path]],
-    path: Path,
-    unit: str | float,
-    image_size: Sizes | None,
-    exteriors: bool = True,
+    tables: list[tuple[str, dict, Path]], unit: str | float, image_size: Sizes | None, exteriors: bool = True
 ) -> Rig:
     if len(tables) > _MAX_CAMERAS:
         problem = f"{len(tables)} cameras, more than {_MAX_CAMERAS}"
-        raise CalibrationError(problem, file=path, remedy="Remove the cameras that recorded nothing.")
-    pose_needed = len(tables) > 1 if exteriors else None
-    cameras = [
-        camera_from_table(name, table, file, image_size=image_size, pose_needed=pose_needed)
-        for name, table, file in tables
-    ]
-    return _rig(cameras, path, _chosen_unit([table for _, table, _ in tables], unit, path))
+        raise CalibrationError(problem, remedy="Remove the cameras that recorded nothing.")
+    pose_needed, cameras = len(tables) > 1 if exteriors else None, []
+    for name, table, file in tables:
+        with located(file):
+            cameras.append(camera_from_table(name, table, image_size=image_size, pose_needed=pose_needed))
+    return _rig(cameras, _chosen_unit([table for _, table, _ in tables], unit))
 
 
 def _parse(path: Path) -> tuple[str, Any]:
     """Kind of a file (of `recognise`, or "mat"), and its tables, or the root of its XML."""
-    if path.suffix.lower() == ".mat":
-        return "mat", read_mat(path)
-    text = _read_text(path)
-    kind = recognise(text, path)
-    return kind, _xml_root(text, path) if kind in _XML_MAKERS else matlab_tree(read_table(text, kind, path), path)
+    with located(path):
+        if path.suffix.lower() == ".mat":
+            return "mat", read_mat(path)
+        if (size := path.stat().st_size) > MAX_CALIBRATION_BYTES:
+            problem = f"{size / 1e6:.0f} MB, too large for a calibration"
+            raise FileError(problem, remedy=f"Is it another file? kinefit reads {FORMATS}.")
+        text = read_text(path, "the calibration", remedy=f"kinefit reads {FORMATS}.")
+        kind = recognise(text, path)
+        return kind, _xml_root(text) if kind in _XML_MAKERS else matlab_tree(read_table(text, kind))
 
 
 def _tree(path: Path) -> dict:
@@ -253,27 +240,17 @@ def _tree(path: Path) -> dict:
     return dict(tree)
 
 
-def _read_text(path: Path) -> str:
-    try:
-        if (size := path.stat().st_size) > MAX_CALIBRATION_BYTES:
-            problem = f"{size / 1e6:.0f} MB, too large for a calibration"
-            raise FileError(problem, file=path, remedy=f"Is it another file? kinefit reads {FORMATS}.")
-        return regular(path).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError):
-        raise FileError("cannot be read as text", file=path, remedy=f"kinefit reads {FORMATS}.") from None
-
-
 def recognise(text: str, path: Path) -> str:
     """Detect "toml", "json", "yaml", "xml" (OpenCV), "qualisys" or "vicon" from the content; else raise FileError."""
     for program, (mark, remedy) in _FOREIGN.items():
         if text.lstrip().startswith("<") and re.search(mark, text, re.S | re.I):
             raise CalibrationError(
-                "kinefit does not read this format", file=path, place=f"calibration of {program}",
+                "kinefit does not read this format", place=f"calibration of {program}",
                 remedy=f"{remedy}, or write K, dist, R, t and size of each camera as JSON (docs/calibration.md).",
             )  # fmt: skip
     start = text.lstrip()
     if start.startswith("<"):
-        tag = _xml_root(text, path).tag.lower()
+        tag = _xml_root(text).tag.lower()
         if tag in (roots := {"calibration": "qualisys", "opencv_storage": "xml", "cameras": "vicon"}):
             return roots[tag]
     elif start.startswith("{") or (start.startswith("[") and path.suffix.lower() == ".json"):
@@ -284,55 +261,50 @@ def recognise(text: str, path: Path) -> str:
         return "toml"
     elif re.search(r"^[ \t]*+[\w-]++[ \t]*+:", text, re.M):
         return "yaml"
-    raise FileError("not a calibration that kinefit knows", file=path, remedy=f"kinefit reads {FORMATS}.")
+    raise FileError("not a calibration that kinefit knows", remedy=f"kinefit reads {FORMATS}.")
 
 
-def _xml_root(text: str, path: Path) -> ElementTree.Element:
+def _xml_root(text: str) -> ElementTree.Element:
     try:
         return parse_xml(text)
     except (ElementTree.ParseError, ValueError) as error:
         remedy = "Export it again; it may be cut."
-        raise CalibrationError(f"broken XML: {error}", file=path, remedy=remedy) from None
+        raise CalibrationError(f"broken XML: {error}", remedy=remedy) from None
 
 
-def _chosen_unit(tables: list[dict], unit: str | float, path: Path) -> str | float:
+def _chosen_unit(tables: list[dict], unit: str | float) -> str | float:
     """The unit that is asked for, else that which the tables of all cameras state."""
     stated = [find(table, "unit") for table in tables] if unit == "auto" else [unit]
     units = {one if one and type(one) in (str, int, float) else "auto" for one in stated}
     if len(units) > 1:
         problem = f"its cameras state different units: {', '.join(sorted(map(str, units)))}"
-        raise CalibrationError(problem, file=path, remedy="Pass the unit that all of them have.")
+        raise CalibrationError(problem, remedy="Pass the unit that all of them have.")
     return units.pop() if units else unit
 
 
-def metres_per_unit(tables: list[dict], unit: str | float, path: Path) -> float:
+def metres_per_unit(tables: list[dict], unit: str | float) -> float:
     """Metres per unit of length of the tables of cameras; 1 if they state none."""
-    return _factor(_chosen_unit(tables, unit, path), path) or 1.0
+    return _factor(_chosen_unit(tables, unit)) or 1.0
 
 
-def _factor(unit: str | float, path: Path) -> float | None:
+def _factor(unit: str | float) -> float | None:
     """Metres per unit; None for "auto"."""
     if isinstance(unit, str):
         if unit == "auto":
             return None
-        metres = worth(unit, LENGTHS)
-        if metres is None:
-            remedy = "Use one of these, or a number of metres."
-            raise CalibrationError(choices("unit of length", unit, LENGTHS), file=path, remedy=remedy)
-        return metres
+        remedy = "Use one of these, or a number of metres."
+        return metres_of(unit, CalibrationError, "unit of length", remedy=remedy)
     if not (np.isfinite(unit) and unit > 0):
-        raise CalibrationError(f"unit of length {unit}", file=path, remedy="Give a positive number of metres.")
+        raise CalibrationError(f"unit of length {unit}", remedy="Give a positive number of metres.")
     return float(unit)
 
 
-def _in_metres(camera: Camera, factor: float | None, path: Path) -> Camera:
+def _in_metres(camera: Camera, factor: float | None) -> Camera:
     if factor is None:
         distance = float(np.linalg.norm(camera.centre_world))
         if distance > _MAX_ORIGIN_DISTANCE:
             raise CalibrationError(
-                f"stands {distance:.0f} from the world's origin, which cannot be metres",
-                file=path,
-                place=f"camera {camera.name}",
+                f"stands {distance:.0f} from the world's origin, which cannot be metres", place=f"camera {camera.name}",
                 remedy='Write unit = "mm" under [calibration] in the take (from Python: unit="mm").',
             )
         return camera
@@ -341,9 +313,82 @@ def _in_metres(camera: Camera, factor: float | None, path: Path) -> Camera:
     return camera.with_pose(T)
 
 
-def _rig(cameras: list[Camera], path: Path, unit: str | float) -> Rig:
+def _rig(cameras: list[Camera], unit: str | float) -> Rig:
     if not cameras:
-        raise CalibrationError("no camera in it", file=path, remedy=f"kinefit reads {FORMATS}.")
-    factor = _factor(unit, path)
-    with located(path):
-        return Rig(tuple(_in_metres(camera, factor, path) for camera in cameras))
+        raise CalibrationError("no camera in it", remedy=f"kinefit reads {FORMATS}.")
+    factor = _factor(unit)
+    return Rig(tuple(_in_metres(camera, factor) for camera in cameras))
+
+
+_KEY = "kinefit_found_from"
+
+
+class FoundCameras(msgspec.Struct, frozen=True, kw_only=True, eq=False):
+    """A rig that was estimated from people; what is not the rig stands in [metadata] of its file.
+
+    Parameters
+    ----------
+    rig : Rig [m]
+    time_offsets : (C,) [s] to add to each camera's times, in the rig's order.
+    position_sigma, rotation_sigma : float [m], [deg] standard deviations of a camera's pose.
+    notes : sentences on the result and its uncertainty.
+    made_from : (C,) texts that identify each camera's keypoints and settings: another text, another result; one text
+        where the file is of a version that did not state them.
+    height : float [m] of the person, which sets the scale; 0: unknown.
+    """
+
+    rig: Rig
+    time_offsets: tuple[float, ...]
+    position_sigma: Annotated[float, msgspec.Meta(ge=0.0)]
+    rotation_sigma: Annotated[float, msgspec.Meta(ge=0.0)]
+    notes: tuple[str, ...]
+    made_from: tuple[str, ...] | str = msgspec.field(name=_KEY)
+    height: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
+
+    def __post_init__(self) -> None:
+        of_each = self.time_offsets, self.time_offsets if isinstance(self.made_from, str) else self.made_from
+        if any(len(one) != len(self.rig) for one in of_each):
+            raise ValueError(f"it is not of {len(self.rig)} cameras")
+
+
+def write_found(found: FoundCameras, path: str | PathLike[str]) -> None:
+    """Write a rig that was estimated from people; raises as `write_calibration`."""
+    metadata = msgspec.structs.asdict(found)
+    write_calibration(metadata.pop("rig"), path, metadata=metadata | {_KEY: metadata.pop("made_from")})
+
+
+def read_found(path: str | PathLike[str]) -> FoundCameras | None:
+    """Read a file of `write_found`; None where there is no file.
+
+    Raises
+    ------
+    FileError, CalibrationError
+        A file of something else; one of `write_found` that was damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        return None
+    remedy = "Delete it: it is made again. A calibration of your own has another name, which [calibration] states."
+    if (metadata := _metadata(path)) is None:
+        raise FileError("no whole file of cameras that were found from people", file=path, remedy=remedy)
+    try:
+        return msgspec.convert({**metadata, "rig": read_calibration(path)}, FoundCameras)
+    except msgspec.ValidationError as error:
+        raise FileError(f"its [metadata] is not whole: {error}", file=path, remedy=remedy) from error
+
+
+def found_notes(entry: CalibrationEntry | None) -> tuple[str, ...]:
+    """Notes on a take's calibration if it was estimated from people; else empty."""
+    metadata = _metadata(entry.file) if entry is not None else None
+    return () if metadata is None else tuple(map(str, metadata.get("notes", ())))
+
+
+def _metadata(path: Path) -> dict[str, Any] | None:
+    """[metadata] of a file of `write_found`; None for any other."""
+    if path.suffix != ".toml" or not path.is_file():
+        return None
+    content = read_bytes(path)
+    if _KEY.encode() not in content:
+        return None
+    metadata = parse_toml(content.decode("utf-8", "replace"), path).get("metadata")
+    return metadata if isinstance(metadata, dict) and _KEY in metadata else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ _PART = re.compile(r"(?:projection|distortion|mirror)(?:parameters)?|lens")
 _OF_PAIR = re.compile(r"(?:(M|K|mtx|camera_?[mM]atrix)|(D|dist|dist_?[cC]oeffs))_?([12])")
 
 
-def tables_of(tree: Table, name: str, path: Path, exteriors: bool = True) -> list[tuple[str, Table]]:
+def tables_of(tree: Table, name: str, exteriors: bool = True) -> list[tuple[str, Table]]:
     """All tables of a parsed file that hold a camera, with the camera's name.
 
     Parameters
@@ -33,20 +33,20 @@ def tables_of(tree: Table, name: str, path: Path, exteriors: bool = True) -> lis
     CalibrationError
         A pose of a chain that cannot be read, cameras without a common world, a stereo pair that lacks a key.
     """
-    tree = _of_transforms(_of_multical(_of_kalibr(stereo_named(tree), path), path), path)
+    tree = _of_transforms(_of_multical(_of_kalibr(stereo_named(tree))))
     unit = unit_of_program(tree)
     tree = {"unit": unit} | tree if unit else tree
     if "M1" in tree:
-        return stereo_tables(tree if exteriors else {"R": [0, 0, 0], "T": [0, 0, 0]} | tree, path)
+        return stereo_tables(tree if exteriors else {"R": [0, 0, 0], "T": [0, 0, 0]} | tree)
     tables = camera_tables(tree, name)
     groups = {str(table.get("camera_group")) for _, table in tables}  # MC-Calib's: each has its own world
     if exteriors and len(groups) > 1:
         problem = f"cameras of {len(groups)} groups, between which no pose is known"
-        raise CalibrationError(problem, file=path, place="camera_group", remedy="Let a board be seen by both groups.")
+        raise CalibrationError(problem, place="camera_group", remedy="Let a board be seen by both groups.")
     return tables
 
 
-def _of_kalibr(tree: Table, path: Path) -> Table:
+def _of_kalibr(tree: Table) -> Table:
     """The tree with each camera's pose where T_cn_cnm1 leads from the camera before to each; cam0 is the world."""
     cameras = [key for key, value in tree.items() if isinstance(value, dict) and find(value, "matrix") is not None]
     if not any("T_cn_cnm1" in tree[name] for name in cameras):
@@ -55,13 +55,13 @@ def _of_kalibr(tree: Table, path: Path) -> Table:
     T, out = np.eye(4), dict(tree)
     for name in cameras:
         step = tree[name].get("T_cn_cnm1", np.eye(4) if name == cameras[0] else None)
-        T = numbers(step, (4, 4), path, f"camera {name}, T_cn_cnm1") @ T
+        T = numbers(step, (4, 4), f"camera {name}, T_cn_cnm1") @ T
         rest = {key: value for key, value in tree[name].items() if key != "T_cn_cnm1"}
         out[name] = rest | {"T_camera_world": T.tolist()}
     return out
 
 
-def _of_multical(tree: Table, path: Path) -> Table:
+def _of_multical(tree: Table) -> Table:
     """The tree with poses at the cameras, where `camera_poses` has one for each.
 
     "a" leads from the world to a; "a_to_b", whatever its name says, from b to a.
@@ -74,13 +74,13 @@ def _of_multical(tree: Table, path: Path) -> Table:
         name, _, parent = str(key).partition("_to_")
         if isinstance(pose, dict) and parent in T:
             R, t = (find(pose, kind) for kind in ("rotation", "translation"))
-            R, t = numbers(R, (3, 3), path, f"camera_poses, {key}"), numbers(t, (3,), path, f"camera_poses, {key}")
+            R, t = numbers(R, (3, 3), f"camera_poses, {key}"), numbers(t, (3,), f"camera_poses, {key}")
             T[name] = transform(R, t) @ T[parent]
     posed = {name: {"T_camera_world": T[name].tolist()} for name in cameras if name in T}
     return tree | {"cameras": {name: table | posed.get(name, {}) for name, table in cameras.items()}}
 
 
-def _of_transforms(tree: Table, path: Path) -> Table:
+def _of_transforms(tree: Table) -> Table:
     """The cameras of a transforms.json (nerfstudio, instant-ngp), one an image; any other tree as it is.
 
     `transform_matrix` leads from a camera that looks along -z, y up, to the world; the centre of the first pixel is
@@ -92,7 +92,7 @@ def _of_transforms(tree: Table, path: Path) -> Table:
     cameras = []
     for name, frame in zip(image_names([PurePosixPath(str(f.get("file_path", "?"))) for f in frames]), frames):
         lens = {key: value for key, value in (tree | frame).items() if kind_of(str(key))}
-        pinhole = [float(numbers(lens.get(k), (), path, f"camera {name}, {k}")) for k in ("fl_x", "fl_y", "cx", "cy")]
+        pinhole = [float(numbers(lens.get(k), (), f"camera {name}, {k}")) for k in ("fl_x", "fl_y", "cx", "cy")]
         pose = {"c2w": frame["transform_matrix"], "convention": "opengl"}
         cameras.append({"name": name, "matrix": np.subtract(pinhole, (0, 0, 0.5, 0.5)).tolist()} | lens | pose)
     return {"cameras": cameras}
@@ -180,15 +180,12 @@ def stereo_named(tree: Table) -> Table:
     return named if {"M1", "M2", "R", "T"} <= named.keys() else tree
 
 
-def stereo_tables(tree: Table, path: Path, names: tuple[str, str] = ("left", "right")) -> list[tuple[str, Table]]:
+def stereo_tables(tree: Table, names: tuple[str, str] = ("left", "right")) -> list[tuple[str, Table]]:
     """The two cameras of OpenCV's stereo calibration; the first is the world. Lacking keys raise CalibrationError."""
     missing = [key for key in ("M1", "D1", "M2", "D2", "R", "T") if key not in tree]
     if missing:
-        raise CalibrationError(
-            f"{', '.join(missing)} missing in a stereo calibration",
-            file=path,
-            remedy="Give the folder that holds both intrinsics.yml and extrinsics.yml, or both to read_opencv_stereo.",
-        )
+        remedy = "Give the folder that holds both intrinsics.yml and extrinsics.yml, or both to read_opencv_stereo."
+        raise CalibrationError(f"{', '.join(missing)} missing in a stereo calibration", remedy=remedy)
     poses = (([0, 0, 0], [0, 0, 0]), (tree["R"], tree["T"]))
     sizes = ("size", "shape", "width", "height")
     common = statements(tree) | {key: value for key, value in tree.items() if kind_of(str(key)) in sizes}

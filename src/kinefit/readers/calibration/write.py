@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import tempfile
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -15,19 +16,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
 from kinefit._files import regular
-from kinefit.errors import CalibrationError, ExportError, KinefitError, check_choice
+from kinefit.errors import CalibrationError, ExportError, KinefitError, check_choice, located
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.geometry.se3 import inverse, log_so3
 from kinefit.readers.calibration.colmap import colmap_texts
 from kinefit.readers.calibration.keys import find, find_all
-from kinefit.readers.calibration.qualisys import qualisys_text
+from kinefit.readers.calibration.mocap import qualisys_text
 from kinefit.readers.calibration.read import (
     calibration_sources,
     metres_per_unit,
     read_calibration,
     recognise,
 )
-from kinefit.readers.calibration.spans import value_span
 from kinefit.readers.calibration.tables import is_transposed, read_table
 from kinefit.readers.calibration.trees import tables_of
 from kinefit.readers.ros.recordings import inside
@@ -83,7 +83,8 @@ def write_calibration_like(
     for name in rig.names:
         check_choice("camera", name, old.names, CalibrationError, file=like, remedy="Give the rig these names.")
     _check_target(like, path, overwrite)
-    texts, rig = _texts(rig, like, unit)
+    with located(like):
+        texts, rig = _texts(rig, like, unit)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}-") as staging:
@@ -137,12 +138,8 @@ def _compare(rig: Rig, written: Path, like: Path, **reading: Any) -> None:
         else:
             lost = ["image size or lens model"]
         if lost:
-            raise CalibrationError(
-                f"its format does not hold the {' and '.join(lost)}",
-                file=like,
-                place=f"camera {camera.name}",
-                remedy=_REMEDY,
-            )
+            problem = f"its format does not hold the {' and '.join(lost)}"
+            raise CalibrationError(problem, file=like, place=f"camera {camera.name}", remedy=_REMEDY)
 
 
 def _padded(camera: Camera) -> NDArray:
@@ -152,7 +149,7 @@ def _padded(camera: Camera) -> NDArray:
 def _texts(rig: Rig, like: Path, unit: str | float) -> tuple[dict[str, str], Rig]:
     """Text of each file by its path below `like` ("" for the file itself), and the rig in the format's frame."""
     if like.is_dir() and ((like / "cameras.txt").exists() or (like / "cameras.bin").exists()):
-        texts = colmap_texts(rig, like, metres_per_unit([], unit, like))
+        texts = colmap_texts(rig, like, metres_per_unit([], unit))
         points = like / "points3D.txt"  # COLMAP opens no model without
         if points.exists():
             texts["points3D.txt"] = regular(points).read_text(encoding="utf-8")
@@ -164,8 +161,8 @@ def _texts(rig: Rig, like: Path, unit: str | float) -> tuple[dict[str, str], Rig
         files = {file: regular(file).read_bytes().decode("utf-8-sig") for file in group}
         kinds = {file: recognise(text, file) for file, text in files.items()}
         if "qualisys" in kinds.values():
-            scale = metres_per_unit([{"unit": "mm"}], unit, like)
-            files = {file: qualisys_text(rig, text, scale, file) for file, text in files.items()}
+            scale = metres_per_unit([{"unit": "mm"}], unit)
+            files = {file: qualisys_text(rig, text, scale) for file, text in files.items()}
         else:
             rig = _replace_tables(rig, name, files, kinds, unit)
         texts |= {"" if file == like else str(file.relative_to(like)): text for file, text in files.items()}
@@ -174,13 +171,12 @@ def _texts(rig: Rig, like: Path, unit: str | float) -> tuple[dict[str, str], Rig
 
 def _replace_tables(rig: Rig, name: str, files: dict[Path, str], kinds: dict[Path, str], unit: str | float) -> Rig:
     """Replace the numbers of all cameras of one group of files, in `files`; returns the rig in their frame."""
-    trees = {file: read_table(text, kinds[file], file) for file, text in files.items()}
+    trees = {file: read_table(text, kinds[file]) for file, text in files.items()}
     merged = {key: value for tree in trees.values() for key, value in tree.items()}
-    first = next(iter(files))
-    tables = tables_of(merged, name, first, exteriors=False)
+    tables = tables_of(merged, name, exteriors=False)
     if "M1" in merged and tables[0][0] in rig:
         rig = rig.moved(rig[tables[0][0]].T_camera_world)
-    scale = metres_per_unit([table for _, table in tables], unit, first)
+    scale = metres_per_unit([table for _, table in tables], unit)
     places = {at: (file, *spot) for file, tree in trees.items() for at, spot in _places(tree, kinds[file]).items()}
     edits: dict[Path, list[tuple[int, int, str]]] = {file: [] for file in files}
     roots = {file: _xml_root(files[file]) for file in files if kinds[file] == "xml"}
@@ -250,11 +246,7 @@ def _entries(camera: Camera, table: dict, scale: float) -> list[tuple[str, Any, 
         ("rotation", old, _shaped(whole if np.size(old) == 9 else log_so3(R), old))
         for old in find_all(table, "rotation") or [None]
     ]
-    return [
-        *entries,
-        *rotations,
-        ("translation", translation, _shaped(T[:3, 3], translation)),
-    ]
+    return [*entries, *rotations, ("translation", translation, _shaped(T[:3, 3], translation))]
 
 
 def _shaped(new: ArrayLike, old: Any) -> NDArray:
@@ -292,3 +284,74 @@ def _edit_xml(root: ElementTree.Element, word: str, n: int, new: NDArray, key: s
         parent = next(p for p in root.iter() if element in list(p))
         added = ElementTree.SubElement(parent, key)
         added.text, added.tail = numbers, "\n"
+
+
+_STRING = r'"(?:\\.|[^"\\\n])*"|\'[^\'\n]*\''
+_TOKEN = re.compile(rf"#[^\n]*|({_STRING}|[\w.-]+)(?:[ \t]*([:=]))?")
+_BRACKET = re.compile(rf"#[^\n]*|{_STRING}|[\[\]{{}}]")
+_LEAD = re.compile(r"\s*(!!opencv-[\w-]+|\{|\[)?")
+
+
+class ValueSpan(NamedTuple):
+    """Position of one value in a text.
+
+    `start:stop` are the brackets of its numbers, `after` is the end of the whole value (an OpenCV matrix has more than
+    its numbers), `indent` the text before its key on the key's line; `matrix`: whether it is an OpenCV matrix.
+    """
+
+    start: int
+    stop: int
+    after: int
+    indent: str
+    matrix: bool
+
+
+def value_span(text: str, key: str, occurrence: int) -> ValueSpan | None:
+    """Span of the list or matrix of the n-th `key` in a text; None if the value has another notation."""
+    for token in _TOKEN.finditer(text):
+        if token[2] and _name(token[1]) == key:
+            if occurrence == 0:
+                return _span(text, token)
+            occurrence -= 1
+    return None
+
+
+def _name(text: str) -> str:
+    return json.loads(text) if text[0] == '"' else text.strip("'")
+
+
+def _span(text: str, token: re.Match) -> ValueSpan | None:
+    indent = text[text.rfind("\n", 0, token.start()) + 1 : token.start()]
+    lead = _LEAD.match(text, token.end())
+    kind = lead[1] if lead else None
+    if lead is None or kind is None:
+        return _block(text, token.end(), indent)
+    if kind == "[":
+        stop = _closing(text, lead.end() - 1)
+        return ValueSpan(lead.end() - 1, stop, stop, indent, False) if stop else None
+    for inner in _TOKEN.finditer(text, lead.end()):
+        if inner[2] and _name(inner[1]) == "data":
+            start = text.find("[", inner.end())
+            stop = _closing(text, start) if start >= 0 else None
+            after = _closing(text, lead.end() - 1) if kind == "{" else stop
+            return ValueSpan(start, stop, after, indent, True) if stop and after else None
+    return None
+
+
+def _block(text: str, start: int, indent: str) -> ValueSpan | None:
+    """Span of a YAML block sequence: the lines below its key that are indented more."""
+    rest = re.compile(rf"[ \t]*\r?\n(?:{' ' * len(indent)}[ \t]+[^\n]*(?:\n|$))+").match(text, start)
+    if rest is None or not rest[0].lstrip().startswith("-"):
+        return None
+    stop = start + len(rest[0].rstrip())
+    return ValueSpan(start, stop, stop, indent, False)
+
+
+def _closing(text: str, start: int) -> int | None:
+    """Index behind the bracket that closes the one at `start`."""
+    depth = 0
+    for token in _BRACKET.finditer(text, start):
+        depth += (token[0] in "[{") - (token[0] in "]}")
+        if depth == 0:
+            return token.end()
+    return None

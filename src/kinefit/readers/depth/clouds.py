@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import read_bytes
-from kinefit.errors import CalibrationError, FileError
+from kinefit.errors import CalibrationError, FileError, names_file
 from kinefit.geometry.camera import Camera
-from kinefit.geometry.se3 import inverse
+from kinefit.geometry.se3 import inverse, rotation_from_quaternion, transform
 from kinefit.readers.depth._kernels_clouds import lzf
 
 ENDINGS = (".pcd", ".ply")
@@ -47,6 +47,7 @@ class FileCloud:
     T_file_sensor: NDArray
 
 
+@names_file
 def read_cloud(path: str | PathLike[str]) -> FileCloud:
     """Read a PCD or PLY file.
 
@@ -55,25 +56,24 @@ def read_cloud(path: str | PathLike[str]) -> FileCloud:
     FileError
         Missing, truncated, or of another format.
     """
-    path = Path(path)
-    data = read_bytes(path)
+    data = read_bytes(Path(path))
     try:
         if data.startswith(b"ply"):
-            return _ply(data, path)
+            return _ply(data)
         if b"FIELDS" in data[:2000]:
-            return _pcd(data, path)
+            return _pcd(data)
     except (ValueError, KeyError, IndexError, TypeError, OverflowError) as error:
-        raise FileError(f"its header cannot be understood ({error})", file=path, remedy=_REMEDY) from error
-    raise FileError("neither PCD nor PLY", file=path, remedy=_REMEDY)
+        raise FileError(f"its header cannot be understood ({error})", remedy=_REMEDY) from error
+    raise FileError("neither PCD nor PLY", remedy=_REMEDY)
 
 
-def _pcd(data: bytes, path: Path) -> FileCloud:
+def _pcd(data: bytes) -> FileCloud:
     header: dict[str, list[str]] = {}
     at = 0
     while "DATA" not in header:
         end = data.find(b"\n", at)
         if end < 0 or at > 10_000:
-            raise FileError("a PCD header without DATA", file=path, remedy=_REMEDY)
+            raise FileError("a PCD header without DATA", remedy=_REMEDY)
         words = data[at:end].decode("ascii").split()
         at = end + 1
         if words and not words[0].startswith("#"):
@@ -83,49 +83,50 @@ def _pcd(data: bytes, path: Path) -> FileCloud:
     width, height = int(header["WIDTH"][0]), int(header["HEIGHT"][0])
     number = int(header.get("POINTS", [str(width * height)])[0])
     if not 0 <= number == width * height < _MAX_POINTS:
-        raise FileError(f"{number} points, but {width} x {height}", file=path, remedy=_REMEDY)
+        raise FileError(f"{number} points, but {width} x {height}", remedy=_REMEDY)
     if not (set(sizes) <= {1, 2, 4, 8} and all(0 < c < 10_000 for c in counts) and len(counts) == len(names)):
         problem = f"SIZE {' '.join(map(str, sizes[:9]))}, COUNT {' '.join(map(str, counts[:9]))}"
-        raise FileError(problem, file=path, remedy=_REMEDY)
+        raise FileError(problem, remedy=_REMEDY)
     kinds = [np.dtype(f"<{_PCD_TYPES[t]}{s}") for t, s in zip(types, sizes, strict=True)]
-    where = [_place(axis, names, path) for axis in "xyz"]
+    where = [_place(axis, names) for axis in "xyz"]
     body, kind = data[at:], header["DATA"][0]
     if kind == "ascii":
         columns = np.cumsum([0, *counts])
-        points = _text(body, number, int(columns[-1]), path)[:, [columns[w] for w in where]]
+        points = _text(body, number, int(columns[-1]))[:, [columns[w] for w in where]]
     elif kind == "binary":
         record = np.dtype([(f"f{i}", k, (c,)) for i, (k, c) in enumerate(zip(kinds, counts, strict=True))])
-        table = _binary(body, record, number, path)
+        table = _binary(body, record, number)
         points = np.stack([table[f"f{w}"][:, 0].astype(float) for w in where], axis=1)
     elif kind == "binary_compressed":
-        raw = _unpacked(body, path)
+        raw = _unpacked(body)
         starts = np.cumsum([0, *(number * s * c for s, c in zip(sizes, counts, strict=True))])
         if len(raw) < starts[-1]:
-            raise FileError(f"{len(raw)} of {starts[-1]} bytes are there", file=path, remedy=_CUT)
+            raise FileError(f"{len(raw)} of {starts[-1]} bytes are there", remedy=_CUT)
         arrays = [np.frombuffer(raw, kinds[w], number * counts[w], int(starts[w]))[:: counts[w]] for w in where]
         points = np.stack([a.astype(float) for a in arrays], axis=1)
     else:
-        raise FileError(f"DATA {kind}", file=path, remedy="There are: ascii, binary, binary_compressed.")
+        raise FileError(f"DATA {kind}", remedy="There are: ascii, binary, binary_compressed.")
     tx, ty, tz, *q = [float(v) for v in header.get("VIEWPOINT", "0 0 0 1 0 0 0".split())]
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = _rotation(np.array(q)), (tx, ty, tz)
+    if len(q) != 4 or not np.linalg.norm(q) > 0.0:
+        raise ValueError(f"VIEWPOINT with the quaternion {q}")
+    T = transform(rotation_from_quaternion(np.array(q)), np.array([tx, ty, tz]))
     return FileCloud(points, (height, width) if height > 1 else None, T)
 
 
-def _unpacked(body: bytes, path: Path) -> NDArray[np.uint8]:
+def _unpacked(body: bytes) -> NDArray[np.uint8]:
     packed, size = (int(v) for v in np.frombuffer(body, "<u4", 2))
     if len(body) < 8 + packed or size > _MAX_LZF_RATIO * len(body):
-        raise FileError(f"{len(body) - 8} of {packed} bytes are there", file=path, remedy=_CUT)
+        raise FileError(f"{len(body) - 8} of {packed} bytes are there", remedy=_CUT)
     out = np.empty(size, np.uint8)
     if lzf(np.frombuffer(body, np.uint8, packed, 8), out) != size:
-        raise FileError("its compressed data is broken", file=path, remedy="Copy it again, or write it as binary.")
+        raise FileError("its compressed data is broken", remedy="Copy it again, or write it as binary.")
     return out
 
 
-def _ply(data: bytes, path: Path) -> FileCloud:
+def _ply(data: bytes) -> FileCloud:
     end = data.find(b"\n", data.find(b"end_header"))
     if b"end_header" not in data or end < 0:
-        raise FileError("a PLY header without end_header", file=path, remedy=_CUT)
+        raise FileError("a PLY header without end_header", remedy=_CUT)
     lines, body = data[:end].decode("ascii").splitlines(), data[end + 1 :]
     kind = next((line.split()[1] for line in lines if line.startswith("format")), "")
     elements: list[tuple[str, int, list[list[str]]]] = []
@@ -136,53 +137,40 @@ def _ply(data: bytes, path: Path) -> FileCloud:
             elements[-1][2].append(words[1:])
     name, number, properties = elements[0] if elements else ("", 0, [])
     if name != "vertex" or any(p[0] == "list" for p in properties) or not 0 <= number < _MAX_POINTS:
-        raise FileError("its first element is not a plain 'vertex'", file=path, remedy=_REMEDY)
-    where = [_place(axis, [p[1] for p in properties], path) for axis in "xyz"]
+        raise FileError("its first element is not a plain 'vertex'", remedy=_REMEDY)
+    where = [_place(axis, [p[1] for p in properties]) for axis in "xyz"]
     if kind == "ascii":
-        points = _text(body, number, len(properties), path)[:, where]
+        points = _text(body, number, len(properties))[:, where]
     elif kind in ("binary_little_endian", "binary_big_endian"):
         order = "<" if kind == "binary_little_endian" else ">"
         record = np.dtype([(f"f{i}", order + _PLY_TYPES[p[0]]) for i, p in enumerate(properties)])
-        table = _binary(body, record, number, path)
+        table = _binary(body, record, number)
         points = np.stack([table[f"f{w}"].astype(float) for w in where], axis=1)
     else:
-        raise FileError(f"format {kind or 'missing'}", file=path, remedy=_REMEDY)
+        raise FileError(f"format {kind or 'missing'}", remedy=_REMEDY)
     return FileCloud(points, None, np.eye(4))
 
 
-def _place(axis: str, names: list[str], path: Path) -> int:
+def _place(axis: str, names: list[str]) -> int:
     if axis not in names:
-        raise FileError(f"it has no {axis}, only {', '.join(names)}", file=path, remedy=_REMEDY)
+        raise FileError(f"it has no {axis}, only {', '.join(names)}", remedy=_REMEDY)
     return names.index(axis)
 
 
-def _text(body: bytes, rows: int, columns: int, path: Path) -> NDArray:
+def _text(body: bytes, rows: int, columns: int) -> NDArray:
     """(rows, columns) numbers; anything after them (faces) is ignored."""
     words = body.split(None, rows * columns)[: rows * columns]
     if len(words) < rows * columns:
         problem = f"{len(words) // max(columns, 1)} of {rows} points are there"
-        raise FileError(problem, file=path, remedy=_CUT)
+        raise FileError(problem, remedy=_CUT)
     return np.array(words, dtype="S32").astype(float).reshape(rows, columns)
 
 
-def _binary(body: bytes, record: np.dtype, number: int, path: Path) -> NDArray:
+def _binary(body: bytes, record: np.dtype, number: int) -> NDArray:
     if len(body) < number * record.itemsize:
         problem = f"{len(body) // record.itemsize} of {number} points are there"
-        raise FileError(problem, file=path, remedy=_CUT)
+        raise FileError(problem, remedy=_CUT)
     return np.frombuffer(body, record, number)
-
-
-def _rotation(q: NDArray) -> NDArray:
-    """(3, 3) rotation of a quaternion (w, x, y, z)."""
-    length = float(np.linalg.norm(q))
-    if len(q) != 4 or not length > 0.0:
-        raise ValueError(f"VIEWPOINT with the quaternion {q}")
-    w, x, y, z = q / length
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
 
 
 def depth_of(cloud: FileCloud) -> NDArray:
@@ -198,7 +186,7 @@ def in_sensor(cloud: FileCloud) -> NDArray:
     return cloud.points @ T[:3, :3].T + T[:3, 3]
 
 
-def camera_of(cloud: FileCloud, name: str, path: str | PathLike[str] | None = None) -> Camera:
+def camera_of(cloud: FileCloud, name: str) -> Camera:
     """The pinhole camera of an organised cloud, at the origin, fitted to its points.
 
     Raises
@@ -216,14 +204,12 @@ def camera_of(cloud: FileCloud, name: str, path: str | PathLike[str] | None = No
         ray = x[ok, axis] / x[ok, 2]
         A = np.stack([ray, np.ones(len(ray))], axis=1)
         if len(ray) < 100 or np.ptp(ray) < 1e-3:
-            raise CalibrationError("too few points to determine the camera", file=path, remedy="Give its intrinsics.")
+            raise CalibrationError("too few points to determine the camera", remedy="Give its intrinsics.")
         if not np.abs(A).max() < 1e6:
-            raise CalibrationError("points that no camera sees", file=path, remedy="Give its intrinsics.")
+            raise CalibrationError("points that no camera sees", remedy="Give its intrinsics.")
         (K[axis, axis], K[axis, 2]), *_ = np.linalg.lstsq(A, pixel[ok], rcond=None)
         fits.append(np.percentile(np.abs(A @ (K[axis, axis], K[axis, 2]) - pixel[ok]), 99))
     if max(fits) > 0.5 or K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise CalibrationError(
-            f"its points do not lie on the rays of a pinhole camera ({max(fits):.2g} px off)", file=path,
-            remedy="Give intrinsics, or the points as an unorganised cloud (HEIGHT 1).",
-        )  # fmt: skip
+        problem = f"its points do not lie on the rays of a pinhole camera ({max(fits):.2g} px off)"
+        raise CalibrationError(problem, remedy="Give intrinsics, or the points as an unorganised cloud (HEIGHT 1).")
     return Camera(name, (width, height), K)

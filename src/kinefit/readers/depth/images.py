@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kinefit._files import read_npz, regular
 from kinefit._pictures import page_sizes, read_page, read_picture
-from kinefit.errors import FileError, ObservationError
+from kinefit.errors import FileError, ObservationError, names_file
 from kinefit.geometry.camera import Camera
 
 PICTURES = (".png", ".tif", ".tiff")
@@ -132,10 +132,8 @@ def raw_source(files: list[Path], size: tuple[int, int] | None) -> DepthSource:
     files = [file for file in files if re.sub(r"\d+", "#", file.name) == alike]
     length = files[0].stat().st_size
     if size is None:
-        raise ObservationError(
-            f"raw files of {length} bytes without a stated image size", file=files[0],
-            remedy="Give size = [width, height]; 614400 bytes are 640x480 in 16 bits.",
-        )  # fmt: skip
+        remedy = "Give size = [width, height]; 614400 bytes are 640x480 in 16 bits."
+        raise ObservationError(f"raw files of {length} bytes without a stated image size", file=files[0], remedy=remedy)
     width, height = size
     frame = 2 * width * height
     for file in files:
@@ -158,6 +156,7 @@ def raw_source(files: list[Path], size: tuple[int, int] | None) -> DepthSource:
     return DepthSource(count, image, size, 0.001, names=tuple(f.name for f in files) if len(files) > 1 else ())
 
 
+@names_file
 def array_source(path: Path) -> DepthSource:
     """Source of a numpy archive: `depth` (F, H, W) or (H, W); optional `times` (F,) [s], `unit` [m], `rate` [Hz].
 
@@ -171,21 +170,19 @@ def array_source(path: Path) -> DepthSource:
     depth = content.get("depth")
     if depth is None or depth.ndim not in (2, 3) or not depth.size or depth.dtype.kind not in "uif":
         shape = "" if depth is None else f", `depth` has shape {depth.shape} of {depth.dtype}"
-        raise ObservationError(
-            f"it holds {', '.join(keys) or 'nothing'}{shape}", file=path,
-            remedy="Give `depth` (frames, height, width), in metres or in whole counts with `unit` [m].",
-        )  # fmt: skip
+        remedy = "Give `depth` (frames, height, width), in metres or in whole counts with `unit` [m]."
+        raise ObservationError(f"it holds {', '.join(keys) or 'nothing'}{shape}", remedy=remedy)
     depth = depth if depth.ndim == 3 else depth[None]
     times = content.get("times")
     if times is not None and (times.shape != (len(depth),) or times.dtype.kind not in "uif"):
         problem = f"{times.shape} times for {len(depth)} frames, of type {times.dtype}"
-        raise ObservationError(problem, file=path, remedy="Give `times` (frames,) in seconds.")
+        raise ObservationError(problem, remedy="Give `times` (frames,) in seconds.")
     number = {}
     for key in ("unit", "rate"):
         if key in content:
             value = content[key]
             if value.size != 1 or value.dtype.kind not in "uif":
-                raise ObservationError(f"`{key}` is not a number", file=path, remedy="Give one number.")
+                raise ObservationError(f"`{key}` is not a number", remedy="Give one number.")
             number[key] = float(value.ravel()[0])
     unit = number.get("unit", 1.0 if depth.dtype.kind == "f" else 0.001)
     return DepthSource(

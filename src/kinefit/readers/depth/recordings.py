@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
-from kinefit.errors import FileError, ObservationError
+from kinefit.errors import FileError, ObservationError, names_file
 from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.readers.depth import clouds
 from kinefit.readers.depth.images import PICTURES, DepthSource, array_source, listed, picture_source, raw_source
 from kinefit.readers.depth.streams import bag_source, track_source
-from kinefit.readers.ros.depth import mcap_source
+from kinefit.readers.ros.images import mcap_source
 from kinefit.readers.ros.recordings import inside
 
 FORMATS = (
@@ -32,6 +32,7 @@ _DEFAULT_RATE = 30.0  # [Hz] of nearly every depth camera
 
 
 @checked
+@names_file
 def read_depth(
     path: str | PathLike[str],
     *,
@@ -79,17 +80,18 @@ def read_depth(
     path = Path(path)
     name = sensor or path.stem
     source = _source(path, name, size)
-    times, rate = _times(source, rate, usual_rate, time_unit, time_offset, path)
-    factor = _factor(unit if unit is not None else source.unit, path)
+    times, rate = _times(source, rate, usual_rate, time_unit, time_offset)
+    factor = _factor(unit if unit is not None else source.unit)
     video = DepthVideo(
         name, rate, times, source.size, _scaled(source.image, factor), float(range[0]), float(range[1]),
         source.camera, source=str(path),
     )  # fmt: skip
-    _check_content(video, factor, path)
+    _check_content(video, factor)
     return video
 
 
 @checked
+@names_file
 def read_clouds(
     path: str | PathLike[str],
     *,
@@ -120,13 +122,13 @@ def read_clouds(
     FileError, ObservationError
         As `read_depth`.
     """
-    path, unit = Path(path), _factor(unit, Path(path))
+    path, unit = Path(path), _factor(unit)
     files = _of_ending(listed(path), clouds.ENDINGS)
     if not files:
-        raise _nothing(path, f"clouds ({', '.join(clouds.ENDINGS)})")
+        raise _nothing(f"clouds ({', '.join(clouds.ENDINGS)})")
     name = sensor or path.stem
     source = DepthSource(len(files), lambda i: np.zeros((1, 1)), (1, 1), unit, names=tuple(f.name for f in files))
-    times, rate = _times(source, rate, usual_rate, time_unit, time_offset, path)
+    times, rate = _times(source, rate, usual_rate, time_unit, time_offset)
     first = clouds.read_cloud(files[0])
     T = np.array(first.T_file_sensor if T_world_sensor is None else T_world_sensor, float)
     if T_world_sensor is None:
@@ -137,7 +139,7 @@ def read_clouds(
     )  # fmt: skip
     points = clouds.in_sensor(first)
     away = np.linalg.norm(points[np.isfinite(points).all(axis=1)], axis=1) * unit
-    _check_values(away[away > 0.0], unit, video.near, video.far, path, least=0.001)
+    _check_values(away[away > 0.0], unit, video.near, video.far, least=0.001)
     return video
 
 
@@ -153,8 +155,8 @@ def _source(path: Path, name: str, size: tuple[int, int] | None) -> DepthSource:
     files = listed(path)
     if not files:
         if path.is_dir():
-            raise _nothing(path, "files")
-        raise FileError("no such file or folder", file=path, remedy=f"Check the path; kinefit reads {FORMATS}.")
+            raise _nothing("files")
+        raise FileError("no such file or folder", remedy=f"Check the path; kinefit reads {FORMATS}.")
     if len(files) == 1:
         ending = files[0].suffix.lower()
         if ending == ".npz":
@@ -169,7 +171,7 @@ def _source(path: Path, name: str, size: tuple[int, int] | None) -> DepthSource:
         return _organised(pieces, name)
     if size is None and (colour := _of_ending(files, (".jpg", ".jpeg", ".bmp", ".gif"))):
         problem = f"{colour[0].suffix} files hold colour, not depth"
-        raise FileError(problem, file=path, remedy=f"kinefit reads {FORMATS}.")
+        raise FileError(problem, remedy=f"kinefit reads {FORMATS}.")
     return raw_source(files, size)
 
 
@@ -184,20 +186,18 @@ def _of_ending(files: list[Path], endings: tuple[str, ...]) -> list[Path]:
     return found
 
 
-def _nothing(path: Path, what: str) -> FileError:
-    return FileError(f"it holds no {what}", file=path, remedy=f"kinefit reads {FORMATS}.")
+def _nothing(what: str) -> FileError:
+    return FileError(f"it holds no {what}", remedy=f"kinefit reads {FORMATS}.")
 
 
 def _organised(files: list[Path], name: str) -> DepthSource:
     first = clouds.read_cloud(files[0])
     if first.shape is None:
-        raise ObservationError(
-            "a cloud without the rows of an image", file=files[0],
-            remedy="Read it with kinefit.read_clouds; a take does so by itself.",
-        )  # fmt: skip
+        remedy = "Read it with kinefit.read_clouds; a take does so by itself."
+        raise ObservationError("a cloud without the rows of an image", file=files[0], remedy=remedy)
     return DepthSource(
         len(files), lambda i: _depth(files[i]), first.shape[::-1], 1.0,
-        camera=clouds.camera_of(first, name, files[0]), names=tuple(f.name for f in files),
+        camera=clouds.camera_of(first, name), names=tuple(f.name for f in files),
     )  # fmt: skip
 
 
@@ -209,41 +209,38 @@ def _depth(file: Path) -> NDArray:
 
 
 def _times(
-    source: DepthSource, rate: float | None, default_rate: float | None, time_unit: float | None, time_offset: float,
-    path: Path,
+    source: DepthSource, rate: float | None, default_rate: float | None, time_unit: float | None, time_offset: float
 ) -> tuple[NDArray, float]:
     """Times (F,) [s] and rate [Hz]; the caller's values come before the file's."""
     times = source.times
     if time_unit is not None:
         numbers = [re.findall(r"\d+", name) for name in source.names]
         if not numbers or not all(numbers):
-            raise ObservationError("the file names have no number", file=path, remedy="Remove time_unit, give rate.")
+            raise ObservationError("the file names have no number", remedy="Remove time_unit, give rate.")
         counts = [int(found[-1]) for found in numbers]
         times = np.array([count - counts[0] for count in counts], float) * time_unit
     if not (np.isfinite(time_offset) and (time_unit is None or (np.isfinite(time_unit) and time_unit > 0))):
-        raise ObservationError(f"time unit {time_unit} s, offset {time_offset} s", file=path, remedy="Give seconds.")
+        raise ObservationError(f"time unit {time_unit} s, offset {time_offset} s", remedy="Give seconds.")
     if rate is not None and not 0 < rate < 1e6:
-        raise ObservationError(f"rate {rate:g} Hz", file=path, remedy="Give frames per second.")
+        raise ObservationError(f"rate {rate:g} Hz", remedy="Give frames per second.")
     if times is None:
         rate = rate or source.rate or (default_rate if source.count > 1 else _DEFAULT_RATE)
         if rate is None:
-            raise ObservationError("its rate is not stated", file=path, remedy="Give rate = ... in frames per second.")
+            raise ObservationError("its rate is not stated", remedy="Give rate = ... in frames per second.")
         return np.arange(source.count) / rate + time_offset, rate
     steps = np.diff(times)
     measured = 1.0 / float(np.median(steps[steps > 0])) if (steps > 0).any() else None
     if rate is not None and measured is not None and not 0.9 < rate / measured < 1.1:
-        raise ObservationError(
-            f"the times of its frames give {measured:.4g} Hz, not {rate:g} Hz", file=path,
-            remedy="Remove the rate, or correct the unit of the times.",
-        )  # fmt: skip
+        problem = f"the times of its frames give {measured:.4g} Hz, not {rate:g} Hz"
+        raise ObservationError(problem, remedy="Remove the rate, or correct the unit of the times.")
     if source.rate and measured and abs(source.rate / measured - 1.0) < 0.1:
         measured = source.rate  # times are rounded to milliseconds
     return times + time_offset, rate or measured or source.rate or default_rate or _DEFAULT_RATE
 
 
-def _factor(unit: float, path: Path) -> float:
+def _factor(unit: float) -> float:
     if not (np.isfinite(unit) and unit > 0):
-        raise ObservationError(f"a unit of {unit} m", file=path, remedy="Give metres a count: 0.001 for millimetres.")
+        raise ObservationError(f"a unit of {unit} m", remedy="Give metres a count: 0.001 for millimetres.")
     return float(unit)
 
 
@@ -251,7 +248,7 @@ def _scaled(image: Callable[[int], NDArray], factor: float) -> Callable[[int], N
     return lambda i: image(i) * np.float32(factor)
 
 
-def _check_content(video: DepthVideo, factor: float, path: Path) -> None:
+def _check_content(video: DepthVideo, factor: float) -> None:
     """Check some frames for depth, a plausible unit and a range that contains it; raises ObservationError."""
     seen: list[NDArray] = []
     first = dict.fromkeys(round(k) for k in np.linspace(0, len(video) - 1, 5))
@@ -264,29 +261,21 @@ def _check_content(video: DepthVideo, factor: float, path: Path) -> None:
             seen.append(image[(image > 0) & np.isfinite(image)])
         else:
             video.frame(i)  # raises for the wrong size
-    _check_values(np.concatenate(seen), factor, video.near, video.far, path)
+    _check_values(np.concatenate(seen), factor, video.near, video.far)
 
 
-def _check_values(
-    depth: NDArray, factor: float, near: float, far: float, path: Path, least: float = _MIN_MEDIAN_DEPTH
-) -> None:
+def _check_values(depth: NDArray, factor: float, near: float, far: float, least: float = _MIN_MEDIAN_DEPTH) -> None:
     if not len(depth):
-        raise ObservationError(
-            "no frame has a depth value", file=path,
-            remedy="Check that the sensor was not covered and that these are not infrared images.",
-        )  # fmt: skip
+        remedy = "Check that the sensor was not covered and that these are not infrared images."
+        raise ObservationError("no frame has a depth value", remedy=remedy)
     median = float(np.median(depth))
     if not least < median < _MAX_MEDIAN_DEPTH:
         likely = [unit for unit in _COUNT_UNITS if _PERSON_DISTANCES[0] < median / factor * unit < _PERSON_DISTANCES[1]]
         entry = f"unit = {likely[0]:g}" if likely else "the sensor's own unit = ..."
         what = " (probably millimetres)" if factor == 1.0 and median > 100 else ""
-        raise ObservationError(
-            f"the median depth is {median:.4g} m{what}: the unit of {factor:g} m a count is wrong", file=path,
-            remedy=f"Write {entry} (metres a count).",
-        )  # fmt: skip
+        problem = f"the median depth is {median:.4g} m{what}: the unit of {factor:g} m a count is wrong"
+        raise ObservationError(problem, remedy=f"Write {entry} (metres a count).")
     if not ((depth >= near) & (depth <= far)).any():
         low, high = np.percentile(depth, (1, 99))
-        raise ObservationError(
-            f"nothing lies within the range of {near:g} to {far:g} m: depths go from {low:.3g} to {high:.3g} m",
-            file=path, remedy="Correct the range, or the unit.",
-        )  # fmt: skip
+        problem = f"nothing lies within the range of {near:g} to {far:g} m: depths go from {low:.3g} to {high:.3g} m"
+        raise ObservationError(problem, remedy="Correct the range, or the unit.")

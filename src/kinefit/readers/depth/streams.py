@@ -11,7 +11,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import CalibrationError, FileError, ObservationError, extra
+from kinefit.errors import CalibrationError, FileError, ObservationError, extra, names_file
 from kinefit.geometry.camera import Camera
 from kinefit.readers.depth.images import DepthSource
 from kinefit.readers.video_files import open_container
@@ -70,6 +70,7 @@ class _StreamTrack:
         return np.frombuffer(data, ">u2").reshape(codec.height, codec.width).astype(np.float32)
 
 
+@names_file
 def track_source(path: Path, name: str) -> DepthSource:
     """Source of an Azure Kinect recording, or of any lossless video of one 16-bit grey channel.
 
@@ -84,25 +85,23 @@ def track_source(path: Path, name: str) -> DepthSource:
     """
     try:
         with open_container(path) as container:
-            stream = _depth_stream(container, path)
+            stream = _depth_stream(container)
             index, base = stream.index, float(stream.time_base)
             codec = stream.codec_context
             if codec is None:
-                raise FileError("a codec that FFmpeg does not know", file=path, remedy="Copy the recording again.")
+                raise FileError("a codec that FFmpeg does not know", remedy="Copy the recording again.")
             size, raw = (codec.width, codec.height), codec.codec_tag.lower() == "b16g"
             pixels = None if codec.format is None else codec.format.name  # old PyAV has no `pix_fmt` then
             if not raw and pixels not in _GREY:
-                raise ObservationError(
-                    f"its video is {codec.name} {pixels}, not depth", file=path,
-                    remedy="Give 16-bit grey (FFV1 gray16le) or the depth track of an Azure Kinect recording.",
-                )  # fmt: skip
+                remedy = "Give 16-bit grey (FFV1 gray16le) or the depth track of an Azure Kinect recording."
+                raise ObservationError(f"its video is {codec.name} {pixels}, not depth", remedy=remedy)
             rate = float(stream.average_rate or 0) or None
-            camera = _azure_camera(container, name, size, path)
+            camera = _azure_camera(container, name, size)
             times = sorted({p.pts for p in container.demux(stream) if p.size and p.pts is not None})
     except (av.FFmpegError, OSError, ValueError) as error:
-        raise FileError(f"not a readable video ({error})", file=path, remedy="Copy it again.") from error
+        raise FileError(f"not a readable video ({error})", remedy="Copy it again.") from error
     if not times:
-        raise FileError("its depth track has no frames", file=path, remedy="Record for longer.")
+        raise FileError("its depth track has no frames", remedy="Record for longer.")
     seconds = np.array(times) * base
     return DepthSource(
         len(times), _StreamTrack(path, index, raw, times), size, 0.001, camera is not None, seconds - seconds[0],
@@ -110,7 +109,7 @@ def track_source(path: Path, name: str) -> DepthSource:
     )  # fmt: skip
 
 
-def _depth_stream(container: Any, path: Path) -> Any:
+def _depth_stream(container: Any) -> Any:
     videos = container.streams.video
     named = [s for s in videos if s.metadata.get("title", "").upper() == "DEPTH" or "K4A_DEPTH_MODE" in s.metadata]
     if named:
@@ -118,10 +117,10 @@ def _depth_stream(container: Any, path: Path) -> Any:
     if len(videos) == 1:
         return videos[0]
     titles = ", ".join(s.metadata.get("title", f"track {s.index}") for s in videos) or "none"
-    raise FileError(f"no depth track; its video tracks: {titles}", file=path, remedy="Record with the depth camera on.")
+    raise FileError(f"no depth track; its video tracks: {titles}", remedy="Record with the depth camera on.")
 
 
-def _azure_camera(container: Any, name: str, size: tuple[int, int], path: Path) -> Camera | None:
+def _azure_camera(container: Any, name: str, size: tuple[int, int]) -> Camera | None:
     """Depth camera from the attached calibration, at the origin; None without one.
 
     Parameters are cx cy fx fy, as shares of the sensor's size with (0, 0) its corner, k1..k6, the centre of distortion
@@ -138,10 +137,10 @@ def _azure_camera(container: Any, name: str, size: tuple[int, int], path: Path) 
         cx, cy, fx, fy, k1, k2, k3, k4, k5, k6, _, _, p2, p1 = [float(v) for v in intrinsics["ModelParameters"][:14]]
     except (ValueError, KeyError, TypeError, StopIteration, RecursionError) as error:
         raise CalibrationError(
-            f"its attached calibration cannot be understood ({error})", file=path, remedy="Give intrinsics."
+            f"its attached calibration cannot be understood ({error})", remedy="Give intrinsics."
         ) from error
     if size not in _AZURE_MODES:
-        raise CalibrationError(f"no depth mode of an Azure Kinect has {size} px", file=path, remedy="Give intrinsics.")
+        raise CalibrationError(f"no depth mode of an Azure Kinect has {size} px", remedy="Give intrinsics.")
     binned, (u, v) = _AZURE_MODES[size]
     K = [[fx * binned, 0, cx * binned - u - 0.5], [0, fy * binned, cy * binned - v - 0.5], [0, 0, 1]]
     return Camera(name, size, K, (k1, k2, p1, p2, k3, k4, k5, k6))  # type: ignore[arg-type]
@@ -190,6 +189,7 @@ class _Bag:
         raise FileError("the recording ends before", file=self._path, place=f"frame {i}", remedy="Copy it again.")
 
 
+@names_file
 def bag_source(path: Path, name: str) -> DepthSource:
     """Source of a RealSense .bag, read by Intel's library.
 
@@ -200,7 +200,7 @@ def bag_source(path: Path, name: str) -> DepthSource:
     CalibrationError
         A lens model that OpenCV lacks.
     """
-    with extra("realsense", "a RealSense recording needs Intel's library", FileError, file=path):
+    with extra("realsense", "a RealSense recording needs Intel's library", FileError):
         import pyrealsense2 as rs
     bag = _Bag(rs, path)
     try:
@@ -209,14 +209,12 @@ def bag_source(path: Path, name: str) -> DepthSource:
         unit = float(profile.get_device().first_depth_sensor().get_depth_scale())
         times = [frame.get_timestamp() * 1e-3 for frame in bag.frames()]
     except RuntimeError as error:
-        raise FileError(f"no depth can be read from it ({error})", file=path, remedy="Record it again.") from error
+        raise FileError(f"no depth can be read from it ({error})", remedy="Record it again.") from error
     finally:
         bag.stop()
     K = [[lens.fx, 0, lens.ppx], [0, lens.fy, lens.ppy], [0, 0, 1]]
     if any(lens.coeffs) and lens.model != rs.distortion.brown_conrady:
-        raise CalibrationError(
-            f"lens model {lens.model}", file=path, remedy="Give intrinsics of the undistorted depth image."
-        )
+        raise CalibrationError(f"lens model {lens.model}", remedy="Give intrinsics of the undistorted depth image.")
     camera = Camera(name, (lens.width, lens.height), K, lens.coeffs if any(lens.coeffs) else ())  # type: ignore[arg-type]
     seconds = np.array(times)
     return DepthSource(len(times), bag, camera.size, unit, True, seconds - seconds[:1], camera)

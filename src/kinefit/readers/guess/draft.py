@@ -14,6 +14,7 @@ from kinefit.readers.guess.files import CalibrationFile
 CONFIDENCE_LEVELS = ("sure", "likely", "guess", "open")
 """From "stated by the files" to "the user decides"."""
 
+_TABLES = ("keypoints", "depth", "markers", "surface_points")  # in the order in which they are written
 _COMMENT_COLUMN = 40
 _HEAD = """\
 # A first take file, made by kinefit init from what lies in the folder.
@@ -62,7 +63,7 @@ class Draft:
     calibration : the file, and keys of [calibration]
     others : calibrations that were not chosen.
     cameras : name -> keys of its [[camera]]
-    keypoints, depth, markers, surface_points : (True if in use, False if a comment; keys) of each table
+    tables : {"keypoints", "depth" ...: (True if in use, False if a comment; keys) of each entry}
     """
 
     folder: Path
@@ -72,10 +73,7 @@ class Draft:
     calibration: tuple[CalibrationFile, dict[str, Value]] | None = None
     others: list[Path] = field(default_factory=list)
     cameras: dict[str, dict[str, Value]] = field(default_factory=dict)
-    keypoints: list[tuple[bool, Entry]] = field(default_factory=list)
-    depth: list[tuple[bool, Entry]] = field(default_factory=list)
-    markers: list[tuple[bool, Entry]] = field(default_factory=list)
-    surface_points: list[tuple[bool, Entry]] = field(default_factory=list)
+    tables: dict[str, list[tuple[bool, Entry]]] = field(default_factory=lambda: {table: [] for table in _TABLES})
     comments: list[str] = field(default_factory=list)
 
     def note(self, about: str, sure: str, text: str) -> None:
@@ -101,10 +99,8 @@ class Draft:
             others = "".join(f"# file = {_value(path, self)}\n" for path in self.others)
             parts.append(_table("[calibration]", self.calibration[1], self) + others)
         parts += [_table("[[camera]]", {"name": Value(name), **keys}, self) for name, keys in self.cameras.items()]
-        parts += [_table("[[keypoints]]", keys, self, active) for active, keys in self.keypoints]
-        parts += [_table("[[depth]]", keys, self, active) for active, keys in self.depth]
-        parts += [_table("[[markers]]", keys, self, active) for active, keys in self.markers]
-        parts += [_table("[[surface_points]]", keys, self, active) for active, keys in self.surface_points]
+        for table, rows in self.tables.items():
+            parts += [_table(f"[[{table}]]", keys, self, active) for active, keys in rows]
         return "\n".join(parts)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -16,17 +15,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import npy_header
+from kinefit._files import npy_header, read_table
 from kinefit._pictures import read_picture
 from kinefit.errors import CalibrationError, FileError, KinefitError
 from kinefit.geometry.camera import Rig
 from kinefit.readers.calibration.read import MAX_CALIBRATION_BYTES, PAIRS, read_calibration
 from kinefit.readers.guess.names import camera_of, natural
-from kinefit.readers.image_folders import ENDINGS, ImageFolder
 from kinefit.readers.keypoint_sets import SPLIT, other_keypoints
 from kinefit.readers.keypoints import decode_openpose
 from kinefit.readers.ros.recordings import inside
-from kinefit.readers.video import Video
+from kinefit.readers.video import ENDINGS, ImageFolder, Video
 
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts", ".m2ts", ".ts", ".wmv", ".mxf"}
 CALIBRATIONS = (".yml", ".yaml", ".xml", ".json", ".toml", ".qca", ".qca.txt", ".xcp", ".mat")
@@ -46,7 +44,7 @@ _MAX_DEPTH = 6  # folders below the given one
 _MIN_SEQUENCE = 12  # numbered json files in one folder are a detector's frames, fewer may be cameras
 _JSON_NUMBER = re.compile(r"(\d+)(?:_keypoints)?\.json$", re.I)
 _MAYBE_KEYPOINTS = (".json", ".csv", ".h5")
-_CALISCOPE_COLUMNS = {"sync_index", "port", "point_id", "img_loc_x", "img_loc_y"}
+_CALISCOPE_COLUMNS = ("sync_index", "port", "point_id", "img_loc_x", "img_loc_y")
 _CALIBRATION_NAME = re.compile(r"calib|intrin|extrin|cam", re.IGNORECASE)  # else a broken file may be anything
 _UNITS = ("mm", "cm", "inch", "dm")
 _LAST_NUMBER = re.compile(r"\d+(?=\D*$)")
@@ -324,11 +322,8 @@ def _array_shape(path: Path) -> tuple[int, ...] | None:
 def _caliscope_frames(path: Path) -> int:
     """Number of frames of a caliscope table with points of a body, not of a board; 0 for any other table."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            if not set(reader.fieldnames or ()) >= _CALISCOPE_COLUMNS:
-                return 0
-            body = [int(row["sync_index"]) for row in reader if not row.get("obj_loc_x")]
-    except (OSError, ValueError, TypeError, UnicodeDecodeError, csv.Error):
+        table = read_table(path, _CALISCOPE_COLUMNS, "", optional=("obj_loc_x",))[1]
+    except KinefitError:
         return 0
-    return max(body) - min(body) + 1 if body else 0
+    body = table[np.isnan(table[:, -1]), 0]
+    return int(np.ptp(body)) + 1 if len(body) else 0

@@ -17,8 +17,7 @@ from kinefit.readers.guess.draft import Draft, Entry, Note, Value
 from kinefit.readers.guess.files import DRAWN_ON, OF_CALIBRATION, STATIC, CalibrationFile
 from kinefit.readers.guess.names import trials
 from kinefit.readers.markers import read_markers
-from kinefit.readers.ros.contents import Shown, shown
-from kinefit.readers.ros.rig import mcap_rig
+from kinefit.readers.ros.images import Shown, mcap_rig, shown
 
 _CALIBRATE = (
     "Calibrate with a board (kinefit calibrate board) or, if the cameras' intrinsics are known, from the person "
@@ -85,7 +84,8 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
     _describe_markers(draft, markers)
     for path in [file for file in files if file.name == "trajectories.csv"] if draft.cameras else []:
         file = Value(path, "likely", "a surface that kinefit surface tracked; it needs a [start] or another sensor")
-        draft.surface_points.append((not draft.surface_points, {"file": draft.note_value("surface", file, "file")}))
+        rows = draft.tables["surface_points"]
+        rows.append((not rows, {"file": draft.note_value("surface", file, "file")}))
     draft.comments.append(OPEN_HEIGHT)
     return Guess(draft.text(), tuple(draft.notes))
 
@@ -175,7 +175,7 @@ def _describe_markers(draft: Draft, files: Sequence[Path]) -> None:
     used = next(iter(moving or records), None) if not draft.cameras else None
     for path, record in records.items():
         file = Value(path, "sure", f"{len(record.names)} markers, {len(record.positions)} frames, {record.rate:g} Hz")
-        draft.markers.append((path == used, {"file": file}))
+        draft.tables["markers"].append((path == used, {"file": file}))
         for text in record.notes:
             draft.note("markers", "open", text)
     if used is not None:
@@ -254,7 +254,7 @@ def _depth(draft: Draft, path: Path, topics: Sequence[Shown], rig: Rig | None) -
         entry: dict[str, Value] = {"name": Value(t.name), "file": Value(path), "topic": Value(t.topic, "sure", count)}
         if t.camera is None:
             entry["intrinsics"] = Value(None, "open", "[fx, fy, cx, cy] in pixels: the topic has no camera_info")
-        draft.depth.append((t in used, entry))
+        draft.tables["depth"].append((t in used, entry))
         why = "" if t in used else (
             ": a comment, the same images again" if t not in plain else ": a comment, its pose is unknown"
         )  # fmt: skip
@@ -272,6 +272,6 @@ def _colour(draft: Draft, path: Path, topics: Sequence[Shown], rig: Rig | None, 
         draft.note(f"camera {t.name}", "sure", t.topic)
         if beside_depth:
             entry: Entry = {"camera": Value(t.name), "format": Value("detect", "open", "keypoints besides depth")}
-            draft.keypoints.append((False, entry))
+            draft.tables["keypoints"].append((False, entry))
     if draft.cameras and not beside_depth:
         draft.note("keypoints", "sure", "none here: kinefit track runs the built-in detector on the videos")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import os
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.errors import FileError, KinefitError, ObservationError, extra
+from kinefit.errors import FileError, KinefitError, ObservationError, extra, located
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"
@@ -79,12 +79,12 @@ class Topics:
         A recording without an index.
     """
 
-    def __init__(self, reader: Any, path: Path) -> None:
-        self._reader, self.path = reader, path
+    def __init__(self, reader: Any) -> None:
+        self._reader = reader
         summary = reader.get_summary()
         if summary is None:
             problem = "it has no index: was the recording cut short?"
-            raise FileError(problem, file=path, remedy="Run `mcap recover` on it.")
+            raise FileError(problem, remedy="Run `mcap recover` on it.")
         self.kinds = {c.topic: summary.schemas[c.schema_id].name for c in summary.channels.values() if c.schema_id}
 
     def of(self, *kinds: str) -> list[str]:
@@ -114,16 +114,16 @@ class Topics:
             kind = self.kinds.get(topic)
             problem = f"no topic {topic}" if kind is None else f"{topic} ({kind}) has no {what}"
             problem += f"; topics with {what}: {listed or 'none'}"
-            raise ObservationError(problem, file=self.path, remedy="Correct topic.")
+            raise ObservationError(problem, remedy="Correct topic.")
         named = [t for t in fitting if name in t.split("/")] or list(fitting)
         if len(named) == 1:
             return named[0]
         if not named:
             have = ", ".join(sorted(self.kinds)) or "none"
             problem = f"no topic of it has {what}; its topics are {have}"
-            raise ObservationError(problem, file=self.path, remedy="Record the camera's images.")
+            raise ObservationError(problem, remedy="Record the camera's images.")
         problem = f"{len(named)} topics have {what}: {', '.join(sorted(named))}"
-        raise ObservationError(problem, file=self.path, remedy="Write topic = ... in the table that names the file.")
+        raise ObservationError(problem, remedy="Write topic = ... in the table that names the file.")
 
     def begin(self) -> int:
         """[ns] time of the first image of any topic, by its header; 0 if headers have no time."""
@@ -150,7 +150,7 @@ class Topics:
         return (by - begin) * 1e-9, logged
 
 
-def median_rate(times: NDArray, topic: str, path: Path) -> float:
+def median_rate(times: NDArray, topic: str) -> float:
     """Rate [Hz] of a topic's images, from the median step of their times (N,) [s].
 
     Raises
@@ -160,11 +160,11 @@ def median_rate(times: NDArray, topic: str, path: Path) -> float:
     """
     steps = np.diff(times)
     if not len(steps):
-        raise ObservationError(f"only one image on the topic {topic}", file=path, remedy="Record it for longer.")
+        raise ObservationError(f"only one image on the topic {topic}", remedy="Record it for longer.")
     step = float(np.median(steps))
     if step < _MIN_STEP_S:
         problem = f"a median step of {step:g} s between the images on the topic {topic}"
-        raise ObservationError(problem, file=path, remedy="Record them with the times at which they were taken.")
+        raise ObservationError(problem, remedy="Record them with the times at which they were taken.")
     return 1.0 / step
 
 
@@ -176,15 +176,16 @@ class Messages:
     path : of the recording
     topic : str
     logged : log time of each [ns]
+    convert : what is made of each
     """
 
-    def __init__(self, path: Path, topic: str, logged: list[int]) -> None:
-        self._path, self._topic, self._logged = path, topic, logged
+    def __init__(self, path: Path, topic: str, logged: list[int], convert: Callable[[Any], NDArray]) -> None:
+        self._path, self._topic, self._logged, self._convert = path, topic, logged, convert
         self._open, self._next = ExitStack(), -1
         self._coming: Iterator[Any] = iter(())
 
-    def __call__(self, i: int) -> Any:
-        """Message `i`, decoded.
+    def __call__(self, i: int) -> NDArray:
+        """Message `i`, decoded and converted.
 
         Raises
         ------
@@ -201,7 +202,8 @@ class Messages:
         except Exception as error:  # of damaged files libraries raise anything
             raise _damaged(error, self._path) from error
         self._next = i + 1
-        return message
+        with located(self._path, f"frame {i}"):
+            return self._convert(message)
 
     def close(self) -> None:
         """Close the file; the next access opens it again."""
@@ -224,9 +226,9 @@ def reading(path: Path) -> Iterator[Any]:
         from mcap.reader import make_reader
         from mcap_ros2.decoder import DecoderFactory
     try:
-        with _BoundedReader(io.FileIO(path)) as file:
+        with located(path), _BoundedReader(io.FileIO(path)) as file:
             reader = make_reader(file, decoder_factories=[DecoderFactory()])
-            _check_chunks(reader, file, path)
+            _check_chunks(reader, file)
             yield reader
     except KinefitError:
         raise
@@ -234,7 +236,7 @@ def reading(path: Path) -> Iterator[Any]:
         raise _damaged(error, path) from error
 
 
-def _check_chunks(reader: Any, file: io.BufferedReader, path: Path) -> None:
+def _check_chunks(reader: Any, file: io.BufferedReader) -> None:
     """Raise FileError if a chunk unpacks to more than `_MAX_CHUNK_BYTES`, by its record and its Zstandard frame."""
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader
@@ -255,7 +257,7 @@ def _check_chunks(reader: Any, file: io.BufferedReader, path: Path) -> None:
         size = max(size, _zstd_size(head[16 + name_length + 8 :]))
         if size > _MAX_CHUNK_BYTES:
             problem = f"a chunk of {size / 1e6:.0f} MB, more than {_MAX_CHUNK_BYTES / 1e6:.0f} MB"
-            raise FileError(problem, file=path, remedy="Record with smaller chunks; copy it again if it is damaged.")
+            raise FileError(problem, remedy="Record with smaller chunks; copy it again if it is damaged.")
 
 
 def _zstd_size(frame: bytes) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit.errors import FileError
+from kinefit.errors import FileError, names_file
 from kinefit.observations import SkeletonMotion
 from kinefit.readers.skeletons.common import (
     euler_rotations,
@@ -19,7 +19,7 @@ from kinefit.readers.skeletons.common import (
     joint_poses,
     landmarks,
     parse_numbers,
-    read_text,
+    text_of,
     vertical_axis,
 )
 
@@ -42,6 +42,7 @@ class _BvhJoint:
 
 
 @checked
+@names_file
 def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str = "auto") -> SkeletonMotion:
     """Read a BVH file.
 
@@ -72,22 +73,22 @@ def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str =
     FileError
         Missing, truncated, not BVH, numbers that are not finite, or no unit with a plausible stature.
     """
-    text = read_text(path, "BVH")
+    text = text_of(path, "BVH")
     hierarchy, *motion = re.split(r"^[ \t]*MOTION\b", text, maxsplit=1, flags=re.M | re.I)
-    joints = _read_hierarchy(hierarchy, path)
+    joints = _read_hierarchy(hierarchy)
     if not motion:
-        raise FileError("holds no MOTION section", file=path, remedy="Export the skeleton with its motion.")
+        raise FileError("holds no MOTION section", remedy="Export the skeleton with its motion.")
     channels = sum(len(joint.channels) for joint in joints)
-    rate, values = _read_motion(motion[0], channels, hierarchy.count("\n") + 1, path)
+    rate, values = _read_motion(motion[0], channels, hierarchy.count("\n") + 1)
 
     names = tuple(joint.name for joint in joints)
     parents = [joint.parent for joint in joints]
     Ts_parent_joint = _local_poses(joints, values)
     offsets = np.median(Ts_parent_joint[..., :3, 3], axis=0)
     offsets[0] = joints[0].offset
-    scale = _human_unit(names, parents, offsets, path) if unit == "auto" else given_unit(unit, path)
+    scale = _human_unit(names, parents, offsets) if unit == "auto" else given_unit(unit)
     Ts_world_joint = joint_poses(parents, Ts_parent_joint)
-    up = vertical_axis(up, names, Ts_world_joint[..., :3, 3], path)
+    up = vertical_axis(up, names, Ts_world_joint[..., :3, 3])
     Ts_world_joint[..., :3, 3] += _root_shift(joints[0], values, up)
     Ts_world_joint[..., :3, 3] *= scale
     return SkeletonMotion(
@@ -101,17 +102,17 @@ def read_bvh(path: str | PathLike[str], *, unit: float | str = "auto", up: str =
     )
 
 
-def _read_hierarchy(text: str, path: str | PathLike[str]) -> list[_BvhJoint]:
+def _read_hierarchy(text: str) -> list[_BvhJoint]:
     """Joints and end sites in the order of the file, parents first."""
     tokens = [(word, n) for n, line in enumerate(text.split("\n"), 1) for word in re.findall(r"[{}]|[^\s{}]+", line)]
     if not tokens or tokens[0][0].upper() != "HIERARCHY":
-        raise FileError("does not begin with HIERARCHY", file=path, place="line 1", remedy="Give a BVH file.")
+        raise FileError("does not begin with HIERARCHY", place="line 1", remedy="Give a BVH file.")
     joints: list[_BvhJoint] = []
     open_joints: list[dict] = []  # stack of open braces: name, parent, index
     at = 1
 
     def fault(problem: str, line: int) -> FileError:
-        return FileError(problem, file=path, place=f"line {line}", remedy="Export the file again.")
+        return FileError(problem, place=f"line {line}", remedy="Export the file again.")
 
     def take(count: int) -> list[str]:
         nonlocal at
@@ -139,7 +140,7 @@ def _read_hierarchy(text: str, path: str | PathLike[str]) -> list[_BvhJoint]:
                     raise fault(f"the joint name '{name}' is missing or already used", line)
                 open_joints.append({"name": name, "parent": parent, "end": kind == "END", "index": None})
             case "OFFSET" if open_joints and open_joints[-1]["index"] is None:
-                offset = tuple(parse_numbers(take(3), file=path, line=line))
+                offset = tuple(parse_numbers(take(3), line))
                 open_joints[-1]["index"] = len(joints)
                 joints.append(_BvhJoint(open_joints[-1]["name"], open_joints[-1]["parent"], offset, ()))
             case "CHANNELS" if open_joints and open_joints[-1]["index"] is not None and not open_joints[-1]["end"]:
@@ -170,48 +171,36 @@ def _end_name(parent: str, taken: set[str]) -> str:
     return name
 
 
-def _read_motion(text: str, channels: int, line: int, path: str | PathLike[str]) -> tuple[float, NDArray]:
+def _read_motion(text: str, channels: int, line: int) -> tuple[float, NDArray]:
     """Rate [Hz] and values (F, C) of the motion; `line` is the line number at which `text` begins."""
     lines = [(n, content) for n, content in enumerate(text.split("\n"), line) if content.strip()]
     found = []
     for i, pattern in enumerate((r"\s*Frames\s*:\s*(\d{1,12})\s*", r"\s*Frame\s+Time\s*:\s*(\S+)\s*")):
         match = re.fullmatch(pattern, lines[i][1], flags=re.I) if i < len(lines) else None
         if match is None:
-            raise FileError(
-                f"the line '{('Frames:', 'Frame Time:')[i]} ...' is missing or not a number",
-                file=path,
-                place=f"line {lines[i][0] if i < len(lines) else line}",
-                remedy="Export the motion again.",
-            )
+            problem = f"the line '{('Frames:', 'Frame Time:')[i]} ...' is missing or not a number"
+            remedy = "Export the motion again."
+            raise FileError(problem, place=f"line {lines[i][0] if i < len(lines) else line}", remedy=remedy)
         found.append(match[1])
     frames, rows = int(found[0]), lines[2:]
-    (frame_time,) = parse_numbers([found[1]], file=path, line=lines[1][0])
+    (frame_time,) = parse_numbers([found[1]], lines[1][0])
     if frame_time <= 0 or frames == 0:
-        raise FileError(
-            "the frame time is not positive" if frames else "the motion has no frames",
-            file=path,
-            place=f"line {lines[1 if frames else 0][0]}",
-            remedy="Export the motion again.",
-        )
+        problem = "the frame time is not positive" if frames else "the motion has no frames"
+        raise FileError(problem, place=f"line {lines[1 if frames else 0][0]}", remedy="Export the motion again.")
     values: list[list[float]] = []
     for n, row in rows:
-        numbers = parse_numbers(row.split(), file=path, line=n)
+        numbers = parse_numbers(row.split(), n)
         if len(numbers) != channels:
             raise FileError(
-                f"{len(numbers)} values for {channels} channels",
-                file=path,
-                place=f"line {n}",
+                f"{len(numbers)} values for {channels} channels", place=f"line {n}",
                 remedy="If it is the last line the file was cut off: export it again, or delete the line and set "
                 f"'Frames: {len(values)}'.",
             )
         values.append(numbers)
     if len(values) != frames:
-        raise FileError(
-            f"{len(values)} frames, but the file announces {frames}",
-            file=path,
-            place=f"line {rows[-1][0] if rows else lines[1][0]}",
-            remedy=f"Export it again, or set 'Frames: {len(values)}' on line {lines[0][0]}.",
-        )
+        problem = f"{len(values)} frames, but the file announces {frames}"
+        remedy = f"Export it again, or set 'Frames: {len(values)}' on line {lines[0][0]}."
+        raise FileError(problem, place=f"line {rows[-1][0] if rows else lines[1][0]}", remedy=remedy)
     return _exact_rate(frame_time, found[1]), np.array(values)
 
 
@@ -262,7 +251,7 @@ def _root_shift(root: _BvhJoint, values: NDArray, up: str) -> NDArray:
     return shift
 
 
-def _human_unit(names: Sequence[str], parents: Sequence[int], offsets: NDArray, path: str | PathLike[str]) -> float:
+def _human_unit(names: Sequence[str], parents: Sequence[int], offsets: NDArray) -> float:
     """The unit of `UNITS` with the most plausible stature.
 
     The stature is the length of the bones from head to ankle, independent of the pose; the extent of the rest pose
@@ -280,11 +269,8 @@ def _human_unit(names: Sequence[str], parents: Sequence[int], offsets: NDArray, 
         height = float(np.ptp(rest, axis=0).max())
     unit = min(UNITS, key=lambda u: abs(height * u - _TYPICAL_STATURE))
     if not _MIN_STATURE <= height * unit <= _MAX_STATURE:
-        raise FileError(
-            f"the skeleton is {height:.4g} units tall: no known unit makes that a person",
-            file=path,
-            remedy=_UNIT_REMEDY if height > 0 else "Export the skeleton again, with the lengths of its bones.",
-        )
+        remedy = _UNIT_REMEDY if height > 0 else "Export the skeleton again, with the lengths of its bones."
+        raise FileError(f"the skeleton is {height:.4g} units tall: no known unit makes that a person", remedy=remedy)
     return unit
 
 

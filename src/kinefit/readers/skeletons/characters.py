@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import parse_toml, read_text, regular
+from kinefit._files import parse_toml, read_text
 from kinefit.bodies.joint_names import ENDS, FAMILIES, FINGERS, SEGMENTS, VRM0_FINGERS, VRM1_FINGERS
 from kinefit.bodies.limbs import FACE
-from kinefit.errors import FileError, choices
+from kinefit.errors import FileError, check_choice, names_file
 from kinefit.motion import rotation_between_up
 from kinefit.readers.skeletons.bvh import read_bvh
+from kinefit.readers.skeletons.common import text_of
 from kinefit.readers.skeletons.gltf import MALFORMED, Gltf, read_gltf
 
 KINDS = {".glb": "glb", ".vrm": "glb", ".gltf": "glb", ".bvh": "bvh"}
@@ -75,6 +76,7 @@ class Character:
         return np.asarray(away / (self.scales[parent] * self.unit))
 
 
+@names_file
 def read_character(path: str | PathLike[str]) -> Character:
     """Read a character from a GLB, VRM, glTF or BVH file, in the pose of its nodes.
 
@@ -89,10 +91,11 @@ def read_character(path: str | PathLike[str]) -> Character:
     kind = KINDS.get(path.suffix.lower())
     if kind is None:
         remedy = f"Give a character as {', '.join(KINDS)}; FBX becomes GLB in Blender."
-        raise FileError(f"'{path.suffix}' is no format of characters", file=path, remedy=remedy)
+        raise FileError(f"'{path.suffix}' is no format of characters", remedy=remedy)
     return _from_gltf(path) if kind == "glb" else _from_bvh(path)
 
 
+@names_file
 def read_names(path: str | PathLike[str]) -> dict[str, str]:
     """Read a table of joint names: TOML of lines `segment = "joint"`.
 
@@ -107,15 +110,14 @@ def read_names(path: str | PathLike[str]) -> dict[str, str]:
     """
     table = parse_toml(read_text(path, "the table", remedy="Give a TOML file."), path)
     for segment, name in table.items():
-        if segment not in (known := (*SEGMENTS, *FINGERS, *FACE, *ENDS)):
-            remedy = 'A line is: thigh_l = "LeftUpLeg".'
-            raise FileError(choices("segment", segment, known), file=path, remedy=remedy)
+        known = (*SEGMENTS, *FINGERS, *FACE, *ENDS)
+        check_choice("segment", segment, known, FileError, remedy='A line is: thigh_l = "LeftUpLeg".')
         if not isinstance(name, str):
-            raise FileError("is no name of a joint", file=path, place=segment, remedy="Write it in quotes.")
+            raise FileError("is no name of a joint", place=segment, remedy="Write it in quotes.")
     return dict(table)
 
 
-def _order(parents: NDArray, path: Path) -> NDArray:
+def _order(parents: NDArray) -> NDArray:
     """(J,) node numbers, parents before their children; raises FileError for a cycle."""
     out, children = list[int](), [list[int]() for _ in parents]
     for node, parent in enumerate(parents.tolist()):
@@ -123,7 +125,7 @@ def _order(parents: NDArray, path: Path) -> NDArray:
     for node in out:
         out += children[node]
     if len(out) != len(parents):
-        raise FileError("its nodes form a circle", file=path)
+        raise FileError("its nodes form a circle")
     return np.array(out, int)
 
 
@@ -133,11 +135,11 @@ def _from_gltf(path: Path) -> Character:
         parents = gltf.parents()
         if not 0 < len(parents) <= _MAX_NODES:
             count = f"more than {_MAX_NODES}" if len(parents) else "no"
-            raise FileError(f"holds {count} nodes", file=path, remedy="Export the character alone, with its skeleton.")
-        return _of_gltf(gltf, parents, _order(parents, path), path)
+            raise FileError(f"holds {count} nodes", remedy="Export the character alone, with its skeleton.")
+        return _of_gltf(gltf, parents, _order(parents), path)
     except MALFORMED as error:
         problem = f"is no whole glTF file ({type(error).__name__}: {error})"
-        raise FileError(problem, file=path, remedy="Export the character again, as GLB.") from error
+        raise FileError(problem, remedy="Export the character again, as GLB.") from error
 
 
 def _of_gltf(gltf: Gltf, parents: NDArray, order: NDArray, path: Path) -> Character:
@@ -158,8 +160,8 @@ def _of_gltf(gltf: Gltf, parents: NDArray, order: NDArray, path: Path) -> Charac
         R = Ms[node, :3, :3] / max(scales[node], 1e-12)
         if not np.allclose(R.T @ R, np.eye(3), atol=_MAX_SHEAR):
             remedy = "Apply the scale in the program that it comes from (Blender: Ctrl-A, Scale)."
-            raise FileError("is scaled unevenly", file=path, place=f"node '{names[node]}'", remedy=remedy)
-    points, owners = _vertices(gltf, Ms, path)
+            raise FileError("is scaled unevenly", place=f"node '{names[node]}'", remedy=remedy)
+    points, owners = _vertices(gltf, Ms)
     if not (np.isfinite(Ms).all() and np.isfinite(points).all()):
         raise ValueError("a position that is not finite")
     rotations = Ms[:, :3, :3] / np.maximum(scales, 1e-12)[:, None, None]
@@ -169,7 +171,7 @@ def _of_gltf(gltf: Gltf, parents: NDArray, order: NDArray, path: Path) -> Charac
     )  # fmt: skip
 
 
-def _vertices(gltf: Gltf, Ms: NDArray, path: Path) -> tuple[NDArray, NDArray]:
+def _vertices(gltf: Gltf, Ms: NDArray) -> tuple[NDArray, NDArray]:
     """Vertices (P, 3) of all skinned meshes at rest, and the node (P,) that moves each most."""
     points, owners = [np.zeros((0, 3))], [np.zeros(0, int)]
     for node in gltf.json["nodes"]:
@@ -188,7 +190,7 @@ def _vertices(gltf: Gltf, Ms: NDArray, path: Path) -> tuple[NDArray, NDArray]:
                 continue
             if sum(map(len, points)) + len(x) > _MAX_VERTICES:
                 remedy = "Export the character with a simpler mesh."
-                raise FileError(f"has more than {_MAX_VERTICES} vertices", file=path, remedy=remedy)
+                raise FileError(f"has more than {_MAX_VERTICES} vertices", remedy=remedy)
             which, placed = which.astype(int), np.zeros_like(x)
             for joint, weight in zip(which.T, weights.T):
                 M = moves[joint, :3]
@@ -223,5 +225,5 @@ def _from_bvh(path: Path) -> Character:
     return Character(
         path, skeleton.names, parents, np.arange(len(parents)), rest @ R.T, R @ rotations, np.ones(len(parents)), R,
         np.ones(len(parents), bool), {}, np.zeros((0, 3)), np.zeros(0, int), unit=float(unit[1]) if unit else 1.0,
-        text=regular(path).read_text(encoding="utf-8-sig", errors="replace"),
+        text=text_of(path, "BVH"),
     )  # fmt: skip

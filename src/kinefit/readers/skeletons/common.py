@@ -10,43 +10,30 @@ from os import PathLike
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import regular
+from kinefit._files import LENGTHS, read_text, worth
 from kinefit.errors import FileError, check_choice
 from kinefit.motion import UP_AXES
-from kinefit.readers.units import LENGTHS, worth
 
 
-def read_text(path: str | PathLike[str], kind: str) -> str:
+def text_of(path: str | PathLike[str], kind: str) -> str:
     """Text of a file of the given kind ("BVH"); raises FileError if it cannot be read or is binary."""
-    try:
-        text = regular(path).read_text(encoding="utf-8-sig", errors="replace")
-    except OSError as error:
-        problem = f"cannot be read: {error.strerror}"
-        raise FileError(problem, file=path, remedy=f"Give the path of a {kind} file.") from error
+    text = read_text(path, f"the {kind} file", remedy=f"Give the path of a {kind} file.", errors="replace")
     if "\0" in text:
-        raise FileError(f"is a binary file, not {kind} text", file=path, remedy=f"Give a {kind} file.")
+        raise FileError(f"is a binary file, not {kind} text", remedy=f"Give a {kind} file.")
     return text
 
 
-def parse_numbers(tokens: Sequence[str], *, file: str | PathLike[str], line: int) -> list[float]:
-    """Finite numbers of one line; raises FileError with file and line."""
+def parse_numbers(tokens: Sequence[str], line: int) -> list[float]:
+    """Finite numbers of one line; raises FileError with the line."""
     try:
         values = [float(token) for token in tokens]
     except ValueError:
         bad = next(token for token in tokens if not _is_number(token))
-        raise FileError(
-            f"'{bad}' is not a number",
-            file=file,
-            place=f"line {line}",
-            remedy="Export the motion again, with a point as the decimal mark.",
-        ) from None
+        remedy = "Export the motion again, with a point as the decimal mark."
+        raise FileError(f"'{bad}' is not a number", place=f"line {line}", remedy=remedy) from None
     if not all(map(math.isfinite, values)):
-        raise FileError(
-            "holds a value that is not finite",
-            file=file,
-            place=f"line {line}",
-            remedy="Fill the gaps of the motion before exporting, or cut these frames out.",
-        )
+        remedy = "Fill the gaps of the motion before exporting, or cut these frames out."
+        raise FileError("holds a value that is not finite", place=f"line {line}", remedy=remedy)
     return values
 
 
@@ -100,12 +87,12 @@ def landmarks(names: Sequence[str]) -> tuple[int | None, list[int]]:
     return (heads[0] if heads else None), feet
 
 
-def vertical_axis(up: str, names: Sequence[str], positions: NDArray, path: str | PathLike[str]) -> str:
+def vertical_axis(up: str, names: Sequence[str], positions: NDArray) -> str:
     """The given axis, such as "y" or "-z"; for "auto" the one along which the head is above the feet on average.
 
     Positions are (F, J, 3). "y" if no joint is named as head and feet. Raises FileError for another axis.
     """
-    check_choice("vertical axis", up, (*UP_AXES, "auto"), FileError, file=path)
+    check_choice("vertical axis", up, (*UP_AXES, "auto"), FileError)
     head, feet = landmarks(names)
     if up != "auto" or head is None or not feet:
         return "y" if up == "auto" else up
@@ -113,12 +100,12 @@ def vertical_axis(up: str, names: Sequence[str], positions: NDArray, path: str |
     return max(UP_AXES, key=lambda axis: float(away @ UP_AXES[axis]))
 
 
-def given_unit(unit: float | str, path: str | PathLike[str]) -> float:
+def given_unit(unit: float | str) -> float:
     """Metres of a unit of length, given by its name or in metres; raises FileError if it is no length."""
     try:
         value = worth(unit, LENGTHS) or float(unit)
     except ValueError:
         value = math.nan
     if not 0 < value < math.inf:
-        raise FileError(f"unit {unit!r} is not a length", file=path, remedy="Give m, cm, mm, in, or metres per unit.")
+        raise FileError(f"unit {unit!r} is not a length", remedy="Give m, cm, mm, in, or metres per unit.")
     return value

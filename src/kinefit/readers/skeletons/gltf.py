@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._files import read_bytes
-from kinefit.errors import FileError
+from kinefit.errors import FileError, names_file
 from kinefit.geometry import se3
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -78,6 +78,7 @@ class Gltf:
         return se3.transform(R * np.array(entry.get("scale", (1, 1, 1)), float), entry.get("translation", (0, 0, 0)))
 
 
+@names_file
 def read_gltf(path: str | PathLike[str]) -> Gltf:
     """Read a GLB (also VRM) or glTF file; external buffers and images are embedded.
 
@@ -91,13 +92,13 @@ def read_gltf(path: str | PathLike[str]) -> Gltf:
     try:
         tree, binary = _chunks(content) if content[:4] == b"glTF" else (json.loads(content), b"")
         if not str(tree["asset"]["version"]).startswith("2."):
-            raise FileError(f"is glTF {tree['asset']['version']}, not 2.0", file=path, remedy=_EXPORT_REMEDY)
+            raise FileError(f"is glTF {tree['asset']['version']}, not 2.0", remedy=_EXPORT_REMEDY)
         if wrong := [name for name in _LIST_KEYS if not isinstance(tree.get(name, []), list)]:
             raise ValueError(f"{wrong[0]} is no list")
         return _in_one(tree, binary, path)
     except MALFORMED as error:
         problem = f"is no whole glTF file ({type(error).__name__}: {error})"
-        raise FileError(problem, file=path, remedy=_EXPORT_REMEDY) from error
+        raise FileError(problem, remedy=_EXPORT_REMEDY) from error
 
 
 def _chunks(content: bytes) -> tuple[dict[str, Any], bytes]:
@@ -154,7 +155,7 @@ def _content(uri: str, path: Path) -> bytes:
     file, folder = (path.parent / unquote(uri)).resolve(), path.parent.resolve()
     if not file.is_relative_to(folder):  # else a malicious character could embed any file of the user
         problem = f"it names a file outside of its folder: {uri}"
-        raise FileError(problem, file=path, remedy="Move that file into the folder, or export the character as GLB.")
+        raise FileError(problem, remedy="Move that file into the folder, or export the character as GLB.")
     return read_bytes(file)
 
 

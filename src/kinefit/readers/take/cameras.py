@@ -2,21 +2,65 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kinefit.errors import CalibrationError, TakeError, choices
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
 from kinefit.motion import UP_AXES
-from kinefit.readers.calibration.found import found_notes
-from kinefit.readers.calibration.read import read_calibration
+from kinefit.readers.calibration.read import found_notes, read_calibration
 from kinefit.readers.take.entries import CameraEntry, Take
 from kinefit.readers.video import Video
 
 DEFAULT_FIELD_OF_VIEW = 64.0
 """[deg] across the longer side of the image by default: videos of telephones have some 60 to 70."""
+
+
+@dataclass(frozen=True, eq=False)
+class TakeCameras:
+    """The cameras of a take, as the loaders of its sensors need them.
+
+    Parameters
+    ----------
+    take : Take
+    rig : Rig or None, as calibrated or as assumed.
+    images : {camera: ImageFrame}
+    clocks : {camera: (N,) [s] of its video's frames, from the first on}
+    rates : {stream: [Hz]} of the streams that were loaded so far.
+    streams : {stream: (N,) [s] in the take}, likewise.
+    """
+
+    take: Take
+    rig: Rig | None
+    images: Mapping[str, ImageFrame]
+    clocks: Mapping[str, NDArray]
+    rates: dict[str, float]
+    streams: dict[str, NDArray]
+
+    def offset(self, name: str) -> float:
+        """Time offset [s] of a camera."""
+        return next(entry.time_offset for entry in self.take.cameras if entry.name == name)
+
+    def video(self, name: str) -> Video:
+        """The opened video of a camera, which has one; raises what opening it raises."""
+        path = next(entry.video for entry in self.take.cameras if entry.name == name)
+        assert path is not None
+        return Video(path, rate=self.take.rate)
+
+    def size(self, name: str) -> tuple[int, int]:
+        """(width, height) [px] of a camera's calibration."""
+        assert self.rig is not None
+        return self.rig[name].size
+
+    @property
+    def fastest(self) -> float | None:
+        """Rate [Hz] of the take's steps, as far as its streams tell it."""
+        return self.take.rate or max(self.rates.values(), default=None)
 
 
 def is_alone(take: Take) -> bool:

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from kinefit._files import repeated
-from kinefit.errors import FileError, ObservationError, TakeError, choices
+from kinefit.errors import FileError, ObservationError, TakeError, choices, command
 from kinefit.motion import UP_AXES
 from kinefit.observations.person import PersonChoice
 from kinefit.readers.depth.images import listed
 from kinefit.readers.keypoint_sets import FACE_SET
 from kinefit.readers.ros.recordings import inside
-from kinefit.readers.take.entries import Take, keys_of
-from kinefit.readers.take.streams import odd_streams, refuse_streams
+from kinefit.readers.take.entries import SINGLE_TABLES, Take, keys_of
 
 ONE_CAMERA = "keypoints of one camera do not give a person's distance; two cameras do, or one with depth or markers"
 
@@ -183,3 +182,46 @@ def _files(take: Take) -> Iterator[tuple[str, Path]]:
         for key in keys_of(table):
             if key != "stream" and isinstance(file := getattr(entry, key), Path):
                 yield f"{name} {key}" if name.startswith("[") else name if key == "file" else f"{name}, {key}", file
+
+
+def streams_of(take: Take) -> list[str]:
+    """Every sensor of a take that has a `stream`, as messages name it."""
+    return [name for _, name, entry in take.entries if getattr(entry, "stream", None) is not None]
+
+
+def refuse_streams(take: Take) -> None:
+    """Refuse a take of streams where a recording is needed.
+
+    Raises
+    ------
+    TakeError
+        With the command that follows them.
+    """
+    streams = streams_of(take)
+    if streams:
+        remedy = f"Track it live ({command('live', take.path)}), or name its recording in place of the stream."
+        raise TakeError("a stream is no recording", file=take.path, place=streams[0], remedy=remedy)
+
+
+def odd_streams(take: Take) -> Iterator[tuple[str, str, str]]:
+    """Streams that stand beside what excludes them: problem, place, remedy."""
+    streaming = {camera.name for camera in take.cameras if camera.stream is not None}
+    for source in take.keypoints:
+        if source.stream is not None and source.camera in streaming:
+            place = f"keypoints of camera {source.camera}"
+            yield "its camera also has a stream", place, "Remove one: the detector runs on the camera's stream."
+    streams = streams_of(take)
+    if not streams:
+        return
+    recorded = [
+        name for table, name, entry in take.entries
+        if table not in SINGLE_TABLES and getattr(entry, "stream", None) is None
+        and (table != "camera" or entry.video is not None)
+    ]  # fmt: skip
+    recorded += ["[start] clicks"] * (take.clicks is not None)
+    seen = {entry.camera for entry in take.keypoints}
+    blind = [entry.name for entry in take.cameras if entry.stream is None and entry.name not in seen]
+    if recorded:
+        yield f"a recording cannot be combined with streams ({streams[0]})", recorded[0], "Remove it."
+    elif blind and streaming:
+        yield "it has no stream, others have", f"camera {blind[0]}", "Give each camera a stream, or remove it."

@@ -2,76 +2,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from kinefit.errors import CalibrationError, TakeError, located
+from kinefit.errors import CalibrationError, TakeError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations.depth import CloudVideo, DepthVideo
 from kinefit.readers.depth.recordings import is_unordered, read_clouds, read_depth
-from kinefit.readers.take.entries import DepthEntry, Take
+from kinefit.readers.take.cameras import TakeCameras
+from kinefit.readers.take.entries import DepthEntry
 
 _MAX_RATE_DIFFERENCE = 0.01  # rates that differ by less are one
 
 
-@dataclass(frozen=True, eq=False)
-class DepthSensors:
-    """What the depth sensors of a take saw.
-
-    Parameters
-    ----------
-    depth : tuple of DepthVideo
-    clouds : tuple of CloudVideo
-    cameras : tuple of Camera, of all depth videos
-    """
-
-    depth: tuple[DepthVideo, ...] = ()
-    clouds: tuple[CloudVideo, ...] = ()
-    cameras: tuple[Camera, ...] = ()
-
-    def notes(self, rate: float) -> tuple[str, ...]:
-        """What is worth saying of their time beside that of the take: other rates, frames that are missing."""
-        notes = []
-        for video in (*self.depth, *self.clouds):
-            if abs(video.rate / rate - 1.0) > _MAX_RATE_DIFFERENCE:
-                notes.append(
-                    f"depth {video.sensor} has {video.rate:.4g} Hz, the take {rate:.4g} Hz: "
-                    "each depth image counts at the step nearest to it"
-                )
-            if len(video.gaps):
-                first = int(video.gaps[0])
-                gap = video.times[first] - video.times[first - 1]
-                notes.append(
-                    f"depth {video.sensor} lacks frames in {len(video.gaps)} places, the first before frame {first} "
-                    f"({gap:.3g} s instead of {1.0 / video.rate:.3g} s)"
-                )
-        return tuple(notes)
+def depth_notes(videos: Iterable[DepthVideo | CloudVideo], rate: float) -> Iterator[str]:
+    """What is worth saying of the time of depth beside that of the take [Hz]: other rates, frames that are missing."""
+    for video in videos:
+        if abs(video.rate / rate - 1.0) > _MAX_RATE_DIFFERENCE:
+            yield (
+                f"depth {video.sensor} has {video.rate:.4g} Hz, the take {rate:.4g} Hz: "
+                "each depth image counts at the step nearest to it"
+            )
+        if len(video.gaps):
+            first = int(video.gaps[0])
+            gap = video.times[first] - video.times[first - 1]
+            yield (
+                f"depth {video.sensor} lacks frames in {len(video.gaps)} places, the first before frame {first} "
+                f"({gap:.3g} s instead of {1.0 / video.rate:.3g} s)"
+            )
 
 
-def load_depth(take: Take, rig: Rig | None, rates: Mapping[str, float]) -> DepthSensors:
-    """Read all `[[depth]]` of a take; `rates` [Hz] of its other streams, for recordings that do not state theirs.
+def load_depth(entry: DepthEntry, cameras: TakeCameras) -> DepthVideo | CloudVideo:
+    """A `[[depth]]` of a take, with its camera; rates of other streams are for recordings that do not state theirs.
 
     Raises
     ------
     CalibrationError
-        Nothing states a sensor's intrinsics, or its images have another size than its calibration.
+        Nothing states the sensor's intrinsics, or its images have another size than its calibration.
     TakeError, ObservationError, FileError
-        As `read_depth`, with the sensor's name.
+        As `read_depth`.
     """
-    depth, clouds, cameras = [], [], []
-    usual = take.rate or next(iter(rates.values()), None)
-    for entry in take.depth:
-        assert entry.file is not None
-        with located(take.path, f"depth {entry.name}"):
-            if is_unordered(entry.file):
-                clouds.append(_clouds(entry, rig, usual))
-                continue
-            depth.append(_video(entry, usual))
-            cameras.append(_camera(entry, depth[-1], rig))
-    return DepthSensors(tuple(depth), tuple(clouds), tuple(cameras))
+    usual = cameras.take.rate or next(iter(cameras.rates.values()), None)
+    assert entry.file is not None
+    if is_unordered(entry.file):
+        return _clouds(entry, cameras.rig, usual)
+    video = _video(entry, usual)
+    return replace(video, camera=_camera(entry, video, cameras.rig))
 
 
 def _clouds(entry: DepthEntry, rig: Rig | None, rate: float | None) -> CloudVideo:

@@ -17,11 +17,11 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from kinefit._files import LENGTHS, worth
 from kinefit.errors import TakeError, choices, located
 from kinefit.geometry import se3
 from kinefit.observations import KEYPOINT_SIGMA
 from kinefit.readers.keypoint_sets import FACE_SET, KEYPOINT_SETS, MEDIAPIPE_SETS
-from kinefit.readers.units import LENGTHS, worth
 
 _Read = TypeVar("_Read")
 _Pixels = Annotated[float, Meta(gt=0, lt=1e4, description="Give a positive number of pixels.")]

@@ -1,20 +1,32 @@
-"""The take file: one TOML that names the sensors of a recording, parsed once into typed records."""
+"""The take file: one TOML that names the sensors of a recording, found, parsed once into records, and explained."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
 
 from kinefit._arguments import checked
-from kinefit._files import BACKSLASHES, parse_toml, regular
-from kinefit.errors import FileError, TakeError, check_choice, choices, located, printable, shortened
+from kinefit._files import BACKSLASHES, LENGTHS, TIMES, parse_toml, read_text, worth
+from kinefit.errors import (
+    FileError,
+    KinefitError,
+    TakeError,
+    check_choice,
+    choices,
+    command,
+    located,
+    printable,
+    shortened,
+)
+from kinefit.readers.guess.files import MARKERS, VIDEOS
 from kinefit.readers.ros.recordings import inside
 from kinefit.readers.take.checks import check_take
 from kinefit.readers.take.entries import (
@@ -23,11 +35,9 @@ from kinefit.readers.take.entries import (
     SINGLE_TABLES,
     TABLES,
     Take,
+    WrongEntryError,
     keys_of,
 )
-from kinefit.readers.take.find import find_take
-from kinefit.readers.take.values import wrong_value
-from kinefit.readers.units import LENGTHS, TIMES, worth
 
 __all__ = ["Take", "read_take"]
 
@@ -44,12 +54,9 @@ def read_take(path: str | PathLike[str]) -> Take:
         Unknown sensors, keys or values (the message lists what exists), no sensor at all, names that do not agree.
     """
     path = find_take(path).absolute()
-    try:
-        raw = parse_toml(regular(path).read_text(encoding="utf-8"), path)
-    except FileNotFoundError as error:
-        raise FileError("no such take file", file=path, remedy="Check the path.") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileError(f"cannot be read ({error})", file=path, remedy="Give a text file in UTF-8.") from error
+    if not path.exists():
+        raise FileError("no such take file", file=path, remedy="Check the path.")
+    raw = parse_toml(read_text(path, "the take file", remedy="Give a text file in UTF-8."), path)
     digest = hashlib.sha256(json.dumps(raw, sort_keys=True, default=str).encode()).hexdigest()
     _tidy(raw, path)
     head = raw.pop("take", {}) | {"path": path, "digest": digest}
@@ -131,3 +138,129 @@ def _name_topic(topic: str, row: dict[str, Any], key: str, path: Path) -> None:
     if recording.exists() and inside(recording) is None:
         raise TakeError(f"'topic' has no use with {file}", remedy="It is for MCAP recordings of ROS 2.")
     row[key] = f"{file}/{topic.strip('/')}"
+
+
+def find_take(path: str | PathLike[str], *, wanted: Sequence[str] = ("track",)) -> Path:
+    """The take file at a path: the file itself, or the take file in a folder.
+
+    `wanted`: words of the command that takes it, for what is advised where a video is given.
+
+    Raises
+    ------
+    FileError
+        A video, a marker file or a motion, for which another command is meant; a folder without a take file.
+    TakeError
+        A folder with several take files, none of which is called take.toml.
+    """
+    path = Path(path)
+    if path.is_dir():
+        found = takes_in(path)
+        if not found:
+            raise FileError("no take file in this folder", file=path, remedy=f"Write one: {command('init', path)}")
+        if len(found) > 1 and found[0].name != "take.toml":
+            names = ", ".join(file.name for file in found[:10])
+            raise TakeError(f"{len(found)} take files in this folder: {names}", file=path, remedy="Name one of them.")
+        return found[0]
+    kind = path.suffix.lower()
+    if kind in VIDEOS:
+        there = next(iter(takes_in(path.parent)), None)
+        first = f"Run {command('init', path.parent)}, which writes the take file of all videos and their calibration."
+        what = first if there is None else f"Use the take file next to it: {command(*wanted, there)}."
+        remedy = f"{what} For keypoints of this video alone: {command('detect', path)}"
+        raise FileError("a video, not a take file", file=path, remedy=remedy)
+    if kind in MARKERS:
+        raise FileError("a marker file, not a take file", file=path, remedy=f"Run: {command('markers', 'fit', path)}")
+    if kind == ".npz":
+        raise FileError("a motion, not a take file", file=path, remedy=f"Look at it: {command('view', path)}")
+    return path
+
+
+def takes_in(folder: Path) -> list[Path]:
+    """The take files that lie in a folder, take.toml first."""
+    return sorted((file for file in folder.glob("*.toml") if is_take(file)), key=lambda f: (f.name != "take.toml", f))
+
+
+def is_take(file: Path) -> bool:
+    """Whether a TOML file is a take file; one that cannot be read is, where it is called take.toml."""
+    if file.name == "take.toml":
+        return True
+    try:
+        tables = parse_toml(read_text(file, "it", remedy=""), file)
+    except KinefitError:
+        return False
+    return bool(set(tables) - {"calibration"}) and not set(tables) - set(TABLES)  # which calibrations have, too
+
+
+_WORDS = {
+    "float": "a number", "int": "a whole number", "str": "a text", "bool": "true or false", "array": "a list",
+    "object": "a table", "null": "nothing", "date": "a date",
+}  # fmt: skip
+
+
+def wrong_value(error: msgspec.ValidationError, content: Mapping[str, Any], path: Path) -> TakeError:
+    """The error of a value that a table of a take file cannot have; `content` is what could not become a `Take`."""
+    message, _, at = str(error).partition(" - at `$.")
+    attribute, *inner = re.findall(r"\w+", at) or [""]
+    table = {ATTRIBUTES.get(name, name): name for name in TABLES if name != "take"}.get(attribute, "take")
+    if table in SINGLE_TABLES:
+        row, keys = (content, [attribute]) if table == "take" else (content[attribute], inner)
+        key, where = next(iter(keys), ""), f"[{table}]"
+        place = f"{where} {key}".strip()
+    else:
+        number, key = int(inner[0]), next(iter(inner[1:]), "")
+        row = content[attribute][number]
+        whose = f"camera {row['camera']}" if "camera" in row and table != "depth" else row.get("name")
+        whose = f"{row.get('left')}-{row.get('right')}" if table == "stereo" else whose
+        where = ", ".join([f"[[{table}]] {number + 1}", *([str(whose)] if whose else [])])
+        place = f"{where}, {key}" if key else where
+    if isinstance(cause := error.__cause__, WrongEntryError):
+        return TakeError(cause.problem, file=path, place=where, remedy=cause.remedy)
+    hints = list(_parts(get_type_hints(TABLES[table], include_extras=True).get(key)))
+    listed = next((", ".join(map(repr, get_args(hint))) for hint in hints if get_origin(hint) is Literal), "")
+    if re.match(r"Expected `\w+` [<>]", message):
+        remedy = next(m.description for hint in hints for m in getattr(hint, "__metadata__", ()))
+        if key == "height" and 30.0 < row[key] < 300.0:
+            remedy = f"Give the stature in metres: height = {row[key] / 100:g}."
+        return TakeError(f"{key} = {row[key]}", file=path, place=where, remedy=remedy)
+    known = listed and ("enum" in message or "Invalid" in message)
+    remedy = f"There are: {listed}." if known else _form(message, key)
+    return TakeError(_plain(message), file=path, place=place if at else None, remedy=remedy)
+
+
+def _parts(hint: Any) -> Iterator[Any]:
+    """A type, and all types that it is made of."""
+    yield hint
+    for part in () if get_origin(hint) is Literal else get_args(hint):
+        yield from _parts(part)
+
+
+def _plain(message: str) -> str:
+    """What msgspec says, in words."""
+    message = message.replace("Object missing required field", "there is no").replace("enum ", "")
+    wanted, _, given = message.partition(", got ")
+    if not wanted.startswith("Expected ") or not given:
+        return message
+    kinds = [word for kind in re.findall(r"\w+", wanted.partition("`")[2].partition("`")[0]) if kind != "null"
+             for word in [_WORDS.get(kind, kind)]]  # fmt: skip
+    length = re.search(r"of length (.*)", wanted)
+    if length:
+        return f"a list of {length[1]} is expected, not of {given}"
+    return f"{' or '.join(kinds)} is expected, not {_WORDS.get(given.strip('`'), given)}"
+
+
+def _form(message: str, key: str) -> str | None:
+    """How a value is written, of which msgspec says that it is of another type."""
+    wanted, _, given = message.partition(", got ")
+    if key == "unit" and "str" in wanted:
+        return 'Write it in quotes: unit = "mm", "cm" or "m".'
+    if key in ("unit", "time_unit") and "str" in given:
+        return "Write mm, cm or m in quotes, or a number of metres." if key == "unit" else 'Write "s", "ms" or "us".'
+    if key.startswith(("excluded", "swapped")):
+        return f"Write a list of ranges: {key.partition('[')[0]} = [[0, 100], [150, 200]]."
+    if key == "frames":
+        return "Write the first and the one after the last: frames = [0, 100]."
+    if "str" in given and ("float" in wanted or "int" in wanted):
+        return "Write a number, without quotes and without its unit: 1.75."
+    forms = {"str": "Write it in quotes.", "bool": "Write true or false.", "array": "Write a list: [1, 2].",
+             "object": "Write a table: { key = value }."}  # fmt: skip
+    return next((form for kind, form in forms.items() if kind in wanted), None)

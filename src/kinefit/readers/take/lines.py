@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import regular
+from kinefit._files import read_text
 from kinefit.errors import FileError, ObservationError, TakeError, choices
-from kinefit.geometry.camera import ImageFrame
 from kinefit.observations import ClickVideo, LineVideo
-from kinefit.readers.clicks import read_clicks
-from kinefit.readers.take.cameras import stated_frame, stated_rate
-from kinefit.readers.take.entries import LinesEntry, Take
+from kinefit.readers.annotations import read_clicks
+from kinefit.readers.take.cameras import TakeCameras, stated_frame, stated_rate
+from kinefit.readers.take.entries import LinesEntry
 
 _COLUMNS = ("frame", "line", "u1", "v1", "u2", "v2")
 _REMEDY = f"Give a table with the columns {', '.join(_COLUMNS)} (.csv), or a list of objects with these keys (.json)."
@@ -63,21 +62,19 @@ def read_lines(path: Path, names: Iterable[str]) -> tuple[NDArray, NDArray]:
 def _rows(path: Path) -> Iterable[tuple[str, Mapping[str, Any]]]:
     """Rows of a table, each with its place for messages."""
     try:
-        text = regular(path).read_text(encoding="utf-8-sig")
+        text = read_text(path, "the lines", remedy=_REMEDY)
         if path.suffix.lower() == ".json":
             content = json.loads(text)
             if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
                 raise FileError("not a list of objects", file=path, remedy=_REMEDY)
             return [(f"entry {i}", row) for i, row in enumerate(content)]
         return [(f"line {i}", row) for i, row in enumerate(csv.DictReader(text.splitlines()), 2)]
-    except (OSError, ValueError, RecursionError, csv.Error) as error:
+    except (ValueError, RecursionError, csv.Error) as error:
         raise FileError(f"cannot read the lines ({error})", file=path, remedy=_REMEDY) from error
 
 
-def load_clicks(take: Take, images: Mapping[str, ImageFrame], rate: float | None) -> tuple[ClickVideo, ...]:
+def load_clicks(cameras: TakeCameras) -> tuple[ClickVideo, ...]:
     """Joints that were clicked: each is two image lines that cross in it, along u and v, with its landmark on both.
-
-    `rate` [Hz] is that of the take's steps.
 
     Raises
     ------
@@ -86,20 +83,21 @@ def load_clicks(take: Take, images: Mapping[str, ImageFrame], rate: float | None
     FileError
         As `read_clicks`.
     """
+    take, images, out = cameras.take, cameras.images, list[ClickVideo]()
     if take.clicks is None:
         return ()
-    steps, out = read_clicks(take.clicks), []
+    steps = read_clicks(take.clicks)
     for camera in dict.fromkeys(camera for of in steps for camera in of.points):
         if camera not in images:
             problem = choices("camera", camera, images)
             raise TakeError(problem, file=take.clicks, place="[start] clicks", remedy="Remove its clicks.")
-        rate = stated_rate(rate, take.path)
+        rate = stated_rate(cameras.fastest, take.path)
         mine = [of for of in steps if of.points.get(camera)]
         names = tuple(dict.fromkeys(name for of in mine for name in of.points[camera]))
         uv = np.array([[of.points[camera].get(name, (np.nan, np.nan)) for name in names] for of in mine])
         cross = _CLICK_CROSS_PX * np.array([[[0, -1], [0, 1]], [[-1, 0], [1, 0]]])
         ends = images[camera].to_calibration(uv[:, :, None, None] + cross).reshape(len(mine), -1, 2, 2)
-        offset = next(entry.time_offset for entry in take.cameras if entry.name == camera)
+        offset = cameras.offset(camera)
         times = offset + np.array([round(of.step - offset * rate) for of in mine]) / rate
         titles = tuple(f"{name} {axis}" for name in names for axis in "uv")
         landmarks = tuple((name,) for name in names for _ in "uv")
@@ -107,10 +105,8 @@ def load_clicks(take: Take, images: Mapping[str, ImageFrame], rate: float | None
     return tuple(out)
 
 
-def load_lines(
-    entry: LinesEntry, take: Take, image: ImageFrame, rate: float | None, clock: NDArray | None
-) -> LineVideo:
-    """A `[[lines]]` of a take; `rate` [Hz] of its steps, `clock` (N,) [s] of the camera's video.
+def load_lines(entry: LinesEntry, cameras: TakeCameras) -> LineVideo:
+    """A `[[lines]]` of a take.
 
     Raises
     ------
@@ -119,16 +115,16 @@ def load_lines(
     KinefitError
         As `read_lines`.
     """
-    frame = stated_frame(image, entry.frame, "lines")
-    rate = stated_rate(entry.rate or rate)
+    frame = stated_frame(cameras.images[entry.camera], entry.frame, "lines")
+    rate, clock = stated_rate(entry.rate or cameras.fastest), cameras.clocks.get(entry.camera)
     names = tuple(entry.landmarks)
     frames, ends = read_lines(entry.file, names)
     if frame is not None:
         ends = frame.to_calibration(ends)
-    offset = next(camera.time_offset for camera in take.cameras if camera.name == entry.camera)
     of_video = entry.rate is None and clock is not None and frames[-1] < len(clock)
     times = clock[frames] if of_video and clock is not None else frames / rate
+    times = cameras.offset(entry.camera) + times
     return LineVideo(
-        entry.camera, rate, offset + times, names, tuple(map(tuple, entry.landmarks.values())), ends,
+        entry.camera, rate, times, names, tuple(map(tuple, entry.landmarks.values())), ends,
         source=str(entry.file),
     )  # fmt: skip

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +31,13 @@ from kinefit.observations import (
     SurfacePointVideo,
 )
 from kinefit.observations.clocks import frame_times, is_even, on_steps
-from kinefit.readers.body_trackers import read_body_trackers
-from kinefit.readers.calibration.found import found_notes
+from kinefit.readers.calibration.read import found_notes
 from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoint_sets import FACE_SET
 from kinefit.readers.keypoints import read_keypoints
 from kinefit.readers.markers import read_markers
 from kinefit.readers.take.cameras import (
+    TakeCameras,
     assumed_camera,
     image_frame,
     is_alone,
@@ -46,13 +47,20 @@ from kinefit.readers.take.cameras import (
     stated_rate,
     what_is_assumed,
 )
-from kinefit.readers.take.depth import load_depth
-from kinefit.readers.take.entries import KeypointsEntry, MarkersEntry, Take, read_each, sensor_name
+from kinefit.readers.take.checks import refuse_streams
+from kinefit.readers.take.depth import depth_notes, load_depth
+from kinefit.readers.take.entries import (
+    KeypointsEntry,
+    MarkersEntry,
+    SurfacePointsEntry,
+    Take,
+    TrackerEntry,
+    read_each,
+    sensor_name,
+)
 from kinefit.readers.take.lines import load_clicks, load_lines
-from kinefit.readers.take.silhouettes import load_region, load_silhouettes
-from kinefit.readers.take.skin import load_skin
-from kinefit.readers.take.streams import refuse_streams
-from kinefit.readers.take.surface_points import read_surface_points
+from kinefit.readers.take.silhouettes import load_region, load_silhouettes, load_skin
+from kinefit.readers.tracked_points import read_body_trackers, read_surface_points
 from kinefit.readers.video import Video, common_frames
 
 _Timed = DepthVideo | CloudVideo | LineVideo | SurfacePointVideo | BodyTrackerVideo
@@ -133,6 +141,25 @@ class Observations:
         )  # fmt: skip
 
 
+def _surface_points(entry: SurfacePointsEntry, cameras: TakeCameras) -> SurfacePointVideo:
+    entries = cameras.take.surface_points
+    name = sensor_name("surface_points", entries, entries.index(entry))
+    return read_surface_points(entry.file, name, time_offset=entry.time_offset)
+
+
+def _trackers(entry: TrackerEntry, cameras: TakeCameras) -> BodyTrackerVideo:
+    entries, T = cameras.take.trackers, entry.T_world_file
+    name = sensor_name("trackers", entries, entries.index(entry))
+    return read_body_trackers(entry.file, entry.points, name, time_offset=entry.time_offset, T_world_file=T)
+
+
+_LOADERS: dict[str, Callable[..., Any]] = {
+    "depth": load_depth, "silhouettes": load_silhouettes, "regions": load_region, "skin": load_skin,
+    "lines": load_lines, "surface_points": _surface_points, "trackers": _trackers,
+}  # fmt: skip
+"""{attribute of a take and of its observations: what reads one entry}, those first whose rates others need."""
+
+
 @checked
 def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     """Read everything that a take names, and check that it fits together.
@@ -159,7 +186,6 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     rates: dict[str, float] = {}
     streams: dict[str, NDArray] = {}  # (N,) [s] in the take
     clocks: dict[str, NDArray] = {}  # (N,) [s] of each camera's video, from its first frame
-    offsets = {entry.name: entry.time_offset for entry in take.cameras}
     sizes: dict[str, tuple[int, int]] = {}
     notes = []
     for entry in take.cameras:
@@ -182,38 +208,22 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         remedy = f"They are found from the people in view: {command('track', take.path)}, or find_cameras in Python."
         raise TakeError("cameras that are not calibrated yet", file=take.path, remedy=remedy)
     images = {entry.name: image_frame(entry, rig, sizes.get(entry.name), take) for entry in take.cameras}
+    of_cameras = TakeCameras(take, rig, images, clocks, rates, streams)
     keypoints, markers = [], tuple(_read_markers(entry) for entry in take.markers)
     for number, source in enumerate(take.keypoints):
-        read, times = _read_keypoints(source, images[source.camera], take, rates, clocks, number)
+        read, times = _read_keypoints(source, of_cameras, number)
         stream = f"keypoints {source.camera}" + f" ({source.format})" * (len(take.keypoints) > len(take.cameras))
         if times is not clocks.get(source.camera):
             rates[stream] = read.rate
-        streams[stream] = times + offsets[source.camera]
+        streams[stream] = times + of_cameras.offset(source.camera)
         keypoints.append((read, streams[stream]))
-    sensors = load_depth(take, rig, rates)
-    silhouettes = read_each(
-        take, take.silhouettes, lambda e: load_silhouettes(e, take, rig, images[e.camera], rates, clocks.get(e.camera))
-    )
-    for outlines in silhouettes:
-        rates[f"silhouettes {outlines.sensor}"] = outlines.rate
-        streams[f"silhouettes {outlines.sensor}"] = outlines.times
-    fastest = take.rate or max(rates.values(), default=None)
-    videos = {e.name: e.video for e in take.cameras if e.video is not None}
-    skin = read_each(take, take.skin, lambda e: load_skin(e, take, images[e.camera], videos[e.camera], fastest))
-    lines = read_each(
-        take, take.lines, lambda e: load_lines(e, take, images[e.camera], fastest, clocks.get(e.camera))
-    )
-    clicks = load_clicks(take, images, fastest)
-    surfaces = tuple(
-        read_surface_points(e.file, sensor_name("surface_points", take.surface_points, k), time_offset=e.time_offset)
-        for k, e in enumerate(take.surface_points)
-    )
-    trackers = tuple(
-        read_body_trackers(e.file, e.points, sensor_name("trackers", take.trackers, k), time_offset=e.time_offset,
-                           T_world_file=e.T_world_file)
-        for k, e in enumerate(take.trackers)
-    )  # fmt: skip
-    recordings: tuple[_Timed, ...] = (*sensors.depth, *sensors.clouds, *surfaces, *trackers)
+    loaded = {
+        kind: read_each(take, getattr(take, kind), partial(load, cameras=of_cameras)) for kind, load in _LOADERS.items()
+    }
+    depth = tuple(video for video in loaded["depth"] if isinstance(video, DepthVideo))
+    clouds = tuple(video for video in loaded.pop("depth") if isinstance(video, CloudVideo))
+    fastest, lines, clicks = of_cameras.fastest, loaded["lines"], load_clicks(of_cameras)
+    recordings: tuple[_Timed, ...] = (*depth, *clouds, *loaded["surface_points"], *loaded["trackers"])
     marked = [(f"[[markers]] {k}", e.time_offset + m.times) for k, (e, m) in enumerate(zip(take.markers, markers), 1)]
     if not (streams or lines or clicks or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
@@ -243,24 +253,23 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         frames, marked = take.frames or (0, round((end - first_time) * rate)), []
     kinds = {LineVideo: "lines of camera", KeypointVideo: "keypoints of camera", SurfacePointVideo: "surface",
              BodyTrackerVideo: "trackers"}  # fmt: skip
-    others = [(f"{kinds.get(type(r), 'depth')} {r.sensor}", r.times) for r in (*recordings, *lines, *skin)]
+    others = [(f"{kinds.get(type(r), 'depth')} {r.sensor}", r.times) for r in (*recordings, *lines, *loaded["skin"])]
     _check_times([*others, *marked], frames, rate, take)
     notes += [
         f"{place}: {Path(m.source).name} begins at {times[0]:.6g} s of the take, by its own clock and time_offset"
         for (place, times), m in zip(marked, markers) if m.first_time
     ]  # fmt: skip
-    cameras = (*(rig[entry.name] for entry in take.cameras if rig is not None), *sensors.cameras)
+    notes += [*(n for m in markers for n in m.notes), *depth_notes((*depth, *clouds), rate)]
+    cameras = [rig[entry.name] for entry in take.cameras if rig is not None]
+    cameras += [video.camera for video in depth if video.camera is not None]
     return Observations(
-        rate=rate, frames=frames, rig=Rig(cameras) if cameras else None,
+        rate=rate, frames=frames, rig=Rig(tuple(cameras)) if cameras else None,
         markers=markers,
         keypoints=tuple(_cut(*k, rate, frames, entry) for k, entry in zip(keypoints, take.keypoints)),
-        videos=videos, images=images,
-        depth=sensors.depth, clouds=sensors.clouds, silhouettes=silhouettes,
-        regions=read_each(take, take.regions, lambda e: load_region(e, take, rig, images[e.camera])),
-        skin=skin, lines=lines,
+        videos={e.name: e.video for e in take.cameras if e.video is not None}, images=images,
+        depth=depth, clouds=clouds, **loaded,
         clicks=tuple(c for c in clicks if _within(np.rint(c.times * rate), [frames]).any()),
-        surface_points=surfaces, trackers=trackers,
-        notes=(*notes, *(n for m in markers for n in m.notes), *sensors.notes(rate), *found, *what_is_assumed(take)),
+        notes=(*notes, *found, *what_is_assumed(take)),
         first_time=first_time,
     )
 
@@ -286,14 +295,11 @@ def _check_times(
             )  # fmt: skip
 
 
-def _read_keypoints(
-    source: KeypointsEntry, image: ImageFrame, take: Take, rates: Mapping[str, float], clocks: Mapping[str, NDArray],
-    number: int,
-) -> tuple[Keypoints, NDArray]:
+def _read_keypoints(source: KeypointsEntry, cameras: TakeCameras, number: int) -> tuple[Keypoints, NDArray]:
     """Keypoints of a camera, and the times (F,) [s] of their frames from the first on."""
     place = f"[[keypoints]] {number + 1}, camera {source.camera}"
-    offset = next(entry.time_offset for entry in take.cameras if entry.name == source.camera)
-    clock = clocks.get(source.camera)
+    take, image, rates = cameras.take, cameras.images[source.camera], cameras.rates
+    offset, clock = cameras.offset(source.camera), cameras.clocks.get(source.camera)
     if source.format == "detect":
         file = source.file or detections_file(take.path, source.camera)
         found = read_detections(file)

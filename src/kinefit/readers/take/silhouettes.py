@@ -1,8 +1,8 @@
-"""Masks of a take in files, by a video's background, the body's colour or the built-in detector; colour images."""
+"""Masks of a take in files, by a video's background, by colour or by detector; colour images; skin by its colour."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 
@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 
 from kinefit._pictures import read_picture
 from kinefit.errors import FileError, ObservationError, TakeError
-from kinefit.geometry.camera import ImageFrame, Rig
+from kinefit.geometry.camera import ImageFrame
+from kinefit.images.detectors.skin import LANDMARKS, WRISTS, SkinTracker, face_box
 from kinefit.images.silhouette import colour_mask
 from kinefit.images.silhouette_background import BackgroundPlate
-from kinefit.observations import ColourVideo, Detections, SilhouetteVideo
+from kinefit.observations import ColourVideo, Detections, KeypointVideo, SilhouetteVideo
 from kinefit.observations.clocks import frame_times
 from kinefit.readers.depth.images import listed
 from kinefit.readers.detections import detections_file, read_detections
-from kinefit.readers.take.cameras import stated_frame, stated_rate
-from kinefit.readers.take.entries import CameraEntry, RegionEntry, SilhouetteEntry, Take
+from kinefit.readers.take.cameras import TakeCameras, stated_frame, stated_rate
+from kinefit.readers.take.entries import KeypointsEntry, RegionEntry, SilhouetteEntry, Take
 from kinefit.readers.video import Video
 
 _SIDE = 1000  # [px] of an image that its background is taken from: larger ones are made smaller by a whole number
@@ -67,11 +68,8 @@ def read_silhouettes(
     return SilhouetteVideo(camera, rate, times, size, image, str(path))
 
 
-def load_silhouettes(
-    entry: SilhouetteEntry, take: Take, rig: Rig | None, frame: ImageFrame, rates: Mapping[str, float],
-    clock: NDArray | None,
-) -> SilhouetteVideo:
-    """A `[[silhouette]]` of a take; `rates` [Hz] of its other streams, `clock` [s] of the camera's video.
+def load_silhouettes(entry: SilhouetteEntry, cameras: TakeCameras) -> SilhouetteVideo:
+    """A `[[silhouette]]` of a take, which becomes one of its streams.
 
     Raises
     ------
@@ -80,48 +78,53 @@ def load_silhouettes(
     KinefitError
         As `read_silhouettes`.
     """
-    assert rig is not None
-    camera = next(c for c in take.cameras if c.name == entry.camera)
-    size, offset = rig[entry.camera].size, camera.time_offset
-    rate = entry.rate or rates.get(f"video {entry.camera}") or take.rate
+    found = _silhouettes(entry, cameras)
+    cameras.rates[f"silhouettes {found.sensor}"] = found.rate
+    cameras.streams[f"silhouettes {found.sensor}"] = found.times
+    return found
+
+
+def _silhouettes(entry: SilhouetteEntry, cameras: TakeCameras) -> SilhouetteVideo:
+    name, take = entry.camera, cameras.take
+    size, offset, frame = cameras.size(name), cameras.offset(name), cameras.images[name]
+    clock = cameras.clocks.get(name)
     if entry.format == "masks":
         assert entry.file is not None
         return read_silhouettes(
-            entry.file, camera=entry.camera, rate=stated_rate(rate), size=size,
-            image_frame=stated_frame(frame, entry.frame, "masks"), time_offset=offset,
+            entry.file, camera=name, rate=stated_rate(entry.rate or cameras.rates.get(f"video {name}") or take.rate),
+            size=size, image_frame=stated_frame(frame, entry.frame, "masks"), time_offset=offset,
             clock=None if entry.rate else clock,
         )  # fmt: skip
+    if entry.format == "detect":
+        file = entry.file or detections_file(take.path, name)
+        found = read_detections(file)
+        if found.seen.any() and not len(found.mask_runs):
+            remedy = "Run `kinefit detect` on this take: it stores silhouettes."
+            raise TakeError("the detector's file has no silhouettes", file=file, remedy=remedy)
+        times = offset + frame_times(len(found), found.rate, clock if found.times is None else found.times)
+        image = lambda i: in_calibration(_everybody(found, i), size, frame)
+        return SilhouetteVideo(name, found.rate, times, size, image, found.source)
+    video = cameras.video(name)
     if entry.format == "threshold":
-        return _coloured(entry, camera, size, frame, take.rate)
-    if entry.format == "background":
-        assert camera.video is not None
-        scene = _BeforeBackground(Video(camera.video, rate=take.rate), entry.file, size, frame)
-        times = offset + scene.video.times
-        return SilhouetteVideo(entry.camera, scene.video.rate, times, size, scene.mask, str(camera.video))
-    file = entry.file or detections_file(take.path, entry.camera)
-    found = read_detections(file)
-    if found.seen.any() and not len(found.mask_runs):
-        remedy = "Run `kinefit detect` on this take: it stores silhouettes."
-        raise TakeError("the detector's file has no silhouettes", file=file, remedy=remedy)
-    times = offset + frame_times(len(found), found.rate, clock if found.times is None else found.times)
-    return SilhouetteVideo(
-        entry.camera, found.rate, times, size, lambda i: in_calibration(_everybody(found, i), size, frame), found.source
-    )
+        image = _coloured(entry, video, size, frame)
+    else:
+        image = _BeforeBackground(video, entry.file, size, frame).mask
+    return SilhouetteVideo(name, video.rate, offset + video.times, size, image, str(video.path))
 
 
 _SPACES = {"hsv": cv2.COLOR_RGB2HSV, "lab": cv2.COLOR_RGB2Lab, "ycrcb": cv2.COLOR_RGB2YCrCb}
 
 
 def _coloured(
-    entry: SilhouetteEntry, camera: CameraEntry, size: tuple[int, int], frame: ImageFrame, rate: float | None
-) -> SilhouetteVideo:
+    entry: SilhouetteEntry, video: Video, size: tuple[int, int], frame: ImageFrame
+) -> Callable[[int], NDArray]:
     """What has the body's colour in a camera's video (P1 2.4).
 
     The mask is smoothed before the Laplace operator; where that changes its sign the mask has half its height, which is
     where an outline is looked for.
     """
-    assert camera.video is not None and entry.low is not None and entry.high is not None
-    video, low, high = Video(camera.video, rate=rate), entry.low, entry.high
+    assert entry.low is not None and entry.high is not None
+    low, high = entry.low, entry.high
     smooth, space = 1.0 if entry.smooth is None else entry.smooth, _SPACES.get(entry.channels or "rgb")
 
     def image(i: int) -> NDArray:
@@ -129,8 +132,7 @@ def _coloured(
         mask = colour_mask(picture if space is None else cv2.cvtColor(picture, space), low, high)
         return in_calibration(np.asarray(cv2.GaussianBlur(mask, (0, 0), smooth)), size, frame)
 
-    times = camera.time_offset + video.times
-    return SilhouetteVideo(entry.camera, video.rate, times, size, image, str(camera.video))
+    return image
 
 
 class _BeforeBackground:
@@ -195,11 +197,76 @@ def in_calibration(mask: NDArray, size: tuple[int, int], frame: ImageFrame | Non
     return np.asarray(cv2.warpAffine(mask, T, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP))
 
 
-def load_region(entry: RegionEntry, take: Take, rig: Rig | None, frame: ImageFrame) -> ColourVideo:
+def load_region(entry: RegionEntry, cameras: TakeCameras) -> ColourVideo:
     """The video of a `[[region]]` of a take, in the calibration's image frame; raises what reading a video raises."""
-    assert rig is not None
-    camera = next(c for c in take.cameras if c.name == entry.camera)
-    assert camera.video is not None
-    video, size = Video(camera.video, rate=take.rate), rig[entry.camera].size
+    video, size, frame = cameras.video(entry.camera), cameras.size(entry.camera), cameras.images[entry.camera]
     image = lambda i: in_calibration(video.read(i), size, frame)
-    return ColourVideo(entry.camera, video.rate, camera.time_offset + video.times, size, image, str(camera.video))
+    times = cameras.offset(entry.camera) + video.times
+    return ColourVideo(entry.camera, video.rate, times, size, image, str(video.path))
+
+
+_NAMES = {"HANDS": LANDMARKS, "WRISTS": WRISTS}
+
+
+def load_skin(entry: KeypointsEntry, cameras: TakeCameras) -> KeypointVideo:
+    """A `[[keypoints]]` of a take with format = "skin"; images are read when their frames are asked for.
+
+    Raises
+    ------
+    TakeError
+        Nothing states where the face is.
+    KinefitError
+        What reading the video, and the tracker at a face that is not in it, raise.
+    """
+    take, video, offset = cameras.take, cameras.video(entry.camera), cameras.offset(entry.camera)
+    used = entry.frames or take.frames
+    begin, end = 0, len(video)
+    if used is not None:  # half a step before the first of them, and before the one after the last
+        bounds = (np.array(used) - 0.5) / (cameras.fastest or video.rate) - offset
+        begin, end = (int(k) for k in np.searchsorted(video.times, bounds))
+    if begin >= end:
+        raise TakeError("none of its frames is in the video", remedy=f"The video has {len(video)} frames.")
+    face = entry.face
+    if face is None:
+        begin, face = _detected_face(take, entry, begin, end)
+    seen = _Seen(video, begin, face, cameras.images[entry.camera])
+    times = offset + video.times[begin:end]
+    names = _NAMES[entry.set or "HANDS"]
+    return KeypointVideo(entry.camera, video.rate, times, names, seen.points, source=str(video.path))
+
+
+def _detected_face(
+    take: Take, entry: KeypointsEntry, begin: int, end: int
+) -> tuple[int, tuple[float, float, float, float]]:
+    """The first frame in which the built-in detector saw somebody, and the face there, of which it saw best."""
+    file = detections_file(take.path, entry.camera)
+    if not file.exists():
+        raise TakeError(
+            "the place of the face is not stated",
+            remedy="Write face = [left, top, width, height] of the first image used, or run `kinefit detect`.",
+        )
+    found = read_detections(file)
+    frames = [i for i in range(begin, min(end, len(found))) if found.seen[i].any()]
+    if not frames:
+        raise TakeError("no person is detected", remedy="Write face = [left, top, width, height] of the first one.")
+    people = np.where(found.seen[frames[0]], found.confidence[frames[0]].mean(axis=1), -1.0)
+    return frames[0], face_box(found.points[frames[0], int(np.argmax(people))])
+
+
+class _Seen:
+    """Face and hands in the frames of a video: followed from the first one on, each image once."""
+
+    def __init__(
+        self, video: Video, begin: int, face: tuple[float, float, float, float], image: ImageFrame
+    ) -> None:
+        self._video, self._begin, self._image = video, begin, image
+        self._tracker = SkinTracker(video.read(begin), face, rate=video.rate)
+        self._found: list[tuple[NDArray, NDArray]] = []
+
+    def points(self, i: int) -> tuple[NDArray, NDArray]:
+        """Places (3, 2) [px] in the calibration's image and confidence (3,) in frame `i` after the first."""
+        while len(self._found) <= i:
+            self._tracker.update(self._video.read(self._begin + len(self._found)))
+            frame = self._tracker.frame("", 0.0)
+            self._found.append((self._image.to_calibration(frame.uv), frame.confidence))
+        return self._found[i]

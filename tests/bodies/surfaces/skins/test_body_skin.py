@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from kinefit.bodies import load_body
 from kinefit.bodies.surfaces.skins.body_skin import MAX_OWNERS, body_skins
 from kinefit.bodies.surfaces.skins.skin_tubes import field
-from kinefit.bodies.surfaces.skins.subdivision import check_closed, limit, subdivided
+from kinefit.bodies.surfaces.skins.skinning import check_closed, limit, subdivided
 from kinefit.errors import BodyError
 
 BODY = load_body("humanoid_metaballs")

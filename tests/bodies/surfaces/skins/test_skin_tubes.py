@@ -6,7 +6,7 @@ import pytest
 from kinefit.bodies import load_body
 from kinefit.bodies.surfaces import Metaballs
 from kinefit.bodies.surfaces.skins.skin_tubes import PosedLimb, field, tube
-from kinefit.bodies.surfaces.skins.subdivision import check_closed
+from kinefit.bodies.surfaces.skins.skinning import check_closed
 from kinefit.errors import BodyError
 from kinefit.geometry import se3
 

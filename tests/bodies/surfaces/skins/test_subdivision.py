@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from kinefit.bodies.surfaces.skins.subdivision import check_closed, interpolated, limit, spread, subdivided
+from kinefit.bodies.surfaces.skins.skinning import check_closed, interpolated, limit, spread, subdivided
 from kinefit.errors import BodyError
 
 CUBE = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])

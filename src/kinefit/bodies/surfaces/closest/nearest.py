@@ -20,7 +20,7 @@ from kinefit.errors import ObservationError
 
 if TYPE_CHECKING:
     from kinefit.bodies.body import Body
-    from kinefit.bodies.state import BodyState
+    from kinefit.bodies.tree import BodyState
 
 
 class SurfaceTables(NamedTuple):

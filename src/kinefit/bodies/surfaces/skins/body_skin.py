@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.body import Body
-from kinefit.bodies.state import BodyState
 from kinefit.bodies.surfaces.metaballs import LEVEL, Metaballs
 from kinefit.bodies.surfaces.skins.skin_tubes import PosedLimb, Tube, field, tube
-from kinefit.bodies.surfaces.skins.subdivision import check_closed, interpolated, limit, spread, subdivided
+from kinefit.bodies.surfaces.skins.skinning import check_closed, interpolated, limit, spread, subdivided
+from kinefit.bodies.tree import BodyState
 from kinefit.errors import BodyError
 from kinefit.geometry import se3
 

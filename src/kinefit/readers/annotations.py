@@ -1,4 +1,4 @@
-"""Manual annotations: joints that a user clicked in the images of one or several times, as JSON."""
+"""Manual annotations: joints that a user clicked in images, as JSON, and pixels of static objects, as TOML."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit._files import read_bytes, repeated
-from kinefit.errors import FileError, located
+from kinefit._files import parse_toml, read_bytes, read_text, repeated
+from kinefit.errors import FileError, ObservationError, check_choice, located
 
 _MAX_NUMBER = 1e9  # of a frame or a pixel; no recording has as many
 _FORM = 'Write {"step": 0, "points": {"CAMERA": {"r_knee": [812.0, 401.5], ...}, ...}}, or a list of these.'
@@ -87,3 +87,47 @@ def clicks_of(value: Any) -> Clicks:
                 raise FileError(f"{place!r} is not a pixel position", place=f"camera {camera}, {name}", remedy=_FORM)
             points[camera][name] = (float(place[0]), float(place[1]))
     return Clicks(step, points)
+
+
+def read_static_points(
+    path: str | PathLike[str], cameras: Sequence[str]
+) -> dict[str, dict[str, tuple[float, float]]]:
+    """Read {point: {camera: (u, v)}} [px] of points that two or more cameras see.
+
+    A TOML file with one table a point, and in it the pixel of each camera that sees it, in the calibration's image:
+
+        [beam_end]
+        cam01 = [512.3, 1204.0]
+        cam03 = [430.1, 1311.8]
+
+    Raises
+    ------
+    FileError
+        No such file, or not TOML.
+    ObservationError
+        An unknown camera, a pixel that is not two finite numbers, a point in fewer than two cameras, no points.
+    """
+    file = Path(path)
+    raw = parse_toml(read_text(file, "the static points", remedy="Give the path of a TOML file in UTF-8."), file)
+    form = "Write [name] and below it camera = [u, v] for two or more cameras."
+    out: dict[str, dict[str, tuple[float, float]]] = {}
+    for name, views in raw.items():
+        if not isinstance(views, dict) or len(views) < 2:
+            raise ObservationError("a point needs two or more cameras", file=file, place=f"[{name}]", remedy=form)
+        out[name] = {}
+        for camera, pixel in views.items():
+            place = f"[{name}] {camera}"
+            check_choice("camera", camera, cameras, ObservationError, file=file, place=place)
+            if not _is_pixel(pixel):
+                raise ObservationError(f"{pixel} is not a pixel position", file=file, place=place, remedy=form)
+            out[name][camera] = (float(pixel[0]), float(pixel[1]))
+    if not out:
+        raise ObservationError("there are no points", file=file, remedy=form)
+    return out
+
+
+def _is_pixel(value: object) -> bool:
+    return (
+        isinstance(value, list) and len(value) == 2
+        and all(isinstance(v, int | float) and not isinstance(v, bool) and -1e9 < v < 1e9 for v in value)
+    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Read body-worn trackers: a table of times, names, positions and optional quaternions."""
+"""Read tables of tracked points: body-worn trackers, and the paths of `kinefit surface`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from kinefit._files import rate_of, read_table, repeated
 from kinefit.errors import FileError, ObservationError, choices
 from kinefit.geometry import se3
-from kinefit.observations import BodyTrackerVideo
+from kinefit.observations import BodyTrackerVideo, SurfacePointVideo
 
 _POSITION_COLUMNS = ("time_s", "x", "y", "z")
 _QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
@@ -65,3 +65,32 @@ def read_body_trackers(
         R[frame[own & turned], k] = T[:3, :3] @ se3.rotation_from_quaternion(values[own & turned, 4:])
     rate = rate_of(times, path, _REMEDY)
     return BodyTrackerVideo(sensor, rate, times + time_offset, names, x, R, source=str(path))
+
+
+_SURFACE_COLUMNS = ("time_s", "point", "x", "y", "z", "std_x", "std_y", "std_z")
+_SURFACE_REMEDY = f"Give trajectories.csv of `kinefit surface`, or a table with {', '.join(_SURFACE_COLUMNS)}."
+
+
+def read_surface_points(path: Path, sensor: str = "surface_points", *, time_offset: float = 0.0) -> SurfacePointVideo:
+    """Points of a table with the columns time_s, point, x, y, z, std_x, std_y, std_z [s, m]; others are not read.
+
+    Raises
+    ------
+    FileError
+        No such table, other columns, or a number that is none, with its line.
+    ObservationError
+        No points, or a single time, of which no rate follows.
+    """
+    values = read_table(path, _SURFACE_COLUMNS, _SURFACE_REMEDY)[1]
+    bad = ~(np.isfinite(values).all(axis=1) & (values[:, 5:] > 0).all(axis=1) & (np.abs(values[:, 1]) < 2**53))
+    if bad.any():
+        problem = "a number that is not finite, or a standard deviation that is not positive"
+        raise FileError(problem, file=path, place=f"line {int(np.argmax(bad)) + 2}", remedy="Remove the row.")
+    times, frame = np.unique(values[:, 0], return_inverse=True)
+    rate = rate_of(times, path, _SURFACE_REMEDY)
+    order = np.argsort(frame, kind="stable")
+    values, first = values[order], np.searchsorted(frame[order], np.arange(len(times) + 1))
+    return SurfacePointVideo(
+        sensor, rate, times + time_offset, first, values[:, 1].astype(np.int64), values[:, 2:5], values[:, 5:],
+        source=str(path),
+    )  # fmt: skip
