@@ -21,7 +21,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 LEVELS = [
     {"errors", "_jit", "_processes"},
     {"_arguments", "_files", "_image_headers", "_mapped", "_records", "_threads", "findings", "serving"},
-    {"geometry", "_pictures"},
+    {"geometry", "_pictures", "lasting_errors"},
     {"bodies", "observations", "motion", "motion_columns"},
     {"readers", "images", "rendering", "rows", "losses", "photogrammetry"},
     {"correspondences"},

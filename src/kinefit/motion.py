@@ -9,12 +9,13 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies.body import Body, PointSet
 from kinefit.bodies.tree import BodyState
 from kinefit.errors import ExportError, ObservationError, check_choice
 from kinefit.geometry import se3
+from kinefit.lasting_errors import LastingErrors
 from kinefit.motion_columns import angle_columns, joint_columns
 
 UP_AXES = {
@@ -34,6 +35,9 @@ ARRAYS = "times", "Ts_world_root", "angles", "dof_std", "joint_std", "quality", 
 
 SHOWN_UNITS = {"px": (1.0, "px"), "m": (1000.0, "mm")}
 """Unit of residuals -> the factor and the unit in which they are shown."""
+
+BRIEF_S = 0.1
+"""[s] in which the correlation of errors that are not lasting falls to 1/e: smoothing spreads them over so much."""
 
 OUTLIER_WEIGHT = 0.05
 """Robust weight below which a measurement had no say."""
@@ -162,6 +166,8 @@ class Motion:
         Name of the take.
     provenance : Mapping
         What was done with which settings, in numbers, texts, lists and mappings (as JSON has them).
+    lasting : LastingErrors
+        Errors that frames have in common, see `std_of`; None where unknown.
     """
 
     body: Body
@@ -177,6 +183,7 @@ class Motion:
     up: str = "y"
     name: str = "motion"
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    lasting: LastingErrors | None = None
 
     def __post_init__(self) -> None:
         for name in ARRAYS:
@@ -227,7 +234,8 @@ class Motion:
         """Its stretches of so many frames, without residuals: what is computed of one takes little memory."""
         for start in range(0, max(len(self), 1), frames):
             arrays = {name: getattr(self, name)[start : start + frames] for name in ARRAYS}
-            yield replace(self, residuals={}, **arrays)
+            lasting = self.lasting and self.lasting.part(slice(start, start + frames))
+            yield replace(self, residuals={}, lasting=lasting, **arrays)
 
     def frame_at(self, time: float) -> int | None:
         """Frame nearest to a time [s], None where there is none within one frame."""
@@ -281,6 +289,35 @@ class Motion:
         """(F, S) bool: segments that no measurement supports, or that more speaks against than for."""
         return np.asarray(self.segment_quality < BELIEVED)
 
+    def std_of(self, frames: ArrayLike, coordinates: ArrayLike, weights: ArrayLike) -> float:
+        """Standard deviation of a weighted sum of coordinates in some frames, such as one frame minus another.
+
+        With x the coordinates and w the weights, σ² = Σ w_r w_q Cov(x_r, x_q). Cov is that of `LastingErrors`, plus,
+        for one coordinate, what `dof_std`² is beyond it, which falls with exp(−|Δt| / 0.1 s). Where it is not known
+        which errors frames have in common (`lasting` is None), they count as independent.
+
+        Parameters
+        ----------
+        frames, coordinates : (R,) int; coordinates are numbered as in `dof_std`: the root's six, then the angles
+        weights : (R,)
+
+        Returns
+        -------
+        float [m, rad]; inf where a coordinate was not observed
+        """
+        f, c, w = np.asarray(frames), np.asarray(coordinates), np.asarray(weights, float)
+        own = np.square(self.dof_std[f, c])
+        if not np.all(np.isfinite(own)):
+            return np.inf
+        if self.lasting is None:
+            return float(np.sqrt(w**2 @ own))
+        constant, drift = self.lasting.at(f, c)
+        brief = np.sqrt(np.maximum(own - np.square(constant).sum(axis=1) - np.square(drift).sum(axis=1), 0.0))
+        apart = np.abs(self.times[f][:, None] - self.times[f])
+        together = constant @ constant.T + np.exp(-apart / max(self.lasting.drift_time, 1e-9)) * (drift @ drift.T)
+        together += (c[:, None] == c) * np.exp(-apart / BRIEF_S) * np.outer(brief, brief)
+        return float(np.sqrt(max(w @ together @ w, 0.0)))
+
     def moved(self, T_new_world: NDArray, eye: NDArray | None = None) -> Motion:
         """The same motion in another world with the same vertical axis, such as one whose floor is level.
 
@@ -302,6 +339,7 @@ class Motion:
         return replace(
             self, Ts_world_root=roots, joint_std=_turned_std(self.joint_std, R, rays), residuals=residuals,
             dof_std=np.concatenate([shift, turn, self.dof_std[:, 6:]], axis=1),
+            lasting=self.lasting and self.lasting.turned(R),
         )  # fmt: skip
 
     def turned(self, up: str) -> Motion:
@@ -322,4 +360,5 @@ class Motion:
             joint_std=self.joint_std[..., axis],
             residuals=residuals,
             up=up,
+            lasting=self.lasting and self.lasting.turned(R),
         )

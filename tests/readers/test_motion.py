@@ -10,6 +10,7 @@ from kinefit.bodies import KinematicTree, catalogue, load_body
 from kinefit.bodies.serial import body_from_arrays, body_to_arrays
 from kinefit.errors import BodyError, ExportError, FileError
 from kinefit.exporters import write_motion
+from kinefit.lasting_errors import LastingErrors
 from kinefit.motion import ARRAYS, Residuals
 from kinefit.readers.motion import read_motion
 
@@ -31,6 +32,8 @@ def rewritten(path, **changes):
 @pytest.fixture
 def written(tmp_path):
     motion = replace(smooth_motion(15, up="-z"), provenance={"track": {"accuracy": [8.0], "smooth": True}})
+    factors = np.random.default_rng(0).standard_normal((2, 4, motion.dof_std.shape[1], 3)).astype(np.float16)
+    motion = replace(motion, lasting=LastingErrors(np.array([0, 5, 10, 14]), *factors, 0.3))
     write_motion(motion, tmp_path / "a.npz")
     return motion, tmp_path / "a.npz"
 
@@ -38,7 +41,7 @@ def written(tmp_path):
 def test_everything_comes_back_exactly(written):
     motion, path = written
     back = read_motion(path)
-    assert len(fields(motion)) == len(ARRAYS) + 6  # whoever adds one to a motion adds it to its file
+    assert len(fields(motion)) == len(ARRAYS) + 7  # whoever adds one to a motion adds it to its file
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(back, name), getattr(motion, name), strict=True)
     assert (back.rate, back.up, back.name) == (motion.rate, motion.up, motion.name)
@@ -48,6 +51,9 @@ def test_everything_comes_back_exactly(written):
         for field in fields(Residuals):
             a, b = getattr(back.residuals[sensor], field.name), getattr(r, field.name)
             np.testing.assert_array_equal(a, b, err_msg=f"{sensor} {field.name}")
+    for name in ("frames", "constant", "drift"):
+        np.testing.assert_array_equal(getattr(back.lasting, name), getattr(motion.lasting, name), strict=True)
+    assert back.lasting.drift_time == motion.lasting.drift_time
     assert_same_arrays(body_to_arrays(back.body), body_to_arrays(motion.body))
     np.testing.assert_array_equal(back.positions(), motion.positions())
 

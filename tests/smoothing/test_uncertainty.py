@@ -78,6 +78,32 @@ def test_drift_moves_the_pose_as_refitting_does(scene):
     assert np.all((ratio > 0.6) & (ratio < 1.5))
 
 
+def test_a_constant_error_changes_a_difference_of_frames_as_refitting_does(scene):
+    subject, channels, _, _ = scene
+    random = np.random.default_rng(1)
+    layout, none = Layout(channels, subject.body), np.zeros((subject.body.tree.n_dofs,) * 2)
+    count = len(channels.column)
+    noise = replace(noise_of(channels), bias=np.full(count, 2.0))
+    exact = replace(KeypointPriors.of(subject, channels, None), covariance=np.zeros((len(subject.covariance),) * 2))
+    factors, fits = [], []
+    for frame in (20, 40):
+        weight = channels.weight[frame]
+        state = fit(subject.body, channels, channels.uv[frame], weight, MOTION.state(frame))
+        one = systematic_errors(exact, layout, state, weight, noise, SharedErrors.none(count), none, none)
+        np.testing.assert_allclose(one.constant @ one.constant.T, one.dofs, atol=1e-12)
+        factors.append(one.constant)
+        fits.append((frame, weight, state))
+    changes = []
+    for _ in range(60):
+        error = 2.0 * random.standard_normal((count, 2))
+        a, b = (s.difference(fit(subject.body, channels, channels.uv[f] + error, w, s)) for f, w, s in fits)
+        changes.append(b - a)
+    told, alone = np.linalg.norm(factors[1] - factors[0], axis=1), np.linalg.norm(factors[1], axis=1)
+    sure = alone[6:] < 0.15
+    ratio = np.std(changes, axis=0)[6:][sure] / told[6:][sure]
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.12) and np.median(told[6:] / alone[6:]) < 0.9
+
+
 def test_a_shifted_camera_moves_the_pose_as_refitting_does(scene):
     subject, channels, weight, state = scene
     shift = np.zeros((4, 2))

@@ -38,6 +38,8 @@ def write_motion(motion: Motion, path: str | PathLike[str]) -> None:
     form = motion_format
     arrays = {"provenance": np.array(_json(motion.provenance)), **arrays_of(motion, form.SHAPES)}
     arrays |= {f"body/{key}": array for key, array in body_to_arrays(motion.body).items()}
+    if motion.lasting is not None:
+        arrays |= arrays_of(motion.lasting, form.LASTING_SHAPES, "lasting/")
     for sensor, residuals in motion.residuals.items():
         shapes = form.RESIDUAL_SHAPES | form.SURFACE_SHAPES
         arrays |= arrays_of(residuals, shapes, f"residuals/{quote(sensor, safe='')}/")

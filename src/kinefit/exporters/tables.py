@@ -38,7 +38,8 @@ from kinefit.motion_columns import angle_columns, continuous_quaternions, joint_
 class Curve:
     """One coordinate over time, as OpenSim calls it: values and standard deviations (F,) in `unit`.
 
-    `speed_std` is that of its rate of change [unit/s], NaN where the motion does not tell it.
+    `speed_std` is that of its rate of change [unit/s], NaN where the motion does not tell it. `coordinate` is its
+    number in `Motion.dof_std`, None for a mixture of several.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Curve:
     values: NDArray
     std: NDArray
     speed_std: float = np.nan
+    coordinate: int | None = None
 
     @property
     def stem(self) -> str:
@@ -74,7 +76,7 @@ def curves(motion: Motion) -> list[Curve]:
         if not slides:
             values, std, speed = np.degrees(np.unwrap(values)), np.degrees(std), float(np.degrees(speed))
         joint, _ = split_side(motion.body.joints[tree.owners[d]])
-        out.append(Curve(name, joint, split_side(name)[1], "m" if slides else "deg", values, std, speed))
+        out.append(Curve(name, joint, split_side(name)[1], "m" if slides else "deg", values, std, speed, 6 + d))
     return out
 
 

@@ -14,6 +14,8 @@ F frames, S segments, D coordinates; metres, radians, seconds, pixels; float64 u
     joint_std (F, S, 3)              of every joint centre along the world's axes
     quality (F,)  segment_quality (F, S)              0..1
     body/...                         the fitted body, in the format of `kinefit.bodies.serial`
+    lasting/frames (K,)              int, key frames of the errors that frames have in common; all of lasting/ optional
+    lasting/constant (K, 6 + D, k)  drift (K, 6 + D, m)  drift_time ()   float16, see `kinefit.lasting_errors`; [s]
     residuals/SENSOR/names (K,)  segments (K,)        points of a sensor, and the segment of each
     residuals/SENSOR/unit ()         "px" or "m"
     residuals/SENSOR/values (F, K, N)                 measured minus fitted, NaN if unobserved; N = 2 or 3
@@ -36,6 +38,7 @@ from kinefit._arguments import checked
 from kinefit._files import read_npz, regular
 from kinefit.bodies.serial import below, body_from_arrays, fields_of, prefixes
 from kinefit.errors import FileError, KinefitError, command
+from kinefit.lasting_errors import LastingErrors
 from kinefit.motion import Motion, Residuals
 
 FORMAT, VERSION = "kinefit motion", 1
@@ -47,6 +50,7 @@ RESIDUAL_SHAPES = {
     "names": "k$", "segments": "k<S", "unit": "$", "values": "F k n", "weights": "F k", "measured": "F k n",
     "swapped": "F",
 }  # fmt: skip
+LASTING_SHAPES = {"frames": "K<F", "constant": "K N s!", "drift": "K N d!", "drift_time": ""}
 SURFACE_SHAPES = {"rms": "F k", "count": "F k"}
 _REMEDY = "Write it again with kinefit, or copy it again from its source."
 
@@ -114,7 +118,10 @@ def _motion(arrays: Mapping[str, NDArray]) -> Motion:
     provenance = json.loads(str(arrays["provenance"])) if "provenance" in arrays else {}
     sensors = prefixes(arrays, "residuals")
     residuals = {sensor: _residuals(arrays, prefix, sizes) for sensor, prefix in sensors.items()}
-    return Motion(body=body, **own, residuals=residuals, provenance=provenance)
+    lasting = None
+    if "lasting/frames" in arrays:
+        lasting = LastingErrors(**fields_of(arrays, LASTING_SHAPES, sizes, "lasting/"))
+    return Motion(body=body, **own, residuals=residuals, provenance=provenance, lasting=lasting)
 
 
 def _residuals(arrays: Mapping[str, NDArray], prefix: str, sizes: dict[str, int]) -> Residuals:

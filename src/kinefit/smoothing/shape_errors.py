@@ -43,21 +43,29 @@ class ShapeErrors:
     frames : (K,) int
     dofs : (K, n) [m², rad²] of the degrees of freedom
     joints : (K, S, 3) [m²] of the joint centres along the world's axes
+    factors : (K, n, q) [m, rad] of the degrees of freedom's covariance
     """
 
     frames: NDArray
     dofs: NDArray
     joints: NDArray
+    factors: NDArray
 
     def at(self, frame: int) -> tuple[NDArray, NDArray]:
         """(n,) [m², rad²] and (S, 3) [m²] variances of any frame, interpolated."""
-        after = int(np.clip(np.searchsorted(self.frames, frame), 1, max(len(self.frames) - 1, 1)))
+        return self._between(self.dofs, frame), self._between(self.joints, frame)
+
+    def factor_at(self, frame: int) -> NDArray:
+        """(n, q) [m, rad] factor of the covariance of any frame, interpolated."""
+        return self._between(self.factors, frame)
+
+    def _between(self, values: NDArray, frame: int) -> NDArray:
         if len(self.frames) == 1:
-            return self.dofs[0], self.joints[0]
+            return np.asarray(values[0])
+        after = int(np.clip(np.searchsorted(self.frames, frame), 1, len(self.frames) - 1))
         a, b = self.frames[after - 1], self.frames[after]
         t = float(np.clip((frame - a) / (b - a), 0.0, 1.0))
-        dofs, joints = (v[after - 1] * (1.0 - t) + v[after] * t for v in (self.dofs, self.joints))
-        return dofs, joints
+        return np.asarray(values[after - 1] * (1.0 - t) + values[after] * t)
 
 
 def shape_errors(
@@ -81,7 +89,9 @@ def shape_errors(
     wide = np.concatenate([np.full(len(p.names), not isinstance(p, PointOffsets)) for p in found.parameters])
     step, worlds = stacked(found.parameters)[3], Worlds(found.prior_world, found.parameters)
     Sigma = found.covariance[np.ix_(used, used)]
-    dofs, joints = [], []
+    sizes, directions = np.linalg.eigh(Sigma)
+    root = directions * np.sqrt(np.maximum(sizes, 0.0))
+    dofs, joints, factors = [], [], []
     for frame, P in zip(frames, alone):
         scene, matched = frame_data(frame)
         matches = _FrameMatches(worlds, scene, matched, found.mean, used, np.flatnonzero(wide[used]), scale or {})
@@ -89,9 +99,10 @@ def shape_errors(
         response = P @ gradients
         moves = joint_moves(scene.body, scene.state)
         whole = moves @ response + matches.stretch(step)
-        dofs.append(np.einsum("ip,pq,iq->i", response, Sigma, response))
+        factors.append(response @ root)
+        dofs.append(np.square(factors[-1]).sum(axis=1))
         joints.append(np.einsum("sap,pq,saq->sa", whole, Sigma, whole, optimize=True))
-    return ShapeErrors(np.asarray(frames), np.maximum(dofs, 0.0), np.maximum(joints, 0.0))
+    return ShapeErrors(np.asarray(frames), np.array(dofs), np.maximum(joints, 0.0), np.array(factors))
 
 
 @dataclass(frozen=True, eq=False)

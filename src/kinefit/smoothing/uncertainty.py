@@ -14,14 +14,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit._mapped import room
 from kinefit.bodies import BodyState, KinematicTree
 from kinefit.correspondences import _kernels, targets
 from kinefit.correspondences.closures import closed_at
 from kinefit.frame.results import FrameResult
+from kinefit.lasting_errors import LastingErrors
 from kinefit.rows import Rows
 from kinefit.sensors.channels import Channels
 from kinefit.sensors.points.keypoints import Layout
@@ -45,6 +48,8 @@ Answers = Callable[[Sequence[int], Sequence[NDArray]], ShapeErrors]
 MOTION_CORRELATION_TIME = 0.1
 """[s] within which the motion correlates frames: an acceleration lasts about twice that."""
 
+_KEY_FRAMES_PER_S = 20.0  # of lasting errors; interpolated between them, they err by at most 2 % of sigma
+_DIRECTIONS = 120  # of lasting errors that are kept; 20 lose 19 % of a difference's sigma, 120 at most 2 %
 _NOISE_STRETCHES = 6  # of a long take, from which the detectors' noise is estimated: 12,000 frames are enough
 _SEPARATING_FRAMES = 800  # without detections between two stretches: more than the longest lag, at up to 400 Hz
 
@@ -58,19 +63,25 @@ class SystematicErrors:
     dofs : (n, n) covariance of the degrees of freedom [m, rad]
     joints : (S, 3) [m²] variance of the joint centres along the world's axes
     alone : (n, n) covariance of the frame on its own, prior included
+    constant, drift : (n, k) factors of what of `dofs` comes from constant errors of keypoints and the shape, and from
+        drift
     """
 
     dofs: NDArray
     joints: NDArray
     alone: NDArray
+    constant: NDArray
+    drift: NDArray
 
 
 def with_systematic_errors(
     results: Sequence[FrameResult], subject: Subject, take: SmoothTake, weight: NDArray,
     others: OtherNoise | None = None, answers: Sequence[Answers] = (), *,
     cameras: CameraErrors | None = None, shared: SharedErrors | None = None,
-) -> tuple[Iterator[FrameResult], VarianceComponents]:  # fmt: skip
-    """Add systematic errors and the uncertainty of the shape to standard deviations; also returns the detectors' noise.
+) -> tuple[Iterator[FrameResult], VarianceComponents, LastingErrors]:  # fmt: skip
+    """Add systematic errors and the uncertainty of the shape to standard deviations.
+
+    Also returns the detectors' noise, and what lasts of the errors, complete once all frames are taken.
 
     Parameters
     ----------
@@ -114,14 +125,14 @@ def with_systematic_errors(
         near = weight[max(f - half, 0) : f + half + 1]
         return systematic_errors(priors, layout, results[f].state, near.mean(axis=0), noise, shared, *other_sensors)
 
-    shapes = []
-    if answers:
-        alone = [errors_at(int(f)).alone for f in sampled]
-        shapes = [answer([int(f) for f in sampled], alone) for answer in answers]
+    few = [errors_at(int(f)) for f in sampled]
+    shapes = [answer([int(f) for f in sampled], [errors.alone for errors in few]) for answer in answers]
+    kept = _Kept.of(few, sampled, shapes, len(results), rate, noise.drift_time)
 
     def inflated() -> Iterator[FrameResult]:
         for f, result in enumerate(results):
             errors = errors_at(f)
+            kept.add(f, errors, shapes)
             dofs, joints = np.maximum(np.diag(errors.dofs), 0.0), errors.joints
             for shape in shapes:
                 dofs, joints = (variance + added for variance, added in zip((dofs, joints), shape.at(f)))
@@ -130,7 +141,53 @@ def with_systematic_errors(
                 joint_std=np.sqrt(np.square(result.joint_std) + joints),
             )  # fmt: skip
 
-    return inflated(), noise
+    return inflated(), noise, kept.errors
+
+
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """Lasting errors of key frames as they are computed, in the directions that hold most of them.
+
+    Parameters
+    ----------
+    errors : zeros, to be filled
+    constant, drift : (k, K) directions
+    """
+
+    errors: LastingErrors
+    constant: NDArray
+    drift: NDArray
+
+    @classmethod
+    def of(
+        cls, few: Sequence[SystematicErrors], sampled: NDArray, shapes: Sequence[ShapeErrors], frames: int, rate: float,
+        drift_time: float,
+    ) -> _Kept:  # fmt: skip
+        """For so many frames, with directions from a few (`sampled`)."""
+        std = np.sqrt(np.mean([np.diag(errors.dofs) for errors in few], axis=0))[:, None]
+        both = zip(*((_with_shapes(errors, shapes, int(f)), errors.drift) for f, errors in zip(sampled, few)))
+        constant, drift = (_directions([v / np.maximum(std, 1e-12) for v in several]) for several in both)
+        count = min(frames, round(frames / rate * _KEY_FRAMES_PER_S) + 2)
+        keys = np.unique(np.linspace(0, frames - 1, count).round().astype(int))
+        s, d = (room((len(keys), len(std), v.shape[1]), np.float16) for v in (constant, drift))
+        return cls(LastingErrors(keys, s, d, drift_time), constant, drift)
+
+    def add(self, frame: int, errors: SystematicErrors, shapes: Sequence[ShapeErrors]) -> None:
+        """Keep those of a frame, if it is a key frame."""
+        k = int(np.searchsorted(self.errors.frames, frame))
+        if k < len(self.errors.frames) and self.errors.frames[k] == frame:
+            self.errors.constant[k] = _with_shapes(errors, shapes, frame) @ self.constant
+            self.errors.drift[k] = errors.drift @ self.drift
+
+
+def _with_shapes(errors: SystematicErrors, shapes: Sequence[ShapeErrors], frame: int) -> NDArray:
+    """(n, k) factors of all constant errors of a frame."""
+    return np.concatenate([errors.constant, *(shape.factor_at(frame) for shape in shapes)], axis=1)
+
+
+def _directions(factors: Sequence[NDArray]) -> NDArray:
+    """(k, K) orthonormal directions of factors (n, k) that hold most of them, all where these are few."""
+    return np.linalg.eigh(gram(*(np.concatenate(factors),) * 2))[1][:, ::-1][:, :_DIRECTIONS]
 
 
 def _residuals(take: SmoothTake) -> NDArray:
@@ -163,6 +220,12 @@ class KeypointPriors:
     cameras: CameraExtrinsics | None
     covariance: NDArray
     closing: ClosureMoves | None = None
+
+    @cached_property
+    def root(self) -> NDArray:
+        """(p, p) of which the product with its own transpose is the covariance."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
     @classmethod
     def of(cls, subject: Subject, channels: Channels, errors: CameraErrors | None) -> KeypointPriors:
@@ -260,20 +323,28 @@ def systematic_errors(
     alone = covariance_alone(body, state, gram(J, pushed) + other_information)
     of_axis = 2 * channels.source[rows.group] + np.arange(len(rows)) % 2
     push = np.ravel(noise.shared)[:, None] * gram(np.eye(2 * len(noise.shared))[of_axis], pushed)
-    own_error, share = (v[rows.group][:, None] * pushed for v in (noise.systematic * np.sqrt(1.0 - shared.share),
-                                                                 noise.systematic * np.sqrt(shared.share)))
-    group_error = shared.sums(share, rows.group)
-    drift = gram(own_error, own_error) + gram(group_error, group_error)
-    meat = drift + product(push.T, push) + other_systematic
+
+    def pushed_by(sigma: NDArray) -> NDArray:
+        """(2 N + 2 G, n) gradient by errors of sigma (N,) [px] of each channel and each group."""
+        own_error = np.zeros((2 * len(sigma), J.shape[1]))
+        own, common = ((sigma * np.sqrt(share))[rows.group] for share in (1.0 - shared.share, shared.share))
+        own_error[2 * rows.group + np.arange(len(rows)) % 2] = own[:, None] * pushed
+        return np.concatenate([own_error, shared.sums(common[:, None] * pushed, rows.group)])
+
     own = (weight / (1.0 - shared.share))[rows.group]
     pushed_by_shape = gram(pushed, by_shape / np.sqrt(np.where(own > 0.0, own, 1.0))[:, None])
     if priors.closing is not None:
         moved_by = priors.closing.at(state)
         pushed_by_shape[:, : moved_by.shape[1]] += closed.jacobian.T @ (w[:, None] * moved_by)
     response = -product(alone, pushed_by_shape)
-    dofs = product(product(alone, meat), alone)
+    constant = product(alone, np.concatenate([push, pushed_by(np.hypot(noise.bias, noise.bias_error))]).T)
+    drift = product(alone, pushed_by(noise.drift).T)
+    dofs = sum(product(v, v.T) for v in (constant, drift)) + product(product(alone, other_systematic), alone)
     moved = joint_moves(body, state)
     whole = product(moved, response) + stretch
     joints = np.sum(product(moved, dofs) * moved, axis=-1) + np.sum(product(whole, Sigma) * whole, axis=-1)
-    shape = product(product(response, Sigma), response.T)
-    return SystematicErrors(dofs + shape, np.maximum(joints, 0.0), alone)
+    by_shape = product(response, priors.root)
+    shape = product(by_shape, by_shape.T)
+    return SystematicErrors(
+        dofs + shape, np.maximum(joints, 0.0), alone, np.concatenate([constant, by_shape], axis=1), drift
+    )

@@ -108,7 +108,7 @@ def _elsewhere(motion: Motion, own: Motion) -> Motion:
     apart = motion.Ts_world_root[:, :3, 3] - own.Ts_world_root[k, :3, 3]
     use = np.linalg.norm(apart, axis=1) > _MAX_DUPLICATE_DISTANCE_M
     arrays = {name: getattr(motion, name)[use] for name in ARRAYS}
-    return replace(motion, **arrays, residuals={})
+    return replace(motion, **arrays, residuals={}, lasting=None)
 
 
 def people_in_view(take: Take) -> InView | None:

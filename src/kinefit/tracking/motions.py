@@ -123,7 +123,7 @@ def motion_of(
     if cameras := as_record(found):
         provenance[CAMERAS] = composed(provenance.get(CAMERAS, {}), cameras)
     elsewhere = any(one.cameras is not None for one in found)
-    last, detectors = with_systematic_errors(
+    last, detectors, lasting = with_systematic_errors(
         results, subject, take, weight, noise_of_others, answers,
         cameras=None if elsewhere else settings.camera_errors, shared=shared,
     )  # fmt: skip
@@ -135,7 +135,7 @@ def motion_of(
     provenance["estimate"] = "smoothed" if smooth else "filtered" if lag is None else "fixed lag"
     return Motion(
         body=body, rate=rate, times=frames.times, **_arrays(last, body, len(results)), residuals=residuals, up=up,
-        name=name, provenance=provenance,
+        name=name, provenance=provenance, lasting=lasting,
     )  # fmt: skip
 
 

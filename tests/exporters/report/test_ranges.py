@@ -9,9 +9,12 @@ from tests.exporters.synthetic import smooth_motion
 
 from kinefit.exporters.report.angles import MAX_STD_DEG, extremes, ranges_of, ranges_table
 from kinefit.exporters.tables import NAMES, Curve, curves
+from kinefit.lasting_errors import LastingErrors
+from kinefit.motion import BRIEF_S
 
 RATE = 50.0
 TIMES = np.arange(101) / RATE
+MOTION = smooth_motion(101, RATE)
 
 
 def curve(std=2.0, values=None):
@@ -20,13 +23,13 @@ def curve(std=2.0, values=None):
 
 
 def test_of_a_sine_its_ends_range_and_speed():
-    found = extremes(curve(), RATE, np.ones(101, bool))
+    found = extremes(curve(), MOTION, np.ones(101, bool))
     assert found.lowest == pytest.approx((10.0, 4.0), abs=0.05)
     assert found.highest == pytest.approx((50.0, 4.0), abs=0.05)
     assert found.span == pytest.approx((40.0, 4 * 2**0.5), abs=0.1)
     assert found.fastest[0] == pytest.approx(20 * 2 * np.pi, rel=0.01) and found.share == 1.0
     assert np.isnan(found.fastest[1])  # nobody told it
-    assert extremes(replace(curve(), speed_std=3.0), RATE, np.ones(101, bool)).fastest[1] == 6.0
+    assert extremes(replace(curve(), speed_std=3.0), MOTION, np.ones(101, bool)).fastest[1] == 6.0
 
 
 def test_what_was_not_observed_takes_no_part():
@@ -34,11 +37,26 @@ def test_what_was_not_observed_takes_no_part():
     values[40:50] = 500.0
     std = np.full(101, 2.0)
     std[40:50] = np.inf
-    found = extremes(curve(std, values), RATE, np.ones(101, bool))
+    found = extremes(curve(std, values), MOTION, np.ones(101, bool))
     assert found.highest[0] < 51 and found.fastest[0] < 150 and found.share == pytest.approx(91 / 101)
     tracked = np.arange(101) < 20
-    assert extremes(curve(), RATE, tracked).lowest[0] == pytest.approx(30.0)
-    assert extremes(curve(MAX_STD_DEG), RATE, np.ones(101, bool)) is None
+    assert extremes(curve(), MOTION, tracked).lowest[0] == pytest.approx(30.0)
+    assert extremes(curve(MAX_STD_DEG), MOTION, np.ones(101, bool)) is None
+
+
+def test_what_both_ends_have_in_common_is_not_in_the_range():
+    motion = smooth_motion(40)
+    motion = replace(motion, quality=np.ones(40), dof_std=np.full_like(motion.dof_std, np.radians(5.0)))
+    n = motion.dof_std.shape[1]
+    shared = np.full((1, n, 1), np.radians(4.0))
+    known = replace(motion, lasting=LastingErrors(np.array([0]), shared, np.zeros((1, n, 0)), 0.3))
+    before, after = (ranges_of(m)["knee_angle"]["left"] for m in (motion, known))
+    assert before.span[1] == pytest.approx(2 * 5 * 2**0.5) and after.lowest == before.lowest
+    low, high = after.ends
+    brief = 1 - np.exp(-abs(motion.times[high] - motion.times[low]) / BRIEF_S)
+    assert after.span[1] == pytest.approx(2 * 3 * (2 * brief) ** 0.5)
+    assert "± 14" in own(ranges_table(motion)) and "± 20" in own(ranges_table(motion))  # left minus right: four ends
+    assert "± 20" not in own(ranges_table(known))
 
 
 def test_the_table_has_left_beside_right_and_says_what_is_unknown():

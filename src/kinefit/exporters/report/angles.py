@@ -163,10 +163,12 @@ class Extremes:
     Parameters
     ----------
     lowest, highest, span : (value, two standard deviations)
-        Those of the span as if both ends erred on their own: an error that lasts is in neither.
+        Those of the span are of the difference: what both ends have in common is not in it, see `Motion.std_of`.
     fastest : largest speed; its deviation is NaN where the motion does not tell it. Of a greatest of many it is no
         interval of its own: that of noise alone is above zero, too.
     share : of the frames in which the coordinate was observed.
+    ends : frames of the lowest and the highest value
+    coordinate : its number in `Motion.dof_std`, None for a mixture of several
     """
 
     lowest: tuple[float, float]
@@ -174,15 +176,13 @@ class Extremes:
     span: tuple[float, float]
     fastest: tuple[float, float]
     share: float
+    ends: tuple[int, int]
+    coordinate: int | None
 
 
-def extremes(curve: Curve, rate: float, tracked: NDArray) -> Extremes | None:
-    """Of one angle over time; None where it was observed in no two frames.
+def extremes(curve: Curve, motion: Motion, tracked: NDArray) -> Extremes | None:
+    """Of one angle [deg] of a motion over time; None where it was observed in no two frames.
 
-    Parameters
-    ----------
-    curve : Curve [deg]
-    rate : float [Hz]
     tracked : (F,) bool, frames in which somebody was seen.
     """
     known = tracked & (curve.std < MAX_STD_DEG)
@@ -191,14 +191,16 @@ def extremes(curve: Curve, rate: float, tracked: NDArray) -> Extremes | None:
     at = np.flatnonzero(known)
     low, high = (int(at[k]) for k in (np.argmin(curve.values[at]), np.argmax(curve.values[at])))
     span = float(curve.values[high] - curve.values[low])
-    speed = np.abs(np.gradient(curve.values)) * rate
+    speed = np.abs(np.gradient(curve.values)) * motion.rate
     inside = known & np.roll(known, 1) & np.roll(known, -1)
     inside[[0, -1]] = False
     fastest = float(speed[inside].max()) if inside.any() else np.nan
     ends = [(float(curve.values[f]), float(2 * curve.std[f])) for f in (low, high)]
     share = float(known.mean())
     of_span = span, float(np.hypot(ends[0][1], ends[1][1]))
-    return Extremes(ends[0], ends[1], of_span, (fastest, 2.0 * curve.speed_std), share)
+    if curve.coordinate is not None:
+        of_span = span, 2.0 * float(np.degrees(motion.std_of((high, low), (curve.coordinate,) * 2, (1, -1))))
+    return Extremes(ends[0], ends[1], of_span, (fastest, 2.0 * curve.speed_std), share, (low, high), curve.coordinate)
 
 
 def ranges_of(motion: Motion) -> dict[str, dict[str, Extremes | None]]:
@@ -210,7 +212,7 @@ def ranges_of(motion: Motion) -> dict[str, dict[str, Extremes | None]]:
     out: dict[str, dict[str, Extremes | None]] = {}
     for rows in by_joint(curves(motion)).values():
         for stem, found in rows.items():
-            of = {c.side: extremes(c, motion.rate, tracked) for c in found if c.unit == "deg"}
+            of = {c.side: extremes(c, motion, tracked) for c in found if c.unit == "deg"}
             if of:
                 out[stem] = of
     return out
@@ -227,7 +229,7 @@ def ranges_table(motion: Motion) -> p.Html:
             single.append((name, *_cells(of[""])))
         else:
             left, right = of.get("left"), of.get("right")
-            paired.append((name, *_cells(left), *_cells(right), _difference(left, right)))
+            paired.append((name, *_cells(left), *_cells(right), _difference(motion, left, right)))
     parts = []
     if paired:
         columns = [f"{side} {what}" for side in ("left", "right") for what in _HEAD]
@@ -246,10 +248,12 @@ def _cells(found: Extremes | None) -> tuple[str, ...]:
     return (*(with_error(*pair) for pair in (found.lowest, found.highest)), with_error(*found.span) + part, fastest)
 
 
-def _difference(left: Extremes | None, right: Extremes | None) -> str:
+def _difference(motion: Motion, left: Extremes | None, right: Extremes | None) -> str:
     if left is None or right is None:
         return "–"
-    return with_error(left.span[0] - right.span[0], float(np.hypot(left.span[1], right.span[1])))
+    frames, coordinates = zip(*((f, side.coordinate) for side in (left, right) for f in side.ends[::-1]))
+    std = motion.std_of(frames, coordinates, (1, -1, -1, 1))
+    return with_error(left.span[0] - right.span[0], 2.0 * float(np.degrees(std)))
 
 
 def with_error(value: float, twice: float) -> str:
