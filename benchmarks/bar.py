@@ -19,8 +19,8 @@ from benchmarks.bar_scene import bar_rig, draw_bar, see_bar, wave_bar
 from benchmarks.figures import amount, figure
 from kinefit.calibration.bar.calibrate import BarCalibration, calibrate_bar
 from kinefit.geometry.camera import Rig
+from kinefit.geometry.lines import triangulate
 from kinefit.geometry.se3 import log_so3
-from kinefit.geometry.triangulation import triangulate
 
 _NOISE, _LENGTH, _PLACES, _ROOMS = 0.1, 0.9, 300, 40
 

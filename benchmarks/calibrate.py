@@ -24,7 +24,7 @@ from kinefit.calibration.refine.gauge import aligned
 from kinefit.calibration.refine.refine import refine
 from kinefit.calibration.refine.result import Refinement
 from kinefit.geometry import se3
-from kinefit.geometry.triangulation import triangulate
+from kinefit.geometry.lines import triangulate
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.simulation import cut, simulate_keypoints, studio_rig
 

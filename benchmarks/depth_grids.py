@@ -13,8 +13,8 @@ from tests.bodies.surfaces.shapes import brute_force, points_on
 from benchmarks.figures import data, figure
 from kinefit.bodies.surfaces import MeshSurface
 from kinefit.bodies.surfaces.closest._kernels_grid import nearest_on_grids
-from kinefit.bodies.surfaces.closest.grid import GridTable, distance_grid, pack_grids, parts
-from kinefit.bodies.surfaces.mesh import mesh_surface
+from kinefit.bodies.surfaces.closest.grid import distance_grid, parts
+from kinefit.bodies.surfaces.mesh import GridTable, mesh_surface, pack_grids
 
 NEAR = (-0.02, 0.05)  # [m] from the surface, where measured points lie
 GOALS = {

@@ -14,7 +14,7 @@ from benchmarks.figures import amount, data, figure, quick
 from kinefit.assets import CAMERAS
 from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.camera import ImageFrame
-from kinefit.geometry.triangulation import triangulate
+from kinefit.geometry.lines import triangulate
 from kinefit.images.detectors.roi import MIRROR
 from kinefit.multiview.association import choose_people
 from kinefit.observations import Detections

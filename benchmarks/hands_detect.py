@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import data, figure, quick
 from kinefit.errors import AssetError, ObservationError
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.geometry.triangulation import triangulate
+from kinefit.geometry.lines import triangulate
 from kinefit.images.detectors.box_detector import Models
 from kinefit.images.detectors.detection import detect_people
 from kinefit.images.detectors.faces import HandFollower, HandModels

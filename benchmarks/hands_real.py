@@ -21,7 +21,7 @@ from benchmarks.figures import amount, data, figure
 from benchmarks.held_out import left_over
 from kinefit import Keypoints, Recording, Rig, load_body, track
 from kinefit.errors import AssetError, ObservationError
-from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.geometry.lines import triangulate_robust
 from kinefit.observations import MEDIAPIPE_33, MEDIAPIPE_75
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.keypoints import read_caliscope_csv

@@ -36,7 +36,7 @@ from kinefit.errors import AssetError
 from kinefit.exporters.c3d_file import write_markers
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig
-from kinefit.geometry.triangulation import triangulate
+from kinefit.geometry.lines import triangulate
 from kinefit.observations import Markers
 from kinefit.readers.calibration.read import read_calibration, write_calibration
 from kinefit.readers.take.file import read_take

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from kinefit.geometry.camera import Rig
-from kinefit.geometry.triangulation import triangulate
+from kinefit.geometry.lines import triangulate
 
 POINTS: dict[str, dict[str, tuple[float, float]]] = {
     "sticker_cable_post": {

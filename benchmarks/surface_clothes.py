@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, data, figure
 from kinefit.photogrammetry.least_squares_matching import match
-from kinefit.photogrammetry.matching.correlation import search_box
+from kinefit.photogrammetry.matching.multi_image import search_box
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.readers.video import Video
 

@@ -15,7 +15,7 @@ import pytest
 from kinefit import assets
 from kinefit.assets import clients
 from kinefit.errors import AssetError, FileError
-from kinefit.geometry.triangulation import triangulate
+from kinefit.geometry.lines import triangulate
 from kinefit.readers.take.file import read_take
 from kinefit.readers.take.load import load_observations
 

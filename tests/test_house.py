@@ -22,7 +22,7 @@ LEVELS = [
     {"errors", "_jit", "_processes"},
     {"_arguments", "_files", "_image_headers", "_mapped", "_records", "_threads", "findings", "serving"},
     {"geometry", "_pictures", "lasting_errors"},
-    {"bodies", "observations", "motion", "motion_columns"},
+    {"bodies", "observations", "motion"},
     {"readers", "images", "rendering", "rows", "losses", "photogrammetry"},
     {"correspondences"},
     {"solvers"},
@@ -41,7 +41,7 @@ LEVELS = [
     {"cli", "__main__"},
 ]
 BESIDE = {
-    ("motion", "bodies"), ("motion", "motion_columns"), ("motion_columns", "motion"),
+    ("motion", "bodies"),
     ("readers", "images"), ("images", "rendering"), ("rows", "losses"), ("__main__", "cli"),
     ("initialization", "subject"), ("subject", "initialization"),
 }

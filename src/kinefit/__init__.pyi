@@ -29,7 +29,7 @@ from kinefit.readers.take.file import read_take as read_take
 from kinefit.readers.take.load import load_observations as load_observations
 from kinefit.sensors.settings import TrackSettings as TrackSettings
 from kinefit.smoothing.online.fixed_lag import FixedLag as FixedLag
-from kinefit.smoothing.online.known_noise import KnownNoise as KnownNoise
+from kinefit.smoothing.online.lag_frame import KnownNoise as KnownNoise
 from kinefit.subject.fit import fit_subject as fit_subject
 from kinefit.subject.sensor_parameters import OwnUnknowns as OwnUnknowns
 from kinefit.tracking.recording import Recording as Recording
@@ -46,7 +46,7 @@ from kinefit.identification.model.learn import learn_model as learn_model
 from kinefit.identification.take.takes import identify_people as identify_people
 from kinefit.identification.take.takes import identify_take as identify_take
 from kinefit.markers.fit import fit_markers as fit_markers
-from kinefit.markers.people import split_people as split_people
+from kinefit.markers.poses import split_people as split_people
 from kinefit.markers.subject import fit_marker_subject as fit_marker_subject
 
 # Calibration, and checks of a recording

@@ -24,7 +24,7 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.simulation import cut
 from kinefit.simulation.movements import movement, people
 from kinefit.simulation.recordings import write_recording
-from kinefit.smoothing.online.known_noise import KnownNoise
+from kinefit.smoothing.online.lag_frame import KnownNoise
 from kinefit.subject.subject import Subject
 from kinefit.takes.track import track_take
 from kinefit.tracking.recording import Recording

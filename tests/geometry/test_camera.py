@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from kinefit.errors import CalibrationError, ObservationError
 from kinefit.geometry.camera import Camera, ImageFrame, Rig
+from kinefit.geometry.lines import triangulate, triangulate_robust
 from kinefit.geometry.se3 import exp_so3, transform
-from kinefit.geometry.triangulation import triangulate, triangulate_robust
 
 SIZE = (1280, 720)
 MATRIX = np.array([[900.0, 0, 641.5], [0, 905.0, 352.25], [0, 0, 1]])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.oracle import look_at
 
-from kinefit.geometry.triangulation import placed
+from kinefit.geometry.lines import placed
 
 CAMERA = look_at("c", (1.0, 2.0, 4.0), (0.0, 1.0, 0.0))
 

@@ -10,8 +10,7 @@ from kinefit.bodies.marker_sets import placement
 from kinefit.errors import KinefitError, ObservationError, TrackingError
 from kinefit.evaluation import joint_errors
 from kinefit.markers.fit import fit_markers
-from kinefit.markers.people import split_people
-from kinefit.markers.poses import columns
+from kinefit.markers.poses import columns, split_people
 from kinefit.markers.subject import fit_marker_subject
 from kinefit.readers.markers import read_markers
 from kinefit.simulation import squat_and_wave

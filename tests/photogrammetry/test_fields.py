@@ -8,7 +8,7 @@ from av.codec.context import Flags
 
 from kinefit.cli.surfaces._measure import field_of
 from kinefit.photogrammetry.least_squares_matching import match
-from kinefit.photogrammetry.matching.correlation import search_box
+from kinefit.photogrammetry.matching.multi_image import search_box
 from kinefit.photogrammetry.spline_image import SplineImage
 from kinefit.readers.video import Video
 

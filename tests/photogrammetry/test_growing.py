@@ -6,7 +6,7 @@ from tests.photogrammetry import scenes
 
 from kinefit.errors import ObservationError
 from kinefit.photogrammetry._kernels_growing import pop, push
-from kinefit.photogrammetry.matching.correlation import search_box
+from kinefit.photogrammetry.matching.multi_image import search_box
 from kinefit.photogrammetry.region_growing import Grid, Seeds, grow
 from kinefit.photogrammetry.seeding.unaided import sift_seeds
 from kinefit.photogrammetry.spline_image import SplineImage

@@ -7,8 +7,7 @@ import pytest
 from tests.oracle import posture
 
 from kinefit.bodies import load_body
-from kinefit.correspondences.parameters import prior_rows
-from kinefit.correspondences.points import pixel_rows
+from kinefit.correspondences.points import pixel_rows, prior_rows
 from kinefit.frame.prediction import prediction_row
 from kinefit.losses import SQUARED, geman_mcclure, huber
 from kinefit.simulation import squat_and_wave, studio_rig

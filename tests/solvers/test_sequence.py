@@ -7,7 +7,7 @@ from tests.oracle import posture, random_unit
 
 from kinefit.bodies import BodyState, load_body
 from kinefit.correspondences import plane_rows, point_rows
-from kinefit.correspondences.parameters import prior_rows
+from kinefit.correspondences.points import prior_rows
 from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, huber
 from kinefit.solvers.equations import variances

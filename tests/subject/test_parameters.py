@@ -17,7 +17,7 @@ from kinefit.rows import ParameterRows, Rows
 from kinefit.sensors.base import RowsOf, Unknown
 from kinefit.sensors.points.markers import MarkerMeasurement, MarkerSensor
 from kinefit.solvers.bundle.border_frames import differences
-from kinefit.subject.excess import FrameRows, excess
+from kinefit.subject.gear import FrameRows, excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import (
     KNOWN_SIZE_STD,

@@ -17,7 +17,7 @@ from kinefit.smoothing import spool
 from kinefit.smoothing.smoother import smooth_results
 from kinefit.subject.subject import Subject
 from kinefit.tracking import motions
-from kinefit.tracking.checkpoints.interrupted import TrackingInterrupted
+from kinefit.tracking.checkpoints.checkpoint import TrackingInterrupted
 
 SUBJECT = Subject(BODY, np.ones(len(BODY.scale_groups)))
 FIELDS = ("Ts_world_root", "angles", "dof_std", "joint_std", "quality", "segment_quality")

@@ -9,7 +9,7 @@ from tests.viewers.recordings import write_video
 from kinefit import viewers
 from kinefit.errors import FileError
 from kinefit.geometry.camera import Camera, ImageFrame
-from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.geometry.lines import triangulate_robust
 from kinefit.readers.calibration.read import read_calibration
 from kinefit.readers.keypoints import read_keypoints
 from kinefit.readers.video import Video

@@ -8,8 +8,17 @@ from kinefit.correspondences.contours.outlines import outline_pairs, outline_row
 from kinefit.correspondences.occupancy.collisions import collision_rows
 from kinefit.correspondences.occupancy.depth_image import depth_image_rows
 from kinefit.correspondences.occupancy.free_space import free_space_rows
-from kinefit.correspondences.parameters import limit_rows, prediction_rows, prior_rows
-from kinefit.correspondences.points import edge_rows, image_line_rows, pixel_rows, plane_rows, point_rows, ray_rows
+from kinefit.correspondences.points import (
+    edge_rows,
+    image_line_rows,
+    limit_rows,
+    pixel_rows,
+    plane_rows,
+    point_rows,
+    prediction_rows,
+    prior_rows,
+    ray_rows,
+)
 from kinefit.correspondences.surfaces import field_rows, surface_rows
 
 __all__ = [

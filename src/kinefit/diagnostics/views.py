@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit.findings import Finding, frame_ranges, listed
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.geometry.triangulation import triangulate, triangulate_robust
+from kinefit.geometry.lines import triangulate, triangulate_robust
 from kinefit.multiview.association import choose_people
 from kinefit.observations import Keypoints
 from kinefit.observations.recordings import mirror_name

@@ -30,8 +30,7 @@ from kinefit._files import writing
 from kinefit.errors import ExportError, extra
 from kinefit.exporters.opensim import root_coordinates
 from kinefit.exporters.skeletons.common import UNITS, bone_names, euler_zxy, length_factor, turned
-from kinefit.motion import Motion
-from kinefit.motion_columns import angle_columns, continuous_quaternions, joint_columns, place_columns
+from kinefit.motion import Motion, angle_columns, continuous_quaternions, joint_columns, place_columns
 
 
 @dataclass(frozen=True, eq=False)

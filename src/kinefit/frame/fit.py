@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import HARD_SIGMA, hard_equations, looped, soft_closures
 from kinefit.correspondences.occupancy.collisions import CollisionPairs, collision_pairs, collision_rows
-from kinefit.correspondences.parameters import prior_rows
+from kinefit.correspondences.points import prior_rows
 from kinefit.frame.minimum import ROUGH_ITERATIONS, ROUGH_TOLERANCE, Minimum, minimum
 from kinefit.frame.prediction import prediction_row, release_dofs
 from kinefit.frame.results import ROOT_PRIOR_STD, FrameResult, evidence_of, frame_result, sum_evidence

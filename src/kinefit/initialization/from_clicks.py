@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.errors import TrackingError, choices
 from kinefit.geometry.camera import Rig
-from kinefit.geometry.triangulation import triangulate
+from kinefit.geometry.lines import triangulate
 from kinefit.initialization.from_points import first_scales, pose_from_points
 from kinefit.photogrammetry.intersection import intersect
 

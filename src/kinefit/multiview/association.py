@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit._mapped import kept
 from kinefit.errors import TrackingError
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.geometry.triangulation import triangulate
+from kinefit.geometry.lines import triangulate
 from kinefit.multiview import _kernels_medians
 from kinefit.multiview.boxes import match_by_boxes
 from kinefit.observations import MEDIAPIPE_478, Keypoints

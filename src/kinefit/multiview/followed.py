@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kinefit.errors import TrackingError
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.geometry.triangulation import placed
+from kinefit.geometry.lines import placed
 from kinefit.multiview.association import confidences, heights, medians
 from kinefit.multiview.likeness import ImageSource
 from kinefit.multiview.mirrors import mark_mirror_images

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.geometry.camera import Rig
-from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.geometry.lines import triangulate_robust
 from kinefit.multiview.association import heights, medians
 from kinefit.multiview.people import PersonTrack
 from kinefit.observations import Keypoints

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import check_shape
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Rig
-from kinefit.geometry.triangulation import triangulate
+from kinefit.geometry.lines import triangulate
 
 _MAX_ITERATIONS = 5  # of Gauss-Newton, from the close solution with equal weights
 _TOLERANCE = 1e-9  # [m] step at which the iteration ends

@@ -12,8 +12,7 @@ from kinefit.errors import CalibrationError, ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.photogrammetry.intersection import intersect
 from kinefit.photogrammetry.least_squares_matching import WINDOW, Matches, half_sides
-from kinefit.photogrammetry.matching.correlation import search_box
-from kinefit.photogrammetry.matching.multi_image import match_along_rays
+from kinefit.photogrammetry.matching.multi_image import match_along_rays, search_box
 from kinefit.photogrammetry.region_growing import MIN_CORRELATION, Grid, Seeds, grow
 from kinefit.photogrammetry.seeding.unaided import grow_between
 from kinefit.photogrammetry.spline_image import SplineImage

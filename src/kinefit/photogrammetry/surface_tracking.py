@@ -20,7 +20,7 @@ from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.photogrammetry.intersection import intersect
 from kinefit.photogrammetry.least_squares_matching import WINDOW, match
-from kinefit.photogrammetry.matching.correlation import search_box
+from kinefit.photogrammetry.matching.multi_image import search_box
 from kinefit.photogrammetry.region_growing import MIN_CORRELATION, Grid, Seeds
 from kinefit.photogrammetry.returning import PointReturn, Vanished
 from kinefit.photogrammetry.spline_image import SplineImage

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.surfaces import Metaballs, nearest
 from kinefit.correspondences import field_rows
-from kinefit.correspondences.parameters import prior_rows
+from kinefit.correspondences.points import prior_rows
 from kinefit.errors import ObservationError
 from kinefit.losses import SQUARED, Loss
 from kinefit.rows import AnyRows

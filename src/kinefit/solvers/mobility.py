@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import closed_at, owners
-from kinefit.correspondences.parameters import prior_rows
+from kinefit.correspondences.points import prior_rows
 from kinefit.errors import BodyError
 from kinefit.rows import DofRows
 from kinefit.solvers.closed import CLOSED, null_space, onto

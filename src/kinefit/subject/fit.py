@@ -20,7 +20,7 @@ from kinefit.sensors.base import Measurement
 from kinefit.solvers.bundle.border import Bordered, Prior, solve
 from kinefit.solvers.bundle.border_frames import MAX_POSE_STEPS, POSTURE_SHARE, Weighing
 from kinefit.solvers.equations import inverse
-from kinefit.subject.excess import excess
+from kinefit.subject.gear import excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import Parameters, World, stacked
 from kinefit.subject.subject import SubjectFit

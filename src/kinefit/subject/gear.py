@@ -12,6 +12,11 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.closures import Closure, Dimension, known_gear, with_dimensions, with_places
 from kinefit.geometry import se3
+from kinefit.rows import AnyRows
+from kinefit.sensors.base import Matched
+from kinefit.sensors.channels import ChannelResiduals
+from kinefit.solvers.equations import residuals
+from kinefit.solvers.trajectory.variance_components import variance_components
 from kinefit.subject.parameters import Parameters, World
 
 _WHERE = ("x", "y", "z", "rx", "ry", "rz")
@@ -101,3 +106,60 @@ def _middle(R: NDArray) -> NDArray:
     """(3, 3) median of rotations (K, 3, 3): the one with the smallest sum of angles to all others."""
     angle = np.arccos(np.clip((np.einsum("aij,bij->ab", R, R) - 1.0) / 2.0, -1.0, 1.0))
     return np.asarray(R[int(np.argmin(angle.sum(axis=1)))])
+
+
+_MIN_RESIDUALS = 10  # of a sensor: with fewer its excess is not estimated
+_MAX_ABSORBED = 0.75  # share of all biases that parameters of the fit may absorb
+_MIN_EXCESS = 1e-3  # reported for a sensor whose residuals are almost zero
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRows:
+    """Rows of one measurement of a frame, at the fit.
+
+    Parameters
+    ----------
+    matched : the measurement's match, with sensor and channels
+    rows : its rows, of any kind
+    """
+
+    matched: Matched
+    rows: Sequence[AnyRows]
+
+
+def excess(frames: Sequence[Sequence[FrameRows]], followed: float) -> dict[str, float]:
+    """{sensor: factor} by which the variance of all frames together exceeds that of their rows.
+
+    The variance of a channel with n rows is that of its jitter plus n times that of its bias. The factor is below 1
+    where residuals are smaller than the rows' standard deviations. Channels of points are points along each axis, with
+    biases of one size. Channels of surfaces are whole segments, because surface errors are constant over a patch; each
+    has a bias of its own size, since segments differ in the number of rows and in their bias.
+
+    Parameters
+    ----------
+    frames : rows of every measurement of each frame
+    followed : number of mean residuals that a fit can make zero: degrees of freedom, and parameters that data determine
+    """
+    collected, of_points = ChannelResiduals(), dict[str, bool]()
+    for f, measured in enumerate(frames):
+        for m in measured:
+            used = [r.weight > 0.0 if r.weight.ndim == 1 else np.ones(len(r), bool) for r in m.rows]
+            collected.add(f, m.matched, m.rows, [residuals(r) for r in m.rows], [w.astype(float) for w in used])
+            of_points[m.matched.sensor] = m.matched.of_points
+    found = {s: both for s, both in collected.arrays(len(frames)).items() if both[1].sum() >= _MIN_RESIDUALS}
+    looks = {
+        s: float(count.any(axis=0).sum() if of_points[s] else count.sum() / len(frames))
+        for s, (_, count) in found.items()
+    }
+    absorbed, out = min(followed / max(sum(looks.values()), 1.0), _MAX_ABSORBED), {}
+    for s, (values, count) in found.items():
+        C = values.shape[1]
+        errors = variance_components(values, leverage=np.full(C, absorbed * of_points[s]), group=np.arange(C))
+        jitter, bias = (float(np.median(v)) ** 2 for v in (errors.jitter, errors.bias))
+        rows = count.sum(axis=0)
+        white, constant = jitter * (count**2).sum(), bias * (rows**2).sum()
+        if not of_points[s]:
+            sums = np.nansum(np.where(errors.outlier[..., None], np.nan, values * count), axis=0)
+            constant = max((sums**2).sum() - white, 0.0)
+        out[s] = max(float(white + constant) / float(rows.sum()), _MIN_EXCESS)
+    return out

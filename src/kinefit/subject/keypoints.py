@@ -20,8 +20,7 @@ from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import CameraErrors
 from kinefit.solvers.equations import inverse
 from kinefit.subject import fit as joint
-from kinefit.subject.excess import excess
-from kinefit.subject.gear import Gear
+from kinefit.subject.gear import Gear, excess
 from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import KnownLengths, Parameters, PointOffsets, SegmentScales, World, place_spread
 from kinefit.subject.sensor_parameters import CameraExtrinsics

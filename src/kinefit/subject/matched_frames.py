@@ -17,7 +17,7 @@ from kinefit.sensors.points.keypoints import packed
 from kinefit.sensors.scene import Scene
 from kinefit.solvers.bundle.border_frames import Part, apart
 from kinefit.solvers.pixels import PixelPoints
-from kinefit.subject.excess import FrameRows
+from kinefit.subject.gear import FrameRows
 from kinefit.subject.parameters import Parameters, World, stacked
 from kinefit.subject.point_moves import ClosureMoves, PointMoves, closing_rows
 from kinefit.subject.sensor_parameters import CameraExtrinsics

@@ -20,14 +20,13 @@ from kinefit.readers.take.checks import check_enough
 from kinefit.readers.take.file import Take, read_take
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.sensors.settings import TrackSettings
-from kinefit.smoothing.online.known_noise import KnownNoise
+from kinefit.smoothing.online.lag_frame import KnownNoise
 from kinefit.subject.keypoints import fit_subject
 from kinefit.subject.subject import Subject
 from kinefit.takes.in_view import InView, people_in_view
 from kinefit.takes.missing import prepared
 from kinefit.tracking.cameras import as_found
-from kinefit.tracking.checkpoints.checkpoint import Checkpoint
-from kinefit.tracking.checkpoints.interrupted import TrackingInterrupted
+from kinefit.tracking.checkpoints.checkpoint import Checkpoint, TrackingInterrupted
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.sizing import channels_of
 from kinefit.tracking.take_recording import from_afar, label_findings_of, on_floor, recording_of, rig_on_floor

@@ -19,8 +19,7 @@ from kinefit.sensors.base import Leftover, Matched, leftovers_at, pixels_of
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.online.fixed_lag import FixedLag
-from kinefit.smoothing.online.known_noise import KnownNoise
-from kinefit.smoothing.online.lag_frame import TrackerView
+from kinefit.smoothing.online.lag_frame import KnownNoise, TrackerView
 from kinefit.smoothing.sensor_noise import other_noise
 from kinefit.smoothing.shape_errors import shape_errors
 from kinefit.smoothing.smoother import as_tracked, smooth_results

@@ -22,9 +22,8 @@ from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.spool import Spool
 from kinefit.smoothing.tracked_frames import TrackedFrames
 from kinefit.subject.subject import Progress
-from kinefit.tracking.checkpoints.checkpoint import Checkpoint
+from kinefit.tracking.checkpoints.checkpoint import Checkpoint, append_rows
 from kinefit.tracking.checkpoints.frame_file import KINDS
-from kinefit.tracking.checkpoints.so_far import append_rows
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.session import KeptFrame
 from kinefit.tracking.tracker import Tracker

@@ -9,10 +9,9 @@ from kinefit.motion import Motion
 from kinefit.sensors.base import of_kind
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.online.fixed_lag import lag_frames
-from kinefit.smoothing.online.known_noise import KnownNoise
+from kinefit.smoothing.online.lag_frame import KnownNoise
 from kinefit.subject.subject import Progress, Subject
-from kinefit.tracking.checkpoints.checkpoint import Checkpoint
-from kinefit.tracking.checkpoints.interrupted import TrackingInterrupted
+from kinefit.tracking.checkpoints.checkpoint import Checkpoint, TrackingInterrupted
 from kinefit.tracking.motions import Estimation, motion_of
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.run import run

@@ -9,8 +9,8 @@ from tests.bodies.surfaces.shapes import ball, box, brute_force, points_on
 
 from kinefit.bodies.surfaces import MeshSurface
 from kinefit.bodies.surfaces.closest import _kernels_grid as kernels
-from kinefit.bodies.surfaces.closest.grid import distance_grid, features_of, pack_grids, parts
-from kinefit.bodies.surfaces.mesh import read_obj
+from kinefit.bodies.surfaces.closest.grid import distance_grid, features_of, parts
+from kinefit.bodies.surfaces.mesh import pack_grids, read_obj
 
 HERE = np.array([[1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]])
 

@@ -6,11 +6,10 @@ from benchmarks.bar_scene import bar_rig, draw_bar, see_bar, wave_bar
 
 from kinefit.calibration.bar.bundle import INTERIOR, POSE, BarProblem
 from kinefit.calibration.bar.calibrate import calibrate_bar
-from kinefit.calibration.bar.placing import place
+from kinefit.calibration.bar.placing import on_floor, place
 from kinefit.calibration.bar.start import epipolar, flat
 from kinefit.calibration.bar.table import read_centroids
 from kinefit.calibration.bar.targets import BarViews, targets_in
-from kinefit.calibration.bar.world import on_floor
 from kinefit.calibration.board.bundle import moved_camera
 from kinefit.errors import CalibrationError, FileError
 from kinefit.geometry import se3

@@ -23,7 +23,7 @@ from kinefit.findings import frame_ranges
 from kinefit.preparing import faces
 from kinefit.readers.video import Video
 from kinefit.simulation import cut, simulate_keypoints, squat_and_wave, studio_rig
-from kinefit.tracking.checkpoints.interrupted import TrackingInterrupted
+from kinefit.tracking.checkpoints.checkpoint import TrackingInterrupted
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.video import track
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from kinefit.errors import CalibrationError, ExportError, FileError, KinefitError
 from kinefit.geometry.camera import Camera, Rig
+from kinefit.geometry.lines import triangulate, triangulate_robust
 from kinefit.geometry.se3 import exp_so3, quaternion, transform
-from kinefit.geometry.triangulation import triangulate, triangulate_robust
 from kinefit.readers.calibration.read import read_calibration, read_opencv_stereo, write_calibration
 
 K = np.array([[900.0, 0, 641.5], [0, 905.0, 352.25], [0, 0, 1]])

@@ -13,7 +13,7 @@ from kinefit import BodyState, Recording, load_body, track
 from kinefit.bodies.tree import twin
 from kinefit.errors import ObservationError
 from kinefit.smoothing.online.fixed_lag import FixedLag
-from kinefit.smoothing.online.known_noise import KnownNoise
+from kinefit.smoothing.online.lag_frame import KnownNoise
 from kinefit.smoothing.process_noise import Strength
 from kinefit.smoothing.smoother import as_tracked
 from kinefit.smoothing.tracked_frames import TrackedFrames

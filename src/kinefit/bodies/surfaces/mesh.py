@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from os import PathLike
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -276,3 +276,42 @@ def surface_of_file(
             raise BodyError(f"the mesh is {length:.4g} m long", remedy=remedy)
         surface = MeshSurface(segment, vertices, faces, series=series, nodes=series and nodes)
     return surface.mirrored() if mirror else surface
+
+
+class GridTable(NamedTuple):
+    """All meshes of a body, for `nearest_on_grids`; limbs of equal shape share their nodes.
+
+    Parameters
+    ----------
+    values : (M, 4) float32, nodes of all grids.
+    layout : (G, 5) int64, of each mesh: segment, first node, nodes along x, y, z.
+    boxes : (G, 10) [m], in the root frame at rest
+        First node (3), cell, centre of the surface's box (3), half its size (3).
+    """
+
+    values: NDArray
+    layout: NDArray
+    boxes: NDArray
+
+
+def pack_grids(surfaces: Sequence[MeshSurface], rest: NDArray) -> GridTable:
+    """Pack a body's meshes into a table; rest (S, 3) [m]: joint centres in the root frame at rest."""
+    starts: dict[tuple[bytes, bytes], int] = {}
+    grids: dict[tuple[bytes, bytes], DistanceGrid] = {}
+    values, layout, boxes, total = [], [], [], 0
+    for surface in surfaces:
+        shape = surface.vertices.tobytes(), surface.faces.tobytes()
+        if shape not in grids:
+            grids[shape], starts[shape] = surface.grid, total
+            values.append(surface.grid.values.reshape(-1, 4))
+            total += len(values[-1])
+        grid = grids[shape]
+        layout.append([surface.segment, starts[shape], *grid.values.shape[:3]])
+        at = rest[surface.segment]
+        centre = 0.5 * (grid.lower + grid.upper) + at
+        boxes.append([*(grid.origin + at), grid.cell, *centre, *(0.5 * (grid.upper - grid.lower))])
+    return GridTable(
+        np.concatenate(values) if values else np.zeros((0, 4), np.float32),
+        np.array(layout, np.int64).reshape(-1, 5),
+        np.array(boxes, float).reshape(-1, 10),
+    )

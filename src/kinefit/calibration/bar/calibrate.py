@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from kinefit._arguments import checked
 from kinefit.calibration.bar.bundle import INTERIOR, POSE, BarBundle, BarProblem
-from kinefit.calibration.bar.placing import place
+from kinefit.calibration.bar.placing import on_floor, place
 from kinefit.calibration.bar.report import BarCameraReport, advice_of, reports_of
 from kinefit.calibration.bar.start import MIN_PLACES, first_pairs, inlier_distance, resect
 from kinefit.calibration.bar.targets import BarViews
-from kinefit.calibration.bar.world import on_floor
 from kinefit.calibration.board.intrinsics import known_camera
 from kinefit.errors import CalibrationError
 from kinefit.geometry.camera import Camera, Rig

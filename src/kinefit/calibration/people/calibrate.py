@@ -21,7 +21,7 @@ from kinefit.calibration.refine.sightings import PersonSighting, PersonTrial, Pr
 from kinefit.errors import CalibrationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.geometry.triangulation import triangulate, triangulate_robust
+from kinefit.geometry.lines import triangulate, triangulate_robust
 from kinefit.multiview.association import person_records
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.sensors.channels import Channels, make_channels

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from kinefit.errors import CalibrationError
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.geometry.lines import triangulate_robust
 
 _MIN_COMMON_KEYPOINTS = 50  # keypoints that two cameras must have in common
 _MAX_KEYPOINTS = 4000  # of them that take part

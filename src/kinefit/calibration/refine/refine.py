@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked, renamed
 from kinefit.bodies import Body
 from kinefit.calibration.refine.gauge import aligned, resized
-from kinefit.calibration.refine.result import MAX_STATIC_SIGMA_PX, CameraChange, Refinement, changes_of
+from kinefit.calibration.refine.result import MAX_STATIC_SIGMA_PX, CameraChange, Refinement, bias, chance, changes_of
 from kinefit.calibration.refine.sightings import (
     PersonSighting,
     PersonTrial,
@@ -22,10 +22,9 @@ from kinefit.calibration.refine.sightings import (
     spread_frames,
     static_pixels,
 )
-from kinefit.calibration.refine.uncertainty import bias, chance
 from kinefit.errors import CalibrationError, ObservationError, TrackingError
 from kinefit.geometry.camera import Rig
-from kinefit.geometry.triangulation import triangulate
+from kinefit.geometry.lines import triangulate
 from kinefit.observations import KEYPOINT_SIGMA, Keypoints
 from kinefit.solvers.bundle.body_bundle import BundleState, adjust
 from kinefit.solvers.bundle.cameras import COLUMNS, FOCAL, POSE, RADIAL, TIME, CameraPrior, PointPixels, departure

@@ -190,7 +190,7 @@ def _doubts(found: dict[str, TakeIdentification], markers: Markers, many: bool) 
 
 def check_labels(markers: Markers, marker_set: str | None) -> list[Finding]:
     """Check sides and labels of every person of a take on the humanoid, where it has the labels (`label_findings`)."""
-    from kinefit.markers.people import split_people
+    from kinefit.markers.poses import split_people
     from kinefit.markers.sides import label_findings
 
     found: list[Finding] = []
@@ -335,7 +335,7 @@ def worn_body(subject: MarkerSubject, labels: Iterable[str]) -> Body:
 
 def read_people(file: Path, unit: str | None, sides: str | None = None) -> dict[str, Markers]:
     """The people of a file, by the prefix of their labels, with left and right as `sides` states (see `read_sides`)."""
-    from kinefit.markers.people import split_people
+    from kinefit.markers.poses import split_people
 
     markers = read_file(file, unit)
     if sides:

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit.bodies import Body
 from kinefit.errors import ExportError, check_choice, spelled
 from kinefit.geometry import se3
-from kinefit.motion import UP_AXES, Motion
-from kinefit.motion_columns import continuous_quaternions
+from kinefit.motion import UP_AXES, Motion, continuous_quaternions
 from kinefit.rendering.looks import TubeMesh
 
 NAMES = ("kinefit", "bvh", "mixamo", "cmu", "opensim", "hanim")

@@ -28,8 +28,7 @@ from kinefit.exporters.skeletons.bvh import bvh_motion
 from kinefit.exporters.skeletons.common import euler
 from kinefit.exporters.skeletons.glb import GltfFile
 from kinefit.geometry import se3
-from kinefit.motion import Motion
-from kinefit.motion_columns import continuous_quaternions
+from kinefit.motion import Motion, continuous_quaternions
 from kinefit.readers.skeletons.characters import KINDS, Character, read_character
 
 # Bones whose direction is kept, with the segment that each leads to.

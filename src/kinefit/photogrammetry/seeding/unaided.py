@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera, Rig
-from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.geometry.lines import triangulate_robust
 from kinefit.photogrammetry.least_squares_matching import Matches, as_points
-from kinefit.photogrammetry.matching.correlation import search_box
+from kinefit.photogrammetry.matching.multi_image import search_box
 from kinefit.photogrammetry.region_growing import Grid, Seeds, grow
 from kinefit.photogrammetry.seeding import _kernels_rays as kernels
 from kinefit.photogrammetry.spline_image import SplineImage

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kinefit._files import LENGTHS
 from kinefit.errors import KinefitError, ObservationError
 from kinefit.geometry.camera import ImageFrame, Rig
-from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.geometry.lines import triangulate_robust
 from kinefit.motion import UP_AXES
 from kinefit.observations import Keypoints
 from kinefit.readers.guess.draft import Draft, Value

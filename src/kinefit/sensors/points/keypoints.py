@@ -14,7 +14,7 @@ from kinefit.bodies import Body, PointSet
 from kinefit.correspondences import _kernels
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
-from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.geometry.lines import triangulate_robust
 from kinefit.losses import Loss
 from kinefit.observations import KEYPOINTS, KeypointFrame, Keypoints
 from kinefit.rows import AnyRows

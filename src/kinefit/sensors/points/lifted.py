@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
 from kinefit.bodies.limbs import rigid_pairs
-from kinefit.geometry.triangulation import placed
+from kinefit.geometry.lines import placed
 from kinefit.observations import Keypoints, LiftedFrame
 from kinefit.rows import AnyRows, PairRows
 from kinefit.sensors.base import Hints, Matched, Measurement, Sensor

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, KinematicTree, PointSet
 from kinefit.bodies.limbs import finger_groups
 from kinefit.geometry.camera import Rig
-from kinefit.geometry.triangulation import triangulate_robust
+from kinefit.geometry.lines import triangulate_robust
 from kinefit.sensors.channels import Channels, exchange
 from kinefit.sensors.points import _kernels_view_bias as _kernels
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.bodies.surfaces import segment_middles
 from kinefit.correspondences import point_rows
-from kinefit.correspondences.parameters import prediction_rows
+from kinefit.correspondences.points import prediction_rows
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera
 from kinefit.images import _kernels_regions as kernels

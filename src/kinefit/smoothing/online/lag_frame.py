@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,16 +11,17 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure, looped
+from kinefit.errors import ObservationError
 from kinefit.frame.fit import rows_of, rows_of_points
 from kinefit.frame.results import UNOBSERVED_STD_RATIO, FrameResult
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched, Measurement, matched_by, pixels_of
+from kinefit.sensors.channels import Channels
 from kinefit.sensors.evidence import moves_points
 from kinefit.sensors.points.keypoints import KeypointMatched
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.linearised import ApartRows, SceneOf
-from kinefit.smoothing.online.known_noise import KnownNoise, known_sigma
 from kinefit.smoothing.process_noise import MIN_INLIER_FACTOR
 from kinefit.solvers.equations import inverse, normal_equations
 
@@ -191,3 +192,67 @@ def _with_time(old: Matched, new: KeypointMatched) -> KeypointMatched:
     """The new match, with the time of the old one."""
     object.__setattr__(new, "time", old.time)
     return new
+
+
+_DEFAULT_ACCELERATIONS = 5.0, 30.0  # [m/s²], [rad/s²] of root and angles: quick; everyday takes have 1 to 4, 4 to 20
+
+
+@dataclass(frozen=True, eq=False)
+class KnownNoise:
+    """Process noise of a person and noise of sensors, known before a take.
+
+    Parameters
+    ----------
+    acceleration : (n,) [m/s², rad/s²] random acceleration of every degree of freedom, one standard deviation
+    pixel_sigma : {source of keypoints: {point: standard deviation [px] at full confidence}}; others keep theirs
+    scale : {sensor: factor on its standard deviation}
+    """
+
+    acceleration: NDArray
+    pixel_sigma: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    scale: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def usual(cls, body: Body) -> KnownNoise:
+        """Accelerations of a person who moves quickly, 5 m/s² and 30 rad/s², and the sensors' own noise.
+
+        Calm movements have half of that. They are smoothed a little less than they could be.
+        """
+        return cls(np.where(np.arange(body.tree.n_dofs) < 3, *_DEFAULT_ACCELERATIONS))
+
+    @classmethod
+    def of_take(cls, body: Body, provenance: Mapping[str, Any]) -> KnownNoise:
+        """Noise estimated from another take: the `Motion.provenance` of its smoothed motion.
+
+        Raises
+        ------
+        ObservationError
+            The motion was not smoothed as a whole, or has another body.
+        """
+        smoothing = provenance.get("smoothing", {})
+        found = smoothing.get("acceleration", {})
+        names = ("root_shift",) * 3 + ("root_turn",) * 3 + body.tree.coordinates
+        missing = [name for name in names if name not in found]
+        if missing:
+            problem = f"the motion has no process noise of {missing[0]}"
+            raise ObservationError(problem, remedy="Give a motion of this body, smoothed over the whole take.")
+        acceleration = np.maximum(np.array([found[name] for name in names]), 1e-3)
+        return cls(acceleration, smoothing.get("pixel_sigma", {}), smoothing.get("sigma_factor", {}))
+
+    def as_record(self, body: Body) -> dict[str, Any]:
+        """The noise as a provenance record by name, readable by `of_take`."""
+        names = ("root_shift", "root_turn", *body.tree.coordinates)
+        values = [self.acceleration[0], *self.acceleration[5:]]
+        return {
+            "acceleration": {name: float(f"{v:.4g}") for name, v in zip(names, values)},
+            "pixel_sigma": {source: dict(of) for source, of in self.pixel_sigma.items()},
+            "sigma_factor": dict(self.scale),
+        }  # fmt: skip
+
+
+def known_sigma(channels: Channels, noise: KnownNoise) -> NDArray:
+    """(N,) [px] standard deviations of keypoints: known ones, else the channels' own."""
+    out = np.array(channels.sigma)
+    for k, (q, c) in enumerate(zip(channels.source, channels.column)):
+        out[k] = noise.pixel_sigma.get(channels.sources[q], {}).get(channels.points.names[c], out[k])
+    return out

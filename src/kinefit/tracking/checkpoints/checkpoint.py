@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -18,10 +18,12 @@ from typing import IO, Any
 
 import numpy as np
 
+from kinefit.bodies import Body
 from kinefit.errors import ExportError, KinefitError
+from kinefit.frame.results import FrameResult
+from kinefit.motion import Motion
 from kinefit.readers.take.file import Take, read_take
 from kinefit.tracking.checkpoints.frame_file import FrameFile
-from kinefit.tracking.checkpoints.so_far import BEGIN
 
 try:
     import fcntl
@@ -200,3 +202,50 @@ def _paths(thing: Any) -> set[Path]:
         names = [*getattr(thing, "__struct_fields__", ()), *getattr(thing, "__dataclass_fields__", ())]
         thing = tuple(getattr(thing, name) for name in names)
     return set().union(*(_paths(one) for one in thing))
+
+
+class TrackingInterrupted(KeyboardInterrupt):
+    """Ctrl-C while frames were being tracked; what is done is kept.
+
+    Parameters
+    ----------
+    motion : Motion of the frames done, from the first one on.
+    total : int, how many frames there are.
+    """
+
+    def __init__(self, motion: Motion, total: int) -> None:
+        super().__init__(f"{len(motion)} of {total} frames are tracked")
+        self.motion, self.total = motion, total
+
+
+BEGIN = b"frame,time [s],quality,"
+"""What such a file begins with."""
+
+
+def append_rows(file: Path, body: Body, results: Iterable[tuple[int, FrameResult]]) -> None:
+    """Add frames as the tracker left them, not smoothed: time, quality, the root's place, every coordinate.
+
+    Parameters
+    ----------
+    file : begins with a header where it is not there yet
+    results : step and result of each frame
+
+    Raises
+    ------
+    ExportError
+        It cannot be written.
+    """
+    units = ["m" if slides else "deg" for slides in body.tree.prismatic]
+    factors = np.where(body.tree.prismatic, 1.0, np.degrees(1.0))
+    names = [f"{name} [{unit}]" for name, unit in zip(body.tree.coordinates, units)]
+    header = ["frame", "time [s]", "quality", *(f"root_t{axis} [m]" for axis in "xyz"), *names]
+    try:
+        with open(file, "a", encoding="utf-8") as out:
+            if not out.tell():
+                out.write(",".join(header) + "\n")
+            for step, r in results:
+                values = [r.time, r.quality, *r.state.T_world_root[:3, 3], *(factors * r.state.angles)]
+                out.write(",".join([str(step), *(f"{value:.5f}" for value in values)]) + "\n")
+    except OSError as error:
+        remedy = "Free some space, or give another folder with --out."
+        raise ExportError(f"cannot be written ({error.strerror})", file=file, remedy=remedy) from error

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies.surfaces.closest import _kernels_grid as kernels
-
-if TYPE_CHECKING:
-    from kinefit.bodies.surfaces.mesh import MeshSurface
 
 GRID_CELLS = 64  # along the longest side: 1 cm for a limb. Finer ones gain less than a sensor's noise
 MARGIN = 0.15  # [m] around the surface; farther points are extrapolated
@@ -123,42 +118,3 @@ def features_of(vertices: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
     across[half[pairs]], across[half[pairs + 1]] = half[pairs + 1] // 3, half[pairs] // 3
     out = np.concatenate([normal[:, None], at_vertex[faces], at_edge[edge.reshape(-1, 3)]], axis=1)
     return out / np.maximum(np.linalg.norm(out, axis=2, keepdims=True), 1e-30), across.reshape(-1, 3)
-
-
-class GridTable(NamedTuple):
-    """All meshes of a body, for `nearest_on_grids`; limbs of equal shape share their nodes.
-
-    Parameters
-    ----------
-    values : (M, 4) float32, nodes of all grids.
-    layout : (G, 5) int64, of each mesh: segment, first node, nodes along x, y, z.
-    boxes : (G, 10) [m], in the root frame at rest
-        First node (3), cell, centre of the surface's box (3), half its size (3).
-    """
-
-    values: NDArray
-    layout: NDArray
-    boxes: NDArray
-
-
-def pack_grids(surfaces: Sequence[MeshSurface], rest: NDArray) -> GridTable:
-    """Pack a body's meshes into a table; rest (S, 3) [m]: joint centres in the root frame at rest."""
-    starts: dict[tuple[bytes, bytes], int] = {}
-    grids: dict[tuple[bytes, bytes], DistanceGrid] = {}
-    values, layout, boxes, total = [], [], [], 0
-    for surface in surfaces:
-        shape = surface.vertices.tobytes(), surface.faces.tobytes()
-        if shape not in grids:
-            grids[shape], starts[shape] = surface.grid, total
-            values.append(surface.grid.values.reshape(-1, 4))
-            total += len(values[-1])
-        grid = grids[shape]
-        layout.append([surface.segment, starts[shape], *grid.values.shape[:3]])
-        at = rest[surface.segment]
-        centre = 0.5 * (grid.lower + grid.upper) + at
-        boxes.append([*(grid.origin + at), grid.cell, *centre, *(0.5 * (grid.upper - grid.lower))])
-    return GridTable(
-        np.concatenate(values) if values else np.zeros((0, 4), np.float32),
-        np.array(layout, np.int64).reshape(-1, 5),
-        np.array(boxes, float).reshape(-1, 10),
-    )

@@ -12,9 +12,8 @@ from kinefit._arguments import shaped
 from kinefit.bodies.surfaces.closest._kernels_cylinder import nearest_on_cylinders, nearest_on_cylinders_exact
 from kinefit.bodies.surfaces.closest._kernels_grid import nearest_on_grids
 from kinefit.bodies.surfaces.closest._kernels_metaballs import nearest_on_metaballs
-from kinefit.bodies.surfaces.closest.grid import GridTable, pack_grids
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
-from kinefit.bodies.surfaces.mesh import MeshSurface
+from kinefit.bodies.surfaces.mesh import GridTable, MeshSurface, pack_grids
 from kinefit.bodies.surfaces.metaballs import BallTable, Metaballs, pack_balls
 from kinefit.errors import ObservationError
 
