@@ -294,7 +294,7 @@ def test_options_of_clicks_that_do_not_fit(folder, tmp_path):
         answer = run("init", folder, *words)
         assert answer.exit_code == 2 and problem in answer.stderr
     answer = run("init", folder, "--points", tmp_path / "x.json")
-    assert answer.exit_code == 2 and "cannot be read" in answer.stderr
+    assert answer.exit_code == 2 and "no such file" in answer.stderr
 
 
 def test_a_surface_that_was_followed_is_entered(folder):

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kinefit._files import regular
 from kinefit.cli import _screen
 from kinefit.errors import TakeError, TrackingError, choices
 
@@ -204,7 +203,7 @@ def _started(out: Path, take: Take, seen: Observations, body: Body, steps: Seque
     """Write body and start of the first step, and the clicks of all, to which the take file refers; what to tell."""
     import numpy as np
 
-    from kinefit._files import write_text
+    from kinefit._files import regular, write_text
     from kinefit.bodies.serial import save_body
     from kinefit.initialization.from_clicks import clickable, clicked_points, clicked_start
     from kinefit.readers.annotations import clicks_text

@@ -40,7 +40,7 @@ class _SensorFrame:
         names = getattr(self, "names", ())
         check_seen(self.sensor, self.time, names)
         for name, (what, row) in self._rows.items():
-            if (values := getattr(self, name)) is not None:
+            if (values := getattr(self, name)) is not None or not hasattr(type(self), name):  # None may be a default
                 freeze(self, **{name: frozen(values, float, f"{what} of {self.sensor}", (len(names), *row))})
 
 

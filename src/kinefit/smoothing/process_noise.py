@@ -28,6 +28,7 @@ _MEDIAN_SQUARE_2D = 2.0 * np.log(2.0)  # median |r|² of a normal error in the p
 _MEDIAN_SQUARE_1D = 0.4549  # median of a squared normal variable
 _MIN_ROWS = 30  # of a sensor: with fewer its standard deviation is not estimated
 _DETECTOR_CORRELATION_TIME = 0.25  # [s] whose frames count as one independent measurement of a point
+_MIN_SIGMA_RATIO = 0.01  # estimated to stated sigma of a point: of exact ones, weights would leave nothing but rounding
 _PRIOR_MEASUREMENTS = 30.0  # independent measurements of a point that the estimate of its source counts as
 _PRIOR_CHANGES = 10.0  # changes of a degree of freedom that its prior acceleration counts as
 _MAX_RELATIVE_CHANGE = 0.05  # of all estimates between rounds, below which they have converged
@@ -208,6 +209,7 @@ def estimate(
         looks = min(takes[0].dt / _DETECTOR_CORRELATION_TIME, 1.0)
         residuals, r2, variance = (np.concatenate(p) for p in zip(*errors, strict=True))
         sigma, shared = _noise(channels, r2, variance, looks), shared_by(channels, residuals, variance, looks)
+        sigma = np.maximum(sigma, _MIN_SIGMA_RATIO * channels.sigma)
         if takes[0].one_view:  # the pose absorbs systematic errors of the only view: residuals show jitter alone
             sigma, shared = np.maximum(sigma, channels.sigma), np.zeros(len(sigma))
         found = Strength(acceleration, sigma, shared)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kinefit._files import LENGTHS, worth
 from kinefit.batch import results
 from kinefit.cli import _screen
 from kinefit.errors import spelled
@@ -113,6 +112,8 @@ def _meant(key: str, value: str, valid: Sequence[str]) -> str:
     """A value as it is called here: "MM" and "millimetres" are mm, "OpenSim" is opensim, "Z" is z."""
     if key == "up":
         return value.strip().lower()
+    from kinefit._files import LENGTHS, worth
+
     metres = worth(value, LENGTHS) if key == "unit" else None
     return next((unit for unit in valid if metres == LENGTHS.get(unit)), value) if metres else spelled(value, valid)
 
