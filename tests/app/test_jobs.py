@@ -15,7 +15,7 @@ def ended(queue):
         while any(job.is_open for job in queue.jobs):
             await asyncio.sleep(0.02)
 
-    return asyncio.wait_for(wait(), 60.0)
+    return asyncio.wait_for(wait(), 180.0)
 
 
 def test_events_are_taken_in(tmp_path):
