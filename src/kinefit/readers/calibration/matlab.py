@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.io import loadmat
 
 from kinefit._files import LENGTHS, regular, worth
 from kinefit._processes import environment, python
@@ -107,30 +105,3 @@ def _stereo(tree: Table) -> list[Table]:
         second = second | {"matrix": np.transpose(find(second, "matrix")).tolist()}
     zero = {"rotation": [0, 0, 0], "translation": [0, 0, 0]}
     return [{"name": "left"} | first | zero, {"name": "right"} | second | {"rotation": R, "translation": t}]
-
-
-def _plain(value: object) -> object:
-    """Convert a value of scipy's reader to dicts, lists, texts and numbers; TypeError for an object of MATLAB."""
-    if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, np.ndarray) and value.dtype.names is None and value.dtype != object:
-        return value.tolist()
-    if isinstance(value, list | np.ndarray) and type(value).__name__ != "MatlabOpaque":
-        return [_plain(inner) for inner in value]
-    if not isinstance(value, str | int | float | np.generic):
-        raise TypeError(type(value).__name__)
-    return value.item() if isinstance(value, np.generic) else value
-
-
-if __name__ == "__main__":
-    answer: dict[str, object]
-    try:
-        found = loadmat(sys.argv[1], simplify_cells=True)
-        answer = {"variables": {key: _plain(value) for key, value in found.items() if not key.startswith("__")}}
-    except NotImplementedError:
-        answer = {"version": "7.3"}
-    except TypeError as error:
-        answer = {"object": str(error)}
-    except Exception as error:  # a damaged file can raise anything
-        answer = {"damage": f"{type(error).__name__}: {error}"}
-    print(json.dumps(answer, default=str))
