@@ -12,6 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 
+def between(keys: NDArray, frames: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Indices of the key frames (K,) before and after frames (...,) int, and the share 0..1 of the way between them."""
+    after = np.minimum(np.maximum(np.searchsorted(keys, frames), 1), len(keys) - 1)
+    before = np.maximum(after - 1, 0)
+    share = (frames - keys[before]) / np.maximum(keys[after] - keys[before], 1)
+    return before, after, np.clip(share, 0.0, 1.0)
+
+
 @dataclass(frozen=True, eq=False)
 class LastingErrors:
     """Factors of the covariance between frames of a motion.
@@ -37,13 +45,8 @@ class LastingErrors:
 
     def at(self, frames: ArrayLike, coordinates: ArrayLike) -> tuple[NDArray, NDArray]:
         """Factors (R, k) of R coordinates (int, 6 + D of them) in R frames (int): s and d."""
-        frames, rows = np.asarray(frames), np.asarray(coordinates)
-        after = np.clip(np.searchsorted(self.frames, frames), 1, max(len(self.frames) - 1, 1))
-        if len(self.frames) == 1:
-            after = np.zeros(len(frames), int)
-        before = np.maximum(after - 1, 0)
-        steps = np.maximum(self.frames[after] - self.frames[before], 1)
-        share = np.clip((frames - self.frames[before]) / steps, 0.0, 1.0)[:, None]
+        (before, after, share), rows = between(self.frames, np.asarray(frames)), np.asarray(coordinates)
+        share = share[:, None]
         s, d = (v[before, rows] * (1.0 - share) + v[after, rows] * share for v in (self.constant, self.drift))
         return s, d
 

@@ -100,8 +100,8 @@ def test_a_shape_found_without_cameras_answers_to_pixels_too(found):
 
 
 def test_between_frames_variances_are_interpolated():
-    factors = np.array([[[0.0, 2.0]], [[1.0, 0.0]]])
-    errors = ShapeErrors(np.array([0, 10]), np.array([[0.0], [1.0]]), np.zeros((2, 1, 3)), factors)
-    np.testing.assert_allclose(errors.factor_at(5), [[0.5, 1.0]])
+    factors = np.array([[[0.0, 0.0]], [[1.0, 0.0]]])
+    errors = ShapeErrors(np.array([0, 10]), np.zeros((2, 1, 3)), factors)
+    np.testing.assert_allclose(errors.factor_at(5), [[0.5, 0.0]])
     assert errors.at(0)[0] == 0.0 and errors.at(10)[0] == 1.0 and errors.at(4)[0] == pytest.approx(0.4)
-    assert ShapeErrors(np.array([3]), np.array([[2.0]]), np.zeros((1, 1, 3)), factors[:1]).at(9)[0] == 2.0
+    assert ShapeErrors(np.array([3]), np.zeros((1, 1, 3)), factors[1:]).at(9)[0] == 1.0

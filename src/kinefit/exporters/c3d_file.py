@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit._arguments import checked
-from kinefit._files import write_bytes, write_text
+from kinefit._files import LENGTHS, write_bytes, write_text
 from kinefit.errors import ExportError
 from kinefit.exporters.opensim import trc_head
 from kinefit.exporters.skeletons.common import UNITS, bone_names, convention, length_factor, plain_names, turned
@@ -198,7 +198,7 @@ def _angles(motion: Motion) -> dict[str, list[Curve]]:
     return out
 
 
-MARKER_UNITS = {"m": 1.0, "dm": 10.0, "cm": 100.0, "mm": 1000.0, "in": 1.0 / 0.0254, "ft": 1.0 / 0.3048}
+MARKER_UNITS = {unit: 1.0 / LENGTHS[unit] for unit in ("m", "dm", "cm", "mm", "in", "ft")}
 """Units of length in a metre."""
 
 _MOST_RESIDUAL = 255  # what a byte counts to

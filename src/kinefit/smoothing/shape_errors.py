@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,12 @@ from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure
 from kinefit.frame.fit import rows_of, rows_of_points, weaker
 from kinefit.geometry.camera import Rig
+from kinefit.lasting_errors import between
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.bundle.border_frames import Part, Weighing, differences, frame_at, gram
-from kinefit.solvers.equations import joint_moves, normal_equations
+from kinefit.solvers.equations import joint_moves, normal_equations, square_root
 from kinefit.subject.matched_frames import CLOSURES, Worlds
 from kinefit.subject.parameters import PointOffsets, stacked
 from kinefit.subject.subject import SubjectFit
@@ -41,15 +43,18 @@ class ShapeErrors:
     Parameters
     ----------
     frames : (K,) int
-    dofs : (K, n) [m², rad²] of the degrees of freedom
     joints : (K, S, 3) [m²] of the joint centres along the world's axes
     factors : (K, n, q) [m, rad] of the degrees of freedom's covariance
     """
 
     frames: NDArray
-    dofs: NDArray
     joints: NDArray
     factors: NDArray
+
+    @cached_property
+    def dofs(self) -> NDArray:
+        """(K, n) [m², rad²] of the degrees of freedom."""
+        return np.asarray(np.square(self.factors).sum(axis=2))
 
     def at(self, frame: int) -> tuple[NDArray, NDArray]:
         """(n,) [m², rad²] and (S, 3) [m²] variances of any frame, interpolated."""
@@ -60,12 +65,8 @@ class ShapeErrors:
         return self._between(self.factors, frame)
 
     def _between(self, values: NDArray, frame: int) -> NDArray:
-        if len(self.frames) == 1:
-            return np.asarray(values[0])
-        after = int(np.clip(np.searchsorted(self.frames, frame), 1, len(self.frames) - 1))
-        a, b = self.frames[after - 1], self.frames[after]
-        t = float(np.clip((frame - a) / (b - a), 0.0, 1.0))
-        return np.asarray(values[after - 1] * (1.0 - t) + values[after] * t)
+        before, after, share = between(self.frames, np.asarray(frame))
+        return np.asarray(values[before] * (1.0 - share) + values[after] * share)
 
 
 def shape_errors(
@@ -89,9 +90,7 @@ def shape_errors(
     wide = np.concatenate([np.full(len(p.names), not isinstance(p, PointOffsets)) for p in found.parameters])
     step, worlds = stacked(found.parameters)[3], Worlds(found.prior_world, found.parameters)
     Sigma = found.covariance[np.ix_(used, used)]
-    sizes, directions = np.linalg.eigh(Sigma)
-    root = directions * np.sqrt(np.maximum(sizes, 0.0))
-    dofs, joints, factors = [], [], []
+    root, joints, factors = square_root(Sigma), [], []
     for frame, P in zip(frames, alone):
         scene, matched = frame_data(frame)
         matches = _FrameMatches(worlds, scene, matched, found.mean, used, np.flatnonzero(wide[used]), scale or {})
@@ -100,9 +99,8 @@ def shape_errors(
         moves = joint_moves(scene.body, scene.state)
         whole = moves @ response + matches.stretch(step)
         factors.append(response @ root)
-        dofs.append(np.square(factors[-1]).sum(axis=1))
         joints.append(np.einsum("sap,pq,saq->sa", whole, Sigma, whole, optimize=True))
-    return ShapeErrors(np.asarray(frames), np.array(dofs), np.maximum(joints, 0.0), np.array(factors))
+    return ShapeErrors(np.asarray(frames), np.maximum(joints, 0.0), np.array(factors))
 
 
 @dataclass(frozen=True, eq=False)

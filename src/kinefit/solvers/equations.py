@@ -354,6 +354,12 @@ def joint_std(body: Body, state: BodyState, cov: Covariance) -> NDArray:
     return cov.of(joint_moves(body, state))
 
 
+def square_root(covariance: NDArray) -> NDArray:
+    """(p, p) of which the product with its own transpose is a covariance (p, p)."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
 def joint_moves(body: Body, state: BodyState) -> NDArray:
     """(S, 3, n) derivatives of every joint centre, along the world's axes, by every degree of freedom."""
     tree = body.tree

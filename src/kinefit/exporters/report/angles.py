@@ -197,10 +197,12 @@ def extremes(curve: Curve, motion: Motion, tracked: NDArray) -> Extremes | None:
     fastest = float(speed[inside].max()) if inside.any() else np.nan
     ends = [(float(curve.values[f]), float(2 * curve.std[f])) for f in (low, high)]
     share = float(known.mean())
-    of_span = span, float(np.hypot(ends[0][1], ends[1][1]))
-    if curve.coordinate is not None:
-        of_span = span, 2.0 * float(np.degrees(motion.std_of((high, low), (curve.coordinate,) * 2, (1, -1))))
-    return Extremes(ends[0], ends[1], of_span, (fastest, 2.0 * curve.speed_std), share, (low, high), curve.coordinate)
+    if curve.coordinate is None:
+        twice = float(np.hypot(ends[0][1], ends[1][1]))
+    else:
+        twice = 2.0 * float(np.degrees(motion.std_of((high, low), (curve.coordinate,) * 2, (1, -1))))
+    fast = fastest, 2.0 * curve.speed_std
+    return Extremes(ends[0], ends[1], (span, twice), fast, share, (low, high), curve.coordinate)
 
 
 def ranges_of(motion: Motion) -> dict[str, dict[str, Extremes | None]]:
