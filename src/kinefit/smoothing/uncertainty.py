@@ -50,7 +50,7 @@ MOTION_CORRELATION_TIME = 0.1
 
 _KEY_FRAMES_PER_S = 20.0  # of lasting errors. The sigma of differences on the balancing trial is within 2.6 % of that
 # with every frame, 0.5 % for nine tenths; with 10 a second within 8 %.
-_DIRECTIONS = 120  # of lasting errors that are kept: sigma of differences within 0.3 %; with 60 within 5.8, with 20 43 %
+_DIRECTIONS = 120  # of lasting errors that are kept. Likewise: 120 within 0.3 %, 60 within 6 %, 20 within 43 %
 _NOISE_STRETCHES = 6  # of a long take, from which the detectors' noise is estimated: 12,000 frames are enough
 _SEPARATING_FRAMES = 800  # without detections between two stretches: more than the longest lag, at up to 400 Hz
 
