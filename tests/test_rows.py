@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kinefit.errors import ObservationError
-from kinefit.rows import DofRows, PairRows, ParameterRows, Rows, sort_out
+from kinefit.rows import DofRows, PairRows, ParameterRows, Rows, less_sure, sort_out, weaker
 
 
 def some_rows(count, seed=0, group=None):
@@ -107,3 +107,26 @@ def test_rows_of_unequal_length_are_refused():
         ParameterRows([6, 7], [1.0, 2.0], [1.0])
     with pytest.raises(ObservationError, match=r"point_b of PairRows has shape \(2, 3\).*Give \(1, 3\)"):
         some_pairs(point_b=np.ones((2, 3)))
+
+
+def kinds_of_rows():
+    one = np.ones(3)
+    full = np.array([[4.0, 1.0, 0.0], [1.0, 3.0, 0.5], [0.0, 0.5, 2.0]])
+    index = np.arange(3)
+    return [
+        some_rows(3), ParameterRows(index, one, 2.0 * one), ParameterRows(index, one, full),
+        DofRows(np.ones((3, 9)), one, 5.0 * one, index),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("rows", kinds_of_rows())
+def test_variances_are_added_to_rows_of_every_kind(rows):
+    more = np.array([0.0, 0.25, 3.0])
+    weight, wider = (w if w.ndim == 2 else np.diag(w) for w in (rows.weight, less_sure(rows, more).weight))
+    np.testing.assert_allclose(np.linalg.inv(wider), np.linalg.inv(weight) + np.diag(more), rtol=1e-12)
+    np.testing.assert_allclose(weaker(rows, 3.0).weight, rows.weight / 9.0)
+    np.testing.assert_array_equal(weaker(rows, 3.0).residual, rows.residual)
+
+
+def test_a_row_that_is_not_felt_stays_so():
+    assert less_sure(some_rows(1).__class__.of([0], [[0, 0, 0]], [[1, 0, 0]], [1], 0.0), np.ones(1)).weight == 0.0

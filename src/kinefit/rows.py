@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,14 +102,6 @@ class Rows:
 
     def __len__(self) -> int:
         return self.data.shape[1]
-
-    def weaker(self, factor: float) -> Rows:
-        """The same with standard deviations that are so many times larger."""
-        if factor == 1.0:
-            return self
-        data = np.array(self.data)
-        data[7] /= factor**2
-        return Rows(data, self.segment, self.group, self.loss)
 
     @property
     def point(self) -> NDArray:
@@ -231,6 +224,28 @@ class DofRows:
 
 
 AnyRows = Rows | PairRows | ParameterRows | DofRows
+_Same = TypeVar("_Same", Rows, PairRows, ParameterRows, DofRows, AnyRows)
+
+
+def weaker(rows: _Same, factor: float) -> _Same:
+    """Rows with standard deviations multiplied by a factor (a number above 0)."""
+    return rows if factor == 1.0 else _weighted(rows, rows.weight / factor**2)
+
+
+def less_sure(rows: AnyRows, variance: NDArray) -> AnyRows:
+    """Rows with (N,) [m²] added to the variance of each."""
+    W = rows.weight
+    if W.ndim == 1:
+        return _weighted(rows, W / (1.0 + W * variance))
+    return _weighted(rows, np.linalg.solve(np.eye(len(W)) + W * variance, W))
+
+
+def _weighted(rows: _Same, weight: NDArray) -> _Same:
+    if not isinstance(rows, Rows):
+        return replace(rows, weight=weight)
+    data = np.array(rows.data)
+    data[7] = weight
+    return replace(rows, data=data)
 
 
 def sort_out(

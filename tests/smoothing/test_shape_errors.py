@@ -7,9 +7,8 @@ import pytest
 from tests.subject import measured
 from tests.subject.measured import ARM, RIG
 
-from kinefit.frame.fit import weaker
 from kinefit.geometry.camera import Rig
-from kinefit.rows import ParameterRows
+from kinefit.rows import ParameterRows, weaker
 from kinefit.sensors.base import matched_by, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.oracle import rig_around
+from tests.subject import measured
+from tests.subject.measured import ARM, Pulling, Rope
 
 from kinefit import Keypoints, MarkerFrame, Markers, load_body, track
 from kinefit.geometry.camera import Rig
@@ -101,6 +103,19 @@ def test_landmarks_as_markers_have_no_places_to_find():
 @pytest.mark.parametrize(("lengths", "expected"), [(True, [SegmentScales, CylinderShape]), (False, [CylinderShape])])
 def test_surfaces_tell_lengths_only_where_points_do_not(lengths, expected):
     assert kinds(of_all(a_recording(), SIZED.body, size=True, lengths=lengths, surfaces=True)) == expected
+
+
+def test_a_sensors_unknown_begins_where_most_of_its_rows_agree():
+    """It is 0.3 m off at 1 mm of standard deviation, where a robust loss no longer pulls; one of seven rows is wrong."""
+    states, post = measured.arms(7, seed=2), np.array([0.5, 1.2, 0.4])
+    points = ARM.landmarks.select(("r_dactylion",))
+    away = [np.linalg.norm(post - ARM.positions(s, points)[0]) for s in states]
+    posts = [post + (a - 0.7) / a * (ARM.positions(s, points)[0] - post) for a, s in zip(away, states)]
+    posts[3] = posts[3] + 0.2  # the hand is 0.7 m from all others
+    steps = [[Pulling("rope", k / 10, p, taut=True)] for k, p in enumerate(posts)]
+    recording = replace(a_recording(), markers=(), sensors=(Rope(),))
+    found = of_all(recording, ARM, size=False, lengths=False, surfaces=False, steps=steps, states=states)
+    assert found.start == pytest.approx(0.7, abs=0.002)
 
 
 def test_a_body_of_known_size_leaves_nothing_to_find():

@@ -26,7 +26,7 @@ from kinefit.frame.trust import (
     segments_not_shown,
     without_segments,
 )
-from kinefit.rows import AnyRows, Rows
+from kinefit.rows import AnyRows, Rows, weaker
 from kinefit.sensors.base import Matched, Measurement, matched_by, pixels_of, rows_at
 from kinefit.sensors.evidence import Evidence
 from kinefit.sensors.scene import Scene
@@ -333,15 +333,6 @@ def _kinds(
 def rows_of_points(scene: Scene, matched: Sequence[Matched]) -> int:
     """Number of rows of points with a weight above 0 among the matches."""
     return sum(int(np.count_nonzero(rows.weight)) for m in matched if m.of_points for rows in rows_at(m, scene))
-
-
-def weaker(rows: AnyRows, factor: float) -> AnyRows:
-    """Rows with standard deviations multiplied by a factor (a number above 0)."""
-    if factor == 1.0:
-        return rows
-    if isinstance(rows, Rows):
-        return rows.weaker(factor)
-    return replace(rows, weight=rows.weight / factor**2)
 
 
 def _match(scene: Scene, measurements: Sequence[Measurement], reach: float) -> list[Matched]:

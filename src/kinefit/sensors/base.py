@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.errors import ObservationError
-from kinefit.rows import AnyRows, DofRows, PairRows, ParameterRows, Rows
+from kinefit.rows import AnyRows, DofRows, PairRows, ParameterRows, Rows, less_sure
 from kinefit.sensors import _kernels
 from kinefit.sensors.evidence import AGREEMENT_SIGMAS, MIN_VISIBLE_OUTLINE, Evidence
 from kinefit.sensors.scene import Scene
@@ -208,7 +208,7 @@ class Matched(ABC):
 
     def squares(self, scene: Scene) -> NDArray:
         """(M,) squared residual of each point, in variances; by default of each group of rows."""
-        return np.concatenate([np.zeros(0), *(np.array([s for _, s in _groups(r)]) for r in self.rows(scene))])
+        return np.concatenate([np.zeros(0), *(np.array([s for _, s in _groups(r)]) for r in felt(self, scene))])
 
     def leftovers(self, scene: Scene) -> list[Leftover]:
         """Residuals after the fit; by default the signed median, RMS and number of rows of each segment [m]."""
@@ -222,7 +222,7 @@ class Matched(ABC):
     def evidence(self, scene: Scene) -> Evidence:
         """Evidence on each segment; by default every group of rows supports its segments or contradicts them."""
         out = np.zeros((2, len(scene.body.tree.segments)))
-        for rows in self.rows(scene):
+        for rows in felt(self, scene):
             for segments, square in _groups(rows):
                 out[int(square >= AGREEMENT_SIGMAS**2), list(segments)] += MIN_VISIBLE_OUTLINE
         return Evidence(*out)
@@ -363,11 +363,31 @@ def matched_by(measurement: Measurement, scene: Scene, reach: float) -> Matched:
     return matched
 
 
-def rows_at(matched: Matched, scene: Scene) -> list[AnyRows]:
+def rows_at(matched: Matched, scene: Scene) -> Sequence[AnyRows]:
     """Checked rows of a match, the body moved to the time of the measurement; see `check_rows` for errors."""
     with named(matched.sensor):
-        rows = matched.rows(scene.at_time(matched.time))
-    return check_rows(rows, matched.sensor, scene.body)
+        return felt(matched, scene.at_time(matched.time), check=True)
+
+
+def felt(matched: Matched, scene: Scene, *, check: bool = False) -> Sequence[AnyRows]:
+    """Rows of a match; unknowns of its sensor that have no estimate add their variance to each.
+
+    Parameters
+    ----------
+    check : whether the rows are checked, see `check_rows` for errors
+    """
+
+    def made(at: Scene) -> Sequence[AnyRows]:
+        rows = matched.rows(at)
+        return check_rows(rows, matched.sensor, scene.body) if check else rows
+
+    rows, known = made(scene), scene.values.get(matched.sensor, {})
+    for name, unknown in scene.unknowns.get(matched.sensor, {}).items():
+        if name not in known:
+            values = {**scene.values, matched.sensor: {**known, name: unknown.mean + unknown.std}}
+            moved = made(scene.at(scene.state, values=values))
+            rows = [less_sure(a, np.square(b.residual - a.residual)) for a, b in zip(rows, moved, strict=True)]
+    return rows
 
 
 def leftovers_at(matched: Matched, scene: Scene) -> list[Leftover]:

@@ -18,7 +18,7 @@ from kinefit.rows import DofRows, Rows
 from kinefit.sensors.visibility.visibility import TrackedSurface
 
 if TYPE_CHECKING:
-    from kinefit.sensors.base import Measurement
+    from kinefit.sensors.base import Measurement, Unknown
 
 SURFACE_SAMPLES = 600  # points of a body's surface that are compared with depth images
 
@@ -39,6 +39,8 @@ class Scene:
         Of the body, for measurements of another time than the scene's.
     values : {sensor: {name: value}}, optional
         Estimates of the sensors' own unknowns, such as the length of a rope; see `Unknown`.
+    unknowns : {sensor: {name: Unknown}}, optional
+        All of them: rows of the sensor are less sure by those without an estimate.
     measurements : of all sensors at this time, for sensors that use each other's
     surface : TrackedSurface of the body, made when it is first needed
     others : scenes of other bodies at the same time
@@ -50,11 +52,12 @@ class Scene:
         self, body: Body, state: BodyState, rig: Rig, *, time: float = 0.0, velocity: NDArray | None = None,
         values: Mapping[str, Mapping[str, float]] | None = None, measurements: Sequence[Measurement] = (),
         surface: TrackedSurface | None = None, others: Sequence[Scene] = (), samples: int = SURFACE_SAMPLES,
-        covariance: NDArray | None = None,
+        covariance: NDArray | None = None, unknowns: Mapping[str, Mapping[str, Unknown]] | None = None,
     ) -> None:  # fmt: skip
         self.covariance = covariance
         self.body, self.state, self.rig, self.time, self.velocity = body, state, rig, time, velocity
         self.values, self.measurements, self.others = values or {}, tuple(measurements), tuple(others)
+        self.unknowns = unknowns or {}
         self._samples = samples
         self._shared: dict[str, Any] = {} if surface is None else {"surface": surface}
         self._frames: NDArray | None = None
@@ -64,7 +67,8 @@ class Scene:
         """The same scene with the body in another state; `changes` are other arguments of a scene."""
         given: dict[str, Any] = {
             "rig": self.rig, "time": self.time, "velocity": self.velocity, "values": self.values,
-            "measurements": self.measurements, "others": self.others, "samples": self._samples, **changes,
+            "measurements": self.measurements, "others": self.others, "samples": self._samples,
+            "unknowns": self.unknowns, **changes,
         }  # fmt: skip
         out = Scene(self.body, state, **given)
         out._shared = self._shared

@@ -7,7 +7,7 @@ approximated: the solver evaluates them at every step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -170,6 +170,17 @@ class OtherSensors:
             last = new if last is None else last.part(slice(span.start - first, None)).followed_by(new)
             first, done = span.start, span.stop
             yield last
+
+
+def with_values(others: OtherSensors, values: Mapping[str, Mapping[str, float]]) -> OtherSensors:
+    """The same measurements with other estimates of their sensors' own unknowns."""
+    scene_of = others.scene_of
+
+    def valued(state: BodyState, time: float) -> Scene:
+        scene = scene_of(state, time)
+        return scene.at(scene.state, values={**scene.values, **values})
+
+    return replace(others, scene_of=valued)
 
 
 def with_quadratic(body: Body, make: MakeEquations, more: Linearised) -> MakeEquations:

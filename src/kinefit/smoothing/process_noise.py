@@ -27,7 +27,8 @@ MIN_INLIER_FACTOR = 0.25  # robust factor (Geman-McClure: within its scale) abov
 _MEDIAN_SQUARE_2D = 2.0 * np.log(2.0)  # median |r|² of a normal error in the plane, in σ² (Rayleigh)
 _MEDIAN_SQUARE_1D = 0.4549  # median of a squared normal variable
 _MIN_ROWS = 30  # of a sensor: with fewer its standard deviation is not estimated
-_DETECTOR_CORRELATION_TIME = 0.25  # [s] whose frames count as one independent measurement of a point
+DETECTOR_CORRELATION_TIME = 0.25
+"""[s] whose frames count as one independent measurement of a point."""
 _MIN_SIGMA_RATIO = 0.01  # estimated to stated sigma of a point: of exact ones, weights would leave nothing but rounding
 _PRIOR_MEASUREMENTS = 30.0  # independent measurements of a point that the estimate of its source counts as
 _PRIOR_CHANGES = 10.0  # changes of a degree of freedom that its prior acceleration counts as
@@ -149,14 +150,14 @@ class SmoothTake:
         measured = replace(fit.system, C=fit.system.C - self.linear.unsupported)
         return fit, posterior(self.body, replace(fit, system=measured))
 
-    def solved(self, strength: Strength, *, tolerance: float = 1e-5) -> Smoothed:
-        """Solve all frames jointly from the take's states; `tolerance` is unitless."""
+    def solved(self, strength: Strength, *, tolerance: float = 1e-5, posture: float = 1.0) -> Smoothed:
+        """Solve all frames jointly from the take's states; `tolerance` is unitless, `posture` the prior's share."""
         lower, upper, mean = boxes(self.body.tree, self.angles)
         unobserved = ~self.observed.any(axis=0)  # stays at the prior mean
         lower[:, unobserved] = upper[:, unobserved] = mean[:, unobserved]
         tree = self.body.tree
         prior = MotionPrior(
-            strength.acceleration, self.memory, self.dt, mean, tree.spread, self.live, tree.couplings
+            strength.acceleration, self.memory, self.dt, mean, tree.spread / posture**0.5, self.live, tree.couplings
         )  # fmt: skip
         make = self.solver_points(strength.sigma, strength.shared).equations(self.body)
         dense = self.linear is not None
@@ -206,7 +207,7 @@ def estimate(
         level = np.bincount(limb, level) / np.maximum(np.bincount(limb, informed), 1e-12)  # goes to the accelerations
         takes = [replace(take, live=take.live / np.exp(level[limb])) for take in takes]
         acceleration = _accelerations(squares, informed, start / strength.acceleration, groups) * strength.acceleration
-        looks = min(takes[0].dt / _DETECTOR_CORRELATION_TIME, 1.0)
+        looks = min(takes[0].dt / DETECTOR_CORRELATION_TIME, 1.0)
         residuals, r2, variance = (np.concatenate(p) for p in zip(*errors, strict=True))
         sigma, shared = _noise(channels, r2, variance, looks), shared_by(channels, residuals, variance, looks)
         sigma = np.maximum(sigma, _MIN_SIGMA_RATIO * channels.sigma)

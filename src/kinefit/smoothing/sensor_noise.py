@@ -15,7 +15,7 @@ from kinefit.correspondences.closures import every_closure
 from kinefit.frame.fit import ignores_surface_offsets, rows_of_points
 from kinefit.frame.results import ROOT_PRIOR_STD
 from kinefit.frame.skin import skin_of
-from kinefit.rows import DofRows, Rows
+from kinefit.rows import DofRows, Rows, weaker
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.channels import ChannelResiduals
 from kinefit.smoothing.linearised import OtherSensors, squares_of
@@ -117,7 +117,7 @@ def other_noise(
             scale = others.scale.get(m.sensor, 1.0)
             made = [r for r in rows_at(m, scene) if isinstance(r, Rows | DofRows) and len(r)]
             points = [r for r in made if m.of_points or isinstance(r, DofRows)]
-            surface += [r.weaker(scale) for r in made if isinstance(r, Rows) and not m.of_points]
+            surface += [weaker(r, scale) for r in made if isinstance(r, Rows) and not m.of_points]
             weights = [r.weight * squares_of(r)[1] / scale**2 for r in points]
             for rows, w, at in zip(points, weights, residuals.add(f, m, points, [r.residual for r in points], weights)):
                 used = w > 0.0

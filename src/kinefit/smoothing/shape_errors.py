@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.correspondences.closures import every_closure
-from kinefit.frame.fit import rows_of, rows_of_points, weaker
+from kinefit.frame.fit import rows_of, rows_of_points
 from kinefit.geometry.camera import Rig
 from kinefit.lasting_errors import between
+from kinefit.rows import weaker
 from kinefit.sensors.base import Matched, rows_at
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
@@ -93,8 +94,8 @@ def shape_errors(
     root, joints, factors = square_root(Sigma), [], []
     for frame, P in zip(frames, alone):
         scene, matched = frame_data(frame)
-        matches = _FrameMatches(worlds, scene, matched, found.mean, used, np.flatnonzero(wide[used]), scale or {})
-        gradients = matches.points(step) + matches.surfaces(step, settings)
+        matches = FrameMatches(worlds, scene, matched, found.mean, used, np.flatnonzero(wide[used]), scale or {})
+        gradients = matches.surfaces(step, settings) - matches.border(step)[2]
         response = P @ gradients
         moves = joint_moves(scene.body, scene.state)
         whole = moves @ response + matches.stretch(step)
@@ -104,7 +105,7 @@ def shape_errors(
 
 
 @dataclass(frozen=True, eq=False)
-class _FrameMatches:
+class FrameMatches:
     """One frame's matches as a function of q of p parameters: a `BorderedProblem` of one frame.
 
     Parameters
@@ -141,12 +142,17 @@ class _FrameMatches:
         ]  # fmt: skip
         return [*points, *((CLOSURES, rows) for rows in every_closure(scene.body, scene.state))]
 
-    def points(self, step: NDArray) -> NDArray:
-        """(n, q) ∂g/∂θ of all points; step (p,) of finite differences."""
+    def border(self, step: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Equations (q, q), (q,) of the parameters by all points, and their coupling (n, q) to the pose.
+
+        Parameters
+        ----------
+        step : (p,) of finite differences
+        """
         mean, state = self.theta[self.used], self.scene.state
         frame = frame_at(self, mean, 0, state, Weighing())
-        moved = differences(self, mean, step[self.used], [state])[0]
-        return -gram(frame.J, frame.factor[:, None] * moved)
+        moved = frame.factor[:, None] * differences(self, mean, step[self.used], [state])[0]
+        return gram(moved, moved), frame.residual @ moved, gram(frame.J, moved)
 
     def surfaces(self, step: NDArray, settings: TrackSettings) -> NDArray:
         """(n, q) ∂g/∂θ of all surfaces, by the `wide` parameters; step (p,) of finite differences."""

@@ -20,6 +20,7 @@ from kinefit.sensors.channels import Channels
 from kinefit.sensors.evidence import moves_points, near
 from kinefit.sensors.points.views import find_swaps, limb_groups
 from kinefit.sensors.settings import TrackSettings
+from kinefit.smoothing.border import Border, with_border
 from kinefit.smoothing.foot_contacts import find_contacts
 from kinefit.smoothing.linearised import OtherSensors
 from kinefit.smoothing.process_noise import MIN_INLIER_FACTOR, SmoothTake, Strength, estimate, estimate_liveliness
@@ -51,6 +52,7 @@ class SmoothedTake:
     weight : (F, N) [1/px²] of every channel in the fit, robust factor included
     provenance : estimated noise, for `Motion.provenance`
     shared : errors that keypoints of one segment share, as the fit assumed them
+    border : the sensors' own unknowns as the whole take tells them; None where there are none
     """
 
     results: Sequence[FrameResult]
@@ -59,11 +61,12 @@ class SmoothedTake:
     weight: NDArray
     provenance: dict[str, Any]
     shared: SharedErrors
+    border: Border | None = None
 
 
 def smooth_results(
     body: Body, frames: TrackedFrames, settings: TrackSettings, *, contacts: bool = False, up: str = "z",
-    eye: NDArray | None = None, level: bool = True, windows: tuple[int, int] = (300, 60),
+    eye: NDArray | None = None, level: bool = True, windows: tuple[int, int] = (300, 60), border: Border | None = None,
 ) -> SmoothedTake:  # fmt: skip
     """Smooth tracked frames of any sensors jointly.
 
@@ -78,10 +81,13 @@ def smooth_results(
         then never estimated below the stated one, since no other view shows their systematic errors.
     level : bool, `up` is measured, so that the floor is level
     windows : number of frames that are solved at a time, and that two neighbouring windows share
+    border : the sensors' own unknowns, to start from
     """
     take = replace(_take(as_tracked(body, frames, settings), settings), one_view=eye is not None)
-    channels, swapped, others = take.channels, take.swapped, take.others
+    channels, swapped = take.channels, take.swapped
     strength, take, rounds = _estimate(take, settings, *windows)
+    if border is not None and take.others is not None:
+        take, border = with_border(take, strength, border, *windows)
     take, covariances, others_matched = solved_with_covariances(take, strength, *windows)
     new_swaps = _swaps(take)
     if not np.array_equal(new_swaps, swapped):
@@ -105,6 +111,7 @@ def smooth_results(
     covariance = np.empty((body.tree.n_dofs,) * 2)
     for f, result in enumerate(frames.results):
         state, weight = BodyState(take.roots[f], take.angles[f]), take.confidence[f] / np.square(channels.sigma)
+        others = take.others
         scene = frames.scene_of(state, result.time) if others is None else others.scene(f, take.roots, take.angles)
         pixels = tuple(
             replace(
@@ -123,7 +130,7 @@ def smooth_results(
     if surfaces:
         smoothed = _with_unknown_joints(body, smoothed, round(_UNKNOWN_TIME * frames.rate))
     shared = SharedErrors.of(channels, strength.shared, strength.sigma)
-    return SmoothedTake(smoothed, take, others_matched, fit_weight, _provenance(take, strength, rounds), shared)
+    return SmoothedTake(smoothed, take, others_matched, fit_weight, _provenance(take, strength, rounds), shared, border)
 
 
 def _closed(take: SmoothTake, hard: Constraint) -> SmoothTake:

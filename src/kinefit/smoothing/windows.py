@@ -51,7 +51,7 @@ def solved(
         fit = partial(SmoothTake.solved, strength=strength, tolerance=tolerance)
         roots, angles = np.array(take.roots), np.array(take.angles)
         matched = None if take.others is None else Spool[tuple[Matched, ...]]()
-        fits = side_by_side(fit, _linear_parts(take, windows, matched))
+        fits = side_by_side(fit, linear_parts(take, windows, matched))
         for (whole, kept), found in zip(windows, fits, strict=True):
             inside = slice(kept.start - whole.start, kept.stop - whole.start)
             roots[kept], angles[kept] = found.roots[inside], found.angles[inside]
@@ -73,7 +73,7 @@ def solved_with_covariances(
     roots, angles = np.array(take.roots), np.array(take.angles)
     covariances, speeds = Spool[NDArray](), []
     matched = None if take.others is None else Spool[tuple[Matched, ...]]()
-    fits = side_by_side(lambda part: part.fit(strength), _linear_parts(take, windows, matched, judge=True))
+    fits = side_by_side(lambda part: part.fit(strength), linear_parts(take, windows, matched, judge=True))
     for whole, kept in windows:
         fit, post = next(fits)
         inside = slice(kept.start - whole.start, kept.stop - whole.start)
@@ -88,7 +88,7 @@ def solved_with_covariances(
     return replace(take, roots=roots, angles=angles, speed_std=speed_std), covariances, matched
 
 
-def _linear_parts(
+def linear_parts(
     take: SmoothTake, windows: Sequence[tuple[slice, slice]], matched: Spool[tuple[Matched, ...]] | None, *,
     judge: bool = False,
 ) -> Iterator[SmoothTake]:  # fmt: skip

@@ -302,7 +302,10 @@ class OwnUnknowns(Parameters):
 
     def apply(self, world: World, values: NDArray) -> World:
         """The world with these values (p,) of the unknowns."""
-        out = {sensor: dict(own) for sensor, own in world.values.items()}
-        for (sensor, name, _), value in zip(self._each, values, strict=True):
-            out.setdefault(sensor, {})[name] = float(value)
-        return replace(world, values=out)
+        own = {sensor: {**world.values.get(sensor, {}), **new} for sensor, new in self.values(values).items()}
+        return replace(world, values={**world.values, **own})
+
+    def values(self, values: NDArray) -> dict[str, dict[str, float]]:
+        """{sensor: {name: value}} of values (p,)."""
+        each = iter(np.asarray(values, float).tolist())
+        return {sensor: {name: next(each) for name in own} for sensor, own in self.unknowns.items()}

@@ -96,6 +96,17 @@ class SubjectFit:
         return np.sqrt(np.diag(self.covariance))
 
     @property
+    def kinds(self) -> list[tuple[Parameters, slice]]:
+        """Each kind of parameters, and its slice of all p."""
+        ends = np.cumsum([0, *(len(kind.names) for kind in self.parameters)]).tolist()
+        return [(kind, slice(*ends[k : k + 2])) for k, kind in enumerate(self.parameters)]
+
+    def record(self) -> dict[str, list[float]]:
+        """{parameter: [estimate, standard deviation]}, each in its own unit."""
+        each = zip(self.names, self.mean, self.std)
+        return {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in each}
+
+    @property
     def cameras(self) -> CameraExtrinsics | None:
         """The parameters of cameras; None if the fit had none."""
         return next((p for p in self.parameters if isinstance(p, CameraExtrinsics)), None)

@@ -18,6 +18,7 @@ from kinefit.motion import Motion, Residuals
 from kinefit.sensors.base import Leftover, Matched, leftovers_at, pixels_of
 from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
+from kinefit.smoothing.border import Border
 from kinefit.smoothing.online.fixed_lag import FixedLag
 from kinefit.smoothing.online.lag_frame import KnownNoise, TrackerView
 from kinefit.smoothing.sensor_noise import other_noise
@@ -76,10 +77,16 @@ def motion_of(
     matched: Sequence[tuple[Matched, ...]] | None = None  # of all sensors but the keypoints
     if smooth:
         held = how.contacts or eye is not None or not how.level
-        done = smooth_results(body, frames, settings, contacts=held, up=up, eye=eye, level=how.level)
+        border = next(filter(None, map(Border.of, found)), None)
+        done = smooth_results(
+            body, frames, settings, contacts=held, up=up, eye=eye, level=how.level, border=border
+        )
         results, take, weight, shared = done.results, done.take, done.weight, done.shared
         provenance["smoothing"] = done.provenance
         matched = done.matched
+        if done.border is not None:
+            found = [done.border.applied(one) for one in found]
+            provenance["shape"] = dict(item for one in found for item in one.record().items())
     else:
         if lag is not None:
             results, matched, provenance["fixed lag"] = _behind(frames, body, settings, lag, how.noise)

@@ -214,8 +214,7 @@ def sized_by_depth(person: SizedPerson, progress: Progress | None = None) -> Siz
     step, best = max(zip(frames, starts), key=lambda found: found[1].score)
     if _is_inverted(fit.body, [f.depth for f in frames.values()], camera, empty, r.up_axis, starts):
         person = person.reporting(**{INVERTED: camera.name})
-    size = {n: [round(float(m), 4), round(float(s), 4)] for n, m, s in zip(fit.names, fit.mean, fit.std)}
-    person = _by_joint(person, fit).reporting(size=size)
+    person = _by_joint(person, fit).reporting(size=fit.record())
     if is_rare(r.rate):
         person = replace(person, poses={i: found.state for i, found in zip(frames, starts)})
     return person if person.start is not None else replace(person, start=(step, best.state))
@@ -298,8 +297,9 @@ def _by_all(
         person, states = _by_joint(person, found), found.states
     lengths = points is None and person.subject.fit is None and not person.joint
     left = of_all(
-        person.recording, person.subject.body, size=size, lengths=lengths, surfaces=surfaces, states=states
-    )
+        person.recording, person.subject.body, size=size, lengths=lengths, surfaces=surfaces, steps=steps,
+        states=states,
+    )  # fmt: skip
     if left is not None:
         found = fit(left, steps, states)
         person, states = _by_joint(person, found), found.states
@@ -328,15 +328,13 @@ def _fitted_at(
 
 def _by_joint(person: SizedPerson, found: SubjectFit) -> SizedPerson:
     """The person as a fit of several kinds of sensors found it; with its lengths where they were sought."""
-    subject, first = person.subject, 0
-    for kind in found.parameters:
-        own = slice(first, first := first + len(kind.names))
+    subject = person.subject
+    for kind, own in found.kinds:
         if isinstance(kind, SegmentScales):
             base = subject.scales if found.prior_world.body is subject.body else 1.0
             scales = base * np.exp(found.mean[own])
             subject = replace(subject, scales=scales, fit=None, covariance=None, length_share=found.std[own])
-    shape = {name: [round(float(m), 4), round(float(s), 4)] for name, m, s in zip(found.names, found.mean, found.std)}
-    shape = {**person.provenance.get("shape", {}), **shape}
+    shape = {**person.provenance.get("shape", {}), **found.record()}
     person = replace(person, subject=replace(subject, body=found.body)).reporting(shape=shape)
     if found.cameras is not None:
         person = replace(person, recording=replace(person.recording, rig=found.rig))

@@ -98,8 +98,9 @@ class Tracker:
         self.body, self._seen = body, np.full(len(body.tree.coordinates), -np.inf)  # [s] when each was last observed
         self._fit = FrameFit(body, s)
         self._scene = Scene(
-            body, body.usual_state(np.eye(4)), self.rig, values=self.values, samples=s.samples
-        )
+            body, body.usual_state(np.eye(4)), self.rig, values=self.values, samples=s.samples,
+            unknowns={sensor.name: sensor.unknowns for sensor in self.sensors.own},
+        )  # fmt: skip
         self._recovery = Recovery(body, self.rig, self.up, s, self.rate)
         self._prediction = Prediction(
             body, 1.0 / self.rate, angle_acceleration=s.angle_acceleration, root_acceleration=s.root_acceleration,

@@ -11,9 +11,13 @@ from numpy.typing import NDArray
 from kinefit.bodies import Body, BodyState, PointSet
 from kinefit.geometry.camera import Rig
 from kinefit.multiview.followed import only_lifted
+from kinefit.sensors.base import Measurement
 from kinefit.sensors.points.lifted import SIZE_STD, person_size
 from kinefit.sensors.settings import CameraErrors
+from kinefit.solvers.bundle.border_frames import Weighing, differences, frame_at
+from kinefit.subject.fit import REACH
 from kinefit.subject.gear import Gear
+from kinefit.subject.matched_frames import MatchedFrames, Worlds
 from kinefit.subject.parameters import (
     UNKNOWN_SIZE_STD,
     KnownLengths,
@@ -30,6 +34,7 @@ from kinefit.tracking.recording import Recording
 
 _ONE_CAMERA = 0.02  # [m] how far a detector's points stand from their places, for one camera: with 0, 5, 10, 20 mm each
 # camera of the balancing trial has joints 76, 70, 69 and 66 mm off and 79, 83, 89 and 95 % inside, in the worst axis
+_START_ROUNDS = 20  # of reweighted least squares, which then change the start by less than a standard deviation
 _SEAT = 0.01  # [m] how far a marker of the body's own set sits from its place on a person: as a detector's points
 
 
@@ -137,8 +142,9 @@ def _of(values: NDArray, whole: PointSet, part: PointSet) -> NDArray:
 
 
 def of_all(
-    recording: Recording, body: Body, *, size: bool, lengths: bool, surfaces: bool, states: Sequence[BodyState] = ()
-) -> Unknowns | None:
+    recording: Recording, body: Body, *, size: bool, lengths: bool, surfaces: bool,
+    steps: Sequence[Sequence[Measurement]] = (), states: Sequence[BodyState] = (),
+) -> Unknowns | None:  # fmt: skip
     """What is left for all sensors together: the body's surface, gear, and what sensors do not know of themselves.
 
     Parameters
@@ -148,7 +154,7 @@ def of_all(
     lengths : whether neither points nor a few depth images have determined them: nearest points of a surface of simple
         shapes, frame after frame, are surer of lengths than they are right
     surfaces : whether any sensor sees them
-    states : some poses of the body, which tell where gear begins
+    steps, states : what was measured at some poses of the body, which tell where gear and sensors' unknowns begin
     """
     found: list[tuple[Parameters, NDArray]] = []
     if size and lengths and (surfaces or recording.markers):
@@ -160,8 +166,25 @@ def of_all(
         found.append((gear, gear.start(states)))
     unknown = OwnUnknowns.of(recording.sensors)
     if unknown.names:
-        found.append((unknown, unknown.mean))
+        found.append((unknown, _start_of(unknown, World(body, recording.rig), steps, states)))
     return _together(World(body, recording.rig), found)
+
+
+def _start_of(
+    unknown: OwnUnknowns, world: World, steps: Sequence[Sequence[Measurement]], states: Sequence[BodyState]
+) -> NDArray:
+    """(p,) values at which the poses leave the least absolute residuals: a robust loss finds nothing from far away."""
+    worlds, prior, theta = Worlds(world, (unknown,)), unknown.information, unknown.mean
+    frames = MatchedFrames(worlds, steps, None, None, theta, states, REACH[0])
+    for _ in range(_START_ROUNDS):
+        H, g = prior.copy(), prior @ (unknown.mean - theta)
+        moved = differences(frames, theta, unknown.step, states)
+        for f, (state, D) in enumerate(zip(states, moved)):
+            at = frame_at(frames, theta, f, state, Weighing())
+            J = D * (at.used / np.maximum(np.abs(at.residual), 1.0))[:, None]
+            H, g = H + D.T @ J, g + J.T @ at.residual
+        theta = theta + np.linalg.solve(H, g)
+    return theta
 
 
 def _together(world: World, found: Sequence[tuple[Parameters, NDArray]]) -> Unknowns | None:

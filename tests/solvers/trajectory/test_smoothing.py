@@ -15,7 +15,15 @@ from kinefit.solvers.equations import block_diagonal, dense_pattern
 from kinefit.solvers.trajectory import _kernels_band
 from kinefit.solvers.trajectory.motion_prior import MotionPrior
 from kinefit.solvers.trajectory.seen_points import SeenPoints
-from kinefit.solvers.trajectory.smoothing import Smoothed, _system, _workspace, blocks, posterior, smooth
+from kinefit.solvers.trajectory.smoothing import (
+    Smoothed,
+    _system,
+    _workspace,
+    blocks,
+    posterior,
+    responses,
+    smooth,
+)
 
 BODY = load_body("humanoid")
 TREE, N = BODY.tree, BODY.tree.n_dofs
@@ -133,7 +141,7 @@ def test_factor_solution_and_covariance_are_those_of_the_dense_matrix(T, pattern
 
     share = np.kron(np.eye(T), block_diagonal(np.zeros((6, 6)), p.posture_share - p.precision))
     V = np.linalg.inv(H + share).reshape(T, N, T, N)
-    found = posterior(BODY, Smoothed(roots, angles, system.cost, 0, True, p, system, pattern))
+    found = posterior(BODY, Smoothed(roots, angles, system.cost, 0, True, p, system, pattern, np.zeros((T, N), bool)))
     for t in range(T):
         np.testing.assert_allclose(found.frames[t], V[t, :, t], atol=1e-9)
         if t + 1 < T:
@@ -148,6 +156,22 @@ def test_factor_solution_and_covariance_are_those_of_the_dense_matrix(T, pattern
             c[s - 1 - back] += past[s, back]
         expected = np.einsum("a,aibi,b->i", c, V, c)
         np.testing.assert_allclose(found.change_variance[s], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_responses_are_those_of_the_dense_matrix_without_what_is_held(pattern):
+    T, random, pattern_of = 5, np.random.default_rng(8), PATTERNS[pattern]
+    roots, angles = random_states(T, 0.4)
+    make = held(random.uniform(1, 3, (T, N))) if pattern == "tree" else coupled(T, random)
+    system, at_rest = _system(BODY, roots, angles, make, prior(), pattern_of[1]), random.random((T, N)) < 0.1
+    B, free = random.normal(size=(T, N, 2)), ~at_rest.ravel()
+    before = system.C.copy(), system.band.copy(), system.g.copy()
+    found = responses(BODY, Smoothed(roots, angles, system.cost, 0, True, prior(), system, pattern_of, at_rest), B)
+    H = whole(system, T, pattern_of)[np.ix_(free, free)]
+    np.testing.assert_allclose(found.reshape(-1, 2)[free], np.linalg.solve(H, B.reshape(-1, 2)[free]), atol=1e-9)
+    assert not found[at_rest].any()
+    for kept, array in zip(before, (system.C, system.band, system.g)):
+        np.testing.assert_array_equal(kept, array)
 
 
 def test_a_matrix_that_is_not_positive_is_told():

@@ -51,6 +51,7 @@ class Smoothed:
     cost : float
     iterations : int, number of steps tried
     converged : bool
+    held : (T, n) bool, degrees of freedom that are fixed or at a limit
     """
 
     roots: NDArray
@@ -61,6 +62,7 @@ class Smoothed:
     prior: MotionPrior
     system: _BandEquations
     pattern: tuple[NDArray, NDArray]
+    held: NDArray
 
     @property
     def changes(self) -> NDArray:
@@ -135,9 +137,7 @@ def smooth(
     fresh, converged, tried, any_held = True, False, 0, False
     while tried < max_iterations and not converged:
         if fresh:
-            held = np.zeros(now.g.shape, bool)
-            held[:, 6:] = ((angles <= lower) & (now.g[:, 6:] < 0)) | ((angles >= upper) & (now.g[:, 6:] > 0))
-            held[:, :6] = not tree.root_free
+            held = _held(body, now, angles, lower, upper)
             any_held = bool(held.any())
             if any_held:
                 _kernels_smoothing.hold(held, first, width, chain, depth, now.C, now.band, now.g)
@@ -160,7 +160,33 @@ def smooth(
             fresh, now, roots, angles = True, new, new_roots, new_angles
     if any_held and not fresh:
         now = _system(body, roots, angles, equations, prior, depth, entering)  # without held angles' modifications
-    return Smoothed(roots, angles, now.cost, tried, converged, prior, now, pattern)
+    held = _held(body, now, angles, lower, upper)
+    return Smoothed(roots, angles, now.cost, tried, converged, prior, now, pattern, held)
+
+
+def _held(body: Body, at: _BandEquations, angles: NDArray, lower: NDArray, upper: NDArray) -> NDArray:
+    """(T, n) bool: degrees of freedom that are fixed, or at a limit and pulled beyond it."""
+    g = at.g[:, 6:]
+    moving = ((angles <= lower) & (g < 0)) | ((angles >= upper) & (g > 0))
+    return np.concatenate([np.full((len(g), 6), not body.tree.root_free), moving], axis=1)
+
+
+def responses(body: Body, smoothed: Smoothed, B: NDArray) -> NDArray:
+    """A⁻¹ B (T, n, p) for the system A of a smoothed take and B (T, n, p); 0 where limits hold."""
+    s, (chain, depth), n = smoothed.system, smoothed.pattern, B.shape[1]
+    C, band, (first, width), out = s.C.copy(), s.band.copy(), blocks(body), np.array(B)
+    out[smoothed.held] = 0.0
+    _kernels_smoothing.hold(smoothed.held, first, width, chain, depth, C, band, s.g.copy())
+    W, below, delta = _workspace(len(B), n)
+    start = start_of(s.entering, n, W.shape[1], smoothed.held[:3])
+    tiny = 1e-12 * float(C[:, np.arange(n), depth].mean())
+    for k in range(B.shape[2]):
+        delta[:, :n] = out[..., k]
+        while not _kernels_band.factor_band(C, chain, depth, band, first, width, tiny, start, W, below, delta):
+            tiny, delta[:, :n] = 10.0 * tiny, out[..., k]
+        _kernels_band.back_substitute(W, below, delta)
+        out[..., k] = delta[:, :n]
+    return out
 
 
 def _made_dense(body: Body, equations: MakeEquations) -> MakeEquations:
