@@ -224,7 +224,7 @@ class DofRows:
 
 
 AnyRows = Rows | PairRows | ParameterRows | DofRows
-_Same = TypeVar("_Same", Rows, PairRows, ParameterRows, DofRows, AnyRows)
+_Same = TypeVar("_Same", bound=AnyRows)
 
 
 def weaker(rows: _Same, factor: float) -> _Same:
@@ -241,11 +241,9 @@ def less_sure(rows: AnyRows, variance: NDArray) -> AnyRows:
 
 
 def _weighted(rows: _Same, weight: NDArray) -> _Same:
-    if not isinstance(rows, Rows):
-        return replace(rows, weight=weight)
-    data = np.array(rows.data)
-    data[7] = weight
-    return replace(rows, data=data)
+    if isinstance(rows, Rows):
+        return replace(rows, data=np.concatenate([rows.data[:7], weight[None]]))
+    return replace(rows, weight=weight)
 
 
 def sort_out(

@@ -106,7 +106,7 @@ def test_surfaces_tell_lengths_only_where_points_do_not(lengths, expected):
 
 
 def test_a_sensors_unknown_begins_where_most_of_its_rows_agree():
-    """It is 0.3 m off at 1 mm of standard deviation, where a robust loss no longer pulls; one of seven rows is wrong."""
+    """It is 0.3 m off at 1 mm of standard deviation, where a robust loss pulls no more; one row of seven is wrong."""
     states, post = measured.arms(7, seed=2), np.array([0.5, 1.2, 0.4])
     points = ARM.landmarks.select(("r_dactylion",))
     away = [np.linalg.norm(post - ARM.positions(s, points)[0]) for s in states]

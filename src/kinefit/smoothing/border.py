@@ -56,7 +56,7 @@ class Border:
 
     @property
     def values(self) -> Mapping[str, Mapping[str, float]]:
-        """{sensor: {name: value}}"""
+        """{sensor: {name: value}} of all unknowns."""
         return self.unknowns.values(self.theta)
 
     def applied(self, found: SubjectFit) -> SubjectFit:
