@@ -189,7 +189,7 @@ def _with_shapes(errors: SystematicErrors, shapes: Sequence[ShapeErrors], frame:
 def _directions(factors: NDArray) -> NDArray:
     """(k, K) orthonormal directions that hold most of factors (F, n, k), every coordinate alike; all where few."""
     std = np.sqrt(np.square(factors).sum(axis=2).mean(axis=0))
-    rows = (factors / np.maximum(std, 1e-12)[:, None]).reshape(std.size * len(factors), factors.shape[2])
+    rows = (factors / np.maximum(std, 1e-12)[:, None]).reshape(std.size * len(factors), -1)
     return np.asarray(np.linalg.eigh(gram(rows, rows))[1][:, ::-1][:, :_DIRECTIONS])
 
 
