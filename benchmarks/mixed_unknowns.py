@@ -1,4 +1,4 @@
-"""A sensor's own unknown by `kinefit.track`: the rope of `examples/07_own_sensor.py`, 0.8 m long, begun at 1.0 ± 0.3 m."""
+"""An unknown of a sensor by `kinefit.track`: the rope of `examples/07_own_sensor.py`, 0.8 m, begun at 1.0 ± 0.3 m."""
 
 from __future__ import annotations
 
