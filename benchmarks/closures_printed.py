@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from benchmarks.closures_planar import UNIT, explicit, pedal
 from benchmarks.figures import amount, figure
 from kinefit.bodies import Body, BodyState, TaperedCylinder, load_body
-from kinefit.bodies.closures import known_gear
+from kinefit.bodies.parts import known_gear
 from kinefit.correspondences.closures import closure_values, hard_equations
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig

@@ -17,7 +17,8 @@ from benchmarks.closures_people import off
 from benchmarks.closures_takes import PLACED, Take, another_person, from_drive, posture_of, towards, wandering, waves
 from benchmarks.figures import amount, figure, quick
 from kinefit.bodies import Body, load_body
-from kinefit.bodies.closures import Closure, with_dimensions
+from kinefit.bodies.closures import Closure
+from kinefit.bodies.parts import with_dimensions
 from kinefit.rows import ParameterRows
 from kinefit.tracking.video import track
 

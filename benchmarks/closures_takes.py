@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.bodies.closures import Closure, with_dimensions
+from kinefit.bodies.closures import Closure
+from kinefit.bodies.parts import with_dimensions
 from kinefit.correspondences import prior_rows
 from kinefit.correspondences.closures import closed_at
 from kinefit.geometry import se3

@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, figure
 from kinefit import load_body, track_take
 from kinefit.bodies import Body, BodyState
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.bodies.surfaces import TaperedCylinder
-from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh
+from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.correspondences import collision_rows
 from kinefit.geometry.camera import Camera
 from kinefit.motion import BELIEVED, Motion

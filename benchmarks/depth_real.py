@@ -86,7 +86,7 @@ def fitted(images: list[NDArray], camera: Any) -> Any:
 
 def explained(body: Any, state: Any, camera: Any, depth: NDArray) -> tuple[NDArray, float]:
     """Distances (N,) [m] of accepted points from the visible surface, and the share of all that are close to it."""
-    from kinefit.bodies.surfaces import nearest
+    from kinefit.bodies.body_surfaces import nearest
     from kinefit.images.depth import to_points
 
     points = to_points(depth, camera, step=3)
@@ -100,7 +100,7 @@ def picture(body: Any, state: Any, camera: Any, depth: NDArray) -> NDArray:
     """(H, 2 W, 3) uint8: depth in colours, and beside it the body drawn over it."""
     import cv2
 
-    from kinefit.bodies.surfaces.triangles import body_mesh
+    from kinefit.bodies.body_surfaces import body_mesh
     from kinefit.rendering import render_body
 
     mesh = body_mesh(body)

@@ -152,7 +152,7 @@ class Stage:
 
 def _fusion(folder: Path) -> dict[str, float]:
     """Time and error with 5,000 points of the body a frame; the clouds are left in the folder."""
-    from kinefit.bodies.surfaces import sample
+    from kinefit.bodies.body_surfaces import sample
 
     least, first, iterations, error = [], [], [], []
     told: dict[str, Any] = {}

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, data, figure
 from kinefit.bodies import load_body
-from kinefit.bodies.surfaces import sample
+from kinefit.bodies.body_surfaces import sample
 from kinefit.correspondences import collision_rows, free_space_rows
 from kinefit.correspondences.occupancy.collisions import collision_pairs
 from kinefit.correspondences.occupancy.depth_image import SurfaceSamples

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.evaluation.sequences import INPUTS, TruthSequence, sequence
 from kinefit.evaluation.voodoo import voodoo_method
 from kinefit.geometry.camera import Camera

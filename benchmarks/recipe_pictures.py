@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet, load_body
-from kinefit.bodies.surfaces import MeshSurface, Metaballs, body_mesh, sample
+from kinefit.bodies.body_surfaces import body_mesh, sample
+from kinefit.bodies.surfaces import MeshSurface, Metaballs
 from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.bodies.tree import KinematicTree
 from kinefit.correspondences.contours.rims import RimFinder

@@ -22,7 +22,7 @@ from benchmarks.closures_takes import Take
 from benchmarks.curves import COLOURS, curves
 from benchmarks.figures import LEFT_OUT, amount, figure, quick
 from benchmarks.gear_takes import GearTake, rendered_cyclist, rendered_snowboarder
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.geometry.camera import Camera
 from kinefit.images.silhouette import BackgroundPlate
 from kinefit.motion import Motion

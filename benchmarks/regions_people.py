@@ -19,7 +19,7 @@ from benchmarks.figures import LEFT_OUT, amount, data, figure, quick
 from benchmarks.silhouettes_track import CAMERAS, overlaps, tracked, trial_text
 from benchmarks.silhouettes_track import take_text as masks_text
 from kinefit.bodies import BodyState
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.correspondences.contours.rims import RimFinder
 from kinefit.geometry.camera import Rig
 from kinefit.motion import UP_AXES, Motion

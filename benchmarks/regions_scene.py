@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from benchmarks.figures import data
 from benchmarks.silhouettes_car import surface as car_surface
 from kinefit.bodies import Body, BodyState, PointSet, load_body
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.bodies.surfaces.mesh import MeshSurface
-from kinefit.bodies.surfaces.triangles import body_mesh
 from kinefit.bodies.tree import KinematicTree
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, figure
 from benchmarks.silhouettes_scene import ring, swaying
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.geometry.camera import Rig
 from kinefit.observations import ColourFrame
 from kinefit.rendering import render_body

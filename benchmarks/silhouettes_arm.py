@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, data, figure
 from benchmarks.silhouettes_scene import shape_from_silhouettes
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.images.silhouette import choose_person, colour_mask
 from kinefit.initialization.from_silhouettes import Level, coarse_to_fine

@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks.figures import amount, data, figure
 from benchmarks.regions_cat import camera, images, take_of, truth
 from benchmarks.regions_scene import away
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.motion import Motion
 from kinefit.rendering import render_body
 from kinefit.takes.track import track_take

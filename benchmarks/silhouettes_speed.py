@@ -25,7 +25,7 @@ from benchmarks.figures import amount, data, figure
 from benchmarks.silhouettes_scene import of_meshes, ring, swaying
 from benchmarks.silhouettes_track import take_text
 from kinefit.bodies import Body, load_body
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.geometry.camera import Rig
 from kinefit.images.silhouette import colour_mask
 from kinefit.observations import SilhouetteFrame

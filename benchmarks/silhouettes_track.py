@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import LEFT_OUT, amount, data, figure, quick
 from kinefit.bodies import BodyState
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.observations import SilhouetteVideo

@@ -19,7 +19,7 @@ from benchmarks.figures import amount, figure
 from benchmarks.regions_speed import pictures
 from benchmarks.silhouettes_scene import ring, swaying
 from kinefit.bodies import Body, BodyState, load_body
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import ColourFrame, DepthFrame, KeypointFrame, MarkerFrame, SilhouetteFrame
 from kinefit.rendering import render_body

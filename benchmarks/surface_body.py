@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import amount, figure
 from benchmarks.textured import textured_picture
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.surfaces.triangles import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.motion import Motion

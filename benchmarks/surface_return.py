@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import amount, figure
 from benchmarks.surface_body import cameras, frames_of, moving_arm, record
-from kinefit.bodies.surfaces import nearest
+from kinefit.bodies.body_surfaces import nearest
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 

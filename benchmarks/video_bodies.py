@@ -27,7 +27,7 @@ from benchmarks.bar_scene import draw_bar, wave_bar
 from benchmarks.figures import amount, figure
 from benchmarks.surface_body import frames_of, moving_arm
 from benchmarks.textured import textured_picture
-from kinefit.bodies.surfaces.triangles import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.initialization.from_clicks import clickable

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from drawing import results
 from kinefit import read_motion
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.exporters import draw_overlay, write_motion
 from kinefit.exporters.pictures.drawing import draw_body
 from kinefit.exporters.report.cycles import PERCENT, find_cycles, normalised

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body, parse_body
-from kinefit.bodies.closures import has_unknown_gear, known_gear, with_dimensions
-from kinefit.bodies.parts import without_part
+from kinefit.bodies.parts import has_unknown_gear, known_gear, with_dimensions, without_part
 from kinefit.bodies.serial import body_from_arrays, body_to_arrays
 from kinefit.bodies.toml.bodies import catalogue_text
 from kinefit.errors import BodyError

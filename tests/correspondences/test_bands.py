@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body
+from kinefit.bodies.body_surfaces import sample
 from kinefit.bodies.parts import free_parts, parts_state
-from kinefit.bodies.surfaces import sample
 from kinefit.correspondences import band_rows, joint_bands, surface_rows
 from kinefit.correspondences.bands import elliptic_bands, hinge_bands, universal_band
 from kinefit.errors import BodyError

@@ -7,7 +7,7 @@ from tests.oracle import central_differences, design, slow_positions
 from tests.solvers.test_closed import LEG
 
 from kinefit.bodies import BodyState, load_body, parse_body
-from kinefit.bodies.closures import known_gear
+from kinefit.bodies.parts import known_gear
 from kinefit.correspondences import _kernels_closures as kernels
 from kinefit.correspondences import point_rows
 from kinefit.correspondences.closures import (

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body
-from kinefit.bodies.surfaces import nearest
+from kinefit.bodies.body_surfaces import nearest
 from kinefit.correspondences import anchored_rows, surface_rows
 from kinefit.correspondences.anchored import anchored
 from kinefit.errors import ObservationError

@@ -10,7 +10,7 @@ from benchmarks.bar_scene import bar_rig, draw_bar, wave_bar
 from tests.calibration.board import test_calibrate as boards
 
 import kinefit
-from kinefit.bodies.surfaces import sample
+from kinefit.bodies.body_surfaces import sample
 from kinefit.calibration.board.detection import Board
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Camera, Rig

@@ -8,7 +8,7 @@ import pytest
 from benchmarks.surface_body import cameras, moving_arm
 from benchmarks.textured import textured_picture
 
-from kinefit.bodies.surfaces.triangles import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.errors import ObservationError
 from kinefit.photogrammetry.returning import Vanished
 from kinefit.photogrammetry.spline_image import SplineImage

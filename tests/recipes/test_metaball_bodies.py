@@ -6,7 +6,8 @@ from benchmarks.metaballs import HELPS, arm, errors
 from tests.subject.test_metaballs import on
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.surfaces import Metaballs, nearest
+from kinefit.bodies.body_surfaces import nearest
+from kinefit.bodies.surfaces import Metaballs
 from kinefit.correspondences import field_rows, point_rows
 from kinefit.errors import ObservationError
 from kinefit.recipes.metaball_bodies import MetaballHelps, metaball_bodies

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body
-from kinefit.bodies.surfaces import nearest, sample
+from kinefit.bodies.body_surfaces import nearest, sample
 from kinefit.correspondences import joint_bands
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera, Rig

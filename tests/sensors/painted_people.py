@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import ColourFrame
 from kinefit.rendering import render_body

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from kinefit import MarkerFrame, Recording
-from kinefit.bodies.surfaces import body_mesh, segment_middles
+from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.surfaces import segment_middles
 from kinefit.frame.fit import rows_of
 from kinefit.frame.results import ROOT_PRIOR_STD
 from kinefit.geometry.camera import Rig

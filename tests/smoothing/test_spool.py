@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body
-from kinefit.bodies.surfaces import SurfaceAnchors
+from kinefit.bodies.body_surfaces import SurfaceAnchors
 from kinefit.errors import ExportError
 from kinefit.sensors.base import Leftover, Measurement, RowsOf
 from kinefit.smoothing.spool import Spool

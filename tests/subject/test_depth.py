@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from tests.tracking.depth_oracle import ARMS, BODY, camera, depth_of, facing
 
-from kinefit.bodies.surfaces import TaperedCylinder, nearest
+from kinefit.bodies.body_surfaces import nearest
+from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.errors import BodyError, ObservationError
 from kinefit.sensors.surfaces.depth_view import view_of
 from kinefit.subject.depth import fit_surfaces

@@ -5,7 +5,7 @@ import pytest
 from tests.sensors.scenes import ring
 from tests.subject import measured
 
-from kinefit.bodies.surfaces import sample
+from kinefit.bodies.body_surfaces import sample
 from kinefit.frame.routing import Sensors
 from kinefit.geometry import se3
 from kinefit.geometry.camera import Rig

@@ -7,7 +7,8 @@ import pytest
 from tests.sensors.scenes import posture, ring
 
 from kinefit.bodies import load_body
-from kinefit.bodies.surfaces import TaperedCylinder, body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.errors import BodyError
 from kinefit.observations import SilhouetteFrame
 from kinefit.rendering import render_body

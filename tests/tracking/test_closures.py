@@ -9,7 +9,7 @@ from tests.sensors.fakes import Told
 from tests.solvers.test_closed import LEG
 
 from kinefit.bodies import BodyState, load_body, parse_body
-from kinefit.bodies.closures import with_dimensions
+from kinefit.bodies.parts import with_dimensions
 from kinefit.correspondences import point_rows
 from kinefit.correspondences.closures import closed_at, closure_values, hard_equations, looped
 from kinefit.errors import BodyError

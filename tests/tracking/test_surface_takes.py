@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from benchmarks.surface_body import errors, moving_arm
 
-from kinefit.bodies.surfaces import sample
+from kinefit.bodies.body_surfaces import sample
 from kinefit.errors import FileError, KinefitError, ObservationError
 from kinefit.readers.take.file import read_take
 from kinefit.readers.tracked_points import read_surface_points

@@ -1,11 +1,11 @@
-"""Change a body while it is tracked: add and remove parts, replace surfaces, convert its state.
+"""Change a body: add and remove parts, replace surfaces, other dimensions and places of gear, convert its state.
 
 New parts are appended, so that indices of segments and coordinates do not change.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from kinefit._files import repeated
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.closures import without_landmarks
+from kinefit.bodies.closures import Closure, without_landmarks
 from kinefit.bodies.morphs.operators import Operator
 from kinefit.bodies.surfaces import MeshSurface, Surface
 from kinefit.bodies.tree import COLUMNS, BodyState, KinematicTree
-from kinefit.errors import BodyError
+from kinefit.errors import BodyError, check_choice
 from kinefit.geometry import se3
 
 # Corners of a box by the bits of their index (x: 1, y: 2, z: 4), two triangles a side, counter-clockwise from outside.
@@ -331,3 +331,88 @@ def parts_state(parts: Body, frames: NDArray) -> BodyState:
     a = np.where(locked, np.arctan2(turned[:, 1, 0], turned[:, 0, 0]), a)
     c = np.where(locked, 0.0, c)
     return BodyState(se3.transform(root, joints[0]), np.column_stack([slides, a, b, c]).ravel())
+
+
+def with_dimensions(body: Body, values: Mapping[str, float]) -> Body:
+    """Change dimensions of gear to values [m] or [rad]. Everything they move shifts by the change, whatever its scale.
+
+    Raises
+    ------
+    BodyError
+        A dimension that the body does not have, or a value that is not finite.
+    """
+    known = {d.name: d for d in body.dimensions}
+    for name in values:
+        check_choice(f"dimension of body '{body.name}' named", name, known, BodyError, remedy="Use one of these.")
+        if not np.isfinite(values[name]):
+            raise BodyError(f"dimension '{name}' of {values[name]}", remedy="Give metres, or radians.")
+    offsets, points = np.array(body.tree.offsets), np.array(body.landmarks.points)
+    closures = {c.name: c for c in body.closures}
+    moved = False
+    for name, value in values.items():
+        d, change = known[name], float(value) - known[name].value
+        if change == 0.0:
+            continue
+        shift, moved = change * np.array(d.along), True
+        for what in d.moves:
+            if what in closures:
+                closures[what] = _shifted(closures[what], shift, change * np.array(d.about))
+            elif what in body.landmarks.names:
+                points[body.landmarks.names.index(what)] += shift
+            else:
+                offsets[body.tree.segment(what)] += shift
+        known[name] = replace(d, value=float(value))
+    if not moved:
+        return body
+    landmarks = replace(body.landmarks, points=points)
+    sets = {name: _moved_points(s, body.landmarks, landmarks) for name, s in body.keypoint_sets.items()}
+    return replace(
+        body, tree=body.tree.with_offsets(offsets), landmarks=landmarks, keypoint_sets=sets,
+        closures=tuple(closures.values()), dimensions=tuple(known.values()),
+    )  # fmt: skip
+
+
+def _moved_points(points: PointSet, old: PointSet, new: PointSet) -> PointSet:
+    """Move the points that coincide with an old landmark to the new one."""
+    at = {(int(s), tuple(x)): k for k, (s, x) in enumerate(zip(old.segments, old.points))}
+    out = np.array(points.points)
+    for i, (s, x) in enumerate(zip(points.segments, points.points)):
+        k = at.get((int(s), tuple(x)))
+        if k is not None:
+            out[i] = new.points[k]
+    return replace(points, points=out)
+
+
+def _shifted(closure: Closure, shift: NDArray, turn: NDArray) -> Closure:
+    """Shift a closure's position by (3,) [m], and rotate its segment by a rotation vector (3,) [rad]."""
+    out = closure
+    if shift.any():
+        out = replace(out, place=tuple((np.array(out.place) + shift).tolist()))
+    if turn.any():
+        R = se3.exp_so3(turn) @ se3.exp_so3(np.array(out.turn))
+        out = replace(out, turn=tuple(se3.log_so3(R).tolist()))
+    return out
+
+
+def with_places(body: Body, places: Mapping[str, tuple[NDArray, NDArray]]) -> Body:
+    """Replace the position (3,) [m] and rotation vector (3,) [rad] in the world of some closures."""
+    out = []
+    for c in body.closures:
+        if c.name in places:
+            at, turn = places[c.name]
+            c = replace(c, place=tuple(np.asarray(at, float).tolist()), turn=tuple(np.asarray(turn, float).tolist()))
+        out.append(c)
+    return replace(body, closures=tuple(out))
+
+
+def known_gear(body: Body) -> Body:
+    """The body with all dimensions and positions in the world marked as known."""
+    return replace(
+        body, closures=tuple(replace(c, place_std=0.0, turn_std=0.0) for c in body.closures),
+        dimensions=tuple(replace(d, std=0.0) for d in body.dimensions),
+    )  # fmt: skip
+
+
+def has_unknown_gear(body: Body) -> bool:
+    """Whether a dimension or a position in the world is to be estimated."""
+    return any(c.place_std > 0.0 for c in body.closures) or any(d.std > 0.0 for d in body.dimensions)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState, PointSet
-from kinefit.bodies.closures import has_unknown_gear, with_dimensions
+from kinefit.bodies.parts import has_unknown_gear, with_dimensions
 from kinefit.correspondences import _kernels_closures
 from kinefit.errors import BodyError
 from kinefit.geometry import se3

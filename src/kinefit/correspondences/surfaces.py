@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import shaped
 from kinefit.bodies import Body, BodyState
+from kinefit.bodies.body_surfaces import nearest_lines
 from kinefit.bodies.surfaces import Metaballs
-from kinefit.bodies.surfaces.closest.nearest import nearest_lines
 from kinefit.bodies.surfaces.metaballs import LEVEL
 from kinefit.correspondences import _kernels, targets
 from kinefit.correspondences._kernels_surface import surface_rows as fill

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.bodies.surfaces import body_mesh, segment_middles
+from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.surfaces import segment_middles
 from kinefit.rows import DofRows, Rows
 from kinefit.sensors.base import Matched
 from kinefit.sensors.scene import Scene

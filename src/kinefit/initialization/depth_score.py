@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.bodies.limbs import limbs, of_fingers
-from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh
+from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.correspondences.occupancy.collisions import CollisionPairs, collision_pairs
 from kinefit.rendering import Canvas, rasterise
 from kinefit.sensors.surfaces import _kernels_depth_view as kernels

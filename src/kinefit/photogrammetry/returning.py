@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies.surfaces.closest.nearest import nearest_lines
+from kinefit.bodies.body_surfaces import nearest_lines
 from kinefit.geometry.camera import Rig
 from kinefit.motion import Motion
 from kinefit.photogrammetry.spline_image import SplineImage

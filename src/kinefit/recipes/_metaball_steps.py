@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.surfaces import Metaballs, nearest
+from kinefit.bodies.body_surfaces import nearest
+from kinefit.bodies.surfaces import Metaballs
 from kinefit.correspondences import field_rows
 from kinefit.correspondences.points import prior_rows
 from kinefit.errors import ObservationError

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, PointSet
-from kinefit.bodies.surfaces.closest.nearest import nearest_lines
+from kinefit.bodies.body_surfaces import nearest_lines
 from kinefit.images.depth import downsample
 
 

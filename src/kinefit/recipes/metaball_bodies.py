@@ -18,7 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import checked
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.surfaces import Metaballs, nearest
+from kinefit.bodies.body_surfaces import nearest
+from kinefit.bodies.surfaces import Metaballs
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import PointCloud

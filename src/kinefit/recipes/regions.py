@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.correspondences import point_rows
 from kinefit.correspondences.closures import closure_targets

@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from kinefit._arguments import check_shape, shaped
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.rendering import _kernels as kernels

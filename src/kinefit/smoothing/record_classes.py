@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from kinefit._records import Codec
 from kinefit.bodies import BodyState, PointSet
-from kinefit.bodies.surfaces import SurfaceAnchors
+from kinefit.bodies.body_surfaces import SurfaceAnchors
 from kinefit.correspondences.contours.rims import Rim
 from kinefit.frame.results import FrameResult
 from kinefit.images.regions import Ratios, RegionColours

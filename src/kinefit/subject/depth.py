@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.surfaces import SurfaceAnchors, TaperedCylinder
+from kinefit.bodies.body_surfaces import SurfaceAnchors
+from kinefit.bodies.surfaces import TaperedCylinder
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera, Rig
 from kinefit.observations import PointCloud

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.closures import Closure, Dimension, known_gear, with_dimensions, with_places
+from kinefit.bodies.closures import Closure, Dimension
+from kinefit.bodies.parts import known_gear, with_dimensions, with_places
 from kinefit.geometry import se3
 from kinefit.rows import AnyRows
 from kinefit.sensors.base import Matched

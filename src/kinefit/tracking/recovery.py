@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
 from kinefit.bodies.limbs import limbs
+from kinefit.frame.fit import Fitted
 from kinefit.frame.prediction import marginal_information
 from kinefit.frame.results import ROOT_PRIOR_STD, FrameResult, evidence_of, sum_evidence
+from kinefit.frame.routing import Sensors
 from kinefit.geometry.camera import Rig
 from kinefit.initialization.candidates import LEAP, dofs_of_limbs, find_limbs, starts_from_points, starts_from_views
 from kinefit.initialization.depth_search import PostureSearch
 from kinefit.sensors.base import Measurement
+from kinefit.sensors.scene import Scene
 from kinefit.sensors.settings import TrackSettings
 from kinefit.solvers.equations import inverse
-
-if TYPE_CHECKING:
-    from kinefit.tracking.tracker import Tracker
 
 _SPEED = 3.0  # [m/s] of a hand in a brisk wave; a limb found farther away than that must be the more certain
 _ANEW = 0.3  # [s] between frames in which a pose becomes any other: what limbs are not found is sought with the whole
@@ -33,6 +33,30 @@ _GAIN = 0.1  # of the support, by which a start must be better than what was tra
 def is_rare(rate: float) -> bool:
     """Whether images are so far apart (rate [Hz]) that a pose becomes any other from one to the next."""
     return rate < 1.0 / _ANEW
+
+
+class Searching(Protocol):
+    """What searches need of a tracker; see `Tracker`."""
+
+    sensors: Sensors
+    others: tuple[Scene, ...]
+
+    @property
+    def velocity(self) -> NDArray:
+        """(n,) [m, rad] a frame, of the last one."""
+        ...
+
+    def scene_of(self, state: BodyState, time: float = 0.0) -> Scene:
+        """The body in a state."""
+        ...
+
+    def fitted(self, time: float, frames: Sequence[Any], state: BodyState, held: Any = None) -> Fitted:
+        """What comes of a fit that begins at a state."""
+        ...
+
+    def restart(self, result: FrameResult, velocity: NDArray | None = None) -> None:
+        """Go on from a result, with a velocity (n,) [m, rad] a frame or an unknown one."""
+        ...
 
 
 class Recovery:
@@ -69,7 +93,7 @@ class Recovery:
         self._sought, self._lost_since = clocks
 
     def run(
-        self, tracker: Tracker, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],
+        self, tracker: Searching, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],
         result: FrameResult | None, guess: BodyState | None = None,
     ) -> FrameResult | None:  # fmt: skip
         """The result of one time, or a better one that was found; `guess`: where the body may be, by an earlier fit.
@@ -93,7 +117,7 @@ class Recovery:
         return replace(result, segment_quality=evidence.segment_quality(self.body.tree))
 
     def _best(
-        self, tracker: Tracker, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],
+        self, tracker: Searching, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],
         result: FrameResult | None, guess: BodyState | None,
     ) -> FrameResult | None:  # fmt: skip
         s, search = self.settings, None
@@ -137,7 +161,7 @@ class Recovery:
         return result
 
     def _from_points(
-        self, tracker: Tracker, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],
+        self, tracker: Searching, time: float, frames: Sequence[Any], measurements: Sequence[Measurement],
         result: FrameResult | None,
     ) -> FrameResult | None:  # fmt: skip
         """A start from points that are known in space, which costs little; from rays as often as a search runs."""
@@ -152,7 +176,7 @@ class Recovery:
         return result
 
     def _from_views(
-        self, tracker: Tracker, time: float, frames: Sequence[Any], result: FrameResult | None,
+        self, tracker: Searching, time: float, frames: Sequence[Any], result: FrameResult | None,
         search: PostureSearch | None = None,
     ) -> FrameResult | None:  # fmt: skip
         """A start from what shows a whole person; `search`, where much about the result is left out by it."""
@@ -183,7 +207,7 @@ class Recovery:
         return result
 
     def _limbs(
-        self, tracker: Tracker, time: float, frames: Sequence[Any], search: PostureSearch, result: FrameResult,
+        self, tracker: Searching, time: float, frames: Sequence[Any], search: PostureSearch, result: FrameResult,
         seek: NDArray, lost: NDArray,
     ) -> FrameResult:  # fmt: skip
         free = dofs_of_limbs(self.body, seek)
@@ -201,7 +225,7 @@ class Recovery:
         return result
 
     def _search(
-        self, tracker: Tracker, time: float, measurements: Sequence[Measurement], result: FrameResult
+        self, tracker: Searching, time: float, measurements: Sequence[Measurement], result: FrameResult
     ) -> PostureSearch | None:
         """In the first view that there is of what was measured."""
         scene = tracker.scene_of(result.state, time)
@@ -209,7 +233,7 @@ class Recovery:
         view = next((v for m in surfaces if (v := m.hints(scene).view) is not None), None)
         return None if view is None else PostureSearch(self.body, view, self.up, np.random.default_rng(0))
 
-    def _shown(self, tracker: Tracker, found: FrameResult, seek: NDArray) -> bool:
+    def _shown(self, tracker: Searching, found: FrameResult, seek: NDArray) -> bool:
         """Whether the surfaces that were seen show what was found: else it would hide, and not be found."""
         scene = tracker.scene_of(found.state, found.time)
         views = [m for m in found.matched if m.shows_surface]
@@ -226,7 +250,7 @@ class Recovery:
         return max(float(np.linalg.norm(gone, axis=1).max(initial=0.0)) / (_SPEED * elapsed), 1.0)
 
 
-def _against(tracker: Tracker, result: FrameResult) -> float:
+def _against(tracker: Searching, result: FrameResult) -> float:
     """How many points a result does not agree with; half for one that is ten deviations off."""
     scene = tracker.scene_of(result.state, result.time)
     square = np.concatenate([np.zeros(0), *(m.squares(scene) for m in result.matched if m.of_points)])

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
-from kinefit.bodies.closures import has_unknown_gear
 from kinefit.bodies.marker_sets import MarkerPlacement
+from kinefit.bodies.parts import has_unknown_gear
 from kinefit.errors import KinefitError, ObservationError, TrackingError
 from kinefit.findings import INVERTED
 from kinefit.frame.results import FrameResult

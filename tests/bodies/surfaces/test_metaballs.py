@@ -7,8 +7,9 @@ import pytest
 from tests.oracle import central_differences, design
 
 from kinefit.bodies import BodyState, load_body
+from kinefit.bodies.body_surfaces import SurfaceAnchors, nearest
 from kinefit.bodies.serial import save_body, saved_body
-from kinefit.bodies.surfaces import Metaballs, SurfaceAnchors, nearest
+from kinefit.bodies.surfaces import Metaballs
 from kinefit.bodies.surfaces.closest._kernels_metaballs import field
 from kinefit.bodies.surfaces.metaballs import pack_balls
 from kinefit.correspondences import surface_rows

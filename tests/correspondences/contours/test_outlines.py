@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kinefit.bodies import load_body
-from kinefit.bodies.surfaces import body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.correspondences.contours.outlines import outline_pairs, outline_rows
 from kinefit.correspondences.contours.rims import RimFinder
 from kinefit.errors import ObservationError

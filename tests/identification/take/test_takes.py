@@ -6,7 +6,7 @@ from benchmarks.marker_takes import CASES, broken, load, training, truth_of
 
 from kinefit.bodies.marker_sets import placement
 from kinefit.errors import ObservationError
-from kinefit.identification.frame.identify import Identification
+from kinefit.identification.frame.beliefs import Identification
 from kinefit.identification.model.learn import learn_model
 from kinefit.identification.take.consistency import Consistency, fill_gaps, gaps_of
 from kinefit.identification.take.takes import TakeSettings, identify_people, identify_take, one_after_the_other

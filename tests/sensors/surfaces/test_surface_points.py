@@ -6,7 +6,7 @@ from tests.oracle import central_differences, design
 from tests.sensors.scenes import at, posture
 
 from kinefit.bodies import BodyState, load_body
-from kinefit.bodies.surfaces import sample
+from kinefit.bodies.body_surfaces import sample
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Rig
 from kinefit.observations import SurfacePointFrame

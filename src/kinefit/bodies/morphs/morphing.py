@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kinefit.bodies.body import Body, PointSet
+from kinefit.bodies.body_surfaces import body_mesh
 from kinefit.bodies.morphs.operators import (
     GlobalMorph,
     JointMotion,
@@ -27,7 +28,7 @@ from kinefit.bodies.morphs.operators import (
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.bodies.surfaces.skins import _kernels_skinning as kernels
 from kinefit.bodies.surfaces.skins.skinning import SkinnedMesh
-from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh, triangles
+from kinefit.bodies.surfaces.triangles import BodyMesh, triangles
 from kinefit.bodies.tree import BodyState
 from kinefit.errors import BodyError, choices
 from kinefit.geometry import se3

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from kinefit._arguments import checked
 from kinefit._files import parse_toml, read_text, record_of
 from kinefit.bodies.body import Body, PointSet
-from kinefit.bodies.closures import KINDS, Closure, Dimension, with_dimensions
+from kinefit.bodies.closures import KINDS, Closure, Dimension
 from kinefit.bodies.morphs.morph_files import morphs_of
+from kinefit.bodies.parts import with_dimensions
 from kinefit.bodies.surfaces.files import surfaces_of
 from kinefit.bodies.surfaces.skins.skinning import skin_of
 from kinefit.bodies.toml.records import (

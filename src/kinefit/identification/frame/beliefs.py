@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +11,6 @@ from numpy.typing import NDArray
 from kinefit.identification.frame._kernels_evidence import least_squares
 from kinefit.identification.frame.tables import segment_tables
 from kinefit.identification.model.model import MarkerModel
-
-if TYPE_CHECKING:
-    from kinefit.identification.frame.identify import Identification
 
 PRIOR_PRESENCE = 0.95
 """Prior share of frames that show a label."""
@@ -31,6 +27,28 @@ MAX_NOISE = 2.5
 
 MIN_CONFIDENCE = 0.9
 """Only labels of this confidence count for the noise: less certain ones were selected by a good fit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """Labels of one frame's points.
+
+    Parameters
+    ----------
+    assignment : (M,) int, the point of each label of the model; -1 if missing or unknown
+    confidence : (M,) probability, 0 to 1, that `guess` is right; 0 without one
+    cost : -log likelihood ratio of the best explanation to no point being a marker
+    ambiguous : whether a label has a guess below the required probability
+    scale : estimated noise, as a factor on the model's deviations
+    guess : (M,) int, the most probable point of each label, however improbable; -1 for none
+    """
+
+    assignment: NDArray
+    confidence: NDArray
+    cost: float
+    ambiguous: bool
+    scale: float = 1.0
+    guess: NDArray | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from kinefit._arguments import checked, shaped
 from kinefit.identification.frame._kernels_evidence import place_joint
 from kinefit.identification.frame._kernels_posture import turn_costs
-from kinefit.identification.frame.beliefs import Beliefs
+from kinefit.identification.frame.beliefs import Beliefs, Identification
 from kinefit.identification.frame.explain import Solution, explain, gain_of, refine, solution
 from kinefit.identification.frame.polish import MAX_RIVAL_COST, labels_of, rivals
 from kinefit.identification.frame.search import LabelSearch, UnlabelledFrame
@@ -61,28 +61,6 @@ class IdentifySettings:
     miss: float = 0.05
     searches: int = 60
     work: float = 1.3e8
-
-
-@dataclass(frozen=True, eq=False)
-class Identification:
-    """Labels of one frame's points.
-
-    Parameters
-    ----------
-    assignment : (M,) int, the point of each label of the model; -1 if missing or unknown
-    confidence : (M,) probability, 0 to 1, that `guess` is right; 0 without one
-    cost : -log likelihood ratio of the best explanation to no point being a marker
-    ambiguous : whether a label has a guess below the required probability
-    scale : estimated noise, as a factor on the model's deviations
-    guess : (M,) int, the most probable point of each label, however improbable; -1 for none
-    """
-
-    assignment: NDArray
-    confidence: NDArray
-    cost: float
-    ambiguous: bool
-    scale: float = 1.0
-    guess: NDArray | None = None
 
 
 @checked

@@ -7,8 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.identification.frame.beliefs import Beliefs, learn_beliefs
-from kinefit.identification.frame.identify import Identification
+from kinefit.identification.frame.beliefs import Beliefs, Identification, learn_beliefs
 from kinefit.identification.model.model import MarkerModel
 from kinefit.identification.take.consistency import Consistency
 from kinefit.identification.take.votes import Pieces, Votes, assign_pieces

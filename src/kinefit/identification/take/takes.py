@@ -13,8 +13,8 @@ from kinefit._arguments import checked
 from kinefit.bodies.marker_sets import find_marker_set
 from kinefit.errors import ObservationError, located
 from kinefit.findings import runs_of
-from kinefit.identification.frame.beliefs import Beliefs
-from kinefit.identification.frame.identify import Identification, IdentifySettings, identify
+from kinefit.identification.frame.beliefs import Beliefs, Identification
+from kinefit.identification.frame.identify import IdentifySettings, identify
 from kinefit.identification.model.model import MarkerModel, load_model
 from kinefit.identification.take.consistency import fill_gaps
 from kinefit.identification.take.naming import INLIER_SIGMAS, OUTLIER_SIGMAS, Naming, Step

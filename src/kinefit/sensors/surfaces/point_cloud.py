@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from kinefit.bodies.surfaces import SurfaceAnchors
+from kinefit.bodies.body_surfaces import SurfaceAnchors
 from kinefit.correspondences import anchored_rows, free_space_rows, surface_rows, target_rows
 from kinefit.correspondences.anchored import anchored
 from kinefit.correspondences.contours.morphed import on_moved_joints

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kinefit.bodies.surfaces import SurfaceAnchors
+from kinefit.bodies.body_surfaces import SurfaceAnchors
 from kinefit.correspondences import surface_rows
 from kinefit.errors import ObservationError
 from kinefit.observations import SurfacePointFrame

@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body, BodyState
+from kinefit.bodies.body_surfaces import body_mesh, sample
 from kinefit.bodies.limbs import knuckles, limbs, of_fingers
 from kinefit.bodies.morphs.morphing import MorphedPose, Morphing
-from kinefit.bodies.surfaces import BodyMesh, body_mesh, sample
+from kinefit.bodies.surfaces import BodyMesh
 from kinefit.correspondences.contours.rims import RimFinder
 from kinefit.correspondences.occupancy.depth_image import SurfaceSamples
 from kinefit.correspondences.targets import check_depth_image

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kinefit.bodies import Body
-from kinefit.bodies.surfaces.triangles import BodyMesh, body_mesh
+from kinefit.bodies.body_surfaces import body_mesh
+from kinefit.bodies.surfaces.triangles import BodyMesh
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
 from kinefit.motion import UP_AXES, Motion

@@ -7,7 +7,7 @@ import pytest
 from tests.bodies.surfaces.shapes import ball, points_on
 
 from kinefit.bodies import MeshSurface, TaperedCylinder, load_body
-from kinefit.bodies.surfaces import SurfaceAnchors, sample
+from kinefit.bodies.body_surfaces import SurfaceAnchors, sample
 from kinefit.bodies.surfaces.closest._kernels_grid import nearest_faces
 from kinefit.errors import BodyError
 

@@ -10,18 +10,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kinefit.bodies.body import Body
 from kinefit.bodies.surfaces.closest._kernels_grid import nearest_faces
 from kinefit.bodies.surfaces.cylinder import TaperedCylinder
 from kinefit.bodies.surfaces.mesh import MeshSurface
 from kinefit.errors import BodyError
-
-if TYPE_CHECKING:
-    from kinefit.bodies.body import Body
 
 
 class _SurfacePlaces(NamedTuple):
