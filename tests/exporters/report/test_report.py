@@ -299,6 +299,41 @@ def test_doubt_comes_before_results_and_names_its_severity(tmp_path):
     assert '<div class="callout good">' in page_of(good_motion(), tmp_path)
 
 
+def lines(text):
+    """The five lines of the summary, by their names."""
+    short = text[text.index("In short"):]
+    short = short[:short.index("</div></div>")]
+    found = re.findall(r"<p><strong>([^<]*): </strong>(.*?)</p>", short)
+    return {name: re.sub("<[^>]*>", "", line) for name, line in found}
+
+
+def test_the_page_begins_with_what_was_found_how_sure_and_what_to_do(tmp_path):
+    motion = smooth_motion(60)
+    motion = replace(motion, quality=np.ones(60), dof_std=np.full_like(motion.dof_std, np.radians(2.0)))
+    text = page_of(motion, tmp_path)
+    found = lines(text)
+    assert list(found) == ["Recorded", "Moved most", "Left and right", "How sure", "What to do"]
+    assert "60 frames" in found["Recorded"] and "tracked in 100 %" in found["Recorded"]
+    assert found["Moved most"].count("±") == 3 and "range of motion [°]" in text
+    assert "nothing. The subject" in found["What to do"]
+    assert "were independent: an upper bound" in text  # it tells no errors that frames share
+    first = np.zeros(60, int)
+    angles = motion.angles[first] + 0.1 * motion.angles
+    still = replace(motion, angles=angles, Ts_world_root=motion.Ts_world_root[first])
+    unsure = page_of(replace(still, dof_std=np.full_like(motion.dof_std, np.radians(40.0))), tmp_path)
+    assert lines(unsure)["Moved most"] == "no angle moved by twice its error bar."
+    assert "range of motion [°]" not in unsure and "Moved less than their error bars: " in unsure
+
+
+def test_a_side_that_moves_farther_is_told(tmp_path):
+    motion = smooth_motion(60)
+    angles, knee = np.array(motion.angles), motion.body.tree.coordinate("knee_angle_l")
+    angles[:, knee] = 0.8 + 0.7 * np.sin(np.linspace(0, 6, 60))
+    angles[:, motion.body.tree.coordinate("knee_angle_r")] = 0.8
+    motion = replace(motion, angles=angles, quality=np.ones(60), dof_std=np.full_like(motion.dof_std, np.radians(1.0)))
+    assert "knee flexion (80 ± 4°)" in lines(page_of(motion, tmp_path))["Left and right"]
+
+
 def test_a_walk_has_cycles_and_another_motion_none(tmp_path):
     text = page_of(walk(), tmp_path)
     assert "Gait: " in text and "stride time [s]" in text and "stride length [m]" in text
@@ -393,10 +428,10 @@ def test_methods_tell_what_the_provenance_knows_and_no_more(tmp_path):
     motion = good_motion()
     bare = " ".join(methods_sentences(motion, 0))
     assert "cam0, cam1 and cam2" in bare and "No moment was flagged" in bare
-    assert "smoothed" not in bare and "SHA-256" not in bare
+    assert "estimated together" not in bare and "SHA-256" not in bare
     told = {
         "kinefit": "9.9", "tracking": {"poor": 0.5},
-        "smoothing": {"window": 500, "pixel_sigma": {"cam0": {"nose": 4.0, "neck": 5.0}}},
+        "smoothing": {"acceleration_memory": 0.2, "pixel_sigma": {"cam0": {"nose": 4.0, "neck": 5.0}}},
         "calibration": {"file": "calib.toml", "sha256": "ab" * 32},
         "keypoints": [{"camera": "cam0", "format": "openpose", "set": "BODY_25B", "accuracy": 8.0}],
     }  # fmt: skip
@@ -404,7 +439,8 @@ def test_methods_tell_what_the_provenance_knows_and_no_more(tmp_path):
     for part in (
         "kinefit 9.9", "(OpenPose (Cao et al. 2021, IEEE TPAMI 43:172) BODY_25B)",
         "a stated standard deviation of 8 px", "calib.toml (SHA-256 abababababababab…)",
-        "window 500", "every keypoint (median 4.5 px) was estimated", "poor 0.5", "3 moments were",
+        "random joint accelerations that last 0.2 s; ", "every keypoint (median 4.5 px) was estimated",
+            "poor 0.5", "3 moments were",
     ):  # fmt: skip
         assert part in text, part
     page = page_of(replace(motion, provenance=told), tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -230,12 +231,11 @@ def ranges_table(motion: Motion) -> p.Html:
         if "" in of:
             single.append((name, *_cells(of[""])))
         else:
-            left, right = of.get("left"), of.get("right")
-            paired.append((name, *_cells(left), *_cells(right), _difference(motion, left, right)))
+            paired.append((name, *_cells(of.get("left")), *_cells(of.get("right"))))
     parts = []
     if paired:
         columns = [f"{side} {what}" for side in ("left", "right") for what in _HEAD]
-        parts.append(p.table(["[°], [°/s]", *columns, "range, left minus right"], paired))
+        parts.append(p.table(["[°], [°/s]", *columns], paired))
     if single:
         parts.append(p.table(["[°], [°/s]", *_HEAD], single))
     return p.joined(*parts)
@@ -250,12 +250,55 @@ def _cells(found: Extremes | None) -> tuple[str, ...]:
     return (*(with_error(*pair) for pair in (found.lowest, found.highest)), with_error(*found.span) + part, fastest)
 
 
-def _difference(motion: Motion, left: Extremes | None, right: Extremes | None) -> str:
-    if left is None or right is None:
-        return "–"
+@dataclass(frozen=True)
+class Range:
+    """Range of motion of one angle on both sides, or of the body's middle, each with two standard deviations [deg].
+
+    Parameters
+    ----------
+    name : of the angle, in words
+    sides : {"left", "right", or "": (range, two standard deviations)} of those that were observed
+    difference : left minus right; None where one of them was not observed
+    """
+
+    name: str
+    sides: Mapping[str, tuple[float, float]]
+    difference: tuple[float, float] | None
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether the angle moved by more than the error bar on any side."""
+        return any(span > twice for span, twice in self.sides.values())
+
+
+def all_ranges(motion: Motion) -> list[Range]:
+    """Ranges of all angles that were observed."""
+    out = []
+    for stem, of in ranges_of(motion).items():
+        sides = {side: found.span for side, found in of.items() if found is not None}
+        if sides:
+            out.append(Range(spoken(stem), sides, _difference(motion, of.get("left"), of.get("right"))))
+    return out
+
+
+def short_table(found: Sequence[Range]) -> p.Html:
+    """Ranges, left beside right, and their difference."""
+    cells = [
+        [with_error(*pair) if pair else "" for pair in (*map(one.sides.get, ("left", "right", "")), one.difference)]
+        for one in found
+    ]
+    names = [one.name[0].upper() + one.name[1:] for one in found]
+    columns = ["range of motion [°]", "left", "right", "middle", "left minus right"]
+    return p.table(columns, [(name, *row) for name, row in zip(names, cells)])
+
+
+def _difference(motion: Motion, left: Extremes | None, right: Extremes | None) -> tuple[float, float] | None:
+    """Range of the left side minus that of the right, with two standard deviations [deg]."""
+    if left is None or right is None or left.coordinate is None or right.coordinate is None:
+        return None
     frames, coordinates = zip(*((f, side.coordinate) for side in (left, right) for f in side.ends[::-1]))
     std = motion.std_of(frames, coordinates, (1, -1, -1, 1))
-    return with_error(left.span[0] - right.span[0], 2.0 * float(np.degrees(std)))
+    return left.span[0] - right.span[0], 2.0 * float(np.degrees(std))
 
 
 def with_error(value: float, twice: float) -> str:

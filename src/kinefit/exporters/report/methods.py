@@ -27,7 +27,13 @@ _DETECTORS = {
 def methods(motion: Motion, date: str, doubtful: int) -> list[p.Html]:
     """A paragraph for a paper and the same as JSON; only what the motion and its provenance tell."""
     text = " ".join(methods_sentences(motion, doubtful))
+    facts = {
+        "Body": f"{motion.body.name}, {len(motion.body.tree.coordinates)} angles",
+        "Sensors": f"{len(motion.residuals)}",
+        "Quality, mean (0–1)": f"{motion.quality.mean():.2f}", "Quality, lowest": f"{motion.quality.min():.2f}",
+    }  # fmt: skip
     return [
+        p.facts(facts),
         p.paragraph("To paste into a paper:", small=True), p.quote(text),
         p.paragraph(
             "Error bars are standard deviations. They include jitter and systematic errors of the keypoints, "
@@ -142,8 +148,11 @@ def _settings(provenance: Mapping[str, Any]) -> list[str]:
     out = []
     smoothing = provenance.get("smoothing")
     if smoothing:
-        how = _listing(smoothing) if isinstance(smoothing, Mapping) else ""
-        out.append(f"The whole take was smoothed in one solve{f' ({how})' if how else ''}{_estimated(smoothing)}.")
+        of = smoothing if isinstance(smoothing, Mapping) else {}
+        lasts = f" that last {of['acceleration_memory']:g} s" if "acceleration_memory" in of else ""
+        out.append(
+            f"All frames were estimated together, with a prior of random joint accelerations{lasts}{_estimated(of)}."
+        )
     if isinstance(provenance.get("tracking"), Mapping):
         out.append(f"Settings of the tracking: {_listing(provenance['tracking'])}.")
     if provenance.get("height"):
@@ -151,11 +160,9 @@ def _settings(provenance: Mapping[str, Any]) -> list[str]:
     return out
 
 
-def _estimated(smoothing: Any) -> str:
+def _estimated(smoothing: Mapping[str, Any]) -> str:
     """What smoothing found out from the take itself."""
-    if not isinstance(smoothing, Mapping):
-        return ""
-    parts = ["the strength of its prior on accelerations"] if isinstance(smoothing.get("acceleration"), Mapping) else []
+    parts = ["the size of the accelerations"] if isinstance(smoothing.get("acceleration"), Mapping) else []
     sigma = smoothing.get("pixel_sigma")
     values = [v for found in sigma.values() for v in found.values()] if isinstance(sigma, Mapping) else []
     if values:

@@ -56,7 +56,13 @@
   });
   // The library is unpacked when the page has come to rest, so that printing finds it ready.
   if (source) addEventListener("load", () => setTimeout(plotly, 500));
-  addEventListener("beforeprint", () => document.querySelectorAll(".plot").forEach(draw));
+  // On paper a plot is as wide as its column there (page.css: zoom), not as it was on the screen.
+  const plots = [...document.querySelectorAll(".plot")];
+  const sized = size => place => place.dataset.drawn && window.Plotly?.relayout(place, size(place));
+  const paper = sized(place => ({ autosize: false, width: place.closest(".chooser") ? 690 : 980 }));
+  const screen = sized(() => ({ autosize: true, width: null }));
+  addEventListener("beforeprint", () => plots.forEach(place => draw(place).then(() => paper(place))));
+  addEventListener("afterprint", () => plots.forEach(screen));
 
   function seek(time) { document.dispatchEvent(new CustomEvent("seek", { detail: time })); }
   document.querySelectorAll("a.seek").forEach(a => a.addEventListener("click", () => seek(+a.dataset.time)));

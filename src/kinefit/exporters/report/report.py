@@ -2,9 +2,9 @@
 
     write_report(motion, "report.html")
 
-Who, when and how far every joint moved come first, in a sentence beside them how far that can be trusted; then the
-moving figure, angles and cycles; then what is doubtful, and why. Angles are those of OpenSim in degrees, with ±2
-standard deviations; what nothing observes is said to be so. Cycles are shown only where the movement repeats itself.
+What moved, how sure that is and what to do come first, in five lines and a table of ranges; then the moving figure,
+angles and cycles; then what the measurements do not tell, and what is doubtful. Angles are those of OpenSim in degrees,
+with ±2 standard deviations; what nothing observes is said to be so. Cycles are shown only where the movement repeats.
 """
 
 from __future__ import annotations
@@ -20,7 +20,15 @@ from kinefit._arguments import checked
 from kinefit._files import write_text
 from kinefit.errors import ExportError, choices
 from kinefit.exporters.report import page as p
-from kinefit.exporters.report.angles import cycle_plots, joint_plots, ranges_table
+from kinefit.exporters.report.angles import (
+    Range,
+    all_ranges,
+    cycle_plots,
+    joint_plots,
+    ranges_table,
+    short_table,
+    with_error,
+)
 from kinefit.exporters.report.cycles import Cycles, Norms, find_cycles, gait_numbers
 from kinefit.exporters.report.figure import figure
 from kinefit.exporters.report.fit import overall_median, point_table, quality_plot, sensor_fits, sensor_table
@@ -109,6 +117,7 @@ def write_report(
             "fit. Click a time on this page, or a plot over time, to move the figure to that time.", small=True)),
         p.section("Angles", *_angles(motion)),
         p.section("Cycles", *_cycles(motion, cycles, norms or {})),
+        *([p.section("Limits", *limits)] if (limits := _limits(motion)) else []),
         p.section("Doubtful moments", *flagged(motion, moments, shown, width)),
         p.section("Fit to the measurements", *_fit(motion, moments)),
     ]  # fmt: skip
@@ -143,20 +152,99 @@ def _subtitle(motion: Motion, date: str) -> str:
 def _summary(
     motion: Motion, moments: Sequence[Moment], findings: Sequence[tuple[str, str, str]], date: str
 ) -> p.Section:
-    unobserved = float(np.mean(motion.quality <= 0))
+    """What was found, how sure it is and what to do, in five lines and one table of ranges."""
+    found, session = all_ranges(motion), motion.provenance.get("session")
+    sure = [one for one in found if one.is_sure]
+    severity, trust = _trust(motion, moments)
+    facts = {}
+    if isinstance(session, Mapping):
+        facts = {SESSION.get(key, str(key)): str(value) for key, value in session.items() if value}
+    people = motion.provenance.get("people")
+    if isinstance(people, Mapping):
+        facts["Person"] = f"{people['followed']} of {people['in view']} in view"
+    tall = f", {motion.body.stature:.2f} m tall," if motion.body.stature else ""
+    seen = float(np.mean(motion.quality > 0))
+    lines = {
+        "Recorded": f"{len(motion) / motion.rate:.2f} s, {len(motion)} frames at {motion.rate:g} Hz. "
+                    f"The person{tall} was tracked in {100 * seen:.0f} % of them.",
+        "Moved most": _moved_most(sure), "Left and right": _sides(found), "How sure": p.inline(trust),
+        "What to do": _what_to_do(motion, moments),
+    }  # fmt: skip
+    least = [one.name for one in found if not one.is_sure]
+    shared = motion.lasting is not None
+    about = (
+        "± is two standard deviations: nineteen of twenty such intervals hold the true value. Of a range it is that of "
+        "the difference of its ends" + (", without the errors that both have in common." if shared else
+        ", as if their errors were independent: an upper bound. This motion does not tell what errors they share.")
+    )  # fmt: skip
+    more = (
+        "*: observed in only some of the frames. An angle with a standard deviation above 45° counts as not observed. "
+        "± of the fastest speed is from the covariance of adjacent frames after smoothing; nine tenths of the frames "
+        "have less."
+    )
+    return p.section(
+        "Summary", *([p.facts(facts)] if facts else []),
+        p.callout(severity, "In short", *(p.paragraph(p.strong(f"{name}: "), text) for name, text in lines.items())),
+        *(p.callout(*finding) for finding in findings),
+        *([short_table(sure)] if sure else []),
+        *([f"Moved less than their error bars: {listed(least, 60)}."] if least else []), p.paragraph(about, small=True),
+        p.folded("Lowest, highest, fastest of every angle", ranges_table(motion), p.paragraph(more, small=True)),
+        p.folded("Lengths of the body", lengths_table(motion)),
+    )  # fmt: skip
+
+
+def _trust(motion: Motion, moments: Sequence[Moment]) -> tuple[str, str]:
+    """How far the motion can be trusted: severity of a box, and the sentence."""
     poor = float(np.mean(motion.quality < POORLY_SUPPORTED))
+    unobserved = float(np.mean(motion.quality <= 0))
     wrong = unobserved > 0.1 or poor > 0.5 or of_provenance(motion.provenance)
     severity = "bad" if wrong else "warning" if moments else "good"
-    severity = severity if motion.residuals else "note"
-    notes: list[str] = []
+    parts = [trust_sentence(motion, moments)]
     if moments:
-        notes.append(p.paragraph("See ", p.link("doubtful-moments", "where and why"), "."))
+        parts += [" See ", p.link("doubtful-moments", "where and why"), "."]
     if unobserved:
-        notes.append(f"In {100 * unobserved:.0f} % of the frames no person was observed.")
-    if throughout := throughout_sentence(motion):
-        notes.append(f"Uncertain in most frames, at the far end (2 σ): {throughout}.")
-    parts = [p.callout(severity, trust_sentence(motion, moments), *notes)]
-    parts += [p.callout(severity, title, text) for severity, title, text in findings]
+        parts.append(f" In {100 * unobserved:.0f} % of the frames no person was observed.")
+    return severity if motion.residuals else "note", p.joined(*parts)
+
+
+def _moved_most(sure: Sequence[Range]) -> str:
+    """The three largest ranges of those that are twice their error bars."""
+    each = [(span, f"{side} {one.name}".strip(), twice) for one in sure for side, (span, twice) in one.sides.items()]
+    most = sorted((one for one in each if one[0] > 2.0 * one[2]), reverse=True)[:3]
+    if not most:
+        return "no angle moved by twice its error bar."
+    return listed([f"{name} ({with_error(span, twice)}°)" for span, name, twice in most]) + "."
+
+
+def _sides(found: Sequence[Range]) -> str:
+    """Ranges of left and right that differ by more than the error bar."""
+    differ = [(one.name, one.difference) for one in found if one.difference is not None]
+    apart = [(name, pair) for name, pair in differ if abs(pair[0]) > pair[1]]
+    if not differ:
+        return "no angle was observed on both sides."
+    if not apart:
+        least = min(twice for _, (_, twice) in differ)
+        return f"no range differs by more than its error bar; the least difference that would count is {least:.0f}°."
+    return "ranges differ in " + listed([f"{name} ({with_error(*pair)}°)" for name, pair in apart], 6) + "."
+
+
+def _what_to_do(motion: Motion, moments: Sequence[Moment]) -> str:
+    """The first remedy."""
+    faults = [fault.remedy for fault in of_provenance(motion.provenance) if fault.remedy]
+    if faults:
+        return faults[0]
+    if any(f.is_shifted for f in sensor_fits(motion)):
+        return "run kinefit check on the take: the calibration or the image size does not fit (see Limits)."
+    if moments:
+        return "look at the doubtful moments before you use what happens in them."
+    if not motion.provenance.get("session"):
+        return "nothing. The subject, the date and the movement are not stated: write them into [session] of the take."
+    return "nothing."
+
+
+def _limits(motion: Motion) -> list[p.Html]:
+    """What the measurements do not tell, and what does not fit."""
+    parts = []
     shifted = [f for f in sensor_fits(motion) if f.is_shifted]
     if shifted:
         shifts = ", ".join(f"{f.name} ({f.shift[0]:+.1f}, {f.shift[1]:+.1f}) px" for f in shifted)
@@ -165,6 +253,8 @@ def _summary(
             "image size, not to the person: run kinefit check on the take."
         )
         parts.append(p.callout("warning", f"Constant shift in {shifts}.", text))
+    if throughout := throughout_sentence(motion):
+        parts.append(p.callout("note", f"Uncertain in most frames, at the far end (2 σ): {throughout}."))
     blind = never_observed(motion)
     if blind:
         text = "No measurement observes them. Their values come from the prior and are no results."
@@ -182,37 +272,7 @@ def _summary(
             "of the pelvis would determine the shares."
         )
         parts.append(p.callout("note", title, text))
-    body = motion.body
-    session, facts = motion.provenance.get("session"), {}
-    if isinstance(session, Mapping):
-        facts = {SESSION.get(key, str(key)): str(value) for key, value in session.items() if value}
-    people = motion.provenance.get("people")
-    if isinstance(people, Mapping):
-        facts["Person"] = f"{people['followed']} of {people['in view']} in view"
-    facts |= {
-        "Date of the report": date, "Duration": f"{len(motion) / motion.rate:.2f} s", "Frames": f"{len(motion)}",
-        "Rate": f"{motion.rate:g} Hz", "Body": f"{body.name}, {len(body.tree.coordinates)} angles",
-        "Sensors": f"{len(motion.residuals)}", "Quality, mean (0–1)": f"{motion.quality.mean():.2f}",
-        "Quality, lowest": f"{motion.quality.min():.2f}",
-    }  # fmt: skip
-    if body.stature:
-        facts["Stature of the body"] = f"{body.stature:.2f} m"
-    about = (
-        "± is two standard deviations. Of a range it assumes independent errors at its ends: an upper bound if errors "
-        "are systematic. *: observed in only some of the frames."
-    )
-    more = (
-        "An angle with a standard deviation above 45° counts as not observed. ± of the fastest speed is from the "
-        "covariance of adjacent frames after smoothing; nine tenths of the frames have less."
-    )
-    hint = [] if session else [p.paragraph(
-        "The subject, the date and the movement are not stated. Write them into [session] of the take.", small=True
-    )]  # fmt: skip
-    return p.section(
-        "Summary", p.facts(facts), *hint, *parts, p.heading("How far every joint moved"),
-        p.paragraph(about, small=True), ranges_table(motion), p.paragraph(more, small=True),
-        p.folded("Lengths of the body", lengths_table(motion)),
-    )  # fmt: skip
+    return parts
 
 
 def _angles(motion: Motion) -> list[p.Html]:
