@@ -11,7 +11,8 @@ from kinefit.bodies import load_body
 from kinefit.bodies.marker_sets import placement
 from kinefit.cli import main
 from kinefit.readers.annotations import read_static_points
-from kinefit.readers.take.entries import TABLES
+from kinefit.readers.take.entries import TABLES as OWN_TABLES
+from kinefit.readers.take.kinds import BUILT_IN
 from kinefit.readers.take.file import read_take
 
 CAMERA = '[calibration]\nfile = "calibration.toml"\n[[camera]]\nname = "cam01"\nvideo = "cam01.mp4"\n'

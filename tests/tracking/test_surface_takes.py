@@ -49,7 +49,7 @@ def test_points_of_a_table_move_the_body(taken, tmp_path):
     names = list(truth.body.tree.coordinates)
     off = np.degrees(np.abs(found.angles - truth.angles)).max(axis=0)
     assert off[names.index("elbow_flex_r")] < 1.0 and off[names.index("pro_sup_r")] < 2.0
-    assert list(found.residuals) == ["surface_points"] and len(seen.surface_points[0]) == 12
+    assert list(found.residuals) == ["surface_points"] and len(seen.sensors[0].recording) == 12
     with Checkpoint(tmp_path / "unfinished", key_of(take)) as unfinished:  # what the sensor learnt is kept
         again, _ = track_take(take, checkpoint=unfinished)
     assert np.array_equal(again.angles, found.angles)

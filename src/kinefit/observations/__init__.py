@@ -32,6 +32,7 @@ from kinefit.observations.videos import (
     KeypointVideo,
     LineVideo,
     NamedMarkers,
+    SensorRecording,
     SilhouetteVideo,
     SurfacePointVideo,
 )
@@ -40,6 +41,7 @@ __all__ = [
     "KEYPOINTS", "KEYPOINT_SIGMA", "MEDIAPIPE_33", "MEDIAPIPE_75", "MEDIAPIPE_478", "MEDIAPIPE_HAND_21",
     "BodyTrackerFrame", "BodyTrackerVideo", "ClickFrame", "ClickVideo", "CloudVideo", "ColourFrame", "ColourVideo",
     "DepthFrame", "DepthVideo", "Detections", "Frame", "KeypointFrame", "KeypointVideo", "Keypoints", "LiftedFrame",
-    "LineFrame", "LineVideo", "MarkerEvent", "MarkerFrame", "Markers", "NamedMarkers", "PointCloud", "SilhouetteFrame",
-    "SilhouetteVideo", "SkeletonMotion", "SurfacePointFrame", "SurfacePointVideo", "by_record", "sensor_of",
+    "LineFrame", "LineVideo", "MarkerEvent", "MarkerFrame", "Markers", "NamedMarkers", "PointCloud", "SensorRecording",
+    "SilhouetteFrame", "SilhouetteVideo", "SkeletonMotion", "SurfacePointFrame", "SurfacePointVideo", "by_record",
+    "sensor_of",
 ]

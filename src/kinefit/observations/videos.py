@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,15 +58,37 @@ def checked_times(times: NDArray, sensor: str, source: str = "") -> NDArray:
 
 
 @dataclass(frozen=True, eq=False)
-class _Recording:
-    """Base of recordings of one sensor with a time for each frame."""
+class SensorRecording(ABC):
+    """Base of recordings of one sensor with a time for each frame.
+
+    Parameters
+    ----------
+    sensor : name
+    rate : float [Hz]; None: that of the median step of the times
+    times : (F,) [s] in the take; strictly increasing
+
+    Raises
+    ------
+    ObservationError
+        Times that do not increase; a single time without a rate.
+    """
 
     sensor: str
     rate: float
     times: NDArray
 
     def __post_init__(self) -> None:
-        freeze(self, times=checked_times(self.times, self.sensor, getattr(self, "source", "")))
+        source = getattr(self, "source", "")
+        freeze(self, times=checked_times(self.times, self.sensor, source))
+        if self.rate is None:
+            if len(self.times) < 2:
+                remedy = "Give two frames or more, or the rate."
+                raise ObservationError(f"{self.sensor} has one frame and no rate", file=source or None, remedy=remedy)
+            freeze(self, rate=1.0 / float(np.median(np.diff(self.times))))
+
+    @abstractmethod
+    def frame(self, i: int) -> Any:
+        """Frame number `i`: a measurement, or what its sensor prepares."""
 
     def __len__(self) -> int:
         return len(self.times)
@@ -99,7 +122,7 @@ class _Recording:
 
 
 @dataclass(frozen=True, eq=False)
-class ColourVideo(_Recording):
+class ColourVideo(SensorRecording):
     """Colour images of one camera.
 
     Parameters
@@ -149,7 +172,7 @@ def _image(video: ColourVideo | DepthVideo, i: int) -> tuple[float, NDArray]:
 
 
 @dataclass(frozen=True, eq=False)
-class DepthVideo(_Recording):
+class DepthVideo(SensorRecording):
     """Depth images of one sensor.
 
     Parameters
@@ -220,7 +243,7 @@ class DepthVideo(_Recording):
 
 
 @dataclass(frozen=True, eq=False)
-class CloudVideo(_Recording):
+class CloudVideo(SensorRecording):
     """Unordered point clouds of one sensor.
 
     Parameters
@@ -275,7 +298,7 @@ class CloudVideo(_Recording):
 
 
 @dataclass(frozen=True, eq=False)
-class KeypointVideo(_Recording):
+class KeypointVideo(SensorRecording):
     """Keypoints of one person in one camera, detected on demand.
 
     Parameters
@@ -317,7 +340,7 @@ class KeypointVideo(_Recording):
 
 
 @dataclass(frozen=True, eq=False)
-class LineVideo(_Recording):
+class LineVideo(SensorRecording):
     """Image lines and edges of known objects in one camera.
 
     Parameters
@@ -399,7 +422,7 @@ class NamedMarkers:
 
 
 @dataclass(frozen=True, eq=False)
-class BodyTrackerVideo(_Recording):
+class BodyTrackerVideo(SensorRecording):
     """Trackers on the body over time.
 
     Parameters
@@ -437,7 +460,7 @@ class BodyTrackerVideo(_Recording):
 
 
 @dataclass(frozen=True, eq=False)
-class SurfacePointVideo(_Recording):
+class SurfacePointVideo(SensorRecording):
     """Tracked points of a surface over time.
 
     Parameters

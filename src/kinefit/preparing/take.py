@@ -17,6 +17,7 @@ from kinefit.readers.detections import detections_file, read_detections
 from kinefit.readers.keypoint_sets import FACE_SET
 from kinefit.readers.take.entries import KeypointsEntry
 from kinefit.readers.take.file import Take
+from kinefit.readers.take.kinds import kind_of
 
 
 def warn(text: str) -> None:
@@ -96,8 +97,8 @@ def uses_detector(take: Take) -> bool:
     """Whether a take asks for the built-in detector's keypoints, or has nothing but videos and so gets them."""
     if any(entry.format == "detect" and entry.file is None for entry in take.keypoints):
         return True
-    bodies = (take.depth, take.stereo, take.silhouettes, take.regions, take.trackers)
-    points = (take.keypoints, take.skin, take.lines, take.surface_points)
+    bodies = (take.depth, take.stereo, take.silhouettes, take.regions)
+    points = (take.keypoints, take.skin, take.lines, *(kind_of(table).replaces_keypoints for table in take.sensors))
     return any(camera.video for camera in take.cameras) and not (any(bodies) or any(points))
 
 

@@ -117,7 +117,7 @@ def people_in_view(take: Take) -> InView | None:
     None where markers, lines or other points take part, which are not parted by people, or where the take tells itself
     where a body is.
     """
-    points = take.markers or take.lines or take.skin or take.surface_points or take.trackers
+    points = take.markers or take.lines or take.skin or take.sensors
     if points or not (take.keypoints or ((take.depth or take.stereo) and not (take.start or take.pose))):
         return None
     seen = load_uncovered(take)

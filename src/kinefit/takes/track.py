@@ -29,7 +29,14 @@ from kinefit.tracking.cameras import as_found
 from kinefit.tracking.checkpoints.checkpoint import Checkpoint, TrackingInterrupted
 from kinefit.tracking.recording import Recording
 from kinefit.tracking.sizing import channels_of
-from kinefit.tracking.take_recording import from_afar, label_findings_of, on_floor, recording_of, rig_on_floor
+from kinefit.tracking.take_recording import (
+    from_afar,
+    label_findings_of,
+    on_floor,
+    recording_of,
+    rig_on_floor,
+    sensors_of,
+)
 from kinefit.tracking.video import Progress, track
 
 _DEFAULT_BODY = "humanoid"  # body of a take that names none
@@ -61,13 +68,13 @@ def track_take(
     view = view or people_in_view(take)
     seen = with_names(take, view.seen if view else load_uncovered(take), progress=progress)
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
-    sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin, take.trackers)
-    alone = take.start or take.pose or any(sensors)
-    if (take.silhouettes or take.regions or take.surface_points) and not alone:
-        kinds = {"surface_points": "surface points", "silhouette": "silhouettes", "region": "colours"}
-        table = next(kind for kind in kinds if any(kind == table for table, *_ in take.entries))
+    sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin)
+    alone = take.start or take.pose or any(sensors) or any(one.places_points for one in sensors_of(take, seen, body))
+    if (take.silhouettes or take.regions or take.sensors) and not alone:
+        kinds = {"silhouette": "silhouettes", "region": "colours"}
+        table = next(table for table, *_ in take.entries if table in (*kinds, *take.sensors))
         raise TakeError(
-            f"{kinds[table]} alone do not determine the first pose", file=take.path, place=f"[[{table}]]",
+            f"{kinds.get(table, table)} alone do not determine the first pose", file=take.path, place=f"[[{table}]]",
             remedy='Add [start], or [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
         )  # fmt: skip
     if not alone:

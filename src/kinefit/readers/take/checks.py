@@ -83,7 +83,7 @@ def _head(take: Take) -> _Odd:
             yield f"'{key}' has no use with start, which gives the body", f"[take] {key}", "Remove one of the two."
         if take.size is False and key != "size" and getattr(take, key) is not None:
             yield f"'{key}' has no use with size = false", f"[take] {key}", "Remove one of the two."
-    others = (take.silhouettes, take.markers, take.depth, take.stereo, take.lines, take.skin, take.trackers)
+    others = (take.silhouettes, take.markers, take.depth, take.stereo, take.lines, take.skin, take.sensors)
     if take.calibration and take.calibration.position_sigma is not None and not take.keypoints and any(others):
         yield "position_sigma and rotation_sigma are for cameras with keypoints", "[calibration]", "Remove both."
 
@@ -107,7 +107,7 @@ def _pose(take: Take) -> _Odd:
 def _cameras(take: Take) -> _Odd:
     """There is something to see, by cameras whose places are known where they have to be."""
     sensors = (take.keypoints, take.skin, take.silhouettes, take.regions)
-    places = (take.markers, take.surface_points, take.trackers, take.depth)
+    places = (take.markers, take.sensors, take.depth)
     if not (take.cameras or any(sensors) or any(places)):
         remedy = "Add [[camera]] with [[keypoints]], [[depth]], or [[markers]]."
         yield "an empty take: it names no sensor", "", remedy
@@ -159,7 +159,12 @@ def _files_of_two(take: Take) -> _Odd:
         (name, entry.file, sorted(getattr(entry, "points", ())),
          *(getattr(entry, key, None) for key in (("set",) if table == "markers" else ("format", "frames"))),
          getattr(entry, "set", None) == FACE_SET)
-        for table, name, entry in take.entries if table in ("keypoints", "markers", "surface_points", "tracker")
+        for table, name, entry in take.entries if table in ("keypoints", "markers")
+    ]  # fmt: skip
+    inputs += [
+        (name, entry.file, sorted(getattr(entry, "points", ())),
+         [value for key in keys_of(table) if isinstance(value := getattr(entry, key), str | bool)])
+        for table, name, entry in take.entries if table in take.sensors and isinstance(getattr(entry, "file", None), Path)
     ]  # fmt: skip
     for one in inputs:
         if inputs.count(one) > 1:

@@ -12,22 +12,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
 from kinefit._files import LENGTHS, worth
-from kinefit.errors import TakeError, choices, located
+from kinefit.errors import choices, located
 from kinefit.geometry import se3
 from kinefit.observations import KEYPOINT_SIGMA
 from kinefit.readers.keypoint_sets import FACE_SET, KEYPOINT_SETS, MEDIAPIPE_SETS
+from kinefit.readers.take.kinds import TakeEntry, kind_of, refuse
 
 _Read = TypeVar("_Read")
 _Pixels = Annotated[float, Meta(gt=0, lt=1e4, description="Give a positive number of pixels.")]
 _Rate = Annotated[float, Meta(gt=0, lt=1e6, description="Give frames per second, a positive number, or remove it.")]
-_Metres = Annotated[float, Meta(gt=0, lt=1, description="Give metres, above 0 and below 1.")]
-_Seconds = Annotated[float, Meta(gt=-1e6, lt=1e6, description="Give seconds.")]
+Metres = Annotated[float, Meta(gt=0, lt=1, description="Give metres, above 0 and below 1.")]
+Seconds = Annotated[float, Meta(gt=-1e6, lt=1e6, description="Give seconds.")]
 _Scale = Annotated[float, Meta(gt=0, lt=1e6, description="Give a positive number: unit in metres a count, times in s.")]
 _Number = Annotated[float, Meta(ge=-1e6, le=1e6, description="Give metres, directions and degrees.")]
 _Side = Annotated[int, Meta(ge=1, lt=100_000, description="Give [width, height] in pixels.")]
@@ -48,32 +48,6 @@ _Counted = Annotated[
 ]
 
 
-class WrongEntryError(TakeError, ValueError):
-    """Keys of an entry that do not agree."""
-
-
-def _refuse(wrong: object, problem: str, remedy: str) -> None:
-    if wrong:
-        raise WrongEntryError(problem, remedy=remedy)
-
-
-class _Entry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A table of the take file; paths are absolute once it is read."""
-
-    def _uses(self, given: str, only: Mapping[str, Sequence[str]]) -> None:
-        """Refuse keys that mean nothing with the entry's format; `only`: {key: formats}."""
-        for key, formats in only.items():
-            odd = getattr(self, key) not in (None, ()) and given not in formats
-            _refuse(odd, f"'{key}' has no use with format = \"{given}\"", f"Remove it; it is for {', '.join(formats)}.")
-
-    def _ordered(self, *keys: str) -> None:
-        """Refuse ranges (first, last) that are none."""
-        for key in keys:
-            value = getattr(self, key) or ()
-            for one in value if value and isinstance(value[0], tuple) else (value,):
-                _refuse(one and not one[0] < one[1], f"{key} has {list(one)}", "Give the lesser number first.")
-
-
 SKIN_SETS = ("HANDS", "WRISTS")
 """Which points of the body the skin's patches are: middles of the hands, or wrists of a body without fingers."""
 
@@ -83,7 +57,7 @@ RENAMED: dict[str, dict[str, str]] = {
 """{table: {old key: new key}}: old keys are read with a warning in this version, and are unknown in the next."""
 
 
-class StartEntry(_Entry, frozen=True, kw_only=True):
+class StartEntry(TakeEntry, frozen=True, kw_only=True):
     """`[start]`: where the body is at one step, for sensors that alone cannot find it."""
 
     at: tuple[_Number, _Number, _Number] | None = None  # [m] of the root's origin in the world; of clicks alone: none
@@ -101,7 +75,7 @@ class StartEntry(_Entry, frozen=True, kw_only=True):
         return self.clicks is not None and self == StartEntry(clicks=self.clicks, click_sigma=self.click_sigma)
 
 
-class SessionEntry(_Entry, frozen=True, kw_only=True):
+class SessionEntry(TakeEntry, frozen=True, kw_only=True):
     """`[session]`: subject and movement of the recording, for the report; nothing is computed from it."""
 
     subject: str = ""  # a code rather than a name
@@ -119,7 +93,7 @@ class SessionEntry(_Entry, frozen=True, kw_only=True):
         return {k: str(v) for k in self.__struct_fields__ if (v := getattr(self, k)) and k != "norms"}
 
 
-class CalibrationEntry(_Entry, frozen=True, kw_only=True):
+class CalibrationEntry(TakeEntry, frozen=True, kw_only=True):
     """`[calibration]`: where the cameras stood."""
 
     file: Path
@@ -131,10 +105,10 @@ class CalibrationEntry(_Entry, frozen=True, kw_only=True):
         both = self.position_sigma, self.rotation_sigma
         problem = "position_sigma {}, rotation_sigma {}".format(*both)
         remedy = "Give metres and degrees above 0, or 0 and 0 for an exact calibration, or neither."
-        _refuse(both not in ((None, None), (0, 0)) and not all(both), problem, remedy)
+        refuse(both not in ((None, None), (0, 0)) and not all(both), problem, remedy)
 
 
-class CameraEntry(_Entry, frozen=True, kw_only=True):
+class CameraEntry(TakeEntry, frozen=True, kw_only=True):
     """`[[camera]]`: one camera of the calibration, with its video or the size of its image."""
 
     name: str
@@ -144,14 +118,14 @@ class CameraEntry(_Entry, frozen=True, kw_only=True):
     size: tuple[_Side, _Side] | None = None  # [px] (width, height) of the image; default: the video's
     image: Literal["as calibrated", "scaled", "letterboxed"] = "as calibrated"  # what became of the image
     rotation: Literal[0, 90, 180, 270] = 0  # [deg] the image is the calibration's, turned clockwise
-    time_offset: _Seconds = 0.0  # [s] added to frame / rate
+    time_offset: Seconds = 0.0  # [s] added to frame / rate
     field_of_view: _View | None = None  # [deg] across the longer side, of a camera of a take without calibration
 
     def __post_init__(self) -> None:
-        _refuse(self.stream is not None and self.video is not None, "a stream and a video", "Remove one of the two.")
+        refuse(self.stream is not None and self.video is not None, "a stream and a video", "Remove one of the two.")
 
 
-class KeypointsEntry(_Entry, frozen=True, kw_only=True):
+class KeypointsEntry(TakeEntry, frozen=True, kw_only=True):
     """`[[keypoints]]`: what a detector saw in one camera."""
 
     camera: str
@@ -177,17 +151,17 @@ class KeypointsEntry(_Entry, frozen=True, kw_only=True):
         known = sets.get(self.format, MEDIAPIPE_SETS)
         kind = "keypoint set" if self.format == "openpose" else f"keypoint set of {self.format}"
         odd = self.set is not None and self.set not in known
-        _refuse(odd, choices(kind, str(self.set), known), f'Use set = "{known[0]}", or remove it.')
+        refuse(odd, choices(kind, str(self.set), known), f'Use set = "{known[0]}", or remove it.')
         none = self.file is None and self.stream is None and self.format not in ("detect", "skin")
-        _refuse(none, f"no file of {self.format} keypoints", 'Write file = "...", or format = "detect".')
+        refuse(none, f"no file of {self.format} keypoints", 'Write file = "...", or format = "detect".')
         self._ordered("frames", "excluded", "swapped")
         if self.stream is not None:
-            _refuse(self.file is not None, "a stream and a file", "Remove one of the two.")
+            refuse(self.file is not None, "a stream and a file", "Remove one of the two.")
             for key in ("excluded", "swapped"):
-                _refuse(getattr(self, key), f"'{key}' has no use with a stream", "Leave it out.")
+                refuse(getattr(self, key), f"'{key}' has no use with a stream", "Leave it out.")
 
 
-class SilhouetteEntry(_Entry, frozen=True, kw_only=True):
+class SilhouetteEntry(TakeEntry, frozen=True, kw_only=True):
     """`[[silhouette]]`: which pixels of one camera show the person."""
 
     camera: str
@@ -207,22 +181,22 @@ class SilhouetteEntry(_Entry, frozen=True, kw_only=True):
             **dict.fromkeys(("low", "high", "channels", "smooth"), ("threshold",)),
         })  # fmt: skip
         none = self.file is None and self.format == "masks"
-        _refuse(none, "no file of masks", 'Write file = "..." (a folder), or another format.')
+        refuse(none, "no file of masks", 'Write file = "..." (a folder), or another format.')
         if self.format == "threshold":
             remedy = "Write low = [r, g, b] and high = [r, g, b], 0 to 255 each."
-            _refuse(self.low is None or self.high is None, "no colour of the body", remedy)
+            refuse(self.low is None or self.high is None, "no colour of the body", remedy)
             odd = any(a > b for a, b in zip(self.low or (), self.high or ()))
-            _refuse(odd, f"low = {self.low}, high = {self.high}", "Give 0 to 255, the lower ones first.")
+            refuse(odd, f"low = {self.low}, high = {self.high}", "Give 0 to 255, the lower ones first.")
 
 
-class RegionEntry(_Entry, frozen=True, kw_only=True):
+class RegionEntry(TakeEntry, frozen=True, kw_only=True):
     """`[[region]]`: a camera in whose video the body is followed by the colours inside and outside of its contour."""
 
     camera: str
     sigma: _Pixels | None = None  # [px] standard deviation of the contour, shape included; default: as the body is made
 
 
-class LinesEntry(_Entry, frozen=True, kw_only=True):
+class LinesEntry(TakeEntry, frozen=True, kw_only=True):
     """`[[lines]]`: image lines in one camera on which points or edges of the body lie."""
 
     camera: str
@@ -234,26 +208,18 @@ class LinesEntry(_Entry, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         example = 'Write landmarks = { edge = ["r_asis", "l_asis"] }, one entry for each line.'
-        _refuse(not self.landmarks, "no landmarks", example)
+        refuse(not self.landmarks, "no landmarks", example)
         for name, own in self.landmarks.items():
             odd = not 1 <= len(set(own)) == len(own) <= 2
-            _refuse(odd, f"line '{name}' has {len(own)} landmarks", "Give the two ends of an edge, or one point.")
+            refuse(odd, f"line '{name}' has {len(own)} landmarks", "Give the two ends of an edge, or one point.")
 
 
-class SurfacePointsEntry(_Entry, frozen=True, kw_only=True):
-    """`[[surface_points]]`: a surface that was tracked, such as by `kinefit surface`."""
-
-    file: Path  # table of time_s, point, x, y, z, std_x, std_y, std_z [s, m]
-    time_offset: _Seconds = 0.0  # [s]
-    sigma: _Metres = 0.01  # [m] standard deviation by which the surface slides on the bone, and the body's shape is off
-
-
-class _PlacedEntry(_Entry, frozen=True, kw_only=True):
+class PlacedEntry(TakeEntry, frozen=True, kw_only=True):
     """A file of places in a world of its own."""
 
     file: Path
-    time_offset: _Seconds = 0.0  # [s]
-    sigma: _Metres = 0.005  # [m] standard deviation
+    time_offset: Seconds = 0.0  # [s]
+    sigma: Metres = 0.005  # [m] standard deviation
     shift: tuple[_Shift, _Shift, _Shift] = (0.0, 0.0, 0.0)  # [m] of the file's origin, in the world
     turn: tuple[_Turn, _Turn, _Turn] = (0.0, 0.0, 0.0)  # [deg] rotation vector, from the file's axes to the world's
 
@@ -263,7 +229,7 @@ class _PlacedEntry(_Entry, frozen=True, kw_only=True):
         return se3.transform(se3.exp_so3(np.radians(self.turn)), np.array(self.shift))
 
 
-class MarkersEntry(_PlacedEntry, frozen=True, kw_only=True):
+class MarkersEntry(PlacedEntry, frozen=True, kw_only=True):
     """`[[markers]]`: a marker recording."""
 
     unit: str | None = None  # where the file does not state it
@@ -273,19 +239,10 @@ class MarkersEntry(_PlacedEntry, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         odd = self.unit is not None and worth(self.unit, LENGTHS) is None
-        _refuse(odd, choices("unit", str(self.unit), LENGTHS), "Use one of these.")
+        refuse(odd, choices("unit", str(self.unit), LENGTHS), "Use one of these.")
 
 
-class TrackerEntry(_PlacedEntry, frozen=True, kw_only=True):
-    """`[[tracker]]`: trackers fixed on the body, such as magnetic ones: poses of segments, or places of points."""
-
-    points: dict[str, str]  # of each tracker of the file: landmark of the body, or segment, whose origin it then is
-    mounts: dict[str, tuple[float, float, float]] = {}  # [deg] rotation vector, from a tracker's axes to its segment's
-    rotation_sigma: float = 2.0  # [deg] standard deviation of an orientation
-    mount_sigma: float = 0.0  # [deg] standard deviation of the mounts, which are then estimated; default: exact
-
-
-class DepthEntry(_Entry, frozen=True, kw_only=True):
+class DepthEntry(TakeEntry, frozen=True, kw_only=True):
     """`[[depth]]`: a depth sensor."""
 
     name: str
@@ -300,8 +257,8 @@ class DepthEntry(_Entry, frozen=True, kw_only=True):
     distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]] beside the intrinsics
     rate: _Rate | None = None  # [Hz]; default: what the file states, the take's, the videos'
     time_unit: _Scale | None = None  # [s] of the last number in every file's name, where that is the time
-    time_offset: _Seconds = 0.0  # [s] time of the first frame
-    sigma: _Metres = 0.01  # [m] standard deviation of a depth
+    time_offset: Seconds = 0.0  # [s] time of the first frame
+    sigma: Metres = 0.01  # [m] standard deviation of a depth
     background: Path | None = None  # the same sensor before the empty scene
     on_body: bool = False  # everything but the body was taken out already
     segment: str | None = None  # of clouds of points: the one segment of the body that they are on
@@ -309,19 +266,19 @@ class DepthEntry(_Entry, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         problem = "neither a file nor a stream" if self.file is None else "a stream and a file"
         remedy = 'Write file = "...", or, for `kinefit live`, stream = "FOLDER".'
-        _refuse((self.stream is None) == (self.file is None), problem, remedy)
+        refuse((self.stream is None) == (self.file is None), problem, remedy)
         if self.stream is not None:
             for key in ("time_unit", "segment"):
-                _refuse(getattr(self, key) is not None, f"'{key}' has no use with a stream", "Remove it.")
+                refuse(getattr(self, key) is not None, f"'{key}' has no use with a stream", "Remove it.")
             unsized = self.intrinsics is not None and self.size is None
             remedy = "Write size = [width, height] of its images."
-            _refuse(unsized, "a stream with intrinsics, and no size", remedy)
+            refuse(unsized, "a stream with intrinsics, and no size", remedy)
         bare = self.distortion and self.intrinsics is None
-        _refuse(bare, "distortion without intrinsics", "Write intrinsics = [fx, fy, cx, cy] too.")
+        refuse(bare, "distortion without intrinsics", "Write intrinsics = [fx, fy, cx, cy] too.")
         self._ordered("range")
 
 
-class StereoEntry(_Entry, frozen=True, kw_only=True):
+class StereoEntry(TakeEntry, frozen=True, kw_only=True):
     """`[[stereo]]`: two cameras of the take whose videos give depth."""
 
     left: str
@@ -331,7 +288,7 @@ class StereoEntry(_Entry, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         self._ordered("range")
-        _refuse(self.left == self.right, "left and right are one camera", "Name two cameras.")
+        refuse(self.left == self.right, "left and right are one camera", "Name two cameras.")
 
     @property
     def name(self) -> str:
@@ -393,8 +350,9 @@ class Take(TakeHead):
     session : SessionEntry, subject and movement of the recording
     placed : StartEntry or None, `[start]`
     calibration : CalibrationEntry or None
-    cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines, surface_points, trackers : tuples
+    cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines : tuples
         Of entries; `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
+    sensors : {table: entries} of all other kinds, see `SensorKind`
     digest : str
         SHA-256 of the file's tables as they are written, without comments and spacing; "" for a take of no file.
     """
@@ -413,8 +371,7 @@ class Take(TakeHead):
     regions: tuple[RegionEntry, ...] = ()
     skin: tuple[KeypointsEntry, ...] = ()
     lines: tuple[LinesEntry, ...] = ()
-    surface_points: tuple[SurfacePointsEntry, ...] = ()
-    trackers: tuple[TrackerEntry, ...] = ()
+    sensors: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Keypoints by colour apart from others."""
@@ -451,25 +408,30 @@ class Take(TakeHead):
             of_table = found if isinstance(found, tuple) else () if found is None else (found,)
             for entry in (*of_table, *(self.skin if table == "keypoints" else ())):
                 yield table, _name_of(table, entry), entry
+        for table, entries in self.sensors.items():
+            for entry in entries:
+                yield table, _name_of(table, entry), entry
 
 
 TABLES: dict[str, type[Any]] = {
     "take": TakeHead, "session": SessionEntry, "start": StartEntry, "calibration": CalibrationEntry,
     "camera": CameraEntry, "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry,
     "stereo": StereoEntry, "silhouette": SilhouetteEntry, "region": RegionEntry, "lines": LinesEntry,
-    "surface_points": SurfacePointsEntry, "tracker": TrackerEntry,
 }  # fmt: skip
-"""Every table of a take file, and its keys as the fields of a record."""
-ATTRIBUTES = {
-    "start": "placed", "camera": "cameras", "silhouette": "silhouettes", "region": "regions", "tracker": "trackers",
-}  # fmt: skip
+"""Tables of a take file without those of `SensorKind`s, and their keys as the fields of a record."""
+ATTRIBUTES = {"start": "placed", "camera": "cameras", "silhouette": "silhouettes", "region": "regions"}
 """{table: attribute of a `Take`} where they differ; the keys of [take] are attributes themselves."""
 SINGLE_TABLES = ("take", "session", "start", "calibration")
 
 
+def entry_class(table: str) -> type[Any]:
+    """The record of a table's entries."""
+    return TABLES.get(table) or kind_of(table).entry
+
+
 def keys_of(table: str) -> tuple[str, ...]:
     """All keys of a table."""
-    record = TABLES[table]
+    record = entry_class(table)
     return tuple(getattr(record, "__struct_fields__", None) or record.__dataclass_fields__)
 
 
@@ -477,7 +439,10 @@ def _name_of(table: str, entry: Any) -> str:
     if table in SINGLE_TABLES:
         return f"[{table}]"
     if table not in ("camera", "depth", "stereo"):
-        return f"{table} of camera {entry.camera}" if hasattr(entry, "camera") else f"{table} {entry.file.name}"
+        if hasattr(entry, "camera"):
+            return f"{table} of camera {entry.camera}"
+        file = getattr(entry, "file", None)
+        return f"{table} {file.name}" if isinstance(file, Path) else table
     return f"{table} {entry.name}"
 
 

@@ -18,7 +18,6 @@ from kinefit.geometry import se3
 from kinefit.geometry.camera import ImageFrame, Rig
 from kinefit.observations import (
     MEDIAPIPE_33,
-    BodyTrackerVideo,
     ClickVideo,
     CloudVideo,
     ColourVideo,
@@ -27,8 +26,8 @@ from kinefit.observations import (
     KeypointVideo,
     LineVideo,
     Markers,
+    SensorRecording,
     SilhouetteVideo,
-    SurfacePointVideo,
 )
 from kinefit.observations.clocks import frame_times, is_even, on_steps
 from kinefit.readers.calibration.read import found_notes
@@ -52,21 +51,26 @@ from kinefit.readers.take.depth import depth_notes, load_depth
 from kinefit.readers.take.entries import (
     KeypointsEntry,
     MarkersEntry,
-    SurfacePointsEntry,
     Take,
-    TrackerEntry,
     read_each,
     sensor_name,
 )
+from kinefit.readers.take.kinds import SensorKind, kind_of
 from kinefit.readers.take.lines import load_clicks, load_lines
 from kinefit.readers.take.silhouettes import load_region, load_silhouettes, load_skin
-from kinefit.readers.tracked_points import read_body_trackers, read_surface_points
 from kinefit.readers.video import Video, common_frames
 
-_Timed = DepthVideo | CloudVideo | LineVideo | SurfacePointVideo | BodyTrackerVideo
-_Whole = _Timed | SilhouetteVideo | ColourVideo | KeypointVideo
 _MIN_COMMON_FRAMES = 10  # without a calibration: fewer tell neither clocks nor places of cameras
 _LEVEL = 45.0  # [deg] turned by less, the axis of a marker file that was vertical still is the nearest to it
+
+
+@dataclass(frozen=True, eq=False)
+class TakeSensor:
+    """A sensor of a take: its kind, its entry and what it recorded."""
+
+    kind: SensorKind
+    entry: Any
+    recording: SensorRecording
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,10 +105,8 @@ class Observations:
         In the order of `take.lines`, those frames that have lines.
     clicks : tuple of ClickVideo
         Clicked joints, by camera, of cameras with clicks at `frames`.
-    surface_points : tuple of SurfacePointVideo
-        In the order of `take.surface_points`, whole, at their own rates.
-    trackers : tuple of BodyTrackerVideo
-        In the order of `take.trackers`, whole, at their own rates.
+    sensors : tuple of TakeSensor
+        Of `take.sensors`, whole, at their own rates.
     notes : tuple of str
         What is worth saying: depth of another rate, frames that are missing.
     first_time : float [s]
@@ -125,37 +127,47 @@ class Observations:
     skin: tuple[KeypointVideo, ...] = ()
     lines: tuple[LineVideo, ...] = ()
     clicks: tuple[ClickVideo, ...] = ()
-    surface_points: tuple[SurfacePointVideo, ...] = ()
-    trackers: tuple[BodyTrackerVideo, ...] = ()
+    sensors: tuple[TakeSensor, ...] = ()
     notes: tuple[str, ...] = ()
     first_time: float = 0.0
 
     @property
-    def recordings(
-        self,
-    ) -> tuple[_Whole, ...]:
+    def recordings(self) -> tuple[SensorRecording, ...]:
         """Every recording with `at_step(step, rate)` and `frame(i)`: all but keypoints and markers."""
+        of_kinds = (sensor.recording for sensor in self.sensors)
         return (
             *self.depth, *self.clouds, *self.silhouettes, *self.regions, *self.skin, *self.lines, *self.clicks,
-            *self.surface_points, *self.trackers,
+            *of_kinds,
         )  # fmt: skip
 
 
-def _surface_points(entry: SurfacePointsEntry, cameras: TakeCameras) -> SurfacePointVideo:
-    entries = cameras.take.surface_points
-    name = sensor_name("surface_points", entries, entries.index(entry))
-    return read_surface_points(entry.file, name, time_offset=entry.time_offset)
+def _load_sensors(cameras: TakeCameras) -> tuple[TakeSensor, ...]:
+    """The sensors of all kinds of a take.
 
+    Raises
+    ------
+    PluginError
+        A kind of another distribution raises an error, or returns no recording of the sensor's name.
+    """
+    out = list[TakeSensor]()
+    for table, entries in cameras.take.sensors.items():
+        kind, numbers = kind_of(table), iter(range(len(entries)))
 
-def _trackers(entry: TrackerEntry, cameras: TakeCameras) -> BodyTrackerVideo:
-    entries, T = cameras.take.trackers, entry.T_world_file
-    name = sensor_name("trackers", entries, entries.index(entry))
-    return read_body_trackers(entry.file, entry.points, name, time_offset=entry.time_offset, T_world_file=T)
+        def read(entry: Any, kind: SensorKind = kind, entries: Any = entries, numbers: Any = numbers) -> TakeSensor:
+            name = sensor_name(kind.label or kind.table, entries, next(numbers))
+            with kind.calling("read"):
+                recording = kind.read(entry, name, cameras)
+            correct = isinstance(recording, SensorRecording) and recording.sensor == name
+            kind.expect(correct, f"returned from `read` no SensorRecording of the sensor '{name}'")
+            return TakeSensor(kind, entry, recording)
+
+        out += read_each(cameras.take, entries, read)
+    return tuple(out)
 
 
 _LOADERS: dict[str, Callable[..., Any]] = {
     "depth": load_depth, "silhouettes": load_silhouettes, "regions": load_region, "skin": load_skin,
-    "lines": load_lines, "surface_points": _surface_points, "trackers": _trackers,
+    "lines": load_lines,
 }  # fmt: skip
 """{attribute of a take and of its observations: what reads one entry}, those first whose rates others need."""
 
@@ -222,8 +234,9 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
     }
     depth = tuple(video for video in loaded["depth"] if isinstance(video, DepthVideo))
     clouds = tuple(video for video in loaded.pop("depth") if isinstance(video, CloudVideo))
+    sensors = _load_sensors(of_cameras)
     fastest, lines, clicks = of_cameras.fastest, loaded["lines"], load_clicks(of_cameras)
-    recordings: tuple[_Timed, ...] = (*depth, *clouds, *loaded["surface_points"], *loaded["trackers"])
+    recordings: tuple[SensorRecording, ...] = (*depth, *clouds, *(sensor.recording for sensor in sensors))
     marked = [(f"[[markers]] {k}", e.time_offset + m.times) for k, (e, m) in enumerate(zip(take.markers, markers), 1)]
     if not (streams or lines or clicks or markers or recordings):
         remedy = "Add a video to a [[camera]], or [[keypoints]]: `kinefit init` proposes a take."
@@ -251,9 +264,9 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         first_time = float(min(times[0] for _, times in marked))
         end = max(times[-1] + 1.0 / m.rate for (_, times), m in zip(marked, markers))
         frames, marked = take.frames or (0, round((end - first_time) * rate)), []
-    kinds = {LineVideo: "lines of camera", KeypointVideo: "keypoints of camera", SurfacePointVideo: "surface",
-             BodyTrackerVideo: "trackers"}  # fmt: skip
-    others = [(f"{kinds.get(type(r), 'depth')} {r.sensor}", r.times) for r in (*recordings, *lines, *loaded["skin"])]
+    kinds = {LineVideo: "lines of camera ", KeypointVideo: "keypoints of camera ", DepthVideo: "depth ",
+             CloudVideo: "depth "}  # fmt: skip
+    others = [(f"{kinds.get(type(r), '')}{r.sensor}", r.times) for r in (*recordings, *lines, *loaded["skin"])]
     _check_times([*others, *marked], frames, rate, take)
     notes += [
         f"{place}: {Path(m.source).name} begins at {times[0]:.6g} s of the take, by its own clock and time_offset"
@@ -267,14 +280,14 @@ def load_observations(take: Take, *, exteriors: bool = True) -> Observations:
         markers=markers,
         keypoints=tuple(_cut(*k, rate, frames, entry) for k, entry in zip(keypoints, take.keypoints)),
         videos={e.name: e.video for e in take.cameras if e.video is not None}, images=images,
-        depth=depth, clouds=clouds, **loaded,
+        depth=depth, clouds=clouds, sensors=sensors, **loaded,
         clicks=tuple(c for c in clicks if _within(np.rint(c.times * rate), [frames]).any()),
         notes=(*notes, *found, *what_is_assumed(take)),
         first_time=first_time,
     )
 
 
-def _span(recordings: Sequence[_Timed], rate: float) -> tuple[int, int]:
+def _span(recordings: Sequence[SensorRecording], rate: float) -> tuple[int, int]:
     """Steps from the first frame of any recording to the last."""
     first, last = min(r.times[0] for r in recordings), max(r.times[-1] for r in recordings)
     return round(float(first) * rate), round(float(last) * rate) + 1
