@@ -11,9 +11,9 @@ from kinefit.bodies import load_body
 from kinefit.bodies.marker_sets import placement
 from kinefit.cli import main
 from kinefit.readers.annotations import read_static_points
-from kinefit.readers.take.entries import TABLES as OWN_TABLES
-from kinefit.readers.take.kinds import BUILT_IN
+from kinefit.readers.take.entries import TABLES
 from kinefit.readers.take.file import read_take
+from kinefit.readers.take.kinds import BUILT_IN
 
 CAMERA = '[calibration]\nfile = "calibration.toml"\n[[camera]]\nname = "cam01"\nvideo = "cam01.mp4"\n'
 SENSOR = '[[keypoints]]\ncamera = "cam01"\nfile = "cam01.npy"\nformat = "mediapipe"\n'
@@ -28,10 +28,11 @@ BOX = "".join(
 def whole(text):
     """What a block is, as the whole file that it belongs into: (kind, text)."""
     keys = tomllib.loads(text).keys()
-    if keys <= TABLES.keys():
+    tables = {*TABLES, *BUILT_IN}
+    if keys <= tables:
         if not keys & {"camera", "depth"}:
             text += CAMERA
-        if not keys & (TABLES.keys() - {"take", "session", "start", "calibration", "camera"}) and "stream" not in text:
+        if not keys & (tables - {"take", "session", "start", "calibration", "camera"}) and "stream" not in text:
             text += SENSOR
         return "take", text
     if keys & {"body", "segment"}:

@@ -26,7 +26,7 @@ _MAX_ATTEMPTS = 12  # to load; each works around one error
 def calibrated(take: Take) -> tuple[Take, Rig | None, list[Finding]]:
     """The take without cameras that its calibration lacks, and the calibration's rig; None if that cannot be read."""
     stated = take.calibration
-    if stated is None and not take.depth and (take.cameras or not take.markers):
+    if stated is None and not take.depth and (take.cameras or not (take.markers or take.sensors)):
         remedy = "Add [[camera]] and [calibration]."
         return take, None, [Finding("fault", "load", "The take names no cameras.", remedy=remedy)]
     try:

@@ -18,6 +18,7 @@ from kinefit.readers.calibration.read import found_notes
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.checks import check_enough
 from kinefit.readers.take.file import Take, read_take
+from kinefit.readers.take.kinds import naming_plugins
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.online.lag_frame import KnownNoise
@@ -85,25 +86,26 @@ def track_take(
             f"body is {take.body}, but the motion of start has the body {body.name}",
             file=take.path, place="[take] start", remedy="Leave out body, or start from a motion of this body.",
         )  # fmt: skip
-    recording, body = recording_of(take, seen, body, view.people if view else None)
-    settings = settings_of(take, settings)
-    if view is not None:
-        recording = view.recording(recording, body, take.person, settings)
-    if take.pose is not None:
-        recording = from_afar(recording, body, settings, low_pass=take.pose.low_pass)
-    labels = label_findings_of(take, seen, body, refuse=True)
-    followed = recording.followed.keypoints if recording.followed else ()
-    findings = (*labels, *input_findings(take, seen, followed, body))
-    try:
-        motion = track(
-            recording, body, trial=trial_of(take), height=take.height, smooth=smooth, contacts=contacts,
-            size=take.start is None and take.size is not False, lag=lag, noise=noise, settings=settings,
-            progress=progress, checkpoint=checkpoint,
-        )  # fmt: skip
-    except TrackingInterrupted as stopped:
-        raise TrackingInterrupted(with_findings(stopped.motion, findings, seen, take.height), stopped.total) from None
-    except KinefitError as error:
-        raise with_cause(error, findings) from error
+    with naming_plugins(((one.recording.sensor, one.kind) for one in seen.sensors), take.path):
+        recording, body = recording_of(take, seen, body, view.people if view else None)
+        settings = settings_of(take, settings)
+        if view is not None:
+            recording = view.recording(recording, body, take.person, settings)
+        if take.pose is not None:
+            recording = from_afar(recording, body, settings, low_pass=take.pose.low_pass)
+        labels = label_findings_of(take, seen, body, refuse=True)
+        followed = recording.followed.keypoints if recording.followed else ()
+        findings = (*labels, *input_findings(take, seen, followed, body))
+        try:
+            motion = track(
+                recording, body, trial=trial_of(take), height=take.height, smooth=smooth, contacts=contacts,
+                size=take.start is None and take.size is not False, lag=lag, noise=noise, settings=settings,
+                progress=progress, checkpoint=checkpoint,
+            )  # fmt: skip
+        except TrackingInterrupted as stopped:
+            raise TrackingInterrupted(with_findings(stopped.motion, findings, seen, take.height), stopped.total) from None
+        except KinefitError as error:
+            raise with_cause(error, findings) from error
     motion = with_findings(motion, findings, seen, take.height)
     motion = on_floor(motion, recording, view.floors if view else [])
     if seen.rig is not None:

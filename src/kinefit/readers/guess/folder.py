@@ -19,7 +19,7 @@ from kinefit.readers.guess.names import trials
 from kinefit.readers.markers import read_markers
 from kinefit.readers.ros.images import Shown, mcap_rig, shown
 from kinefit.readers.take.entries import TABLES
-from kinefit.readers.take.kinds import kind_names, kind_of, refuse_shadows
+from kinefit.readers.take.kinds import Proposal, kind_names, kind_of, refuse_shadows
 
 _CALIBRATE = (
     "Calibrate with a board (kinefit calibrate board) or, if the cameras' intrinsics are known, from the person "
@@ -97,6 +97,8 @@ def _describe_kinds(draft: Draft, files: Sequence[Path]) -> None:
             kind = kind_of(table)
             with kind.calling("propose"):
                 found = list(kind.propose(files)) if kind.propose else []
+            correct = all(isinstance(one, Proposal) and one.entry for one in found)
+            kind.expect(correct, "returned from `propose` what is no Proposal with an entry")
         except PluginError as error:
             draft.note(table, "open", f"{error.problem}. {error.remedy or ''}".strip())
             continue

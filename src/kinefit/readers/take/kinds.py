@@ -195,6 +195,35 @@ class SensorKind:
             raise TypeError(problem) if self.plugin is None else self.plugin.error(problem)
 
 
+@contextmanager
+def naming_plugins(sensors: Iterable[tuple[str, SensorKind]], file: Path) -> Iterator[None]:
+    """Context in which sensors of plug-ins run: an error of theirs, or about their rows, names the plug-in.
+
+    Parameters
+    ----------
+    sensors : name and kind of each sensor
+    file : the take
+
+    Raises
+    ------
+    PluginError
+        Code of a plug-in raised an error, or a sensor of one broke the rules of sensors.
+    """
+    of_plugins = [(name, kind.table, kind.plugin) for name, kind in sensors if kind.plugin is not None]
+    try:
+        yield
+    except PluginError:
+        raise
+    except Exception as error:
+        about = error.problem if isinstance(error, KinefitError) else ""
+        for name, table, plugin in of_plugins:
+            raised = about if f"sensor '{name}'" in about else plugin.raised(error) if not about else ""
+            if raised:
+                remedy = error.remedy if isinstance(error, KinefitError) else None
+                raise plugin.error(f"failed: {raised}" if about else raised, remedy, file=file, place=f"[[{table}]]") from error
+        raise
+
+
 @cache
 def plugins() -> dict[str, tuple[Plugin, ...]]:
     """{table: the plug-ins that name it} of all installed distributions; none of them is imported."""
