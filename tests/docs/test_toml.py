@@ -35,6 +35,8 @@ def whole(text):
         if not keys & (tables - {"take", "session", "start", "calibration", "camera"}) and "stream" not in text:
             text += SENSOR
         return "take", text
+    if "project" in keys:
+        return "package", text
     if keys & {"body", "segment"}:
         return "body", text
     if keys == {"surface"}:
@@ -64,6 +66,8 @@ def read(kind, text, folder):
     content = tomllib.loads(text)
     path = folder / f"{content['body']['name'] if kind == 'body' else kind}.toml"
     path.write_text(text, encoding="utf-8")
+    if kind == "package":  # which tests/test_plugins.py installs
+        return content["project"]
     if kind == "take":
         take = read_take(path)
         return take if "body" not in content.get("take", {}) else load_body(take.body)
