@@ -1,5 +1,6 @@
 """Sensors of another distribution: installed as pip does, found in a fresh process; what goes wrong names the plug-in."""
 
+import importlib
 import os
 import re
 import subprocess
@@ -12,8 +13,19 @@ import pytest
 from tests.conftest import ROOT
 from tests.docs.blocks import blocks
 
+from kinefit.batch.many import track_takes
+from kinefit.batch.one import Choices
+from kinefit.errors import FileError, ObservationError, PluginError, TakeError
+from kinefit.readers.guess.folder import guess_take
 from kinefit.readers.motion import read_motion
+from kinefit.readers.take import kinds
+from kinefit.readers.take.file import read_take
+from kinefit.readers.take.load import load_observations
 from kinefit.simulation import squat_and_wave
+from kinefit.takes.check import check_take
+from kinefit.takes.track import track_take
+from kinefit.tracking import run as running
+from kinefit.tracking.checkpoints.checkpoint import Checkpoint, key_of
 
 MODULE = next(block.text for block in blocks("own-sensor", "python") if "KIND = SensorKind" in block.text)
 PROJECT = next(block.text for block in blocks("own-sensor", "toml") if "[project]" in block.text)
@@ -98,3 +110,267 @@ def test_a_sensor_of_another_distribution_goes_from_init_to_the_report(plugin, r
     heel = [body.positions(motion.state(i), body.landmarks.select(("r_heel",)))[0, 2] for i in range(len(motion))]
     assert np.sqrt(np.mean(np.square(heel))) < 0.004
     assert "insole" in (out / "report.html").read_text("utf-8")
+
+
+@pytest.fixture
+def here(plugin, monkeypatch):
+    """The plug-in in this process: a function that changes its code, which is then imported anew."""
+    monkeypatch.syspath_prepend(str(plugin.folder))
+
+    def change(*pairs):
+        plugin.change(*pairs)
+        forget()
+
+    def forget():
+        sys.modules.pop("kinefit_insole", None)
+        importlib.invalidate_caches()
+        for found in (kinds.plugins, kinds.kind_of):
+            found.cache_clear()
+
+    forget()
+    yield change
+    monkeypatch.undo()
+    forget()
+
+
+@pytest.fixture
+def short(recording):
+    """The recording with a dozen steps and a body that is not sized, for tests of the fit."""
+    recording.write_text(recording.read_text().replace("[take]\n", "[take]\nframes = [0, 12]\nsize = false\n", 1))
+    return recording
+
+
+def refused(action, take, *words):
+    """The text of an error that names the plug-in, the take file, the table and what to do."""
+    with pytest.raises(PluginError) as caught:
+        action(take)
+    error = caught.value
+    assert re.search(NAMED, error.problem), error.problem
+    assert Path(error.file) == take and "insole" in error.place and error.remedy
+    for word in words:
+        assert re.search(word, str(error)), str(error)
+
+
+def loaded(take):
+    return load_observations(read_take(take))
+
+
+def tracked(take):
+    return track_take(take, smooth=False)
+
+
+END = "\nKIND = SensorKind("
+IMPORT = '"""Insoles that measure pressure'
+
+
+@pytest.mark.parametrize(
+    ("pair", "words"),
+    [
+        ((END, "\nraise ValueError('broken')" + END), ("cannot be imported", "ValueError.*kinefit_insole.py, line.*broken")),
+        (("from msgspec import Meta", "from msgspec import Meta\nimport absent_package"), ("needs the package 'absent_package'", "pip install absent_package")),
+        (("from msgspec import Meta", "from msgspec import Meta, absent"), ("cannot be imported", "ImportError")),
+        ((END, "\nimport kinefit_insole.absent" + END), ("cannot be imported",)),
+        ((END, "\nKIND = 1\nOTHER = SensorKind("), ("is no SensorKind",)),
+        (("class InsoleEntry(TakeEntry, frozen=True, kw_only=True)", "@dataclass(kw_only=True)\nclass InsoleEntry"), ("is no SensorKind",)),
+        (('table="insole"', 'table="sole"'), ("has the table 'sole', not 'insole'",)),
+    ],
+)  # fmt: skip
+def test_a_plugin_that_cannot_be_imported(here, recording, pair, words):
+    here(pair)
+    refused(read_take, recording, *words)
+
+
+@pytest.mark.parametrize(
+    ("pair", "words"),
+    [
+        (("    time, heel, toe = ", "    raise KeyError('cells')\n    time, heel, toe = "), ("`read`", "raised KeyError in read .*line")),
+        (("def read(entry, name, cameras):", "def read(entry, name):"), ("`read`", "TypeError: read.. takes 2")),
+        (("return InsoleRecording(name,", "return InsoleRecording(name + 'x',"), ("no SensorRecording of the sensor 'insole'",)),
+        (("    return InsoleRecording(", "    return ("), ("no SensorRecording",)),
+    ],
+)  # fmt: skip
+def test_a_plugin_whose_reading_fails(here, recording, pair, words):
+    here(pair)
+    refused(loaded, recording, *words)
+
+
+def test_a_plugin_that_a_wrong_file_stops(here, recording):
+    here()
+    (recording.parent / "insole_right.csv").write_text("time_s,heel,toe\n0,1,x\n")
+    refused(loaded, recording, "raised ValueError in read", "could not convert string")
+
+
+PREPARED = [
+    ("        return Pressure(self.sensor, float(self.times[i]), loaded, self.up)",
+     "        return Load(self.sensor, float(self.times[i]), Pressure(self.sensor, float(self.times[i]), loaded, self.up))"
+     "\n\n@dataclass\nclass Load:\n    sensor: str\n    time: float\n    pressure: object"),
+    ("        return frame\n", "        return frame.pressure\n"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("pairs", "words"),
+    [
+        ([("sensor=lambda entry, recording, body: Insole(recording.sensor)", "sensor=lambda entry, recording, body: 1")],
+         ("returned from `sensor` no Sensor of the name 'insole'",)),
+        ([("sensor=lambda entry, recording, body: Insole(recording.sensor)", "sensor=lambda entry, recording, body: 1 / 0")],
+         ("`sensor`", "raised ZeroDivisionError in <lambda>")),
+        ([PREPARED[0], ("        return frame\n", "        return 1 / 0\n")], ("raised ZeroDivisionError in Insole.prepare",)),
+        ([PREPARED[0], ("        return frame\n", "        return 1\n")], ("failed: .*prepare.*is a int, not a Measurement",)),
+        ([("        loaded = tuple(", "        1 / 0\n        loaded = tuple(")], ("ZeroDivisionError in InsoleRecording.frame",)),
+        ([("        return RowsOf(", "        1 / 0\n        return RowsOf(")], ("ZeroDivisionError in Pressure.match",)),
+        ([("        return scene.along(", "        1 / 0\n        return scene.along(")], ("ZeroDivisionError in Pressure.rows",)),
+        ([("        return scene.along(points, self.up, -scene.positions(points) @ self.up, 0.005)",
+           "        return Rows.of(points.segments + 99, np.zeros((2, 3)), np.eye(3)[:2], np.zeros(2), np.ones(2))"),
+          ("import Measurement, Proposal,", "import Measurement, Proposal, Rows,")],
+         ("failed: sensor 'insole' has rows on segment 1[01].; body 'humanoid' has",)),
+    ],
+)  # fmt: skip
+def test_a_plugin_that_fails_while_it_tracks(here, short, pairs, words):
+    here(*pairs)
+    refused(tracked, short, *words)
+
+
+def test_a_check_that_fails_is_a_finding(here, recording):
+    here(("    if not recording.loaded.any():", "    if 1 / 0:"))
+    found = [finding for finding in check_take(recording).findings if "kinefit-insole 0.1" in finding.text]
+    assert len(found) == 1 and "`check`" in found[0].text and "ZeroDivisionError in check" in found[0].text
+
+
+@pytest.mark.parametrize(
+    ("pair", "words"),
+    [
+        ((END, "\nraise ValueError('broken')" + END), "cannot be imported.*ValueError"),
+        (("    for file in files:", "    for file in 1 / 0:"), "ZeroDivisionError in propose"),
+        (("yield Proposal(", "yield file  # ("), "returned from `propose` what is no Proposal"),
+    ],
+)
+def test_init_goes_on_without_a_plugin_that_fails(here, recording, pair, words):
+    here(pair)
+    guess = guess_take(recording.parent)
+    notes = [note.text for note in guess.notes if note.about == "insole"]
+    assert len(notes) == 1 and re.search(f"{NAMED} .*({words})", notes[0]) and "[[insole]]" not in guess.text
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("least = -1", r"insole_right|\[\[insole\]\] 1: least = -1.*Give newtons, above 0"),
+        ('least = "much"', "number is expected.*Write a number, without quotes"),
+        ("weight = 3", "no key 'weight'; there are: file, foot, time_offset, least"),
+    ],
+)
+def test_keys_of_a_plugin_are_checked_as_those_of_kinefit(here, recording, line, words):
+    recording.write_text(recording.read_text() + line + "\n")
+    with pytest.raises(TakeError, match=words) as caught:
+        read_take(recording)
+    assert caught.value.file == recording and "[[insole]] 1" in caught.value.place
+
+
+def test_a_file_of_a_plugin_that_is_missing_or_named_twice(here, recording):
+    text = recording.read_text()
+    recording.write_text(text + '\n[[insole]]\nfile = "insole_right.csv"\nfoot = "right"\n')
+    with pytest.raises(TakeError, match="insole insole_right.csv: the same file twice"):
+        read_take(recording)
+    recording.write_text(text + '\n[[insole]]\nfile = "insole_right.csv"\nfoot = "left"\n')
+    assert [one.recording.sensor for one in loaded(recording).sensors] == ["insole 1", "insole 2"]
+    (recording.parent / "insole_right.csv").unlink()
+    with pytest.raises(FileError, match="insole insole_right.csv: no such file"):
+        read_take(recording)
+
+
+def test_an_insole_alone_gives_no_first_pose(here, tmp_path, recording):
+    recording.write_text('[take]\nrate = 30\n[[insole]]\nfile = "insole_right.csv"\nfoot = "right"\n')
+    with pytest.raises(TakeError, match=r"\[\[insole\]\]: insole alone do not determine the first pose"):
+        track_take(recording)
+
+
+def test_a_kind_that_is_not_installed(recording):
+    text = recording.read_text()
+    with pytest.raises(TakeError, match=r"no sensor or table 'insole'; there are: .*tracker.*Correct the name, or install the plug-in that reads \[\[insole\]\]: .* -m pip install the package"):
+        read_take(recording)
+    recording.write_text(text.replace("[[insole]]", "[[insole]]    # of the plug-in kinefit-insole 0.1"))
+    with pytest.raises(TakeError, match=r"-m pip install kinefit-insole\.") as caught:
+        read_take(recording)
+    assert caught.value.file == recording and caught.value.place == "[insole]"
+
+
+@pytest.mark.parametrize(
+    ("name", "point", "file", "words"),
+    [
+        ("kinefit-other", "tracker", '[[tracker]]\nfile = "a"\npoints = { a = "b" }\n', "entry point 'tracker'.* name of kinefit's own table .*pip uninstall kinefit-other"),
+        ("kinefit-other", "keypoints", '[[keypoints]]\ncamera = "a"\n', "entry point 'keypoints'.* name of kinefit's own table .*pip uninstall kinefit-other"),
+        ("kinefit-other", "insole", '[[insole]]\nfile = "a"\nfoot = "left"\n', "has the same name as kinefit-other 0.1.*pip uninstall kinefit-other|has the same name as kinefit-insole 0.1"),
+    ],
+)  # fmt: skip
+def test_a_plugin_with_a_name_that_is_taken(here, tmp_path, monkeypatch, name, point, file, words):
+    info = tmp_path / "site" / "kinefit_other-0.1.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.1\n")
+    (info / "entry_points.txt").write_text(f"[kinefit.sensors]\n{point} = kinefit_other:KIND\n")
+    monkeypatch.syspath_prepend(str(info.parent))
+    here()
+    take = tmp_path / "take.toml"
+    take.write_text(file)
+    with pytest.raises(PluginError, match=words) as caught:
+        read_take(take)
+    assert caught.value.file == take and point in caught.value.place
+
+
+COUNTING = [
+    PREPARED[0],
+    ("        self.name = name\n", "        self.name, self.count, self.state_attributes = name, 0, ('count',)\n"
+     "\n    def learn(self, measurement, scene, sure):\n        self.count = self.count + 1\n"),
+    ("        return frame\n", "        frame.pressure.up = (1.0 + 0.1 * self.count) * frame.pressure.up\n        return frame.pressure\n"),
+]  # fmt: skip
+
+
+class Killed(BaseException):
+    """As nothing in kinefit expects."""
+
+
+def test_a_killed_run_goes_on_with_the_state_of_the_plugin(here, short, tmp_path, monkeypatch):
+    here(*COUNTING)
+    monkeypatch.setattr(running, "_EVERY", 4)
+    take = read_take(short)
+    steps = []
+
+    def progress(what, done, _):
+        steps.append(done if what == "frames" else 0)
+        if steps.count(10) == 1 and done == 10:
+            raise Killed
+
+    def followed(**more):
+        of_take = [kinds.kind_of(table) for table in take.sensors]
+        with Checkpoint(tmp_path / "unfinished", key_of(take), kinds=of_take) as unfinished:
+            return track_take(take, smooth=False, checkpoint=unfinished, **more)[0]
+
+    with pytest.raises(Killed):
+        followed(progress=progress)
+    steps.clear()
+    again = followed(progress=lambda what, done, _: steps.append(done) if what == "frames" else None)
+    assert min(steps) == 9
+    whole = track_take(take, smooth=False)[0]
+    assert np.array_equal(again.angles, whole.angles) and np.array_equal(again.Ts_world_root, whole.Ts_world_root)
+    assert again.residuals["insole"].values.tobytes() == whole.residuals["insole"].values.tobytes()
+    old = key_of(take)
+    here(*PREPARED)
+    kinds.kind_of("insole")
+    assert key_of(take) != old
+
+
+def test_a_state_that_cannot_be_stored_is_named(here, short, tmp_path):
+    here(("        self.name = name\n", "        self.name, self.state_attributes, self.made = name, ('made',), object()\n"))
+    take = read_take(short)
+    of_take = [kinds.kind_of(table) for table in take.sensors]
+    with Checkpoint(tmp_path / "unfinished", key_of(take), kinds=of_take) as unfinished:
+        refused(lambda take: track_take(take, smooth=False, checkpoint=unfinished), short, "failed: sensor 'insole' has a state that cannot be stored: a object")
+    with pytest.raises(ObservationError, match="custom sensors that are no kinds"), Checkpoint(tmp_path / "o", "") as none:
+        track_take(take, smooth=False, checkpoint=none)
+
+
+def test_many_takes_with_a_plugin(here, short, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(kinds.plugins()["insole"][0].point.dist.locate_file("")), str(ROOT / "src")]))
+    choices = Choices(formats=("csv",), report=False, overlays=False, smooth=False)
+    (row,) = track_takes(str(short), tmp_path / "out", choices=choices)
+    assert row.status == "done", row

@@ -107,8 +107,10 @@ class FrameFile(Store):
         try:
             data = self._codec.encode(state)
         except TypeError as error:
+            names = (name for name, (_, learnt) in state["sensors"]["sensors"].items() if not self._can_store(learnt))
+            problem = f"sensor '{next(names, '?')}' has a state that cannot be stored: {error}"
             remedy = "Keep numbers, texts, arrays and lists of them in `state_attributes`, or leave out the checkpoint."
-            raise ObservationError(f"a sensor's state cannot be stored: {error}", remedy=remedy) from error
+            raise ObservationError(problem, remedy=remedy) from error
         try:
             self._records.append(data, _STATE, at)
             self._records.flush()
@@ -116,6 +118,13 @@ class FrameFile(Store):
             raise self._full(error) from error
         self.at = at
         return self._codec.decode(data)
+
+    def _can_store(self, state: Any) -> bool:
+        try:
+            self._codec.encode(state)
+        except TypeError:
+            return False
+        return True
 
     def name(self, **objects: Any) -> None:
         """Names by which records refer to objects that every run has of its own."""
