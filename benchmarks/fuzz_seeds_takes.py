@@ -142,7 +142,7 @@ def _surface_points(folder: Path) -> Seed:
 
     def read() -> object:
         seen = load_observations(read_take(folder / "take.toml"))
-        return [one.recording.frame(i) for one in seen.sensors for i in range(min(len(one.recording), 3))]
+        return [video.frame(i) for video in seen.of_kind("surface_points") for i in range(min(len(video), 3))]
 
     return Seed((folder / "surface.csv",), read)
 

@@ -98,7 +98,7 @@ ENDINGS = {
     "kinefit.readers.keypoints:read_caliscope_csv": ("a.csv",),
     "kinefit.readers.tracked_points:read_body_trackers": ("a.csv",),
     "kinefit.readers.annotations:read_static_points": ("a.toml",),
-    "kinefit.readers.take.lines:read_lines": ("a.csv", "a.json"),
+    "kinefit.sensors.kinds.lines:read_lines": ("a.csv", "a.json"),
     "kinefit.readers.detections:read_detections": ("a.npz",),
     "kinefit.readers.motion:read_motion": ("a.npz",),
     "kinefit.readers.depth.recordings:read_depth": ("a.mcap", "a.png", "a.tiff", "a.raw", "a.npz", "a.bag"),

@@ -281,7 +281,7 @@ def test_a_file_of_a_plugin_that_is_missing_or_named_twice(here, recording):
 
 def test_an_insole_alone_gives_no_first_pose(here, tmp_path, recording):
     recording.write_text('[take]\nrate = 30\n[[insole]]\nfile = "insole_right.csv"\nfoot = "right"\n')
-    with pytest.raises(TakeError, match=r"\[\[insole\]\]: insole alone do not determine the first pose"):
+    with pytest.raises(TakeError, match=r"\[\[insole\]\]: it alone does not determine the first pose"):
         track_take(recording)
 
 

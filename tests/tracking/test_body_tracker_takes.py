@@ -118,5 +118,5 @@ def test_a_take_of_two_tables(taken):
     text += '[[tracker]]\nfile = "trackers.csv"\npoints = { skull = "nose_tip" }\nsigma = 0.5\nturn = [0, 0, 30]\n'
     taken.write_text(text)
     found, seen = track_take(read_take(taken))
-    assert [sensor.recording.sensor for sensor in seen.sensors] == ["trackers 1", "trackers 2"]
+    assert [video.sensor for video in seen.of_kind("tracker")] == ["trackers 1", "trackers 2"]
     assert set(found.residuals) == {"trackers 1", "trackers 2"} and len(found.body.landmarks) == len(BODY.landmarks)

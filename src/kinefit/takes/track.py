@@ -18,7 +18,7 @@ from kinefit.readers.calibration.read import found_notes
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.checks import check_enough
 from kinefit.readers.take.file import Take, read_take
-from kinefit.readers.take.kinds import naming_plugins
+from kinefit.readers.take.kinds import kinds_of, naming_plugins
 from kinefit.readers.take.load import Observations, load_observations
 from kinefit.sensors.settings import TrackSettings
 from kinefit.smoothing.online.lag_frame import KnownNoise
@@ -36,7 +36,6 @@ from kinefit.tracking.take_recording import (
     on_floor,
     recording_of,
     rig_on_floor,
-    sensors_of,
 )
 from kinefit.tracking.video import Progress, track
 
@@ -69,13 +68,12 @@ def track_take(
     view = view or people_in_view(take)
     seen = with_names(take, view.seen if view else load_uncovered(take), progress=progress)
     body = load_body(take.body) if take.start is None else read_motion(take.start).body
-    sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.lines, take.skin)
-    alone = take.start or take.pose or any(sensors) or any(one.places_points for one in sensors_of(take, seen, body))
-    if (take.silhouettes or take.regions or take.sensors) and not alone:
-        kinds = {"silhouette": "silhouettes", "region": "colours"}
-        table = next(table for table, *_ in take.entries if table in (*kinds, *take.sensors))
+    sensors = (seen.keypoints, take.markers, take.depth, take.stereo, take.skin)
+    alone = take.start or take.pose or any(sensors) or any(kind.finds_pose for kind in kinds_of(take))
+    if take.sensors and not alone:
+        table = next(iter(take.sensors))
         raise TakeError(
-            f"{kinds.get(table, table)} alone do not determine the first pose", file=take.path, place=f"[[{table}]]",
+            "it alone does not determine the first pose", file=take.path, place=f"[[{table}]]",
             remedy='Add [start], or [[keypoints]] with frames = [0, 1], or start = "motion.npz" to [take].',
         )  # fmt: skip
     if not alone:
@@ -103,7 +101,8 @@ def track_take(
                 progress=progress, checkpoint=checkpoint,
             )  # fmt: skip
         except TrackingInterrupted as stopped:
-            raise TrackingInterrupted(with_findings(stopped.motion, findings, seen, take.height), stopped.total) from None
+            motion = with_findings(stopped.motion, findings, seen, take.height)
+            raise TrackingInterrupted(motion, stopped.total) from None
         except KinefitError as error:
             raise with_cause(error, findings) from error
     motion = with_findings(motion, findings, seen, take.height)

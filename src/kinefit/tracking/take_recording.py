@@ -197,10 +197,8 @@ def _sigma(take: Take, seen: Observations, stereo: Sequence[DepthVideo]) -> dict
     """Standard deviation of every sensor, [m] or [px]."""
     out = {entry.name: entry.sigma for entry in take.depth}
     out |= {entry.name: stereo_sigma(entry, video, seen) for entry, video in zip(take.stereo, stereo)}
-    out |= {f"silhouette {entry.camera}": entry.sigma for entry in take.silhouettes}
-    out |= {f"region {entry.camera}": entry.sigma for entry in take.regions if entry.sigma is not None}
+    out |= {name: sigma for of in seen.sensors for name, sigma in of.kind.sigma(of.entry).items()}
     out |= {f"clicks {video.sensor}": take.click_sigma for video in seen.clicks}
-    out |= {f"lines {entry.camera}": entry.sigma for entry in take.lines}
     out |= {entry.camera: entry.sigma for entry in (*take.skin, *take.keypoints)}
     return out | {sensor_name("markers", take.markers, k): entry.sigma for k, entry in enumerate(take.markers)}
 
@@ -217,12 +215,14 @@ def sensors_of(take: Take, seen: Observations, body: Body) -> tuple[Sensor, ...]
     for of in seen.sensors:
         kind, name = of.kind, of.recording.sensor
         numbers[kind.table] += 1
+        if kind.sensor is None:
+            continue
         with located(take.path, f"[[{kind.table}]] {numbers[kind.table]}"):
             with kind.calling("sensor"):
                 sensor = kind.sensor(of.entry, of.recording, body)
-            correct = sensor is None or (isinstance(sensor, Sensor) and getattr(sensor, "name", None) == name)
+            correct = isinstance(sensor, Sensor) and getattr(sensor, "name", None) == name
             kind.expect(correct, f"returned from `sensor` no Sensor of the name '{name}'")
-            out += [] if sensor is None else [sensor]
+            out.append(sensor)
     return tuple(out)
 
 

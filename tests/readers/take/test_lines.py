@@ -7,8 +7,8 @@ import pytest
 
 from kinefit.errors import FileError, KinefitError, ObservationError, TakeError
 from kinefit.readers.take.file import read_take
-from kinefit.readers.take.lines import read_lines
 from kinefit.readers.take.load import load_observations
+from kinefit.sensors.kinds.lines import read_lines
 
 CALIBRATION = """[cam]
 name = "cam"
@@ -35,7 +35,7 @@ def load(folder, lines=LINES, table=TABLE, camera="", head="rate = 30"):
 
 def test_lines_of_a_table(tmp_path):
     seen = load(tmp_path, LINES + "sigma = 1.5\n", camera="time_offset = 0.1")
-    (video,) = seen.lines
+    (video,) = seen.of_kind("lines")
     assert (seen.rate, seen.frames, video.sensor, video.names) == (30.0, (3, 7), "cam", ("hips", "back"))
     np.testing.assert_allclose(video.times, [0.1, 0.2])
     frame = video.frame(0)

@@ -90,7 +90,7 @@ def guess_take(folder: str | PathLike[str], *, beside: str | PathLike[str] | Non
 
 
 def _describe_kinds(draft: Draft, files: Sequence[Path]) -> None:
-    """Enter what kinds of sensors find among files; a plug-in that fails is a note, as none of its files may be here."""
+    """Enter what kinds of sensors find among files; a plug-in that fails becomes a note."""
     for table in kind_names():
         try:
             refuse_shadows(table, TABLES)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
+import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
@@ -24,8 +25,8 @@ from kinefit.readers.keypoint_sets import FACE_SET, KEYPOINT_SETS, MEDIAPIPE_SET
 from kinefit.readers.take.kinds import TakeEntry, kind_of, refuse
 
 _Read = TypeVar("_Read")
-_Pixels = Annotated[float, Meta(gt=0, lt=1e4, description="Give a positive number of pixels.")]
-_Rate = Annotated[float, Meta(gt=0, lt=1e6, description="Give frames per second, a positive number, or remove it.")]
+Pixels = Annotated[float, Meta(gt=0, lt=1e4, description="Give a positive number of pixels.")]
+Rate = Annotated[float, Meta(gt=0, lt=1e6, description="Give frames per second, a positive number, or remove it.")]
 Metres = Annotated[float, Meta(gt=0, lt=1, description="Give metres, above 0 and below 1.")]
 Seconds = Annotated[float, Meta(gt=-1e6, lt=1e6, description="Give seconds.")]
 _Scale = Annotated[float, Meta(gt=0, lt=1e6, description="Give a positive number: unit in metres a count, times in s.")]
@@ -33,7 +34,6 @@ _Number = Annotated[float, Meta(ge=-1e6, le=1e6, description="Give metres, direc
 _Side = Annotated[int, Meta(ge=1, lt=100_000, description="Give [width, height] in pixels.")]
 _Shift = Annotated[float, Meta(gt=-1e4, lt=1e4, description="Give metres.")]
 _Turn = Annotated[float, Meta(ge=-360, le=360, description="Give degrees, at most 360.")]
-_Level = Annotated[int, Meta(ge=0, le=255, description="Give [r, g, b], 0 to 255 each.")]
 _Focal = Annotated[float, Meta(gt=0, description="Give [fx, fy, cx, cy] in pixels.")]
 _Length = Annotated[float, Meta(gt=0, description="Give [left, top, width, height] in pixels of the video.")]
 _Reach = Annotated[float, Meta(ge=0, description="Give [near, far] in metres.")]
@@ -63,11 +63,12 @@ class StartEntry(TakeEntry, frozen=True, kw_only=True):
     at: tuple[_Number, _Number, _Number] | None = None  # [m] of the root's origin in the world; of clicks alone: none
     forward: tuple[_Number, _Number, _Number] | None = None  # direction in the world in which the root's x looks
     upward: tuple[_Number, _Number, _Number] | None = None  # and its y; default: the take's `up`
-    angles: dict[str, _Number] = {}  # [deg] or, of joints that slide, [m]; others are the body's usual ones
+    angles: dict[str, _Number] = msgspec.field(default_factory=dict)  # [deg] or, of joints that slide, [m]; others are
+    # those of the default pose
     step: int | None = None  # of the common time; default: the first
     low_pass: bool = True  # whether silhouettes are also fitted with low-pass approximations of the surface first
     clicks: Path | None = None  # joints clicked at any steps, which are measurements of their steps
-    click_sigma: _Pixels = 3.0  # [px] standard deviation of a click along each axis, in the calibration's image
+    click_sigma: Pixels = 3.0  # [px] standard deviation of a click along each axis, in the calibration's image
 
     @property
     def is_clicks_alone(self) -> bool:
@@ -134,8 +135,8 @@ class KeypointsEntry(TakeEntry, frozen=True, kw_only=True):
     format: Literal["openpose", "mediapipe", "caliscope", "detect", "skin"] = "openpose"
     set: str | None = None  # default: BODY_25B of openpose, MEDIAPIPE_33 of mediapipe, HANDS of skin
     frame: Literal["calibration", "video"] | None = None  # image frame of the coordinates; needed where the two differ
-    rate: _Rate | None = None  # [Hz]; default: the camera's video, or the take
-    sigma: _Pixels = KEYPOINT_SIGMA  # [px] standard deviation, in the calibration's image
+    rate: Rate | None = None  # [Hz]; default: the camera's video, or the take
+    sigma: Pixels = KEYPOINT_SIGMA  # [px] standard deviation, in the calibration's image
     frames: tuple[_Step, _Step] | None = None  # steps (start, stop) at which they count; default: all
     excluded: tuple[tuple[_Counted, _Counted], ...] = ()  # ranges (start, stop) of steps at which they do not count
     swapped: tuple[tuple[_Counted, _Counted], ...] = ()  # ranges (start, stop) of steps at which left is right
@@ -159,59 +160,6 @@ class KeypointsEntry(TakeEntry, frozen=True, kw_only=True):
             refuse(self.file is not None, "a stream and a file", "Remove one of the two.")
             for key in ("excluded", "swapped"):
                 refuse(getattr(self, key), f"'{key}' has no use with a stream", "Leave it out.")
-
-
-class SilhouetteEntry(TakeEntry, frozen=True, kw_only=True):
-    """`[[silhouette]]`: which pixels of one camera show the person."""
-
-    camera: str
-    file: Path | None = None  # of "masks": folder or pattern; of "background": image of the empty scene
-    format: Literal["masks", "background", "threshold", "detect"] = "masks"
-    frame: Literal["calibration", "video"] | None = None  # image frame of the masks; needed where the two differ
-    rate: _Rate | None = None  # [Hz] of the masks; default: the camera's video, or the take
-    sigma: _Pixels = 4.0  # [px] standard deviation of an outline, in the calibration's image
-    low: tuple[_Level, _Level, _Level] | None = None  # of "threshold": least value of each channel that is the body's
-    high: tuple[_Level, _Level, _Level] | None = None  # and the largest
-    channels: Literal["rgb", "hsv", "lab", "ycrcb"] | None = None  # of low and high, 8 bits each; default: rgb
-    smooth: _Pixels | None = None  # [px] of the Gaussian before the Laplace operator; default: 1
-
-    def __post_init__(self) -> None:
-        self._uses(self.format, {
-            "file": ("masks", "background", "detect"), "frame": ("masks",), "rate": ("masks",),
-            **dict.fromkeys(("low", "high", "channels", "smooth"), ("threshold",)),
-        })  # fmt: skip
-        none = self.file is None and self.format == "masks"
-        refuse(none, "no file of masks", 'Write file = "..." (a folder), or another format.')
-        if self.format == "threshold":
-            remedy = "Write low = [r, g, b] and high = [r, g, b], 0 to 255 each."
-            refuse(self.low is None or self.high is None, "no colour of the body", remedy)
-            odd = any(a > b for a, b in zip(self.low or (), self.high or ()))
-            refuse(odd, f"low = {self.low}, high = {self.high}", "Give 0 to 255, the lower ones first.")
-
-
-class RegionEntry(TakeEntry, frozen=True, kw_only=True):
-    """`[[region]]`: a camera in whose video the body is followed by the colours inside and outside of its contour."""
-
-    camera: str
-    sigma: _Pixels | None = None  # [px] standard deviation of the contour, shape included; default: as the body is made
-
-
-class LinesEntry(TakeEntry, frozen=True, kw_only=True):
-    """`[[lines]]`: image lines in one camera on which points or edges of the body lie."""
-
-    camera: str
-    file: Path  # table of frame, line, u1, v1, u2, v2 [px]
-    landmarks: dict[str, tuple[str, ...]]  # of each line: two ends of an edge of the body, or one point
-    frame: Literal["calibration", "video"] | None = None  # image frame of the lines; needed where the two differ
-    rate: _Rate | None = None  # [Hz]; default: the camera's video, or the take
-    sigma: _Pixels = 2.0  # [px] standard deviation, in the calibration's image
-
-    def __post_init__(self) -> None:
-        example = 'Write landmarks = { edge = ["r_asis", "l_asis"] }, one entry for each line.'
-        refuse(not self.landmarks, "no landmarks", example)
-        for name, own in self.landmarks.items():
-            odd = not 1 <= len(set(own)) == len(own) <= 2
-            refuse(odd, f"line '{name}' has {len(own)} landmarks", "Give the two ends of an edge, or one point.")
 
 
 class PlacedEntry(TakeEntry, frozen=True, kw_only=True):
@@ -255,7 +203,7 @@ class DepthEntry(TakeEntry, frozen=True, kw_only=True):
     range: tuple[_Reach, _Reach] | None = None  # [m] (near, far): what is measured outside of it is dropped
     intrinsics: tuple[_Focal, _Focal, float, float] | None = None  # [px] fx, fy, cx, cy, in a take without calibration
     distortion: tuple[float, ...] = ()  # k1 k2 p1 p2 [k3 [k4 k5 k6]] beside the intrinsics
-    rate: _Rate | None = None  # [Hz]; default: what the file states, the take's, the videos'
+    rate: Rate | None = None  # [Hz]; default: what the file states, the take's, the videos'
     time_unit: _Scale | None = None  # [s] of the last number in every file's name, where that is the time
     time_offset: Seconds = 0.0  # [s] time of the first frame
     sigma: Metres = 0.01  # [m] standard deviation of a depth
@@ -327,7 +275,7 @@ class TakeHead:
     """
 
     name: str = ""
-    rate: _Rate | None = None
+    rate: Rate | None = None
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
     body: str = "humanoid"
     height: _Stature | None = None
@@ -350,7 +298,7 @@ class Take(TakeHead):
     session : SessionEntry, subject and movement of the recording
     placed : StartEntry or None, `[start]`
     calibration : CalibrationEntry or None
-    cameras, keypoints, markers, depth, stereo, silhouettes, regions, skin, lines : tuples
+    cameras, keypoints, markers, depth, stereo, skin : tuples
         Of entries; `skin` are the [[keypoints]] of format "skin", `keypoints` all others.
     sensors : {table: entries} of all other kinds, see `SensorKind`
     digest : str
@@ -367,10 +315,7 @@ class Take(TakeHead):
     markers: tuple[MarkersEntry, ...] = ()
     depth: tuple[DepthEntry, ...] = ()
     stereo: tuple[StereoEntry, ...] = ()
-    silhouettes: tuple[SilhouetteEntry, ...] = ()
-    regions: tuple[RegionEntry, ...] = ()
     skin: tuple[KeypointsEntry, ...] = ()
-    lines: tuple[LinesEntry, ...] = ()
     sensors: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -416,10 +361,10 @@ class Take(TakeHead):
 TABLES: dict[str, type[Any]] = {
     "take": TakeHead, "session": SessionEntry, "start": StartEntry, "calibration": CalibrationEntry,
     "camera": CameraEntry, "keypoints": KeypointsEntry, "markers": MarkersEntry, "depth": DepthEntry,
-    "stereo": StereoEntry, "silhouette": SilhouetteEntry, "region": RegionEntry, "lines": LinesEntry,
+    "stereo": StereoEntry,
 }  # fmt: skip
 """Tables of a take file without those of `SensorKind`s, and their keys as the fields of a record."""
-ATTRIBUTES = {"start": "placed", "camera": "cameras", "silhouette": "silhouettes", "region": "regions"}
+ATTRIBUTES = {"start": "placed", "camera": "cameras"}
 """{table: attribute of a `Take`} where they differ; the keys of [take] are attributes themselves."""
 SINGLE_TABLES = ("take", "session", "start", "calibration")
 

@@ -73,8 +73,8 @@ def read_take(path: str | PathLike[str]) -> Take:
     head["name"] = head.get("name") or printable(path.stem)
     if isinstance(body := head.get("body"), str) and body.endswith((".toml", ".npz")):
         head["body"] = str(path.parent / body)
-    of_kinds = [table for table in raw if table not in TABLES]
-    head["sensors"] = {t: _converted({t: raw.pop(t)}, tuple[kind_of(t).entry, ...], path, t) for t in of_kinds}
+    of_kinds = {table: entry_class(table) for table in kind_names() if table in raw}
+    head["sensors"] = {t: _converted({t: raw.pop(t)}, tuple[of_kinds[t], ...], path, t) for t in of_kinds}  # type: ignore
     take: Take = _converted(head | {ATTRIBUTES.get(table, table): rows for table, rows in raw.items()}, Take, path)
     check_take(take)
     return take

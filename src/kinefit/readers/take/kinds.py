@@ -30,10 +30,13 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 BUILT_IN = {
+    "silhouette": "kinefit.sensors.kinds.silhouettes:SILHOUETTES",
+    "region": "kinefit.sensors.kinds.silhouettes:REGIONS",
+    "lines": "kinefit.sensors.kinds.lines:KIND",
     "surface_points": "kinefit.sensors.kinds.surface_points:KIND",
     "tracker": "kinefit.sensors.kinds.trackers:KIND",
 }
-"""{table of a take file: where its kind stands}: all kinds of kinefit that have an interface of their own."""
+"""{table of a take file: where its kind stands}, in the order in which they are read."""
 
 PLUGIN_COMMENT = "of the plug-in "
 """Begin of the comment that `kinefit init` writes beside the name of a plug-in's table; its distribution follows."""
@@ -149,10 +152,14 @@ class SensorKind:
     summary : what it is, in a line
     entry : subclass of `TakeEntry`, the keys of the table
     read : (entry, name of the sensor, `TakeCameras` of the take) -> `SensorRecording` of this name
-    sensor : (entry, recording, body) -> `Sensor` of this name; None if frames are of a class that kinefit tracks anyway
+    sensor : (entry, recording, body) -> `Sensor` of this name; default: frames are of a class that kinefit tracks, such
+        as `LineFrame`, with the name of their camera as their sensor
+    sigma : (entry) -> {sensor: standard deviation [m] or [px]} of such frames
     check : (entry, recording, body) -> findings of `kinefit check`
     propose : (files of a folder) -> `Proposal` of each entry that `kinefit init` writes
     label : name of the sensor of a single entry, "insole"; of several "insole 2"; default: the table
+    finds_pose : whether it shows where the body is, so that it needs no start
+    shows_everybody : whether it shows all people in view, and not the tracked person alone
     replaces_keypoints : whether videos beside it are not searched for keypoints, where the take names none
     records : classes, besides its measurements, that a checkpoint has to store
     plugin : the entry point of another distribution; None for a kind of kinefit
@@ -162,10 +169,13 @@ class SensorKind:
     summary: str
     entry: type[TakeEntry]
     read: Callable[[Any, str, Any], SensorRecording]
-    sensor: Callable[[Any, Any, Body], Any]
+    sensor: Callable[[Any, Any, Body], Any] | None = None
+    sigma: Callable[[Any], Mapping[str, float]] = lambda _: {}
     check: Callable[[Any, Any, Body], Iterable[Finding]] | None = None
     propose: Callable[[Sequence[Path]], Iterable[Proposal]] | None = None
     label: str = ""
+    finds_pose: bool = False
+    shows_everybody: bool = False
     replaces_keypoints: bool = False
     records: tuple[type, ...] = ()
     plugin: Plugin | None = None
@@ -214,13 +224,16 @@ def naming_plugins(sensors: Iterable[tuple[str, SensorKind]], file: Path) -> Ite
         yield
     except PluginError:
         raise
-    except Exception as error:
-        about = error.problem if isinstance(error, KinefitError) else ""
+    except KinefitError as error:
         for name, table, plugin in of_plugins:
-            raised = about if f"sensor '{name}'" in about else plugin.raised(error) if not about else ""
-            if raised:
-                remedy = error.remedy if isinstance(error, KinefitError) else None
-                raise plugin.error(f"failed: {raised}" if about else raised, remedy, file=file, place=f"[[{table}]]") from error
+            if f"sensor '{name}'" in error.problem:
+                more: dict[str, Any] = {"file": file, "place": f"[[{table}]]"}
+                raise plugin.error(f"failed: {error.problem}", error.remedy, **more) from error
+        raise
+    except Exception as error:
+        for _, table, plugin in of_plugins:
+            if raised := plugin.raised(error):
+                raise plugin.error(raised, file=file, place=f"[[{table}]]") from error
         raise
 
 
@@ -238,6 +251,11 @@ def plugins() -> dict[str, tuple[Plugin, ...]]:
 def kind_names() -> tuple[str, ...]:
     """Tables of all kinds, built-in ones first."""
     return tuple(dict.fromkeys([*BUILT_IN, *plugins()]))
+
+
+def kinds_of(take: Any) -> list[SensorKind]:
+    """The kinds of the sensors of a take."""
+    return [kind_of(table) for table in take.sensors]
 
 
 def refuse_shadows(table: str, tables: Iterable[str]) -> None:

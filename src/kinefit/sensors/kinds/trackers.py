@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from msgspec import field
 
 from kinefit.bodies import Body
 from kinefit.observations import BodyTrackerVideo
@@ -18,7 +19,8 @@ class TrackerEntry(PlacedEntry, frozen=True, kw_only=True):
     """`[[tracker]]`."""
 
     points: dict[str, str]  # of each tracker of the file: landmark of the body, or segment, whose origin it then is
-    mounts: dict[str, tuple[float, float, float]] = {}  # [deg] rotation vector, from a tracker's axes to its segment's
+    mounts: dict[str, tuple[float, float, float]] = field(default_factory=dict)  # [deg] rotation vector, from a
+    # tracker's axes to its segment's
     rotation_sigma: float = 2.0  # [deg] standard deviation of an orientation
     mount_sigma: float = 0.0  # [deg] standard deviation of the mounts, which are then estimated; default: exact
 
@@ -40,5 +42,5 @@ def _sensor(entry: TrackerEntry, recording: BodyTrackerVideo, body: Body) -> Bod
 
 KIND = SensorKind(
     table="tracker", summary="trackers fixed on the body: poses of segments, or places of points", label="trackers",
-    entry=TrackerEntry, read=_read, sensor=_sensor, replaces_keypoints=True,
+    entry=TrackerEntry, read=_read, sensor=_sensor, finds_pose=True, replaces_keypoints=True,
 )  # fmt: skip

@@ -23,7 +23,7 @@ from kinefit.errors import ExportError, KinefitError
 from kinefit.frame.results import FrameResult
 from kinefit.motion import Motion
 from kinefit.readers.take.file import Take, read_take
-from kinefit.readers.take.kinds import SensorKind, kind_of
+from kinefit.readers.take.kinds import SensorKind, kinds_of
 from kinefit.sensors.base import Measurement
 from kinefit.tracking.checkpoints.frame_file import FrameFile
 
@@ -180,8 +180,9 @@ def _record_classes(kinds: Iterable[SensorKind]) -> list[type]:
     packages = {kind.plugin.package for kind in kinds if kind.plugin is not None}
     found, queue = set[type](), list[type]([Measurement])
     while queue:
-        queue += (own := queue.pop().__subclasses__())
+        own: list[type] = queue.pop().__subclasses__()
         found |= {one for one in own if one.__module__.partition(".")[0] in packages}
+        queue += own
     listed = {one for kind in kinds for one in kind.records}
     return sorted(found | listed, key=lambda one: (one.__module__, one.__qualname__))
 
@@ -190,7 +191,7 @@ def key_of(take: Take, **options: Any) -> str:
     """Digest of a take, of its files as far as size and time of change tell, of options and of kinefit's own code."""
     digest = hashlib.sha256(repr((take, sorted(options.items()), np.__version__)).encode())
     digest.update(code_digest())
-    for kind in map(kind_of, take.sensors):
+    for kind in kinds_of(take):
         digest.update(b"" if kind.plugin is None else kind.plugin.code_digest)
     takes = [take] if take.subject is None else [take, read_take(take.subject)]
     paths = set().union(*(_paths(one) | {Path(one.body)} for one in takes)) - {take.path}

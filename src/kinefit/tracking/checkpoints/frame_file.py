@@ -156,7 +156,8 @@ class FrameFile(Store):
         if isinstance(thing, Layout):
             return _LAYOUT + json.dumps(thing.streams)
         problem = f"a checkpoint cannot store a custom {type(thing).__name__}"
-        raise ObservationError(problem, remedy="Name its class in `records` of the SensorKind, or leave out checkpoint.")
+        remedy = "Name its class in `records` of its SensorKind, or leave out checkpoint."
+        raise ObservationError(problem, remedy=remedy)
 
     def _resolve(self, reference: int | str) -> Any:
         if (name := str(reference)).startswith(_LAYOUT):
