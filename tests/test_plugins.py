@@ -185,8 +185,8 @@ def test_a_plugin_that_cannot_be_imported(here, recording, pair, words):
     [
         (("    time, heel, toe = ", "    raise KeyError('cells')\n    time, heel, toe = "), ("`read`", "raised KeyError in read .*line")),
         (("def read(entry, name, cameras):", "def read(entry, name):"), ("`read`", "TypeError: read.. takes 2")),
-        (("return InsoleRecording(name,", "return InsoleRecording(name + 'x',"), ("no SensorRecording of the sensor 'insole'",)),
-        (("    return InsoleRecording(", "    return ("), ("no SensorRecording",)),
+        (("return InsoleRecording(name,", "return InsoleRecording(name + 'x',"), ("returned a InsoleRecording from `read`, not a SensorRecording of the sensor 'insole'",)),
+        (("    return InsoleRecording(", "    return ("), ("returned a tuple from `read`, not a SensorRecording",)),
     ],
 )  # fmt: skip
 def test_a_plugin_whose_reading_fails(here, recording, pair, words):
@@ -212,7 +212,7 @@ PREPARED = [
     ("pairs", "words"),
     [
         ([("sensor=lambda entry, recording, body: Insole(recording.sensor)", "sensor=lambda entry, recording, body: 1")],
-         ("returned from `sensor` no Sensor of the name 'insole'",)),
+         ("returned a int from `sensor`, not a Sensor of the name 'insole'",)),
         ([("sensor=lambda entry, recording, body: Insole(recording.sensor)", "sensor=lambda entry, recording, body: 1 / 0")],
          ("`sensor`", "raised ZeroDivisionError in <lambda>")),
         ([PREPARED[0], ("        return frame\n", "        return 1 / 0\n")], ("raised ZeroDivisionError in Insole.prepare",)),
@@ -242,7 +242,7 @@ def test_a_check_that_fails_is_a_finding(here, recording):
     [
         ((END, "\nraise ValueError('broken')" + END), "cannot be imported.*ValueError"),
         (("    for file in files:", "    for file in 1 / 0:"), "ZeroDivisionError in propose"),
-        (("yield Proposal(", "yield file  # ("), "returned from `propose` what is no Proposal"),
+        (("yield Proposal(", "yield file  # ("), "returned a list from `propose`, not proposals"),
     ],
 )
 def test_init_goes_on_without_a_plugin_that_fails(here, recording, pair, words):

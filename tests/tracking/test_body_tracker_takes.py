@@ -10,7 +10,7 @@ from kinefit.errors import FileError, KinefitError, ObservationError
 from kinefit.geometry import se3
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
-from kinefit.readers.tracked_points import read_body_trackers
+from kinefit.sensors.kinds.trackers import read_body_trackers
 from kinefit.takes.track import track_take
 
 HEADER = "time_s,tracker,x,y,z,qw,qx,qy,qz\n"

@@ -7,7 +7,7 @@ from benchmarks.surface_body import errors, moving_arm
 from kinefit.bodies.surfaces import sample
 from kinefit.errors import FileError, KinefitError, ObservationError
 from kinefit.readers.take.file import read_take
-from kinefit.readers.tracked_points import read_surface_points
+from kinefit.sensors.kinds.surface_points import read_surface_points
 from kinefit.takes.track import track_take
 from kinefit.tracking.checkpoints.checkpoint import Checkpoint, key_of
 

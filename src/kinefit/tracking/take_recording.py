@@ -218,11 +218,9 @@ def sensors_of(take: Take, seen: Observations, body: Body) -> tuple[Sensor, ...]
         if kind.sensor is None:
             continue
         with located(take.path, f"[[{kind.table}]] {numbers[kind.table]}"):
-            with kind.calling("sensor"):
-                sensor = kind.sensor(of.entry, of.recording, body)
-            correct = isinstance(sensor, Sensor) and getattr(sensor, "name", None) == name
-            kind.expect(correct, f"returned from `sensor` no Sensor of the name '{name}'")
-            out.append(sensor)
+            valid = lambda s, name=name: isinstance(s, Sensor) and getattr(s, "name", None) == name
+            what = f"a Sensor of the name '{name}'"
+            out.append(kind.call("sensor", of.entry, of.recording, body, valid=valid, what=what))
     return tuple(out)
 
 

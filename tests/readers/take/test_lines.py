@@ -50,7 +50,7 @@ def test_the_same_as_json_and_in_the_videos_picture(tmp_path):
     rows = [{"frame": 0, "line": "hips", "u1": 10, "v1": 20, "u2": 30, "v2": 40}]
     (tmp_path / "lines.json").write_text(json.dumps(rows))
     lines = LINES.replace(".csv", ".json") + 'frame = "video"\n'
-    (video,) = load(tmp_path, lines, camera='size = [128, 96]\nimage = "scaled"').lines
+    (video,) = load(tmp_path, lines, camera='size = [128, 96]\nimage = "scaled"').of_kind("lines")
     np.testing.assert_allclose(video.frame(0).ends[0], [[4.75, 9.75], [14.75, 19.75]])
     with pytest.raises(TakeError, match="not stated which the lines use"):
         load(tmp_path, LINES, camera='size = [128, 96]\nimage = "scaled"')

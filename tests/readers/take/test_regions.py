@@ -65,7 +65,7 @@ def test_sigma_is_the_sensors(tmp_path):
 @pytest.mark.parametrize("region, message", [
     ('[[region]]\ncamera = "cam"\nsigma = 0.0\n', "sigma = 0.0. Give a positive"),
     ('[[region]]\ncamera = "other"\n', "other"),
-    ('[[region]]\ncamera = "cam"\n[[region]]\ncamera = "cam"\n', "two \[\[region\]\]"),
+    ('[[region]]\ncamera = "cam"\n[[region]]\ncamera = "cam"\n', r"two \[\[region\]\]"),
     ('[[region]]\ncamera = "cam"\nfile = "masks"\n', "file"),
     ('[[camera]]\nname = "blind"\n[[region]]\ncamera = "blind"\n', "blind"),
 ])  # fmt: skip

@@ -94,11 +94,8 @@ def _describe_kinds(draft: Draft, files: Sequence[Path]) -> None:
     for table in kind_names():
         try:
             refuse_shadows(table, TABLES)
-            kind = kind_of(table)
-            with kind.calling("propose"):
-                found = list(kind.propose(files)) if kind.propose else []
-            correct = all(isinstance(one, Proposal) and one.entry for one in found)
-            kind.expect(correct, "returned from `propose` what is no Proposal with an entry")
+            kind, valid = kind_of(table), lambda found: all(isinstance(one, Proposal) and one.entry for one in found)
+            found = kind.call("propose", files, valid=valid, what="proposals with an entry") if kind.propose else []
         except PluginError as error:
             draft.note(table, "open", f"{error.problem}. {error.remedy or ''}".strip())
             continue

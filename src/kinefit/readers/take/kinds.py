@@ -102,12 +102,12 @@ class Plugin:
     @property
     def distribution(self) -> str:
         """Name for `pip`."""
-        return self.point.dist.name if self.point.dist else self.package
+        return self.point.dist.name  # type: ignore[union-attr]
 
     @property
     def version(self) -> str:
         """Name and version of the distribution."""
-        return f"{self.distribution} {self.point.dist.version}" if self.point.dist else self.package
+        return f"{self.distribution} {self.point.dist.version}"  # type: ignore[union-attr]
 
     @property
     def package(self) -> str:
@@ -180,29 +180,27 @@ class SensorKind:
     records: tuple[type, ...] = ()
     plugin: Plugin | None = None
 
-    @contextmanager
-    def calling(self, part: str) -> Iterator[None]:
-        """Context in which a part of the kind runs: what else than a KinefitError a plug-in raises names it.
+    def call(self, part: str, *args: Any, valid: Callable[[Any], bool], what: str) -> Any:
+        """Result of a part of the kind; `valid` of it is True if it is `what` the part must return.
 
         Raises
         ------
         PluginError
-            The part raised such an error.
+            A part of a plug-in raised something else than a KinefitError, or returned something else.
         """
         try:
-            yield
+            result = getattr(self, part)(*args)
+            result = list(result) if isinstance(result, Iterator) else result
         except KinefitError:
             raise
         except Exception as error:
             if self.plugin is None:
                 raise
             raised = self.plugin.raised(error) or f"raised {type(error).__name__}: {error}"
-            raise self.plugin.error(f"{raised}", place=f"`{part}`") from error
-
-    def expect(self, correct: bool, problem: str) -> None:
-        """Raise PluginError if a part of a plug-in did not return what it has to."""
-        if not correct:
-            raise TypeError(problem) if self.plugin is None else self.plugin.error(problem)
+            raise self.plugin.error(raised, place=f"`{part}`") from error
+        if self.plugin is not None and not valid(result):
+            raise self.plugin.error(f"returned a {type(result).__name__} from `{part}`, not {what}", place=f"`{part}`")
+        return result
 
 
 @contextmanager

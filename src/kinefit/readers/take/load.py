@@ -145,11 +145,9 @@ def _load_sensors(cameras: TakeCameras) -> tuple[TakeSensor, ...]:
 
         def read(entry: Any, kind: SensorKind = kind, entries: Any = entries, numbers: Any = numbers) -> TakeSensor:
             name = sensor_name(kind.label or kind.table, entries, next(numbers))
-            with kind.calling("read"):
-                recording = kind.read(entry, name, cameras)
-            correct = isinstance(recording, SensorRecording) and (recording.sensor == name or kind.sensor is None)
-            kind.expect(correct, f"returned from `read` no SensorRecording of the sensor '{name}'")
-            return TakeSensor(kind, entry, recording)
+            valid = lambda r: isinstance(r, SensorRecording) and (r.sensor == name or kind.sensor is None)
+            what = f"a SensorRecording of the sensor '{name}'"
+            return TakeSensor(kind, entry, kind.call("read", entry, name, cameras, valid=valid, what=what))
 
         out += read_each(cameras.take, entries, read)
     return tuple(out)
