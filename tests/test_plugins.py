@@ -5,7 +5,7 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -95,7 +95,7 @@ def test_a_sensor_of_another_distribution_goes_from_init_to_the_report(plugin, r
     code, said = plugin.kinefit("init", recording.parent)
     assert code == 0 and "pressure under the right foot" in said
     text = recording.read_text()
-    assert re.search(r"^\[\[insole\]\] +# of the plug-in kinefit-insole 0\.1$", text, re.M)
+    assert re.search(r"^\[\[insole\]\] +# of the plug-in kinefit-insole 0\.1: pressure under the foot", text, re.M)
     assert re.search(r'^file = "insole_right.csv" +# likely: pressure', text, re.M) and 'foot = "right"' in text
     recording.write_text(text + "least = 1e4\n")
     code, said = plugin.kinefit("check", recording)
@@ -289,7 +289,7 @@ def test_a_kind_that_is_not_installed(recording):
     text = recording.read_text()
     with pytest.raises(TakeError, match=r"no sensor or table 'insole'; there are: .*tracker.*Correct the name, or install the plug-in that reads \[\[insole\]\]: .* -m pip install the package"):
         read_take(recording)
-    recording.write_text(text.replace("[[insole]]", "[[insole]]    # of the plug-in kinefit-insole 0.1"))
+    recording.write_text(text.replace("[[insole]]", "[[insole]]    # of the plug-in kinefit-insole 0.1: pressure"))
     with pytest.raises(TakeError, match=r"-m pip install kinefit-insole\.") as caught:
         read_take(recording)
     assert caught.value.file == recording and caught.value.place == "[insole]"
@@ -374,3 +374,21 @@ def test_many_takes_with_a_plugin(here, short, tmp_path, monkeypatch):
     choices = Choices(formats=("csv",), report=False, overlays=False, smooth=False)
     (row,) = track_takes(str(short), tmp_path / "out", choices=choices)
     assert row.status == "done", row
+
+
+def test_the_page_explains_every_part_of_a_kind():
+    page = (ROOT / "docs" / "own-sensor.md").read_text("utf-8")
+    for part in fields(kinds.SensorKind):
+        assert part.name == "plugin" or re.search(rf"^\| .*`{part.name}\b.*` \|", page, re.M), part.name
+
+
+@pytest.mark.parametrize("table", kinds.BUILT_IN)
+def test_kinds_of_kinefit_keep_the_rules_of_plugins(table):
+    kind = kinds.kind_of(table)
+    assert kind.table == table and issubclass(kind.entry, kinds.TakeEntry) and kind.summary and kind.plugin is None
+
+
+def test_nothing_is_imported_before_a_take_names_it():
+    code = "import sys, kinefit.readers.take.file; print([m for m in sys.modules if m.startswith('kinefit.sensors')])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from kinefit.errors import FileError, printable
 from kinefit.readers.guess.files import CalibrationFile
-from kinefit.readers.take.kinds import PLUGIN_COMMENT
 
 CONFIDENCE_LEVELS = ("sure", "likely", "guess", "open")
 """From "stated by the files" to "the user decides"."""
@@ -65,7 +64,7 @@ class Draft:
     others : calibrations that were not chosen.
     cameras : name -> keys of its [[camera]]
     tables : {"keypoints", "depth" ...: (True if in use, False if a comment; keys) of each entry}
-    plugins : {table: distribution and version} of tables that plug-ins read
+    kinds : {table: what it is} of tables of a `SensorKind`
     """
 
     folder: Path
@@ -76,7 +75,7 @@ class Draft:
     others: list[Path] = field(default_factory=list)
     cameras: dict[str, dict[str, Value]] = field(default_factory=dict)
     tables: dict[str, list[tuple[bool, Entry]]] = field(default_factory=lambda: {table: [] for table in _TABLES})
-    plugins: dict[str, str] = field(default_factory=dict)
+    kinds: dict[str, str] = field(default_factory=dict)
     comments: list[str] = field(default_factory=list)
 
     def note(self, about: str, sure: str, text: str) -> None:
@@ -104,8 +103,8 @@ class Draft:
         parts += [_table("[[camera]]", {"name": Value(name), **keys}, self) for name, keys in self.cameras.items()]
         for table, rows in self.tables.items():
             title = f"[[{table}]]"
-            if table in self.plugins:
-                title = f"{title:<{_COMMENT_COLUMN - 2}}  # {PLUGIN_COMMENT}{self.plugins[table]}"
+            if table in self.kinds:
+                title = f"{title:<{_COMMENT_COLUMN - 2}}  # {self.kinds[table]}"
             parts += [_table(title, keys, self, active) for active, keys in rows]
         return "\n".join(parts)
 

@@ -104,8 +104,7 @@ def _describe_kinds(draft: Draft, files: Sequence[Path]) -> None:
             entry = {key: draft.note_value(table, Value(first, "likely", one.reason), key)}
             entry |= {name: Value(value) for name, value in more}
             draft.tables.setdefault(table, []).append((one.used, entry))
-        if found and kind.plugin is not None:
-            draft.plugins[table] = kind.plugin.version
+            draft.kinds[table] = kind.comment
 
 
 def _choose_calibration(

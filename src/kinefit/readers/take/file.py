@@ -44,7 +44,6 @@ from kinefit.readers.take.kinds import (
     PLUGIN_COMMENT,
     WrongEntryError,
     kind_names,
-    kind_of,
     refuse_shadows,
 )
 

@@ -180,6 +180,11 @@ class SensorKind:
     records: tuple[type, ...] = ()
     plugin: Plugin | None = None
 
+    @property
+    def comment(self) -> str:
+        """What stands beside the table's name where `kinefit init` writes it."""
+        return self.summary if self.plugin is None else f"{PLUGIN_COMMENT}{self.plugin.version}: {self.summary}"
+
     def call(self, part: str, *args: Any, valid: Callable[[Any], bool], what: str) -> Any:
         """Result of a part of the kind; `valid` of it is True if it is `what` the part must return.
 

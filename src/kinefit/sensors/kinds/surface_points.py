@@ -16,7 +16,6 @@ from kinefit.readers.take.entries import Metres, Seconds
 from kinefit.readers.take.kinds import Proposal, SensorKind, TakeEntry
 from kinefit.sensors.surfaces.surface_points import SurfacePointSensor
 
-
 _COLUMNS = ("time_s", "point", "x", "y", "z", "std_x", "std_y", "std_z")
 _REMEDY = f"Give trajectories.csv of `kinefit surface`, or a table with {', '.join(_COLUMNS)}."
 

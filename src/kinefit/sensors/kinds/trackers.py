@@ -19,7 +19,6 @@ from kinefit.readers.take.entries import PlacedEntry
 from kinefit.readers.take.kinds import SensorKind
 from kinefit.sensors.points.body_trackers import BodyTrackerSensor
 
-
 _POSITION_COLUMNS = ("time_s", "x", "y", "z")
 _QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
 _REMEDY = "Give a table with the columns time_s, tracker, x, y, z [s, m] and, for orientations, qw, qx, qy, qz."
