@@ -1,5 +1,7 @@
 """`[[tracker]]` of a take: trackers on the body from a table, alone and beside depth, and what is refused."""
 
+import re
+
 import numpy as np
 import pytest
 from tests.sensors.points.test_body_trackers import MOUNTS, POINTS, SIGMA, frame
@@ -11,6 +13,7 @@ from kinefit.geometry import se3
 from kinefit.readers.motion import read_motion
 from kinefit.readers.take.file import read_take
 from kinefit.sensors.kinds.trackers import read_body_trackers
+from kinefit.takes.check import check_take
 from kinefit.takes.track import track_take
 
 HEADER = "time_s,tracker,x,y,z,qw,qx,qy,qz\n"
@@ -111,6 +114,14 @@ def test_takes_that_are_refused(taken, old, new, said):
     with pytest.raises(KinefitError, match=said) as raised:
         track_take(read_take(taken))
     assert raised.value.remedy or "there are" in raised.value.problem
+
+
+def test_the_check_makes_the_sensor(taken):
+    found = check_take(taken).findings
+    assert [finding.severity for finding in found] == ["note"] and "checked by itself" in found[0].text
+    taken.write_text(re.sub(r'skull = "\w+"', 'skull = "no_such_point"', taken.read_text()))
+    faults = [finding for finding in check_take(taken).findings if finding.severity == "fault"]
+    assert len(faults) == 1 and "[[tracker]] 1: tracker 'skull': no landmark or segment 'no_such_point'" in faults[0].text
 
 
 def test_a_take_of_two_tables(taken):
