@@ -121,7 +121,8 @@ def test_the_check_makes_the_sensor(taken):
     assert [finding.severity for finding in found] == ["note"] and "checked by itself" in found[0].text
     taken.write_text(re.sub(r'skull = "\w+"', 'skull = "no_such_point"', taken.read_text()))
     faults = [finding for finding in check_take(taken).findings if finding.severity == "fault"]
-    assert len(faults) == 1 and "[[tracker]] 1: tracker 'skull': no landmark or segment 'no_such_point'" in faults[0].text
+    said = "[[tracker]] 1: tracker 'skull': no landmark or segment 'no_such_point'"
+    assert len(faults) == 1 and said in faults[0].text
 
 
 def test_a_take_of_two_tables(taken):

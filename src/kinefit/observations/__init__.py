@@ -24,7 +24,6 @@ from kinefit.observations.frames import (
 )
 from kinefit.observations.recordings import KEYPOINT_SIGMA, Keypoints, MarkerEvent, Markers, SkeletonMotion
 from kinefit.observations.videos import (
-    BodyTrackerVideo,
     ClickVideo,
     CloudVideo,
     ColourVideo,
@@ -34,14 +33,13 @@ from kinefit.observations.videos import (
     NamedMarkers,
     SensorRecording,
     SilhouetteVideo,
-    SurfacePointVideo,
 )
 
 __all__ = [
     "KEYPOINTS", "KEYPOINT_SIGMA", "MEDIAPIPE_33", "MEDIAPIPE_75", "MEDIAPIPE_478", "MEDIAPIPE_HAND_21",
-    "BodyTrackerFrame", "BodyTrackerVideo", "ClickFrame", "ClickVideo", "CloudVideo", "ColourFrame", "ColourVideo",
+    "BodyTrackerFrame", "ClickFrame", "ClickVideo", "CloudVideo", "ColourFrame", "ColourVideo",
     "DepthFrame", "DepthVideo", "Detections", "Frame", "KeypointFrame", "KeypointVideo", "Keypoints", "LiftedFrame",
     "LineFrame", "LineVideo", "MarkerEvent", "MarkerFrame", "Markers", "NamedMarkers", "PointCloud", "SensorRecording",
-    "SilhouetteFrame", "SilhouetteVideo", "SkeletonMotion", "SurfacePointFrame", "SurfacePointVideo", "by_record",
+    "SilhouetteFrame", "SilhouetteVideo", "SkeletonMotion", "SurfacePointFrame", "by_record",
     "sensor_of",
 ]

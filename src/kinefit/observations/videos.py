@@ -1,4 +1,4 @@
-"""Recordings of one sensor with a time for each frame: images, clouds, keypoints, lines, trackers, surface points."""
+"""Recordings of one sensor with a time for each frame: images, clouds, keypoints, lines."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from kinefit.errors import ObservationError
 from kinefit.geometry.camera import Camera
-from kinefit.observations.arrays import freeze, frozen, sealed
+from kinefit.observations.arrays import freeze, sealed
 from kinefit.observations.frames import (
-    BodyTrackerFrame,
     ClickFrame,
     ColourFrame,
     DepthFrame,
@@ -23,7 +22,6 @@ from kinefit.observations.frames import (
     MarkerFrame,
     PointCloud,
     SilhouetteFrame,
-    SurfacePointFrame,
 )
 from kinefit.observations.recordings import Markers
 
@@ -419,86 +417,3 @@ class NamedMarkers:
             return None
         own = k / self.markers.rate + first
         return MarkerFrame(self.sensor, own, self.markers.names, self.markers.positions[k], self.marker_set)
-
-
-@dataclass(frozen=True, eq=False)
-class BodyTrackerVideo(SensorRecording):
-    """Trackers on the body over time.
-
-    Parameters
-    ----------
-    sensor : str
-    rate : float [Hz]
-    times : (F,) [s] in the take; strictly increasing
-    names : (K,) of the trackers
-    x_world : (F, K, 3) [m]; NaN if missing
-    Rs_world_tracker : (F, K, 3, 3); NaN if missing
-    source : file, for messages
-
-    Raises
-    ------
-    ObservationError
-        Times that do not increase; arrays of other shapes.
-    """
-
-    names: tuple[str, ...]
-    x_world: NDArray
-    Rs_world_tracker: NDArray
-    source: str = ""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        what, shape, file = f"trackers of {self.sensor}", (len(self), len(self.names), 3), self.source or None
-        x = frozen(self.x_world, float, what, shape, file)
-        R = frozen(self.Rs_world_tracker, float, f"rotations of {what}", (*shape, 3), file)
-        freeze(self, x_world=x, Rs_world_tracker=R)
-
-    def frame(self, i: int) -> BodyTrackerFrame:
-        """Frame number `i`; a negative number counts from the end."""
-        i, time = self._at(i)
-        return BodyTrackerFrame(self.sensor, time, self.names, self.x_world[i], self.Rs_world_tracker[i])
-
-
-@dataclass(frozen=True, eq=False)
-class SurfacePointVideo(SensorRecording):
-    """Tracked points of a surface over time.
-
-    Parameters
-    ----------
-    sensor : str
-    rate : float [Hz]
-    times : (F,) [s] in the take; strictly increasing.
-    first : (F + 1,) int
-        Start of each frame in the columns below, and their length.
-    ids : (N,) int, the same for the same point at all times
-    x_world : (N, 3) [m]
-    std : (N, 3) [m] standard deviations along the world's axes
-    source : str
-        File, for messages.
-
-    Raises
-    ------
-    ObservationError
-        Times that do not increase; columns of different lengths.
-    """
-
-    first: NDArray
-    ids: NDArray
-    x_world: NDArray
-    std: NDArray
-    source: str = ""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        lengths = {len(self.ids), len(self.x_world), len(self.std), int(self.first[-1]) if len(self.first) else -1}
-        if len(lengths) > 1 or len(self.first) != len(self.times) + 1:
-            problem = f"columns of {sorted(lengths)} points, {len(self.first)} starts of {len(self.times)} frames"
-            remedy = "Give every point its position and standard deviation."
-            raise ObservationError(problem, file=self.source or None, remedy=remedy)
-
-    def frame(self, i: int) -> SurfacePointFrame:
-        """Frame number `i`; a negative number counts from the end."""
-        i, time = self._at(i)
-        part = slice(int(self.first[i]), int(self.first[i + 1]))
-        covariance = self.std[part, :, None] ** 2 * np.eye(3)
-        return SurfacePointFrame(self.sensor, time, self.ids[part], self.x_world[part], covariance)

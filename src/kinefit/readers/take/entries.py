@@ -352,10 +352,10 @@ class Take(TakeHead):
             found = self if table == "take" else getattr(self, ATTRIBUTES.get(table, table))
             of_table = found if isinstance(found, tuple) else () if found is None else (found,)
             for entry in (*of_table, *(self.skin if table == "keypoints" else ())):
-                yield table, _name_of(table, entry), entry
+                yield table, title_of(table, entry), entry
         for table, entries in self.sensors.items():
             for entry in entries:
-                yield table, _name_of(table, entry), entry
+                yield table, title_of(table, entry), entry
 
 
 TABLES: dict[str, type[Any]] = {
@@ -380,7 +380,8 @@ def keys_of(table: str) -> tuple[str, ...]:
     return tuple(getattr(record, "__struct_fields__", None) or record.__dataclass_fields__)
 
 
-def _name_of(table: str, entry: Any) -> str:
+def title_of(table: str, entry: Any) -> str:
+    """Name of an entry in messages."""
     if table in SINGLE_TABLES:
         return f"[{table}]"
     if table not in ("camera", "depth", "stereo"):

@@ -53,6 +53,7 @@ from kinefit.readers.take.entries import (
     Take,
     read_each,
     sensor_name,
+    title_of,
 )
 from kinefit.readers.take.kinds import SensorKind, kind_of
 from kinefit.readers.take.skin import load_skin
@@ -141,17 +142,16 @@ def _load_sensors(cameras: TakeCameras) -> tuple[TakeSensor, ...]:
     """
     out = list[TakeSensor]()
     for table, entries in cameras.take.sensors.items():
-        kind, numbers = kind_of(table), iter(range(len(entries)))
-
-        def read(entry: Any, kind: SensorKind = kind, entries: Any = entries, numbers: Any = numbers) -> TakeSensor:
-            name = sensor_name(kind.label or kind.table, entries, next(numbers))
-            valid = lambda r: isinstance(r, SensorRecording) and (r.sensor == name or kind.sensor is None)
-            what = f"a SensorRecording of the sensor '{name}'"
-            return TakeSensor(kind, entry, kind.call("read", entry, name, cameras, valid=valid, what=what))
-
-        out += read_each(cameras.take, entries, read)
+        kind = kind_of(table)
+        for k, entry in enumerate(entries):
+            name = sensor_name(kind.label or table, entries, k)
+            valid = lambda r, name=name, kind=kind: (
+                isinstance(r, SensorRecording) and (r.sensor == name or kind.sensor is None)
+            )
+            with located(cameras.take.path, title_of(table, entry)):
+                what = f"a SensorRecording of the sensor '{name}'"
+                out.append(TakeSensor(kind, entry, kind.call("read", entry, name, cameras, valid=valid, what=what)))
     return tuple(out)
-
 
 
 @checked

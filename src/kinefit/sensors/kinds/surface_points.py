@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kinefit._files import rate_of, read_table
 from kinefit.bodies import Body
 from kinefit.errors import FileError
-from kinefit.observations import SurfacePointVideo
+from kinefit.observations import SensorRecording, SurfacePointFrame
 from kinefit.readers.take.entries import Metres, Seconds
 from kinefit.readers.take.kinds import Proposal, SensorKind, TakeEntry
 from kinefit.sensors.surfaces.surface_points import SurfacePointSensor
@@ -28,7 +30,38 @@ class SurfacePointsEntry(TakeEntry, frozen=True, kw_only=True):
     sigma: Metres = 0.01  # [m] standard deviation by which the surface slides on the bone, and the body's shape is off
 
 
-def read_surface_points(path: Path, sensor: str = "surface_points", *, time_offset: float = 0.0) -> SurfacePointVideo:
+@dataclass(frozen=True, eq=False)
+class SurfacePointRecording(SensorRecording):
+    """Tracked points of a surface over time.
+
+    Parameters
+    ----------
+    sensor, rate, times : see `SensorRecording`
+    first : (F + 1,) int
+        Start of each frame in the columns below, and their length.
+    ids : (N,) int, the same for the same point at all times
+    x_world : (N, 3) [m]
+    std : (N, 3) [m] standard deviations along the world's axes
+    source : file, for messages
+    """
+
+    first: NDArray
+    ids: NDArray
+    x_world: NDArray
+    std: NDArray
+    source: str = ""
+
+    def frame(self, i: int) -> SurfacePointFrame:
+        """Frame number `i`; a negative number counts from the end."""
+        i, time = self._at(i)
+        part = slice(int(self.first[i]), int(self.first[i + 1]))
+        covariance = self.std[part, :, None] ** 2 * np.eye(3)
+        return SurfacePointFrame(self.sensor, time, self.ids[part], self.x_world[part], covariance)
+
+
+def read_surface_points(
+    path: Path, sensor: str = "surface_points", *, time_offset: float = 0.0
+) -> SurfacePointRecording:
     """Points of a table with the columns time_s, point, x, y, z, std_x, std_y, std_z [s, m]; others are not read.
 
     Raises
@@ -47,17 +80,17 @@ def read_surface_points(path: Path, sensor: str = "surface_points", *, time_offs
     rate = rate_of(times, path, _REMEDY)
     order = np.argsort(frame, kind="stable")
     values, first = values[order], np.searchsorted(frame[order], np.arange(len(times) + 1))
-    return SurfacePointVideo(
+    return SurfacePointRecording(
         sensor, rate, times + time_offset, first, values[:, 1].astype(np.int64), values[:, 2:5], values[:, 5:],
         source=str(path),
     )  # fmt: skip
 
 
-def _read(entry: SurfacePointsEntry, name: str, _: Any) -> SurfacePointVideo:
+def _read(entry: SurfacePointsEntry, name: str, _: Any) -> SurfacePointRecording:
     return read_surface_points(entry.file, name, time_offset=entry.time_offset)
 
 
-def _sensor(entry: SurfacePointsEntry, recording: SurfacePointVideo, _: Body) -> SurfacePointSensor:
+def _sensor(entry: SurfacePointsEntry, recording: SurfacePointRecording, _: Body) -> SurfacePointSensor:
     return SurfacePointSensor(recording.sensor, slide=entry.sigma)
 
 

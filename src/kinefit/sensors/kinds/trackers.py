@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from msgspec import field
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from kinefit._files import rate_of, read_table, repeated
 from kinefit.bodies import Body
 from kinefit.errors import FileError, ObservationError, choices
 from kinefit.geometry import se3
-from kinefit.observations import BodyTrackerVideo
+from kinefit.observations import BodyTrackerFrame, SensorRecording
 from kinefit.readers.take.entries import PlacedEntry
 from kinefit.readers.take.kinds import SensorKind
 from kinefit.sensors.points.body_trackers import BodyTrackerSensor
@@ -35,10 +36,34 @@ class TrackerEntry(PlacedEntry, frozen=True, kw_only=True):
     mount_sigma: float = 0.0  # [deg] standard deviation of the mounts, which are then estimated; default: exact
 
 
+@dataclass(frozen=True, eq=False)
+class BodyTrackerRecording(SensorRecording):
+    """Trackers on the body over time.
+
+    Parameters
+    ----------
+    sensor, rate, times : see `SensorRecording`
+    names : (K,) of the trackers
+    x_world : (F, K, 3) [m]; NaN if missing
+    Rs_world_tracker : (F, K, 3, 3); NaN if missing
+    source : file, for messages
+    """
+
+    names: tuple[str, ...]
+    x_world: NDArray
+    Rs_world_tracker: NDArray
+    source: str = ""
+
+    def frame(self, i: int) -> BodyTrackerFrame:
+        """Frame number `i`; a negative number counts from the end."""
+        i, time = self._at(i)
+        return BodyTrackerFrame(self.sensor, time, self.names, self.x_world[i], self.Rs_world_tracker[i])
+
+
 def read_body_trackers(
     path: Path, names: Iterable[str], sensor: str = "trackers", *, time_offset: float = 0.0,
     T_world_file: ArrayLike | None = None,
-) -> BodyTrackerVideo:  # fmt: skip
+) -> BodyTrackerRecording:  # fmt: skip
     """Read named trackers of a table with the columns time_s, tracker, x, y, z [s, m], and optional qw, qx, qy, qz.
 
     Parameters
@@ -80,15 +105,15 @@ def read_body_trackers(
         x[frame[own], k] = se3.apply(T, values[own, 1:4])
         R[frame[own & turned], k] = T[:3, :3] @ se3.rotation_from_quaternion(values[own & turned, 4:])
     rate = rate_of(times, path, _REMEDY)
-    return BodyTrackerVideo(sensor, rate, times + time_offset, names, x, R, source=str(path))
+    return BodyTrackerRecording(sensor, rate, times + time_offset, names, x, R, source=str(path))
 
 
-def _read(entry: TrackerEntry, name: str, _: Any) -> BodyTrackerVideo:
+def _read(entry: TrackerEntry, name: str, _: Any) -> BodyTrackerRecording:
     T = entry.T_world_file
     return read_body_trackers(entry.file, entry.points, name, time_offset=entry.time_offset, T_world_file=T)
 
 
-def _sensor(entry: TrackerEntry, recording: BodyTrackerVideo, body: Body) -> BodyTrackerSensor:
+def _sensor(entry: TrackerEntry, recording: BodyTrackerRecording, body: Body) -> BodyTrackerSensor:
     turn, mounts = np.radians(entry.rotation_sigma), {name: np.radians(m) for name, m in entry.mounts.items()}
     sensor = BodyTrackerSensor(
         recording.sensor, entry.points, sigma=entry.sigma, rotation_sigma=float(turn), mounts=mounts,
