@@ -481,3 +481,24 @@ def test_nothing_is_imported_before_a_take_names_it():
     code = "import sys, kinefit.readers.take.file; print([m for m in sys.modules if m.startswith('kinefit.sensors')])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+NESTED = [
+    ("        return Pressure(self.sensor, float(self.times[i]), loaded, self.up)",
+     "        return Pressure(self.sensor, float(self.times[i]), Cells(loaded), self.up)\n\n"
+     "@dataclass\nclass Cells:\n    names: tuple"),
+    ("select(self.loaded)}, channels=self.loaded)", "select(self.loaded.names)}, channels=self.loaded.names)"),
+]  # fmt: skip
+
+
+def test_records_in_a_measurement_are_stored_where_the_kind_lists_them(here, short, tmp_path):
+    take = read_take(short)
+
+    def stored(folder, *pairs):
+        here(*NESTED, *pairs)
+        with Checkpoint(tmp_path / folder, key_of(take), kinds=kinds.kinds_of(take)) as unfinished:
+            return track_take(take, smooth=False, checkpoint=unfinished)[0]
+
+    with pytest.raises(ObservationError, match="cannot store a custom Cells.*`records` of its SensorKind"):
+        stored("a")
+    assert "insole" in stored("b", ("propose=propose,\n", "propose=propose, records=(Cells,),\n")).residuals
