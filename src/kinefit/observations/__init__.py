@@ -4,6 +4,10 @@ Readers make them, correspondences use them. Nothing here opens a file or depend
 time, `recordings` of a whole take of one sensor.
 """
 
+import warnings
+from importlib import import_module
+from typing import Any
+
 from kinefit.observations.detections import MEDIAPIPE_33, MEDIAPIPE_75, MEDIAPIPE_478, MEDIAPIPE_HAND_21, Detections
 from kinefit.observations.frames import (
     KEYPOINTS,
@@ -43,3 +47,11 @@ __all__ = [
     "SilhouetteFrame", "SilhouetteVideo", "SkeletonMotion", "SurfacePointFrame", "by_record",
     "sensor_of",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name != "SurfacePointVideo":
+        raise AttributeError(name)
+    text = "kinefit.observations.SurfacePointVideo is sensors.kinds.surface_points.SurfacePointRecording now"
+    warnings.warn(text, FutureWarning, stacklevel=2)
+    return import_module("kinefit.sensors.kinds.surface_points").SurfacePointRecording

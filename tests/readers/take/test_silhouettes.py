@@ -85,6 +85,11 @@ def test_a_take_with_silhouettes_alone(tmp_path):
     seen = load_observations(told)
     assert (seen.rate, seen.frames, len(seen.of_kind("silhouette"))) == (30.0, (0, 3), 1)
     (video,) = seen.of_kind("silhouette")
+    with pytest.warns(FutureWarning, match="'silhouettes' is Observations.of_kind"):
+        assert seen.silhouettes == (video,)
+    with pytest.warns(FutureWarning, match="'silhouettes' is Take.sensors"):
+        assert told.silhouettes == told.sensors["silhouette"]
+    assert not hasattr(seen, "no_such_attribute") and not hasattr(told, "no_such_attribute")
     assert video.frame(0).mask[20, 12] == 255
 
 

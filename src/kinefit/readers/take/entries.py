@@ -7,10 +7,11 @@ say what to write; keys that need each other by `__post_init__`.
 from __future__ import annotations
 
 import datetime
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -287,6 +288,20 @@ class TakeHead:
     hide_faces: bool = False
 
 
+_OLD_ATTRIBUTES = {
+    "silhouettes": "silhouette", "regions": "region", "lines": "lines", "surface_points": "surface_points",
+}  # fmt: skip
+"""{attribute of a `Take` and its `Observations` in 0.2: its table}"""
+
+
+def old_attribute(name: str, successor: str) -> str:
+    """The table that an attribute of 0.2 is of, with a warning; AttributeError if it was none."""
+    if name not in _OLD_ATTRIBUTES:
+        raise AttributeError(name)
+    warnings.warn(f"'{name}' is {successor} by the name of its table now", FutureWarning, stacklevel=3)
+    return _OLD_ATTRIBUTES[name]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Take(TakeHead):
     """A take file, checked: all names in it agree and all files it names exist.
@@ -323,6 +338,11 @@ class Take(TakeHead):
         if skin := tuple(entry for entry in self.keypoints if entry.format == "skin"):
             object.__setattr__(self, "skin", (*self.skin, *skin))
             object.__setattr__(self, "keypoints", tuple(entry for entry in self.keypoints if entry.format != "skin"))
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            return self.sensors.get(old_attribute(name, "Take.sensors"), ())
 
     @property
     def pose(self) -> StartEntry | None:

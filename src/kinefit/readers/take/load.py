@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,7 @@ from kinefit.readers.take.entries import (
     KeypointsEntry,
     MarkersEntry,
     Take,
+    old_attribute,
     read_each,
     sensor_name,
     title_of,
@@ -120,6 +121,11 @@ class Observations:
     sensors: tuple[TakeSensor, ...] = ()
     notes: tuple[str, ...] = ()
     first_time: float = 0.0
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            return self.of_kind(old_attribute(name, "Observations.of_kind"))
 
     @property
     def recordings(self) -> tuple[SensorRecording, ...]:
